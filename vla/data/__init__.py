@@ -1,0 +1,1 @@
+"""The episode store, the window loader and exporters."""

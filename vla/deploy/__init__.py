@@ -1,0 +1,1 @@
+"""Putting a trained policy on a robot."""

@@ -1,0 +1,1 @@
+"""Action tokenizers, image tokenizers, text encoders, policies' networks and the learner."""

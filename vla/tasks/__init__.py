@@ -1,0 +1,1 @@
+"""The simulated Franka tabletop: scene, randomisation, goals, controller and scripted expert."""
