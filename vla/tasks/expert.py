@@ -1,0 +1,174 @@
+"""The scripted expert: a closed loop on the simulator's truth that remembers nothing.
+
+What it does depends only on the state it sees, so every action it gives is the right label for that state, however the
+state came about, and a policy can learn to recover from anything the expert was pushed into.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from vla.spec import Array, Observation, Spec
+from vla.tasks.control import DOWN, MAX_OPENING, rotation_z, vector_from_rotation
+
+HOVER = 0.08  # height above the block from which it is approached [m]
+CARRY = 0.07  # height above the table at which it is carried [m]
+FUNNEL = 2.5  # height gained per metre of horizontal distance, so that approaches come from above
+GRASP_XY, GRASP_Z, GRASP_YAW = 0.008, 0.008, 0.2  # tolerances at which the gripper closes [m], [m], [rad]
+PLACE_XY, PLACE_Z = 0.012, 0.006  # tolerances at which it opens [m]
+CLEARANCE = 0.012  # between open fingers and a block on both sides together [m]
+
+
+class Waypoint:
+    """Reaches, grasps, carries and releases, with recovery after a missed grasp, a drop or a push."""
+
+    def __init__(self, spec: Spec, perturb: Perturbation | None = None) -> None:
+        """Args: what an action looks like; how to disturb what is executed, while the clean action is recorded."""
+        self._low, self._high = np.array(spec.low), np.array(spec.high)
+        self._perturb = perturb
+        self.info: dict[str, Any] = {}
+
+    def reset(self, instruction: str, seed: int) -> None:
+        """Start over; `seed` feeds the perturbation."""
+        self.info = {}
+        if self._perturb is not None:
+            self._perturb.reset(seed)
+
+    def act(self, observation: Observation) -> Array:
+        """The action to execute; `info["clean"]` is the one to imitate.
+
+        Raises:
+            ValueError: the observation carries no simulator truth.
+        """
+        if observation.truth is None:
+            raise ValueError("the scripted expert needs the simulator's truth, which this observation does not carry")
+        clean = np.clip(self._decide(observation.truth, observation.gripper), self._low, self._high).astype(np.float32)
+        self.info = {"clean": clean}
+        if self._perturb is None:
+            return clean
+        executed = self._perturb(clean, observation.truth["commanded"])
+        return np.clip(executed, self._low, self._high).astype(np.float32)
+
+    def _decide(self, truth: dict[str, Array], opening: float) -> Array:
+        """(7,) unclipped action for this state."""
+        if truth["grasped"][0]:
+            return self._carry(truth)
+        if truth["releases"][0] and _placed(truth):
+            free = opening > 2 * truth["half_size"][0] + CLEARANCE / 2
+            return self._action(truth, np.array([0.0, 0.0, HOVER if free else 0.0]), 0.0, 1.0)
+        return self._reach(truth, opening)
+
+    def _reach(self, truth: dict[str, Array], opening: float) -> Array:
+        tool, block, width = truth["commanded"][:3, 3], truth["block"], 2 * truth["half_size"][0]
+        offset = block - tool
+        yaw = _yaw_to_faces(truth)
+        away = float(np.hypot(offset[0], offset[1]))
+        between = away < GRASP_XY + 0.004 and abs(offset[2]) < GRASP_Z + 0.004
+        closing = between and width - 0.006 < opening < MAX_OPENING - 0.004
+        aligned = away < GRASP_XY and abs(offset[2]) < GRASP_Z and abs(yaw) < GRASP_YAW
+        if closing or (aligned and opening > width - 0.006):
+            return self._action(truth, offset, yaw, 0.0)
+        # Down only where it is straight below; further away, or with the fingers too close, stay above it.
+        misaligned = max(away - GRASP_XY / 2, 0.0) + 0.05 * max(abs(yaw) - GRASP_YAW / 2, 0.0)
+        height = min(FUNNEL * misaligned, HOVER)
+        if opening < width + CLEARANCE:
+            height = max(height, 0.045) if not between else HOVER
+        offset[2] += height
+        if offset[2] > 0.01:  # too low: rise before moving sideways, so that nothing is pushed over
+            offset[:2] *= 0.02 / (0.02 + offset[2])
+        return self._action(truth, offset, yaw, 1.0)
+
+    def _carry(self, truth: dict[str, Array]) -> Array:
+        offset = truth["destination"] - truth["block"]
+        away = float(np.hypot(offset[0], offset[1]))
+        if not truth["releases"][0]:
+            return self._action(truth, offset, 0.0, 0.0)
+        height = min(FUNNEL * max(away - PLACE_XY / 2, 0.0), CARRY)
+        opens = away < PLACE_XY and abs(offset[2]) < PLACE_Z
+        offset[2] += height
+        if offset[2] > 0.01:
+            offset[:2] *= 0.02 / (0.02 + offset[2])
+        return self._action(truth, offset, 0.0, 1.0 if opens else 0.0)
+
+    def _action(self, truth: dict[str, Array], offset: Array, yaw: float, gripper: float) -> Array:
+        """Move by `offset`, scaled to what one step allows without bending the path, upright and turned by `yaw`."""
+        rotation = truth["commanded"][:3, :3]
+        upright = rotation_z(np.arctan2(rotation[1, 0], rotation[0, 0]) + yaw) @ DOWN
+        scale = max(1.0, float(np.max(np.abs(offset) / self._high[:3])))
+        return np.concatenate([offset / scale, vector_from_rotation(upright @ rotation.T), [gripper]])
+
+
+def _placed(truth: dict[str, Array]) -> bool:
+    """The block rests close enough to its destination."""
+    offset = truth["destination"] - truth["block"]
+    return bool(np.hypot(offset[0], offset[1]) < 2 * PLACE_XY and abs(offset[2]) < PLACE_Z)
+
+
+def _yaw_to_faces(truth: dict[str, Array]) -> float:
+    """Turn [rad] that brings the fingers onto two faces of the block, within ±45° of the arm's neutral yaw."""
+    rotation, block = truth["commanded"][:3, :3], truth["block_rotation"]
+    side = block[:, int(np.argmin(np.abs(block[2])))]  # an edge that lies flat, whichever face is up
+    quarter = np.pi / 2
+    wanted = (np.arctan2(side[1], side[0]) + quarter / 2) % quarter - quarter / 2
+    return float(wanted - np.arctan2(rotation[1, 0], rotation[0, 0]))
+
+
+class Perturbation:
+    """Pushes the robot off the expert's path, so that demonstrations cover the states a learner will drift into.
+
+    An excursion drives towards a random point at full speed for a few steps, with the gripper open or closed at random.
+    """
+
+    def __init__(
+        self,
+        start: float = 0.7,
+        start_steps: Sequence[int] = (2, 9),
+        rate: float = 0.04,
+        steps: Sequence[int] = (2, 5),
+        noise: float = 0.2,
+        closed: float = 0.3,
+        low: Sequence[float] = (0.34, -0.26, 0.015),
+        high: Sequence[float] = (0.66, 0.26, 0.34),
+    ) -> None:
+        """Args:
+        start: probability that an episode begins with an excursion.
+        start_steps: shortest and longest first excursion [steps].
+        rate: probability per step of another one.
+        steps: shortest and longest later excursion [steps].
+        noise: standard deviation of the noise on every executed motion, as a share of it.
+        closed: probability that an excursion commands a closed gripper.
+        low: lower corner of the box of points to go to, in the base frame [m].
+        high: upper corner.
+        """
+        self._start, self._start_steps, self._rate, self._steps = start, tuple(start_steps), rate, tuple(steps)
+        self._noise, self._closed = noise, closed
+        self._low, self._high = np.array(low), np.array(high)
+
+    def reset(self, seed: int) -> None:
+        """Draw whether and where this episode starts off."""
+        self._random = np.random.default_rng([seed, 0x5EED])
+        self._left = 0
+        if self._random.uniform() < self._start:
+            self._begin(self._start_steps)
+
+    def _begin(self, steps: Sequence[int]) -> None:
+        self._left = int(self._random.integers(steps[0], steps[1] + 1))
+        self._point = self._random.uniform(self._low, self._high)
+        self._turn = self._random.uniform(-0.2, 0.2)
+        self._gripper = float(self._random.uniform() >= self._closed)
+
+    def __call__(self, clean: Array, commanded: Array) -> Array:
+        """The (7,) action to execute instead of `clean`, given the commanded (4, 4) pose."""
+        if self._left == 0 and self._random.uniform() < self._rate:
+            self._begin(self._steps)
+        action = clean.astype(float)
+        if self._left > 0:
+            self._left -= 1
+            action[:3] = self._point - commanded[:3, 3]
+            action[5], action[6] = self._turn, self._gripper
+            return action
+        action[:6] *= 1 + self._noise * self._random.standard_normal(6)
+        return action

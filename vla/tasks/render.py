@@ -1,0 +1,88 @@
+"""Colour and depth of every camera from one render pass each."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+
+import mujoco
+import numpy as np
+
+from vla.spec import Array
+
+MILLIMETRES = 1000.0
+
+
+class Renderer:
+    """Renders a compiled model off screen; owns a GL context that belongs to the thread which made it."""
+
+    def __init__(self, model: mujoco.MjModel, height: int, width: int) -> None:
+        """Args: the model; image size [px].
+
+        Raises:
+            RuntimeError: no GL implementation works on this machine.
+        """
+        self._model, self._height, self._width = model, height, width
+        # The off-screen buffer is allocated with the context, so it must be asked for before.
+        model.vis.global_.offwidth, model.vis.global_.offheight = width, height
+        try:
+            self._gl = mujoco.GLContext(width, height)
+            self._gl.make_current()
+            self._context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100)
+        except (AttributeError, ImportError, RuntimeError, mujoco.FatalError) as error:
+            raise RuntimeError(
+                f"cannot render with MUJOCO_GL={os.environ.get('MUJOCO_GL')}: {error}; "
+                "install libegl1 and libgl1-mesa-dri (or libosmesa6), or set MUJOCO_GL to egl, osmesa or glfw"
+            ) from error
+        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self._context)
+        self._context.readDepthMap = mujoco.mjtDepthMap.mjDEPTH_ZEROFAR
+        self._scene = mujoco.MjvScene(model, maxgeom=model.ngeom + 50)
+        self._option = mujoco.MjvOption()
+        self._option.geomgroup[:] = [0, 0, 1, 0, 0, 0]
+        self._scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = False
+        self._camera = mujoco.MjvCamera()
+        self._camera.type = mujoco.mjtCamera.mjCAMERA_FIXED
+        self._rect = mujoco.MjrRect(0, 0, width, height)
+        self._rgb = np.empty((height, width, 3), np.uint8)
+        self._depth = np.empty((height, width), np.float32)
+
+    def render(self, data: mujoco.MjData, camera: int) -> tuple[Array, Array]:
+        """(H, W, 3) uint8 colours and (H, W) uint16 depth along the optical axis [mm] of camera number `camera`."""
+        self._gl.make_current()
+        self._camera.fixedcamid = camera
+        mujoco.mjv_updateScene(
+            self._model, data, self._option, None, self._camera, mujoco.mjtCatBit.mjCAT_ALL.value, self._scene
+        )
+        mujoco.mjr_render(self._rect, self._scene, self._context)
+        mujoco.mjr_readPixels(self._rgb, self._depth, self._rect, self._context)
+        return np.flipud(self._rgb).copy(), np.flipud(self._millimetres(self._depth))
+
+    def _millimetres(self, reading: Array) -> Array:
+        """Depth of a reverse-z buffer: 1 at the near plane, 0 at the far one (inverse of the perspective map)."""
+        near = self._model.vis.map.znear * self._model.stat.extent
+        far = self._model.vis.map.zfar * self._model.stat.extent
+        metres = near * far / (near + reading * (far - near))
+        return np.rint(np.where(reading > 0, metres, 0.0) * MILLIMETRES).astype(np.uint16)
+
+    def close(self) -> None:
+        """Free the GL context; without it a traceback is printed when Python exits."""
+        self._context.free()
+        self._gl.free()
+
+
+def choose_backend() -> None:
+    """Set MUJOCO_GL, unless it is set: EGL on a machine without a display, OSMesa where EGL does not work.
+
+    Must run before MuJoCo is first imported, because it reads the variable then.
+    """
+    if "MUJOCO_GL" in os.environ or os.environ.get("DISPLAY") or sys.platform != "linux":
+        return
+    # A failing EGL can end the process, so it is tried in another one.
+    probe = "import mujoco; mujoco.GLContext(8, 8).make_current()"
+    for backend in ("egl", "osmesa"):
+        tried = subprocess.run([sys.executable, "-c", probe], env={**os.environ, "MUJOCO_GL": backend}, capture_output=True)
+        if tried.returncode == 0:
+            os.environ["MUJOCO_GL"] = backend
+            return
+    os.environ["MUJOCO_GL"] = "egl"

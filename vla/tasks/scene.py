@@ -1,0 +1,301 @@
+"""The tabletop: table, lights, cameras, target pad, blocks and the robot, built once and compiled once."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import mujoco
+import numpy as np
+from dm_control import composer, mjcf
+
+from vla.spec import Array, Shape
+from vla.tasks.control import HOME, MAX_OPENING
+from vla.tasks.franka import Panda
+
+COLOURS: dict[str, tuple[float, float, float]] = {
+    "red": (0.85, 0.10, 0.10),
+    "green": (0.10, 0.65, 0.20),
+    "blue": (0.12, 0.25, 0.85),
+    "yellow": (0.95, 0.80, 0.10),
+    "purple": (0.50, 0.15, 0.65),
+    "orange": (0.95, 0.45, 0.08),
+}
+BLOCK_HALF_SIZE = 0.02  # nominal [m]
+BLOCK_DENSITY = 600.0  # of hardwood [kg/m³]
+PAD_RADIUS = 0.05  # [m]
+PAD_THICKNESS = 0.001  # half [m]: painted on, it does not collide
+TABLE_HALF_SIZE = (0.6, 0.8, 0.03)  # [m]
+TABLE_CENTRE = (0.4, 0.0)  # [m]
+BLOCK_CONTACT = {"contype": 1, "conaffinity": 3}
+
+
+@dataclass(frozen=True)
+class CameraPose:
+    """A camera that looks from `position` at `target`, with a vertical field of view."""
+
+    position: tuple[float, float, float]  # [m]
+    target: tuple[float, float, float]  # [m]
+    fovy: float  # [degrees]
+
+
+FRONT = CameraPose(position=(1.02, 0.0, 0.52), target=(0.5, 0.0, 0.05), fovy=45.0)  # in the base frame
+WRIST = CameraPose(position=(0.085, 0.0, 0.035), target=(0.02, 0.0, 0.12), fovy=75.0)  # in the hand's frame
+WRIST_UP = (1.0, 0.0, 0.0)
+
+
+def look_at(position: Sequence[float] | Array, target: Sequence[float] | Array, up: Sequence[float] | Array) -> Array:
+    """(3, 3) rotation of a MuJoCo camera (looking along −z, y up) at `position` that looks at `target`."""
+    back = np.asarray(position, dtype=float) - np.asarray(target, dtype=float)
+    back /= np.linalg.norm(back)
+    right = np.cross(up, back)
+    right /= np.linalg.norm(right)
+    return np.stack([right, np.cross(back, right), back], axis=1)
+
+
+class Block(composer.Entity):
+    """A coloured cube."""
+
+    def _build(self, name: str) -> None:
+        self._root = mjcf.RootElement(model=name)
+        self._root.compiler.angle = "radian"
+        self.geom = self._root.worldbody.add(
+            "geom",
+            name="cube",
+            type="box",
+            size=(BLOCK_HALF_SIZE,) * 3,
+            density=BLOCK_DENSITY,
+            condim=4,
+            friction=(1.0, 0.01, 0.0002),
+            group=2,
+            **BLOCK_CONTACT,
+        )
+
+    @property
+    def mjcf_model(self) -> mjcf.RootElement:
+        """The model's root element."""
+        return self._root
+
+
+class Scene(composer.Entity):
+    """The world with everything in it; `bind` it to a compiled model to find things by index."""
+
+    def _build(self, blocks: int = 3, meshes: Literal["light", "full"] = "light", shadows: bool = True) -> None:
+        """Args: blocks on the table; what the robot is drawn with; whether the lamp casts shadows."""
+        self._root = mjcf.RootElement(model="tabletop")
+        self._root.compiler.angle = "radian"
+        self._set_physics()
+        self._set_quality()
+        self._add_table()
+        self._add_lights(shadows)
+        self.panda = Panda(meshes=meshes)
+        self.attach(self.panda)
+        self._add_cameras()
+        self.blocks = [Block(name=f"block{index}") for index in range(blocks)]
+        for block in self.blocks:
+            frame = self.attach(block)
+            frame.add("freejoint")
+
+    @property
+    def mjcf_model(self) -> mjcf.RootElement:
+        """The model's root element."""
+        return self._root
+
+    def _set_physics(self) -> None:
+        option = self._root.option
+        option.timestep, option.integrator = 0.004, "implicitfast"
+        option.cone, option.impratio = "elliptic", 10  # no creep of a held block
+
+    def _set_quality(self) -> None:
+        visual = self._root.visual
+        # Rendered on the CPU, a multisampled image with a large shadow map costs thirty times this.
+        visual.quality.shadowsize, visual.quality.offsamples = 512, 0
+        visual.map.znear, visual.map.zfar = 0.01, 10.0
+        visual.headlight.ambient, visual.headlight.diffuse = (0.42,) * 3, (0.2,) * 3
+        visual.headlight.specular = (0.0,) * 3
+        visual.map.shadowclip, visual.map.shadowscale = 1.0, 0.8
+        self._root.statistic.extent, self._root.statistic.center = 1.0, (0.4, 0, 0.2)
+        self._root.asset.add(
+            "texture", type="skybox", builtin="gradient", rgb1=(0.78, 0.83, 0.88), rgb2=(0.55, 0.60, 0.66), width=64, height=384
+        )
+
+    def _add_table(self) -> None:
+        world = self._root.worldbody
+        world.add(
+            "geom",
+            name="table",
+            type="box",
+            size=TABLE_HALF_SIZE,
+            pos=(*TABLE_CENTRE, -TABLE_HALF_SIZE[2]),
+            rgba=(0.72, 0.66, 0.58, 1),
+            friction=(1.0, 0.01, 0.0002),
+            group=2,
+        )
+        world.add(
+            "geom", name="floor", type="plane", size=(3, 3, 0.1), pos=(0, 0, -0.75), rgba=(0.45, 0.46, 0.48, 1), group=2
+        )
+        self.pad = world.add("body", name="pad", mocap=True, pos=(0.5, 0, PAD_THICKNESS))
+        self.pad.add(
+            "geom",
+            name="pad",
+            type="cylinder",
+            size=(PAD_RADIUS, PAD_THICKNESS),
+            rgba=(0.12, 0.12, 0.14, 1),
+            contype=0,
+            conaffinity=0,
+            group=2,
+        )
+
+    def _add_lights(self, shadows: bool) -> None:
+        self._root.worldbody.add(
+            "light",
+            name="lamp",
+            pos=(0.6, -0.4, 1.8),
+            dir=(-0.1, 0.25, -1),
+            directional=True,
+            castshadow=shadows,
+            diffuse=(0.55,) * 3,
+            specular=(0.15,) * 3,
+        )
+
+    def _add_cameras(self) -> None:
+        front = look_at(FRONT.position, FRONT.target, (0, 0, 1))
+        self._root.worldbody.add(
+            "camera", name="front", pos=FRONT.position, xyaxes=(*front[:, 0], *front[:, 1]), fovy=FRONT.fovy
+        )
+        wrist = look_at(WRIST.position, WRIST.target, WRIST_UP)
+        self.panda.hand.add(
+            "camera", name="wrist", pos=WRIST.position, xyaxes=(*wrist[:, 0], *wrist[:, 1]), fovy=WRIST.fovy
+        )
+
+
+class BoundScene:
+    """A scene's elements in its compiled model: indices to read and write, and the nominal model to return to."""
+
+    # Model fields that randomisation may change; everything else stays as compiled.
+    RANDOMISABLE = (
+        "geom_rgba geom_size geom_friction geom_rbound geom_aabb body_mass body_inertia light_pos light_dir "
+        "light_diffuse cam_pos cam_quat cam_fovy bvh_aabb"
+    ).split()
+
+    def __init__(self, scene: Scene, physics: mjcf.Physics) -> None:
+        """Args: the scene and the physics it was compiled into."""
+        self.model: mujoco.MjModel = physics.model.ptr
+        self.data: mujoco.MjData = physics.data.ptr
+        bind = physics.bind
+        self.joints = np.array([bind(joint).qposadr for joint in scene.panda.joints]).ravel()
+        self.velocities = np.array([bind(joint).dofadr for joint in scene.panda.joints]).ravel()
+        self.fingers = np.array([bind(finger).qposadr for finger in scene.panda.fingers]).ravel()
+        self.finger_velocities = np.array([bind(finger).dofadr for finger in scene.panda.fingers]).ravel()
+        self.pads = [int(bind(pad).element_id) for pad in scene.panda.pads]
+        self.tcp = int(bind(scene.panda.tcp).element_id)
+        self.block_geoms = np.array([bind(block.geom).element_id for block in scene.blocks], dtype=int)
+        self.block_bodies = self.model.geom_bodyid[self.block_geoms]
+        free = self.model.body_jntadr[self.block_bodies]
+        self.block_positions = self.model.jnt_qposadr[free]  # of x y z, quaternion wxyz
+        self.block_velocities = self.model.jnt_dofadr[free]
+        self.pad = int(self.model.body("pad").mocapid[0])
+        self.cameras = {"front": self.model.camera("front").id, "wrist": self.model.camera("panda/wrist").id}
+        self._nominal = {name: getattr(self.model, name).copy() for name in self.RANDOMISABLE}
+        self._scratch = mujoco.MjData(self.model)
+
+    def restore(self) -> None:
+        """Undo every randomisation: nominal model, blocks in a row, arm at home."""
+        for name, value in self._nominal.items():
+            getattr(self.model, name)[:] = value
+
+        count = len(self.block_geoms)
+        self.paint_blocks(list(COLOURS)[:count], np.array(list(COLOURS.values()))[:count])
+        self.place_pad(0.4, 0.0)
+        for index in range(count):
+            self.place_block(index, 0.52, 0.12 * (index - (count - 1) / 2), 0.0)
+        self.place_arm(HOME, MAX_OPENING)
+
+    def paint_blocks(self, names: list[str], rgb: Array) -> None:
+        """Give each block a colour (count, 3) and the name that instructions call it by."""
+        self.block_names = names
+        self.model.geom_rgba[self.block_geoms, :3] = rgb
+
+    def set_block(self, index: int, half_size: float) -> None:
+        """Resize block `index` to a cube of `half_size` [m], with its mass and all that MuJoCo derives from them."""
+        mass = BLOCK_DENSITY * (2 * half_size) ** 3
+        model, geom, body = self.model, self.block_geoms[index], self.block_bodies[index]
+        model.geom_size[geom] = half_size
+        model.geom_rbound[geom] = half_size * np.sqrt(3)
+        model.geom_aabb[geom, 3:] = half_size
+        start, count = model.body_bvhadr[body], model.body_bvhnum[body]
+        model.bvh_aabb[start : start + count, 3:] = half_size
+        model.body_mass[body] = mass
+        model.body_inertia[body] = mass * (2 * half_size) ** 2 / 6
+
+    def finish(self) -> None:
+        """Make model and state consistent after all changes."""
+        mujoco.mj_setConst(self.model, self._scratch)  # without it, physics explodes after a change of mass
+        self.data.qpos[self.block_positions + 2] = self.model.geom_size[self.block_geoms, 2]
+
+    def place_pad(self, x: float, y: float) -> None:
+        """Put the target pad on the table at (x, y) [m]."""
+        self.data.mocap_pos[self.pad] = (x, y, PAD_THICKNESS)
+
+    def place_arm(self, joints: Array, opening: float) -> None:
+        """Put the arm at rest in `joints` (7,) [rad], with `opening` between the fingertips [m]."""
+        self.data.qpos[self.joints] = joints
+        self.data.qpos[self.fingers] = opening / 2
+
+    def turn_camera(self, camera: int, rotation: Array) -> None:
+        """Turn camera number `camera` by the rotation vector `rotation` (3,) [rad] in its own frame."""
+        turn, turned = np.empty(4), np.empty(4)
+        angle = float(np.linalg.norm(rotation))
+        mujoco.mju_axisAngle2Quat(turn, rotation / angle if angle > 0 else np.array([1.0, 0, 0]), angle)
+        mujoco.mju_mulQuat(turned, self.model.cam_quat[camera], turn)
+        self.model.cam_quat[camera] = turned
+
+    def place_block(self, index: int, x: float, y: float, yaw: float) -> None:
+        """Rest block `index` on the table at (x, y) [m], turned by `yaw` [rad]."""
+        height = self.model.geom_size[self.block_geoms[index], 2]
+        start = self.block_positions[index]
+        self.data.qpos[start : start + 7] = (x, y, height, np.cos(yaw / 2), 0, 0, np.sin(yaw / 2))
+
+    def block_position(self, index: int) -> Array:
+        """(3,) centre of block `index` [m]."""
+        return self.data.geom_xpos[self.block_geoms[index]].copy()
+
+    def touching(self) -> set[tuple[int, int]]:
+        """(pad number, block index) of every fingertip that touches a block."""
+        pairs = set()
+        block_of = {int(geom): index for index, geom in enumerate(self.block_geoms)}
+        for first, second in self.data.contact.geom[: self.data.ncon].tolist():
+            for pad, other in ((first, second), (second, first)):
+                if pad in self.pads and other in block_of:
+                    pairs.add((self.pads.index(pad), block_of[other]))
+        return pairs
+
+    def shapes(self) -> list[Shape]:
+        """The visible solids, for recorders."""
+        model, shapes = self.model, []
+        kinds = {
+            mujoco.mjtGeom.mjGEOM_MESH: "mesh",
+            mujoco.mjtGeom.mjGEOM_BOX: "box",
+            mujoco.mjtGeom.mjGEOM_CYLINDER: "cylinder",
+        }
+        for geom in np.flatnonzero(model.geom_group == 2):
+            kind = kinds.get(model.geom_type[geom])
+            if kind is None:
+                continue
+            vertices = faces = None
+            if kind == "mesh":
+                mesh = model.geom_dataid[geom]
+                vertex, face = model.mesh_vertadr[mesh], model.mesh_faceadr[mesh]
+                vertices = model.mesh_vert[vertex : vertex + model.mesh_vertnum[mesh]].copy()
+                faces = model.mesh_face[face : face + model.mesh_facenum[mesh]].copy()
+            name = model.geom(geom).name or f"geom{geom}"
+            body = model.body(model.geom_bodyid[geom]).name
+            place = (model.geom_pos[geom].copy(), model.geom_quat[geom].copy(), model.geom_size[geom].copy())
+            shapes.append(Shape(body, name, kind, *place, model.geom_rgba[geom].copy(), vertices, faces))
+        return shapes
+
+    def poses(self) -> dict[str, Array]:
+        """Body name → (7,) position [m] and quaternion wxyz in the world."""
+        pose = np.concatenate([self.data.xpos, self.data.xquat], axis=1)
+        return {self.model.body(body).name: pose[body] for body in range(self.model.nbody)}
