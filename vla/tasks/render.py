@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import os
-import subprocess
-import sys
 
 import mujoco
 import numpy as np
@@ -69,20 +67,3 @@ class Renderer:
         """Free the GL context; without it a traceback is printed when Python exits."""
         self._context.free()
         self._gl.free()
-
-
-def choose_backend() -> None:
-    """Set MUJOCO_GL, unless it is set: EGL on a machine without a display, OSMesa where EGL does not work.
-
-    Must run before MuJoCo is first imported, because it reads the variable then.
-    """
-    if "MUJOCO_GL" in os.environ or os.environ.get("DISPLAY") or sys.platform != "linux":
-        return
-    # A failing EGL can end the process, so it is tried in another one.
-    probe = "import mujoco; mujoco.GLContext(8, 8).make_current()"
-    for backend in ("egl", "osmesa"):
-        tried = subprocess.run([sys.executable, "-c", probe], env={**os.environ, "MUJOCO_GL": backend}, capture_output=True)
-        if tried.returncode == 0:
-            os.environ["MUJOCO_GL"] = backend
-            return
-    os.environ["MUJOCO_GL"] = "egl"

@@ -110,11 +110,11 @@ class Scene(composer.Entity):
     def _set_quality(self) -> None:
         visual = self._root.visual
         # Rendered on the CPU, a multisampled image with a large shadow map costs thirty times this.
-        visual.quality.shadowsize, visual.quality.offsamples = 512, 0
+        visual.quality.shadowsize, visual.quality.offsamples = 256, 0
         visual.map.znear, visual.map.zfar = 0.01, 10.0
         visual.headlight.ambient, visual.headlight.diffuse = (0.42,) * 3, (0.2,) * 3
         visual.headlight.specular = (0.0,) * 3
-        visual.map.shadowclip, visual.map.shadowscale = 1.0, 0.8
+        visual.map.shadowclip, visual.map.shadowscale = 0.9, 0.8
         self._root.statistic.extent, self._root.statistic.center = 1.0, (0.4, 0, 0.2)
         self._root.asset.add(
             "texture", type="skybox", builtin="gradient", rgb1=(0.78, 0.83, 0.88), rgb2=(0.55, 0.60, 0.66), width=64, height=384
@@ -275,12 +275,12 @@ class BoundScene:
         """The visible solids, for recorders."""
         model, shapes = self.model, []
         kinds = {
-            mujoco.mjtGeom.mjGEOM_MESH: "mesh",
-            mujoco.mjtGeom.mjGEOM_BOX: "box",
-            mujoco.mjtGeom.mjGEOM_CYLINDER: "cylinder",
+            int(mujoco.mjtGeom.mjGEOM_MESH): "mesh",
+            int(mujoco.mjtGeom.mjGEOM_BOX): "box",
+            int(mujoco.mjtGeom.mjGEOM_CYLINDER): "cylinder",
         }
         for geom in np.flatnonzero(model.geom_group == 2):
-            kind = kinds.get(model.geom_type[geom])
+            kind = kinds.get(int(model.geom_type[geom]))
             if kind is None:
                 continue
             vertices = faces = None

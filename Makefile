@@ -1,0 +1,42 @@
+# `make run` does the main job, `make test` all checks; both set up .venv first. Another Python: make PYTHON=python3.12
+SHELL := bash
+.DEFAULT_GOAL := run
+.PHONY: run test setup clean
+
+SUITABLE = import sys; sys.exit(not (3, 11) <= sys.version_info < (3, 14))
+PYTHON ?= $(firstword $(foreach name,python3 python3.13 python3.12 python3.11,$(shell $(name) -c '$(SUITABLE)' 2> /dev/null && echo $(name))))
+VERSION = $(shell $(PYTHON) -c 'import sys; print("python%d.%d" % sys.version_info[:2])')
+
+# Rendering without a display needs these, on Linux.
+GL := libegl1 libgl1-mesa-dri libosmesa6
+ROOT := $(shell test "$$(id -u)" = 0 || echo sudo -n) env DEBIAN_FRONTEND=noninteractive
+APT = ($(ROOT) apt-get -qq update && $(ROOT) apt-get -qq install --no-install-recommends -y $(1)) > /dev/null
+
+run: setup
+	.venv/bin/python -m vla.run
+
+test: export OMP_NUM_THREADS = 1
+test: export MKL_NUM_THREADS = 1
+test: export OPENBLAS_NUM_THREADS = 1
+test: export LP_NUM_THREADS = 1
+test: setup
+	.venv/bin/ruff format --check
+	.venv/bin/ruff check
+	.venv/bin/mypy
+	.venv/bin/pytest -n 2 --dist loadfile
+
+setup: .venv/.installed
+
+.venv/.installed: pyproject.toml constraints.txt
+	$(if $(PYTHON),,$(error vla needs Python 3.11, 3.12 or 3.13: install one, or name it with make PYTHON=/path/to/python3))
+	@$(PYTHON) -c 'import ensurepip' 2> /dev/null || $(call APT,$(VERSION)-venv) \
+	  || { echo "Python cannot make virtual environments here: install the package $(VERSION)-venv" >&2; exit 1; }
+	@! command -v apt-get > /dev/null || dpkg -s $(GL) > /dev/null 2>&1 || $(call APT,$(GL)) \
+	  || echo "To render without a display, install the packages $(GL)" >&2
+	@echo "Installing into .venv; the first time this takes some minutes and, with CUDA, 7 GB"
+	@$(PYTHON) -m venv .venv
+	@.venv/bin/python -m pip install --disable-pip-version-check -q -c constraints.txt -e '.[dev]'
+	@touch $@
+
+clean:
+	rm -rf .venv .mypy_cache .pytest_cache .ruff_cache

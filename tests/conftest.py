@@ -1,0 +1,42 @@
+"""Shared by all tests: headless rendering, one thread per process, and the tabletop as the configuration builds it."""
+
+from __future__ import annotations
+
+import os
+
+for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "LP_NUM_THREADS"):
+    os.environ.setdefault(name, "1")
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+from vla.tasks.backend import choose_backend
+
+if TYPE_CHECKING:
+    from vla.tasks.tabletop import Tabletop
+
+CONF = Path(__file__).parents[1] / "conf"
+
+choose_backend()
+
+
+def make_tabletop(*overrides: str) -> Tabletop:
+    """The environment that `task=tabletop` and `overrides` of it compose to."""
+    from hydra import compose, initialize_config_dir
+    from hydra.utils import instantiate
+
+    with initialize_config_dir(str(CONF / "task"), version_base="1.3"):
+        config: Any = compose("tabletop", overrides=list(overrides))
+    environment: Tabletop = instantiate(config, _convert_="all")
+    return environment
+
+
+@pytest.fixture(scope="module")
+def tabletop() -> Iterator[Tabletop]:
+    """The default task, for tests that do not change it."""
+    environment = make_tabletop()
+    yield environment
+    environment.close()

@@ -1,0 +1,190 @@
+"""The check of a composed config, the objects built from one, and the digest that names its data."""
+
+from __future__ import annotations
+
+import hashlib
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+from omegaconf import DictConfig, OmegaConf
+
+from vla.check import JOBS, PLAIN, build, check, digest, suggestion
+from vla.run import adopt, sentence
+
+PERTURBATION = {"_target_": "vla.tasks.expert.Perturbation", "start": 0.5, "steps": [2, 5]}
+
+
+def config(**changes: Any) -> DictConfig:
+    """A config that is right for job=collect, with dotted changes."""
+    cfg = OmegaConf.create(
+        {
+            "job": "collect",
+            "seed": 0,
+            "checkpoint": None,
+            "output": "outputs/runs/now",
+            "collect": {"episodes": 5, "seed": 0, "workers": None, "verify": True, "folder": "outputs/episodes/x"},
+            "evaluate": {"episodes": 5, "seed": 1_000_000, "workers": None, "recordings": 2},
+            "preview": {"episodes": 1, "seed": 0},
+            "benchmark": {"names": ["train"]},
+            "task": {
+                "_target_": "vla.tasks.tabletop.Tabletop",
+                "goal": {"_target_": "vla.tasks.goals.Lift", "height": 0.1},
+                "randomize": {"mass": {"_target_": "vla.tasks.randomize.Masses", "factor": [0.5, 2.0]}, "size": None},
+            },
+            "expert": {"_target_": "vla.tasks.expert.Waypoint", "perturb": PERTURBATION},
+        }
+    )
+    for key, value in changes.items():
+        OmegaConf.update(cfg, key, value, force_add=True, merge=False)
+    return cfg
+
+
+def problem(**changes: Any) -> str:
+    with pytest.raises(ValueError) as caught:
+        check(config(**changes))
+    return str(caught.value)
+
+
+def test_a_right_config_passes() -> None:
+    check(config())
+    check(config(**{"task.time_limit": 10, "task.image_size": [64, 128], "expert.perturb": None}))
+
+
+def test_an_unknown_key_is_named_with_what_was_probably_meant() -> None:
+    assert problem(**{"task.bloks": 2}).startswith("task.bloks is unknown, did you mean blocks? Tabletop takes goal,")
+    assert problem(**{"task.goal.hight": 0.2}).startswith("task.goal.hight is unknown, did you mean height?")
+    assert problem(**{"task.randomize.mass.faktor": 1}).startswith("task.randomize.mass.faktor is unknown")
+    assert problem(**{"collect.episode": 2}).startswith("collect.episode is unknown, did you mean episodes?")
+    assert problem(sed=1).startswith("sed is unknown, did you mean seed?")
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "expected"),
+    [
+        ("task.blocks", "three", "task.blocks must be int, got 'three'"),
+        ("task.blocks", True, "task.blocks must be int, got True"),
+        ("task.blocks", 2.5, "task.blocks must be int, got 2.5"),
+        ("task.shadows", 1, "task.shadows must be bool, got 1"),
+        ("task.image_size", [96], "task.image_size must be tuple[int, int], got [96]"),
+        ("task.image_size", [96, "x"], "task.image_size must be tuple[int, int], got [96, 'x']"),
+        ("task.goal", "lift", "task.goal must be Goal, got 'lift'"),
+        ("task.randomize.mass.factor", [0.5, "a"], "task.randomize.mass.factor must be Sequence[float], got"),
+        ("expert.perturb.start", None, "expert.perturb.start must be float, got None"),
+        ("collect.workers", "all", "collect.workers must be int or null, got 'all'"),
+        ("seed", "first", "seed must be int, got 'first'"),
+        ("task.meshes", "lite", "task.meshes must be one of light, full, got 'lite', did you mean light?"),
+        ("job", "evalute", "job must be one of"),
+        ("benchmark.names", ["training"], "benchmark.names must be list[one of collect, loader, train, policy]"),
+    ],
+)
+def test_a_wrong_value_is_named_with_what_is_allowed(key: str, value: Any, expected: str) -> None:
+    assert problem(**{key: value}).startswith(expected)
+
+
+def test_a_missing_name_is_named_unless_the_program_gives_it() -> None:
+    cfg = config()
+    del cfg.task.goal
+    with pytest.raises(ValueError, match=r"task\.goal is missing: Tabletop needs it"):
+        check(cfg)
+    check(config(expert={"_target_": "vla.tasks.expert.Waypoint"}))  # spec comes from the task
+    assert problem(**{"expert.spec": 1}).startswith("expert.spec is unknown")
+
+
+def test_a_job_needs_its_groups_and_looks_at_no_others() -> None:
+    assert "job=collect needs expert" in problem(expert=None)
+    check(config(deploy={"_target_": "vla.nowhere.Nothing"}))
+    assert "deploy._target_ is vla.nowhere.Nothing, which cannot be imported" in problem(
+        job="deploy",
+        tokenizer={"_target_": "vla.models.action_tokenizer.Uniform"},
+        model={"_target_": "torch.nn.Identity"},
+        deploy={"_target_": "vla.nowhere.Nothing"},
+    )
+
+
+def test_the_job_menu_is_the_table_of_jobs() -> None:
+    assert set(PLAIN["job"].__args__) == set(JOBS)
+
+
+@pytest.mark.parametrize(
+    "target",
+    ["os.system", "subprocess.Popen", "vla.evaluate.os.system", "vla.evaluate.Path", "torch.hub.load", "vla.check:os"],
+)
+def test_a_target_outside_the_allowed_packages_is_refused(target: str) -> None:
+    node = {"_target_": "vla.tasks.expert.Waypoint", "perturb": {"_target_": target}}
+    with pytest.raises(ValueError, match=r"perturb\._target_ must"):
+        build(node, spec=None)
+    with pytest.raises(ValueError, match=r"expert\.perturb\._target_ must"):
+        check(config(expert=node))
+
+
+def test_build_gives_plain_containers_runtime_arguments_and_nested_factories() -> None:
+    built = build(OmegaConf.create({"_target_": "torch.nn.Linear", "bias": False}), in_features=2, out_features=3)
+    assert built.weight.shape == (3, 2)
+    assert built.bias is None
+    masses = build(OmegaConf.create({"_target_": "vla.tasks.randomize.Masses", "factor": [0.5, 2.0]}))
+    assert type(masses.factor) is list
+    node = {"_target_": "vla.tasks.expert.Waypoint", "perturb": {**PERTURBATION, "_partial_": True}}
+    spec = SimpleNamespace(low=(0.0,), high=(1.0,))
+    assert type(build(node, spec=spec)._perturb()).__name__ == "Perturbation"
+
+
+def test_build_passes_on_what_a_nested_constructor_complains_about() -> None:
+    axis = {"_target_": "vla.tasks.randomize.Colours", "names": ["pink"]}
+    with pytest.raises(ValueError, match="unknown colours"):
+        build({"_target_": "vla.tasks.tabletop.Tabletop", "goal": None, "randomize": {"colour": axis}})
+
+
+def digested(cfg: DictConfig) -> str:
+    return digest("task", "expert", "collect.seed", _root_=cfg)
+
+
+def test_the_digest_is_stable_and_changes_with_the_episodes_only() -> None:
+    expected = digested(config())
+    same = [{"seed": 3}, {"collect.episodes": 9}, {"output": "elsewhere"}, {"task.goal.height": 0.1}]
+    assert {digested(config(**change)) for change in same} == {expected}
+    assert digested(config(**{"task.time_limit": 10})) == digested(config(**{"task.time_limit": 10.0}))
+    different = [{"collect.seed": 1}, {"task.blocks": 2}, {"expert.perturb": None}, {"task.randomize.size": 1}]
+    assert len({digested(config(**change)) for change in different} | {expected}) == 5
+    by_hand = hashlib.sha256(b'[{"a": 1, "b": [2, "x"]}]').hexdigest()[:12]
+    assert digest("task", _root_=OmegaConf.create({"task": {"a": 1, "b": [2.0, "x"]}})) == by_hand
+
+
+def test_the_digest_resolves_references_and_is_a_resolver() -> None:
+    cfg = OmegaConf.create({"a": {"x": "${b}"}, "b": 1, "folder": "episodes/${digest:a,b}"})
+    assert cfg.folder == "episodes/" + digest("a", "b", _root_=OmegaConf.create({"a": {"x": 1}, "b": 1}))
+
+
+def test_a_suggestion_is_made_only_where_something_is_close() -> None:
+    assert suggestion("precison", ["precision", "devices"]) == ", did you mean precision?"
+    assert suggestion("xyz", ["precision", "devices"]) == ""
+
+
+SAVED = {
+    "task": {"_target_": "vla.tasks.tabletop.Tabletop", "blocks": 4, "randomize": {"mass": None, "light": {"x": 1}}},
+    "tokenizer": {"bins": 64},
+    "model": {"history": 6},
+}
+
+
+def test_a_checkpoint_brings_its_task_tokenizer_and_model_and_task_overrides_apply_on_top() -> None:
+    cfg = config(**{"task.blocks": 2, "tokenizer": {"bins": 256}, "model": None, "task.randomize": {"mass": {"a": 1}}})
+    untouched = adopt(cfg, SAVED, ["collect.episodes=3", "evaluate.seed=5"])
+    assert OmegaConf.to_container(untouched.task) == SAVED["task"]
+    assert (untouched.tokenizer.bins, untouched.model.history, cfg.tokenizer.bins) == (64, 6, 256)
+    assert adopt(cfg, SAVED, ["task.blocks=2"]).task.blocks == 2
+    harder = adopt(cfg, SAVED, ["task/randomize=wide", "~task.goal"])
+    assert OmegaConf.to_container(harder.task.randomize) == {"mass": {"a": 1}}
+    assert harder.task.blocks == 4
+    assert "light" not in adopt(cfg, SAVED, ["~task.randomize.light"]).task.randomize
+
+
+@pytest.mark.parametrize("override", ["tokenizer=rt1", "tokenizer.bins=32", "model/image=efficientnet", "+model.x=1"])
+def test_a_checkpoint_keeps_its_tokenizer_and_model(override: str) -> None:
+    with pytest.raises(ValueError, match="cannot be combined with a checkpoint"):
+        adopt(config(), SAVED, [override])
+
+
+def test_any_error_is_one_line() -> None:
+    assert sentence(ValueError("a\n  b")) == "a b"
+    assert sentence(OSError(28, "No space left on device", "f")) == "[Errno 28] No space left on device: 'f'"

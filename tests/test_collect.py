@@ -1,0 +1,159 @@
+"""Collection: the same bytes whatever the workers and whatever interrupts them."""
+
+from __future__ import annotations
+
+import logging
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import toy
+
+from vla.collect import NOT_REPEATABLE, PATIENCE, MakeEnvironment, MakeExpert, Summary, collect
+from vla.data.episodes import EpisodeStore
+
+EPISODES = 30
+TRIED = 37  # seeds 3, 8, 13, … fail
+
+SCRIPT = """
+import sys, toy
+from vla.collect import collect
+from vla.data.episodes import EpisodeStore
+
+if __name__ == "__main__":
+    store = EpisodeStore.create_or_open(sys.argv[1], toy.SPEC, {})
+    collect(store, toy.make_slow_environment, toy.make_expert, episodes=30, workers=2, seed=0)
+"""
+
+
+def gather(
+    folder: Path,
+    episodes: int = EPISODES,
+    workers: int = 1,
+    make_environment: MakeEnvironment = toy.make_environment,
+    make_expert: MakeExpert = toy.make_expert,
+) -> Summary:
+    store = EpisodeStore.create_or_open(folder, toy.SPEC, {})
+    return collect(store, make_environment, make_expert, episodes, workers, seed=0)
+
+
+def content(folder: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in folder.iterdir() if path.name != "lock"}
+
+
+def lines(folder: Path) -> int:
+    index = folder / "index.jsonl"
+    return index.read_bytes().count(b"\n") if index.exists() else 0
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """What an uninterrupted collection by one process leaves."""
+    folder = tmp_path_factory.mktemp("whole")
+    gather(folder)
+    return folder
+
+
+def start(folder: Path, until: int) -> subprocess.Popen[str]:
+    """A process that collects with two workers, and has committed `until` seeds."""
+    script = folder.parent / "collecting.py"
+    script.write_text(SCRIPT)
+    places = [str(Path(toy.__file__).parent), str(Path(toy.__file__).parents[1])]
+    process = subprocess.Popen(
+        [sys.executable, str(script), str(folder)],
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(places)},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        start_new_session=True,
+    )
+    while lines(folder) < until:
+        assert process.poll() is None, process.communicate()[0]
+        time.sleep(0.002)
+    return process
+
+
+def test_the_summary_counts_what_was_tried(tmp_path: Path) -> None:
+    summary = gather(tmp_path)
+    assert (summary.episodes, summary.added, summary.tried) == (EPISODES, EPISODES, TRIED)
+    assert summary.failures == {"timeout": TRIED - EPISODES}
+    assert summary.success_rate == EPISODES / TRIED
+    store = EpisodeStore(tmp_path)
+    assert all(entry.seed % 5 != 3 for entry in store.episodes)
+    assert [entry.seed for entry in store.tried] == list(range(TRIED))
+
+
+def test_two_workers_leave_the_same_bytes_as_one(tmp_path: Path, whole: Path) -> None:
+    gather(tmp_path, workers=2)
+    assert content(tmp_path) == content(whole)
+
+
+def test_a_larger_count_adds_only_what_is_missing(tmp_path: Path, whole: Path) -> None:
+    gather(tmp_path, episodes=11)
+    assert gather(tmp_path).added == EPISODES - 11
+    assert content(tmp_path) == content(whole)
+    assert gather(tmp_path, episodes=5).added == 0
+    assert content(tmp_path) == content(whole)
+
+
+def test_killed_again_and_again_it_loses_and_doubles_nothing(tmp_path: Path, whole: Path) -> None:
+    folder = tmp_path / "episodes"
+    for until in (1, 9, 22):
+        process = start(folder, until)
+        process.kill()
+        process.communicate(timeout=20)  # its workers hold the same pipe: this ends when they are gone too
+        assert until <= len(EpisodeStore(folder).tried) < TRIED
+    gather(folder)
+    assert content(folder) == content(whole)
+
+
+def test_ctrl_c_ends_it_with_one_traceback(tmp_path: Path, whole: Path) -> None:
+    folder = tmp_path / "episodes"
+    process = start(folder, 3)
+    os.killpg(process.pid, signal.SIGINT)
+    output = process.communicate(timeout=20)[0]
+    assert output.count("Traceback") == 1 and output.rstrip().endswith("KeyboardInterrupt")
+    gather(folder)
+    assert content(folder) == content(whole)
+
+
+def test_a_second_job_waits_for_the_first_and_uses_its_episodes(
+    tmp_path: Path, whole: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    folder = tmp_path / "episodes"
+    process = start(folder, 1)
+    with caplog.at_level(logging.INFO, "vla"):
+        assert gather(folder).added == 0
+    assert "waiting for the process that is collecting" in caplog.text
+    assert process.wait(timeout=20) == 0
+    assert content(folder) == content(whole)
+
+
+def test_a_worker_that_dies_is_reported_and_costs_nothing(tmp_path: Path, whole: Path) -> None:
+    with pytest.raises(ValueError, match="a collecting process died"):
+        gather(tmp_path, workers=2, make_environment=toy.make_deadly_environment)
+    assert [entry.seed for entry in EpisodeStore(tmp_path).tried] == list(range(lines(tmp_path)))
+    gather(tmp_path)
+    assert content(tmp_path) == content(whole)
+
+
+def test_an_expert_without_hope_is_given_up(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=rf"failed on {PATIENCE} seeds in a row \({{'timeout': {PATIENCE}}}\)"):
+        gather(tmp_path, make_expert=toy.make_lost_expert)
+    assert EpisodeStore(tmp_path).episodes == []
+
+
+def test_a_success_that_cannot_be_replayed_is_a_failure(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=NOT_REPEATABLE):
+        gather(tmp_path, make_environment=toy.make_forgetful_environment)
+    assert EpisodeStore(tmp_path).episodes == []
+
+
+def test_a_store_goes_on_from_its_own_first_seed(tmp_path: Path) -> None:
+    gather(tmp_path, episodes=2)
+    with pytest.raises(ValueError, match=r"starts at seed 0, not 7: set collect\.seed=0"):
+        collect(EpisodeStore(tmp_path), toy.make_environment, toy.make_expert, episodes=3, workers=1, seed=7)

@@ -1,0 +1,63 @@
+"""Every option of every group composes into a config that passes the check."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from hydra import compose, initialize_config_dir
+from hydra.errors import ConfigCompositionException
+from omegaconf import DictConfig
+
+from vla.check import JOBS, check
+
+CONF = Path(__file__).parents[1] / "conf"
+OPTIONS = [
+    (path.parent.relative_to(CONF).as_posix(), path.stem)
+    for path in sorted(CONF.rglob("*.yaml"))
+    if path.parent != CONF and path.parent.name != "hydra"
+]
+
+
+def composed(*overrides: str) -> DictConfig:
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        return compose("config", overrides=["output=outputs/runs/now", *overrides])
+
+
+def composed_with(group: str, option: str) -> DictConfig:
+    """A config in which `option` stands, together with a parent that has such a nested group."""
+    parent = group.rpartition("/")[0]
+    parents = [f"{parent}={path.stem}" for path in sorted((CONF / parent).glob("*.yaml"))] if parent else []
+    for overrides in ([], *[[choice] for choice in parents]):
+        try:
+            return composed(*overrides, f"{group}={option}")
+        except ConfigCompositionException as error:
+            problem = error
+    raise problem
+
+
+def test_the_default_passes_for_every_job_but_deploy() -> None:
+    for job in JOBS:
+        if job != "deploy":
+            check(composed(f"job={job}"))
+
+
+def test_deploying_nothing_is_refused() -> None:
+    with pytest.raises(ValueError, match="job=deploy needs deploy"):
+        check(composed("job=deploy"))
+
+
+@pytest.mark.parametrize(("group", "option"), OPTIONS, ids=[f"{group}={option}" for group, option in OPTIONS])
+def test_option(group: str, option: str) -> None:
+    cfg = composed_with(group, option)
+    top = group.partition("/")[0]
+    cfg.job = next((job for job in ("evaluate", "export", "deploy") if top in JOBS[job] and cfg.get(top)), "evaluate")
+    check(cfg)
+
+
+def test_data_is_shared_by_everything_that_does_not_change_the_episodes() -> None:
+    folder = composed().collect.folder
+    assert folder.startswith("outputs/episodes/")
+    assert composed("seed=3", "collect.episodes=7", "expert=waypoint").collect.folder == folder
+    assert composed("task/goal=lift").collect.folder != folder
+    assert composed("collect.seed=1").collect.folder != folder

@@ -1,0 +1,187 @@
+"""The episode store: nothing lost, nothing doubled, nothing half written, and clear words where it cannot be read."""
+
+from __future__ import annotations
+
+import json
+import resource
+import shutil
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from toy import SPEC, ToyEnvironment, ToyExpert
+
+from vla.data.episodes import EpisodeStore, fields_of
+from vla.rollout import rollout
+from vla.spec import Episode
+
+CONFIG = {"task": {"size": 1.0}, "seed": 0}
+FIELDS = tuple(fields_of(SPEC))
+EPISODES = [rollout(ToyEnvironment(), ToyExpert(), seed) for seed in range(5)]  # seed 3 fails
+
+
+def add(folder: Path, episodes: list[Episode]) -> EpisodeStore:
+    store = EpisodeStore.create_or_open(folder, SPEC, CONFIG)
+    with store.writing():
+        for episode in episodes:
+            if episode.success:
+                store.append(episode)
+            else:
+                store.fail(episode.seed, episode.outcome, episode.draws)
+    return store
+
+
+def content(folder: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in folder.iterdir() if path.name != "lock"}
+
+
+def test_what_was_stored_is_read_back(tmp_path: Path) -> None:
+    written, store = add(tmp_path, EPISODES), EpisodeStore(tmp_path)
+    assert store.tried == written.tried
+    assert store.spec == SPEC
+    assert [entry.seed for entry in store.episodes] == [0, 1, 2, 4]
+    assert store.tried[3].outcome == "timeout" and store.tried[3].steps == 0
+    assert store.next_seed == 5
+    assert store.tried[0].draws["colour"] in ("red", "blue") and store.tried[0].draws["limit"] == 40
+    for entry in store.episodes:
+        episode, rows = EPISODES[entry.seed], store.read(entry)
+        assert entry.instruction == episode.instruction
+        np.testing.assert_array_equal(rows["action"], episode.actions)
+        np.testing.assert_array_equal(rows["executed"], episode.executed)
+        for step, seen in enumerate(episode.observations):
+            for camera in SPEC.cameras:
+                np.testing.assert_array_equal(rows[f"rgb_{camera}"][step], seen.rgb[camera])
+                np.testing.assert_array_equal(rows[f"depth_{camera}"][step], seen.depth[camera])
+            np.testing.assert_array_equal(rows["joints"][step], seen.joints)
+            np.testing.assert_array_equal(rows["velocities"][step], seen.velocities)
+            assert rows["gripper"][step] == np.float32(seen.gripper)
+            assert seen.truth is not None
+            np.testing.assert_array_equal(rows["truth"][step], [*seen.truth["target"], *seen.truth["point"]])
+    assert len(store.rows("joints")) == sum(entry.steps for entry in store.episodes)
+
+
+def test_the_files_can_be_read_without_this_package(tmp_path: Path) -> None:
+    add(tmp_path, EPISODES)
+    fields = json.loads((tmp_path / "store.json").read_text())["fields"]
+    line = json.loads((tmp_path / "index.jsonl").read_text().splitlines()[1])
+    layout = fields["rgb_front"]
+    frames = np.fromfile(tmp_path / "rgb_front.bin", layout["dtype"]).reshape(-1, *layout["shape"])
+    np.testing.assert_array_equal(frames[line["start"]], EPISODES[1].observations[0].rgb["front"])
+
+
+def test_statistics_are_those_of_all_stored_actions(tmp_path: Path) -> None:
+    statistics = add(tmp_path, EPISODES).statistics
+    actions = np.concatenate([episode.actions for episode in EPISODES if episode.success]).astype(np.float64)
+    np.testing.assert_array_equal(statistics.low, actions.min(0))
+    np.testing.assert_array_equal(statistics.high, actions.max(0))
+    np.testing.assert_allclose(statistics.mean, actions.mean(0), rtol=1e-12)
+    np.testing.assert_allclose(statistics.std, actions.std(0), rtol=1e-9, atol=1e-12)
+    assert statistics.steps == len(actions)
+
+
+def test_a_reader_can_keep_to_the_first_episodes(tmp_path: Path) -> None:
+    add(tmp_path, EPISODES)
+    assert [entry.seed for entry in EpisodeStore(tmp_path, episodes=2).episodes] == [0, 1]
+    assert EpisodeStore(tmp_path, episodes=2).statistics.steps == sum(len(episode.actions) for episode in EPISODES[:2])
+    with pytest.raises(ValueError, match="holds 4 of 9 episodes"):
+        EpisodeStore(tmp_path, episodes=9)
+
+
+def test_an_empty_store_has_no_rows_and_no_statistics(tmp_path: Path) -> None:
+    store = add(tmp_path, [])
+    assert store.episodes == [] and store.next_seed is None and store.rows("rgb_front").shape == (0, 16, 16, 3)
+    with pytest.raises(ValueError, match="no episodes yet"):
+        _ = store.statistics
+
+
+TEARS: dict[str, dict[str, float]] = {  # file → share of the last episode that got there
+    "nothing": {},
+    "half a field": {FIELDS[0]: 0.5},
+    "every field, no line": dict.fromkeys(FIELDS, 1.0),
+    "every field, half a line": {**dict.fromkeys(FIELDS, 1.0), "index": 0.5},
+    "every field, a line without its end": {**dict.fromkeys(FIELDS, 1.0), "index": 0.999},
+}
+
+
+@pytest.mark.parametrize("tear", TEARS)
+def test_a_commit_cut_short_is_as_if_it_never_began(tmp_path: Path, tear: str) -> None:
+    whole, torn = tmp_path / "whole", tmp_path / "torn"
+    add(whole, EPISODES)
+    add(torn, EPISODES[:4])
+    for name, share in TEARS[tear].items():
+        file = "index.jsonl" if name == "index" else f"{name}.bin"
+        missing = (whole / file).read_bytes()[(torn / file).stat().st_size :]
+        with (torn / file).open("ab") as stream:
+            stream.write(missing[: int(share * len(missing))])
+    assert [entry.seed for entry in EpisodeStore(torn).tried] == [0, 1, 2, 3]
+    add(torn, EPISODES[4:])
+    assert content(torn) == content(whole)
+
+
+def test_a_full_disk_takes_back_the_half_written_episode_only(tmp_path: Path) -> None:
+    whole, full = tmp_path / "whole", tmp_path / "full"
+    add(whole, EPISODES)
+    store = add(full, EPISODES[:2])
+    before = content(full)
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    with store.writing():
+        resource.setrlimit(resource.RLIMIT_FSIZE, ((full / "rgb_front.bin").stat().st_size + 1000, hard))
+        try:
+            with pytest.raises(ValueError, match=r"cannot take seed 2 .*: the 2 episodes before it are safe"):
+                store.append(EPISODES[2])
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+        assert content(full) == before
+        store.append(EPISODES[2])
+    add(full, EPISODES[3:])
+    assert content(full) == content(whole)
+
+
+def test_a_store_of_another_task_is_refused(tmp_path: Path) -> None:
+    add(tmp_path, EPISODES)
+    with pytest.raises(ValueError, match=r"this task has control_hz = 20\.0, but the episode store .* has 10\.0"):
+        EpisodeStore.create_or_open(tmp_path, replace(SPEC, control_hz=20.0), CONFIG)
+    with pytest.raises(ValueError, match=r"another config for \['task'\]"):
+        EpisodeStore.create_or_open(tmp_path, SPEC, {**CONFIG, "task": {"size": 2.0}})
+
+
+def test_seeds_come_in_order(tmp_path: Path) -> None:
+    store = add(tmp_path, EPISODES[:2])
+    with store.writing(), pytest.raises(ValueError, match="expects seed 2 next, seed 4 came"):
+        store.append(EPISODES[4])
+
+
+def test_an_episode_that_does_not_fit_the_spec_is_refused(tmp_path: Path) -> None:
+    store = add(tmp_path, [])
+    small = [replace(seen, joints=seen.joints[:6]) for seen in EPISODES[0].observations]
+    with store.writing(), pytest.raises(ValueError, match=r"joints must be \(12, 7\) float32, it came as \(12, 6\)"):
+        store.append(replace(EPISODES[0], observations=small))
+    assert EpisodeStore(tmp_path).tried == []
+
+
+def test_what_cannot_be_read_is_named(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=r"there is no episode store in .*nowhere"):
+        EpisodeStore(tmp_path / "nowhere")
+    whole = tmp_path / "whole"
+    add(whole, EPISODES)
+
+    def damaged(name: str, change: Callable[[bytes], bytes]) -> Path:
+        shutil.copytree(whole, folder := tmp_path / "damaged", dirs_exist_ok=True)
+        (folder / name).write_bytes(change((whole / name).read_bytes()))
+        return folder
+
+    with pytest.raises(ValueError, match="has format 9, this version reads 1"):
+        EpisodeStore(damaged("store.json", lambda data: data.replace(b'"format": 1', b'"format": 9')))
+    with pytest.raises(ValueError, match=r"depth_wrist\.bin is shorter than the \d+ bytes"):
+        EpisodeStore(damaged("depth_wrist.bin", lambda data: data[:-1]))
+    with pytest.raises(ValueError, match=r"line 2 of .*index\.jsonl cannot be read"):
+        EpisodeStore(damaged("index.jsonl", lambda data: data.replace(b'{"seed": 1,', b"#", 1)))
+    with pytest.raises(ValueError, match=r"line 2 of .*index\.jsonl does not follow"):
+        EpisodeStore(damaged("index.jsonl", lambda data: data.split(b"\n")[0] + b"\n" + data))
+    store = EpisodeStore(damaged("action.bin", lambda data: bytes([data[0] ^ 1]) + data[1:]))
+    with pytest.raises(ValueError, match=r"the rows of seed 0 in .* were changed on disk"):
+        store.read(store.episodes[0])
+    with pytest.raises(ValueError, match="has no field 'rgb'"):
+        store.rows("rgb")

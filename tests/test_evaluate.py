@@ -1,0 +1,111 @@
+"""Closed-loop evaluation: counting, intervals, errors, and the same report whatever the number of workers."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+import toy_recordable as toy
+from rerun.chunk import RrdReader
+
+from vla.evaluate import FIRST_SEED, Report, Result, evaluate, keep_recordings, wilson_interval
+from vla.spec import Environment
+
+SEEDS = range(FIRST_SEED, FIRST_SEED + 10)
+
+
+def results(*outcomes: str) -> Report:
+    return Report(tuple(Result(FIRST_SEED + index, outcome) for index, outcome in enumerate(outcomes)))
+
+
+def test_wilson_interval_equals_values_worked_out_by_hand() -> None:
+    # 8 of 10: centre (0.8 + 3.8415/20) / 1.38415 = 0.71674,
+    # half width 1.95996 √(0.8·0.2/10 + 3.8415/400) / 1.38415 = 0.22659
+    np.testing.assert_allclose(wilson_interval(8, 10), (0.49016, 0.94332), atol=1e-5)
+    # None of 10: from 0 to z² / (n + z²) = 3.8415 / 13.8415
+    np.testing.assert_allclose(wilson_interval(0, 10), (0, 0.27753), atol=1e-5)
+    np.testing.assert_allclose(wilson_interval(10, 10), (1 - 0.27753, 1), atol=1e-5)
+    assert wilson_interval(0, 0) == (0, 1)
+
+
+def test_the_last_line_is_the_success_rate() -> None:
+    report = results(*["success"] * 83, *["dropped"] * 17)
+    assert str(report).splitlines() == ["dropped 17", "success 83/100 (83.0 %, 95 % CI 74.5-89.1)"]
+
+
+def test_errors_are_neither_successes_nor_failures() -> None:
+    report = results("success", "error", "dropped", "dropped", "error")
+    assert (report.episodes, report.successes, len(report.errors)) == (3, 1, 2)
+    assert report.success == 1 / 3
+    assert report.taxonomy == {"error": 2, "dropped": 2, "success": 1}
+
+
+def test_a_report_of_errors_alone_has_the_widest_interval() -> None:
+    assert str(results("error")).splitlines()[-1] == "success 0/0 (0.0 %, 95 % CI 0.0-100.0)"
+
+
+def test_two_workers_report_what_one_reports() -> None:
+    alone = evaluate(toy.make_environment, toy.make_agent, None, SEEDS, workers=1)
+    assert evaluate(toy.make_environment, toy.make_agent, None, SEEDS, workers=2) == alone
+    assert [result.seed for result in alone.results] == list(SEEDS)
+    assert alone.taxonomy == {"success": 8, "timeout": 2}
+    first = alone.results[0]
+    assert first.steps > 0
+    assert first.draws["limit"] == 40 and len(first.draws["point"]) == 2 and first.draws["colour"] in first.instruction
+
+
+def test_an_episode_that_raises_is_an_error_and_the_others_go_on() -> None:
+    report = evaluate(toy.make_broken_environment, toy.make_agent, None, SEEDS[:3], workers=1)
+    assert [result.outcome for result in report.results] == ["success", "error", "success"]
+    assert report.errors[0].seed == toy.BROKEN_SEED
+    assert report.errors[0].error.startswith("ValueError: the block fell off the table (toy_recordable.py:")
+    assert "errors 1, the first at seed 1000001: ValueError: the block fell" in str(report)
+
+
+def test_a_worker_that_dies_is_an_error() -> None:
+    report = evaluate(toy.make_deadly_environment, toy.make_agent, None, SEEDS[:4], workers=2)
+    assert toy.DEADLY_SEED in [error.seed for error in report.errors]
+    assert "a worker process died" in report.errors[0].error
+    assert len(report.results) == 4
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_an_environment_that_cannot_be_built_ends_the_evaluation(workers: int) -> None:
+    with pytest.raises(ValueError, match="no such mesh"):
+        evaluate(toy.make_impossible_environment, toy.make_agent, None, SEEDS[:2], workers=workers)
+
+
+def test_seeds_of_training_are_refused() -> None:
+    for seeds in (range(0), range(FIRST_SEED - 1, FIRST_SEED + 1)):
+        with pytest.raises(ValueError, match="seeds from 1000000 on"):
+            evaluate(toy.make_environment, toy.make_agent, None, seeds, workers=1)
+    with pytest.raises(ValueError, match="at least one worker"):
+        evaluate(toy.make_environment, toy.make_agent, None, SEEDS, workers=0)
+
+
+def test_libraries_use_one_thread_while_it_lasts(monkeypatch: pytest.MonkeyPatch) -> None:
+    import torch
+
+    monkeypatch.setenv("OMP_NUM_THREADS", "3")
+    before, seen = torch.get_num_threads(), []
+    torch.set_num_threads(2)
+
+    def make_agent(environment: Environment) -> toy.ThinkingAgent:
+        seen.append((os.environ["OMP_NUM_THREADS"], torch.get_num_threads()))
+        return toy.make_agent(environment)
+
+    evaluate(toy.make_environment, make_agent, None, SEEDS[:1], workers=1)
+    assert seen == [("1", 1)]
+    assert (os.environ["OMP_NUM_THREADS"], torch.get_num_threads()) == ("3", 2)
+    torch.set_num_threads(before)
+
+
+def test_recordings_are_kept_in_one_file_failures_first(tmp_path: Path) -> None:
+    folder, target = tmp_path / "recordings", tmp_path / "rollouts.rrd"
+    report = evaluate(toy.make_environment, toy.make_agent, toy.make_recorder(folder), SEEDS[:5], workers=1)
+    assert keep_recordings(report, folder, target, limit=3) == 3
+    kept = [entry.recording_id.rpartition("-")[0] for entry in RrdReader(target).recordings()]
+    assert kept == ["failure-01000003-timeout", "success-01000000", "success-01000001"]
+    assert list(tmp_path.iterdir()) == [target]

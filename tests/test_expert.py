@@ -1,0 +1,65 @@
+"""The scripted expert solves its goals, and labels what it is pushed into with what it would have done."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+
+from conftest import make_tabletop
+from vla.rollout import rollout
+from vla.tasks.expert import Perturbation, Waypoint
+
+if TYPE_CHECKING:
+    from vla.tasks.tabletop import Tabletop
+
+
+@pytest.mark.parametrize("goal", ["pick_place", "lift"])
+@pytest.mark.parametrize("perturbed", [False, True])
+def test_the_expert_solves_every_goal(goal: str, perturbed: bool) -> None:
+    environment = make_tabletop(f"goal={goal}")
+    expert = Waypoint(environment.spec, Perturbation() if perturbed else None)
+    with environment.blind():
+        episodes = [rollout(environment, expert, seed) for seed in range(40)]
+    environment.close()
+    assert sum(episode.success for episode in episodes) >= 39
+
+
+def test_wide_randomisation_is_within_the_experts_reach() -> None:
+    environment = make_tabletop("randomize=wide")
+    expert = Waypoint(environment.spec)
+    with environment.blind():
+        outcomes = [rollout(environment, expert, seed).outcome for seed in range(30)]
+    environment.close()
+    assert outcomes.count("success") >= 28
+
+
+def test_the_clean_action_is_recorded_where_another_one_is_executed(tabletop: Tabletop) -> None:
+    expert = Waypoint(tabletop.spec, Perturbation(start=1.0, noise=0.0, rate=0.0, start_steps=(4, 4)))
+    with tabletop.blind():
+        episode = rollout(tabletop, expert, 3)
+    differs = (episode.actions != episode.executed).any(axis=1)
+    assert differs[:4].all() and not differs[4:].any()
+
+
+def test_labels_depend_on_the_state_alone(tabletop: Tabletop) -> None:
+    """A fresh expert, shown a state from the middle of an episode, says what the one that lived through it said."""
+    with tabletop.blind():
+        episode = rollout(tabletop, Waypoint(tabletop.spec, Perturbation()), 8)
+    for observation, action in zip(episode.observations, episode.actions, strict=True):
+        np.testing.assert_array_equal(Waypoint(tabletop.spec).act(observation), action)
+
+
+def test_actions_stay_within_the_spec(tabletop: Tabletop) -> None:
+    with tabletop.blind():
+        episode = rollout(tabletop, Waypoint(tabletop.spec, Perturbation(noise=1.0)), 2)
+    for actions in (episode.actions, episode.executed):
+        assert (actions >= np.float32(tabletop.spec.low)).all() and (actions <= np.float32(tabletop.spec.high)).all()
+
+
+def test_without_the_simulators_truth_the_expert_says_so(tabletop: Tabletop) -> None:
+    observation = dataclasses.replace(tabletop.reset(0), truth=None)
+    with pytest.raises(ValueError, match="truth"):
+        Waypoint(tabletop.spec).act(observation)

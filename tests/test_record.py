@@ -1,0 +1,129 @@
+"""Recordings, read back from their files."""
+
+from __future__ import annotations
+
+import io
+import subprocess
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+from rerun.chunk import RrdReader
+from toy_recordable import ThinkingAgent, make_environment
+
+from vla.record import VIEWER, RerunRecorder, merge, recording_name
+from vla.rollout import rollout
+from vla.spec import Episode
+
+SUCCESS, FAILURE = 1_000_000, 1_000_003  # the toy world fails at seeds that are three more than a multiple of five
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[int, Episode]]:
+    folder = tmp_path_factory.mktemp("recordings")
+    recorder, environment, agent = RerunRecorder(folder), make_environment(), ThinkingAgent()
+    return folder, {seed: rollout(environment, agent, seed, recorder) for seed in (SUCCESS, FAILURE)}
+
+
+def columns(file: Path) -> dict[str, dict[str, list[Any]]]:
+    """Entity → column → values, static ones included."""
+    entities: dict[str, dict[str, list[Any]]] = {}
+    for chunk in RrdReader(file).stream().to_chunks():
+        values = chunk.to_record_batch().to_pydict()
+        entities.setdefault(chunk.entity_path, {}).update(values)
+    return entities
+
+
+def test_a_file_per_episode_tells_seed_and_outcome(recorded: tuple[Path, dict[int, Episode]]) -> None:
+    folder, _ = recorded
+    names = sorted(file.name for file in folder.iterdir())
+    assert names == ["failure-01000003-timeout.rrd", "success-01000000.rrd"]
+
+
+def test_every_step_is_recorded(recorded: tuple[Path, dict[int, Episode]]) -> None:
+    folder, episodes = recorded
+    episode = episodes[SUCCESS]
+    steps = len(episode.observations)
+    entities = columns(folder / f"{recording_name(SUCCESS, 'success')}.rrd")
+    per_step = ["robot/joints", "robot/gripper", "tokens", "action/m/executed", "action/m/clean", "action/1/executed"]
+    per_step += [f"camera/{name}/{kind}" for name in ("front", "wrist") for kind in ("rgb", "depth")]
+    for path in per_step:
+        assert entities[f"/{path}"]["step"] == list(range(steps)), path
+    seconds = [time.total_seconds() for time in entities["/robot/joints"]["time"]]
+    np.testing.assert_allclose(seconds, np.arange(steps) / 10)
+    executed = np.array(entities["/action/m/executed"]["Scalars:scalars"])
+    np.testing.assert_allclose(executed, episode.executed[:, :2], atol=1e-7)
+    assert entities["/action/m/clean"]["SeriesLines:names"] == [["x, clean", "y, clean"]]
+
+
+def test_bodies_are_recorded_where_they_move_and_shapes_once(recorded: tuple[Path, dict[int, Episode]]) -> None:
+    folder, episodes = recorded
+    steps = len(episodes[SUCCESS].observations)
+    entities = columns(folder / f"{recording_name(SUCCESS, 'success')}.rrd")
+    assert entities["/world/arm.point"]["step"] == list(range(steps + 1))  # and where the last action led to
+    assert entities["/world/table"]["step"] == [0]
+    for solid in ("box", "cylinder", "sphere", "capsule", "mesh"):
+        assert "step" not in entities[f"/world/arm.point/{solid}"], solid
+    normals = np.array(entities["/world/arm.point/mesh"]["Mesh3D:vertex_normals"][0])
+    np.testing.assert_allclose(normals, [[0, 0, 1]] * 3, atol=1e-6)
+
+
+def test_depth_is_lossless_and_in_millimetres(recorded: tuple[Path, dict[int, Episode]]) -> None:
+    folder, episodes = recorded
+    depth = columns(folder / f"{recording_name(SUCCESS, 'success')}.rrd")["/camera/front/depth"]
+    image = Image.open(io.BytesIO(bytes(depth["EncodedDepthImage:blob"][2][0])))
+    np.testing.assert_array_equal(np.array(image), episodes[SUCCESS].observations[2].depth["front"])
+    assert depth["EncodedDepthImage:meter"] == [[1000.0]]
+
+
+def test_text_tells_what_was_asked_what_happened_and_what_was_drawn(recorded: tuple[Path, dict[int, Episode]]) -> None:
+    folder, episodes = recorded
+    entities = columns(folder / f"{recording_name(FAILURE, 'timeout')}.rrd")
+    [[instruction]] = entities["/instruction"]["TextDocument:text"]
+    assert episodes[FAILURE].instruction in instruction
+    assert "timeout** after 40 steps, seed 1000003" in instruction
+    assert str(episodes[FAILURE].draws["colour"]) in entities["/draws"]["TextDocument:text"][0][0]
+    facts = entities["/__properties/episode"]
+    assert (facts["outcome"], facts["seed"], facts["steps"]) == ([["timeout"]], [[FAILURE]], [[40]])
+
+
+def test_merged_episodes_stay_apart_and_failures_come_first(
+    recorded: tuple[Path, dict[int, Episode]], tmp_path: Path
+) -> None:
+    folder, episodes = recorded
+    target = tmp_path / "rollouts.rrd"
+    merge(sorted(folder.glob("*.rrd")), target)
+    assert subprocess.run([VIEWER, "rrd", "verify", target], capture_output=True).returncode == 0
+    reader = RrdReader(target)
+    names = [entry.recording_id.rpartition("-")[0] for entry in reader.recordings()]
+    assert names == ["failure-01000003-timeout", "success-01000000"]
+    assert len(reader.blueprints()) == 2
+    for entry, seed in zip(reader.recordings(), (FAILURE, SUCCESS), strict=True):
+        [joints] = [
+            chunk
+            for chunk in reader.stream(store=entry).to_chunks()
+            if chunk.entity_path == "/robot/joints" and not chunk.is_static
+        ]
+        assert joints.num_rows == len(episodes[seed].observations)
+    assert list(tmp_path.iterdir()) == [target]
+
+
+def test_the_same_seed_recorded_twice_gives_two_recordings(
+    recorded: tuple[Path, dict[int, Episode]], tmp_path: Path
+) -> None:
+    rollout(make_environment(), ThinkingAgent(), SUCCESS, RerunRecorder(tmp_path))
+    file = f"{recording_name(SUCCESS, 'success')}.rrd"
+    ids = {entry.recording_id for folder in (recorded[0], tmp_path) for entry in RrdReader(folder / file).recordings()}
+    assert len(ids) == 2
+
+
+def test_merging_refuses_nothing_and_nonsense(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="no recordings"):
+        merge([], tmp_path / "rollouts.rrd")
+    nonsense = tmp_path / "nonsense.rrd"
+    nonsense.write_text("this is no recording")
+    with pytest.raises(ValueError, match="could not merge 1 recordings"):
+        merge([nonsense], tmp_path / "rollouts.rrd")
+    assert list(tmp_path.iterdir()) == [nonsense]

@@ -1,0 +1,84 @@
+"""What evaluation and preview leave behind."""
+
+from __future__ import annotations
+
+import io
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+from rich.console import Console
+from toy_recordable import make_environment
+
+from vla.evaluate import FIRST_SEED, Report, Result, wilson_interval
+from vla.report import contact_sheet, draws_table, plot_report, write_report
+
+
+def a_report(episodes: int = 60) -> Report:
+    random = np.random.default_rng(0)
+    results = []
+    for index in range(episodes):
+        place, colour = random.uniform(-1, 1, 2).tolist(), str(random.choice(["red", "blue"]))
+        draws = {"placement": {"block": place, "sizes": random.uniform(0, 1, 3).tolist()}, "colour": colour}
+        outcome = "success" if place[0] > 0 else "missed_grasp"
+        results.append(Result(FIRST_SEED + index, outcome, f"lift the {colour} block", 10 + index % 7, draws))
+    return Report((*results, Result(FIRST_SEED + episodes, "error", error="ValueError: broken")))
+
+
+def test_report_json_tells_everything(tmp_path: Path) -> None:
+    report, path = a_report(), tmp_path / "report.json"
+    write_report(report, path, "runs/best.ckpt", {"model": {"width": 16}})
+    content = json.loads(path.read_text(encoding="utf-8"))
+    assert content["success"] == report.successes / 60
+    assert (content["episodes"], content["successes"], content["errors"]) == (60, report.successes, 1)
+    assert (content["ci_low"], content["ci_high"]) == wilson_interval(report.successes, 60)
+    assert content["seeds"] == list(range(FIRST_SEED, FIRST_SEED + 61))
+    assert content["taxonomy"] == {**report.taxonomy}
+    assert (content["checkpoint"], content["config"]) == ("runs/best.ckpt", {"model": {"width": 16}})
+    assert content["per_episode"][0]["draws"] == report.results[0].draws
+    assert content["per_episode"][-1]["error"] == "ValueError: broken"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.parametrize("report", [a_report(), a_report(1), a_report(0)], ids=["sixty", "one", "none"])
+def test_plots_are_drawn_whatever_happened(report: Report, tmp_path: Path) -> None:
+    plot_report(report, tmp_path / "report.png")
+    page = Image.open(tmp_path / "report.png")
+    assert page.width > 1000
+    assert len(np.unique(np.array(page))) > 10
+
+
+def test_contact_sheet_shows_the_observations(tmp_path: Path) -> None:
+    environment, seeds = make_environment(), [FIRST_SEED, FIRST_SEED + 1, FIRST_SEED + 2]
+    observations = [environment.reset(seed) for seed in seeds]
+    contact_sheet(seeds, observations, tmp_path / "preview.png")
+    sheet = np.array(Image.open(tmp_path / "preview.png"))
+    for seen in observations:
+        for image in seen.rgb.values():
+            large = image.repeat(9, 0).repeat(9, 1)  # 16 px are enlarged to 144
+            places = np.lib.stride_tricks.sliding_window_view(sheet[..., 0], large.shape[:2])
+            rows, columns = np.nonzero(
+                (places[:, :, 0, 0] == large[0, 0, 0]) & (places[:, :, -1, -1] == large[-1, -1, 0])
+            )
+            assert any(
+                np.array_equal(sheet[row : row + 144, column : column + 144], large)
+                for row, column in zip(rows, columns, strict=True)
+            )
+
+
+def test_draws_table_tells_ranges_and_words() -> None:
+    draws = [
+        {"light": {"tint": [0.1, 0.2]}, "colour": "red", "blocks": 3},
+        {"light": {"tint": [0.5, 0.3]}, "colour": "blue", "blocks": 2},
+    ]
+    console = Console(width=100, record=True, file=io.StringIO())
+    console.print(draws_table([7, 8], draws))
+    lines = [line.split("│")[1:-1] for line in console.export_text().splitlines() if "│" in line]
+    rows = {name.strip(): (seen.strip(), first.strip()) for name, seen, first in lines}
+    assert rows == {
+        "light.tint": ("0.1 … 0.5", "0.1 0.2"),
+        "colour": ("blue, red", "red"),
+        "blocks": ("2 … 3", "3"),
+    }

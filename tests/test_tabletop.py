@@ -1,0 +1,128 @@
+"""The simulated task: reproducible, physical, and what its spec says."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+
+from conftest import make_tabletop
+
+if TYPE_CHECKING:
+    from vla.tasks.tabletop import Tabletop
+
+
+def test_observations_are_what_the_spec_says(tabletop: Tabletop) -> None:
+    observation = tabletop.reset(3)
+    spec = tabletop.spec
+    for camera in spec.cameras:
+        assert observation.rgb[camera].shape == (*spec.image_size, 3) and observation.rgb[camera].dtype == np.uint8
+        assert observation.depth[camera].shape == spec.image_size and observation.depth[camera].dtype == np.uint16
+    assert observation.joints.shape == observation.velocities.shape == (7,)
+    assert observation.truth is not None
+    assert {name: observation.truth[name].size for name, _ in spec.truth} == dict(spec.truth)
+
+
+def test_the_same_seed_and_actions_give_the_same_episode_bit_for_bit(tabletop: Tabletop) -> None:
+    actions = np.random.default_rng(0).uniform(tabletop.spec.low, tabletop.spec.high, (8, 7))
+
+    def play(environment: Tabletop) -> list[Any]:
+        seen = [environment.reset(11), *(environment.step(action) for action in actions)]
+        return [(item.joints.tobytes(), item.rgb["front"].tobytes(), item.depth["wrist"].tobytes()) for item in seen]
+
+    first = play(tabletop)
+    tabletop.reset(12)  # another episode in between leaves nothing behind
+    tabletop.step(actions[0])
+    assert play(tabletop) == first
+    fresh = make_tabletop()
+    assert play(fresh) == first
+    fresh.close()
+
+
+def test_depth_is_the_distance_along_the_optical_axis(tabletop: Tabletop) -> None:
+    """The table, seen through the middle of the image, lies where the camera's geometry puts it."""
+    environment = make_tabletop("randomize=none")
+    environment.reset(0)
+    bound = environment.task.bound
+    # Look at bare table, far from everything.
+    position, spot = np.array([0.9, -0.6, 0.5]), np.array([0.7, -0.6, 0.0])
+    from vla.tasks.scene import look_at
+
+    camera = bound.cameras["front"]
+    bound.model.cam_pos[camera] = position
+    quaternion = np.empty(4)
+    import mujoco
+
+    mujoco.mju_mat2Quat(quaternion, look_at(position, spot, (0, 0, 1)).ravel())
+    bound.model.cam_quat[camera] = quaternion
+    mujoco.mj_forward(bound.model, bound.data)
+    depth = environment._observe().depth["front"]
+    height, width = depth.shape
+    middle = depth[height // 2 - 1 : height // 2 + 1, width // 2 - 1 : width // 2 + 1].mean()
+    assert middle == pytest.approx(1000 * np.linalg.norm(position - spot), abs=3)
+    environment.close()
+
+
+def test_blocks_rest_and_the_arm_holds_still(tabletop: Tabletop) -> None:
+    """Resizing and reweighing blocks must not make physics explode: nothing moves when nobody moves."""
+    with tabletop.blind():
+        for seed in range(10):
+            tabletop.reset(seed)
+            bound = tabletop.task.bound
+            start = [bound.block_position(index) for index in range(3)]
+            joints = bound.data.qpos[bound.joints].copy()
+            for _ in range(10):
+                tabletop.step(np.array([0, 0, 0, 0, 0, 0, 1.0]))
+            for index in range(3):
+                assert np.linalg.norm(bound.block_position(index) - start[index]) < 1e-3
+            assert np.abs(bound.data.qpos[bound.joints] - joints).max() < 1e-3
+
+
+def test_the_arm_follows_what_is_commanded(tabletop: Tabletop) -> None:
+    with tabletop.blind():
+        tabletop.reset(0)
+        for _ in range(4):
+            truth = tabletop.step(np.array([0.02, 0.02, 0.02, 0, 0, 0.1, 1.0])).truth
+            assert truth is not None
+            assert np.linalg.norm(truth["commanded"][:3, 3] - truth["tcp"]) < 0.004
+
+
+def test_an_episode_without_success_ends_at_the_time_limit_and_says_why(tabletop: Tabletop) -> None:
+    with tabletop.blind():
+        tabletop.reset(5)
+        steps = 0
+        while not tabletop.done:
+            tabletop.step(np.array([0, 0, 0, 0, 0, 0, 1.0]))
+            steps += 1
+    assert steps == pytest.approx(100, abs=1)  # 10 s at 10 Hz
+    assert tabletop.outcome == "never_reached"
+    with pytest.raises(ValueError, match="reset"):
+        tabletop.step(np.zeros(7))
+
+
+def test_it_is_a_dm_env_environment() -> None:
+    environment = make_tabletop()
+    spec = environment.dm_env.action_spec()
+    timestep = environment.dm_env.reset()
+    assert timestep.first()
+    timestep = environment.dm_env.step(np.clip(np.zeros(7), spec.minimum, spec.maximum))
+    assert timestep.reward == 0.0
+    environment.close()
+
+
+def test_an_unknown_camera_is_named() -> None:
+    with pytest.raises(Exception, match="'front', 'wrist'"):
+        from vla.tasks.goals import Lift
+        from vla.tasks.tabletop import Tabletop
+
+        Tabletop(goal=Lift(), randomize={}, cameras=("side",))
+
+
+def test_shapes_and_poses_describe_the_scene(tabletop: Tabletop) -> None:
+    tabletop.reset(0)
+    shapes, poses = tabletop.shapes(), tabletop.poses()
+    assert {shape.body for shape in shapes} <= set(poses)
+    assert {"mesh", "box", "cylinder"} == {shape.kind for shape in shapes}
+    block = next(shape for shape in shapes if shape.name == "block0/cube")
+    assert block.size[0] == pytest.approx(tabletop.draws["size"]["half_size"][0], abs=1e-4)

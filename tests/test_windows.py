@@ -1,0 +1,240 @@
+"""Windows: what a naive loop over the episodes would give, in an order that can be taken up again exactly."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+import toy
+from lightning import LightningModule, Trainer
+from lightning.pytorch.callbacks import ModelCheckpoint
+
+from vla.collect import collect
+from vla.data.episodes import EpisodeStore
+from vla.data.windows import Gather, Windows, held_out
+
+EPISODES = 30
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("episodes")
+    store = EpisodeStore.create_or_open(folder, toy.SPEC, {})
+    collect(store, toy.make_environment, toy.make_expert, EPISODES, workers=1, seed=0)
+    return folder
+
+
+@pytest.fixture(autouse=True)
+def one_thread() -> Iterator[None]:
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)
+
+
+def windows(folder: Path, **changes: Any) -> Windows:
+    settings = {
+        "spec": toy.SPEC,
+        "history": 3,
+        "chunk": 2,
+        "seed": 1,
+        "batch_size": 8,
+        "validation_fraction": 0.2,
+        "validation_windows": 40,
+        "depth": False,
+        "ahead": 2,
+    }
+    module = Windows(folder, **{**settings, **changes})
+    module.setup()
+    return module
+
+
+def naive(store: EpisodeStore, row: int, history: int, chunk: int) -> dict[str, Any]:
+    """The window whose newest frame is `row`, put together frame by frame."""
+    entry = next(entry for entry in store.episodes if entry.start <= row < entry.start + entry.steps)
+    rows = store.read(entry)
+    newest = row - entry.start
+    frames: list[dict[str, Any]] = []
+    for step in range(newest - history + 1, newest + 1):
+        present = step >= 0
+        seen = {name: values[max(step, 0)] * present for name, values in rows.items()}
+        labels = [min(max(step + ahead, 0), entry.steps - 1) if present else 0 for ahead in range(chunk)]
+        seen["proprio"] = np.concatenate([seen["joints"], seen["velocities"], seen["gripper"]])
+        seen["labels"] = [rows["action"][label] for label in labels]
+        seen["valid"] = [present and step + ahead < entry.steps for ahead in range(chunk)]
+        seen["present"] = present
+        frames.append(seen)
+    return {name: np.stack([frame[name] for frame in frames]) for name in frames[0]} | {"text": entry.instruction}
+
+
+@pytest.mark.parametrize(("history", "chunk"), [(1, 1), (3, 2), (6, 8)])
+def test_a_batch_is_what_a_loop_over_the_episodes_gives(folder: Path, history: int, chunk: int) -> None:
+    store = EpisodeStore(folder)
+    chosen = np.concatenate([np.arange(store.episodes[5].start - 2, store.episodes[5].start + 9), [0, 1]])
+    batch = Gather(store, history, chunk, depth=True)(chosen)
+    for place, row in enumerate(chosen):
+        expected = naive(store, row, history, chunk)
+        for camera in toy.SPEC.cameras:
+            np.testing.assert_array_equal(batch["rgb"][camera][place], expected[f"rgb_{camera}"])
+            np.testing.assert_array_equal(batch["depth"][camera][place], expected[f"depth_{camera}"])
+        for name in ("proprio", "truth", "present", "valid"):
+            np.testing.assert_array_equal(batch[name][place], expected[name])
+        usable = expected["valid"]
+        np.testing.assert_array_equal(batch["action"][place].numpy()[usable], expected["labels"][usable])
+        beyond = ~usable & expected["present"][:, None]
+        np.testing.assert_array_equal(batch["action"][place].numpy()[beyond], expected["labels"][beyond])
+        assert batch["instruction"][place] == expected["text"]
+
+
+def test_shapes_and_types_are_those_of_the_contract(folder: Path) -> None:
+    batch = next(iter(windows(folder, depth=True).train_dataloader()))
+    assert {name: (tuple(image.shape), image.dtype) for name, image in batch["rgb"].items()} == {
+        "front": ((8, 3, 16, 16, 3), torch.uint8),
+        "wrist": ((8, 3, 16, 16, 3), torch.uint8),
+    }
+    assert batch["depth"]["wrist"].shape == (8, 3, 16, 16) and batch["depth"]["wrist"].dtype == torch.int32
+    assert {name: (tuple(batch[name].shape), batch[name].dtype) for name in ("proprio", "truth", "action")} == {
+        "proprio": ((8, 3, 15), torch.float32),
+        "truth": ((8, 3, 4), torch.float32),
+        "action": ((8, 3, 2, 3), torch.float32),
+    }
+    assert batch["present"].shape == (8, 3) and batch["present"].dtype == torch.bool
+    assert batch["valid"].shape == (8, 3, 2) and batch["valid"].dtype == torch.bool
+    assert len(batch["instruction"]) == 8
+    assert "depth" not in next(iter(windows(folder).train_dataloader()))
+
+
+def test_nothing_is_labelled_before_the_start_or_beyond_the_end(folder: Path) -> None:
+    entry = EpisodeStore(folder).episodes[1]
+    batch = Gather(EpisodeStore(folder), history=3, chunk=2)(np.array([entry.start, entry.start + entry.steps - 1]))
+    assert batch["present"].tolist() == [[False, False, True], [True, True, True]]
+    assert batch["valid"][0].tolist() == [[False, False], [False, False], [True, True]]
+    assert batch["valid"][1].tolist() == [[True, True], [True, True], [True, False]]
+    assert not batch["rgb"]["front"][0, :2].any() and not batch["proprio"][0, :2].any()
+    assert torch.equal(batch["action"][1, 2, 0], batch["action"][1, 2, 1])
+
+
+def test_every_window_comes_once_per_shuffle(folder: Path) -> None:
+    module = windows(folder)
+    count = len(module.training_windows)
+    drawn = np.concatenate([module.order(step) for step in range(2 * count // 8 + 1)])
+    for first in (0, count):
+        np.testing.assert_array_equal(np.sort(drawn[first : first + count]), module.training_windows)
+    assert not np.array_equal(drawn[:count], drawn[count : 2 * count])
+    assert not np.array_equal(windows(folder, seed=2).order(0), module.order(0))
+    larger = windows(folder, batch_size=2 * count + 5)
+    assert np.bincount(larger.order(0))[module.training_windows].min() == 2
+
+
+def test_ranks_share_the_windows_out(folder: Path) -> None:
+    module = windows(folder)
+    steps = len(module.training_windows) // (8 * 2)
+    drawn = [np.concatenate([module.order(step, rank, 2) for step in range(steps)]) for rank in (0, 1)]
+    assert not set(drawn[0]) & set(drawn[1])
+    assert len(set(drawn[0]) | set(drawn[1])) == steps * 8 * 2
+
+
+def test_the_split_is_by_episode_and_does_not_move_when_episodes_are_added(folder: Path) -> None:
+    few, many = windows(folder, episodes=20), windows(folder)
+    assert set(few.held_out_windows) < set(many.held_out_windows)
+    assert set(few.training_windows) < set(many.training_windows)
+    for entry in EpisodeStore(folder).episodes:
+        side = many.held_out_windows if held_out(entry.seed, 0.2) else many.training_windows
+        assert np.isin(np.arange(entry.start, entry.start + entry.steps), side).all()
+
+
+@pytest.mark.parametrize("fraction", [0.05, 0.1, 0.5])
+def test_every_stretch_of_seeds_holds_out_its_share(fraction: float) -> None:
+    held = np.array([held_out(seed, fraction) for seed in range(10_000)])
+    assert abs(held.mean() - fraction) < 0.001
+    length = round(2 / fraction)
+    assert all(held[first : first + length].any() for first in range(0, 10_000 - length))
+
+
+def test_validation_is_the_same_pass_in_whole_batches(folder: Path) -> None:
+    module = windows(folder)
+    loader = module.val_dataloader()
+    assert len(loader) == 5  # 40 windows
+    first, second = list(loader), list(loader)
+    assert len(first) == len(second) == 5
+    assert all(torch.equal(one["rgb"]["front"], two["rgb"]["front"]) for one, two in zip(first, second, strict=True))
+    assert all(len(batch["action"]) == 8 for batch in first)
+    assert windows(folder, validation_fraction=0.0).val_dataloader() == []
+
+
+def test_the_stream_is_made_ahead_but_not_without_bound(folder: Path) -> None:
+    module, made = windows(folder, ahead=2), []
+    gather = module.gather
+    module.gather = lambda rows: (made.append(len(rows)), gather(rows))[1]  # type: ignore[assignment,func-returns-value]
+    stream = iter(module.train_dataloader())
+    for _ in islice(stream, 4):
+        pass
+    stream.close()  # type: ignore[attr-defined]
+    assert len(made) <= 4 + 2
+
+
+class Seen(LightningModule):
+    """Remembers the windows it was shown; its one weight depends on all of them and on their order."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.weight = torch.nn.Parameter(torch.zeros(1))
+        self.seen: list[torch.Tensor] = []
+
+    def training_step(self, batch: dict[str, Any], index: int) -> torch.Tensor:
+        self.seen.append(batch["proprio"])
+        return (self.weight - batch["proprio"].mean()).square().mean()
+
+    def validation_step(self, batch: dict[str, Any], index: int) -> None:
+        assert batch["action"].shape == (8, 3, 2, 3)
+
+    def configure_optimizers(self) -> torch.optim.Optimizer:
+        return torch.optim.Adam(self.parameters(), lr=0.1)
+
+
+def fit(folder: Path, steps: int, accumulate: int, checkpoint: Path | None = None, save: Path | None = None) -> Seen:
+    model = Seen()
+    trainer = Trainer(
+        accelerator="cpu",
+        devices=1,
+        max_steps=steps,
+        accumulate_grad_batches=accumulate,
+        val_check_interval=4,
+        check_val_every_n_epoch=None,
+        num_sanity_val_steps=0,
+        logger=False,
+        enable_progress_bar=False,
+        enable_model_summary=False,
+        enable_checkpointing=save is not None,
+        callbacks=[ModelCheckpoint(save, "at_{step}", every_n_train_steps=1, save_top_k=-1)] if save else [],
+    )
+    trainer.fit(model, datamodule=windows(folder), ckpt_path=checkpoint, weights_only=True)
+    return model
+
+
+@pytest.mark.parametrize("accumulate", [1, 2])
+def test_a_resumed_training_sees_what_an_uninterrupted_one_sees(folder: Path, tmp_path: Path, accumulate: int) -> None:
+    whole = fit(folder, 9, accumulate, save=tmp_path)
+    for step in (3, 4):
+        resumed = fit(folder, 9, accumulate, checkpoint=next(tmp_path.glob(f"at_step={step}.ckpt")))
+        assert len(resumed.seen) == (9 - step) * accumulate
+        tail = whole.seen[step * accumulate :]
+        assert all(torch.equal(one, two) for one, two in zip(resumed.seen, tail, strict=True))
+        assert torch.equal(resumed.weight, whole.weight)
+
+
+def test_what_cannot_be_trained_on_is_refused(folder: Path) -> None:
+    with pytest.raises(ValueError, match=r"the model has control_hz = 5\.0, but the episode store .* has 10\.0"):
+        windows(folder, spec=replace(toy.SPEC, control_hz=5.0))
+    with pytest.raises(ValueError, match=r"1 episodes leave 0 for training and 1 for .*: raise collect\.episodes"):
+        windows(folder, episodes=1)
+    with pytest.raises(ValueError, match="a share from 0 up to 1, not 5"):
+        windows(folder, validation_fraction=5)
+    with pytest.raises(ValueError, match="at least 1 each"):
+        windows(folder, batch_size=0)

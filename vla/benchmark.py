@@ -1,0 +1,165 @@
+"""How fast the stages run, each against a floor that was measured on the same work in the same run.
+
+A floor is what the stage could not do without: a ratio of 1 would mean that everything around it costs nothing.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from omegaconf import DictConfig
+
+Measure = dict[str, Any]  # value, unit, n, floor, ratio
+
+
+def benchmark(config: DictConfig, output: Path) -> dict[str, Measure]:
+    """Measure what `config.benchmark.names` lists, print a table, write `benchmark.json`; name → measure.
+
+    Raises:
+        ValueError: a name that is no stage.
+    """
+    unknown = sorted(set(config.benchmark.names) - set(STAGES))
+    if unknown:
+        raise ValueError(f"benchmark.names has {unknown}, the stages are {sorted(STAGES)}")
+    measures = {name: STAGES[name](config) for name in config.benchmark.names}
+    draft = output / "benchmark.json.partial"
+    draft.write_text(json.dumps(measures, indent=2), encoding="utf-8")
+    os.replace(draft, output / "benchmark.json")
+    _show(measures)
+    return measures
+
+
+def collection(config: DictConfig) -> Measure:
+    """Control steps of the expert in one process with all cameras, against bare physics and rendering of as many."""
+    import mujoco
+
+    from vla.jobs import make_environment, make_expert, plain
+    from vla.rollout import rollout
+
+    environment = make_environment(plain(config.task))
+    expert = make_expert(plain(config.expert), environment)
+    rollout(environment, expert, 0)  # the first one compiles shaders
+    started = time.perf_counter()
+    steps = sum(len(rollout(environment, expert, seed).actions) for seed in range(config.benchmark.episodes))
+    seconds = time.perf_counter() - started
+    bound, render = environment.task.bound, environment.renderer.render
+    substeps = environment.task.physics_steps_per_control_step
+    started = time.perf_counter()
+    for _ in range(steps):
+        mujoco.mj_step(bound.model, bound.data, substeps)
+        for camera in environment.spec.cameras:
+            render(bound.data, bound.cameras[camera])
+    floor = steps / (time.perf_counter() - started)
+    environment.close()
+    return _measure(steps / seconds, "control steps/s", steps, floor)
+
+
+def loader(config: DictConfig) -> Measure:
+    """Training windows through the loader, against a bare gather of the same rows from the memory-mapped images."""
+    from vla.jobs import collected, make_data, make_learner
+
+    store = collected(config)
+    data = make_data(config, store, make_learner(config, store).model)
+    data.setup("fit")
+    batches = config.benchmark.batches
+    stream = iter(data.train_dataloader())
+    next(stream)
+    started = time.perf_counter()
+    for _ in range(batches):
+        next(stream)
+    windows = batches * data.batch_size
+    seconds = time.perf_counter() - started
+    images = [store.rows(f"rgb_{camera}") for camera in store.spec.cameras]
+    started = time.perf_counter()
+    for step in range(batches):
+        rows = data.order(step)
+        for image in images:
+            np.take(image, rows, axis=0)
+    floor = windows / (time.perf_counter() - started)
+    return _measure(windows / seconds, "windows/s", windows, floor)
+
+
+def training(config: DictConfig) -> Measure:
+    """Samples through the trainer, against forward, backward and optimiser step alone on one resident batch."""
+    import torch
+
+    from vla.jobs import collected, make_data, make_learner, make_trainer
+
+    store = collected(config)
+    steps = config.benchmark.steps
+    short = config.copy()
+    short.trainer.max_steps, short.trainer.limit_val_batches = 2 * steps, 0
+    learner = make_learner(short, store)
+    data = make_data(short, store, learner.model)
+    clock = _StepClock(steps)
+    trainer = make_trainer(short, None)
+    trainer.callbacks.append(clock)
+    trainer.fit(learner, datamodule=data)
+    batch = learner.prepare(next(iter(data.train_dataloader())))
+    optimizer = torch.optim.AdamW(learner.model.parameters())
+    learner.model.train()
+    started = time.perf_counter()
+    for _ in range(steps):
+        optimizer.zero_grad()
+        learner.model.loss(batch)["loss"].backward()
+        optimizer.step()
+    floor = steps * data.batch_size / (time.perf_counter() - started)
+    samples = steps * data.batch_size
+    return _measure(samples / clock.seconds, "samples/s", samples, floor)
+
+
+def policy(config: DictConfig) -> Measure:
+    """Actions of the policy per second, batch of one, against its network's forward pass alone."""
+    import torch
+
+    from vla.jobs import collected, make_environment, make_learner, plain
+    from vla.policy import Policy
+
+    environment = make_environment(plain(config.task))
+    observation = environment.reset(0)
+    store = collected(config)
+    model = make_learner(config, store).model.eval()
+    agent = Policy(model, environment.spec)
+    agent.reset(observation.instruction, 0)
+    agent.act(observation)
+    steps = config.benchmark.steps
+    started = time.perf_counter()
+    for _ in range(steps):
+        agent.act(observation)
+    rate = steps / (time.perf_counter() - started)
+    batch = agent.window()
+    with torch.inference_mode():
+        started = time.perf_counter()
+        for _ in range(steps):
+            model(batch)
+    floor = steps / (time.perf_counter() - started)
+    environment.close()
+    return _measure(rate, "actions/s", steps, floor)
+
+
+STAGES: dict[str, Callable[[DictConfig], Measure]] = {
+    "collect": collection,
+    "loader": loader,
+    "train": training,
+    "policy": policy,
+}
+
+
+def _measure(value: float, unit: str, n: int, floor: float) -> Measure:
+    return {"value": round(value, 2), "unit": unit, "n": n, "floor": round(floor, 2), "ratio": round(value / floor, 3)}
+
+
+def _show(measures: dict[str, Measure]) -> None:
+    from rich import print as show
+    from rich.table import Table
+
+    table = Table("stage", "value", "unit", "n", "floor", "ratio")
+    for name, measure in measures.items():
+        table.add_row(name, *(str(measure[key]) for key in ("value", "unit", "n", "floor", "ratio")))
+    show(table)

@@ -1,0 +1,268 @@
+"""A composed config against the signatures of the classes it names, before any work, and the objects it describes.
+
+The `__init__` of a class is the schema of its node: names, which of them are needed, types and allowed values.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import inspect
+import json
+import os
+import pkgutil
+import types
+import typing
+from collections.abc import Collection, Iterable, Iterator, Mapping, MutableMapping, Sequence
+from difflib import get_close_matches
+from pathlib import Path
+from typing import Any, Literal, TypeVar, Union, get_args, get_origin
+
+from hydra.errors import InstantiationException
+from hydra.utils import instantiate
+from omegaconf import DictConfig, OmegaConf
+
+# What a `_target_` may name: configs also come out of checkpoints, which may come from anybody.
+ALLOWED = ("vla.", "torch.", "lightning.", "dm_control.composer.variation.")
+
+# The groups that each job builds something from; only these are checked, so only their modules are imported.
+TRAINING = ("task", "expert", "data", "tokenizer", "model", "learner", "trainer")
+JOBS: dict[str, tuple[str, ...]] = {
+    "preview": ("task", "expert"),
+    "collect": ("task", "expert"),
+    "train": TRAINING,
+    "evaluate": (*TRAINING, "recorder"),
+    "export": ("task", "expert", "export"),
+    "deploy": ("tokenizer", "model", "deploy"),
+    "benchmark": TRAINING,
+}
+EVALUATION = ("task", "tokenizer", "model", "recorder")  # of a checkpoint, with nothing to train
+OPTIONAL = ("recorder",)  # groups that a job can do without
+
+# Constructor arguments that the jobs give, so that they never stand in YAML.
+RUNTIME: dict[str, tuple[str, ...]] = {
+    "expert": ("spec",),
+    "data": ("folder", "spec", "history", "chunk", "episodes"),
+    "tokenizer": ("spec", "statistics"),
+    "model": ("spec", "tokenizer"),
+    "learner": ("model", "spec", "config"),
+    "trainer": ("callbacks", "logger"),
+    "recorder": ("folder",),
+    "deploy": ("policy",),
+}
+
+# The nodes that name no class.
+PLAIN: dict[str, Any] = {
+    "job": Literal["preview", "collect", "train", "evaluate", "export", "deploy", "benchmark"],
+    "seed": int,
+    "checkpoint": str | None,
+    "output": str,
+    "collect": {"episodes": int, "seed": int, "workers": int | None, "verify": bool, "folder": str},
+    "evaluate": {"episodes": int, "seed": int, "workers": int | None, "recordings": int},
+    "preview": {"episodes": int, "seed": int},
+    "benchmark": {"names": list[Literal["collect", "loader", "train", "policy"]]},
+}
+GROUPS = tuple(dict.fromkeys(group for groups in JOBS.values() for group in groups))
+
+HYDRA_KEYS = ("_target_", "_partial_", "_convert_", "_recursive_")
+LISTS = (list, Sequence, Collection, Iterable, object)
+MAPPINGS = (dict, Mapping, MutableMapping, object)
+SCALARS: dict[type, tuple[Any, ...]] = {
+    bool: (bool, object),
+    int: (int, float, object),
+    float: (float, object),
+    str: (str, Path, os.PathLike, object),
+}
+
+
+def build(node: DictConfig | Mapping[str, Any], **runtime: Any) -> Any:
+    """The object that `node`, composed or plain, describes, given the arguments that only the program knows.
+
+    Nested nodes are built first, and those with `_partial_: true` arrive as factories.
+
+    Raises:
+        ValueError: a `_target_` that is not allowed, or what the constructor of a nested node raises.
+    """
+    plain = OmegaConf.to_container(node) if isinstance(node, DictConfig) else node
+    for key, target in _targets(plain):
+        _locate(key, target)
+    try:
+        factory = instantiate(node, _convert_="all", _partial_=True)
+    except InstantiationException as error:
+        if isinstance(error.__cause__, ValueError):
+            raise ValueError(str(error.__cause__)) from error
+        raise
+    return factory(**runtime)
+
+
+def check(cfg: DictConfig) -> None:
+    """Bind everything that the job of `cfg` is going to build to the signatures it names.
+
+    Raises:
+        ValueError: an unknown, missing or ill-typed key, with its dotted name and what is allowed in its place.
+    """
+    for name in cfg:
+        _require_known("", str(name), (*PLAIN, *GROUPS), "the config")
+    for name, annotation in PLAIN.items():
+        node = OmegaConf.to_container(cfg[name], resolve=True) if OmegaConf.is_config(cfg[name]) else cfg[name]
+        _check_plain(name, node, annotation)
+    for group in EVALUATION if cfg.job == "evaluate" and cfg.checkpoint is not None else JOBS[cfg.job]:
+        if cfg.get(group) is not None:
+            node = OmegaConf.to_container(cfg[group], resolve=True, throw_on_missing=True)
+            _check_node(group, node, RUNTIME.get(group, ()))
+        elif group not in OPTIONAL:
+            raise ValueError(f"job={cfg.job} needs {group}=OPTION; --help lists the options")
+
+
+def digest(*keys: str, _root_: DictConfig) -> str:
+    """Twelve hexadecimal digits that name what stands at the dotted `keys`, as `${digest:task,expert,collect.seed}`.
+
+    The order of a mapping counts, because randomisation axes are applied in it; 10 and 10.0 are the same number.
+    """
+    values = [OmegaConf.select(_root_, key, throw_on_missing=True) for key in keys]
+    plain = [OmegaConf.to_container(value, resolve=True) if OmegaConf.is_config(value) else value for value in values]
+    return hashlib.sha256(json.dumps(_canonical(plain)).encode()).hexdigest()[:12]
+
+
+def suggestion(name: str, known: Iterable[str]) -> str:
+    """`, did you mean …?`, or nothing where no known name comes close."""
+    close = get_close_matches(name, list(known), n=1)
+    return f", did you mean {close[0]}?" if close else ""
+
+
+def _canonical(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {name: _canonical(item) for name, item in value.items()}
+    if isinstance(value, list):
+        return [_canonical(item) for item in value]
+    return int(value) if isinstance(value, float) and value.is_integer() else value
+
+
+def _targets(node: Any, key: str = "") -> Iterator[tuple[str, Any]]:
+    if isinstance(node, dict):
+        if "_target_" in node:
+            yield f"{key}_target_", node["_target_"]
+        for name, value in node.items():
+            yield from _targets(value, f"{key}{name}.")
+    elif isinstance(node, list):
+        for index, value in enumerate(node):
+            yield from _targets(value, f"{key}{index}.")
+
+
+def _locate(key: str, target: Any) -> type:
+    if not isinstance(target, str) or not target.startswith(ALLOWED):
+        raise ValueError(f"{key} must begin with {' or '.join(ALLOWED)}, got {target!r}")
+    try:
+        found = pkgutil.resolve_name(target)
+    except (ImportError, AttributeError) as error:
+        raise ValueError(f"{key} is {target}, which cannot be imported: {error}") from error
+    # An allowed module may itself have imported something that is not, such as `os`.
+    if not isinstance(found, type) or not found.__module__.startswith(ALLOWED):
+        raise ValueError(f"{key} must name a class defined under {' or '.join(ALLOWED)}, got {target!r}")
+    return found
+
+
+def _check_node(key: str, node: Any, runtime: Sequence[str] = ()) -> None:
+    if not isinstance(node, dict) or "_target_" not in node:
+        raise ValueError(f"{key} must be a node with a _target_, got {node!r}")
+    target = _locate(f"{key}._target_", node["_target_"])
+    parameters = inspect.signature(target).parameters
+    kinds = {parameter.kind for parameter in parameters.values()}
+    known = [name for name in parameters if name not in runtime]
+    hints = _hints(target)
+    for name, value in node.items():
+        if name in HYDRA_KEYS:
+            continue
+        if inspect.Parameter.VAR_KEYWORD not in kinds:
+            _require_known(key, name, known, target.__name__)
+        _check_value(f"{key}.{name}", value, hints.get(name, Any))
+    for name in () if node.get("_partial_") else known:
+        parameter = parameters[name]
+        variadic = parameter.kind in (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
+        if name not in node and parameter.default is inspect.Parameter.empty and not variadic:
+            raise ValueError(f"{key}.{name} is missing: {target.__name__} needs it")
+
+
+def _check_plain(key: str, value: Any, annotation: Any) -> None:
+    if not isinstance(annotation, dict):
+        return _check_value(key, value, annotation)
+    if not isinstance(value, dict):
+        raise ValueError(f"{key} must hold {', '.join(annotation)}, got {value!r}")
+    for name in value:
+        _require_known(key, name, annotation, key)
+    for name in annotation:
+        if name not in value:
+            raise ValueError(f"{key}.{name} is missing")
+        _check_value(f"{key}.{name}", value[name], annotation[name])
+    return None
+
+
+def _check_value(key: str, value: Any, annotation: Any) -> None:
+    if not _matches(value, annotation):
+        choices = [str(choice) for choice in get_args(annotation)] if get_origin(annotation) is Literal else []
+        hint = suggestion(str(value), choices)
+        raise ValueError(f"{key} must be {_describe(annotation)}, got {value!r}{hint}")
+    if isinstance(value, dict) and "_target_" in value:
+        return _check_node(key, value)
+    children = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
+    for name, child in children:
+        _check_value(f"{key}.{name}" if isinstance(value, dict) else f"{key}[{name}]", child, Any)
+    return None
+
+
+def _require_known(key: str, name: str, known: Collection[str], owner: str) -> None:
+    if name not in known:
+        prefix = f"{key}." if key else ""
+        hint = suggestion(name, known) or ":"
+        raise ValueError(f"{prefix}{name} is unknown{hint} {owner} takes {', '.join(known)}")
+
+
+def _hints(target: type) -> dict[str, Any]:
+    try:
+        return typing.get_type_hints(inspect.unwrap(target.__init__))  # type: ignore[misc]
+    except NameError:  # an annotation whose name exists for type checkers only
+        return {}
+
+
+def _matches(value: Any, annotation: Any) -> bool:
+    kind, arguments = get_origin(annotation) or annotation, get_args(annotation)
+    if kind is Any or isinstance(kind, TypeVar):
+        return True
+    if kind in (Union, types.UnionType):
+        return any(_matches(value, argument) for argument in arguments)
+    if kind is Literal:
+        return any(type(value) is type(choice) and value == choice for choice in arguments)
+    if value is None:
+        return kind in (None, types.NoneType, object)
+    if isinstance(value, dict):
+        if "_target_" in value:
+            return kind not in (bool, int, float, str, Path)
+        of = arguments[1] if arguments else Any
+        return kind in MAPPINGS and all(_matches(item, of) for item in value.values())
+    if isinstance(value, list):
+        return _matches_list(value, kind, arguments)
+    return kind in SCALARS.get(type(value), ())
+
+
+def _matches_list(value: list[Any], kind: Any, arguments: tuple[Any, ...]) -> bool:
+    if kind is tuple and arguments and arguments[-1] is not Ellipsis:
+        pairs = zip(value, arguments, strict=False)
+        return len(value) == len(arguments) and all(_matches(item, argument) for item, argument in pairs)
+    arrays = getattr(kind, "__name__", "") == "ndarray"
+    return arrays or (kind in (*LISTS, tuple) and all(_matches(item, arguments[0]) for item in value if arguments))
+
+
+def _describe(annotation: Any) -> str:
+    kind, arguments = get_origin(annotation), get_args(annotation)
+    if kind is Literal:
+        return f"one of {', '.join(str(choice) for choice in arguments)}"
+    if kind in (Union, types.UnionType):
+        return " or ".join(_describe(argument) for argument in arguments)
+    if annotation in (None, types.NoneType):
+        return "null"
+    if arguments:
+        inner = ", ".join("…" if argument is Ellipsis else _describe(argument) for argument in arguments)
+        return f"{getattr(kind, '__name__', kind)}[{inner}]"
+    return str(getattr(annotation, "__name__", annotation))
+
+
+OmegaConf.register_new_resolver("digest", digest, replace=True)

@@ -1,0 +1,299 @@
+"""The episode store: one flat file per field, one index line per tried seed, and nothing else.
+
+A folder holds `store.json` (what the rows mean), `<field>.bin` (the rows of every episode, one after the other) and
+`index.jsonl`. An episode exists once its index line does: its rows are flushed to disk before the line is, so a
+process killed at any moment leaves at most a tail that no line speaks of, and the next writer cuts it off. The bytes
+depend on the episodes only, never on when or by how many processes they were made.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import zlib
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack, contextmanager
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+from filelock import FileLock, Timeout
+
+from vla.spec import Array, Episode, Spec
+
+FORMAT = 1
+REMEDY = "copy the folder again from where it is whole, or delete it and collect again"
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One index line: a seed that was tried; one that failed has no steps."""
+
+    seed: int
+    outcome: str  # "success" or the name of the failure
+    instruction: str
+    start: int  # first row of the episode in every field file
+    steps: int
+    draws: dict[str, Any]  # randomisation axis → what was drawn
+    crc: int  # CRC-32 of the rows of all fields, in the order of `fields_of`
+    action: dict[str, list[float]]  # "low" | "high" | "sum" | "square" → (D,) over the steps; empty for failures
+
+    @property
+    def success(self) -> bool:
+        """Whether the episode is stored."""
+        return self.outcome == "success"
+
+
+@dataclass(frozen=True)
+class Statistics:
+    """Moments of the actions over all stored steps, each (D,) float64."""
+
+    low: Array
+    high: Array
+    mean: Array
+    std: Array
+    steps: int
+
+
+def fields_of(spec: Spec) -> dict[str, tuple[tuple[int, ...], np.dtype]]:
+    """Field name → shape and dtype of the row that one step leaves there."""
+    joints, action, numbers = len(spec.joints), len(spec.action), np.dtype("<f4")
+    sizes = {"joints": joints, "velocities": joints, "gripper": 1, "action": action, "executed": action}
+    if spec.truth:
+        sizes["truth"] = spec.truth_size
+    fields: dict[str, tuple[tuple[int, ...], np.dtype]] = {}
+    for camera in spec.cameras:
+        fields[f"rgb_{camera}"] = ((*spec.image_size, 3), np.dtype(np.uint8))
+        fields[f"depth_{camera}"] = (spec.image_size, np.dtype("<u2"))
+    return fields | {name: ((size,), numbers) for name, size in sizes.items()}
+
+
+class EpisodeStore:
+    """Episodes on disk, opened for reading; `create_or_open` and `writing` make it grow.
+
+    Attributes: `spec`; `config`, what made the episodes; `fields`, as `fields_of`; `tried`, one entry per seed.
+    With `episodes` only the first so many are seen. Raises a ValueError where there is no store, its format is unknown,
+    it is damaged, or it holds fewer than `episodes`.
+    """
+
+    def __init__(self, folder: str | Path, episodes: int | None = None) -> None:
+        self.folder = Path(folder)
+        header = _read_header(self.folder)
+        self.spec = Spec.from_dict(header["spec"])
+        self.config: dict[str, Any] = header["config"]
+        self.fields = fields_of(self.spec)
+        self._limit = episodes
+        self._files: dict[str, BinaryIO] = {}
+        self._refresh()
+        if episodes is not None and len(self.episodes) < episodes:
+            raise ValueError(f"{folder} holds {len(self.episodes)} of {episodes} episodes: collect the rest first")
+
+    @classmethod
+    def create_or_open(cls, folder: str | Path, spec: Spec, config: Mapping[str, Any]) -> EpisodeStore:
+        """The store in `folder`, made there if there is none; a ValueError if it has another spec or config."""
+        folder = Path(folder)
+        plain = json.loads(_dumps(config))
+        if not (folder / "store.json").exists():
+            fields = {name: {"shape": shape, "dtype": dtype.name} for name, (shape, dtype) in fields_of(spec).items()}
+            header = {"format": FORMAT, "spec": spec.to_dict(), "config": plain, "fields": fields}
+            folder.mkdir(parents=True, exist_ok=True)
+            draft = folder / f"store.json.{os.getpid()}"
+            draft.write_text(_dumps(header), encoding="utf-8")
+            os.replace(draft, folder / "store.json")
+        store = cls(folder)
+        spec.require(store.spec, "this task", f"the episode store {folder}")
+        different = sorted(key for key in {*plain, *store.config} if plain.get(key) != store.config.get(key))
+        if different:
+            raise ValueError(f"{folder} was collected with another config for {different}: choose another folder")
+        return store
+
+    @property
+    def episodes(self) -> list[Entry]:
+        """The entries of the stored episodes: the tried seeds that succeeded."""
+        return [entry for entry in self.tried if entry.success][: self._limit]
+
+    @property
+    def next_seed(self) -> int | None:
+        """The seed to try next; None while none has been tried."""
+        return self.tried[-1].seed + 1 if self.tried else None
+
+    @property
+    def statistics(self) -> Statistics:
+        """Moments of the actions in `episodes`, folded from the index alone; a ValueError if there are none."""
+        actions = [entry.action for entry in self.episodes]
+        if not actions:
+            raise ValueError(f"{self.folder} holds no episodes yet: collect some first")
+        steps = sum(entry.steps for entry in self.episodes)
+        mean = np.sum([action["sum"] for action in actions], axis=0) / steps
+        variance = np.sum([action["square"] for action in actions], axis=0) / steps - mean**2
+        low = np.min([action["low"] for action in actions], axis=0)
+        high = np.max([action["high"] for action in actions], axis=0)
+        return Statistics(low=low, high=high, mean=mean, std=np.sqrt(np.maximum(variance, 0)), steps=steps)
+
+    def rows(self, field: str) -> Array:
+        """All committed rows of `field`, (N, …), memory-mapped: nothing is read until it is indexed."""
+        if field not in self.fields:
+            raise ValueError(f"{self.folder} has no field {field!r}: it has {sorted(self.fields)}")
+        shape, dtype = self.fields[field]
+        if self._rows == 0:
+            return np.empty((0, *shape), dtype)
+        return np.memmap(self._path(field), dtype, mode="r", shape=(self._rows, *shape))
+
+    def read(self, entry: Entry) -> dict[str, Array]:
+        """Field → (steps, …) rows of one episode; a ValueError if they are not those that were written."""
+        rows = {field: np.array(self.rows(field)[entry.start : entry.start + entry.steps]) for field in self.fields}
+        if _crc(rows) != entry.crc:
+            raise ValueError(f"the rows of seed {entry.seed} in {self.folder} were changed on disk: {REMEDY}")
+        return rows
+
+    @contextmanager
+    def writing(self) -> Iterator[None]:
+        """Hold the store for writing: waits for another writer, then cuts off what a killed one left unfinished."""
+        lock = FileLock(self.folder / "lock")
+        try:
+            lock.acquire(timeout=0)
+        except Timeout:
+            log.info("waiting for the process that is collecting into %s", self.folder)
+            lock.acquire()
+        with ExitStack() as stack:
+            stack.callback(lock.release)
+            self._refresh()
+            for name in ("index", *self.fields):
+                self._files[name] = stack.enter_context(self._path(name).open("ab", buffering=0))
+            stack.callback(self._files.clear)
+            self._cut()
+            yield
+
+    def append(self, episode: Episode) -> None:
+        """Store a successful episode: all of it or, whatever happens on the way, nothing.
+
+        A ValueError says that it does not fit the spec, is not the next, or that the disk does not take it.
+        """
+        assert episode.success, "failures go to `fail`"
+        rows = self._rows_of(episode)
+        action = rows["action"].astype(np.float64)
+        moments = {"low": action.min(0), "high": action.max(0), "sum": action.sum(0), "square": (action**2).sum(0)}
+        fixed = (episode.seed, episode.outcome, episode.instruction, self._rows, len(action), dict(episode.draws))
+        self._commit(Entry(*fixed, _crc(rows), {name: values.tolist() for name, values in moments.items()}), rows)
+
+    def fail(self, seed: int, outcome: str, draws: Mapping[str, Any]) -> None:
+        """Note that `seed` was tried and why it failed; no rows are stored. Raises as `append` does."""
+        self._commit(Entry(seed, outcome, "", self._rows, 0, dict(draws), 0, {}), {})
+
+    def _commit(self, entry: Entry, rows: Mapping[str, Array]) -> None:
+        assert self._files, "append and fail work inside `with store.writing()`"
+        if self.next_seed not in (None, entry.seed):
+            raise ValueError(f"{self.folder} expects seed {self.next_seed} next, seed {entry.seed} came")
+        line = (_dumps(asdict(entry)) + "\n").encode()
+        try:
+            for name, values in rows.items():
+                _write(self._files[name], values.data.cast("B"))
+            _write(self._files["index"], memoryview(line))
+            self.tried.append(Entry(**json.loads(line)))  # as a reader will see it
+            self._rows += entry.steps
+            self._index_size += len(line)
+        except OSError as error:
+            safe = f"the {len(self.episodes)} episodes before it are safe, make room and run again to go on"
+            raise ValueError(f"{self.folder} cannot take seed {entry.seed} ({error.strerror}): {safe}") from error
+        finally:
+            self._cut()
+
+    def _cut(self) -> None:
+        # The index first: at no moment may a line speak of rows that are gone.
+        os.truncate(self._path("index"), self._index_size)
+        for field in self.fields:
+            os.truncate(self._path(field), self._size(field))
+
+    def _refresh(self) -> None:
+        self.tried, self._index_size = _read_index(self._path("index"))
+        self._rows = sum(entry.steps for entry in self.tried)
+        for field in self.fields if self._rows else ():
+            path, needed = self._path(field), self._size(field)
+            if not path.exists() or path.stat().st_size < needed:
+                raise ValueError(f"{path} is shorter than the {needed} bytes that its index speaks of: {REMEDY}")
+
+    def _rows_of(self, episode: Episode) -> dict[str, Array]:
+        seen = episode.observations
+        columns: dict[str, Any] = {"action": episode.actions, "executed": episode.executed}
+        columns["gripper"] = [[observation.gripper] for observation in seen]
+        for camera in self.spec.cameras:
+            columns[f"rgb_{camera}"] = [observation.rgb[camera] for observation in seen]
+            columns[f"depth_{camera}"] = [observation.depth[camera] for observation in seen]
+        for name in ("joints", "velocities"):
+            columns[name] = [getattr(observation, name) for observation in seen]
+        if self.spec.truth:
+            columns["truth"] = [
+                np.hstack([np.ravel((one.truth or {})[key]) for key, _ in self.spec.truth]) for one in seen
+            ]
+        return {name: self._column(name, columns[name], len(seen)) for name in self.fields}
+
+    def _column(self, name: str, values: Any, steps: int) -> Array:
+        shape, dtype = self.fields[name]
+        column = np.asarray(values)
+        if column.shape != (steps, *shape) or not np.can_cast(column.dtype, dtype, "same_kind"):
+            raise ValueError(f"{name} must be {(steps, *shape)} {dtype}, it came as {column.shape} {column.dtype}")
+        return np.ascontiguousarray(column, dtype)
+
+    def _size(self, field: str) -> int:
+        shape, dtype = self.fields[field]
+        return self._rows * int(np.prod(shape)) * dtype.itemsize
+
+    def _path(self, name: str) -> Path:
+        return self.folder / ("index.jsonl" if name == "index" else f"{name}.bin")
+
+
+def _crc(rows: Mapping[str, Array]) -> int:
+    crc = 0
+    for values in rows.values():
+        crc = zlib.crc32(values.data.cast("B"), crc)
+    return crc
+
+
+def _write(file: BinaryIO, data: memoryview) -> None:
+    while data:  # an unbuffered write may take only a part
+        data = data[file.write(data) :]
+    os.fsync(file.fileno())
+
+
+def _dumps(value: Any) -> str:
+    return json.dumps(value, default=_plain, allow_nan=False, ensure_ascii=False)
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, (np.ndarray, np.generic)):
+        return value.tolist()
+    raise ValueError(f"an episode store keeps numbers, strings, lists and dicts, not {value!r}")
+
+
+def _read_header(folder: Path) -> dict[str, Any]:
+    path = folder / "store.json"
+    if not path.exists():
+        raise ValueError(f"there is no episode store in {folder} (no {path.name}): collect one first, with job=collect")
+    header = json.loads(path.read_text(encoding="utf-8"))
+    if header["format"] != FORMAT:
+        raise ValueError(f"{path} has format {header['format']}, this version reads {FORMAT}: collect again")
+    return header
+
+
+def _read_index(path: Path) -> tuple[list[Entry], int]:
+    """The entries and the number of bytes they take: a last line that was cut short does not count."""
+    entries: list[Entry] = []
+    size = rows = 0
+    lines = path.read_bytes().split(b"\n") if path.exists() else [b""]
+    for number, line in enumerate(lines[:-1], start=1):
+        try:
+            entry = Entry(**json.loads(line))
+        except (ValueError, TypeError) as error:
+            if number == len(lines) - 1:
+                break
+            raise ValueError(f"line {number} of {path} cannot be read: {REMEDY}") from error
+        if entry.start != rows or (entries and entry.seed != entries[-1].seed + 1):
+            raise ValueError(f"line {number} of {path} does not follow the line before it: {REMEDY}")
+        entries.append(entry)
+        rows += entry.steps
+        size += len(line) + 1
+    return entries, size

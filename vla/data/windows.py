@@ -1,0 +1,243 @@
+"""Training windows: a few frames of history and the actions that follow, gathered in whole batches.
+
+Nothing is decoded and nothing copied ahead of time: a batch is one gather per field from the memory-mapped rows of
+the episode store, made by one thread while the model works on the batch before. Which windows a batch holds depends
+on the seed and the number of the step alone, so a resumed run sees exactly what an uninterrupted one would have.
+"""
+
+# B batch, T history frames, k action chunk, D action components, S truth scalars
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from lightning import LightningDataModule
+
+from vla.data.episodes import EpisodeStore
+from vla.spec import Array, Spec
+
+Batch = dict[str, Any]
+
+# Multiplying by the golden ratio spreads consecutive seeds evenly over the circle of 32-bit numbers (Knuth, The Art of
+# Computer Programming 3, section 6.4): every stretch of seeds gets its share of held-out episodes.
+GOLDEN = 2654435769
+
+
+def held_out(seed: int, fraction: float) -> bool:
+    """Whether the episode of `seed` is kept for validation, whatever other episodes there are."""
+    return seed * GOLDEN % 2**32 < fraction * 2**32
+
+
+class Gather:
+    """Rows of an episode store as batches of windows; a window is named by the row of its newest frame.
+
+    Args:
+        store: where the rows are.
+        history: frames T in a window.
+        chunk: actions k that label a frame.
+        depth: whether batches carry depth.
+        pin: whether batches lie in page-locked memory, which a GPU copies from without waiting.
+    """
+
+    def __init__(self, store: EpisodeStore, history: int, chunk: int, depth: bool = False, pin: bool = False) -> None:
+        self._history, self._chunk, self._pin = history, chunk, pin
+        kinds = ("rgb", "depth") if depth else ("rgb",)
+        self._images = {kind: {name: store.rows(f"{kind}_{name}") for name in store.spec.cameras} for kind in kinds}
+        self._proprio = np.concatenate([store.rows(name) for name in ("joints", "velocities", "gripper")], axis=1)
+        self._truth = store.rows("truth") if store.spec.truth else None
+        self._action = store.rows("action")
+        entries = store.episodes
+        self._instructions = [entry.instruction for entry in entries]
+        self._first = np.array([entry.start for entry in entries])
+        self._last = np.array([entry.start + entry.steps - 1 for entry in entries])
+
+    def __call__(self, windows: Array) -> Batch:
+        """The batch of `windows` (B,), row numbers.
+
+        A frame before the start of the episode is all zeros, not present, and has no valid label; a label beyond the
+        end repeats the last action and is not valid.
+        """
+        episode = np.searchsorted(self._first, windows, side="right") - 1  # (B,)
+        first, last = self._first[episode, None], self._last[episode, None]
+        frames = windows[:, None] + np.arange(1 - self._history, 1)  # (B, T)
+        absent = frames < first
+        labels = frames[:, :, None] + np.arange(self._chunk)  # (B, T, k)
+        valid = (labels <= last[:, :, None]) & ~absent[:, :, None]
+        frames = np.maximum(frames, first)
+        batch: Batch = {
+            kind: {camera: self._take(rows, frames, absent) for camera, rows in cameras.items()}
+            for kind, cameras in self._images.items()
+        }
+        batch["proprio"] = self._take(self._proprio, frames, absent)
+        if self._truth is not None:
+            batch["truth"] = self._take(self._truth, frames, absent)
+        batch["action"] = self._take(self._action, np.clip(labels, first[:, :, None], last[:, :, None]))
+        batch["present"] = self._own(torch.from_numpy(~absent))
+        batch["valid"] = self._own(torch.from_numpy(valid))
+        batch["instruction"] = [self._instructions[number] for number in episode]
+        return batch
+
+    def _take(self, rows: Array, index: Array, absent: Array | None = None) -> torch.Tensor:
+        values = torch.empty(*index.shape, *rows.shape[1:], dtype=_torch_type(rows.dtype), pin_memory=self._pin)
+        if rows.dtype == np.uint16:  # torch computes little with uint16
+            values.numpy()[...] = rows[index]
+        else:
+            np.take(rows, index, axis=0, out=values.numpy(), mode="clip")  # "clip" writes into `out` directly
+        if absent is not None and absent.any():
+            values.numpy()[absent] = 0  # many times faster than through torch
+        return values
+
+    def _own(self, tensor: torch.Tensor) -> torch.Tensor:
+        return tensor.pin_memory() if self._pin else tensor
+
+
+class Stream:
+    """Batches of `gather` for the windows that `plan` names, made by one thread a few batches ahead."""
+
+    def __init__(self, gather: Callable[[Array], Batch], plan: Callable[[], Iterable[Array]], ahead: int) -> None:
+        self._gather, self._plan, self._ahead = gather, plan, ahead
+
+    def __iter__(self) -> Iterator[Batch]:
+        pending: deque[Future[Batch]] = deque()
+        with ThreadPoolExecutor(1, thread_name_prefix="windows") as thread:
+            for windows in self._plan():
+                pending.append(thread.submit(self._gather, windows))
+                if len(pending) > self._ahead:
+                    yield pending.popleft().result()
+            while pending:
+                yield pending.popleft().result()
+
+
+class CountedStream(Stream):
+    """A stream that ends, and knows after how many batches."""
+
+    def __init__(self, gather: Callable[[Array], Batch], batches: list[Array], ahead: int) -> None:
+        super().__init__(gather, lambda: batches, ahead)
+        self._length = len(batches)
+
+    def __len__(self) -> int:
+        return self._length
+
+
+class Windows(LightningDataModule):
+    """The windows of an episode store, split by episode and shared out among the processes of a trainer.
+
+    Training is an endless stream (bound it with the trainer's `max_steps`); validation is one pass over windows spread
+    evenly over the held-out episodes, in whole batches.
+
+    Args:
+        folder: the episode store.
+        spec: what the model expects of a step.
+        history: frames T in a window.
+        chunk: actions k that label a frame.
+        seed: of the order of training windows.
+        batch_size: windows B in a batch, per process.
+        validation_fraction: share of the episodes held out, 0…1; 0 trains on all of them and does not validate.
+        validation_windows: about how many held-out windows one validation looks at, over all processes.
+        depth: whether batches carry depth.
+        ahead: batches made ahead of the model.
+        episodes: use only the first so many episodes; all of them when None.
+    """
+
+    def __init__(
+        self,
+        folder: str | Path,
+        spec: Spec,
+        history: int,
+        chunk: int,
+        seed: int,
+        batch_size: int,
+        validation_fraction: float,
+        validation_windows: int,
+        depth: bool,
+        ahead: int,
+        episodes: int | None = None,
+    ) -> None:
+        super().__init__()
+        if not 0 <= validation_fraction < 1:
+            raise ValueError(f"data.validation_fraction is a share from 0 up to 1, not {validation_fraction}")
+        if min(batch_size, validation_windows, history, chunk) < 1:
+            raise ValueError("data.batch_size, data.validation_windows, the history and the chunk are at least 1 each")
+        self.batch_size = batch_size
+        self._folder, self._spec, self._episodes = Path(folder), spec, episodes
+        self._history, self._chunk, self._depth = history, chunk, depth
+        self._seed, self._ahead = seed, ahead
+        self._fraction, self._validation_windows = validation_fraction, validation_windows
+
+    def setup(self, stage: str | None = None) -> None:
+        """Open the store and split its episodes.
+
+        Raises:
+            ValueError: the store cannot be read, has another spec, or too few episodes to split.
+        """
+        store = EpisodeStore(self._folder, self._episodes)
+        self._spec.require(store.spec, "the model", f"the episode store {self._folder}")
+        sides: dict[bool, list[Array]] = {False: [], True: []}
+        for entry in store.episodes:
+            sides[held_out(entry.seed, self._fraction)].append(np.arange(entry.start, entry.start + entry.steps))
+        if not sides[False] or (self._fraction > 0 and not sides[True]):
+            raise ValueError(
+                f"{len(store.episodes)} episodes leave {len(sides[False])} for training and {len(sides[True])} for "
+                f"validation: raise collect.episodes, or set data.validation_fraction (now {self._fraction})"
+            )
+        self.training_windows = np.concatenate(sides[False])  # row numbers
+        self.held_out_windows = np.concatenate(sides[True]) if sides[True] else np.empty(0, np.int64)
+        self.gather = Gather(store, self._history, self._chunk, self._depth, self._on_gpu())
+
+    def train_dataloader(self) -> Stream:
+        """Batches without end, from the trainer's current step on."""
+        return Stream(self.gather, self._training_plan, self._ahead)
+
+    def val_dataloader(self) -> CountedStream | list[Batch]:
+        """The same batches every time."""
+        if not len(self.held_out_windows):
+            return []
+        rank, processes = self._place()
+        share = self.batch_size * processes
+        batches = max(1, min(self._validation_windows, len(self.held_out_windows)) // share)
+        # Whole batches, so that a compiled model sees one shape and all processes take the same number of steps.
+        spread = np.linspace(0, len(self.held_out_windows) - 1, batches * share).round().astype(np.int64)
+        windows = self.held_out_windows[spread].reshape(batches, self.batch_size, processes)
+        return CountedStream(self.gather, list(windows[:, :, rank]), self._ahead)
+
+    def order(self, step: int, rank: int = 0, processes: int = 1) -> Array:
+        """The windows (B,) of training step `step` in process `rank`: row numbers.
+
+        The order is one shuffle of all windows after the other, dealt out in runs of B.
+        """
+        places = np.arange(self.batch_size) + (step * processes + rank) * self.batch_size
+        shuffle, place = np.divmod(places, len(self.training_windows))
+        chosen = np.empty_like(places)
+        for number in np.unique(shuffle):
+            here = shuffle == number
+            chosen[here] = _shuffled(len(self.training_windows), self._seed, int(number))[place[here]]
+        return self.training_windows[chosen]
+
+    def _training_plan(self) -> Iterator[Array]:
+        rank, processes = self._place()
+        step = self.trainer.global_step * self.trainer.accumulate_grad_batches if self.trainer else 0
+        while True:
+            yield self.order(step, rank, processes)
+            step += 1
+
+    def _place(self) -> tuple[int, int]:
+        return (self.trainer.global_rank, self.trainer.world_size) if self.trainer else (0, 1)
+
+    def _on_gpu(self) -> bool:
+        return self.trainer is not None and self.trainer.strategy.root_device.type == "cuda"
+
+
+@lru_cache(maxsize=2)
+def _shuffled(count: int, seed: int, number: int) -> Array:
+    return np.random.default_rng([seed, number]).permutation(count)
+
+
+def _torch_type(dtype: np.dtype) -> torch.dtype:
+    return {"uint8": torch.uint8, "uint16": torch.int32, "float32": torch.float32}[dtype.name]

@@ -1,0 +1,272 @@
+"""Many rollouts of a policy on seeds that it was never trained on: how often it succeeds, and how it fails.
+
+An episode is a function of its seed alone, so a report is the same whatever the number of workers.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import sys
+import traceback
+from collections import Counter
+from collections.abc import Callable, Generator, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import closing, contextmanager, suppress
+from dataclasses import dataclass, field
+from math import sqrt
+from multiprocessing import get_context
+from multiprocessing.util import Finalize
+from pathlib import Path
+from typing import Any, Protocol
+
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+from vla.rollout import rollout
+from vla.spec import Agent, Environment, Recorder
+
+FIRST_SEED = 1_000_000  # evaluation seeds start here; collection, which starts at small ones, never gets this far
+ERROR = "error"  # outcome of an episode that could not be played to its end
+NORMAL_QUANTILE = 1.959964  # of 0.975: an interval of 95 %
+THREAD_SETTINGS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "LP_NUM_THREADS")
+
+
+class ClosableEnvironment(Environment, Protocol):
+    """An environment that holds something, such as a renderer."""
+
+    def close(self) -> None:
+        """Free it."""
+        ...
+
+
+MakeEnvironment = Callable[[], ClosableEnvironment]
+MakeAgent = Callable[[Environment], Agent]
+MakeRecorder = Callable[[], Recorder]
+
+
+@dataclass(frozen=True)
+class Result:
+    """What became of one episode."""
+
+    seed: int
+    outcome: str  # "success", the name of a failure, or "error"
+    instruction: str = ""
+    steps: int = 0
+    draws: dict[str, Any] = field(default_factory=dict)  # randomisation axis → what was drawn, plain values
+    error: str = ""  # what went wrong, where the outcome is "error"
+
+
+@dataclass(frozen=True)
+class Report:
+    """What became of all episodes, in the order of their seeds.
+
+    An error says something about the program, not about the policy: it counts neither as a success nor as a failure.
+    """
+
+    results: tuple[Result, ...]
+
+    @property
+    def errors(self) -> list[Result]:
+        """The episodes that could not be played to their end."""
+        return [result for result in self.results if result.outcome == ERROR]
+
+    @property
+    def episodes(self) -> int:
+        """How many were played to their end."""
+        return len(self.results) - len(self.errors)
+
+    @property
+    def successes(self) -> int:
+        """How many succeeded."""
+        return self.taxonomy.get("success", 0)
+
+    @property
+    def success(self) -> float:
+        """Share of the episodes that succeeded, 0…1; 0 where none was played to its end."""
+        return self.successes / self.episodes if self.episodes else 0.0
+
+    @property
+    def interval(self) -> tuple[float, float]:
+        """95 % confidence interval of `success`."""
+        return wilson_interval(self.successes, self.episodes)
+
+    @property
+    def taxonomy(self) -> dict[str, int]:
+        """Outcome → episodes, the most frequent first."""
+        return dict(Counter(result.outcome for result in self.results).most_common())
+
+    def __str__(self) -> str:
+        """Failures, errors and, on the last line, the success rate with its interval."""
+        lines = [f"{outcome} {count}" for outcome, count in self.taxonomy.items() if outcome not in ("success", ERROR)]
+        if self.errors:
+            first = self.errors[0]
+            lines.append(f"errors {len(self.errors)}, the first at seed {first.seed}: {first.error}")
+        low, high = self.interval
+        share = f"{100 * self.success:.1f} %, 95 % CI {100 * low:.1f}-{100 * high:.1f}"
+        return "\n".join([*lines, f"success {self.successes}/{self.episodes} ({share})"])
+
+
+def wilson_interval(successes: int, trials: int) -> tuple[float, float]:
+    """95 % confidence interval of a proportion; (0, 1) without trials.
+
+    Wilson's score interval: E. B. Wilson, "Probable inference, the law of succession, and statistical inference",
+    Journal of the American Statistical Association 22 (1927).
+    """
+    if trials == 0:
+        return 0.0, 1.0
+    share, spread = successes / trials, NORMAL_QUANTILE**2 / trials
+    centre = (share + spread / 2) / (1 + spread)
+    half_width = sqrt(spread * (share * (1 - share) + spread / 4)) / (1 + spread)
+    return max(0.0, centre - half_width), min(1.0, centre + half_width)
+
+
+def evaluate(
+    make_environment: MakeEnvironment,
+    make_agent: MakeAgent,
+    make_recorder: MakeRecorder | None,
+    seeds: Sequence[int],
+    workers: int | None = None,
+) -> Report:
+    """Play the episodes that the seeds name.
+
+    The factories are called once in each of `workers` spawned processes (None: one per core); a single worker is this
+    process itself. What they raise ends the evaluation; what an episode raises is reported as its error.
+
+    Raises:
+        ValueError: no seeds, seeds that collection might use, or no workers.
+    """
+    if not seeds or min(seeds) < FIRST_SEED:
+        raise ValueError(f"evaluation needs seeds from {FIRST_SEED} on, which no policy is trained on; got {seeds}")
+    workers = _cores() if workers is None else workers
+    if workers < 1:
+        raise ValueError(f"evaluation needs at least one worker, got evaluate.workers={workers}")
+    factories = _Factories(make_environment, make_agent, make_recorder)
+    play = _play_here(factories, seeds) if workers == 1 else _play_apart(factories, seeds, min(workers, len(seeds)))
+    columns = (TextColumn("evaluating"), BarColumn(), MofNCompleteColumn(), TextColumn("{task.fields[note]}"))
+    results: dict[int, Result] = {}
+    with _one_thread(), closing(play), Progress(*columns, TimeRemainingColumn()) as bar:
+        task = bar.add_task("", total=len(seeds), note="")
+        for result in play:
+            results[result.seed] = result
+            so_far = Report(tuple(results.values()))
+            errors = f", {len(so_far.errors)} errors" if so_far.errors else ""
+            bar.update(task, advance=1, note=f"success {100 * so_far.success:.0f} %{errors}")
+    return Report(tuple(results[seed] for seed in seeds))
+
+
+def keep_recordings(report: Report, folder: Path, target: Path, limit: int) -> int:
+    """Merge an evaluation's recordings into one file, failures first and at most `limit`; returns how many.
+
+    The single files are removed, and their folder if nothing else is in it.
+    """
+    from vla.record import merge, recording_name  # the viewer's library is needed only here
+
+    names = sorted(recording_name(result.seed, result.outcome) for result in report.results)
+    files = [file for name in names if (file := folder / f"{name}.rrd").exists()]
+    if files[:limit]:
+        merge(files[:limit], target)
+    for file in files:
+        file.unlink()
+    with suppress(OSError):
+        folder.rmdir()
+    return len(files[:limit])
+
+
+def _cores() -> int:
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """Within, numerical libraries use one thread: sums must not depend on how many workers share the machine."""
+    before = {name: os.environ.get(name) for name in THREAD_SETTINGS}
+    os.environ.update(dict.fromkeys(THREAD_SETTINGS, "1"))  # read by libraries that are loaded from now on
+    torch = sys.modules.get("torch")  # was loaded already where this process trained the policy
+    threads = torch.get_num_threads() if torch else 0
+    if torch:
+        torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        if torch:
+            torch.set_num_threads(threads)
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value
+
+
+@dataclass(frozen=True)
+class _Factories:
+    environment: MakeEnvironment
+    agent: MakeAgent
+    recorder: MakeRecorder | None
+
+
+class _Player:
+    """One process's environment, agent and recorder."""
+
+    def __init__(self, make: _Factories) -> None:
+        self._environment = make.environment()
+        self._agent = make.agent(self._environment)
+        self._recorder = None if make.recorder is None else make.recorder()
+
+    def play(self, seed: int) -> Result:
+        """Play one episode; never raises, so that one bad seed does not cost the others."""
+        try:
+            episode = rollout(self._environment, self._agent, seed, self._recorder)
+        except Exception as problem:
+            where = traceback.extract_tb(problem.__traceback__)[-1]
+            what = f"{type(problem).__name__}: {problem} ({Path(where.filename).name}:{where.lineno})"
+            return Result(seed, ERROR, error=what)
+        # Draws may come as arrays; plain values compare, and fit into JSON.
+        draws = json.loads(json.dumps(episode.draws, default=lambda value: value.tolist()))
+        return Result(seed, episode.outcome, episode.instruction, len(episode.observations), draws)
+
+    def close(self) -> None:
+        """Free the environment."""
+        self._environment.close()
+
+
+def _play_here(factories: _Factories, seeds: Sequence[int]) -> Generator[Result]:
+    with closing(_Player(factories)) as player:
+        for seed in seeds:
+            yield player.play(seed)
+
+
+def _play_apart(factories: _Factories, seeds: Sequence[int], workers: int) -> Generator[Result]:
+    """Results in the order in which they come, from spawned processes: a GL context does not survive a fork."""
+    pool = ProcessPoolExecutor(workers, get_context("spawn"), _start_worker, (factories,))
+    try:
+        futures = {pool.submit(_play_in_worker, seed): seed for seed in seeds}
+        for future in as_completed(futures):
+            try:
+                yield future.result()
+            except BrokenProcessPool:
+                what = "a worker process died before this episode ended; evaluate.workers=1 would show where"
+                yield Result(futures[future], ERROR, error=what)
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+_factories: _Factories
+_player: _Player | None = None
+
+
+def _start_worker(factories: _Factories) -> None:
+    global _factories
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent process handles Ctrl-C
+    _factories = factories
+
+
+def _play_in_worker(seed: int) -> Result:
+    """Built with the first episode, not at the start of the process: only then do exceptions reach the parent."""
+    global _player
+    if _player is None:
+        _player = _Player(_factories)
+        # Runs before atexit's callbacks, among which GL's end would come first.
+        Finalize(None, _player.close, exitpriority=0)
+    return _player.play(seed)

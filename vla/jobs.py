@@ -1,0 +1,296 @@
+"""What `job=…` does: each job a few lines over the parts.
+
+`collect`, `train` and `evaluate` are stages of one line: a stage runs those before it whose product is missing.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from omegaconf import DictConfig, OmegaConf
+
+from vla.check import build
+
+if TYPE_CHECKING:
+    from lightning import Callback, LightningModule, Trainer
+
+    from vla.data.episodes import EpisodeStore
+    from vla.data.windows import Windows
+    from vla.policy import Policy
+    from vla.spec import Agent, Environment, Recorder, Spec
+    from vla.tasks.tabletop import Tabletop
+
+log = logging.getLogger(__name__)
+
+Node = dict[str, Any]
+
+
+def run(config: DictConfig) -> float | None:
+    """Do what `config.job` says; evaluation returns the success rate, which sweeps maximise."""
+    return JOBS[config.job](config)
+
+
+def preview(config: DictConfig) -> None:
+    """Show randomised resets as a contact sheet, their draws as a table, and the expert at work as a recording."""
+    from rich import print as show
+
+    from vla.record import RerunRecorder, merge
+    from vla.report import contact_sheet, draws_table
+    from vla.rollout import rollout
+
+    output = _output(config)
+    environment = make_environment(plain(config.task))
+    expert = build(config.expert, spec=environment.spec)
+    seeds = range(config.preview.seed, config.preview.seed + config.preview.episodes)
+    recorder = RerunRecorder(output / "recordings")
+    episodes = [rollout(environment, expert, seed, recorder) for seed in seeds]
+    environment.close()
+    files = sorted((output / "recordings").glob("*.rrd"))
+    merge(files, output / "preview.rrd")
+    for file in files:
+        file.unlink()
+    (output / "recordings").rmdir()
+    contact_sheet(list(seeds), [episode.observations[0] for episode in episodes], output / "preview.png")
+    show(draws_table(list(seeds), [episode.draws for episode in episodes]))
+    log.info("wrote %s and %s", output / "preview.png", output / "preview.rrd")
+
+
+def collect(config: DictConfig) -> None:
+    """Fill the episode store with verified demonstrations."""
+    collected(config)
+
+
+def train(config: DictConfig) -> None:
+    """Train a model on the episode store, which is filled first; a checkpoint is gone on from."""
+    _trained(config)
+
+
+def evaluate(config: DictConfig) -> float:
+    """Measure the success rate of a checkpoint, which is trained first if none is given.
+
+    Raises:
+        ValueError: an episode could not be played to its end; the report, which is written, says why.
+    """
+    from vla.evaluate import evaluate, keep_recordings
+    from vla.report import plot_report, write_report
+
+    output = _output(config)
+    checkpoint = Path(config.checkpoint) if config.checkpoint else _trained(config)
+    seeds = range(config.evaluate.seed, config.evaluate.seed + config.evaluate.episodes)
+    recordings = output / "recordings"
+    report = evaluate(
+        partial(make_environment, plain(config.task)),
+        partial(make_policy, checkpoint),
+        partial(make_recorder, plain(config.recorder), recordings) if config.recorder else None,
+        seeds,
+        config.evaluate.workers,
+    )
+    if config.recorder:
+        keep_recordings(report, recordings, output / "rollouts.rrd", config.evaluate.recordings)
+    write_report(report, output / "report.json", str(checkpoint), plain(config))
+    plot_report(report, output / "report.png")
+    log.info("wrote %s, report.png and rollouts.rrd", output / "report.json")
+    print(report)
+    if report.errors:
+        raise ValueError(f"{len(report.errors)} episodes ended in an error, see {output / 'report.json'}")
+    return report.success
+
+
+def export(config: DictConfig) -> None:
+    """Write the episode store in another format."""
+    log.info("wrote %s", build(config.export).export(collected(config)))
+
+
+def deploy(config: DictConfig) -> None:
+    """Put a trained policy to work as `config.deploy` says.
+
+    Raises:
+        ValueError: no checkpoint, or no deployment is chosen.
+    """
+    if not config.checkpoint:
+        raise ValueError("job=deploy needs a trained policy: checkpoint=FILE")
+    if not config.deploy:
+        raise ValueError("job=deploy needs a deployment: deploy=NAME, one of the options that --help lists")
+    build(config.deploy, policy=make_policy(Path(config.checkpoint))).run()
+
+
+def benchmark(config: DictConfig) -> None:
+    """Time the stages against their floors and write `benchmark.json`."""
+    from vla.benchmark import benchmark
+
+    benchmark(config, _output(config))
+
+
+JOBS: dict[str, Callable[[DictConfig], float | None]] = {
+    "preview": preview,
+    "collect": collect,
+    "train": train,
+    "evaluate": evaluate,
+    "export": export,
+    "deploy": deploy,
+    "benchmark": benchmark,
+}
+
+
+def make_environment(task: Node) -> Tabletop:
+    """The environment that a task node describes, with a renderer that works on this machine."""
+    from vla.tasks.backend import choose_backend
+
+    choose_backend()
+    environment: Tabletop = build(task)
+    return environment
+
+
+def make_expert(expert: Node, environment: Environment) -> Agent:
+    """The expert for an environment."""
+    agent: Agent = build(expert, spec=environment.spec)
+    return agent
+
+
+def make_recorder(recorder: Node, folder: Path) -> Recorder:
+    """A recorder that writes into a folder."""
+    made: Recorder = build(recorder, folder=folder)
+    return made
+
+
+def make_policy(checkpoint: Path, environment: Environment | None = None) -> Policy:
+    """The policy in a checkpoint.
+
+    Raises:
+        ValueError: no checkpoint is there, or it was trained for another kind of step than the environment has.
+    """
+    from vla.policy import Policy, read_checkpoint
+
+    saved = read_checkpoint(checkpoint)
+    if environment is not None:
+        saved.spec.require(environment.spec, f"the checkpoint {checkpoint}", "the task")
+    tokenizer = build(saved.config["tokenizer"], spec=saved.spec)
+    # What the saved weights are, the pretrained ones would only be overwritten by.
+    model = build(_without_pretraining(saved.config["model"]), spec=saved.spec, tokenizer=tokenizer)
+    saved.restore(model)
+    return Policy(model, saved.spec)
+
+
+def _without_pretraining(model: Node) -> Node:
+    image = model.get("image") or {}
+    return {**model, "image": {**image, "pretrained": False}} if "pretrained" in image else model
+
+
+def collected(config: DictConfig) -> EpisodeStore:
+    """The episode store of this configuration, with at least as many episodes as asked for."""
+    from vla.collect import collect
+    from vla.data.episodes import EpisodeStore
+
+    environment = make_environment(plain(config.task))
+    spec = environment.spec
+    environment.close()
+    source = {"task": plain(config.task), "expert": plain(config.expert)}
+    store = EpisodeStore.create_or_open(Path(config.collect.folder), spec, source)
+    summary = collect(
+        store,
+        partial(make_environment, source["task"]),
+        partial(make_expert, source["expert"]),
+        config.collect.episodes,
+        config.collect.workers or _cores(),
+        config.collect.seed,
+    )
+    failures = ", ".join(f"{count} {cause}" for cause, count in summary.failures.items()) or "none"
+    log.info(
+        "%s: %d episodes, %d of them new in %.0f s; expert success %.1f %%, failures: %s",
+        store.folder,
+        summary.episodes,
+        summary.added,
+        summary.seconds,
+        100 * summary.success_rate,
+        failures,
+    )
+    return store
+
+
+def _trained(config: DictConfig) -> Path:
+    """Path of the checkpoint that training leaves behind."""
+    store = collected(config)
+    import lightning
+
+    _quiet_lightning()
+    lightning.seed_everything(config.seed, verbose=False)
+    learner = make_learner(config, store)
+    data = make_data(config, store, learner.model)
+    checkpoints = _output(config) / "checkpoints"
+    trainer = make_trainer(config, checkpoints)
+    started = time.monotonic()
+    trainer.fit(learner, datamodule=data, ckpt_path=config.checkpoint, weights_only=True)
+    if trainer.interrupted:
+        raise KeyboardInterrupt
+    log.info("trained %d steps in %.0f s: %s", trainer.global_step, time.monotonic() - started, checkpoints)
+    return checkpoints / "last.ckpt"
+
+
+def make_learner(config: DictConfig, store: EpisodeStore) -> LightningModule:
+    """The learner of a configuration's model, with a tokenizer fitted on the store's actions."""
+    spec: Spec = store.spec
+    tokenizer = build(config.tokenizer, spec=spec, statistics=store.statistics)
+    model = build(config.model, spec=spec, tokenizer=tokenizer)
+    learner: LightningModule = build(config.learner, model=model, spec=spec, config=plain(config))
+    return learner
+
+
+def make_data(config: DictConfig, store: EpisodeStore, model: Any) -> Windows:
+    """The windows that a model wants of a store: the first `collect.episodes`, whatever else it holds."""
+    windows: Windows = build(
+        config.data,
+        folder=store.folder,
+        spec=store.spec,
+        history=model.history,
+        chunk=model.chunk,
+        episodes=config.collect.episodes,
+    )
+    return windows
+
+
+def make_trainer(config: DictConfig, checkpoints: Path | None) -> Trainer:
+    """The trainer of a configuration, which averages the weights and keeps its last checkpoint, if there is a place."""
+    from lightning.pytorch.callbacks import EMAWeightAveraging, ModelCheckpoint, RichProgressBar
+    from lightning.pytorch.loggers import CSVLogger
+
+    callbacks: list[Callback] = [RichProgressBar()]
+    if config.learner.ema:
+        callbacks.append(EMAWeightAveraging(decay=config.learner.ema))
+    if checkpoints is None:
+        trainer: Trainer = build(config.trainer, callbacks=callbacks, logger=False, enable_checkpointing=False)
+        return trainer
+    # After the averaging, whose weights it saves.
+    callbacks.append(ModelCheckpoint(checkpoints, filename="last", enable_version_counter=False))
+    logger = CSVLogger(checkpoints.parent, name="", version="")
+    trainer = build(config.trainer, callbacks=callbacks, logger=logger)
+    return trainer
+
+
+def _quiet_lightning() -> None:
+    """Lightning brings its own log handlers, which would print every line a second time under Hydra."""
+    for name in ("lightning", "lightning.pytorch", "lightning.fabric"):
+        logging.getLogger(name).handlers.clear()
+
+
+def _cores() -> int:
+    import os
+
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def _output(config: DictConfig) -> Path:
+    folder = Path(config.output)
+    folder.mkdir(parents=True, exist_ok=True)
+    return folder
+
+
+def plain(node: DictConfig) -> Node:
+    """A node as dicts and lists, which travel to other processes and into files."""
+    plain = OmegaConf.to_container(node, resolve=True)
+    assert isinstance(plain, dict)
+    return {str(key): value for key, value in plain.items()}

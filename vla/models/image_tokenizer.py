@@ -1,0 +1,277 @@
+"""Images as features that listen to the instruction, and features as a few tokens or keypoints.
+
+Shapes: N images, C channels, H×W pixels, h×w positions of a feature map, M tokens or keypoints.
+"""
+
+from __future__ import annotations
+
+import logging
+from abc import ABC, abstractmethod
+from pathlib import Path
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+log = logging.getLogger(__name__)
+
+
+class FiLM(nn.Module):
+    """Scales and shifts every channel by a linear function of the text: (1 + γ)·x + β (arXiv 1709.07871).
+
+    Args:
+        text_width: length of the text vector.
+        channels: C.
+        identity: start with γ = β = 0, so that a pretrained network is left as it was.
+    """
+
+    def __init__(self, text_width: int, channels: int, identity: bool) -> None:
+        super().__init__()
+        self.gamma, self.beta = nn.Linear(text_width, channels), nn.Linear(text_width, channels)
+        if identity:
+            for linear in (self.gamma, self.beta):
+                nn.init.zeros_(linear.weight)
+                nn.init.zeros_(linear.bias)
+
+    def forward(self, x: Tensor, text: Tensor) -> Tensor:
+        """(N, C, h, w) features and (N, text_width) text to (N, C, h, w)."""
+        gamma, beta = self.gamma(text)[:, :, None, None], self.beta(text)[:, :, None, None]
+        return x * (1 + gamma) + beta
+
+
+class ImageEncoder(nn.Module, ABC):
+    """Images and text → feature map.
+
+    Args:
+        channels: C of the feature map.
+    """
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.channels = channels
+
+    @abstractmethod
+    def forward(self, images: Tensor, text: Tensor) -> Tensor:
+        """(N, 3, H, W) float images in 0 … 1 and (N, text_width) text to (N, channels, h, w)."""
+
+
+class FilmConv(ImageEncoder):
+    """A few convolutions, each followed by FiLM; made to train on a CPU.
+
+    Args:
+        channels: output channels, one per convolution.
+        kernels: kernel sizes, one per convolution [px].
+        strides: strides, one per convolution.
+        text_width: length of the text vector.
+    """
+
+    def __init__(self, channels: list[int], kernels: list[int], strides: list[int], *, text_width: int) -> None:
+        if not channels or not len(channels) == len(kernels) == len(strides):
+            raise ValueError(
+                f"channels, kernels and strides need one entry per convolution, got {channels}, {kernels}, {strides}"
+            )
+        super().__init__(channels[-1])
+        inputs = [3, *channels[:-1]]
+        self.convs = nn.ModuleList(
+            nn.Conv2d(i, o, kernel, stride, kernel // 2)
+            for i, o, kernel, stride in zip(inputs, channels, kernels, strides, strict=True)
+        )
+        for conv in self.convs:
+            # Without normalisation layers the signal must keep its size, or the attention over positions starts flat.
+            nn.init.kaiming_normal_(conv.weight, nonlinearity="relu")
+        self.films = nn.ModuleList(FiLM(text_width, c, identity=False) for c in channels)
+        self.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+
+    def forward(self, images: Tensor, text: Tensor) -> Tensor:
+        """(N, 3, H, W) float images in 0 … 1 and (N, text_width) text to (N, channels, h, w)."""
+        x = (images - 0.5) * 4  # about unit variance
+        for conv, film in zip(self.convs, self.films, strict=True):
+            x = F.relu_(film(conv(x), text))
+        return x
+
+
+class FilmEfficientNet(ImageEncoder):
+    """An EfficientNet with FiLM after every block and after its 1×1 projection, as in RT-1 (arXiv 2212.06817).
+
+    At the start every FiLM is the identity, so the features are exactly those of the EfficientNet.
+
+    Args:
+        name: an EfficientNet of timm.
+        pretrained: true fetches ImageNet weights through timm or fails, false starts at random, "auto" fetches and
+            falls back to random with a warning; anything else is the path of a weights file (.safetensors or .pth).
+        channels: C of the feature map.
+        text_width: length of the text vector.
+    """
+
+    mean: Tensor
+    std: Tensor
+
+    def __init__(
+        self,
+        name: str = "efficientnet_b3",
+        pretrained: bool | str = "auto",
+        channels: int = 512,
+        *,
+        text_width: int,
+    ) -> None:
+        super().__init__(channels)
+        net: Any = load_efficientnet(name, pretrained)
+        self.stem = nn.Sequential(net.conv_stem, net.bn1)
+        self.blocks = nn.ModuleList(block for stage in net.blocks for block in stage)
+        self.films = nn.ModuleList(FiLM(text_width, _output_channels(b), identity=True) for b in self.blocks)
+        self.top = nn.Sequential(net.conv_head, net.bn2)
+        self.projection = nn.Conv2d(net.conv_head.out_channels, channels, 1, bias=False)
+        self.last_film = FiLM(text_width, channels, identity=True)
+        self.register_buffer("mean", torch.tensor(net.pretrained_cfg["mean"]).view(3, 1, 1), persistent=False)
+        self.register_buffer("std", torch.tensor(net.pretrained_cfg["std"]).view(3, 1, 1), persistent=False)
+        self.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+
+    def forward(self, images: Tensor, text: Tensor) -> Tensor:
+        """(N, 3, H, W) float images in 0 … 1 and (N, text_width) text to (N, channels, h, w)."""
+        x = self.stem((images - self.mean) / self.std)
+        for block, film in zip(self.blocks, self.films, strict=True):
+            x = film(block(x), text)
+        features: Tensor = self.last_film(self.projection(self.top(x)), text)
+        return features
+
+
+def load_efficientnet(name: str, pretrained: bool | str) -> nn.Module:
+    """An EfficientNet of timm without its classifier; `pretrained` as in `FilmEfficientNet`.
+
+    Raises:
+        ValueError: timm has no such EfficientNet, or the weights that were asked for cannot be had.
+    """
+    import timm  # slow to import, and needed by this one encoder only
+
+    if name not in timm.list_models("*efficientnet*"):
+        raise ValueError(
+            f"'{name}' is no EfficientNet of timm, it has {', '.join(timm.list_models('efficientnet_b*'))}"
+        )
+    if pretrained is True or pretrained == "auto":
+        try:
+            net: nn.Module = timm.create_model(name, pretrained=True, num_classes=0)
+        except (OSError, RuntimeError) as error:
+            if pretrained is True:
+                raise ValueError(
+                    f"the ImageNet weights of {name} cannot be fetched ({_first_line(error)}): give "
+                    "model.image.pretrained the path of a weights file, or false to start at random"
+                ) from error
+            log.warning("%s starts at RANDOM: its ImageNet weights cannot be fetched (%s)", name, _first_line(error))
+        else:
+            log.info("%s starts from the ImageNet weights of timm", name)
+            return net
+    net = timm.create_model(name, pretrained=False, num_classes=0)
+    if isinstance(pretrained, str) and pretrained != "auto":
+        _load_weights(net, name, Path(pretrained))
+    elif not pretrained:
+        log.info("%s starts at random", name)
+    return net
+
+
+def _load_weights(net: nn.Module, name: str, path: Path) -> None:
+    if not path.is_file():
+        raise ValueError(f"model.image.pretrained is true, false, auto or a weights file, and there is no file {path}")
+    if path.suffix == ".safetensors":
+        from safetensors.torch import load_file
+
+        weights = load_file(path)
+    else:
+        weights = torch.load(path, map_location="cpu", weights_only=True)
+    try:
+        net.load_state_dict({key: value for key, value in weights.items() if not key.startswith("classifier.")})
+    except RuntimeError as error:
+        raise ValueError(f"{path} does not hold the weights of timm's {name}: {_first_line(error)}") from error
+    log.info("%s starts from the weights in %s", name, path)
+
+
+def _first_line(error: Exception) -> str:
+    return str(error).strip().partition("\n")[0]
+
+
+def _output_channels(block: nn.Module) -> int:
+    return [module for module in block.modules() if isinstance(module, nn.Conv2d)][-1].out_channels
+
+
+class TokenLearner(nn.Module):
+    """M tokens per image, each an attention-weighted mean of the features (TokenLearner 1.1, arXiv 2106.11297).
+
+    Args:
+        channels: C of the feature map.
+        tokens: M.
+        coordinates: append the mean position under each attention map, x and y in -1 … 1, so that a token also
+            says where it looked.
+    """
+
+    def __init__(self, channels: int, tokens: int = 8, coordinates: bool = False) -> None:
+        super().__init__()
+        self.width = channels + 2 * coordinates
+        self.coordinates = coordinates
+        self.attention = nn.Sequential(
+            nn.LayerNorm(channels, eps=1e-6),
+            nn.Linear(channels, 64),
+            nn.GELU(approximate="tanh"),
+            nn.Linear(64, tokens),
+        )
+
+    def forward(self, features: Tensor) -> Tensor:
+        """(N, C, h, w) features to (N, M, width) tokens."""
+        values = features.flatten(2).mT  # (N, h·w, C)
+        weights = self.attention(values).softmax(1).mT  # (N, M, h·w)
+        tokens = weights @ values
+        if self.coordinates:
+            tokens = torch.cat([tokens, weights @ grid(features).to(weights.dtype)], -1)
+        return tokens
+
+
+class Keypoints(nn.Module):
+    """M keypoints per image: the mean position under the softmax of a feature map (spatial softmax, arXiv 1504.00702).
+
+    Args:
+        channels: C of the feature map.
+        keypoints: M.
+    """
+
+    def __init__(self, channels: int, keypoints: int) -> None:
+        super().__init__()
+        self.score = nn.Linear(channels, keypoints, bias=False)
+        nn.init.normal_(self.score.weight, std=1.0)  # attention that starts flat sends no gradient
+
+    def forward(self, features: Tensor) -> Tensor:
+        """(N, C, h, w) features to (N, M, 2) positions x, y in -1 … 1."""
+        weights = (self.score.weight @ features.flatten(2)).softmax(-1)  # (N, M, h·w)
+        return weights.float() @ grid(features)
+
+
+def grid(features: Tensor) -> Tensor:
+    """(h·w, 2) positions x, y in -1 … 1 of the (N, C, h, w) features, float32."""
+    height, width = features.shape[-2:]
+    y = torch.linspace(-1, 1, height, device=features.device)
+    x = torch.linspace(-1, 1, width, device=features.device)
+    return torch.stack([x.repeat(height), y.repeat_interleave(width)], -1)
+
+
+class RandomShift(nn.Module):
+    """Shifts the images of a clip by one random offset, filling with black; does nothing outside training.
+
+    Args:
+        vertical, horizontal: largest shift either way [1/256 of the image height].
+    """
+
+    def __init__(self, vertical: float, horizontal: float) -> None:
+        super().__init__()
+        self.vertical, self.horizontal = vertical, horizontal
+
+    @torch.compiler.disable  # offsets are numbers here, and every new one would be compiled anew
+    def forward(self, images: Tensor) -> Tensor:
+        """(B, T, H, W, 3) images of B clips to the same shape and type."""
+        if not self.training:
+            return images
+        clips, frames, height, width, _ = images.shape
+        up, left = round(self.vertical * height / 256), round(self.horizontal * height / 256)
+        padded = images.new_zeros(clips, frames, height + 2 * up, width + 2 * left, 3)
+        padded[:, :, up : up + height, left : left + width] = images
+        rows = torch.randint(2 * up + 1, (clips,)).tolist()
+        columns = torch.randint(2 * left + 1, (clips,)).tolist()
+        crops = zip(padded, rows, columns, strict=True)
+        return torch.stack([clip[:, row : row + height, column : column + width] for clip, row, column in crops])

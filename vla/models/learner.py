@@ -1,0 +1,133 @@
+"""The learner: how a model's weights follow from batches; Lightning's trainer decides where and how fast."""
+
+# B batch, T frames, k action chunk, D action components, K bins
+
+from __future__ import annotations
+
+import math
+from typing import Any, Literal
+
+import torch
+from lightning import LightningModule
+from torch import Tensor, nn
+from torchmetrics import MeanMetric
+
+from vla.models.bc import Model
+from vla.spec import Spec
+
+Batch = dict[str, Any]
+
+READABLE = {"m": (1000.0, "mm"), "rad": (180 / math.pi, "deg"), "1": (1.0, "")}  # unit → factor and unit of the logs
+
+
+class Learner(LightningModule):
+    """AdamW on a model's own loss, with warm-up and a schedule over the trainer's steps.
+
+    Args:
+        lr: largest learning rate.
+        weight_decay: of matrices and filters; biases, norms and embeddings are left alone.
+        warmup_steps: steps in which the learning rate rises evenly from 0.
+        schedule: "cosine" falls to 0 at the trainer's last step, "constant" stays.
+        compile: compile the model with torch.compile.
+        ema: decay per step of the averaged weights, which are the ones evaluated and saved; 0 keeps no average.
+        model: what learns.
+        spec: what a step looks like; saved with every checkpoint.
+        config: the resolved configuration as plain dicts and lists; saved with every checkpoint.
+    """
+
+    def __init__(
+        self,
+        lr: float = 1e-3,
+        weight_decay: float = 0.01,
+        warmup_steps: int = 100,
+        schedule: Literal["cosine", "constant"] = "cosine",
+        compile: bool = False,
+        ema: float = 0.998,
+        *,
+        model: Model,
+        spec: Spec,
+        config: dict[str, Any],
+    ) -> None:
+        super().__init__()
+        self.model, self._spec, self._config = model, spec, config
+        self._lr, self._weight_decay, self._warmup, self._schedule = lr, weight_decay, warmup_steps, schedule
+        self._compile, self.ema = compile, ema
+        self.accuracy = MeanMetric()
+        self.errors = nn.ModuleList(MeanMetric() for _ in spec.action)
+
+    def configure_model(self) -> None:
+        """Compile in place, so that the names in a checkpoint stay those of the model."""
+        if self.device.type == "cpu":
+            # The backward pass of flash attention in bfloat16 is pathologically slow on CPUs.
+            torch.backends.cuda.enable_flash_sdp(False)
+        if self._compile:
+            self.model.compile()
+            self._compile = False  # Lightning may call this hook again
+
+    def configure_optimizers(self) -> Any:
+        """AdamW, decaying only what has more than one dimension and is no embedding."""
+        embeddings = {id(m.weight) for m in self.model.modules() if isinstance(m, nn.Embedding)}
+        trained = [p for p in self.model.parameters() if p.requires_grad]
+        decayed = [p for p in trained if p.dim() > 1 and id(p) not in embeddings]
+        others = [p for p in trained if p.dim() <= 1 or id(p) in embeddings]
+        groups = [{"params": decayed, "weight_decay": self._weight_decay}, {"params": others, "weight_decay": 0.0}]
+        optimizer = torch.optim.AdamW(groups, lr=self._lr, fused=True)
+        scheduler = torch.optim.lr_scheduler.LambdaLR(optimizer, self._share)
+        return {"optimizer": optimizer, "lr_scheduler": {"scheduler": scheduler, "interval": "step"}}
+
+    def _share(self, step: int) -> float:
+        """Share of the largest learning rate in a step."""
+        if step < self._warmup:
+            return (step + 1) / (self._warmup + 1)
+        if self._schedule == "constant":
+            return 1.0
+        total = float(self.trainer.estimated_stepping_batches)
+        done = (step - self._warmup) / max(total - self._warmup, 1)
+        return 0.5 * (1 + math.cos(math.pi * min(done, 1.0)))
+
+    def on_after_batch_transfer(self, batch: Batch, dataloader_idx: int) -> Batch:
+        """Add what the text encoder reads: sentences become numbers outside the part that compiles."""
+        return self.prepare(batch)
+
+    def prepare(self, batch: Batch) -> Batch:
+        """The batch with the tokens of its instructions, (B, L) int64, as `text`."""
+        return {**batch, "text": self.model.text.tokenize(batch["instruction"]).to(batch["proprio"].device)}
+
+    def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
+        """The loss of a batch.
+
+        Raises:
+            ValueError: the loss is not a finite number.
+        """
+        losses = self.model.loss(batch)
+        loss = losses["loss"]
+        if not torch.isfinite(loss):
+            raise ValueError(
+                f"the loss is {loss.item()} at step {self.global_step}: lower learner.lr (now {self._lr}), raise "
+                "learner.warmup_steps, or clip harder with trainer.gradient_clip_val; the last checkpoint is kept"
+            )
+        for name, value in losses.items():
+            if name != "logits":
+                self.log(f"train/{name}", value.detach(), prog_bar=name == "loss")
+        return loss
+
+    def validation_step(self, batch: Batch, batch_idx: int) -> None:
+        """Token accuracy, and the error of the action that would be executed, per component."""
+        losses = self.model.loss(batch)
+        logits = losses["logits"]  # (B, T', k, D, K)
+        frames = logits.shape[1]
+        action, valid = batch["action"][:, -frames:], batch["valid"][:, -frames:]
+        tokenizer = self.model.tokenizer
+        right = logits.argmax(-1) == tokenizer.encode(action)  # (B, T', k, D)
+        error = (tokenizer.read(logits) - action).abs()[valid]  # (N, D)
+        self.accuracy.update(right[valid].float())
+        self.log("val/loss", losses["loss"], batch_size=len(action))
+        self.log("val/token_accuracy", self.accuracy)
+        for index, (name, unit) in enumerate(zip(self._spec.action, self._spec.units, strict=True)):
+            factor, readable = READABLE[unit]
+            self.errors[index].update(error[:, index] * factor)
+            self.log(f"val/error_{name}{f'_{readable}' if readable else ''}", self.errors[index])
+
+    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """A checkpoint says what made it, in plain dicts that load without running code."""
+        checkpoint["config"], checkpoint["spec"] = self._config, self._spec.to_dict()

@@ -1,0 +1,84 @@
+"""Sentences as vectors.
+
+Shapes: B sentences, L n-grams of the longest of them.
+"""
+
+from __future__ import annotations
+
+import re
+import zlib
+from abc import ABC, abstractmethod
+from functools import lru_cache
+
+import torch
+from torch import Tensor, nn
+
+PADDING = 0
+
+
+class TextEncoder(nn.Module, ABC):
+    """Sentence → vector in two halves: `tokenize` in plain Python, and `forward`, which compiles and trains.
+
+    Args:
+        width: length of the vector.
+    """
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.width = width
+
+    @abstractmethod
+    def tokenize(self, sentences: list[str]) -> Tensor:
+        """(B, L) int64 for B sentences, filled up with 0."""
+
+    @abstractmethod
+    def forward(self, tokens: Tensor) -> Tensor:
+        """(B, width) vectors for (B, L) tokens."""
+
+
+class NGrams(TextEncoder):
+    """The mean of learned vectors, one for each hashed word and n-gram of the sentence; needs no download.
+
+    Words the training never saw still share n-grams of characters with known ones, and an n-gram of words tells
+    "red on blue" from "blue on red".
+
+    Args:
+        vocabulary: number of learned vectors; n-grams that hash to the same one share it.
+        words: longest n-gram of words.
+        characters: length of the n-grams of characters, taken from every word between its boundary marks.
+        width: length of the sentence vector.
+    """
+
+    def __init__(self, vocabulary: int = 4096, words: int = 2, characters: int = 3, *, width: int) -> None:
+        super().__init__(width)
+        if vocabulary < 2 or words < 1 or characters < 1:
+            raise ValueError(
+                f"n-grams need vocabulary >= 2, words >= 1 and characters >= 1, "
+                f"got vocabulary={vocabulary}, words={words}, characters={characters}"
+            )
+        self.vocabulary, self.words, self.characters = vocabulary, words, characters
+        self.embedding = nn.Embedding(vocabulary, width, padding_idx=PADDING)
+        self.norm = nn.LayerNorm(width)
+
+    def tokenize(self, sentences: list[str]) -> Tensor:
+        """(B, L) int64 hashes of the n-grams of B sentences, whatever their case, filled up with 0."""
+        rows = [_hashes(sentence, self.vocabulary, self.words, self.characters) for sentence in sentences]
+        length = max(len(row) for row in rows)
+        return torch.tensor([row + (PADDING,) * (length - len(row)) for row in rows])
+
+    def forward(self, tokens: Tensor) -> Tensor:
+        """(B, width) vectors for (B, L) tokens, whatever the number of 0s at the end."""
+        count = (tokens != PADDING).sum(1, keepdim=True).clamp(min=1)
+        vector: Tensor = self.norm(self.embedding(tokens).sum(1) / count)
+        return vector
+
+
+@lru_cache(maxsize=65536)
+def _hashes(sentence: str, vocabulary: int, words: int, characters: int) -> tuple[int, ...]:
+    found = re.findall(r"\w+", sentence.lower())
+    grams = [" ".join(found[i : i + n]) for n in range(1, words + 1) for i in range(len(found) - n + 1)]
+    for word in found:
+        marked = f"<{word}>"
+        grams += [f"#{marked[i : i + characters]}" for i in range(len(marked) - characters + 1)]
+    # crc32 and not hash(): the same in every process, so that a checkpoint means the same tomorrow.
+    return tuple(1 + zlib.crc32(gram.encode()) % (vocabulary - 1) for gram in grams) or (PADDING,)

@@ -1,0 +1,299 @@
+"""Recordings of episodes for the Rerun viewer: scene, cameras, curves, tokens, instruction and draws, step by step."""
+
+from __future__ import annotations
+
+import io
+import os
+import socket
+import subprocess
+import time
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import rerun as rr
+import rerun.blueprint as rrb
+import rerun_cli
+from PIL import Image
+from rerun.experimental import ViewerClient
+
+from vla.spec import Array, Environment, Episode, Observation, Shape, Spec
+
+# N steps, S series of a plot, D action components, K bins, V vertices, F faces
+
+VIEWER = str(Path(rerun_cli.__file__).with_name("rerun"))  # the binary: killing the script around it would orphan it
+TITLES = {"m": "translation [m]", "rad": "rotation [rad]", "1": "gripper"}  # of an action's units
+CURVES = np.array([0xE5574CFF, 0x5ABE64FF, 0x508CF0FF, 0xF0AA3CFF, 0xB46EE6FF, 0x3CC8C8FF, 0xDCDCDCFF], np.uint32)
+HEAT = np.array([(10, 8, 24), (70, 18, 95), (160, 45, 95), (235, 105, 55), (252, 190, 75), (252, 253, 200)])
+TOKENS = (210, 256)  # height and width of the picture of the token probabilities [px]
+
+
+def recording_name(seed: int, outcome: str) -> str:
+    """Name of an episode's file; alphabetically, failures come first and seeds ascend."""
+    return f"success-{seed:08d}" if outcome == "success" else f"failure-{seed:08d}-{outcome}"
+
+
+class RerunRecorder:
+    """Writes one .rrd file per episode, whose steps lie on the timelines "step" and "time" [s]."""
+
+    def __init__(
+        self,
+        folder: str | os.PathLike[str],
+        eye: Sequence[float] = (1.2, -0.7, 0.75),
+        look_at: Sequence[float] = (0.38, 0.0, 0.2),
+    ) -> None:
+        """Record into a folder, which is made.
+
+        Args:
+            folder: where the files go, each named by `recording_name`.
+            eye: from where the viewer first looks at the scene (3,) [m].
+            look_at: the point that it looks at (3,) [m].
+        """
+        self._folder = Path(folder)
+        self._eye, self._look_at = eye, look_at
+        self._folder.mkdir(parents=True, exist_ok=True)
+
+    def start(self, name: str, environment: Environment) -> None:
+        """A new episode begins; one that did not end is forgotten."""
+        self._environment, self._shapes = environment, environment.shapes()
+        self._poses: list[dict[str, Array]] = []
+        self._probabilities: dict[int, Array] = {}
+
+    def step(self, observation: Observation, action: Array, info: Mapping[str, Any]) -> None:
+        """Remember what the episode will not tell; written in columns at its end, all costs a fraction."""
+        if "probabilities" in info:
+            self._probabilities[len(self._poses)] = np.array(info["probabilities"], dtype=np.float32)
+        self._poses.append(_copied(self._environment.poses()))
+
+    def end(self, episode: Episode) -> None:
+        """Write the episode's file, under another name until it is whole."""
+        self._poses.append(_copied(self._environment.poses()))
+        name, spec = recording_name(episode.seed, episode.outcome), self._environment.spec
+        partial = self._folder / f"{name}.rrd.partial"
+        # The viewer merges recordings of the same id, and the same seeds are played by many policies.
+        stream = rr.RecordingStream("vla", recording_id=f"{name}-{os.urandom(3).hex()}")
+        blueprint = _blueprint(spec, bool(self._probabilities), self._eye, self._look_at)
+        stream.set_sinks(rr.FileSink(partial), default_blueprint=blueprint)
+        writer = _Writer(stream, spec)
+        writer.facts(episode)
+        writer.shapes(self._shapes)
+        writer.poses(self._poses)
+        writer.cameras(episode.observations)
+        writer.curves(episode)
+        if self._probabilities:
+            writer.tokens(np.array([*self._probabilities]), np.stack([*self._probabilities.values()]))
+        stream.flush()
+        stream.disconnect()
+        os.replace(partial, self._folder / f"{name}.rrd")
+
+
+def _copied(poses: Mapping[str, Array]) -> dict[str, Array]:
+    return {body: np.array(pose, dtype=np.float32) for body, pose in poses.items()}
+
+
+class _Writer:
+    """Puts the parts of one episode into a recording."""
+
+    def __init__(self, stream: rr.RecordingStream, spec: Spec) -> None:
+        self._stream, self._spec = stream, spec
+
+    def facts(self, episode: Episode) -> None:
+        """Name, properties, instruction and draws."""
+        steps = len(episode.observations)
+        self._stream.send_recording_name(f"{episode.outcome}: {episode.instruction}")
+        self._stream.send_property("episode", rr.AnyValues(outcome=episode.outcome, seed=episode.seed, steps=steps))
+        end = f"{'✔' if episode.success else '✘'} **{episode.outcome}** after {steps} steps, seed {episode.seed}"
+        draws = "\n".join(f"- **{axis}** {draw}" for axis, draw in episode.draws.items())
+        self._static("instruction", rr.TextDocument(f"### {episode.instruction}\n\n{end}", media_type="text/markdown"))
+        self._static("draws", rr.TextDocument(draws, media_type="text/markdown"))
+
+    def shapes(self, shapes: Iterable[Shape]) -> None:
+        """The geometry of every body, in its own frame."""
+        self._static("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP)
+        for shape in shapes:
+            place = rr.Transform3D(translation=shape.position, quaternion=_xyzw(shape.quaternion))
+            self._static(_path("world", shape.body, shape.name), place, _solid(shape))
+
+    def poses(self, poses: Sequence[Mapping[str, Array]]) -> None:
+        """Body poses, only at the steps where they changed: for many bodies that is never."""
+        for body in poses[0]:
+            track = np.stack([pose[body] for pose in poses])  # (N + 1, 7)
+            moved = np.flatnonzero(np.append(True, (track[1:] != track[:-1]).any(axis=1)))
+            columns = rr.Transform3D.columns(translation=track[moved, :3], quaternion=_xyzw(track[moved, 3:]))
+            self._columns(_path("world", body), moved, columns)
+
+    def cameras(self, observations: Sequence[Observation]) -> None:
+        """Colour as JPEG, depth as lossless 16-bit PNG [mm]."""
+        steps = np.arange(len(observations))
+        for camera in observations[0].rgb:
+            blobs = [_encoded(seen.rgb[camera], "JPEG", quality=90) for seen in observations]
+            columns = rr.EncodedImage.columns(blob=blobs, media_type=["image/jpeg"] * len(blobs))
+            self._columns(_path("camera", camera, "rgb"), steps, columns)
+        for camera in observations[0].depth:
+            path, some = _path("camera", camera, "depth"), np.stack([seen.depth[camera] for seen in observations[::8]])
+            shades = np.percentile(some[some > 0], (1, 90)) if some.any() else (0.0, 1.0)
+            self._static(path, rr.EncodedDepthImage.from_fields(meter=1000.0, depth_range=shades, colormap="turbo"))
+            blobs = [_encoded(seen.depth[camera], "PNG", compress_level=1) for seen in observations]
+            columns = rr.EncodedDepthImage.columns(blob=blobs, media_type=["image/png"] * len(blobs))
+            self._columns(path, steps, columns)
+
+    def curves(self, episode: Episode) -> None:
+        """Joints, gripper, and the executed action by unit, with the clean action where that is another one."""
+        seen = episode.observations
+        self._series("robot/joints", np.stack([each.joints for each in seen]), self._spec.joints)
+        self._series("robot/gripper", np.array([[each.gripper] for each in seen]), ["opening"])
+        for unit in dict.fromkeys(self._spec.units):
+            which = [index for index, other in enumerate(self._spec.units) if other == unit]
+            names = [self._spec.action[index] for index in which]
+            self._series(f"action/{unit}/executed", episode.executed[:, which], names)
+            if not np.array_equal(episode.actions, episode.executed):
+                names = [f"{name}, clean" for name in names]
+                self._series(f"action/{unit}/clean", episode.actions[:, which], names, width=0.75)
+
+    def tokens(self, steps: Array, probabilities: Array) -> None:
+        """One picture per step: a row per action component, from its lowest bin on the left to its highest.
+
+        Args: steps (N,) and their probabilities (N, D, K), of which each row is scaled by its largest.
+        """
+        components, bins = probabilities.shape[1:]
+        row = TOKENS[0] // components  # [px]
+        pixel_row, pixel_bin = np.arange(row * components) // row, np.arange(TOKENS[1]) * bins // TOKENS[1]
+        # The square root lets the eye see the small ones too.
+        strength = np.sqrt(probabilities / probabilities.max(axis=2, keepdims=True))
+        levels = np.round(strength * 255).astype(np.uint8)[:, pixel_row][:, :, pixel_bin]
+        levels[:, ::row] = 0  # a line between rows
+        shades = np.linspace(0, 255, len(HEAT))
+        palette = np.stack([np.interp(np.arange(256), shades, channel) for channel in HEAT.T], axis=1).astype(np.uint8)
+        blobs = [_encoded(picture, "PNG", palette=palette, compress_level=1) for picture in levels]
+        self._columns("tokens", steps, rr.EncodedImage.columns(blob=blobs, media_type=["image/png"] * len(blobs)))
+        beside = [(-32.0, (index + 0.5) * row) for index in range(components)]
+        self._static("tokens/names", rr.Points2D(beside, labels=self._spec.action, radii=0.0, show_labels=True))
+
+    def _series(self, path: str, values: Array, names: Sequence[str], width: float = 1.75) -> None:
+        """Args: values (N, S), S names, width of the curves [px]."""
+        count = len(names)
+        self._static(path, rr.SeriesLines(names=names, colors=np.resize(CURVES, count), widths=[width] * count))
+        columns = rr.Scalars.columns(scalars=values.reshape(-1)).partition([count] * len(values))
+        self._columns(path, np.arange(len(values)), columns)
+
+    def _static(self, path: str, *what: Any) -> None:
+        self._stream.log(path, *what, static=True)
+
+    def _columns(self, path: str, steps: Array, columns: Iterable[Any]) -> None:
+        seconds = rr.TimeColumn("time", duration=steps / self._spec.control_hz)
+        self._stream.send_columns(path, [rr.TimeColumn("step", sequence=steps), seconds], columns)
+
+
+def _path(*parts: str) -> str:
+    """Entity path; a slash within a name would hang one body below another."""
+    return "/".join(part.replace("/", ".") for part in parts)
+
+
+def _xyzw(wxyz: Array) -> Any:
+    return np.asarray(wxyz)[..., [1, 2, 3, 0]]
+
+
+def _encoded(pixels: Array, kind: str, palette: Array | None = None, **options: int) -> bytes:
+    image, buffer = Image.fromarray(pixels), io.BytesIO()
+    if palette is not None:
+        image.putpalette(palette.tobytes())
+    image.save(buffer, kind, **options)
+    return buffer.getvalue()
+
+
+def _solid(shape: Shape) -> Any:
+    colour, (radius, half_length) = np.round(np.asarray(shape.rgba) * 255).astype(np.uint8), shape.size[:2]
+    if shape.kind == "mesh":
+        vertices, faces = np.asarray(shape.vertices), np.asarray(shape.faces)
+        normals = _normals(vertices, faces)
+        return rr.Mesh3D(
+            vertex_positions=vertices, triangle_indices=faces, vertex_normals=normals, albedo_factor=colour
+        )
+    if shape.kind == "box":
+        return rr.Boxes3D(half_sizes=[shape.size], colors=[colour], fill_mode="solid")
+    if shape.kind == "sphere":
+        return rr.Ellipsoids3D(radii=[radius], colors=[colour], fill_mode="solid")
+    size: dict[str, Any] = {"lengths": [2 * half_length], "radii": [radius], "colors": [colour], "fill_mode": "solid"}
+    if shape.kind == "cylinder":
+        return rr.Cylinders3D(**size)
+    return rr.Capsules3D(translations=[[0, 0, -half_length]], **size)  # Rerun's stands on the origin
+
+
+def _normals(vertices: Array, faces: Array) -> Array:
+    """(V, 3) unit normals: the mean of the adjacent faces' normals, weighed by area."""
+    first, second, third = (vertices[faces[:, corner]] for corner in range(3))  # (F, 3) each
+    normals = np.zeros(vertices.shape)
+    np.add.at(normals, faces.reshape(-1), np.cross(second - first, third - first).repeat(3, axis=0))
+    return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+
+
+def _blueprint(spec: Spec, tokens: bool, eye: Sequence[float], look_at: Sequence[float]) -> rrb.Blueprint:
+    """Scene large on the left; texts and cameras on the right; curves and tokens below."""
+    controls = rrb.EyeControls3D(position=eye, look_target=look_at, eye_up=(0, 0, 1))
+    scene = rrb.Spatial3DView(origin="/world", name="scene", eye_controls=controls, line_grid=False)
+    texts = [rrb.TextDocumentView(origin=f"/{name}", name=name) for name in ("instruction", "draws")]
+    images = [(name, kind) for kind in ("rgb", "depth") for name in spec.cameras]
+    views = [rrb.Spatial2DView(origin=_path("camera", name, kind), name=f"{name} {kind}") for name, kind in images]
+    plots: list[Any] = [rrb.TimeSeriesView(origin="/robot/joints", name="joints [rad]")]
+    for unit in dict.fromkeys(spec.units):
+        plots.append(rrb.TimeSeriesView(origin=f"/action/{unit}", name=f"action: {TITLES.get(unit, unit)}"))
+    legend = rrb.PlotLegend(visible=False)
+    opening = rrb.TimeSeriesView(origin="/robot/gripper", name="gripper opening [m]", plot_legend=legend)
+    plots.append(rrb.Vertical(plots.pop(), opening))
+    if tokens:
+        bounds = rrb.VisualBounds2D(x_range=(-64, TOKENS[1] + 4), y_range=(-4, TOKENS[0] + 4))
+        plots.append(rrb.Spatial2DView(origin="/tokens", name="token probabilities", visual_bounds=bounds))
+    right = rrb.Vertical(rrb.Horizontal(*texts), rrb.Grid(*views, grid_columns=len(spec.cameras)), row_shares=[1, 3])
+    above = rrb.Horizontal(scene, right, column_shares=[5, 4])
+    return rrb.Blueprint(
+        rrb.Vertical(above, rrb.Horizontal(*plots), row_shares=[5, 3]),
+        rrb.TimePanel(state="collapsed", timeline="step", fps=spec.control_hz),
+        rrb.BlueprintPanel(state="collapsed"),
+        rrb.SelectionPanel(state="collapsed"),
+    )
+
+
+def merge(files: Sequence[Path], target: Path) -> None:
+    """Put episodes into one file, in which each stays a recording of its own; the viewer lists them by name.
+
+    Raises:
+        ValueError: there is nothing to merge, or one of the files is no recording.
+    """
+    if not files:
+        raise ValueError(f"no recordings to merge into {target}")
+    partial = target.with_name(f"{target.name}.partial")
+    command = [VIEWER, "rrd", "merge", *map(str, files), "-o", str(partial)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    if done.returncode:
+        partial.unlink(missing_ok=True)
+        raise ValueError(f"rerun could not merge {len(files)} recordings into {target}: {done.stderr[-500:].strip()}")
+    os.replace(partial, target)
+
+
+def screenshot(recording: Path, picture: Path, step: int) -> None:
+    """Save what the viewer shows of a recording at a step as PNG; needs no display, but Vulkan (lavapipe will do).
+
+    Raises:
+        ValueError: the viewer does not start, or one of its views reports a problem.
+    """
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    # The viewer would listen on all interfaces unless told otherwise.
+    options = ["--bind", "127.0.0.1", "--port", str(port), "--headless", "--window-size", "1600x900"]
+    viewer = subprocess.Popen([VIEWER, *options, str(recording)], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    try:
+        time.sleep(10.0)  # until it has started, everything is loaded and the greeting has gone
+        if viewer.poll() is not None:
+            raise ValueError("the viewer does not start; without a display it needs libvulkan1, mesa-vulkan-drivers")
+        client = ViewerClient.connect(f"rerun+http://127.0.0.1:{port}/proxy")
+        client.set_time("step", sequence=step, play_state="paused")
+        time.sleep(2.0)  # until everything is painted
+        problems = [(view.name, view.reports) for view in client.get_state().views if view.reports]
+        if problems:
+            raise ValueError(f"the viewer cannot show all of {recording}: {problems}")
+        picture.write_bytes(client.take_screenshot())
+    finally:
+        viewer.terminate()
+        viewer.wait(timeout=10)

@@ -1,0 +1,250 @@
+"""What an evaluation leaves behind, report.json and a page of plots, and what a preview shows of resets."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from rich.table import Table
+
+from vla.evaluate import ERROR, Report, Result, wilson_interval
+from vla.spec import Array, Observation
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+GREEN, RED, GREY = "#2e9e5b", "#d2483f", "#8a8f98"
+BINS = 5  # groups of equally many episodes into which a drawn number is cut
+GROUPS = 8  # most words between which a factor's panel can tell
+PANELS = 8  # drawn factors on the page
+TILE = 144  # smallest height of an image on a contact sheet [px]
+CAPTION = 18  # height of a line of text on it [px]
+
+
+def write_report(report: Report, path: Path, checkpoint: str | None, config: Mapping[str, Any]) -> None:
+    """Write a report as JSON, all of it or nothing: rate and interval, outcomes, what was evaluated, every episode."""
+    low, high = report.interval
+    content = {
+        "success": report.success,
+        "ci_low": low,
+        "ci_high": high,
+        "episodes": report.episodes,
+        "successes": report.successes,
+        "errors": len(report.errors),
+        "taxonomy": report.taxonomy,
+        "seeds": [result.seed for result in report.results],
+        "checkpoint": checkpoint,
+        "config": config,
+        "per_episode": [asdict(result) for result in report.results],
+    }
+    partial = path.with_name(f"{path.name}.partial")
+    partial.write_text(json.dumps(content, indent=1, allow_nan=False, ensure_ascii=False) + "\n", encoding="utf-8")
+    os.replace(partial, path)
+
+
+def plot_report(report: Report, path: Path) -> None:
+    """Draw one page: success with its interval, outcomes, lengths of episodes, and success over what was drawn.
+
+    The drawn factors over which success varies most, compared with chance, come first.
+    """
+    from matplotlib.figure import Figure
+
+    played = [result for result in report.results if result.outcome != ERROR]
+    factors = sorted(_factors(played).items(), key=lambda factor: -_association(factor[1], played))[:PANELS]
+    rows = 1 + -(-len(factors) // 4)
+    figure = Figure(figsize=(13, 3.1 * rows), layout="constrained")
+    figure.suptitle(str(report).splitlines()[-1], fontsize=15, fontweight="bold")
+    grid = figure.add_gridspec(rows, 4)
+    _plot_outcomes(figure.add_subplot(grid[0, :2]), report)
+    _plot_lengths(figure.add_subplot(grid[0, 2:]), played)
+    for index, (name, values) in enumerate(factors):
+        axes = figure.add_subplot(grid[1 + index // 4, index % 4])
+        axes.set_title(name, fontsize=10)
+        plot = _plot_points if isinstance(values[0], tuple) else _plot_groups
+        plot(axes, values, played)
+    for axes in figure.axes:
+        axes.spines[["top", "right"]].set_visible(False)
+    figure.savefig(path, dpi=110)
+
+
+def _plot_outcomes(axes: Axes, report: Report) -> None:
+    """One bar per outcome, the success bar with its interval."""
+    names, counts = list(report.taxonomy)[::-1], list(report.taxonomy.values())[::-1]
+    colours = [GREEN if name == "success" else GREY if name == ERROR else RED for name in names]
+    axes.barh(names, counts, color=colours, height=0.7)
+    low, high = (bound * report.episodes for bound in report.interval)
+    for row, (name, count) in enumerate(zip(names, counts, strict=True)):
+        axes.annotate(
+            str(count), (high if name == "success" else count, row), (6, 0), textcoords="offset points", va="center"
+        )
+        if name == "success":
+            axes.plot([low, high], [row, row], color="black", linewidth=1.5, marker="|", markersize=10)
+    axes.set_xlim(0, 1.1 * len(report.results))
+    axes.set_xlabel("episodes")
+    axes.set_title("outcomes", fontsize=10)
+
+
+def _plot_lengths(axes: Axes, played: Sequence[Result]) -> None:
+    """Steps until success or failure."""
+    steps = [[result.steps for result in played if (result.outcome == "success") == good] for good in (True, False)]
+    edges = np.histogram_bin_edges(steps[0] + steps[1] or [0], bins=30)
+    axes.hist(steps, bins=list(edges), stacked=True, color=[GREEN, RED], label=["success", "failure"])
+    axes.legend(frameon=False)
+    axes.set_xlabel("steps")
+    axes.set_ylabel("episodes")
+    axes.set_title("length of episodes", fontsize=10)
+
+
+def _plot_points(axes: Axes, values: Sequence[tuple[float, float]], played: Sequence[Result]) -> None:
+    """Where in the plane it succeeds and where it fails; failures on top."""
+    for good, colour, marker in ((True, GREEN, "o"), (False, RED, "X")):
+        points = [value for value, result in zip(values, played, strict=True) if (result.outcome == "success") == good]
+        across, along = np.array(points).reshape(-1, 2).T
+        axes.scatter(across, along, c=colour, marker=marker, s=22, alpha=0.75, linewidths=0)
+    axes.set_aspect("equal", adjustable="datalim")
+
+
+def _plot_groups(axes: Axes, values: Sequence[Any], played: Sequence[Result]) -> None:
+    """Success rate with its interval in each group of values; a group of numbers stands at its mean."""
+    groups = _groups(values)
+    if _numbers(values):
+        places = [float(np.mean([values[index] for index in group])) for group in groups]
+    else:
+        places = list(range(len(groups)))
+        names = [str(values[group[0]]) for group in groups]
+        tilt = 20 if max(map(len, names)) > 9 else 0
+        axes.set_xticks(places, names, fontsize=8, rotation=tilt, ha="right" if tilt else "center")
+        axes.set_xlim(-0.5, len(groups) - 0.5)
+    won = [sum(played[index].outcome == "success" for index in group) for group in groups]
+    rates = np.array([good / len(group) for good, group in zip(won, groups, strict=True)])
+    bounds = np.array([wilson_interval(good, len(group)) for good, group in zip(won, groups, strict=True)])
+    reach = np.abs(bounds.T - rates)
+    axes.errorbar(places, rates, reach, fmt="o-", color=GREEN, ecolor=GREY, linewidth=0.7, capsize=3)
+    axes.set_ylim(0, 1.05)
+    axes.set_ylabel("success")
+    axes.grid(axis="y", alpha=0.3)
+
+
+def _factors(played: Sequence[Result]) -> dict[str, list[Any]]:
+    """Dotted name → value per episode, of every draw that all episodes have and that falls into a few groups.
+
+    A pair of numbers is one factor, a point; longer lists are one factor per item.
+    """
+    rows = [
+        {name: value for axis, draw in _axes("", result.draws) for name, value in _items(axis, draw)}
+        for result in played
+    ]
+    names = [name for name in (rows[0] if rows else {}) if all(name in row for row in rows)]
+    columns = {name: [row[name] for row in rows] for name in names}
+    return {name: values for name, values in columns.items() if 1 < len(_groups(values)) <= GROUPS}
+
+
+def _items(name: str, value: Any) -> Iterator[tuple[str, Any]]:
+    if not isinstance(value, list):
+        yield name, value
+    elif len(value) == 2 and all(isinstance(item, float) for item in value):
+        yield name, tuple(value)
+    else:
+        for index, item in enumerate(value):
+            yield from _items(f"{name}[{index}]", item)
+
+
+def _numbers(values: Sequence[Any]) -> bool:
+    return all(isinstance(value, (int, float)) and not isinstance(value, bool) for value in values)
+
+
+def _groups(values: Sequence[Any]) -> list[list[int]]:
+    """Indices of the episodes, by value if these are few or words, else in groups of equally many; points by the
+    quarter of the plane that they are in."""
+    if isinstance(values[0], tuple):
+        values = [str(quarter) for quarter in np.array(values) > np.median(values, axis=0)]
+    different = sorted(set(values))
+    if len(different) <= BINS or not _numbers(values):
+        return [[index for index, other in enumerate(values) if other == value] for value in different]
+    return [group.tolist() for group in np.array_split(np.argsort(values, kind="stable"), BINS)]
+
+
+def _association(values: Sequence[Any], played: Sequence[Result]) -> float:
+    """How much success differs between the groups: Pearson's χ² per degree of freedom, about 1 by chance."""
+    good = np.array([result.outcome == "success" for result in played], dtype=float)
+    rate, groups = good.mean(), _groups(values)
+    if rate in (0.0, 1.0):
+        return 0.0
+    squares = sum(len(group) * (good[group].mean() - rate) ** 2 for group in groups)
+    return float(squares / (rate * (1 - rate)) / (len(groups) - 1))
+
+
+def contact_sheet(seeds: Sequence[int], observations: Sequence[Observation], path: Path, columns: int = 2) -> None:
+    """Save what the cameras see right after resets as one PNG.
+
+    One block per reset, captioned with its seed and instruction: each camera's colours, then each camera's depth,
+    from near (blue) to far (red) in the same range for all resets. Pixels are enlarged, never blended.
+    """
+    import matplotlib
+    from PIL import Image, ImageDraw, ImageFont
+
+    turbo = matplotlib.colormaps["turbo"]
+    ranges = {name: _depth_range([seen.depth[name] for seen in observations]) for name in observations[0].depth}
+    blocks = []
+    for seen in observations:
+        depth = [turbo(np.clip((seen.depth[name] - low) / (high - low), 0, 1)) for name, (low, high) in ranges.items()]
+        tiles = [*seen.rgb.values(), *((255 * shades[..., :3]).astype(np.uint8) for shades in depth)]
+        factor = max(1, -(-TILE // len(tiles[0])))
+        blocks.append(np.concatenate([_framed(tile.repeat(factor, 0).repeat(factor, 1)) for tile in tiles], axis=1))
+    height, width = blocks[0].shape[0] + CAPTION, blocks[0].shape[1] + CAPTION
+    rows = -(-len(blocks) // columns)
+    sheet = Image.new("RGB", (columns * width + CAPTION, rows * (height + CAPTION // 2) + 2 * CAPTION), "white")
+    draw, font = ImageDraw.Draw(sheet), ImageFont.load_default(13)
+    for index, (seed, seen, block) in enumerate(zip(seeds, observations, blocks, strict=True)):
+        left, top = CAPTION + index % columns * width, CAPTION // 2 + index // columns * (height + CAPTION // 2)
+        draw.text((left, top), f"seed {seed}: {seen.instruction}", fill="black", font=font)
+        sheet.paste(Image.fromarray(block), (left, top + CAPTION))
+    legend = [f"{name} depth {low / 1000:.2f}-{high / 1000:.2f} m" for name, (low, high) in ranges.items()]
+    names = ", ".join([f"{name} colour" for name in observations[0].rgb] + legend)
+    draw.text((CAPTION, sheet.height - CAPTION - 4), f"from left to right: {names}", fill="black", font=font)
+    sheet.save(path)
+
+
+def _depth_range(images: Sequence[Array]) -> tuple[float, float]:
+    """Near and far [mm], without the few extreme pixels and without those that got no return."""
+    depth = np.stack(images)
+    low, high = np.percentile(depth[depth > 0], (1, 90)) if depth.any() else (0.0, 1.0)
+    return float(low), float(max(high, low + 1.0))
+
+
+def _framed(tile: Array) -> Array:
+    return np.pad(tile, ((0, 4), (0, 4), (0, 0)), constant_values=255)
+
+
+def draws_table(seeds: Sequence[int], draws: Sequence[Mapping[str, Any]]) -> Table:
+    """What was drawn in several resets: the range of every draw, or the words in it, and the first reset's values."""
+    table = Table("draw", "range", f"seed {seeds[0]}", title=f"{len(draws)} resets")
+    named = [dict(_axes("", draw)) for draw in draws]
+    for name in dict.fromkeys(name for row in named for name in row):
+        leaves = [leaf for row in named if name in row for leaf in _leaves(row[name])]
+        numbers = all(isinstance(leaf, (int, float)) for leaf in leaves)
+        seen = (
+            f"{min(leaves):.4g} … {max(leaves):.4g}" if numbers else ", ".join(sorted({str(leaf) for leaf in leaves}))
+        )
+        first = " ".join(
+            f"{leaf:.3g}" if isinstance(leaf, float) else str(leaf) for leaf in _leaves(named[0].get(name))
+        )
+        table.add_row(name, seen, first)
+    return table
+
+
+def _axes(name: str, value: Any) -> Iterator[tuple[str, Any]]:
+    if isinstance(value, Mapping):
+        for key, item in value.items():
+            yield from _axes(f"{name}.{key}" if name else str(key), item)
+    else:
+        yield name, value
+
+
+def _leaves(value: Any) -> list[Any]:
+    return [leaf.item() if isinstance(leaf, np.generic) else leaf for leaf in np.array(value, dtype=object).ravel()]

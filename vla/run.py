@@ -1,0 +1,177 @@
+"""The entry, `python -m vla.run [job=…] [GROUP=OPTION …] [KEY=VALUE …]`: compose a config, check it, do the job."""
+
+from __future__ import annotations
+
+import copy
+import os
+import re
+import sys
+import traceback
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, NoReturn
+
+import hydra
+from hydra.core.hydra_config import HydraConfig
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.errors import ConfigCompositionException, HydraException, MissingConfigException, OverrideParseException
+from hydra.types import RunMode
+from omegaconf import DictConfig, OmegaConf, open_dict
+from omegaconf.errors import OmegaConfBaseException
+
+from vla.check import JOBS, check, suggestion
+
+PACKAGE = Path(__file__).resolve().parent
+# Inside the package where it was installed from a wheel, beside it in a clone.
+CONF = next(path for path in (PACKAGE / "conf", PACKAGE.parent / "conf") if (path / "config.yaml").is_file())
+
+ADOPTING = ("evaluate", "export", "deploy")  # jobs that use a checkpoint's own task, tokenizer and model
+TRACEBACKS = "VLA_TRACEBACKS"  # the user's wish for tracebacks, kept for the processes that a trainer starts
+
+
+def adopt(cfg: DictConfig, saved: Mapping[str, Any], overrides: Sequence[str]) -> DictConfig:
+    """`cfg` with the task, tokenizer and model of a checkpoint's config `saved`.
+
+    What the command line `overrides` say about the task, as in `task/randomize=wide task.blocks=4`, applies on top.
+
+    Raises:
+        ValueError: an override of the tokenizer or the model, which the weights were trained with.
+    """
+    adopted = copy.deepcopy(cfg)
+    with open_dict(adopted):
+        for group in ("task", "tokenizer", "model"):
+            adopted[group] = saved[group]
+        for override in OverridesParser.create().parse_overrides(list(overrides)):
+            path = override.key_or_group.replace("/", ".")
+            group = path.partition(".")[0]
+            if group in ("tokenizer", "model"):
+                raise ValueError(
+                    f"{override.input_line} cannot be combined with a checkpoint, whose weights belong to the {group} "
+                    "they were trained with: leave one of the two out"
+                )
+            if group == "task" and override.is_delete():
+                parent, _, name = path.rpartition(".")
+                OmegaConf.select(adopted, parent).pop(name, None)
+            elif group == "task":
+                OmegaConf.update(adopted, path, OmegaConf.select(cfg, path), merge=False, force_add=True)
+    return adopted
+
+
+def sentence(error: Exception) -> str:
+    """One line that says what is wrong, and what was probably meant."""
+    cause = error.__cause__
+    if isinstance(error, MissingConfigException) and error.missing_cfg_file and error.options is not None:
+        group, _, option = error.missing_cfg_file.rpartition("/")
+        hint = suggestion(option, error.options) or ":"
+        return f"{group} has no option {option}{hint} there are {', '.join(error.options)}"
+    if isinstance(error, OverrideParseException):
+        reason = error.message.splitlines()[0]
+        return f"cannot read {error.override}: {reason}; quote special characters, as in 'key=\"value\"'"
+    if isinstance(error, ConfigCompositionException) and isinstance(cause, OmegaConfBaseException) and cause.full_key:
+        return _unknown_key(cause)
+    if isinstance(error, OmegaConfBaseException) and error.full_key:
+        return f"{error.full_key}: {str(error).splitlines()[0]}"
+    return " ".join(str(error).split()) or type(error).__name__
+
+
+def _unknown_key(error: OmegaConfBaseException) -> str:
+    *path, name = str(error.key).replace("/", ".").split(".")
+    parent = OmegaConf.select(error.parent_node, ".".join(path)) if path else error.parent_node
+    known = [str(key) for key in parent if key != "hydra"] if isinstance(parent, DictConfig) else []
+    if not known:
+        return f"there is no {error.full_key}"
+    return f"there is no {error.full_key}{suggestion(name, known) or ':'} there are {', '.join(known)}"
+
+
+def _meant_for_user(error: Exception) -> bool:
+    """Whether `error` speaks about the command line, a file or the machine, rather than about a bug.
+
+    Libraries raise ValueError and RuntimeError for bugs as well; the traceback of one that our own code raises on
+    purpose, here or in a worker process, ends with a `raise` in this package (or in Hydra, for the command line).
+    """
+    if isinstance(error, (OSError, HydraException, OmegaConfBaseException)):
+        return True
+    if type(error).__name__ == "MisconfigurationException":  # Lightning's; importing it would take seconds
+        return True
+    remote = type(error.__cause__).__name__ == "_RemoteTraceback"
+    text = str(error.__cause__) if remote else "".join(traceback.format_tb(error.__traceback__))
+    lines = re.findall(r'File "([^"]+)", line \d+, in .*\n\s+(.*)', text)
+    if not isinstance(error, (ValueError, RuntimeError, ImportError)) or not lines:
+        return False
+    file, statement = lines[-1]
+    ours = any(Path(file).is_relative_to(folder) for folder in (PACKAGE, Path(hydra.__file__).parent))
+    return ours and statement.startswith("raise")
+
+
+def _require_sweepable(cfg: DictConfig) -> None:
+    """Processes that a trainer starts repeat the command line, which under -m would be the whole sweep."""
+    choices = HydraConfig.get().runtime.choices
+    if HydraConfig.get().mode != RunMode.MULTIRUN or choices["hydra/launcher"] != "basic":
+        return
+    if "trainer" in JOBS.get(cfg.job, ()) and cfg.trainer is not None and _devices(cfg.trainer) > 1:
+        raise ValueError(
+            "-m cannot train on several devices in this launcher: add trainer.devices=1, "
+            "or a launcher that gives every job its own processes, such as hydra/launcher=submitit_slurm"
+        )
+
+
+def _devices(trainer: DictConfig) -> int:
+    devices, nodes = trainer.get("devices", "auto"), trainer.get("num_nodes", 1)
+    if OmegaConf.is_list(devices):
+        return len(devices) * nodes
+    if str(devices) not in ("auto", "-1"):
+        return (len(devices.split(",")) if "," in str(devices) else int(devices)) * nodes
+    if trainer.get("accelerator", "auto") == "cpu":
+        return int(nodes)
+    from torch.cuda import device_count  # slow to import, and needed in this case only
+
+    return max(device_count(), 1) * nodes
+
+
+def _do(cfg: DictConfig) -> float | None:
+    from vla import jobs
+
+    _require_sweepable(cfg)
+    if cfg.checkpoint is not None and cfg.job in ADOPTING:
+        from vla.policy import read_checkpoint
+
+        cfg = adopt(cfg, read_checkpoint(cfg.checkpoint).config, HydraConfig.get().overrides.task)
+    if "task" in JOBS.get(cfg.job, ()):
+        from vla.tasks.backend import choose_backend
+
+        choose_backend()  # before the check imports MuJoCo, which reads MUJOCO_GL at once
+    check(cfg)
+    return jobs.run(cfg)
+
+
+def _end(error: Exception) -> NoReturn:
+    if os.environ[TRACEBACKS] == "1" or not _meant_for_user(error):
+        raise error
+    print(f"error: {sentence(error)}", file=sys.stderr)
+    sys.exit(1)
+
+
+@hydra.main(version_base="1.3", config_path=str(CONF), config_name="config")
+def _compose(cfg: DictConfig) -> float | None:
+    try:
+        return _do(cfg)
+    except Exception as error:
+        if HydraConfig.get().mode == RunMode.MULTIRUN:
+            raise  # a sweeper may want to go on with the next job
+        _end(error)
+
+
+def main() -> None:
+    """Do what the command line says; what the user can mend ends in one sentence, unless HYDRA_FULL_ERROR=1."""
+    os.environ.setdefault(TRACEBACKS, os.environ.get("HYDRA_FULL_ERROR", "0"))
+    os.environ["HYDRA_FULL_ERROR"] = "1"  # otherwise Hydra prints errors itself
+    try:
+        _compose()
+    except KeyboardInterrupt:
+        sys.exit(130)
+    except Exception as error:
+        _end(error)
+
+
+if __name__ == "__main__":
+    main()
