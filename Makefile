@@ -3,8 +3,8 @@ SHELL := bash
 .DEFAULT_GOAL := run
 .PHONY: run test setup clean
 
-SUITABLE = import sys; sys.exit(not (3, 11) <= sys.version_info < (3, 14))
-PYTHON ?= $(firstword $(foreach name,python3 python3.13 python3.12 python3.11,$(shell $(name) -c '$(SUITABLE)' 2> /dev/null && echo $(name))))
+SUITABLE = import sys; sys.exit(not (3, 11) <= sys.version_info < (3, 13))
+PYTHON ?= $(firstword $(foreach name,python3 python3.12 python3.11,$(shell $(name) -c '$(SUITABLE)' 2> /dev/null && echo $(name))))
 VERSION = $(shell $(PYTHON) -c 'import sys; print("python%d.%d" % sys.version_info[:2])')
 
 # Rendering without a display needs these, on Linux.
@@ -28,7 +28,7 @@ test: setup
 setup: .venv/.installed
 
 .venv/.installed: pyproject.toml constraints.txt
-	$(if $(PYTHON),,$(error vla needs Python 3.11, 3.12 or 3.13: install one, or name it with make PYTHON=/path/to/python3))
+	$(if $(PYTHON),,$(error vla needs Python 3.11 or 3.12: install one, or name it with make PYTHON=/path/to/python3))
 	@$(PYTHON) -c 'import ensurepip' 2> /dev/null || $(call APT,$(VERSION)-venv) \
 	  || { echo "Python cannot make virtual environments here: install the package $(VERSION)-venv" >&2; exit 1; }
 	@! command -v apt-get > /dev/null || dpkg -s $(GL) > /dev/null 2>&1 || $(call APT,$(GL)) \

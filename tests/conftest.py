@@ -3,10 +3,6 @@
 from __future__ import annotations
 
 import os
-
-for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "LP_NUM_THREADS"):
-    os.environ.setdefault(name, "1")
-
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -20,6 +16,9 @@ if TYPE_CHECKING:
 
 CONF = Path(__file__).parents[1] / "conf"
 
+# Read by libraries when they are first imported, which tests do after this file.
+for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "LP_NUM_THREADS"):
+    os.environ.setdefault(name, "1")
 choose_backend()
 
 

@@ -23,10 +23,10 @@ def config(**changes: Any) -> DictConfig:
             "seed": 0,
             "checkpoint": None,
             "output": "outputs/runs/now",
-            "collect": {"episodes": 5, "seed": 0, "workers": None, "verify": True, "folder": "outputs/episodes/x"},
+            "collect": {"episodes": 5, "seed": 0, "workers": None, "folder": "outputs/episodes/x"},
             "evaluate": {"episodes": 5, "seed": 1_000_000, "workers": None, "recordings": 2},
             "preview": {"episodes": 1, "seed": 0},
-            "benchmark": {"names": ["train"]},
+            "benchmark": {"names": ["train"], "episodes": 1, "batches": 1, "steps": 1},
             "task": {
                 "_target_": "vla.tasks.tabletop.Tabletop",
                 "goal": {"_target_": "vla.tasks.goals.Lift", "height": 0.1},
@@ -141,10 +141,20 @@ def digested(cfg: DictConfig) -> str:
 
 def test_the_digest_is_stable_and_changes_with_the_episodes_only() -> None:
     expected = digested(config())
-    same = [{"seed": 3}, {"collect.episodes": 9}, {"output": "elsewhere"}, {"task.goal.height": 0.1}]
+    same: list[dict[str, Any]] = [
+        {"seed": 3},
+        {"collect.episodes": 9},
+        {"output": "elsewhere"},
+        {"task.goal.height": 0.1},
+    ]
     assert {digested(config(**change)) for change in same} == {expected}
     assert digested(config(**{"task.time_limit": 10})) == digested(config(**{"task.time_limit": 10.0}))
-    different = [{"collect.seed": 1}, {"task.blocks": 2}, {"expert.perturb": None}, {"task.randomize.size": 1}]
+    different: list[dict[str, Any]] = [
+        {"collect.seed": 1},
+        {"task.blocks": 2},
+        {"expert.perturb": None},
+        {"task.randomize.size": 1},
+    ]
     assert len({digested(config(**change)) for change in different} | {expected}) == 5
     by_hand = hashlib.sha256(b'[{"a": 1, "b": [2, "x"]}]').hexdigest()[:12]
     assert digest("task", _root_=OmegaConf.create({"task": {"a": 1, "b": [2.0, "x"]}})) == by_hand

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-
 from conftest import make_tabletop
+
 from vla.rollout import rollout
 from vla.tasks.expert import Perturbation, Waypoint
 
@@ -56,7 +56,8 @@ def test_actions_stay_within_the_spec(tabletop: Tabletop) -> None:
     with tabletop.blind():
         episode = rollout(tabletop, Waypoint(tabletop.spec, Perturbation(noise=1.0)), 2)
     for actions in (episode.actions, episode.executed):
-        assert (actions >= np.float32(tabletop.spec.low)).all() and (actions <= np.float32(tabletop.spec.high)).all()
+        assert (actions >= np.array(tabletop.spec.low, np.float32)).all()
+        assert (actions <= np.array(tabletop.spec.high, np.float32)).all()
 
 
 def test_without_the_simulators_truth_the_expert_says_so(tabletop: Tabletop) -> None:

@@ -39,7 +39,7 @@ PARTS = {
 LIBRARIES = {
     "hydra": ("vla.run", "vla.jobs", "vla.check", "vla.benchmark"),
     "omegaconf": ("vla.run", "vla.jobs", "vla.check", "vla.benchmark"),
-    "mujoco": ("vla.tasks",),
+    "mujoco": ("vla.tasks", "vla.benchmark"),
     "dm_control": ("vla.tasks",),
     "dm_env": ("vla.tasks",),
     "lightning": ("vla.models.learner", "vla.data.windows", "vla.jobs", "vla.benchmark"),

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
-
 from conftest import make_tabletop
+
 from vla.tasks.randomize import Colours, Placement, stream
 
 if TYPE_CHECKING:

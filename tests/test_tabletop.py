@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
-
 from conftest import make_tabletop
 
 if TYPE_CHECKING:

@@ -56,10 +56,15 @@ PLAIN: dict[str, Any] = {
     "seed": int,
     "checkpoint": str | None,
     "output": str,
-    "collect": {"episodes": int, "seed": int, "workers": int | None, "verify": bool, "folder": str},
+    "collect": {"episodes": int, "seed": int, "workers": int | None, "folder": str},
     "evaluate": {"episodes": int, "seed": int, "workers": int | None, "recordings": int},
     "preview": {"episodes": int, "seed": int},
-    "benchmark": {"names": list[Literal["collect", "loader", "train", "policy"]]},
+    "benchmark": {
+        "names": list[Literal["collect", "loader", "train", "policy"]],
+        "episodes": int,
+        "batches": int,
+        "steps": int,
+    },
 }
 GROUPS = tuple(dict.fromkeys(group for groups in JOBS.values() for group in groups))
 

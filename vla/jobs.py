@@ -17,10 +17,11 @@ from omegaconf import DictConfig, OmegaConf
 from vla.check import build
 
 if TYPE_CHECKING:
-    from lightning import Callback, LightningModule, Trainer
+    from lightning import Callback, Trainer
 
     from vla.data.episodes import EpisodeStore
     from vla.data.windows import Windows
+    from vla.models.learner import Learner
     from vla.policy import Policy
     from vla.spec import Agent, Environment, Recorder, Spec
     from vla.tasks.tabletop import Tabletop
@@ -231,12 +232,12 @@ def _trained(config: DictConfig) -> Path:
     return checkpoints / "last.ckpt"
 
 
-def make_learner(config: DictConfig, store: EpisodeStore) -> LightningModule:
+def make_learner(config: DictConfig, store: EpisodeStore) -> Learner:
     """The learner of a configuration's model, with a tokenizer fitted on the store's actions."""
     spec: Spec = store.spec
     tokenizer = build(config.tokenizer, spec=spec, statistics=store.statistics)
     model = build(config.model, spec=spec, tokenizer=tokenizer)
-    learner: LightningModule = build(config.learner, model=model, spec=spec, config=plain(config))
+    learner: Learner = build(config.learner, model=model, spec=spec, config=plain(config))
     return learner
 
 
@@ -253,12 +254,12 @@ def make_data(config: DictConfig, store: EpisodeStore, model: Any) -> Windows:
     return windows
 
 
-def make_trainer(config: DictConfig, checkpoints: Path | None) -> Trainer:
+def make_trainer(config: DictConfig, checkpoints: Path | None, *watching: Callback) -> Trainer:
     """The trainer of a configuration, which averages the weights and keeps its last checkpoint, if there is a place."""
     from lightning.pytorch.callbacks import EMAWeightAveraging, ModelCheckpoint, RichProgressBar
     from lightning.pytorch.loggers import CSVLogger
 
-    callbacks: list[Callback] = [RichProgressBar()]
+    callbacks: list[Callback] = [RichProgressBar(), *watching]
     if config.learner.ema:
         callbacks.append(EMAWeightAveraging(decay=config.learner.ema))
     if checkpoints is None:

@@ -69,7 +69,7 @@ class Policy:
         """Args: the model, with its tokenizer; what a step looks like."""
         self.model, self.spec = model.eval(), spec
         self.info: dict[str, Any] = {}
-        self._low, self._high = np.float32(spec.low), np.float32(spec.high)
+        self._low, self._high = np.array(spec.low, np.float32), np.array(spec.high, np.float32)
         self._frames: deque[dict[str, Tensor]] = deque(maxlen=model.history)
         self._chunk: deque[tuple[Array, Array]] = deque()
         self._instruction = ""

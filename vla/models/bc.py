@@ -171,8 +171,9 @@ class BC(Model):
     ) -> None:
         super().__init__(1, chunk, text(width=text_width), auxiliary, width, spec, tokenizer)
         self.shift = RandomShift(*shift)
-        self.images = nn.ModuleList(image(text_width=text_width) for _ in spec.cameras)
-        self.keypoints = nn.ModuleList(Keypoints(encoder.channels, keypoints) for encoder in self.images)
+        encoders = [image(text_width=text_width) for _ in spec.cameras]
+        self.images = nn.ModuleList(encoders)
+        self.keypoints = nn.ModuleList(Keypoints(encoder.channels, keypoints) for encoder in encoders)
         self.proprioception = Standardize(self.proprioception_width)
         features = len(spec.cameras) * keypoints * 2 + self.proprioception_width + text_width
         self.trunk = nn.Sequential(nn.Linear(features, width), nn.ReLU(), nn.Linear(width, width), nn.ReLU())
@@ -192,7 +193,7 @@ class BC(Model):
 
 
 def pixels(images: Tensor, size: int | None = None) -> Tensor:
-    """(B, T, H, W, 3) uint8 as (B·T, 3, H, W) float32 in 0 … 1, resized to `size`×`size` if one is given [px]."""
+    """(B, T, H, W, 3) uint8 as (B·T, 3, H, W) float32 in 0 … 1, resized to a square of `size` [px] if given."""
     x = images.flatten(0, 1).permute(0, 3, 1, 2).float().div_(255)
     if size is not None and x.shape[-2:] != (size, size):
         x = F.interpolate(x, (size, size), mode="bilinear")

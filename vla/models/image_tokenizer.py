@@ -1,6 +1,6 @@
 """Images as features that listen to the instruction, and features as a few tokens or keypoints.
 
-Shapes: N images, C channels, H×W pixels, h×w positions of a feature map, M tokens or keypoints.
+Shapes: N images, C channels, H by W pixels, h by w positions of a feature map, M tokens or keypoints.
 """
 
 from __future__ import annotations
@@ -9,6 +9,7 @@ import logging
 from abc import ABC, abstractmethod
 from pathlib import Path
 from typing import Any
+from urllib.request import urlopen
 
 import torch
 import torch.nn.functional as F
@@ -16,14 +17,16 @@ from torch import Tensor, nn
 
 log = logging.getLogger(__name__)
 
+WEIGHTS = "model.safetensors"  # the name under which timm publishes the weights of a model
+
 
 class FiLM(nn.Module):
-    """Scales and shifts every channel by a linear function of the text: (1 + γ)·x + β (arXiv 1709.07871).
+    """Scales and shifts every channel by a linear function of the text: (1 + gamma)·x + beta (arXiv 1709.07871).
 
     Args:
         text_width: length of the text vector.
         channels: C.
-        identity: start with γ = β = 0, so that a pretrained network is left as it was.
+        identity: start with gamma = beta = 0, so that a pretrained network is left as it was.
     """
 
     def __init__(self, text_width: int, channels: int, identity: bool) -> None:
@@ -73,15 +76,16 @@ class FilmConv(ImageEncoder):
             )
         super().__init__(channels[-1])
         inputs = [3, *channels[:-1]]
-        self.convs = nn.ModuleList(
+        convs = [
             nn.Conv2d(i, o, kernel, stride, kernel // 2)
             for i, o, kernel, stride in zip(inputs, channels, kernels, strides, strict=True)
-        )
-        for conv in self.convs:
+        ]
+        for conv in convs:
             # Without normalisation layers the signal must keep its size, or the attention over positions starts flat.
             nn.init.kaiming_normal_(conv.weight, nonlinearity="relu")
+        self.convs = nn.ModuleList(convs)
         self.films = nn.ModuleList(FiLM(text_width, c, identity=False) for c in channels)
-        self.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+        self.to(memory_format=torch.channels_last)
 
     def forward(self, images: Tensor, text: Tensor) -> Tensor:
         """(N, 3, H, W) float images in 0 … 1 and (N, text_width) text to (N, channels, h, w)."""
@@ -92,7 +96,7 @@ class FilmConv(ImageEncoder):
 
 
 class FilmEfficientNet(ImageEncoder):
-    """An EfficientNet with FiLM after every block and after its 1×1 projection, as in RT-1 (arXiv 2212.06817).
+    """An EfficientNet with FiLM after every block and after its final projection, as in RT-1 (arXiv 2212.06817).
 
     At the start every FiLM is the identity, so the features are exactly those of the EfficientNet.
 
@@ -125,7 +129,7 @@ class FilmEfficientNet(ImageEncoder):
         self.last_film = FiLM(text_width, channels, identity=True)
         self.register_buffer("mean", torch.tensor(net.pretrained_cfg["mean"]).view(3, 1, 1), persistent=False)
         self.register_buffer("std", torch.tensor(net.pretrained_cfg["std"]).view(3, 1, 1), persistent=False)
-        self.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+        self.to(memory_format=torch.channels_last)
 
     def forward(self, images: Tensor, text: Tensor) -> Tensor:
         """(N, 3, H, W) float images in 0 … 1 and (N, text_width) text to (N, channels, h, w)."""
@@ -144,29 +148,46 @@ def load_efficientnet(name: str, pretrained: bool | str) -> nn.Module:
     """
     import timm  # slow to import, and needed by this one encoder only
 
-    if name not in timm.list_models("*efficientnet*"):
-        raise ValueError(
-            f"'{name}' is no EfficientNet of timm, it has {', '.join(timm.list_models('efficientnet_b*'))}"
-        )
-    if pretrained is True or pretrained == "auto":
+    known = timm.list_models("*efficientnet*")
+    if name not in known:
+        raise ValueError(f"timm has no EfficientNet '{name}', it has {', '.join(known)}")
+    net: nn.Module = timm.create_model(name, num_classes=0)
+    if not pretrained:
+        log.info("%s starts at random", name)
+    elif isinstance(pretrained, str) and pretrained != "auto":
+        _load_weights(net, name, Path(pretrained))
+    else:
         try:
-            net: nn.Module = timm.create_model(name, pretrained=True, num_classes=0)
-        except (OSError, RuntimeError) as error:
+            _load_weights(net, name, fetch_weights(name))
+        except OSError as error:
+            reason = str(error).partition("\n")[0]
             if pretrained is True:
                 raise ValueError(
-                    f"the ImageNet weights of {name} cannot be fetched ({_first_line(error)}): give "
-                    "model.image.pretrained the path of a weights file, or false to start at random"
+                    f"the ImageNet weights of {name} cannot be fetched ({reason}): give model.image.pretrained the "
+                    "path of a weights file, or false to start at random"
                 ) from error
-            log.warning("%s starts at RANDOM: its ImageNet weights cannot be fetched (%s)", name, _first_line(error))
-        else:
-            log.info("%s starts from the ImageNet weights of timm", name)
-            return net
-    net = timm.create_model(name, pretrained=False, num_classes=0)
-    if isinstance(pretrained, str) and pretrained != "auto":
-        _load_weights(net, name, Path(pretrained))
-    elif not pretrained:
-        log.info("%s starts at random", name)
+            log.warning("%s starts at RANDOM: its ImageNet weights cannot be fetched (%s)", name, reason)
     return net
+
+
+def fetch_weights(name: str) -> Path:
+    """The file with timm's ImageNet weights of a model, downloaded unless it has been before.
+
+    Raises:
+        OSError: there are none, or the place where they are cannot be reached.
+    """
+    import timm
+    from huggingface_hub import constants, hf_hub_download, try_to_load_from_cache
+
+    config = timm.get_pretrained_cfg(name)
+    if config is None or config.hf_hub_id is None:
+        raise OSError("timm names none")
+    cached = try_to_load_from_cache(config.hf_hub_id, WEIGHTS)
+    if isinstance(cached, str):
+        return Path(cached)
+    # The download itself tries again for most of a minute before it gives up on a machine without network.
+    urlopen(constants.ENDPOINT, timeout=10).close()
+    return Path(hf_hub_download(config.hf_hub_id, WEIGHTS))
 
 
 def _load_weights(net: nn.Module, name: str, path: Path) -> None:
@@ -181,12 +202,8 @@ def _load_weights(net: nn.Module, name: str, path: Path) -> None:
     try:
         net.load_state_dict({key: value for key, value in weights.items() if not key.startswith("classifier.")})
     except RuntimeError as error:
-        raise ValueError(f"{path} does not hold the weights of timm's {name}: {_first_line(error)}") from error
+        raise ValueError(f"{path} does not hold the weights of timm's {name}: {str(error).splitlines()[-1]}") from error
     log.info("%s starts from the weights in %s", name, path)
-
-
-def _first_line(error: Exception) -> str:
-    return str(error).strip().partition("\n")[0]
 
 
 def _output_channels(block: nn.Module) -> int:

@@ -57,12 +57,14 @@ class Learner(LightningModule):
 
     def configure_model(self) -> None:
         """Compile in place, so that the names in a checkpoint stay those of the model."""
-        if self.device.type == "cpu":
-            # The backward pass of flash attention in bfloat16 is pathologically slow on CPUs.
-            torch.backends.cuda.enable_flash_sdp(False)
         if self._compile:
             self.model.compile()
             self._compile = False  # Lightning may call this hook again
+
+    def on_fit_start(self) -> None:
+        """On a CPU, do without flash attention: its backward pass in bfloat16 is pathologically slow there."""
+        if self.device.type == "cpu":
+            torch.backends.cuda.enable_flash_sdp(False)
 
     def configure_optimizers(self) -> Any:
         """AdamW, decaying only what has more than one dimension and is no embedding."""
@@ -125,8 +127,10 @@ class Learner(LightningModule):
         self.log("val/token_accuracy", self.accuracy)
         for index, (name, unit) in enumerate(zip(self._spec.action, self._spec.units, strict=True)):
             factor, readable = READABLE[unit]
-            self.errors[index].update(error[:, index] * factor)
-            self.log(f"val/error_{name}{f'_{readable}' if readable else ''}", self.errors[index])
+            metric = self.errors[index]
+            assert isinstance(metric, MeanMetric)
+            metric.update(error[:, index] * factor)
+            self.log(f"val/error_{name}{f'_{readable}' if readable else ''}", metric)
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """A checkpoint says what made it, in plain dicts that load without running code."""

@@ -25,7 +25,7 @@ class Layer(nn.Module):
     Args:
         width: E.
         heads: number of attention heads.
-        key_width: width of a head; heads × key_width need not be E.
+        key_width: width of a head; heads * key_width need not be E.
         dropout: of the attention weights and of the feed-forward output.
     """
 
@@ -133,9 +133,9 @@ class RT1(Model):
         return torch.cat(tokens, 2)
 
     def forward(self, batch: Batch) -> dict[str, Tensor]:
-        """logits: (B, T, k, D, K) for every frame, of which there may be fewer than `history`; with an auxiliary head, truth: (B, T, S), standardised.
+        """logits: (B, T, k, D, K) for every frame; with an auxiliary head, truth: (B, T, S), standardised.
 
-        A batch with (B, T, N, E) "tokens" from `encode` needs no images.
+        There may be fewer frames than `history`. A batch with (B, T, N, E) "tokens" from `encode` needs no images.
         """
         tokens = batch["tokens"] if "tokens" in batch else self.encode(batch)
         empty = tokens.new_zeros(*tokens.shape[:2], self.slots, tokens.shape[-1])
@@ -159,7 +159,7 @@ class RT1(Model):
 def attention_mask(frames: int, tokens: int, slots: int) -> Tensor:
     """(L, L) bool, true where position i may attend to j: nothing later, and no action slot to an action slot.
 
-    L is frames × (tokens + slots): image tokens first, then action slots, frame by frame.
+    L is frames * (tokens + slots): image tokens first, then action slots, frame by frame.
     """
     is_slot = (torch.arange(tokens + slots) >= tokens).repeat(frames)
     between_slots = is_slot[:, None] & is_slot[None, :]

@@ -67,9 +67,7 @@ def rotation_from_vector(vector: ArrayLike) -> Array:
 
 def vector_from_rotation(rotation: Array) -> Array:
     """(3,) rotation vector [rad] of a (3, 3) rotation whose angle is below pi."""
-    skew = np.array(
-        [rotation[2, 1] - rotation[1, 2], rotation[0, 2] - rotation[2, 0], rotation[1, 0] - rotation[0, 1]]
-    )
+    skew = np.array([rotation[2, 1] - rotation[1, 2], rotation[0, 2] - rotation[2, 0], rotation[1, 0] - rotation[0, 1]])
     sine = np.linalg.norm(skew) / 2
     if sine < 1e-12:
         return np.zeros(3)

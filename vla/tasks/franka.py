@@ -105,9 +105,11 @@ class Panda(composer.Entity):
         self._meshes = meshes
         self._add_assets()
         body = self._mjcf_root.worldbody.add("body", name="link0")
-        body.add("inertial", mass=0.629769, pos=(-0.041018, -0.00014, 0.049974), diaginertia=(0.00315, 0.00388, 0.004285))
+        body.add(
+            "inertial", mass=0.629769, pos=(-0.041018, -0.00014, 0.049974), diaginertia=(0.00315, 0.00388, 0.004285)
+        )
         self._add_mesh(body, "link0", SHELL)
-        self._joints = []
+        self._joints: list[mjcf.Element] = []
         for index, link in enumerate(LINKS):
             body = self._add_link(body, index, link)
         self._add_gripper(body)
@@ -138,7 +140,9 @@ class Panda(composer.Entity):
         body = parent.add("body", name=f"link{index + 1}", pos=link["pos"], quat=link["quat"], gravcomp=1)
         body.add("inertial", mass=link["mass"], pos=link["com"], fullinertia=link["inertia"])
         limits = (JOINT_LOW[index], JOINT_HIGH[index])
-        joint = body.add("joint", name=f"joint{index + 1}", axis=(0, 0, 1), range=limits, limited=True, armature=ARMATURE)
+        joint = body.add(
+            "joint", name=f"joint{index + 1}", axis=(0, 0, 1), range=limits, limited=True, armature=ARMATURE
+        )
         self._joints.append(joint)
         self._mjcf_root.actuator.add(
             "position",

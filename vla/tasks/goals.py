@@ -27,9 +27,8 @@ class Progress:
 class Goal(Protocol):
     """One kind of task."""
 
-    name: str
     hold_steps: int  # control steps in a row for which `reached` must hold
-    templates: Sequence[str]  # of the instruction; the slot {block} is the named block's colour
+    templates: tuple[str, ...]  # of the instruction; the slot {block} is the named block's colour
     releases: bool  # whether the block is let go at the destination
 
     def destination(self, progress: Progress) -> Array:
@@ -44,7 +43,6 @@ class Goal(Protocol):
 class PickPlace:
     """Put the named block on the pad and let go of it."""
 
-    name = "pick_place"
     releases = True
 
     def __init__(
@@ -74,7 +72,6 @@ class PickPlace:
 class Lift:
     """Lift the named block and keep it up."""
 
-    name = "lift"
     releases = False
 
     def __init__(

@@ -30,7 +30,7 @@ class Judge:
         self._height = 0.0
 
     def watch(self, progress: Progress, reached: bool, tcp: Array, lifted: Sequence[bool], target: int) -> None:
-        """Take note of one step: the truth, whether the goal holds, the tool point (3,), which blocks are in the air."""
+        """Note one step: the truth, whether the goal holds, the tool point (3,), which blocks are in the air."""
         self._held_for = self._held_for + 1 if reached else 0
         self._near |= bool(np.linalg.norm(tcp - progress.block) < REACH)
         self._lifted_other |= any(up for index, up in enumerate(lifted) if index != target)

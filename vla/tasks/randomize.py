@@ -18,7 +18,7 @@ from vla.spec import Array
 from vla.tasks.control import DOWN, HOME, MAX_OPENING, rotation_z, solve
 from vla.tasks.scene import COLOURS, PAD_RADIUS, BoundScene
 
-Range = Sequence[float]
+Range = tuple[float, float]  # low, high
 
 
 class Axis(Protocol):
@@ -112,9 +112,7 @@ class Friction:
 class Placement:
     """Where pad and blocks lie: evenly in a rectangle, apart from each other."""
 
-    def __init__(
-        self, x: Range, y: Range, yaw: Range = (0.0, 0.0), clearance: float = 0.03
-    ) -> None:
+    def __init__(self, x: Range, y: Range, yaw: Range = (0.0, 0.0), clearance: float = 0.03) -> None:
         """Args: ranges of centres [m] and block yaw [rad]; least gap between outlines [m]."""
         self.x, self.y, self.yaw, self.clearance = x, y, yaw, clearance
 
@@ -146,7 +144,8 @@ class Placement:
         yaws = random_state.uniform(*self.yaw, count)
         scene.place_pad(*centres[0])
         for index in range(count):
-            scene.place_block(index, *centres[index + 1], yaws[index])
+            x, y = centres[index + 1]
+            scene.place_block(index, x, y, yaws[index])
         return {"pad": _rounded(centres[0]), "blocks": _rounded(centres[1:]), "yaw": _rounded(yaws)}
 
 

@@ -46,7 +46,7 @@ WRIST_UP = (1.0, 0.0, 0.0)
 
 
 def look_at(position: Sequence[float] | Array, target: Sequence[float] | Array, up: Sequence[float] | Array) -> Array:
-    """(3, 3) rotation of a MuJoCo camera (looking along −z, y up) at `position` that looks at `target`."""
+    """(3, 3) rotation of a camera at `position` that looks at `target`: MuJoCo's look along their negative z, y up."""
     back = np.asarray(position, dtype=float) - np.asarray(target, dtype=float)
     back /= np.linalg.norm(back)
     right = np.cross(up, back)
@@ -117,7 +117,13 @@ class Scene(composer.Entity):
         visual.map.shadowclip, visual.map.shadowscale = 0.9, 0.8
         self._root.statistic.extent, self._root.statistic.center = 1.0, (0.4, 0, 0.2)
         self._root.asset.add(
-            "texture", type="skybox", builtin="gradient", rgb1=(0.78, 0.83, 0.88), rgb2=(0.55, 0.60, 0.66), width=64, height=384
+            "texture",
+            type="skybox",
+            builtin="gradient",
+            rgb1=(0.78, 0.83, 0.88),
+            rgb2=(0.55, 0.60, 0.66),
+            width=64,
+            height=384,
         )
 
     def _add_table(self) -> None:
@@ -175,9 +181,21 @@ class BoundScene:
 
     # Model fields that randomisation may change; everything else stays as compiled.
     RANDOMISABLE = (
-        "geom_rgba geom_size geom_friction geom_rbound geom_aabb body_mass body_inertia light_pos light_dir "
-        "light_diffuse cam_pos cam_quat cam_fovy bvh_aabb"
-    ).split()
+        "geom_rgba",
+        "geom_size",
+        "geom_friction",
+        "geom_rbound",
+        "geom_aabb",
+        "body_mass",
+        "body_inertia",
+        "light_pos",
+        "light_dir",
+        "light_diffuse",
+        "cam_pos",
+        "cam_quat",
+        "cam_fovy",
+        "bvh_aabb",
+    )
 
     def __init__(self, scene: Scene, physics: mjcf.Physics) -> None:
         """Args: the scene and the physics it was compiled into."""
@@ -274,7 +292,7 @@ class BoundScene:
     def shapes(self) -> list[Shape]:
         """The visible solids, for recorders."""
         model, shapes = self.model, []
-        kinds = {
+        kinds: dict[int, Literal["mesh", "box", "cylinder"]] = {
             int(mujoco.mjtGeom.mjGEOM_MESH): "mesh",
             int(mujoco.mjtGeom.mjGEOM_BOX): "box",
             int(mujoco.mjtGeom.mjGEOM_CYLINDER): "cylinder",

@@ -19,7 +19,7 @@ from vla.tasks.language import instruction
 from vla.tasks.outcome import Judge
 from vla.tasks.randomize import Axis, stream
 from vla.tasks.render import Renderer
-from vla.tasks.scene import BoundScene, Scene
+from vla.tasks.scene import COLOURS, BoundScene, Scene
 
 CONTROL_HZ = 10.0
 TRANSLATION = 0.04  # largest translation per step [m]
@@ -64,6 +64,7 @@ class TabletopTask(composer.Task):
         self.target = int(words.randint(len(self.bound.block_geoms)))
         self.instruction = instruction(self.goal.templates, words, block=self.bound.block_names[self.target])
         self.draws["language"] = {"instruction": self.instruction, "target": self.target}
+        self.draws["language"]["position"] = [round(float(x), 5) for x in self.bound.block_position(self.target)[:2]]
         data = self.bound.data
         self.controller.reset(data.qpos[self.bound.joints])
         self._command = np.append(self.controller.joints, data.qpos[self.bound.fingers].mean())
@@ -167,8 +168,10 @@ class Tabletop:
             shadows: whether the lamp casts shadows.
 
         Raises:
-            ValueError: an unknown camera.
+            ValueError: an unknown camera, or more blocks than there are colours to name them by.
         """
+        if not 1 <= blocks <= len(COLOURS):
+            raise ValueError(f"task.blocks is from 1 to {len(COLOURS)}, one colour each, not {blocks}")
         low = np.array([-TRANSLATION] * 3 + [-ROTATION] * 3 + [0.0])
         high = np.array([TRANSLATION] * 3 + [ROTATION] * 3 + [1.0])
         self.spec = Spec(
@@ -190,8 +193,9 @@ class Tabletop:
         unknown = sorted(set(cameras) - set(task.bound.cameras))
         if unknown or not cameras:
             raise ValueError(f"unknown cameras {unknown}; task.cameras may list {sorted(task.bound.cameras)}")
-        self.done, self.outcome, self.draws = True, "timeout", {}
-        self._renderer: Renderer | None = None
+        self.done, self.outcome = True, "timeout"
+        self.draws: dict[str, Any] = {}
+        self._rendering: Renderer | None = None
         self._blind = False
 
     def reset(self, seed: int) -> Observation:
@@ -228,19 +232,24 @@ class Tabletop:
 
     def close(self) -> None:
         """Free physics and GL."""
-        if self._renderer is not None:
-            self._renderer.close()
-            self._renderer = None
+        if self._rendering is not None:
+            self._rendering.close()
+            self._rendering = None
         self.dm_env.close()
+
+    @property
+    def renderer(self) -> Renderer:
+        """The renderer, made when first needed: blind environments need no GL."""
+        if self._rendering is None:
+            self._rendering = Renderer(self.task.bound.model, *self.spec.image_size)
+        return self._rendering
 
     def _observe(self) -> Observation:
         bound = self.task.bound
         rgb, depth = {}, {}
         if not self._blind:
-            if self._renderer is None:
-                self._renderer = Renderer(bound.model, *self.spec.image_size)
             for name in self.spec.cameras:
-                rgb[name], depth[name] = self._renderer.render(bound.data, bound.cameras[name])
+                rgb[name], depth[name] = self.renderer.render(bound.data, bound.cameras[name])
         return Observation(
             rgb=rgb,
             depth=depth,

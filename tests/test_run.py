@@ -1,0 +1,189 @@
+"""The command line as a user types it, in real processes: small, but every part is the real one."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+SMALL = (
+    "task.image_size=[32,32]",
+    "task.shadows=false",
+    "collect.episodes=24",
+    "collect.workers=1",
+    "trainer.max_steps=4",
+    "trainer.val_check_interval=2",
+    "trainer.accelerator=cpu",
+    "data.batch_size=8",
+    "data.validation_fraction=0.1",
+    "data.validation_windows=8",
+    "evaluate.episodes=2",
+    "evaluate.workers=1",
+    "task.time_limit=1.5",
+)
+# Collection needs time to succeed in; the time limit above is for the evaluation of a policy that knows nothing.
+COLLECTING = ("task.time_limit=10.0",)
+
+
+def vla(folder: Path, *arguments: str, ok: bool = True) -> subprocess.CompletedProcess[str]:
+    """Run `python -m vla.run` in `folder`; its exit status must be what the test expects."""
+    done = subprocess.run(
+        [sys.executable, "-m", "vla.run", *arguments], cwd=folder, capture_output=True, text=True, timeout=300
+    )
+    assert (done.returncode == 0) == ok, done.stdout + done.stderr
+    return done
+
+
+@pytest.fixture(scope="module")
+def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """An empty folder to work in, with the outcome of one small main job in it, in `run`."""
+    folder = tmp_path_factory.mktemp("home")
+    done = vla(folder, *SMALL, *COLLECTING, "output=run", "hydra.run.dir=run")
+    (folder / "printed.txt").write_text(done.stdout)
+    return folder
+
+
+def test_the_main_job_collects_trains_evaluates_and_records(home: Path) -> None:
+    report = json.loads((home / "run/report.json").read_text())
+    assert {
+        "success",
+        "episodes",
+        "successes",
+        "ci_low",
+        "ci_high",
+        "seeds",
+        "taxonomy",
+        "checkpoint",
+        "config",
+    } <= set(report)
+    assert report["episodes"] == 2 and report["errors"] == 0
+    assert report["config"]["collect"]["episodes"] == 24
+    for name in ("report.png", "rollouts.rrd", "checkpoints/last.ckpt", "metrics.csv"):
+        assert (home / "run" / name).stat().st_size > 0
+    last = (home / "printed.txt").read_text().strip().splitlines()[-1]
+    assert last.startswith(f"success {report['successes']}/2 (")
+
+
+def test_a_checkpoint_brings_its_task_and_model_and_takes_harder_scenes(home: Path) -> None:
+    arguments = ("checkpoint=run/checkpoints/last.ckpt", "evaluate.episodes=1", "evaluate.workers=1", "output=again")
+    vla(home, *arguments, "task/randomize=wide", "task.time_limit=1.0")
+    report = json.loads((home / "again/report.json").read_text())
+    assert report["config"]["task"]["image_size"] == [32, 32]
+    assert "purple" in report["config"]["task"]["randomize"]["colour"]["names"]
+    refused = vla(home, *arguments, "model=rt1_tiny", ok=False)
+    assert refused.stderr.count("\n") == 1 and "model=rt1_tiny" in refused.stderr
+
+
+def test_a_grid_collects_once_and_trains_every_cell(home: Path) -> None:
+    before = sorted((home / "outputs/episodes").iterdir())
+    done = vla(home, *SMALL, *COLLECTING, "job=train", "-m", "learner.lr=1e-3,3e-4", "seed=0,1")
+    assert sorted((home / "outputs/episodes").iterdir()) == before
+    assert done.stdout.count("24 episodes, 0 of them new") == 4
+    assert len(list((home / "outputs/sweeps").glob("*/*/checkpoints/last.ckpt"))) == 4
+
+
+def test_preview_shows_resets_and_their_draws(home: Path) -> None:
+    done = vla(home, "job=preview", "preview.episodes=2", "output=look")
+    assert (home / "look/preview.png").stat().st_size > 10_000 and (home / "look/preview.rrd").stat().st_size > 100_000
+    assert "placement" in done.stdout
+
+
+def test_export_writes_plain_files(home: Path) -> None:
+    vla(home, *SMALL, *COLLECTING, "job=export", "export.folder=plain")
+    assert len(list((home / "plain").glob("episode_*/manifest.json"))) == 24
+
+
+def test_a_killed_collection_goes_on_and_ends_up_the_same(home: Path, tmp_path: Path) -> None:
+    arguments = [*SMALL, *COLLECTING, "job=collect", f"collect.folder={tmp_path}/store", "collect.workers=2"]
+    process = subprocess.Popen([sys.executable, "-m", "vla.run", *arguments], cwd=home, stdout=subprocess.DEVNULL)
+    index = tmp_path / "store/index.jsonl"
+    deadline = time.monotonic() + 120
+    while time.monotonic() < deadline and (not index.exists() or index.read_text().count("\n") < 5):
+        time.sleep(0.02)
+    os.kill(process.pid, signal.SIGKILL)
+    process.wait()
+    assert 5 <= index.read_text().count("\n") < 24
+    vla(home, *arguments)
+    (reference,) = (home / "outputs/episodes").iterdir()
+    for file in reference.iterdir():
+        if file.suffix in (".bin", ".jsonl"):
+            assert (tmp_path / "store" / file.name).read_bytes() == file.read_bytes(), file.name
+
+
+BAD_INPUT = {
+    "misspelt key": (("colect.episodes=3",), "collect"),
+    "misspelt option": (("model=rt2",), "rt1"),
+    "wrong type": (("trainer.max_steps=many",), "trainer.max_steps"),
+    "unknown job": (("job=evalute",), "evaluate"),
+    "missing checkpoint": (("checkpoint=nowhere.ckpt",), "nowhere.ckpt"),
+    "no deployment": (("job=deploy", "checkpoint=run/checkpoints/last.ckpt"), "deploy="),
+    "no room on the table": (("job=preview", "task.blocks=4", "task.randomize.placement.x=[0.5,0.5]"), "no room"),
+    "no GPU": (("trainer=gpu", *(item for item in SMALL if "accelerator" not in item), *COLLECTING), "GPU"),
+}
+
+
+@pytest.mark.parametrize("name", BAD_INPUT)
+def test_bad_input_ends_in_one_clear_sentence(home: Path, name: str) -> None:
+    arguments, says = BAD_INPUT[name]
+    done = vla(home, *arguments, ok=False)
+    errors = [line for line in done.stderr.splitlines() if line.startswith("error: ")]
+    assert len(errors) == 1 and says in errors[0], done.stderr
+    assert "Traceback" not in done.stderr
+
+
+def test_a_checkpoint_that_is_cut_short_is_named(home: Path) -> None:
+    whole = (home / "run/checkpoints/last.ckpt").read_bytes()
+    (home / "cut.ckpt").write_bytes(whole[: len(whole) // 2])
+    done = vla(home, "checkpoint=cut.ckpt", ok=False)
+    assert "error: cut.ckpt" in done.stderr and "damaged" in done.stderr
+
+
+def test_a_checkpoint_of_other_cameras_is_refused(home: Path) -> None:
+    done = vla(home, "checkpoint=run/checkpoints/last.ckpt", "task.cameras=[front]", "evaluate.workers=1", ok=False)
+    assert "cameras" in done.stderr and "Traceback" not in done.stderr
+
+
+def test_a_damaged_store_is_named_and_left_alone(home: Path, tmp_path: Path) -> None:
+    (store,) = (home / "outputs/episodes").iterdir()
+    shutil.copytree(store, tmp_path / "store")
+    with open(tmp_path / "store/rgb_front.bin", "r+b") as file:
+        file.truncate(1000)
+    done = vla(home, *SMALL, *COLLECTING, "job=train", f"collect.folder={tmp_path}/store", ok=False)
+    assert "rgb_front.bin" in done.stderr and "Traceback" not in done.stderr
+    assert (tmp_path / "store/rgb_front.bin").stat().st_size == 1000
+
+
+def test_without_gl_the_error_says_what_to_install(home: Path) -> None:
+    environment = {**os.environ, "MUJOCO_GL": "egl", "__EGL_VENDOR_LIBRARY_FILENAMES": "/nowhere.json"}
+    done = subprocess.run(
+        [sys.executable, "-m", "vla.run", "job=preview", "preview.episodes=1"],
+        cwd=home,
+        env=environment,
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 1 and "libegl1" in done.stderr and "Traceback" not in done.stderr
+
+
+def test_benchmark_measures_against_floors(home: Path) -> None:
+    vla(home, *SMALL, *COLLECTING, "job=benchmark", "benchmark.episodes=1", "benchmark.batches=4", "benchmark.steps=4",
+        "output=speed")  # fmt: skip
+    measures = json.loads((home / "speed/benchmark.json").read_text())
+    assert set(measures) == {"collect", "loader", "train", "policy"}
+    for measure in measures.values():
+        assert set(measure) == {"value", "unit", "n", "floor", "ratio"} and measure["value"] > 0
+
+
+@pytest.mark.slow
+def test_rt1_in_bfloat16_trains_as_the_readme_says(home: Path) -> None:
+    small = [item for item in SMALL if "max_steps" not in item and "val_check" not in item]
+    vla(home, *small, *COLLECTING, "model=rt1", "trainer.precision=bf16", "job=train", "trainer.max_steps=1",
+        "data.batch_size=2", "data.validation_windows=2", "trainer.limit_val_batches=0", "output=rt1")  # fmt: skip
+    assert (home / "rt1/checkpoints/last.ckpt").stat().st_size > 100e6
