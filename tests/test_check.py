@@ -69,7 +69,7 @@ def test_an_unknown_key_is_named_with_what_was_probably_meant() -> None:
         ("task.image_size", [96], "task.image_size must be tuple[int, int], got [96]"),
         ("task.image_size", [96, "x"], "task.image_size must be tuple[int, int], got [96, 'x']"),
         ("task.goal", "lift", "task.goal must be Goal, got 'lift'"),
-        ("task.randomize.mass.factor", [0.5, "a"], "task.randomize.mass.factor must be Sequence[float], got"),
+        ("task.randomize.mass.factor", [0.5, "a"], "task.randomize.mass.factor must be tuple[float, float], got"),
         ("expert.perturb.start", None, "expert.perturb.start must be float, got None"),
         ("collect.workers", "all", "collect.workers must be int or null, got 'all'"),
         ("seed", "first", "seed must be int, got 'first'"),
@@ -112,9 +112,9 @@ def test_the_job_menu_is_the_table_of_jobs() -> None:
 )
 def test_a_target_outside_the_allowed_packages_is_refused(target: str) -> None:
     node = {"_target_": "vla.tasks.expert.Waypoint", "perturb": {"_target_": target}}
-    with pytest.raises(ValueError, match=r"perturb\._target_ must"):
+    with pytest.raises(ValueError, match=r"perturb\._target_ (must|is)"):
         build(node, spec=None)
-    with pytest.raises(ValueError, match=r"expert\.perturb\._target_ must"):
+    with pytest.raises(ValueError, match=r"expert\.perturb\._target_ (must|is)"):
         check(config(expert=node))
 
 

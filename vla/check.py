@@ -7,9 +7,9 @@ from __future__ import annotations
 
 import hashlib
 import inspect
+from importlib import import_module
 import json
 import os
-import pkgutil
 import types
 import typing
 from collections.abc import Collection, Iterable, Iterator, Mapping, MutableMapping, Sequence
@@ -157,7 +157,8 @@ def _locate(key: str, target: Any) -> type:
     if not isinstance(target, str) or not target.startswith(ALLOWED):
         raise ValueError(f"{key} must begin with {' or '.join(ALLOWED)}, got {target!r}")
     try:
-        found = pkgutil.resolve_name(target)
+        module, _, name = target.rpartition(".")
+        found = getattr(import_module(module), name)
     except (ImportError, AttributeError) as error:
         raise ValueError(f"{key} is {target}, which cannot be imported: {error}") from error
     # An allowed module may itself have imported something that is not, such as `os`.

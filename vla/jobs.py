@@ -215,15 +215,15 @@ def collected(config: DictConfig) -> EpisodeStore:
 
 def _trained(config: DictConfig) -> Path:
     """Path of the checkpoint that training leaves behind."""
-    store = collected(config)
     import lightning
 
     _quiet_lightning()
+    checkpoints = _output(config) / "checkpoints"
+    trainer = make_trainer(config, checkpoints)  # first: it knows whether the devices that were asked for are there
+    store = collected(config)
     lightning.seed_everything(config.seed, verbose=False)
     learner = make_learner(config, store)
     data = make_data(config, store, learner.model)
-    checkpoints = _output(config) / "checkpoints"
-    trainer = make_trainer(config, checkpoints)
     started = time.monotonic()
     trainer.fit(learner, datamodule=data, ckpt_path=config.checkpoint, weights_only=True)
     if trainer.interrupted:

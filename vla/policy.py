@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from pickle import UnpicklingError
 from typing import Any
+from zipfile import is_zipfile
 
 import numpy as np
 import torch
@@ -52,8 +53,11 @@ def read_checkpoint(path: str | Path) -> Checkpoint:
     if not path.is_file():
         raise ValueError(f"there is no checkpoint {path}: give checkpoint=FILE, such as outputs/runs/…/last.ckpt")
     try:
+        # Old pickles, which torch would read too, fail in any way they like.
+        if not is_zipfile(path):
+            raise UnpicklingError("not in the format of torch.save")
         content = torch.load(path, map_location="cpu", weights_only=True)
-    except (RuntimeError, EOFError, UnpicklingError, OSError) as error:
+    except (RuntimeError, UnpicklingError, OSError) as error:
         raise ValueError(f"{path} cannot be read as a checkpoint, it is damaged or something else") from error
     if not isinstance(content, dict) or not {"config", "spec", "state_dict"} <= set(content):
         raise ValueError(f"{path} is no checkpoint of this project: it carries no configuration and spec")

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import logging
 from abc import ABC, abstractmethod
+from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 from urllib.request import urlopen
@@ -150,7 +151,7 @@ def load_efficientnet(name: str, pretrained: bool | str) -> nn.Module:
 
     known = timm.list_models("*efficientnet*")
     if name not in known:
-        raise ValueError(f"timm has no EfficientNet '{name}', it has {', '.join(known)}")
+        raise ValueError(f"timm has no EfficientNet '{name}', it has {', '.join(get_close_matches(name, known, 5, 0))}")
     net: nn.Module = timm.create_model(name, num_classes=0)
     if not pretrained:
         log.info("%s starts at random", name)

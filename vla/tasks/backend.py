@@ -8,25 +8,33 @@ import sys
 from contextlib import suppress
 from importlib import import_module
 
+TRIED = "VLA_GL_WORKS"  # the backend that was seen to work, for the processes that this one starts
+PROBE = "import mujoco; mujoco.GLContext(8, 8).make_current()"
+
 
 def choose_backend() -> None:
     """Set MUJOCO_GL, unless it is set: EGL on a machine without a display, OSMesa where EGL does not work.
 
     Must run before MuJoCo is first imported, because it reads the variable then.
+
+    Raises:
+        RuntimeError: no GL implementation works on this machine.
     """
     # Mesa's software renderer and Triton, which PyTorch may import at any later time, each bring an LLVM of their own;
     # the process crashes if Triton's comes second.
     with suppress(ImportError):
         import_module("triton._C.libtriton")
-    if "MUJOCO_GL" in os.environ or os.environ.get("DISPLAY") or sys.platform != "linux":
+    chosen = os.environ.get("MUJOCO_GL")
+    if os.environ.get("DISPLAY") or sys.platform != "linux" or (chosen and chosen == os.environ.get(TRIED)):
         return
-    # A failing EGL can end the process, so it is tried in another one.
-    probe = "import mujoco; mujoco.GLContext(8, 8).make_current()"
-    for backend in ("egl", "osmesa"):
-        tried = subprocess.run(
-            [sys.executable, "-c", probe], env={**os.environ, "MUJOCO_GL": backend}, capture_output=True
-        )
-        if tried.returncode == 0:
-            os.environ["MUJOCO_GL"] = backend
+    candidates = [chosen] if chosen else ["egl", "osmesa"]
+    for backend in candidates:
+        environment = {**os.environ, "MUJOCO_GL": backend}
+        # A failing GL can end the process, so it is tried in another one.
+        if subprocess.run([sys.executable, "-c", PROBE], env=environment, capture_output=True).returncode == 0:
+            os.environ["MUJOCO_GL"] = os.environ[TRIED] = backend
             return
-    os.environ["MUJOCO_GL"] = "egl"
+    raise RuntimeError(
+        f"nothing here can render with MUJOCO_GL={' or '.join(candidates)}: install the packages libegl1 and "
+        "libgl1-mesa-dri, or libosmesa6, or set MUJOCO_GL to egl, osmesa or glfw"
+    )

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-
 import mujoco
 import numpy as np
 
@@ -16,23 +14,13 @@ class Renderer:
     """Renders a compiled model off screen; owns a GL context that belongs to the thread which made it."""
 
     def __init__(self, model: mujoco.MjModel, height: int, width: int) -> None:
-        """Args: the model; image size [px].
-
-        Raises:
-            RuntimeError: no GL implementation works on this machine.
-        """
+        """Args: the model; image size [px]."""
         self._model, self._height, self._width = model, height, width
         # The off-screen buffer is allocated with the context, so it must be asked for before.
         model.vis.global_.offwidth, model.vis.global_.offheight = width, height
-        try:
-            self._gl = mujoco.GLContext(width, height)
-            self._gl.make_current()
-            self._context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100)
-        except (AttributeError, ImportError, RuntimeError, mujoco.FatalError) as error:
-            raise RuntimeError(
-                f"cannot render with MUJOCO_GL={os.environ.get('MUJOCO_GL')}: {error}; "
-                "install libegl1 and libgl1-mesa-dri (or libosmesa6), or set MUJOCO_GL to egl, osmesa or glfw"
-            ) from error
+        self._gl = mujoco.GLContext(width, height)
+        self._gl.make_current()
+        self._context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100)
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self._context)
         self._context.readDepthMap = mujoco.mjtDepthMap.mjDEPTH_ZEROFAR
         self._scene = mujoco.MjvScene(model, maxgeom=model.ngeom + 50)

@@ -1,0 +1,95 @@
+"""Windows of noise in the form that the loader gives them, and small models to try on them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import torch
+from toy import SPEC
+
+from vla.models.action_tokenizer import Uniform
+from vla.models.bc import BC, Model
+from vla.models.image_tokenizer import FilmConv
+from vla.models.rt1 import RT1
+from vla.models.text import NGrams
+from vla.spec import Spec
+
+TINY_IMAGE = partial(FilmConv, [8, 8], [5, 3], [2, 1])
+TINY_TEXT = partial(NGrams, vocabulary=64)
+
+
+def make_batch(frames: int, chunk: int = 1, size: int = 4, spec: Spec = SPEC) -> dict[str, Any]:
+    """A batch of `size` windows with random images and actions, and sentences that differ."""
+    low, high = torch.tensor(spec.low), torch.tensor(spec.high)
+    return {
+        "rgb": {name: torch.randint(256, (size, frames, *spec.image_size, 3)).byte() for name in spec.cameras},
+        "proprio": torch.randn(size, frames, 2 * len(spec.joints) + 1),
+        "present": torch.ones(size, frames, dtype=torch.bool),
+        "instruction": [f"lift the block number {number}" for number in range(size)],
+        "action": low + (high - low) * torch.rand(size, frames, chunk, len(spec.action)),
+        "valid": torch.ones(size, frames, chunk, dtype=torch.bool),
+        "truth": torch.randn(size, frames, spec.truth_size),
+    }
+
+
+def with_text(model: Model, batch: dict[str, Any]) -> dict[str, Any]:
+    """The batch with its sentences as tokens, as the learner hands it over."""
+    return {**batch, "text": model.text.tokenize(batch["instruction"])}
+
+
+def make_bc(chunk: int = 1, auxiliary: float = 1.0, image: Callable[..., Any] = TINY_IMAGE) -> BC:
+    """A small BC without random shifts."""
+    return BC(
+        image,
+        TINY_TEXT,
+        chunk=chunk,
+        keypoints=8,
+        text_width=16,
+        width=64,
+        shift=(0, 0),
+        auxiliary=auxiliary,
+        spec=SPEC,
+        tokenizer=Uniform(bins=64, spec=SPEC),
+    )
+
+
+def make_rt1(
+    history: int = 3, chunk: int = 1, proprioception: bool = False, coordinates: bool = True, auxiliary: float = 1.0
+) -> RT1:
+    """A small RT-1 without dropout and random shifts."""
+    return RT1(
+        TINY_IMAGE,
+        TINY_TEXT,
+        history=history,
+        image_size=None,
+        learned_tokens=2,
+        coordinates=coordinates,
+        proprioception=proprioception,
+        chunk=chunk,
+        auxiliary=auxiliary,
+        text_width=16,
+        width=32,
+        layers=2,
+        heads=2,
+        key_width=16,
+        dropout=0.0,
+        shift=(0, 0),
+        spec=SPEC,
+        tokenizer=Uniform(bins=64, spec=SPEC),
+    )
+
+
+def overfit(model: Model, batch: dict[str, Any], steps: int = 150) -> torch.Tensor:
+    """Train on one batch; returns the mean error of the actions that are read, as a part of each one's range."""
+    optimizer = torch.optim.AdamW(model.parameters(), lr=3e-3)
+    for _ in range(steps):
+        optimizer.zero_grad()
+        model.loss(batch)["loss"].backward()
+        optimizer.step()
+    model.eval()
+    logits = model(batch)["logits"]
+    span = torch.tensor(model.spec.high) - torch.tensor(model.spec.low)
+    errors = (model.tokenizer.read(logits) - batch["action"][:, -logits.shape[1] :]).abs() / span
+    return errors.mean()

@@ -1,0 +1,99 @@
+"""The behaviour-cloning model, and what holds for every model."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import pytest
+import torch
+from fake_batch import make_batch, make_bc, make_rt1, overfit, with_text
+from toy import SPEC
+
+from vla.models.bc import Model, Standardize
+
+MODELS: dict[str, Callable[[], Model]] = {
+    "bc": make_bc,
+    "bc chunk": lambda: make_bc(chunk=3),
+    "rt1": make_rt1,
+    "rt1 chunk": lambda: make_rt1(chunk=2, proprioception=True),
+}
+every_model = pytest.mark.parametrize("make", MODELS.values(), ids=MODELS.keys())
+
+
+@every_model
+def test_shapes(make: Callable[[], Model]):
+    model = make()
+    batch = with_text(model, make_batch(model.history, model.chunk))
+    output = model(batch)
+    assert output["logits"].shape == (4, model.history, model.chunk, 3, 64)
+    assert output["truth"].shape == (4, model.history, SPEC.truth_size)
+    assert model.loss(batch)["loss"].shape == ()
+
+
+@every_model
+def test_overfits_one_batch(make: Callable[[], Model]):
+    torch.manual_seed(0)
+    model = make()
+    assert overfit(model, with_text(model, make_batch(model.history, model.chunk))) < 0.02
+
+
+@every_model
+def test_saves_and_loads_equal(make: Callable[[], Model]):
+    torch.manual_seed(0)
+    model, other = make(), make()
+    batch = with_text(model, make_batch(model.history, model.chunk))
+    model.loss(batch)  # gathers statistics, which must travel too
+    other.load_state_dict(model.state_dict())
+    assert torch.equal(model.eval()(batch)["logits"], other.eval()(batch)["logits"])
+
+
+@every_model
+def test_predictions_ignore_truth_and_labels(make: Callable[[], Model]):
+    model = make().eval()
+    batch = with_text(model, make_batch(model.history, model.chunk))
+    seen = {name: value for name, value in batch.items() if name not in ("truth", "action", "valid", "instruction")}
+    assert torch.equal(model(batch)["logits"], model(seen)["logits"])
+
+
+@every_model
+def test_the_instruction_matters(make: Callable[[], Model]):
+    model = make().eval()
+    batch = with_text(model, make_batch(model.history, model.chunk))
+    other = {**batch, "text": model.text.tokenize(["push the button"] * 4)}
+    assert not torch.allclose(model(batch)["logits"], model(other)["logits"])
+
+
+def test_without_weight_there_is_no_auxiliary_head():
+    model = make_bc(auxiliary=0.0)
+    losses = model.loss(with_text(model, make_batch(1)))
+    assert set(losses) == {"loss", "action_loss", "logits"}
+    assert losses["loss"] == losses["action_loss"]
+
+
+def test_padding_does_not_count_in_the_auxiliary_loss():
+    model = make_rt1().eval()
+    batch = with_text(model, make_batch(3))
+    batch["present"][:, 0] = False
+    other = {**batch, "truth": batch["truth"].clone()}
+    other["truth"][:, 0] = 99.0
+    assert model.loss(batch)["truth_loss"] == model.loss(other)["truth_loss"]
+
+
+def test_standardize_gathers_the_statistics_of_what_is_present():
+    torch.manual_seed(0)
+    standardize = Standardize(3)
+    values = torch.randn(50, 2, 3) * torch.tensor([0.1, 2.0, 0.0]) + torch.tensor([1.0, -3.0, 7.0])
+    present = torch.rand(50, 2) > 0.3
+    for part, there in zip(values.split(7), present.split(7), strict=True):
+        standardize(part, there)
+    assert torch.allclose(standardize.mean, values[present].mean(0), atol=1e-5)
+    assert torch.allclose(standardize.deviation[:2], values[present].std(0, correction=0)[:2], rtol=1e-4)
+    standard = standardize.eval()(values, present)
+    assert (standard[~present] == 0).all() and torch.isfinite(standard).all()
+    assert torch.allclose(standardize.inverse(standard)[present], values[present], atol=1e-4)
+
+
+def test_standardize_leaves_its_statistics_alone_outside_training():
+    standardize = Standardize(2).eval()
+    standardize(torch.ones(1, 1, 2), torch.ones(1, 1, dtype=torch.bool))
+    assert standardize.count == 0

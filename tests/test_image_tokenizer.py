@@ -1,0 +1,136 @@
+"""Image encoders, tokens, keypoints and the random shift."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+
+import pytest
+import timm
+import torch
+
+from vla.models import image_tokenizer
+from vla.models.image_tokenizer import FiLM, FilmConv, FilmEfficientNet, Keypoints, RandomShift, TokenLearner
+
+
+def test_film_starts_as_the_identity_where_it_should():
+    film = FiLM(8, 4, identity=True)
+    x = torch.randn(2, 4, 3, 3)
+    assert torch.equal(film(x, torch.randn(2, 8)), x)
+
+
+def test_film_scales_and_shifts_every_channel():
+    film = FiLM(1, 2, identity=True)
+    film.gamma.bias.data = torch.tensor([1.0, 0.0])
+    film.beta.bias.data = torch.tensor([0.0, 5.0])
+    out = film(torch.ones(1, 2, 1, 1), torch.zeros(1, 1)).flatten()
+    assert out.tolist() == [2.0, 6.0]
+
+
+def test_at_the_start_the_efficientnet_is_the_plain_one_bit_for_bit():
+    torch.manual_seed(0)
+    plain = timm.create_model("efficientnet_b0", num_classes=0).eval()
+    ours = FilmEfficientNet("efficientnet_b0", pretrained=False, channels=32, text_width=8).eval()
+    blocks = torch.nn.ModuleList(block for stage in plain.blocks for block in stage)
+    for module, source in (
+        (ours.stem, torch.nn.Sequential(plain.conv_stem, plain.bn1)),
+        (ours.blocks, blocks),
+        (ours.top, torch.nn.Sequential(plain.conv_head, plain.bn2)),
+    ):
+        module.load_state_dict(source.state_dict())
+    images = torch.rand(2, 3, 64, 64)
+    plain.to(memory_format=torch.channels_last)
+    with torch.inference_mode():
+        expected = ours.projection(plain.forward_features((images - ours.mean) / ours.std))
+        assert torch.equal(ours(images, torch.randn(2, 8)), expected)
+    assert len(ours.films) == len(ours.blocks) == 16
+
+
+def test_weights_come_from_a_file(tmp_path: Path):
+    source = timm.create_model("efficientnet_b0")
+    torch.save(source.state_dict(), tmp_path / "weights.pth")
+    net = image_tokenizer.load_efficientnet("efficientnet_b0", str(tmp_path / "weights.pth"))
+    assert torch.equal(net.get_parameter("conv_stem.weight"), source.conv_stem.weight)
+    with pytest.raises(ValueError, match="does not hold the weights of timm's efficientnet_b1"):
+        image_tokenizer.load_efficientnet("efficientnet_b1", str(tmp_path / "weights.pth"))
+
+
+def test_weights_are_never_random_in_silence(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture):
+    def unreachable(name: str) -> Path:
+        raise OSError("no network")
+
+    monkeypatch.setattr(image_tokenizer, "fetch_weights", unreachable)
+    with pytest.raises(ValueError, match=r"no network.*path of a weights file, or false"):
+        image_tokenizer.load_efficientnet("efficientnet_b0", True)
+    with caplog.at_level(logging.WARNING, logger=image_tokenizer.__name__):
+        image_tokenizer.load_efficientnet("efficientnet_b0", "auto")
+    assert "starts at RANDOM" in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("name", "pretrained", "message"),
+    [("efficientnet_b33", False, "efficientnet_b3"), ("efficientnet_b0", "nowhere.pth", "no file nowhere.pth")],
+)
+def test_what_does_not_exist_is_named(name: str, pretrained: bool | str, message: str):
+    with pytest.raises(ValueError, match=message):
+        image_tokenizer.load_efficientnet(name, pretrained)
+
+
+def test_film_conv_listens_to_the_text():
+    encoder = FilmConv([4, 6], [5, 3], [2, 2], text_width=8)
+    images = torch.rand(1, 3, 16, 16).expand(2, -1, -1, -1)
+    features = encoder(images, torch.randn(2, 8))
+    assert features.shape == (2, 6, 4, 4) and not torch.allclose(features[0], features[1])
+
+
+def test_film_conv_wants_lists_of_one_length():
+    with pytest.raises(ValueError, match="one entry per convolution"):
+        FilmConv([4, 6], [5], [2, 2], text_width=8)
+
+
+def test_81_positions_become_8_tokens():
+    learner = TokenLearner(512)
+    assert learner(torch.randn(2, 512, 9, 9)).shape == (2, 8, 512)
+    assert sum(p.numel() for p in learner.parameters()) == 2 * 512 + 512 * 64 + 64 + 64 * 8 + 8  # 34 k
+
+
+def test_tokens_are_weighted_means_of_the_features_themselves():
+    constant = torch.arange(6.0)[None, :, None, None].expand(1, 6, 3, 3)
+    assert torch.allclose(TokenLearner(6)(constant)[0, 0], torch.arange(6.0))
+
+
+def test_tokens_and_keypoints_say_where_they_look():
+    features = torch.zeros(1, 2, 5, 5)
+    features[0, 0, 1, 4] = 100.0
+    keypoints = Keypoints(2, 1)
+    keypoints.score.weight.data = torch.tensor([[1.0, 0.0]])
+    assert keypoints(features).flatten().tolist() == pytest.approx([1.0, -0.5])  # x right, y down
+
+    learner = TokenLearner(2, tokens=3, coordinates=True)
+    assert learner(features).shape == (1, 3, 4)
+    assert torch.allclose(learner(torch.ones(1, 2, 5, 5))[..., 2:], torch.zeros(1, 3, 2), atol=1e-6)
+
+
+def test_a_clip_is_shifted_as_one_and_clips_differ():
+    torch.manual_seed(0)
+    images = torch.randint(1, 256, (8, 1, 64, 64, 3)).byte().expand(-1, 3, -1, -1, -1)
+    shifted = RandomShift(16, 32)(images)  # up to 4 px up or down, 8 px left or right
+    assert shifted.shape == images.shape and shifted.dtype == torch.uint8
+    assert torch.equal(shifted[:, 0], shifted[:, 2])
+    assert torch.equal(shifted[:, :, 4:-4, 8:-8].unique(), images.unique())
+    offsets = set()
+    for before, after in zip(images[:, 0], shifted[:, 0], strict=True):
+        found = [
+            (y, x)
+            for y in range(-4, 5)
+            for x in range(-8, 9)
+            if torch.equal(after[4:-4, 8:-8], before[4 + y : 60 + y, 8 + x : 56 + x])
+        ]
+        assert len(found) == 1
+        offsets.add(found[0])
+    assert len(offsets) > 4
+
+
+def test_outside_training_nothing_is_shifted():
+    images = torch.randint(256, (2, 1, 16, 16, 3)).byte()
+    assert RandomShift(64, 64).eval()(images) is images

@@ -1,0 +1,159 @@
+"""What the learner optimises, logs and leaves behind."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import lightning
+import pytest
+import torch
+from fake_batch import make_batch, make_bc, make_rt1
+from lightning.pytorch.callbacks import EMAWeightAveraging
+from torch.utils.data import DataLoader
+from toy import SPEC
+
+from vla.models.bc import Model
+from vla.models.learner import Learner
+from vla.policy import read_checkpoint
+
+CONFIG = {"model": {"_target_": "vla.models.bc.BC", "shift": [0, 0]}, "seed": 0}
+
+
+def make_learner(model: Model | None = None, **options: Any) -> Learner:
+    return Learner(**options, model=model or make_bc(), spec=SPEC, config=CONFIG)
+
+
+def make_trainer(steps: int, *callbacks: lightning.Callback, precision: Any = "32-true") -> lightning.Trainer:
+    return lightning.Trainer(
+        accelerator="cpu",
+        max_steps=steps,
+        precision=precision,
+        logger=False,
+        callbacks=list(callbacks),
+        enable_checkpointing=False,
+        enable_progress_bar=False,
+        enable_model_summary=False,
+        num_sanity_val_steps=0,
+    )
+
+
+def loader(batch: dict[str, Any], steps: int) -> DataLoader[Any]:
+    return DataLoader([batch] * steps, batch_size=None)  # type: ignore[arg-type]
+
+
+def fit(learner: Learner, batch: dict[str, Any], steps: int, **options: Any) -> lightning.Trainer:
+    trainer = make_trainer(steps, **options)
+    trainer.fit(learner, loader(batch, steps), loader(batch, 1))
+    return trainer
+
+
+def test_training_lowers_the_loss_and_validation_reports_errors_in_readable_units():
+    torch.manual_seed(0)
+    batch = make_batch(1)
+    untrained = fit(make_learner(), batch, 1).callback_metrics
+    trained = fit(make_learner(lr=3e-3, warmup_steps=5), batch, 100).callback_metrics
+    assert trained["val/loss"] < untrained["val/loss"]
+    names = {name for name in trained if name.startswith("val/error_")}
+    assert names == {"val/error_x_mm", "val/error_y_mm", "val/error_gripper"}
+    assert trained["val/error_x_mm"] < 10 < 100 * untrained["val/error_x_mm"]
+    assert 0 <= trained["val/token_accuracy"] <= 1
+
+
+def test_the_error_of_a_component_is_the_mean_distance_over_what_is_valid():
+    learner = make_learner(make_bc(auxiliary=0.0)).eval()
+    batch = make_batch(1)
+    batch["valid"][0] = False
+    metrics = make_trainer(1).validate(learner, loader(batch, 1), verbose=False)[0]
+    logits = learner.model(learner.prepare(batch))["logits"]
+    error = (learner.model.tokenizer.read(logits) - batch["action"]).abs()[1:, ..., 0].mean() * 1000
+    assert metrics["val/error_x_mm"] == pytest.approx(error.item(), rel=1e-4)
+
+
+@pytest.mark.parametrize("model", [make_bc(), make_rt1()], ids=["bc", "rt1"])
+def test_bfloat16_trains(model: Model):
+    metrics = fit(make_learner(model), make_batch(model.history), 2, precision="bf16").callback_metrics
+    assert torch.isfinite(metrics["val/loss"])
+
+
+def test_a_loss_that_is_not_finite_stops_training_and_names_the_step():
+    batch = make_batch(1)
+    batch["proprio"][:] = math.nan
+    with pytest.raises(ValueError, match="at step 0"):
+        fit(make_learner(), batch, 1)
+
+
+def test_schedules():
+    def rates(schedule: Any) -> list[float]:
+        seen: list[float] = []
+
+        class Watch(lightning.Callback):
+            def on_train_batch_start(self, trainer: Any, *_: Any) -> None:
+                seen.append(trainer.optimizers[0].param_groups[0]["lr"])
+
+        learner = make_learner(lr=1.0, warmup_steps=4, schedule=schedule)
+        make_trainer(12, Watch()).fit(learner, loader(make_batch(1), 12))
+        return seen
+
+    cosine, constant = rates("cosine"), rates("constant")
+    assert cosine[:5] == constant[:5] == sorted(cosine[:5])
+    assert cosine[4:] == sorted(cosine[4:], reverse=True) and cosine[4] == 1.0 and cosine[-1] < 0.1
+    assert set(constant[4:]) == {1.0}
+
+
+def test_weight_decay_spares_biases_norms_and_embeddings():
+    learner = make_learner(make_rt1(), weight_decay=0.5)
+    learner.trainer = make_trainer(1)
+    decayed, spared = learner.configure_optimizers()["optimizer"].param_groups
+    model = learner.model
+    names = {id(parameter): name for name, parameter in model.named_parameters()}
+    spared_names = {names[id(parameter)] for parameter in spared["params"]}
+    assert decayed["weight_decay"] == 0.5 and spared["weight_decay"] == 0.0
+    assert {"positions.weight", "text.embedding.weight", "head.bias", "layers.0.attention_norm.weight"} <= spared_names
+    assert "head.weight" in {names[id(parameter)] for parameter in decayed["params"]}
+    assert len(decayed["params"]) + len(spared["params"]) == len(names)
+
+
+@pytest.mark.parametrize("averaging", [[], [EMAWeightAveraging(decay=0.9)]], ids=["plain", "averaged"])
+def test_a_checkpoint_holds_what_it_takes_to_build_the_policy(averaging: list[lightning.Callback], tmp_path: Path):
+    learner = make_learner()
+    trainer = make_trainer(3, *averaging)
+    trainer.fit(learner, loader(make_batch(1), 3))
+    trainer.save_checkpoint(tmp_path / "last.ckpt")
+
+    checkpoint = read_checkpoint(tmp_path / "last.ckpt")
+    assert checkpoint.config == CONFIG and checkpoint.spec == SPEC
+    model = make_bc()
+    checkpoint.restore(model)
+    batch = learner.prepare(make_batch(1))
+    assert torch.equal(model.eval()(batch)["logits"], learner.model.eval()(batch)["logits"])
+
+
+def test_going_on_from_a_checkpoint_gives_what_one_run_gives(tmp_path: Path):
+    batch = make_batch(1)
+    torch.manual_seed(0)
+    start = make_bc()
+    ends = []
+    for stop in (None, 2):
+        model = make_bc()
+        model.load_state_dict(start.state_dict())
+        learner = make_learner(model, schedule="constant", warmup_steps=2)
+        if stop:
+            trainer = make_trainer(stop)
+            trainer.fit(learner, loader(batch, 4))
+            trainer.save_checkpoint(tmp_path / "half.ckpt")
+            learner = make_learner(make_bc(), schedule="constant", warmup_steps=2)
+        path = tmp_path / "half.ckpt" if stop else None
+        make_trainer(4).fit(learner, loader(batch, 4), ckpt_path=path, weights_only=True)
+        ends.append(learner.model.state_dict())
+    assert ends[0].keys() == ends[1].keys()
+    assert all(torch.allclose(ends[0][name], ends[1][name], atol=1e-6) for name in ends[0])
+
+
+def test_compiling_keeps_the_names_in_the_checkpoint():
+    learner = make_learner(make_bc(auxiliary=0.0), compile=True)
+    plain = make_bc(auxiliary=0.0)
+    plain.load_state_dict(learner.model.state_dict())
+    learner.configure_model()
+    assert learner.model.state_dict().keys() == plain.state_dict().keys()

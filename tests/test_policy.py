@@ -1,0 +1,177 @@
+"""The policy as an agent, and the files it comes from."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from fake_batch import make_bc, make_rt1
+from toy import SPEC, ToyEnvironment
+
+from vla.models.bc import Model
+from vla.policy import Checkpoint, Policy, read_checkpoint
+from vla.rollout import rollout
+from vla.spec import Observation
+
+
+def observations(count: int, seed: int = 0) -> list[Observation]:
+    environment = ToyEnvironment()
+    seen = [environment.reset(seed)]
+    while len(seen) < count:
+        seen.append(environment.step(np.array([0.02, -0.01, 1.0])))
+    return seen
+
+
+def act(policy: Policy, seen: list[Observation]) -> np.ndarray:
+    return np.stack([policy.act(observation) for observation in seen])
+
+
+def whole_window(model: Model, seen: list[Observation]) -> torch.Tensor:
+    """Logits (k, D, K) of the last of the given frames, all of which the model sees as images."""
+
+    def stack(values: list[np.ndarray]) -> torch.Tensor:
+        return torch.from_numpy(np.stack(values))[None]
+
+    proprio = [np.float32([*o.joints, *o.velocities, o.gripper]) for o in seen]
+    batch = {
+        "rgb": {camera: stack([o.rgb[camera] for o in seen]) for camera in SPEC.cameras},
+        "proprio": stack(proprio),
+        "present": torch.ones(1, len(seen), dtype=torch.bool),
+        "text": model.text.tokenize([seen[0].instruction]),
+    }
+    with torch.inference_mode():
+        logits: torch.Tensor = model(batch)["logits"][0, -1]
+    return logits
+
+
+@pytest.mark.parametrize("make", [make_bc, make_rt1], ids=["bc", "rt1"])
+def test_plays_an_episode_within_the_limits(make: Callable[[], Model]):
+    policy = Policy(make(), replace(SPEC, high=(0.001, 0.05, 1.0)))
+    episode = rollout(ToyEnvironment(), policy, seed=3)
+    assert episode.actions.shape == (40, 3) and episode.actions.dtype == np.float32
+    assert episode.actions[:, 0].max() <= np.float32(0.001)
+    assert policy.info["probabilities"].shape == (3, 64)
+    assert policy.info["probabilities"].dtype == np.float32
+    assert policy.info["probabilities"].sum(-1) == pytest.approx(np.ones(3), abs=1e-5)
+
+
+@pytest.mark.parametrize("proprioception", [False, True])
+def test_kept_tokens_give_what_the_whole_window_gives(proprioception: bool):
+    model = make_rt1(history=3, proprioception=proprioception)
+    policy = Policy(model, SPEC)
+    seen = observations(6)
+    policy.reset(seen[0].instruction, 0)
+    for step, observation in enumerate(seen):
+        policy.act(observation)
+        logits = whole_window(model, seen[max(0, step - 2) : step + 1])
+        assert policy.info["probabilities"] == pytest.approx(logits[0].softmax(-1).numpy(), abs=1e-5)
+
+
+def test_only_the_newest_frame_is_encoded():
+    model = make_rt1(history=3)
+    policy = Policy(model, SPEC)
+    frames = []
+    model.image.register_forward_pre_hook(lambda module, inputs: frames.append(len(inputs[0])))
+    act(policy, observations(5))
+    assert frames == [1] * (5 * len(SPEC.cameras))
+
+
+@pytest.mark.parametrize("make", [make_bc, make_rt1], ids=["bc", "rt1"])
+def test_reset_forgets(make: Callable[[], Model]):
+    policy = Policy(make(), SPEC)
+    seen = observations(4)
+    policy.reset(seen[0].instruction, 0)
+    first = act(policy, seen)
+    policy.reset(seen[0].instruction, 1)
+    assert np.array_equal(act(policy, seen), first)
+
+
+def test_another_instruction_starts_afresh():
+    model = make_rt1(history=3)
+    policy, fresh = Policy(model, SPEC), Policy(model, SPEC)
+    seen = observations(4)
+    act(policy, seen[:3])
+    changed = replace(seen[3], instruction="push the button")
+    fresh.reset("push the button", 0)
+    assert np.array_equal(policy.act(changed), fresh.act(changed))
+
+
+@pytest.mark.parametrize("make", [lambda: make_bc(chunk=3), lambda: make_rt1(chunk=3)], ids=["bc", "rt1"])
+def test_a_chunk_is_executed_action_by_action(make: Callable[[], Model]):
+    model = make()
+    policy = Policy(model, SPEC)
+    seen = observations(4)
+    actions = act(policy, seen)
+    planned = [
+        model.tokenizer.read(whole_window(model, part)).numpy()
+        for part in (seen[:1], seen[max(0, 4 - model.history) :])
+    ]
+    expected = np.clip(np.concatenate([planned[0], planned[1][:1]]), SPEC.low, SPEC.high)
+    assert actions == pytest.approx(expected, abs=1e-5)
+
+
+def test_predictions_ignore_truth():
+    policy = Policy(make_bc(), SPEC)
+    (seen,) = observations(1)
+    with_truth = policy.act(seen)
+    assert np.array_equal(policy.act(replace(seen, truth=None)), with_truth)
+
+
+@pytest.mark.parametrize(
+    "rgb",
+    [
+        {"front": np.zeros((16, 16, 3), np.uint8)},
+        {"front": np.zeros((16, 16, 3), np.uint8), "wrist": np.zeros((8, 16, 3), np.uint8)},
+    ],
+    ids=["camera", "size"],
+)
+def test_observations_of_another_kind_are_refused(rgb: dict[str, np.ndarray]):
+    policy = Policy(make_bc(), SPEC)
+    with pytest.raises(ValueError, match="wrist"):
+        policy.act(replace(observations(1)[0], rgb=rgb))
+
+
+def save(path: Path, **changes: object) -> Path:
+    state = {f"model.{name}": value for name, value in make_bc().state_dict().items()}
+    content = {"config": {"seed": 0}, "spec": SPEC.to_dict(), "state_dict": state, **changes}
+    torch.save({name: value for name, value in content.items() if value is not None}, path)
+    return path
+
+
+def test_a_checkpoint_is_read_as_it_was_written(tmp_path: Path):
+    checkpoint = read_checkpoint(save(tmp_path / "a.ckpt"))
+    assert checkpoint.config == {"seed": 0} and checkpoint.spec == SPEC
+    checkpoint.restore(make_bc())
+
+
+def test_weights_of_another_model_are_refused(tmp_path: Path):
+    checkpoint = read_checkpoint(save(tmp_path / "a.ckpt"))
+    with pytest.raises(ValueError, match="does not fit the model"):
+        Checkpoint(checkpoint.path, checkpoint.config, checkpoint.spec, checkpoint.state).restore(make_rt1())
+
+
+def test_files_that_are_no_checkpoint_are_refused_in_one_sentence(tmp_path: Path):
+    whole = save(tmp_path / "whole.ckpt").read_bytes()
+    for name, content in {"torn": whole[: len(whole) // 2], "empty": b"", "text": b"hello\n"}.items():
+        path = tmp_path / f"{name}.ckpt"
+        path.write_bytes(content)
+        with pytest.raises(ValueError, match=f"{name}.ckpt cannot be read"):
+            read_checkpoint(path)
+    with pytest.raises(ValueError, match="no checkpoint of this project"):
+        read_checkpoint(save(tmp_path / "foreign.ckpt", spec=None))
+    with pytest.raises(ValueError, match="there is no checkpoint"):
+        read_checkpoint(tmp_path / "missing.ckpt")
+
+
+def test_a_checkpoint_cannot_run_code(tmp_path: Path):
+    class Attack:
+        def __reduce__(self) -> tuple[Callable[..., None], tuple[str]]:
+            return Path.touch, (tmp_path / "attacked",)  # type: ignore[return-value]
+
+    with pytest.raises(ValueError, match="cannot be read"):
+        read_checkpoint(save(tmp_path / "attack.ckpt", config=Attack()))
+    assert not (tmp_path / "attacked").exists()

@@ -1,0 +1,116 @@
+"""RT-1 against its specification (arXiv 2212.06817)."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import partial
+
+import pytest
+import torch
+from fake_batch import make_batch, make_rt1, with_text
+from toy import SPEC
+
+from vla.models.action_tokenizer import RT1 as RT1Tokenizer
+from vla.models.image_tokenizer import FilmEfficientNet
+from vla.models.rt1 import RT1, attention_mask
+from vla.models.text import NGrams
+
+
+def test_the_mask_is_causal_and_hides_actions_from_actions():
+    # two frames of two image tokens and two action slots
+    expected = [
+        "1.......",
+        "11......",
+        "11......",
+        "11......",
+        "11111...",
+        "111111..",
+        "11..11..",
+        "11..11..",
+    ]
+    mask = attention_mask(frames=2, tokens=2, slots=2)
+    assert ["".join("1" if allowed else "." for allowed in row) for row in mask.tolist()] == expected
+
+
+def test_no_gradient_reaches_a_frame_from_an_earlier_prediction():
+    model = make_rt1(history=3)
+    batch = with_text(model, make_batch(3))
+    tokens = model.encode(batch).detach().requires_grad_()
+    for frame in range(3):
+        (gradient,) = torch.autograd.grad(model({**batch, "tokens": tokens})["logits"][:, frame].sum(), tokens)
+        assert (gradient[:, frame + 1 :] == 0).all()
+        assert (gradient[:, : frame + 1].abs().sum((0, 2, 3)) > 0).all()
+
+
+def test_one_pass_equals_a_loop_over_the_action_tokens():
+    model = make_rt1(history=2, chunk=2).eval()
+    tokens = model.encode(with_text(model, make_batch(2)))  # (B, 2, N, E)
+    empty = tokens.new_zeros(4, model.slots, tokens.shape[-1])
+    sequence = torch.cat([tokens[:, 0], empty, tokens[:, 1], empty], 1)
+    start = sequence.shape[1] - model.slots  # of the newest frame's action slots
+    loop = [model.head(model.transform(sequence[:, : start + slot])[:, -1]) for slot in range(model.slots)]
+    one_pass = model({"tokens": tokens})["logits"][:, -1].flatten(1, 2)
+    assert torch.allclose(torch.stack(loop, 1), one_pass, atol=1e-5)
+
+
+def test_fewer_frames_than_the_history_give_what_the_first_slots_of_a_full_window_give():
+    model = make_rt1(history=3).eval()
+    tokens = model.encode(with_text(model, make_batch(3)))
+    full = model({"tokens": tokens})["logits"]
+    for frames in (1, 2):
+        assert torch.allclose(model({"tokens": tokens[:, :frames]})["logits"], full[:, :frames], atol=1e-5)
+
+
+def test_frames_are_encoded_independently():
+    model = make_rt1(history=3, proprioception=True).eval()
+    batch = with_text(model, make_batch(3))
+    newest = {name: batch[name][:, 2:] for name in ("proprio", "present")}
+    rgb = {camera: images[:, 2:] for camera, images in batch["rgb"].items()}
+    alone = model.encode({**newest, "rgb": rgb, "text": batch["text"]})
+    assert torch.allclose(alone[:, 0], model.encode(batch)[:, 2], atol=1e-5)
+
+
+def test_every_frame_of_the_window_is_learned_from():
+    model = make_rt1(history=3)
+    batch = with_text(model, make_batch(3))
+    for frame in range(3):
+        only = {**batch, "valid": torch.zeros_like(batch["valid"])}
+        only["valid"][:, frame] = True
+        logits = model(batch)["logits"][:, frame]
+        expected = model.tokenizer.loss(logits, batch["action"][:, frame], only["valid"][:, frame])
+        assert model.loss(only)["action_loss"].item() == pytest.approx(expected.item(), rel=1e-4)
+
+
+@pytest.mark.parametrize("cameras", [("front",), ("front", "wrist")])
+def test_the_tokens_of_the_cameras_stand_side_by_side(cameras: tuple[str, ...]):
+    image = partial(FilmEfficientNet, "efficientnet_b0", pretrained=False, channels=16)
+    spec = replace(SPEC, cameras=cameras)
+    tokenizer = RT1Tokenizer(spec=spec)
+    model = RT1(image, NGrams, 2, 64, width=32, text_width=8, layers=1, heads=1, spec=spec, tokenizer=tokenizer).eval()
+    batch = with_text(model, make_batch(2, spec=spec))
+    assert model.encode(batch).shape == (4, 2, 8 * len(cameras), 32)
+    assert model(batch)["logits"].shape == (4, 2, 1, 3, 256)
+
+
+def test_the_paper_network_has_its_size_and_its_81_positions():
+    spec = replace(
+        SPEC,
+        cameras=("front",),
+        image_size=(256, 320),
+        action=tuple(f"component{number}" for number in range(11)),
+        units=("1",) * 11,
+        low=(-1.0,) * 11,
+        high=(1.0,) * 11,
+    )
+    image = partial(FilmEfficientNet, pretrained=False)
+    model = RT1(image, NGrams, spec=spec, tokenizer=RT1Tokenizer(spec=spec)).eval()
+    language = sum(parameter.numel() for parameter in model.text.parameters())  # a frozen encoder in the paper
+    assert sum(parameter.numel() for parameter in model.parameters()) - language == pytest.approx(35.25e6, rel=0.005)
+    assert len(model.image.films) + 1 == 27
+    assert model.mask.shape == (114, 114)
+    positions = []
+    model.token_learners[0].register_forward_pre_hook(lambda module, inputs: positions.append(inputs[0].shape))
+    with torch.inference_mode():
+        tokens = model.encode(with_text(model, make_batch(1, size=1, spec=spec)))
+    assert positions == [(1, 512, 9, 9)]
+    assert tokens.shape == (1, 1, 8, 512)

@@ -1,0 +1,50 @@
+"""Sentences as vectors."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import pytest
+import torch
+
+from vla.models.text import NGrams
+
+SENTENCES = ["Lift the red block", "put the small green block onto the blue pad", ""]
+
+
+def test_tokens_are_filled_up_and_the_filling_changes_nothing():
+    encoder = NGrams(width=8)
+    together = encoder.tokenize(SENTENCES)
+    alone = encoder.tokenize(SENTENCES[:1])
+    assert together.dtype == torch.int64 and together.shape[0] == 3 and alone.shape[1] < together.shape[1]
+    assert torch.allclose(encoder(together)[0], encoder(alone)[0], atol=1e-6)
+    assert encoder(together).shape == (3, 8) and torch.isfinite(encoder(together)).all()
+
+
+def test_tokens_are_the_same_in_every_process():
+    program = "from vla.models.text import NGrams; print(NGrams(width=4).tokenize(['lift the red block']).tolist())"
+    elsewhere = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout
+    assert elsewhere.strip() == str(NGrams(width=4).tokenize(["lift the red block"]).tolist())
+
+
+def test_case_and_punctuation_do_not_matter_but_order_does():
+    encoder = NGrams(width=8)
+    plain, loud, swapped = encoder.tokenize(["red on blue", "Red on BLUE!", "blue on red"])
+    assert torch.equal(plain, loud)
+    assert set(plain.tolist()) != set(swapped.tolist())
+
+
+def test_related_words_share_tokens():
+    rows = NGrams(width=8).tokenize(["blocks", "block", "pyramid"])
+    blocks, block, pyramid = (set(row.tolist()) - {0} for row in rows)
+    assert len(block & blocks) >= 3 and not block & pyramid
+
+
+def test_all_tokens_have_a_vector():
+    assert NGrams(vocabulary=2, width=4).tokenize(SENTENCES).max() == 1
+
+
+def test_impossible_sizes_are_refused():
+    with pytest.raises(ValueError, match="words=0"):
+        NGrams(words=0, width=4)
