@@ -57,7 +57,7 @@ PLAIN: dict[str, Any] = {
     "checkpoint": str | None,
     "output": str,
     "collect": {"episodes": int, "seed": int, "workers": int | None, "folder": str},
-    "evaluate": {"episodes": int, "seed": int, "workers": int | None, "recordings": int},
+    "evaluate": {"episodes": int, "seed": int, "workers": int | None, "recordings": int | None},
     "preview": {"episodes": int, "seed": int},
     "benchmark": {
         "names": list[Literal["collect", "loader", "train", "policy"]],

@@ -156,8 +156,8 @@ def evaluate(
     return Report(tuple(results[seed] for seed in seeds))
 
 
-def keep_recordings(report: Report, folder: Path, target: Path, limit: int) -> int:
-    """Merge an evaluation's recordings into one file, failures first and at most `limit`; returns how many.
+def keep_recordings(report: Report, folder: Path, target: Path, limit: int | None) -> int:
+    """Merge an evaluation's recordings into one file, failures first and at most `limit` if given; returns how many.
 
     The single files are removed, and their folder if nothing else is in it.
     """

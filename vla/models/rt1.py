@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from vla.models.action_tokenizer import ActionTokenizer
 from vla.models.bc import Batch, Model, Standardize, pixels
-from vla.models.image_tokenizer import ImageEncoder, RandomShift, TokenLearner
+from vla.models.image_tokenizer import ImageEncoder, Keypoints, RandomShift, TokenLearner
 from vla.models.text import TextEncoder
 from vla.spec import Spec
 
@@ -60,7 +60,7 @@ class RT1(Model):
         history: T.
         image_size: images are resized to this height and width [px]; null leaves them as they are.
         learned_tokens: tokens per camera and frame.
-        coordinates: let every token say where in the image it looked.
+        keypoints: add, per camera, a token made of the positions of this many keypoints; the paper has none.
         proprioception: add a token for joints, velocities and gripper; the paper has none.
         chunk: k, the actions predicted for a frame.
         auxiliary: weight of the head that predicts the simulator's truth, in training only; 0 leaves it out.
@@ -83,7 +83,7 @@ class RT1(Model):
         history: int = 6,
         image_size: int | None = 288,
         learned_tokens: int = 8,
-        coordinates: bool = False,
+        keypoints: int = 0,
         proprioception: bool = False,
         chunk: int = 1,
         auxiliary: float = 0.0,
@@ -100,19 +100,21 @@ class RT1(Model):
     ) -> None:
         super().__init__(history, chunk, text(width=text_width), auxiliary, width, spec, tokenizer)
         self.image_size = image_size
-        self.tokens = len(spec.cameras) * learned_tokens + proprioception  # N
+        self.tokens = len(spec.cameras) * (learned_tokens + (keypoints > 0)) + proprioception  # N
         self.slots = chunk * len(spec.action)  # A
         self.shift = RandomShift(*shift)
         self.image = image(text_width=text_width)
-        self.token_learners = nn.ModuleList(
-            TokenLearner(self.image.channels, learned_tokens, coordinates) for _ in spec.cameras
-        )
-        self.image_tokens = nn.Linear(self.image.channels + 2 * coordinates, width)
+        self.token_learners = nn.ModuleList(TokenLearner(self.image.channels, learned_tokens) for _ in spec.cameras)
+        self.image_tokens = nn.Linear(self.image.channels, width)
+        if keypoints:
+            self.keypoints = nn.ModuleList(Keypoints(self.image.channels, keypoints) for _ in spec.cameras)
+            self.keypoint_tokens = nn.ModuleList(nn.Linear(2 * keypoints, width) for _ in spec.cameras)
         if proprioception:
             self.proprioception = Standardize(self.proprioception_width)
             self.proprioception_token = nn.Linear(self.proprioception_width, width)
         length = history * (self.tokens + self.slots)
         self.positions = nn.Embedding(length, width)
+        nn.init.normal_(self.positions.weight, std=0.05)  # where a token stands must not drown what it says
         self.layers = nn.ModuleList(Layer(width, heads, key_width, dropout) for _ in range(layers))
         self.head = nn.Linear(width, tokenizer.bins)
         self.register_buffer("mask", attention_mask(history, self.tokens, self.slots), persistent=False)
@@ -123,10 +125,14 @@ class RT1(Model):
         frames = batch["present"].shape[1]
         repeated = text.repeat_interleave(frames, 0)  # (B·T, text_width)
         tokens = []
-        for camera, token_learner in zip(self.spec.cameras, self.token_learners, strict=True):
+        for index, camera in enumerate(self.spec.cameras):
             images = pixels(self.shift(batch["rgb"][camera]), self.image_size)
-            learned = self.image_tokens(token_learner(self.image(images, repeated)))
+            features = self.image(images, repeated)  # (B·T, C, h, w)
+            learned = self.image_tokens(self.token_learners[index](features))
             tokens.append(learned.unflatten(0, (-1, frames)))  # (B, T, learned_tokens, E)
+            if hasattr(self, "keypoints"):
+                positions = self.keypoint_tokens[index](self.keypoints[index](features).flatten(1))
+                tokens.append(positions.view(-1, frames, 1, positions.shape[-1]))
         if hasattr(self, "proprioception"):
             standard = self.proprioception(batch["proprio"], batch["present"])
             tokens.append(self.proprioception_token(standard).unsqueeze(2))

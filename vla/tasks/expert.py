@@ -17,8 +17,9 @@ from vla.tasks.control import DOWN, MAX_OPENING, rotation_z, vector_from_rotatio
 HOVER = 0.08  # height above the block from which it is approached [m]
 CARRY = 0.07  # height above the table at which it is carried [m]
 FUNNEL = 2.5  # height gained per metre of horizontal distance, so that approaches come from above
-GRASP_XY, GRASP_Z, GRASP_YAW = 0.008, 0.008, 0.2  # tolerances at which the gripper closes [m], [m], [rad]
-PLACE_XY, PLACE_Z = 0.012, 0.006  # tolerances at which it opens [m]
+# As loose as still works: a learner that is a centimetre off must not wait for ever to be exact.
+GRASP_XY, GRASP_Z, GRASP_YAW = 0.012, 0.012, 0.25  # tolerances at which the gripper closes [m], [m], [rad]
+PLACE_XY, PLACE_Z = 0.02, 0.012  # tolerances at which it opens [m]
 CLEARANCE = 0.012  # between open fingers and a block on both sides together [m]
 
 
@@ -104,7 +105,7 @@ class Waypoint:
 def _placed(truth: dict[str, Array]) -> bool:
     """The block rests close enough to its destination."""
     offset = truth["destination"] - truth["block"]
-    return bool(np.hypot(offset[0], offset[1]) < 2 * PLACE_XY and abs(offset[2]) < PLACE_Z)
+    return bool(np.hypot(offset[0], offset[1]) < PLACE_XY + 0.01 and abs(offset[2]) < PLACE_Z)
 
 
 def _yaw_to_faces(truth: dict[str, Array]) -> float:
