@@ -56,7 +56,7 @@ def make_bc(chunk: int = 1, auxiliary: float = 1.0, image: Callable[..., Any] = 
 
 
 def make_rt1(
-    history: int = 3, chunk: int = 1, proprioception: bool = False, coordinates: bool = True, auxiliary: float = 1.0
+    history: int = 3, chunk: int = 1, proprioception: bool = False, keypoints: int = 8, auxiliary: float = 1.0
 ) -> RT1:
     """A small RT-1 without dropout and random shifts."""
     return RT1(
@@ -65,7 +65,7 @@ def make_rt1(
         history=history,
         image_size=None,
         learned_tokens=2,
-        coordinates=coordinates,
+        keypoints=keypoints,
         proprioception=proprioception,
         chunk=chunk,
         auxiliary=auxiliary,

@@ -99,16 +99,12 @@ def test_tokens_are_weighted_means_of_the_features_themselves():
     assert torch.allclose(TokenLearner(6)(constant)[0, 0], torch.arange(6.0))
 
 
-def test_tokens_and_keypoints_say_where_they_look():
+def test_keypoints_say_where_they_look():
     features = torch.zeros(1, 2, 5, 5)
     features[0, 0, 1, 4] = 100.0
     keypoints = Keypoints(2, 1)
     keypoints.score.weight.data = torch.tensor([[1.0, 0.0]])
     assert keypoints(features).flatten().tolist() == pytest.approx([1.0, -0.5])  # x right, y down
-
-    learner = TokenLearner(2, tokens=3, coordinates=True)
-    assert learner(features).shape == (1, 3, 4)
-    assert torch.allclose(learner(torch.ones(1, 2, 5, 5))[..., 2:], torch.zeros(1, 3, 2), atol=1e-6)
 
 
 def test_a_clip_is_shifted_as_one_and_clips_differ():

@@ -217,14 +217,10 @@ class TokenLearner(nn.Module):
     Args:
         channels: C of the feature map.
         tokens: M.
-        coordinates: append the mean position under each attention map, x and y in -1 … 1, so that a token also
-            says where it looked.
     """
 
-    def __init__(self, channels: int, tokens: int = 8, coordinates: bool = False) -> None:
+    def __init__(self, channels: int, tokens: int = 8) -> None:
         super().__init__()
-        self.width = channels + 2 * coordinates
-        self.coordinates = coordinates
         self.attention = nn.Sequential(
             nn.LayerNorm(channels, eps=1e-6),
             nn.Linear(channels, 64),
@@ -233,13 +229,10 @@ class TokenLearner(nn.Module):
         )
 
     def forward(self, features: Tensor) -> Tensor:
-        """(N, C, h, w) features to (N, M, width) tokens."""
+        """(N, C, h, w) features to (N, M, C) tokens."""
         values = features.flatten(2).mT  # (N, h·w, C)
         weights = self.attention(values).softmax(1).mT  # (N, M, h·w)
-        tokens = weights @ values
-        if self.coordinates:
-            tokens = torch.cat([tokens, weights @ grid(features).to(weights.dtype)], -1)
-        return tokens
+        return weights @ values
 
 
 class Keypoints(nn.Module):

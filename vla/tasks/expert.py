@@ -20,6 +20,7 @@ FUNNEL = 2.5  # height gained per metre of horizontal distance, so that approach
 # As loose as still works: a learner that is a centimetre off must not wait for ever to be exact.
 GRASP_XY, GRASP_Z, GRASP_YAW = 0.012, 0.012, 0.25  # tolerances at which the gripper closes [m], [m], [rad]
 PLACE_XY, PLACE_Z = 0.02, 0.012  # tolerances at which it opens [m]
+MAX_YAW = 0.9  # furthest turn from neutral from which the nearest faces are taken [rad]
 CLEARANCE = 0.012  # between open fingers and a block on both sides together [m]
 
 
@@ -109,12 +110,17 @@ def _placed(truth: dict[str, Array]) -> bool:
 
 
 def _yaw_to_faces(truth: dict[str, Array]) -> float:
-    """Turn [rad] that brings the fingers onto two faces of the block, within ±45° of the arm's neutral yaw."""
+    """Turn [rad] that brings the fingers onto the nearest two faces of the block, not far from the arm's neutral yaw.
+
+    Nearest, because a cube looks the same after a quarter turn: a learner could not tell which one is meant.
+    """
     rotation, block = truth["commanded"][:3, :3], truth["block_rotation"]
     side = block[:, int(np.argmin(np.abs(block[2])))]  # an edge that lies flat, whichever face is up
+    yaw = np.arctan2(rotation[1, 0], rotation[0, 0])
+    reference = np.clip(yaw, -MAX_YAW, MAX_YAW)
     quarter = np.pi / 2
-    wanted = (np.arctan2(side[1], side[0]) + quarter / 2) % quarter - quarter / 2
-    return float(wanted - np.arctan2(rotation[1, 0], rotation[0, 0]))
+    turn = (np.arctan2(side[1], side[0]) - reference + quarter / 2) % quarter - quarter / 2
+    return float(reference + turn - yaw)
 
 
 class Perturbation:

@@ -205,7 +205,6 @@ class BoundScene:
         self.joints = np.array([bind(joint).qposadr for joint in scene.panda.joints]).ravel()
         self.velocities = np.array([bind(joint).dofadr for joint in scene.panda.joints]).ravel()
         self.fingers = np.array([bind(finger).qposadr for finger in scene.panda.fingers]).ravel()
-        self.finger_velocities = np.array([bind(finger).dofadr for finger in scene.panda.fingers]).ravel()
         self.pads = [int(bind(pad).element_id) for pad in scene.panda.pads]
         self.tcp = int(bind(scene.panda.tcp).element_id)
         self.block_geoms = np.array([bind(block.geom).element_id for block in scene.blocks], dtype=int)

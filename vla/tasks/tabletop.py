@@ -26,7 +26,6 @@ TRANSLATION = 0.04  # largest translation per step [m]
 ROTATION = 0.25  # largest rotation per step [rad]
 WORKSPACE = ((0.25, -0.40, 0.008), (0.75, 0.40, 0.50))  # corners of the box that the tool point stays in [m]
 FINGER_STEP = FINGER_SPEED / CONTROL_HZ  # furthest a finger moves in one control period [m]
-SETTLED = 0.01  # finger speed below which a grasp is closed [m/s]
 
 
 class TabletopTask(composer.Task):
@@ -115,7 +114,6 @@ class TabletopTask(composer.Task):
     def truth(self) -> dict[str, Array]:
         """The state as an expert may see it, by name; lengths in [m], rotations as matrices."""
         bound, progress = self.bound, self.progress()
-        closing = abs(bound.data.qvel[bound.finger_velocities].sum()) > SETTLED
         return {
             "tcp": bound.data.site_xpos[bound.tcp].copy(),
             "block": progress.block,
@@ -123,7 +121,7 @@ class TabletopTask(composer.Task):
             "commanded": self.controller.pose.copy(),  # (4, 4)
             "block_rotation": bound.data.geom_xmat[bound.block_geoms[self.target]].reshape(3, 3).copy(),
             "half_size": np.array([progress.half_size]),
-            "grasped": np.array([float(progress.held and not closing)]),
+            "grasped": np.array([float(progress.held)]),
             "reached": np.array([float(self.goal.reached(progress))]),
             "releases": np.array([float(self.goal.releases)]),
         }
