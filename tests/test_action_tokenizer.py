@@ -26,24 +26,24 @@ def tokenizers() -> list[ActionTokenizer]:
 
 
 @pytest.mark.parametrize("tokenizer", tokenizers(), ids=["uniform", "rt1"])
-def test_every_token_survives_the_round_trip(tokenizer: ActionTokenizer):
+def test_every_token_survives_the_round_trip(tokenizer: ActionTokenizer) -> None:
     tokens = torch.arange(256)[:, None].expand(256, 3)
     assert torch.equal(tokenizer.encode(tokenizer.decode(tokens)), tokens)
 
 
 @pytest.mark.parametrize("tokenizer", tokenizers(), ids=["uniform", "rt1"])
-def test_actions_beyond_the_bounds_get_the_outermost_tokens(tokenizer: ActionTokenizer):
+def test_actions_beyond_the_bounds_get_the_outermost_tokens(tokenizer: ActionTokenizer) -> None:
     assert tokenizer.encode(torch.full((3,), -9.0)).tolist() == [0, 0, 0]
     assert tokenizer.encode(torch.full((3,), 9.0)).tolist() == [255, 255, 255]
 
 
-def test_uniform_bounds_are_those_of_the_data_and_a_margin():
+def test_uniform_bounds_are_those_of_the_data_and_a_margin() -> None:
     tokenizer = Uniform(margin=0.1, spec=SPEC, statistics=BOUNDS)
     assert tokenizer.low.tolist() == pytest.approx([-0.025, -0.015, -0.1])
     assert tokenizer.high.tolist() == pytest.approx([0.035, 0.045, 1.1])
 
 
-def test_uniform_rounds_without_bias():
+def test_uniform_rounds_without_bias() -> None:
     tokenizer = Uniform(spec=SPEC, statistics=BOUNDS)
     action = torch.tensor(BOUNDS.low + (BOUNDS.high - BOUNDS.low) * np.random.default_rng(0).random((4000, 3))).float()
     error = tokenizer.decode(tokenizer.encode(action)) - action
@@ -52,7 +52,7 @@ def test_uniform_rounds_without_bias():
     assert (error.mean(0).abs() < 0.02 * bin_width).all()
 
 
-def test_a_component_that_never_changes_in_the_data_still_has_bins():
+def test_a_component_that_never_changes_in_the_data_still_has_bins() -> None:
     constant = Bounds(np.array([0.0, 0.01, 1.0]), np.array([0.0, 0.01, 1.0]))
     tokenizer = Uniform(spec=SPEC, statistics=constant)
     assert (tokenizer.high > tokenizer.low).all()
@@ -60,14 +60,14 @@ def test_a_component_that_never_changes_in_the_data_still_has_bins():
     assert torch.allclose(tokenizer.decode(tokenizer.encode(action)), action, atol=1e-3)
 
 
-def test_before_a_checkpoint_is_loaded_the_allowed_range_stands_in_and_the_checkpoint_replaces_it():
+def test_before_a_checkpoint_is_loaded_the_allowed_range_stands_in_and_the_checkpoint_replaces_it() -> None:
     trained, fresh = Uniform(spec=SPEC, statistics=BOUNDS), Uniform(spec=SPEC)
     assert not torch.equal(fresh.low, trained.low)
     fresh.load_state_dict(trained.state_dict())
     assert torch.equal(fresh.low, trained.low) and torch.equal(fresh.high, trained.high)
 
 
-def test_rt1_has_fixed_bounds_by_unit_and_rounds_down():
+def test_rt1_has_fixed_bounds_by_unit_and_rounds_down() -> None:
     tokenizer = RT1(spec=replace(SPEC, units=("m", "rad", "1")))
     assert tokenizer.high.tolist() == pytest.approx([1.0, np.pi / 2, 1.0])
     # 0 lies at 127.5 of 255, a hair below the next bin at 127.9.
@@ -75,18 +75,18 @@ def test_rt1_has_fixed_bounds_by_unit_and_rounds_down():
     assert tokenizer.encode(action).tolist() == [127, 127, 0]
 
 
-def test_units_without_a_bound_are_refused():
+def test_units_without_a_bound_are_refused() -> None:
     with pytest.raises(ValueError, match="'kg'"):
         RT1(spec=replace(SPEC, units=("m", "m", "kg")))
 
 
-def test_statistics_of_other_actions_are_refused():
+def test_statistics_of_other_actions_are_refused() -> None:
     with pytest.raises(ValueError, match="2 components, the spec has 3: x, y, gripper"):
         Uniform(spec=SPEC, statistics=Bounds(np.zeros(2), np.ones(2)))
 
 
 @pytest.mark.parametrize("tokenizer", [*tokenizers(), Uniform(smoothing=0, spec=SPEC)], ids=["uniform", "rt1", "hard"])
-def test_minimising_the_loss_makes_the_action_the_one_that_is_read(tokenizer: ActionTokenizer):
+def test_minimising_the_loss_makes_the_action_the_one_that_is_read(tokenizer: ActionTokenizer) -> None:
     action = torch.tensor([[0.0123, -0.0042, 0.9]])
     logits = torch.zeros(1, 3, 256, requires_grad=True)
     optimizer = torch.optim.Adam([logits], lr=0.3)
@@ -98,7 +98,7 @@ def test_minimising_the_loss_makes_the_action_the_one_that_is_read(tokenizer: Ac
     assert ((tokenizer.read(logits) - action).abs() <= 1.001 * bin_width).all()
 
 
-def test_soft_targets_are_read_finer_than_a_bin():
+def test_soft_targets_are_read_finer_than_a_bin() -> None:
     tokenizer = Uniform(spec=SPEC, statistics=BOUNDS)
     action = torch.tensor([0.0123, -0.0042, 0.9])
     position = (action - tokenizer.low) / (tokenizer.high - tokenizer.low) * 255
@@ -107,7 +107,7 @@ def test_soft_targets_are_read_finer_than_a_bin():
     assert ((tokenizer.read(logits) - action).abs() < 0.05 * bin_width).all()
 
 
-def test_two_ways_to_act_are_not_averaged():
+def test_two_ways_to_act_are_not_averaged() -> None:
     tokenizer = Uniform(spec=SPEC, statistics=BOUNDS)
     logits = torch.full((3, 256), -20.0)
     logits[:, 40], logits[:, 200] = 1.0, 0.9
@@ -115,7 +115,7 @@ def test_two_ways_to_act_are_not_averaged():
 
 
 @pytest.mark.parametrize("tokenizer", tokenizers(), ids=["uniform", "rt1"])
-def test_labels_that_are_not_valid_do_not_count(tokenizer: ActionTokenizer):
+def test_labels_that_are_not_valid_do_not_count(tokenizer: ActionTokenizer) -> None:
     logits, action = torch.randn(2, 3, 1, 3, 256), torch.zeros(2, 3, 1, 3)
     valid = torch.tensor([[True, True, False], [False, True, True]])[..., None]
     other = action + ~valid[..., None] * 0.5
@@ -127,6 +127,6 @@ def test_labels_that_are_not_valid_do_not_count(tokenizer: ActionTokenizer):
     assert tokenizer.loss(logits, action, torch.zeros_like(valid)) == 0
 
 
-def test_a_single_bin_is_refused():
+def test_a_single_bin_is_refused() -> None:
     with pytest.raises(ValueError, match="at least 2 bins"):
         Uniform(bins=1, spec=SPEC)

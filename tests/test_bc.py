@@ -21,7 +21,7 @@ every_model = pytest.mark.parametrize("make", MODELS.values(), ids=MODELS.keys()
 
 
 @every_model
-def test_shapes(make: Callable[[], Model]):
+def test_shapes(make: Callable[[], Model]) -> None:
     model = make()
     batch = with_text(model, make_batch(model.history, model.chunk))
     output = model(batch)
@@ -31,14 +31,14 @@ def test_shapes(make: Callable[[], Model]):
 
 
 @every_model
-def test_overfits_one_batch(make: Callable[[], Model]):
+def test_overfits_one_batch(make: Callable[[], Model]) -> None:
     torch.manual_seed(0)
     model = make()
     assert overfit(model, with_text(model, make_batch(model.history, model.chunk))) < 0.02
 
 
 @every_model
-def test_saves_and_loads_equal(make: Callable[[], Model]):
+def test_saves_and_loads_equal(make: Callable[[], Model]) -> None:
     torch.manual_seed(0)
     model, other = make(), make()
     batch = with_text(model, make_batch(model.history, model.chunk))
@@ -48,7 +48,7 @@ def test_saves_and_loads_equal(make: Callable[[], Model]):
 
 
 @every_model
-def test_predictions_ignore_truth_and_labels(make: Callable[[], Model]):
+def test_predictions_ignore_truth_and_labels(make: Callable[[], Model]) -> None:
     model = make().eval()
     batch = with_text(model, make_batch(model.history, model.chunk))
     seen = {name: value for name, value in batch.items() if name not in ("truth", "action", "valid", "instruction")}
@@ -56,21 +56,21 @@ def test_predictions_ignore_truth_and_labels(make: Callable[[], Model]):
 
 
 @every_model
-def test_the_instruction_matters(make: Callable[[], Model]):
+def test_the_instruction_matters(make: Callable[[], Model]) -> None:
     model = make().eval()
     batch = with_text(model, make_batch(model.history, model.chunk))
     other = {**batch, "text": model.text.tokenize(["push the button"] * 4)}
     assert not torch.allclose(model(batch)["logits"], model(other)["logits"])
 
 
-def test_without_weight_there_is_no_auxiliary_head():
+def test_without_weight_there_is_no_auxiliary_head() -> None:
     model = make_bc(auxiliary=0.0)
     losses = model.loss(with_text(model, make_batch(1)))
     assert set(losses) == {"loss", "action_loss", "logits"}
     assert losses["loss"] == losses["action_loss"]
 
 
-def test_padding_does_not_count_in_the_auxiliary_loss():
+def test_padding_does_not_count_in_the_auxiliary_loss() -> None:
     model = make_rt1().eval()
     batch = with_text(model, make_batch(3))
     batch["present"][:, 0] = False
@@ -79,7 +79,7 @@ def test_padding_does_not_count_in_the_auxiliary_loss():
     assert model.loss(batch)["truth_loss"] == model.loss(other)["truth_loss"]
 
 
-def test_standardize_gathers_the_statistics_of_what_is_present():
+def test_standardize_gathers_the_statistics_of_what_is_present() -> None:
     torch.manual_seed(0)
     standardize = Standardize(3)
     values = torch.randn(50, 2, 3) * torch.tensor([0.1, 2.0, 0.0]) + torch.tensor([1.0, -3.0, 7.0])
@@ -93,7 +93,7 @@ def test_standardize_gathers_the_statistics_of_what_is_present():
     assert torch.allclose(standardize.inverse(standard)[present], values[present], atol=1e-4)
 
 
-def test_standardize_leaves_its_statistics_alone_outside_training():
+def test_standardize_leaves_its_statistics_alone_outside_training() -> None:
     standardize = Standardize(2).eval()
     standardize(torch.ones(1, 1, 2), torch.ones(1, 1, dtype=torch.bool))
     assert standardize.count == 0

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from pathlib import Path
+from typing import Any
 
 import pytest
 import timm
@@ -13,13 +14,13 @@ from vla.models import image_tokenizer
 from vla.models.image_tokenizer import FiLM, FilmConv, FilmEfficientNet, Keypoints, RandomShift, TokenLearner
 
 
-def test_film_starts_as_the_identity_where_it_should():
+def test_film_starts_as_the_identity_where_it_should() -> None:
     film = FiLM(8, 4, identity=True)
     x = torch.randn(2, 4, 3, 3)
     assert torch.equal(film(x, torch.randn(2, 8)), x)
 
 
-def test_film_scales_and_shifts_every_channel():
+def test_film_scales_and_shifts_every_channel() -> None:
     film = FiLM(1, 2, identity=True)
     film.gamma.bias.data = torch.tensor([1.0, 0.0])
     film.beta.bias.data = torch.tensor([0.0, 5.0])
@@ -27,10 +28,10 @@ def test_film_scales_and_shifts_every_channel():
     assert out.tolist() == [2.0, 6.0]
 
 
-def test_at_the_start_the_efficientnet_is_the_plain_one_bit_for_bit():
+def test_at_the_start_the_efficientnet_is_the_plain_one_bit_for_bit() -> None:
     torch.manual_seed(0)
-    plain = timm.create_model("efficientnet_b0", num_classes=0).eval()
-    ours = FilmEfficientNet("efficientnet_b0", pretrained=False, channels=32, text_width=8).eval()
+    plain: Any = timm.create_model("efficientnet_b0", num_classes=0).eval()
+    ours: Any = FilmEfficientNet("efficientnet_b0", pretrained=False, channels=32, text_width=8).eval()
     blocks = torch.nn.ModuleList(block for stage in plain.blocks for block in stage)
     for module, source in (
         (ours.stem, torch.nn.Sequential(plain.conv_stem, plain.bn1)),
@@ -46,8 +47,8 @@ def test_at_the_start_the_efficientnet_is_the_plain_one_bit_for_bit():
     assert len(ours.films) == len(ours.blocks) == 16
 
 
-def test_weights_come_from_a_file(tmp_path: Path):
-    source = timm.create_model("efficientnet_b0")
+def test_weights_come_from_a_file(tmp_path: Path) -> None:
+    source: Any = timm.create_model("efficientnet_b0")
     torch.save(source.state_dict(), tmp_path / "weights.pth")
     net = image_tokenizer.load_efficientnet("efficientnet_b0", str(tmp_path / "weights.pth"))
     assert torch.equal(net.get_parameter("conv_stem.weight"), source.conv_stem.weight)
@@ -55,7 +56,7 @@ def test_weights_come_from_a_file(tmp_path: Path):
         image_tokenizer.load_efficientnet("efficientnet_b1", str(tmp_path / "weights.pth"))
 
 
-def test_weights_are_never_random_in_silence(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture):
+def test_weights_are_never_random_in_silence(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
     def unreachable(name: str) -> Path:
         raise OSError("no network")
 
@@ -71,35 +72,35 @@ def test_weights_are_never_random_in_silence(monkeypatch: pytest.MonkeyPatch, ca
     ("name", "pretrained", "message"),
     [("efficientnet_b33", False, "efficientnet_b3"), ("efficientnet_b0", "nowhere.pth", "no file nowhere.pth")],
 )
-def test_what_does_not_exist_is_named(name: str, pretrained: bool | str, message: str):
+def test_what_does_not_exist_is_named(name: str, pretrained: bool | str, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         image_tokenizer.load_efficientnet(name, pretrained)
 
 
-def test_film_conv_listens_to_the_text():
+def test_film_conv_listens_to_the_text() -> None:
     encoder = FilmConv([4, 6], [5, 3], [2, 2], text_width=8)
     images = torch.rand(1, 3, 16, 16).expand(2, -1, -1, -1)
     features = encoder(images, torch.randn(2, 8))
     assert features.shape == (2, 6, 4, 4) and not torch.allclose(features[0], features[1])
 
 
-def test_film_conv_wants_lists_of_one_length():
+def test_film_conv_wants_lists_of_one_length() -> None:
     with pytest.raises(ValueError, match="one entry per convolution"):
         FilmConv([4, 6], [5], [2, 2], text_width=8)
 
 
-def test_81_positions_become_8_tokens():
+def test_81_positions_become_8_tokens() -> None:
     learner = TokenLearner(512)
     assert learner(torch.randn(2, 512, 9, 9)).shape == (2, 8, 512)
     assert sum(p.numel() for p in learner.parameters()) == 2 * 512 + 512 * 64 + 64 + 64 * 8 + 8  # 34 k
 
 
-def test_tokens_are_weighted_means_of_the_features_themselves():
+def test_tokens_are_weighted_means_of_the_features_themselves() -> None:
     constant = torch.arange(6.0)[None, :, None, None].expand(1, 6, 3, 3)
     assert torch.allclose(TokenLearner(6)(constant)[0, 0], torch.arange(6.0))
 
 
-def test_keypoints_say_where_they_look():
+def test_keypoints_say_where_they_look() -> None:
     features = torch.zeros(1, 2, 5, 5)
     features[0, 0, 1, 4] = 100.0
     keypoints = Keypoints(2, 1)
@@ -107,7 +108,7 @@ def test_keypoints_say_where_they_look():
     assert keypoints(features).flatten().tolist() == pytest.approx([1.0, -0.5])  # x right, y down
 
 
-def test_a_clip_is_shifted_as_one_and_clips_differ():
+def test_a_clip_is_shifted_as_one_and_clips_differ() -> None:
     torch.manual_seed(0)
     images = torch.randint(1, 256, (8, 1, 64, 64, 3)).byte().expand(-1, 3, -1, -1, -1)
     shifted = RandomShift(16, 32)(images)  # up to 4 px up or down, 8 px left or right
@@ -127,6 +128,6 @@ def test_a_clip_is_shifted_as_one_and_clips_differ():
     assert len(offsets) > 4
 
 
-def test_outside_training_nothing_is_shifted():
+def test_outside_training_nothing_is_shifted() -> None:
     images = torch.randint(256, (2, 1, 16, 16, 3)).byte()
     assert RandomShift(64, 64).eval()(images) is images

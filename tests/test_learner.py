@@ -49,7 +49,7 @@ def fit(learner: Learner, batch: dict[str, Any], steps: int, **options: Any) -> 
     return trainer
 
 
-def test_training_lowers_the_loss_and_validation_reports_errors_in_readable_units():
+def test_training_lowers_the_loss_and_validation_reports_errors_in_readable_units() -> None:
     torch.manual_seed(0)
     batch = make_batch(1)
     untrained = fit(make_learner(), batch, 1).callback_metrics
@@ -61,7 +61,7 @@ def test_training_lowers_the_loss_and_validation_reports_errors_in_readable_unit
     assert 0 <= trained["val/token_accuracy"] <= 1
 
 
-def test_the_error_of_a_component_is_the_mean_distance_over_what_is_valid():
+def test_the_error_of_a_component_is_the_mean_distance_over_what_is_valid() -> None:
     learner = make_learner(make_bc(auxiliary=0.0)).eval()
     batch = make_batch(1)
     batch["valid"][0] = False
@@ -72,19 +72,19 @@ def test_the_error_of_a_component_is_the_mean_distance_over_what_is_valid():
 
 
 @pytest.mark.parametrize("model", [make_bc(), make_rt1()], ids=["bc", "rt1"])
-def test_bfloat16_trains(model: Model):
+def test_bfloat16_trains(model: Model) -> None:
     metrics = fit(make_learner(model), make_batch(model.history), 2, precision="bf16").callback_metrics
     assert torch.isfinite(metrics["val/loss"])
 
 
-def test_a_loss_that_is_not_finite_stops_training_and_names_the_step():
+def test_a_loss_that_is_not_finite_stops_training_and_names_the_step() -> None:
     batch = make_batch(1)
     batch["proprio"][:] = math.nan
     with pytest.raises(ValueError, match="at step 0"):
         fit(make_learner(), batch, 1)
 
 
-def test_schedules():
+def test_schedules() -> None:
     def rates(schedule: Any) -> list[float]:
         seen: list[float] = []
 
@@ -102,7 +102,7 @@ def test_schedules():
     assert set(constant[4:]) == {1.0}
 
 
-def test_weight_decay_spares_biases_norms_and_embeddings():
+def test_weight_decay_spares_biases_norms_and_embeddings() -> None:
     learner = make_learner(make_rt1(), weight_decay=0.5)
     learner.trainer = make_trainer(1)
     decayed, spared = learner.configure_optimizers()["optimizer"].param_groups
@@ -116,7 +116,9 @@ def test_weight_decay_spares_biases_norms_and_embeddings():
 
 
 @pytest.mark.parametrize("averaging", [[], [EMAWeightAveraging(decay=0.9)]], ids=["plain", "averaged"])
-def test_a_checkpoint_holds_what_it_takes_to_build_the_policy(averaging: list[lightning.Callback], tmp_path: Path):
+def test_a_checkpoint_holds_what_it_takes_to_build_the_policy(
+    averaging: list[lightning.Callback], tmp_path: Path
+) -> None:
     learner = make_learner()
     trainer = make_trainer(3, *averaging)
     trainer.fit(learner, loader(make_batch(1), 3))
@@ -130,7 +132,7 @@ def test_a_checkpoint_holds_what_it_takes_to_build_the_policy(averaging: list[li
     assert torch.equal(model.eval()(batch)["logits"], learner.model.eval()(batch)["logits"])
 
 
-def test_going_on_from_a_checkpoint_gives_what_one_run_gives(tmp_path: Path):
+def test_going_on_from_a_checkpoint_gives_what_one_run_gives(tmp_path: Path) -> None:
     batch = make_batch(1)
     torch.manual_seed(0)
     start = make_bc()
@@ -151,7 +153,7 @@ def test_going_on_from_a_checkpoint_gives_what_one_run_gives(tmp_path: Path):
     assert all(torch.allclose(ends[0][name], ends[1][name], atol=1e-6) for name in ends[0])
 
 
-def test_compiling_keeps_the_names_in_the_checkpoint():
+def test_compiling_keeps_the_names_in_the_checkpoint() -> None:
     learner = make_learner(make_bc(auxiliary=0.0), compile=True)
     plain = make_bc(auxiliary=0.0)
     plain.load_state_dict(learner.model.state_dict())

@@ -36,7 +36,7 @@ def whole_window(model: Model, seen: list[Observation]) -> torch.Tensor:
     def stack(values: list[np.ndarray]) -> torch.Tensor:
         return torch.from_numpy(np.stack(values))[None]
 
-    proprio = [np.float32([*o.joints, *o.velocities, o.gripper]) for o in seen]
+    proprio = [np.array([*o.joints, *o.velocities, o.gripper], np.float32) for o in seen]
     batch = {
         "rgb": {camera: stack([o.rgb[camera] for o in seen]) for camera in SPEC.cameras},
         "proprio": stack(proprio),
@@ -49,7 +49,7 @@ def whole_window(model: Model, seen: list[Observation]) -> torch.Tensor:
 
 
 @pytest.mark.parametrize("make", [make_bc, make_rt1], ids=["bc", "rt1"])
-def test_plays_an_episode_within_the_limits(make: Callable[[], Model]):
+def test_plays_an_episode_within_the_limits(make: Callable[[], Model]) -> None:
     policy = Policy(make(), replace(SPEC, high=(0.001, 0.05, 1.0)))
     episode = rollout(ToyEnvironment(), policy, seed=3)
     assert episode.actions.shape == (40, 3) and episode.actions.dtype == np.float32
@@ -60,7 +60,7 @@ def test_plays_an_episode_within_the_limits(make: Callable[[], Model]):
 
 
 @pytest.mark.parametrize("proprioception", [False, True])
-def test_kept_tokens_give_what_the_whole_window_gives(proprioception: bool):
+def test_kept_tokens_give_what_the_whole_window_gives(proprioception: bool) -> None:
     model = make_rt1(history=3, proprioception=proprioception)
     policy = Policy(model, SPEC)
     seen = observations(6)
@@ -71,7 +71,7 @@ def test_kept_tokens_give_what_the_whole_window_gives(proprioception: bool):
         assert policy.info["probabilities"] == pytest.approx(logits[0].softmax(-1).numpy(), abs=1e-5)
 
 
-def test_only_the_newest_frame_is_encoded():
+def test_only_the_newest_frame_is_encoded() -> None:
     model = make_rt1(history=3)
     policy = Policy(model, SPEC)
     frames = []
@@ -81,7 +81,7 @@ def test_only_the_newest_frame_is_encoded():
 
 
 @pytest.mark.parametrize("make", [make_bc, make_rt1], ids=["bc", "rt1"])
-def test_reset_forgets(make: Callable[[], Model]):
+def test_reset_forgets(make: Callable[[], Model]) -> None:
     policy = Policy(make(), SPEC)
     seen = observations(4)
     policy.reset(seen[0].instruction, 0)
@@ -90,7 +90,7 @@ def test_reset_forgets(make: Callable[[], Model]):
     assert np.array_equal(act(policy, seen), first)
 
 
-def test_another_instruction_starts_afresh():
+def test_another_instruction_starts_afresh() -> None:
     model = make_rt1(history=3)
     policy, fresh = Policy(model, SPEC), Policy(model, SPEC)
     seen = observations(4)
@@ -101,7 +101,7 @@ def test_another_instruction_starts_afresh():
 
 
 @pytest.mark.parametrize("make", [lambda: make_bc(chunk=3), lambda: make_rt1(chunk=3)], ids=["bc", "rt1"])
-def test_a_chunk_is_executed_action_by_action(make: Callable[[], Model]):
+def test_a_chunk_is_executed_action_by_action(make: Callable[[], Model]) -> None:
     model = make()
     policy = Policy(model, SPEC)
     seen = observations(4)
@@ -114,7 +114,7 @@ def test_a_chunk_is_executed_action_by_action(make: Callable[[], Model]):
     assert actions == pytest.approx(expected, abs=1e-5)
 
 
-def test_predictions_ignore_truth():
+def test_predictions_ignore_truth() -> None:
     policy = Policy(make_bc(), SPEC)
     (seen,) = observations(1)
     with_truth = policy.act(seen)
@@ -129,7 +129,7 @@ def test_predictions_ignore_truth():
     ],
     ids=["camera", "size"],
 )
-def test_observations_of_another_kind_are_refused(rgb: dict[str, np.ndarray]):
+def test_observations_of_another_kind_are_refused(rgb: dict[str, np.ndarray]) -> None:
     policy = Policy(make_bc(), SPEC)
     with pytest.raises(ValueError, match="wrist"):
         policy.act(replace(observations(1)[0], rgb=rgb))
@@ -142,19 +142,19 @@ def save(path: Path, **changes: object) -> Path:
     return path
 
 
-def test_a_checkpoint_is_read_as_it_was_written(tmp_path: Path):
+def test_a_checkpoint_is_read_as_it_was_written(tmp_path: Path) -> None:
     checkpoint = read_checkpoint(save(tmp_path / "a.ckpt"))
     assert checkpoint.config == {"seed": 0} and checkpoint.spec == SPEC
     checkpoint.restore(make_bc())
 
 
-def test_weights_of_another_model_are_refused(tmp_path: Path):
+def test_weights_of_another_model_are_refused(tmp_path: Path) -> None:
     checkpoint = read_checkpoint(save(tmp_path / "a.ckpt"))
     with pytest.raises(ValueError, match="does not fit the model"):
         Checkpoint(checkpoint.path, checkpoint.config, checkpoint.spec, checkpoint.state).restore(make_rt1())
 
 
-def test_files_that_are_no_checkpoint_are_refused_in_one_sentence(tmp_path: Path):
+def test_files_that_are_no_checkpoint_are_refused_in_one_sentence(tmp_path: Path) -> None:
     whole = save(tmp_path / "whole.ckpt").read_bytes()
     for name, content in {"torn": whole[: len(whole) // 2], "empty": b"", "text": b"hello\n"}.items():
         path = tmp_path / f"{name}.ckpt"
@@ -167,7 +167,7 @@ def test_files_that_are_no_checkpoint_are_refused_in_one_sentence(tmp_path: Path
         read_checkpoint(tmp_path / "missing.ckpt")
 
 
-def test_a_checkpoint_cannot_run_code(tmp_path: Path):
+def test_a_checkpoint_cannot_run_code(tmp_path: Path) -> None:
     class Attack:
         def __reduce__(self) -> tuple[Callable[..., None], tuple[str]]:
             return Path.touch, (tmp_path / "attacked",)  # type: ignore[return-value]

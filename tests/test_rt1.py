@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import partial
+from typing import Any
 
 import pytest
 import torch
@@ -16,7 +17,7 @@ from vla.models.rt1 import RT1, attention_mask
 from vla.models.text import NGrams
 
 
-def test_the_mask_is_causal_and_hides_actions_from_actions():
+def test_the_mask_is_causal_and_hides_actions_from_actions() -> None:
     # two frames of two image tokens and two action slots
     expected = [
         "1.......",
@@ -32,7 +33,7 @@ def test_the_mask_is_causal_and_hides_actions_from_actions():
     assert ["".join("1" if allowed else "." for allowed in row) for row in mask.tolist()] == expected
 
 
-def test_no_gradient_reaches_a_frame_from_an_earlier_prediction():
+def test_no_gradient_reaches_a_frame_from_an_earlier_prediction() -> None:
     model = make_rt1(history=3)
     batch = with_text(model, make_batch(3))
     tokens = model.encode(batch).detach().requires_grad_()
@@ -42,7 +43,7 @@ def test_no_gradient_reaches_a_frame_from_an_earlier_prediction():
         assert (gradient[:, : frame + 1].abs().sum((0, 2, 3)) > 0).all()
 
 
-def test_one_pass_equals_a_loop_over_the_action_tokens():
+def test_one_pass_equals_a_loop_over_the_action_tokens() -> None:
     model = make_rt1(history=2, chunk=2).eval()
     tokens = model.encode(with_text(model, make_batch(2)))  # (B, 2, N, E)
     empty = tokens.new_zeros(4, model.slots, tokens.shape[-1])
@@ -53,7 +54,7 @@ def test_one_pass_equals_a_loop_over_the_action_tokens():
     assert torch.allclose(torch.stack(loop, 1), one_pass, atol=1e-5)
 
 
-def test_fewer_frames_than_the_history_give_what_the_first_slots_of_a_full_window_give():
+def test_fewer_frames_than_the_history_give_what_the_first_slots_of_a_full_window_give() -> None:
     model = make_rt1(history=3).eval()
     tokens = model.encode(with_text(model, make_batch(3)))
     full = model({"tokens": tokens})["logits"]
@@ -61,7 +62,7 @@ def test_fewer_frames_than_the_history_give_what_the_first_slots_of_a_full_windo
         assert torch.allclose(model({"tokens": tokens[:, :frames]})["logits"], full[:, :frames], atol=1e-5)
 
 
-def test_frames_are_encoded_independently():
+def test_frames_are_encoded_independently() -> None:
     model = make_rt1(history=3, proprioception=True).eval()
     batch = with_text(model, make_batch(3))
     newest = {name: batch[name][:, 2:] for name in ("proprio", "present")}
@@ -70,7 +71,7 @@ def test_frames_are_encoded_independently():
     assert torch.allclose(alone[:, 0], model.encode(batch)[:, 2], atol=1e-5)
 
 
-def test_every_frame_of_the_window_is_learned_from():
+def test_every_frame_of_the_window_is_learned_from() -> None:
     model = make_rt1(history=3)
     batch = with_text(model, make_batch(3))
     for frame in range(3):
@@ -82,7 +83,7 @@ def test_every_frame_of_the_window_is_learned_from():
 
 
 @pytest.mark.parametrize("cameras", [("front",), ("front", "wrist")])
-def test_the_tokens_of_the_cameras_stand_side_by_side(cameras: tuple[str, ...]):
+def test_the_tokens_of_the_cameras_stand_side_by_side(cameras: tuple[str, ...]) -> None:
     image = partial(FilmEfficientNet, "efficientnet_b0", pretrained=False, channels=16)
     spec = replace(SPEC, cameras=cameras)
     tokenizer = RT1Tokenizer(spec=spec)
@@ -92,7 +93,7 @@ def test_the_tokens_of_the_cameras_stand_side_by_side(cameras: tuple[str, ...]):
     assert model(batch)["logits"].shape == (4, 2, 1, 3, 256)
 
 
-def test_the_paper_network_has_its_size_and_its_81_positions():
+def test_the_paper_network_has_its_size_and_its_81_positions() -> None:
     spec = replace(
         SPEC,
         cameras=("front",),
@@ -103,7 +104,7 @@ def test_the_paper_network_has_its_size_and_its_81_positions():
         high=(1.0,) * 11,
     )
     image = partial(FilmEfficientNet, pretrained=False)
-    model = RT1(image, NGrams, spec=spec, tokenizer=RT1Tokenizer(spec=spec)).eval()
+    model: Any = RT1(image, NGrams, spec=spec, tokenizer=RT1Tokenizer(spec=spec)).eval()
     language = sum(parameter.numel() for parameter in model.text.parameters())  # a frozen encoder in the paper
     assert sum(parameter.numel() for parameter in model.parameters()) - language == pytest.approx(35.25e6, rel=0.005)
     assert len(model.image.films) + 1 == 27

@@ -13,7 +13,7 @@ from vla.models.text import NGrams
 SENTENCES = ["Lift the red block", "put the small green block onto the blue pad", ""]
 
 
-def test_tokens_are_filled_up_and_the_filling_changes_nothing():
+def test_tokens_are_filled_up_and_the_filling_changes_nothing() -> None:
     encoder = NGrams(width=8)
     together = encoder.tokenize(SENTENCES)
     alone = encoder.tokenize(SENTENCES[:1])
@@ -22,29 +22,29 @@ def test_tokens_are_filled_up_and_the_filling_changes_nothing():
     assert encoder(together).shape == (3, 8) and torch.isfinite(encoder(together)).all()
 
 
-def test_tokens_are_the_same_in_every_process():
+def test_tokens_are_the_same_in_every_process() -> None:
     program = "from vla.models.text import NGrams; print(NGrams(width=4).tokenize(['lift the red block']).tolist())"
     elsewhere = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout
     assert elsewhere.strip() == str(NGrams(width=4).tokenize(["lift the red block"]).tolist())
 
 
-def test_case_and_punctuation_do_not_matter_but_order_does():
+def test_case_and_punctuation_do_not_matter_but_order_does() -> None:
     encoder = NGrams(width=8)
     plain, loud, swapped = encoder.tokenize(["red on blue", "Red on BLUE!", "blue on red"])
     assert torch.equal(plain, loud)
     assert set(plain.tolist()) != set(swapped.tolist())
 
 
-def test_related_words_share_tokens():
+def test_related_words_share_tokens() -> None:
     rows = NGrams(width=8).tokenize(["blocks", "block", "pyramid"])
     blocks, block, pyramid = (set(row.tolist()) - {0} for row in rows)
     assert len(block & blocks) >= 3 and not block & pyramid
 
 
-def test_all_tokens_have_a_vector():
+def test_all_tokens_have_a_vector() -> None:
     assert NGrams(vocabulary=2, width=4).tokenize(SENTENCES).max() == 1
 
 
-def test_impossible_sizes_are_refused():
+def test_impossible_sizes_are_refused() -> None:
     with pytest.raises(ValueError, match="words=0"):
         NGrams(words=0, width=4)

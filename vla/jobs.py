@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import logging
 import time
+import warnings
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -224,6 +225,8 @@ def _trained(config: DictConfig) -> Path:
     lightning.seed_everything(config.seed, verbose=False)
     learner = make_learner(config, store)
     data = make_data(config, store, learner.model)
+    parameters = sum(parameter.numel() for parameter in learner.model.parameters())
+    log.info("training %s with %.2f M parameters", type(learner.model).__name__, parameters / 1e6)
     started = time.monotonic()
     trainer.fit(learner, datamodule=data, ckpt_path=config.checkpoint, weights_only=True)
     if trainer.interrupted:
@@ -273,9 +276,12 @@ def make_trainer(config: DictConfig, checkpoints: Path | None, *watching: Callba
 
 
 def _quiet_lightning() -> None:
-    """Lightning brings its own log handlers, which would print every line a second time under Hydra."""
+    """Lightning prints advertisements and, through handlers of its own, every line twice under Hydra."""
     for name in ("lightning", "lightning.pytorch", "lightning.fabric"):
         logging.getLogger(name).handlers.clear()
+    logging.getLogger("lightning.pytorch.utilities.rank_zero").setLevel(logging.WARNING)
+    # What its own callbacks do with its own hooks is nothing that a user could change.
+    warnings.filterwarnings("ignore", module=r"lightning\.pytorch")
 
 
 def _cores() -> int:
