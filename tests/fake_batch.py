@@ -10,8 +10,9 @@ import torch
 from toy import SPEC
 
 from vla.models.action_tokenizer import Uniform
-from vla.models.bc import BC, Model
+from vla.models.bc import BC
 from vla.models.image_tokenizer import FilmConv
+from vla.models.model import Model
 from vla.models.rt1 import RT1
 from vla.models.text import NGrams
 from vla.spec import Spec

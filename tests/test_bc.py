@@ -9,7 +9,7 @@ import torch
 from fake_batch import make_batch, make_bc, make_rt1, overfit, with_text
 from toy import SPEC
 
-from vla.models.bc import Model, Standardize
+from vla.models.model import Model, Standardize
 
 MODELS: dict[str, Callable[[], Model]] = {
     "bc": make_bc,

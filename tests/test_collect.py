@@ -134,7 +134,7 @@ def test_a_second_job_waits_for_the_first_and_uses_its_episodes(
 
 
 def test_a_worker_that_dies_is_reported_and_costs_nothing(tmp_path: Path, whole: Path) -> None:
-    with pytest.raises(ValueError, match="a collecting process died"):
+    with pytest.raises(ValueError, match="the collecting processes die"):
         gather(tmp_path, workers=2, make_environment=toy.make_deadly_environment)
     assert [entry.seed for entry in EpisodeStore(tmp_path).tried] == list(range(lines(tmp_path)))
     gather(tmp_path)

@@ -14,8 +14,8 @@ from lightning.pytorch.callbacks import EMAWeightAveraging
 from torch.utils.data import DataLoader
 from toy import SPEC
 
-from vla.models.bc import Model
 from vla.models.learner import Learner
+from vla.models.model import Model
 from vla.policy import read_checkpoint
 
 CONFIG = {"model": {"_target_": "vla.models.bc.BC", "shift": [0, 0]}, "seed": 0}

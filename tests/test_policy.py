@@ -12,7 +12,7 @@ import torch
 from fake_batch import make_bc, make_rt1
 from toy import SPEC, ToyEnvironment
 
-from vla.models.bc import Model
+from vla.models.model import Model
 from vla.policy import Checkpoint, Policy, read_checkpoint
 from vla.rollout import rollout
 from vla.spec import Observation

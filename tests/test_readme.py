@@ -7,7 +7,6 @@ import shlex
 from pathlib import Path
 
 import pytest
-
 from test_run import SMALL, vla
 
 README = (Path(__file__).parents[1] / "README.md").read_text(encoding="utf-8")

@@ -7,13 +7,13 @@ from __future__ import annotations
 
 import hashlib
 import inspect
-from importlib import import_module
 import json
 import os
 import types
 import typing
 from collections.abc import Collection, Iterable, Iterator, Mapping, MutableMapping, Sequence
 from difflib import get_close_matches
+from importlib import import_module
 from pathlib import Path
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin
 

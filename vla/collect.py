@@ -5,6 +5,7 @@ Seeds are tried in order and committed in order, until the store holds as many s
 
 from __future__ import annotations
 
+import logging
 import os
 import signal
 import threading
@@ -24,6 +25,8 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from vla.data.episodes import EpisodeStore
 from vla.rollout import rollout
 from vla.spec import Agent, Environment, Episode
+
+log = logging.getLogger(__name__)
 
 PATIENCE = 50  # seeds that may fail in a row before the expert counts as hopeless
 LOOK_AHEAD = 4  # episodes under way per worker: a long one must not keep the others waiting
@@ -91,11 +94,33 @@ def collect(
                 raise ValueError(f"{store.folder} starts at seed {first}, not {seed}: set collect.seed={first}")
             if before < episodes:
                 workers = min(workers, episodes - before)
-                with _rollouts(make_environment, make_expert, workers) as submit:
-                    _fill(store, submit, episodes, LOOK_AHEAD * workers if workers > 1 else 1, seed)
+                _fill_with(make_environment, make_expert, workers, store, episodes, seed)
     stored = len(store.episodes)
     failures = Counter(entry.outcome for entry in store.tried if not entry.success)
     return Summary(stored, stored - before, len(store.tried), dict(failures), time.monotonic() - started)
+
+
+def _fill_with(
+    make_environment: MakeEnvironment,
+    make_expert: MakeExpert,
+    workers: int,
+    store: EpisodeStore,
+    episodes: int,
+    seed: int,
+) -> None:
+    """Fill the store, with new processes if one died: a graphics driver may crash once in thousands of episodes."""
+    while True:
+        tried = len(store.tried)
+        try:
+            with _rollouts(make_environment, make_expert, workers) as submit:
+                return _fill(store, submit, episodes, LOOK_AHEAD * workers if workers > 1 else 1, seed)
+        except BrokenProcessPool as error:
+            if len(store.tried) == tried:
+                raise ValueError(
+                    "the collecting processes die, killed for their memory or by a crash outside Python: what was "
+                    "committed is safe, run again with fewer collect.workers, or with 1 to see the crash"
+                ) from error
+            log.warning("a collecting process died after %d episodes; going on with new ones", len(store.episodes))
 
 
 def _fill(store: EpisodeStore, submit: Submit, episodes: int, ahead: int, seed: int) -> None:
@@ -157,11 +182,6 @@ def _rollouts(make_environment: MakeEnvironment, make_expert: MakeExpert, worker
 
         try:
             yield submit
-        except BrokenProcessPool as error:
-            raise ValueError(
-                "a collecting process died, killed for its memory or by a crash outside Python: what was committed is "
-                "safe, run again to go on, with fewer collect.workers or with collect.workers=1 to see the crash"
-            ) from error
         finally:
             pool.shutdown(cancel_futures=True)
 

@@ -216,6 +216,7 @@ def collected(config: DictConfig) -> EpisodeStore:
 
 def _trained(config: DictConfig) -> Path:
     """Path of the checkpoint that training leaves behind."""
+    logging.getLogger("torch.utils.flop_counter").setLevel(logging.ERROR)  # misses Triton, which it does not need
     import lightning
 
     _quiet_lightning()

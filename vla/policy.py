@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from vla.models.bc import Model
+from vla.models.model import Model
 from vla.spec import Array, Observation, Spec
 
 Batch = dict[str, Any]
@@ -76,7 +76,7 @@ class Policy:
         self._low, self._high = np.array(spec.low, np.float32), np.array(spec.high, np.float32)
         self._frames: deque[dict[str, Tensor]] = deque(maxlen=model.history)
         self._chunk: deque[tuple[Array, Array]] = deque()
-        self._instruction = ""
+        self.reset("", 0)
 
     def reset(self, instruction: str, seed: int) -> None:
         """Forget the past; a policy draws nothing, so `seed` is not used."""

@@ -86,13 +86,15 @@ class ActionTokenizer(nn.Module, ABC):
 class Uniform(ActionTokenizer):
     """Bins over the range of the data, nearest bin, and targets that also credit the neighbours of the right bin.
 
-    The action is read as the expectation over the bins around the most likely one, so it is finer than a bin and two
-    separate ways to act are never averaged.
+    The action is read as the expectation over the most likely stretch of bins, so it is finer than a bin and two
+    separate ways to act are never averaged. A stretch and not a bin, because a sharp peak of little weight, such as
+    standing still, would otherwise beat a broad one of more weight, and a robot that stands still goes on doing so.
 
     Args:
         bins: K.
         margin: how far the bounds lie beyond the data, as a part of its range.
-        smoothing: standard deviation of the Gaussian target [bins]; 0 trains and reads the single best bin.
+        smoothing: standard deviation of the Gaussian target [bins]; 0 trains on the single best bin.
+        reach: half the length of the stretch of bins that an action is read from [bins]; 0 reads the single best bin.
         spec: gives the range of allowed actions.
         statistics: bounds of the data; None before a checkpoint's bounds are loaded, the allowed range stands in.
     """
@@ -102,6 +104,7 @@ class Uniform(ActionTokenizer):
         bins: int = 256,
         margin: float = 0.05,
         smoothing: float = 3.0,
+        reach: int = 50,
         *,
         spec: Spec,
         statistics: Statistics | None = None,
@@ -117,7 +120,7 @@ class Uniform(ActionTokenizer):
         span = np.maximum(high - low, LEAST_SPAN * (allowed_high - allowed_low))
         half = (0.5 + margin) * span
         super().__init__((low + high) / 2 - half, (low + high) / 2 + half, bins)
-        self.smoothing = smoothing
+        self.smoothing, self.reach = smoothing, reach
 
     def encode(self, action: Tensor) -> Tensor:
         """(…, D) float actions as the nearest of the K tokens, (…, D) int64."""
@@ -132,11 +135,13 @@ class Uniform(ActionTokenizer):
         return -(target * logits.log_softmax(-1)).sum(-1)
 
     def read(self, logits: Tensor) -> Tensor:
-        """The (…, D) expectation over the bins within three standard deviations of the most likely one."""
+        """The (…, D) expectation over the most likely stretch of bins."""
+        probabilities = logits.float().softmax(-1)  # (…, D, K)
+        window = 2 * self.reach + 1
+        weight = F.avg_pool1d(probabilities.flatten(0, -2), window, stride=1, padding=self.reach).view_as(logits)
         bins = self._bins(logits)
-        far = (bins - logits.argmax(-1, keepdim=True)).abs() > 3 * self.smoothing
-        near = logits.float().masked_fill(far, -math.inf).softmax(-1)  # (…, D, K)
-        return self.decode((near * bins).sum(-1))
+        near = probabilities * ((bins - weight.argmax(-1, keepdim=True)).abs() <= self.reach)
+        return self.decode((near * bins).sum(-1) / near.sum(-1))
 
     def _bins(self, logits: Tensor) -> Tensor:
         return torch.arange(self.bins, device=logits.device, dtype=torch.float32)

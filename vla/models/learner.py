@@ -12,7 +12,7 @@ from lightning import LightningModule
 from torch import Tensor, nn
 from torchmetrics import MeanMetric
 
-from vla.models.bc import Model
+from vla.models.model import Model
 from vla.spec import Spec
 
 Batch = dict[str, Any]

@@ -13,8 +13,8 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from vla.models.action_tokenizer import ActionTokenizer
-from vla.models.bc import Batch, Model, Standardize, pixels
 from vla.models.image_tokenizer import ImageEncoder, Keypoints, RandomShift, TokenLearner
+from vla.models.model import Batch, Model, Standardize, pixels
 from vla.models.text import TextEncoder
 from vla.spec import Spec
 
@@ -61,7 +61,7 @@ class RT1(Model):
         image_size: images are resized to this height and width [px]; null leaves them as they are.
         learned_tokens: tokens per camera and frame.
         keypoints: add, per camera, a token made of the positions of this many keypoints; the paper has none.
-        proprioception: add a token for joints, velocities and gripper; the paper has none.
+        proprioception: add a token for joints and gripper; the paper has none.
         chunk: k, the actions predicted for a frame.
         auxiliary: weight of the head that predicts the simulator's truth, in training only; 0 leaves it out.
         text_width: length of the sentence vector.
@@ -110,8 +110,8 @@ class RT1(Model):
             self.keypoints = nn.ModuleList(Keypoints(self.image.channels, keypoints) for _ in spec.cameras)
             self.keypoint_tokens = nn.ModuleList(nn.Linear(2 * keypoints, width) for _ in spec.cameras)
         if proprioception:
-            self.proprioception = Standardize(self.proprioception_width)
-            self.proprioception_token = nn.Linear(self.proprioception_width, width)
+            self.proprioception = Standardize(self.posture_width)
+            self.proprioception_token = nn.Linear(self.posture_width, width)
         length = history * (self.tokens + self.slots)
         self.positions = nn.Embedding(length, width)
         nn.init.normal_(self.positions.weight, std=0.05)  # where a token stands must not drown what it says
@@ -134,7 +134,7 @@ class RT1(Model):
                 positions = self.keypoint_tokens[index](self.keypoints[index](features).flatten(1))
                 tokens.append(positions.view(-1, frames, 1, positions.shape[-1]))
         if hasattr(self, "proprioception"):
-            standard = self.proprioception(batch["proprio"], batch["present"])
+            standard = self.proprioception(self.posture(batch), batch["present"])
             tokens.append(self.proprioception_token(standard).unsqueeze(2))
         return torch.cat(tokens, 2)
 

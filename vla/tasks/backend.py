@@ -5,8 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-from contextlib import suppress
-from importlib import import_module
+from pathlib import Path
 
 TRIED = "VLA_GL_WORKS"  # the backend that was seen to work, for the processes that this one starts
 PROBE = "import mujoco; mujoco.GLContext(8, 8).make_current()"
@@ -20,10 +19,10 @@ def choose_backend() -> None:
     Raises:
         RuntimeError: no GL implementation works on this machine.
     """
-    # Mesa's software renderer and Triton, which PyTorch may import at any later time, each bring an LLVM of their own;
-    # the process crashes if Triton's comes second.
-    with suppress(ImportError):
-        import_module("triton._C.libtriton")
+    if not Path("/dev/nvidiactl").exists():
+        # Mesa's software renderer and Triton each bring an LLVM, and a process with both crashes sooner or later.
+        # Without an NVIDIA GPU, PyTorch imports Triton but has no use for it.
+        sys.modules.setdefault("triton", None)  # type: ignore[arg-type]
     chosen = os.environ.get("MUJOCO_GL")
     if os.environ.get("DISPLAY") or sys.platform != "linux" or (chosen and chosen == os.environ.get(TRIED)):
         return

@@ -18,7 +18,7 @@ HOVER = 0.08  # height above the block from which it is approached [m]
 CARRY = 0.07  # height above the table at which it is carried [m]
 FUNNEL = 2.5  # height gained per metre of horizontal distance, so that approaches come from above
 # As loose as still works: a learner that is a centimetre off must not wait for ever to be exact.
-GRASP_XY, GRASP_Z, GRASP_YAW = 0.012, 0.012, 0.25  # tolerances at which the gripper closes [m], [m], [rad]
+GRASP_XY, GRASP_Z, GRASP_YAW = 0.012, 0.012, 0.5  # tolerances at which the gripper closes [m], [m], [rad]
 PLACE_XY, PLACE_Z = 0.02, 0.012  # tolerances at which it opens [m]
 MAX_YAW = 0.9  # furthest turn from neutral from which the nearest faces are taken [rad]
 CLEARANCE = 0.012  # between open fingers and a block on both sides together [m]
@@ -74,8 +74,7 @@ class Waypoint:
         if closing or (aligned and opening > width - 0.006):
             return self._action(truth, offset, yaw, 0.0)
         # Down only where it is straight below; further away, or with the fingers too close, stay above it.
-        misaligned = max(away - GRASP_XY / 2, 0.0) + 0.05 * max(abs(yaw) - GRASP_YAW / 2, 0.0)
-        height = min(FUNNEL * misaligned, HOVER)
+        height = min(FUNNEL * max(away - GRASP_XY / 2, 0.0), HOVER)
         if opening < width + CLEARANCE:
             height = max(height, 0.045) if not between else HOVER
         offset[2] += height
@@ -133,7 +132,7 @@ class Perturbation:
         self,
         start: float = 0.7,
         start_steps: Sequence[int] = (2, 9),
-        rate: float = 0.04,
+        rate: float = 0.06,
         steps: Sequence[int] = (2, 5),
         noise: float = 0.2,
         closed: float = 0.3,

@@ -1,0 +1,153 @@
+"""What every model is: from a batch of windows to logits over action tokens.
+
+Shapes: B batch, T history frames, k action chunk, D action components, K bins, S truth scalars, P proprioception.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from vla.models.action_tokenizer import ActionTokenizer
+from vla.models.text import TextEncoder
+from vla.spec import Spec
+
+Batch = dict[str, Any]
+
+
+class Standardize(nn.Module):
+    """Zero mean and unit variance by statistics that are gathered in training and kept in the checkpoint.
+
+    Unlike batch normalisation it never uses the statistics of the current batch alone, whose noise would blur what
+    a joint angle means.
+
+    Args:
+        width: number of components.
+    """
+
+    count: Tensor
+    mean: Tensor
+    square: Tensor
+
+    LEAST_DEVIATION = 1e-3  # a component that never moved in the data must not explode when it does
+    LARGEST = 5.0  # standard deviations; what lies further out was never seen
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.register_buffer("count", torch.zeros(()))
+        self.register_buffer("mean", torch.zeros(width))
+        self.register_buffer("square", torch.zeros(width))  # mean squared distance from the mean
+
+    @property
+    def deviation(self) -> Tensor:
+        """(width,) standard deviations."""
+        return self.square.sqrt().clamp(min=self.LEAST_DEVIATION)
+
+    def forward(self, values: Tensor, present: Tensor) -> Tensor:
+        """(B, T, width) values, of which the (B, T) bool `present` are real, to the same shape; the rest become 0."""
+        if self.training:
+            self._gather(values.detach(), present.unsqueeze(-1).to(values.dtype))
+        standard = ((values - self.mean) / self.deviation).clamp(-self.LARGEST, self.LARGEST)
+        return standard * present.unsqueeze(-1)
+
+    def inverse(self, standard: Tensor) -> Tensor:
+        """(…, width) standardised values in their own units again."""
+        return standard * self.deviation + self.mean
+
+    def _gather(self, values: Tensor, weight: Tensor) -> None:
+        added = weight.sum()
+        total = (self.count + added).clamp(min=1)
+        mean = (values * weight).sum((0, 1)) / added.clamp(min=1)
+        square = ((values - mean).square() * weight).sum((0, 1))
+        # Two groups merged into one (Chan et al. 1979).
+        shift = mean - self.mean
+        between = shift.square() * self.count * added / total
+        self.square.copy_((self.square * self.count + square + between) / total)
+        self.mean.add_(shift * added / total)
+        self.count.add_(added)
+
+
+class Model(nn.Module, ABC):
+    """A policy's network: a batch of windows → logits over action tokens; it knows no simulator.
+
+    A batch is a dict:
+        rgb: camera → (B, T, H, W, 3) uint8; proprio: (B, T, P) float32; present: (B, T) bool, false for padding;
+        text: (B, L) int64 from `model.text.tokenize`; and to learn from, action: (B, T, k, D) float32,
+        valid: (B, T, k) bool, truth: (B, T, S) float32.
+
+    Args:
+        history: T, the frames the model looks at.
+        chunk: k, the actions it predicts for a frame.
+        text: the encoder of the instruction.
+        auxiliary: weight of the loss of the head that predicts the truth; 0 leaves the head out.
+        truth_width: length of the features which that head reads.
+        spec: what a step looks like.
+        tokenizer: what the logits mean.
+    """
+
+    def __init__(
+        self,
+        history: int,
+        chunk: int,
+        text: TextEncoder,
+        auxiliary: float,
+        truth_width: int,
+        spec: Spec,
+        tokenizer: ActionTokenizer,
+    ) -> None:
+        super().__init__()
+        self.history, self.chunk, self.auxiliary = history, chunk, auxiliary
+        self.spec, self.tokenizer, self.text = spec, tokenizer, text
+        self.posture_width = len(spec.joints) + 1
+        self.logits_shape = (chunk, len(spec.action), tokenizer.bins)
+        self.truth_head: nn.Linear | None = None
+        if auxiliary > 0 and spec.truth_size > 0:
+            self.truth_head = nn.Linear(truth_width, spec.truth_size)
+            self.truth_scale = Standardize(spec.truth_size)
+
+    def posture(self, batch: Batch) -> Tensor:
+        """(B, T, posture_width) joint positions and gripper opening.
+
+        Without velocities: a learner that sees them learns that an arm at rest stays at rest.
+        """
+        joints = len(self.spec.joints)
+        return torch.cat([batch["proprio"][..., :joints], batch["proprio"][..., 2 * joints :]], -1)
+
+    def encode(self, batch: Batch) -> Tensor | None:
+        """What of each frame can be kept while a window moves on, (B, T, N, E); None for a model that keeps nothing.
+
+        `forward` then takes it as "tokens" in place of images.
+        """
+        return None
+
+    @abstractmethod
+    def forward(self, batch: Batch) -> dict[str, Tensor]:
+        """logits: (B, T', k, D, K) for the last T' of the T frames; with an auxiliary head, truth: (B, T', S),
+        standardised."""
+
+    def loss(self, batch: Batch) -> dict[str, Tensor]:
+        """The scalar `loss` to minimise, its parts by name, and the `logits`."""
+        output = self(batch)
+        logits = output["logits"]
+        frames = logits.shape[1]
+        action = self.tokenizer.loss(logits, batch["action"][:, -frames:], batch["valid"][:, -frames:])
+        losses = {"loss": action, "action_loss": action, "logits": logits}
+        if self.truth_head is not None:
+            present = batch["present"][:, -frames:]
+            target = self.truth_scale(batch["truth"][:, -frames:], present)
+            error = (output["truth"].float() - target).square().mean(-1)  # (B, T')
+            losses["truth_loss"] = (error * present).sum() / present.sum().clamp(min=1)
+            losses["loss"] = action + self.auxiliary * losses["truth_loss"]
+        return losses
+
+
+def pixels(images: Tensor, size: int | None = None) -> Tensor:
+    """(B, T, H, W, 3) uint8 as (B·T, 3, H, W) float32 in 0 … 1, resized to a square of `size` [px] if given."""
+    x = images.flatten(0, 1).permute(0, 3, 1, 2).float().div_(255)
+    if size is not None and x.shape[-2:] != (size, size):
+        x = F.interpolate(x, (size, size), mode="bilinear")
+    return x
