@@ -36,6 +36,13 @@ def test_the_command_runs(home: Path, command: str) -> None:
         small = [*SMALL, *small]
     elif "job=train" in arguments:
         small = [*SMALL, "trainer.max_steps=6"]
+    if "model=rt1" in arguments:  # a second per frame
+        small += [
+            "data.batch_size=1",
+            "data.validation_windows=1",
+            "trainer.max_steps=1",
+            "trainer.limit_val_batches=0",
+        ]
     vla(home, *arguments, *small)
 
 

@@ -179,11 +179,3 @@ def test_benchmark_measures_against_floors(home: Path) -> None:
     assert set(measures) == {"collect", "loader", "train", "policy"}
     for measure in measures.values():
         assert set(measure) == {"value", "unit", "n", "floor", "ratio"} and measure["value"] > 0
-
-
-@pytest.mark.slow
-def test_rt1_in_bfloat16_trains_as_the_readme_says(home: Path) -> None:
-    small = [item for item in SMALL if "max_steps" not in item and "val_check" not in item]
-    vla(home, *small, "model=rt1", "trainer.precision=bf16", "job=train", "trainer.max_steps=1",
-        "data.batch_size=2", "data.validation_windows=2", "trainer.limit_val_batches=0", "output=rt1")  # fmt: skip
-    assert (home / "rt1/checkpoints/last.ckpt").stat().st_size > 100e6

@@ -216,7 +216,6 @@ def collected(config: DictConfig) -> EpisodeStore:
 
 def _trained(config: DictConfig) -> Path:
     """Path of the checkpoint that training leaves behind."""
-    logging.getLogger("torch.utils.flop_counter").setLevel(logging.ERROR)  # misses Triton, which it does not need
     import lightning
 
     _quiet_lightning()
@@ -232,6 +231,7 @@ def _trained(config: DictConfig) -> Path:
     trainer.fit(learner, datamodule=data, ckpt_path=config.checkpoint, weights_only=True)
     if trainer.interrupted:
         raise KeyboardInterrupt
+    trainer.save_checkpoint(checkpoints / "last.ckpt", weights_only=False)
     log.info("trained %d steps in %.0f s: %s", trainer.global_step, time.monotonic() - started, checkpoints)
     return checkpoints / "last.ckpt"
 
@@ -270,7 +270,9 @@ def make_trainer(config: DictConfig, checkpoints: Path | None, *watching: Callba
         trainer: Trainer = build(config.trainer, callbacks=callbacks, logger=False, enable_checkpointing=False)
         return trainer
     # After the averaging, whose weights it saves.
-    callbacks.append(ModelCheckpoint(checkpoints, filename="last", enable_version_counter=False))
+    callbacks.append(
+        ModelCheckpoint(checkpoints, filename="last", every_n_train_steps=500, enable_version_counter=False)
+    )
     logger = CSVLogger(checkpoints.parent, name="", version="")
     trainer = build(config.trainer, callbacks=callbacks, logger=logger)
     return trainer
@@ -282,7 +284,7 @@ def _quiet_lightning() -> None:
         logging.getLogger(name).handlers.clear()
     logging.getLogger("lightning.pytorch.utilities.rank_zero").setLevel(logging.WARNING)
     # What its own callbacks do with its own hooks is nothing that a user could change.
-    warnings.filterwarnings("ignore", module=r"lightning\.pytorch")
+    warnings.filterwarnings("ignore", module=r"lightning\.")
 
 
 def _cores() -> int:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import subprocess
 import sys
@@ -23,6 +24,7 @@ def choose_backend() -> None:
         # Mesa's software renderer and Triton each bring an LLVM, and a process with both crashes sooner or later.
         # Without an NVIDIA GPU, PyTorch imports Triton but has no use for it.
         sys.modules.setdefault("triton", None)  # type: ignore[arg-type]
+        logging.getLogger("torch.utils.flop_counter").setLevel(logging.ERROR)  # would complain
     chosen = os.environ.get("MUJOCO_GL")
     if os.environ.get("DISPLAY") or sys.platform != "linux" or (chosen and chosen == os.environ.get(TRIED)):
         return
