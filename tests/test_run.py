@@ -144,6 +144,14 @@ def test_a_checkpoint_that_is_cut_short_is_named(home: Path) -> None:
     assert "error: cut.ckpt" in done.stderr and "damaged" in done.stderr
 
 
+def test_training_goes_on_with_the_same_model_only(home: Path) -> None:
+    arguments = ("job=train", "checkpoint=run/checkpoints/last.ckpt")
+    done = vla(home, *SMALL, *arguments, "trainer.max_steps=6", "output=longer")
+    assert "trained 6 steps" in done.stdout
+    refused = vla(home, *SMALL, *arguments, "model.width=32", ok=False)
+    assert "another model" in refused.stderr and "Traceback" not in refused.stderr
+
+
 def test_a_checkpoint_of_other_cameras_is_refused(home: Path) -> None:
     done = vla(home, "checkpoint=run/checkpoints/last.ckpt", "task.cameras=[front]", "evaluate.workers=1", ok=False)
     assert "cameras" in done.stderr and "Traceback" not in done.stderr

@@ -125,3 +125,16 @@ def test_shapes_and_poses_describe_the_scene(tabletop: Tabletop) -> None:
     assert {"mesh", "box", "cylinder"} == {shape.kind for shape in shapes}
     block = next(shape for shape in shapes if shape.name == "block0/cube")
     assert block.size[0] == pytest.approx(tabletop.draws["size"]["half_size"][0], abs=1e-4)
+
+
+def test_the_robot_can_be_drawn_with_all_its_faces(tabletop: Tabletop) -> None:
+    full = make_tabletop("meshes=full")
+    faces = [sum(len(shape.faces) for shape in env.shapes() if shape.faces is not None) for env in (tabletop, full)]
+    assert faces[0] < 5_000 and faces[1] > 100_000
+    np.testing.assert_array_equal(full.reset(0).joints, tabletop.reset(0).joints)
+    full.close()
+
+
+def test_more_blocks_than_colours_are_refused() -> None:
+    with pytest.raises(Exception, match="task.blocks is from 1 to 6"):
+        make_tabletop("blocks=7")

@@ -25,6 +25,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from vla.data.episodes import EpisodeStore
 from vla.rollout import rollout
 from vla.spec import Agent, Environment, Episode
+from vla.workers import one_thread_each
 
 log = logging.getLogger(__name__)
 
@@ -161,7 +162,7 @@ def _give_up_after(store: EpisodeStore, in_a_row: int) -> None:
 @contextmanager
 def _rollouts(make_environment: MakeEnvironment, make_expert: MakeExpert, workers: int) -> Iterator[Submit]:
     """A function that starts the attempt at a seed and gives its future."""
-    with _single_threaded():
+    with one_thread_each():
         if workers == 1:
             worker = _Worker(make_environment, make_expert)
             try:
@@ -184,22 +185,6 @@ def _rollouts(make_environment: MakeEnvironment, make_expert: MakeExpert, worker
             yield submit
         finally:
             pool.shutdown(cancel_futures=True)
-
-
-@contextmanager
-def _single_threaded() -> Iterator[None]:
-    """Processes started within use one thread each: their renderers would otherwise fight for the cores."""
-    names = ("LP_NUM_THREADS", "OMP_NUM_THREADS")  # read when Mesa and OpenMP are loaded: a running process is too late
-    before = {name: os.environ.get(name) for name in names}
-    os.environ.update(dict.fromkeys(names, "1"))
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            if value is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = value
 
 
 class _Worker:

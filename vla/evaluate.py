@@ -6,15 +6,13 @@ An episode is a function of its seed alone, so a report is the same whatever the
 from __future__ import annotations
 
 import json
-import os
 import signal
-import sys
 import traceback
 from collections import Counter
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Callable, Generator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import closing, contextmanager, suppress
+from contextlib import closing, suppress
 from dataclasses import dataclass, field
 from math import sqrt
 from multiprocessing import get_context
@@ -26,11 +24,11 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from vla.rollout import rollout
 from vla.spec import Agent, Environment, Recorder
+from vla.workers import cores, one_thread_each
 
 FIRST_SEED = 1_000_000  # evaluation seeds start here; collection, which starts at small ones, never gets this far
 ERROR = "error"  # outcome of an episode that could not be played to its end
 NORMAL_QUANTILE = 1.959964  # of 0.975: an interval of 95 %
-THREAD_SETTINGS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "LP_NUM_THREADS")
 
 
 class ClosableEnvironment(Environment, Protocol):
@@ -139,14 +137,14 @@ def evaluate(
     """
     if not seeds or min(seeds) < FIRST_SEED:
         raise ValueError(f"evaluation needs seeds from {FIRST_SEED} on, which no policy is trained on; got {seeds}")
-    workers = _cores() if workers is None else workers
+    workers = cores() if workers is None else workers
     if workers < 1:
         raise ValueError(f"evaluation needs at least one worker, got evaluate.workers={workers}")
     factories = _Factories(make_environment, make_agent, make_recorder)
     play = _play_here(factories, seeds) if workers == 1 else _play_apart(factories, seeds, min(workers, len(seeds)))
     columns = (TextColumn("evaluating"), BarColumn(), MofNCompleteColumn(), TextColumn("{task.fields[note]}"))
     results: dict[int, Result] = {}
-    with _one_thread(), closing(play), Progress(*columns, TimeRemainingColumn()) as bar:
+    with one_thread_each(), closing(play), Progress(*columns, TimeRemainingColumn()) as bar:
         task = bar.add_task("", total=len(seeds), note="")
         for result in play:
             results[result.seed] = result
@@ -172,31 +170,6 @@ def keep_recordings(report: Report, folder: Path, target: Path, limit: int | Non
     with suppress(OSError):
         folder.rmdir()
     return len(files[:limit])
-
-
-def _cores() -> int:
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
-@contextmanager
-def _one_thread() -> Iterator[None]:
-    """Within, numerical libraries use one thread: sums must not depend on how many workers share the machine."""
-    before = {name: os.environ.get(name) for name in THREAD_SETTINGS}
-    os.environ.update(dict.fromkeys(THREAD_SETTINGS, "1"))  # read by libraries that are loaded from now on
-    torch = sys.modules.get("torch")  # was loaded already where this process trained the policy
-    threads = torch.get_num_threads() if torch else 0
-    if torch:
-        torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        if torch:
-            torch.set_num_threads(threads)
-        for name, value in before.items():
-            if value is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = value
 
 
 @dataclass(frozen=True)

@@ -187,6 +187,7 @@ def collected(config: DictConfig) -> EpisodeStore:
     """The episode store of this configuration, with at least as many episodes as asked for."""
     from vla.collect import collect
     from vla.data.episodes import EpisodeStore
+    from vla.workers import cores
 
     environment = make_environment(plain(config.task))
     spec = environment.spec
@@ -198,7 +199,7 @@ def collected(config: DictConfig) -> EpisodeStore:
         partial(make_environment, source["task"]),
         partial(make_expert, source["expert"]),
         config.collect.episodes,
-        config.collect.workers or _cores(),
+        config.collect.workers or cores(),
         config.collect.seed,
     )
     failures = ", ".join(f"{count} {cause}" for cause, count in summary.failures.items()) or "none"
@@ -220,7 +221,10 @@ def _trained(config: DictConfig) -> Path:
 
     _quiet_lightning()
     checkpoints = _output(config) / "checkpoints"
-    trainer = make_trainer(config, checkpoints)  # first: it knows whether the devices that were asked for are there
+    # Before anything is collected: the checkpoint to go on from may be unfit, the devices asked for may be missing.
+    if config.checkpoint:
+        _require_same_policy(config)
+    trainer = make_trainer(config, checkpoints)
     store = collected(config)
     lightning.seed_everything(config.seed, verbose=False)
     learner = make_learner(config, store)
@@ -234,6 +238,18 @@ def _trained(config: DictConfig) -> Path:
     trainer.save_checkpoint(checkpoints / "last.ckpt", weights_only=False)
     log.info("trained %d steps in %.0f s: %s", trainer.global_step, time.monotonic() - started, checkpoints)
     return checkpoints / "last.ckpt"
+
+
+def _require_same_policy(config: DictConfig) -> None:
+    from vla.policy import read_checkpoint
+
+    saved = read_checkpoint(config.checkpoint).config
+    for group in ("model", "tokenizer"):
+        if saved[group] != plain(config[group]):
+            raise ValueError(
+                f"training cannot go on from {config.checkpoint}, which has another {group}: give the same overrides "
+                "as when it was started"
+            )
 
 
 def make_learner(config: DictConfig, store: EpisodeStore) -> Learner:
@@ -285,12 +301,6 @@ def _quiet_lightning() -> None:
     logging.getLogger("lightning.pytorch.utilities.rank_zero").setLevel(logging.WARNING)
     # What its own callbacks do with its own hooks is nothing that a user could change.
     warnings.filterwarnings("ignore", module=r"lightning\.")
-
-
-def _cores() -> int:
-    import os
-
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def _output(config: DictConfig) -> Path:

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import io
 import os
-import socket
 import subprocess
-import time
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -16,7 +14,6 @@ import rerun as rr
 import rerun.blueprint as rrb
 import rerun_cli
 from PIL import Image
-from rerun.experimental import ViewerClient
 
 from vla.spec import Array, Environment, Episode, Observation, Shape, Spec
 
@@ -269,31 +266,3 @@ def merge(files: Sequence[Path], target: Path) -> None:
         partial.unlink(missing_ok=True)
         raise ValueError(f"rerun could not merge {len(files)} recordings into {target}: {done.stderr[-500:].strip()}")
     os.replace(partial, target)
-
-
-def screenshot(recording: Path, picture: Path, step: int) -> None:
-    """Save what the viewer shows of a recording at a step as PNG; needs no display, but Vulkan (lavapipe will do).
-
-    Raises:
-        ValueError: the viewer does not start, or one of its views reports a problem.
-    """
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
-    # The viewer would listen on all interfaces unless told otherwise.
-    options = ["--bind", "127.0.0.1", "--port", str(port), "--headless", "--window-size", "1600x900"]
-    viewer = subprocess.Popen([VIEWER, *options, str(recording)], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-    try:
-        time.sleep(10.0)  # until it has started, everything is loaded and the greeting has gone
-        if viewer.poll() is not None:
-            raise ValueError("the viewer does not start; without a display it needs libvulkan1, mesa-vulkan-drivers")
-        client = ViewerClient.connect(f"rerun+http://127.0.0.1:{port}/proxy")
-        client.set_time("step", sequence=step, play_state="paused")
-        time.sleep(2.0)  # until everything is painted
-        problems = [(view.name, view.reports) for view in client.get_state().views if view.reports]
-        if problems:
-            raise ValueError(f"the viewer cannot show all of {recording}: {problems}")
-        picture.write_bytes(client.take_screenshot())
-    finally:
-        viewer.terminate()
-        viewer.wait(timeout=10)

@@ -15,8 +15,9 @@ from zlib import crc32
 import numpy as np
 
 from vla.spec import Array
+from vla.tasks.bound import BoundScene
 from vla.tasks.control import DOWN, HOME, MAX_OPENING, rotation_z, solve
-from vla.tasks.scene import COLOURS, PAD_RADIUS, BoundScene
+from vla.tasks.scene import COLOURS, PAD_RADIUS
 
 Range = tuple[float, float]  # low, high
 

@@ -12,6 +12,7 @@ from dm_control import composer, mjcf
 from dm_env import specs
 
 from vla.spec import Array, Observation, Shape, Spec
+from vla.tasks.bound import BoundScene
 from vla.tasks.control import CartesianController
 from vla.tasks.franka import DAMPING_RATIO, FINGER_SPEED, FINGER_TRAVEL
 from vla.tasks.goals import Goal, Progress
@@ -19,7 +20,7 @@ from vla.tasks.language import instruction
 from vla.tasks.outcome import Judge
 from vla.tasks.randomize import Axis, stream
 from vla.tasks.render import Renderer
-from vla.tasks.scene import COLOURS, BoundScene, Scene
+from vla.tasks.scene import COLOURS, Scene
 
 CONTROL_HZ = 10.0
 TRANSLATION = 0.04  # largest translation per step [m]

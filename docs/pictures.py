@@ -1,0 +1,70 @@
+"""Make the README's pictures anew, with the README's commands: python docs/pictures.py RUN_FOLDER
+
+RUN_FOLDER is what a main job left, `outputs/runs/<time>`. The viewer is photographed without a display, for which it
+needs Vulkan: on Debian the packages libvulkan1 and mesa-vulkan-drivers.
+"""
+
+from __future__ import annotations
+
+import shutil
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+from rerun.experimental import ViewerClient
+
+from vla.record import VIEWER
+
+DOCS = Path(__file__).parent
+STEP = 12  # at which the rollout is shown: about to grasp
+
+
+def vla(*arguments: str) -> None:
+    """Run the command line."""
+    subprocess.run([sys.executable, "-m", "vla.run", *arguments], check=True)
+
+
+def screenshot(recording: Path, picture: Path, step: int) -> None:
+    """Save what the viewer shows of a recording at a step as PNG.
+
+    Raises:
+        ValueError: the viewer does not start, or one of its views reports a problem.
+    """
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    # The viewer would listen on all interfaces unless told otherwise.
+    options = ["--bind", "127.0.0.1", "--port", str(port), "--headless", "--window-size", "1600x900"]
+    viewer = subprocess.Popen([VIEWER, *options, str(recording)], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    try:
+        time.sleep(10.0)  # until it has started, everything is loaded and the greeting has gone
+        if viewer.poll() is not None:
+            raise ValueError("the viewer does not start; without a display it needs libvulkan1, mesa-vulkan-drivers")
+        client = ViewerClient.connect(f"rerun+http://127.0.0.1:{port}/proxy")
+        client.set_time("step", sequence=step, play_state="paused")
+        time.sleep(2.0)  # until everything is painted
+        problems = [(view.name, view.reports) for view in client.get_state().views if view.reports]
+        if problems:
+            raise ValueError(f"the viewer cannot show all of {recording}: {problems}")
+        picture.write_bytes(client.take_screenshot())
+    finally:
+        viewer.terminate()
+        viewer.wait(timeout=10)
+
+
+def main(run: Path) -> None:
+    """Preview, one rollout in the viewer, and the report of `run`."""
+    with tempfile.TemporaryDirectory() as folder:
+        vla("job=preview", "preview.episodes=6", f"output={folder}")
+        shutil.copy(Path(folder) / "preview.png", DOCS / "preview.png")
+        checkpoint = run / "checkpoints/last.ckpt"
+        vla(f"checkpoint={checkpoint}", "evaluate.episodes=1", "evaluate.workers=1", f"output={folder}")
+        screenshot(Path(folder) / "rollouts.rrd", DOCS / "rollout.png", STEP)
+    shutil.copy(run / "report.png", DOCS / "report.png")
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]))
