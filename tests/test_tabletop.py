@@ -136,5 +136,5 @@ def test_the_robot_can_be_drawn_with_all_its_faces(tabletop: Tabletop) -> None:
 
 
 def test_more_blocks_than_colours_are_refused() -> None:
-    with pytest.raises(Exception, match="task.blocks is from 1 to 6"):
+    with pytest.raises(Exception, match=r"task\.blocks is from 1 to 6"):
         make_tabletop("blocks=7")
