@@ -100,12 +100,12 @@ def test_tokens_are_weighted_means_of_the_features_themselves() -> None:
     assert torch.allclose(TokenLearner(6)(constant)[0, 0], torch.arange(6.0))
 
 
-def test_keypoints_say_where_they_look() -> None:
+def test_keypoints_say_where_they_look_and_what_is_there() -> None:
     features = torch.zeros(1, 2, 5, 5)
-    features[0, 0, 1, 4] = 100.0
+    features[0, :, 1, 4] = torch.tensor([100.0, 7.0])
     keypoints = Keypoints(2, 1)
     keypoints.score.weight.data = torch.tensor([[1.0, 0.0]])
-    assert keypoints(features).flatten().tolist() == pytest.approx([1.0, -0.5])  # x right, y down
+    assert keypoints(features).flatten().tolist() == pytest.approx([1.0, -0.5, 100.0, 7.0])  # x right, y down
 
 
 def test_a_clip_is_shifted_as_one_and_clips_differ() -> None:

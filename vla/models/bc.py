@@ -51,9 +51,11 @@ class BC(Model):
         self.shift = RandomShift(*shift)
         encoders = [image(text_width=text_width) for _ in spec.cameras]
         self.images = nn.ModuleList(encoders)
-        self.keypoints = nn.ModuleList(Keypoints(encoder.channels, keypoints) for encoder in encoders)
+        readers = [Keypoints(encoder.channels, keypoints) for encoder in encoders]
+        self.keypoints = nn.ModuleList(readers)
         self.proprioception = Standardize(self.posture_width)
-        features = len(spec.cameras) * keypoints * 2 + self.posture_width + text_width
+        seen = sum(keypoints * reader.width for reader in readers)
+        features = seen + self.posture_width + text_width
         self.trunk = nn.Sequential(nn.Linear(features, width), nn.ReLU(), nn.Linear(width, width), nn.ReLU())
         self.head = nn.Linear(width, chunk * len(spec.action) * tokenizer.bins)
 

@@ -238,6 +238,8 @@ class TokenLearner(nn.Module):
 class Keypoints(nn.Module):
     """M keypoints per image: the mean position under the softmax of a feature map (spatial softmax, arXiv 1504.00702).
 
+    Each comes with the features found there, weighted alike: a position alone does not say how a thing is turned.
+
     Args:
         channels: C of the feature map.
         keypoints: M.
@@ -245,13 +247,15 @@ class Keypoints(nn.Module):
 
     def __init__(self, channels: int, keypoints: int) -> None:
         super().__init__()
+        self.width = 2 + channels
         self.score = nn.Linear(channels, keypoints, bias=False)
         nn.init.normal_(self.score.weight, std=1.0)  # attention that starts flat sends no gradient
 
     def forward(self, features: Tensor) -> Tensor:
-        """(N, C, h, w) features to (N, M, 2) positions x, y in -1 … 1."""
-        weights = (self.score.weight @ features.flatten(2)).softmax(-1)  # (N, M, h·w)
-        return weights.float() @ grid(features)
+        """(N, C, h, w) features to (N, M, 2 + C): positions x, y in -1 … 1, and features."""
+        values = features.flatten(2)  # (N, C, h·w)
+        weights = (self.score.weight @ values).softmax(-1)  # (N, M, h·w)
+        return torch.cat([weights.float() @ grid(features), (weights @ values.mT).float()], -1)
 
 
 def grid(features: Tensor) -> Tensor:

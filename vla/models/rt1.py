@@ -60,7 +60,7 @@ class RT1(Model):
         history: T.
         image_size: images are resized to this height and width [px]; null leaves them as they are.
         learned_tokens: tokens per camera and frame.
-        keypoints: add, per camera, a token made of the positions of this many keypoints; the paper has none.
+        keypoints: add, per camera, a token made of this many keypoints; the paper has none.
         proprioception: add a token for joints and gripper; the paper has none.
         chunk: k, the actions predicted for a frame.
         auxiliary: weight of the head that predicts the simulator's truth, in training only; 0 leaves it out.
@@ -107,8 +107,9 @@ class RT1(Model):
         self.token_learners = nn.ModuleList(TokenLearner(self.image.channels, learned_tokens) for _ in spec.cameras)
         self.image_tokens = nn.Linear(self.image.channels, width)
         if keypoints:
-            self.keypoints = nn.ModuleList(Keypoints(self.image.channels, keypoints) for _ in spec.cameras)
-            self.keypoint_tokens = nn.ModuleList(nn.Linear(2 * keypoints, width) for _ in spec.cameras)
+            readers = [Keypoints(self.image.channels, keypoints) for _ in spec.cameras]
+            self.keypoints = nn.ModuleList(readers)
+            self.keypoint_tokens = nn.ModuleList(nn.Linear(keypoints * reader.width, width) for reader in readers)
         if proprioception:
             self.proprioception = Standardize(self.posture_width)
             self.proprioception_token = nn.Linear(self.posture_width, width)

@@ -18,7 +18,7 @@ HOVER = 0.08  # height above the block from which it is approached [m]
 CARRY = 0.07  # height above the table at which it is carried [m]
 FUNNEL = 2.5  # height gained per metre of horizontal distance, so that approaches come from above
 # As loose as still works: a learner that is a centimetre off must not wait for ever to be exact.
-GRASP_XY, GRASP_Z, GRASP_YAW = 0.012, 0.012, 0.5  # tolerances at which the gripper closes [m], [m], [rad]
+GRASP_XY, GRASP_Z = 0.012, 0.012  # tolerances at which the gripper closes, turned as it is [m]
 PLACE_XY, PLACE_Z = 0.02, 0.012  # tolerances at which it opens [m]
 MAX_YAW = 0.9  # furthest turn from neutral from which the nearest faces are taken [rad]
 CLEARANCE = 0.012  # between open fingers and a block on both sides together [m]
@@ -70,7 +70,7 @@ class Waypoint:
         away = float(np.hypot(offset[0], offset[1]))
         between = away < GRASP_XY + 0.004 and abs(offset[2]) < GRASP_Z + 0.004
         closing = between and width - 0.006 < opening < MAX_OPENING - 0.004
-        aligned = away < GRASP_XY and abs(offset[2]) < GRASP_Z and abs(yaw) < GRASP_YAW
+        aligned = away < GRASP_XY and abs(offset[2]) < GRASP_Z
         if closing or (aligned and opening > width - 0.006):
             return self._action(truth, offset, yaw, 0.0)
         # Down only where it is straight below; further away, or with the fingers too close, stay above it.
@@ -113,13 +113,11 @@ def _yaw_to_faces(truth: dict[str, Array]) -> float:
 
     Nearest, because a cube looks the same after a quarter turn: a learner could not tell which one is meant.
     """
-    rotation, block = truth["commanded"][:3, :3], truth["block_rotation"]
-    side = block[:, int(np.argmin(np.abs(block[2])))]  # an edge that lies flat, whichever face is up
+    rotation, (cosine, sine) = truth["commanded"][:3, :3], truth["faces"]
     yaw = np.arctan2(rotation[1, 0], rotation[0, 0])
-    reference = np.clip(yaw, -MAX_YAW, MAX_YAW)
+    back = np.clip(yaw, -MAX_YAW, MAX_YAW) - yaw  # to where the nearest faces are taken from
     quarter = np.pi / 2
-    turn = (np.arctan2(side[1], side[0]) - reference + quarter / 2) % quarter - quarter / 2
-    return float(reference + turn - yaw)
+    return float(back + (np.arctan2(sine, cosine) / 4 - back + quarter / 2) % quarter - quarter / 2)
 
 
 class Perturbation:
@@ -136,6 +134,7 @@ class Perturbation:
         steps: Sequence[int] = (2, 5),
         noise: float = 0.2,
         closed: float = 0.3,
+        unturned: float = 0.3,
         low: Sequence[float] = (0.34, -0.26, 0.015),
         high: Sequence[float] = (0.66, 0.26, 0.34),
     ) -> None:
@@ -146,17 +145,19 @@ class Perturbation:
         steps: shortest and longest later excursion [steps].
         noise: standard deviation of the noise on every executed motion, as a share of it.
         closed: probability that an excursion commands a closed gripper.
+        unturned: probability that an episode carries no turn out, so that blocks are also held by their edges.
         low: lower corner of the box of points to go to, in the base frame [m].
         high: upper corner.
         """
         self._start, self._start_steps, self._rate, self._steps = start, tuple(start_steps), rate, tuple(steps)
-        self._noise, self._closed = noise, closed
+        self._noise, self._closed, self._unturned = noise, closed, unturned
         self._low, self._high = np.array(low), np.array(high)
 
     def reset(self, seed: int) -> None:
         """Draw whether and where this episode starts off."""
         self._random = np.random.default_rng([seed, 0x5EED])
         self._left = 0
+        self._turns = self._random.uniform() >= self._unturned
         if self._random.uniform() < self._start:
             self._begin(self._start_steps)
 
@@ -177,4 +178,5 @@ class Perturbation:
             action[5], action[6] = self._turn, self._gripper
             return action
         action[:6] *= 1 + self._noise * self._random.standard_normal(6)
+        action[5] *= self._turns
         return action

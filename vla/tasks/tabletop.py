@@ -113,14 +113,22 @@ class TabletopTask(composer.Task):
         )
 
     def truth(self) -> dict[str, Array]:
-        """The state as an expert may see it, by name; lengths in [m], rotations as matrices."""
+        """The state as an expert may see it, by name; lengths in [m].
+
+        faces: cosine and sine of four times the turn that brings the fingers onto faces of the block, since a cube
+        looks the same after a quarter turn.
+        """
         bound, progress = self.bound, self.progress()
+        block = bound.data.geom_xmat[bound.block_geoms[self.target]].reshape(3, 3)
+        edge = block[:, int(np.argmin(np.abs(block[2])))]  # one that lies flat, whichever face is up
+        gripper = self.controller.pose[:, 0]
+        quarters = 4 * (np.arctan2(edge[1], edge[0]) - np.arctan2(gripper[1], gripper[0]))
         return {
             "tcp": bound.data.site_xpos[bound.tcp].copy(),
             "block": progress.block,
             "destination": self.goal.destination(progress),
             "commanded": self.controller.pose.copy(),  # (4, 4)
-            "block_rotation": bound.data.geom_xmat[bound.block_geoms[self.target]].reshape(3, 3).copy(),
+            "faces": np.array([np.cos(quarters), np.sin(quarters)]),
             "half_size": np.array([progress.half_size]),
             "grasped": np.array([float(progress.held)]),
             "reached": np.array([float(self.goal.reached(progress))]),
@@ -183,7 +191,7 @@ class Tabletop:
             high=tuple(high.tolist()),
             frame="panda_link0",
             control_hz=CONTROL_HZ,
-            truth=(("tcp", 3), ("block", 3), ("destination", 3)),
+            truth=(("tcp", 3), ("block", 3), ("destination", 3), ("faces", 2)),
         )
         task = TabletopTask(goal, randomize, Scene(blocks=blocks, meshes=meshes, shadows=shadows), low, high)
         # The scene is compiled once: every reset writes into the compiled model.
