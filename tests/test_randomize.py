@@ -20,7 +20,7 @@ VISIBLE = set(AXES) - {"mass", "friction"}
 
 def test_the_default_randomises_every_axis_and_records_it(tabletop: Tabletop) -> None:
     tabletop.reset(0)
-    assert set(tabletop.draws) == {*AXES, "language"}
+    assert set(tabletop.draws) == {"named", *AXES, "language"}
 
 
 def test_draws_depend_on_the_seed_alone(tabletop: Tabletop) -> None:
@@ -44,10 +44,9 @@ def test_switching_one_axis_off_leaves_the_draws_of_all_others(tabletop: Tableto
         reduced = copy.deepcopy(tabletop.draws)
     finally:
         task.randomize = kept
-    # The instruction names a colour, and the record of it says where that block lies.
-    ignored = {axis, "language"} if axis in ("colour", "placement") else {axis}
+    ignored = {axis, "named"} | ({"language"} if axis == "colour" else set())  # the instruction names a colour
     if axis == "size":
-        ignored |= {"placement", "language"}  # room around a block depends on its size
+        ignored |= {"placement"}  # room around a block depends on its size
     assert {name: draw for name, draw in full.items() if name not in ignored} == {
         name: draw for name, draw in reduced.items() if name not in ignored
     }

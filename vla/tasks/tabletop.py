@@ -63,14 +63,26 @@ class TabletopTask(composer.Task):
         words = stream(seed, "language")
         self.target = int(words.randint(len(self.bound.block_geoms)))
         self.instruction = instruction(self.goal.templates, words, block=self.bound.block_names[self.target])
-        self.draws["language"] = {"instruction": self.instruction, "target": self.target}
-        self.draws["language"]["position"] = [round(float(x), 5) for x in self.bound.block_position(self.target)[:2]]
+        self.draws = {"named": self._named(), **self.draws, "language": {"instruction": self.instruction}}
         data = self.bound.data
         self.controller.reset(data.qpos[self.bound.joints])
         self._command = np.append(self.controller.joints, data.qpos[self.bound.fingers].mean())
         data.ctrl[:] = self._command
         self._start = self.bound.block_position(self.target)
         self.judge = Judge(self.goal.hold_steps)
+
+    def _named(self) -> dict[str, Any]:
+        """What was drawn for the block that the instruction names: what success may well depend on."""
+        geom = self.bound.block_geoms[self.target]
+        x, y, _ = self.bound.block_position(self.target)
+        rotation = self.bound.data.geom_xmat[geom].reshape(3, 3)
+        return {
+            "index": self.target,
+            "position": [round(float(x), 5), round(float(y), 5)],
+            "colour": self.bound.block_names[self.target],
+            "yaw": round(float(np.arctan2(rotation[1, 0], rotation[0, 0])), 5),
+            "half_size": round(float(self.bound.model.geom_size[geom, 0]), 5),
+        }
 
     def before_step(self, physics: mjcf.Physics, action: Array, random_state: np.random.RandomState) -> None:
         """Turn the action into joint targets, approached evenly over the control period."""
