@@ -73,8 +73,8 @@ class Learner(LightningModule):
         decayed = [p for p in trained if p.dim() > 1 and id(p) not in embeddings]
         others = [p for p in trained if p.dim() <= 1 or id(p) in embeddings]
         groups = [{"params": decayed, "weight_decay": self._weight_decay}, {"params": others, "weight_decay": 0.0}]
-        # One kernel per step instead of a dozen per weight; under float16 Lightning cannot clip what it steps with.
-        fused = self.trainer.precision != "16-mixed"
+        # One kernel per step instead of a dozen per weight; in mixed precision Lightning would refuse to clip for it.
+        fused = not self.trainer.precision.endswith("mixed")
         optimizer = torch.optim.AdamW(groups, lr=self._lr, fused=fused)
         scheduler = torch.optim.lr_scheduler.LambdaLR(optimizer, self._share)
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": scheduler, "interval": "step"}}
