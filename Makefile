@@ -23,7 +23,8 @@ test: setup
 	.venv/bin/ruff format --check
 	.venv/bin/ruff check
 	.venv/bin/mypy
-	.venv/bin/pytest -n 2 --dist loadfile
+	.venv/bin/pytest -n 2 --dist loadfile -m "not realtime"
+	.venv/bin/pytest -m realtime
 
 setup: .venv/.installed
 
@@ -35,7 +36,7 @@ setup: .venv/.installed
 	  || echo "To render without a display, install the packages $(GL)" >&2
 	@echo "Installing into .venv; the first time this takes some minutes and, with CUDA, 7 GB"
 	@$(PYTHON) -m venv .venv
-	@.venv/bin/python -m pip install --disable-pip-version-check -q -c constraints.txt -e '.[dev]'
+	@.venv/bin/python -m pip install --disable-pip-version-check -q -c constraints.txt -e '.[dev,ros]'
 	@touch $@
 
 clean:

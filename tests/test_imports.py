@@ -29,7 +29,7 @@ PARTS = {
     "vla.collect": ("vla.spec", "vla.rollout", "vla.data", "vla.workers"),
     "vla.evaluate": ("vla.spec", "vla.rollout", "vla.record", "vla.workers"),
     "vla.report": ("vla.spec", "vla.evaluate"),
-    "vla.deploy": ("vla.spec", "vla.policy", "vla.tasks", "vla.deploy"),
+    "vla.deploy": ("vla.spec", "vla.policy", "vla.tasks", "vla.evaluate", "vla.deploy"),
     "vla.check": (),
     "vla.benchmark": ("vla",),
     "vla.jobs": ("vla",),

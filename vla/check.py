@@ -10,8 +10,8 @@ import inspect
 import json
 import os
 import types
-import typing
 from collections.abc import Collection, Iterable, Iterator, Mapping, MutableMapping, Sequence
+from contextlib import suppress
 from difflib import get_close_matches
 from importlib import import_module
 from pathlib import Path
@@ -47,7 +47,7 @@ RUNTIME: dict[str, tuple[str, ...]] = {
     "learner": ("model", "spec", "config"),
     "trainer": ("callbacks", "logger"),
     "recorder": ("folder",),
-    "deploy": ("policy",),
+    "deploy": ("policy", "environment", "output"),
 }
 
 # The nodes that name no class.
@@ -223,10 +223,12 @@ def _require_known(key: str, name: str, known: Collection[str], owner: str) -> N
 
 
 def _hints(target: type) -> dict[str, Any]:
-    try:
-        return typing.get_type_hints(inspect.unwrap(target.__init__))  # type: ignore[misc]
-    except NameError:  # an annotation whose name exists for type checkers only
-        return {}
+    init = inspect.unwrap(target.__init__)  # type: ignore[misc]
+    hints = {}
+    for name, annotation in init.__annotations__.items():
+        with suppress(NameError):  # a name that exists for type checkers only
+            hints[name] = eval(annotation, init.__globals__) if isinstance(annotation, str) else annotation
+    return hints
 
 
 def _matches(value: Any, annotation: Any) -> bool:

@@ -109,16 +109,30 @@ def export(config: DictConfig) -> None:
 
 
 def deploy(config: DictConfig) -> None:
-    """Put a trained policy to work as `config.deploy` says.
+    """Put a trained policy to work as `config.deploy` says; what reports a success rate is reported like an evaluation.
 
     Raises:
-        ValueError: no checkpoint, or no deployment is chosen.
+        ValueError: there is no checkpoint where one is needed.
     """
-    if not config.checkpoint:
-        raise ValueError("job=deploy needs a trained policy: checkpoint=FILE")
-    if not config.deploy:
-        raise ValueError("job=deploy needs a deployment: deploy=NAME, one of the options that --help lists")
-    build(config.deploy, policy=make_policy(Path(config.checkpoint))).run()
+    from vla.report import plot_report, write_report
+
+    output = _output(config)
+    report = build(
+        config.deploy,
+        policy=partial(_deployed, config.checkpoint),
+        environment=partial(make_environment, plain(config.task)),
+        output=output,
+    ).run()
+    if report is not None:
+        write_report(report, output / "report.json", config.checkpoint, plain(config))
+        plot_report(report, output / "report.png")
+        print(report)
+
+
+def _deployed(checkpoint: str | None) -> Policy:
+    if checkpoint is None:
+        raise ValueError("this deployment needs a trained policy: checkpoint=FILE")
+    return make_policy(Path(checkpoint))
 
 
 def benchmark(config: DictConfig) -> None:

@@ -91,21 +91,33 @@ class Policy:
         Raises:
             ValueError: the observation is not what the policy was trained on.
         """
+        self._see(observation)
+        if not self._chunk:
+            self._chunk.extend(zip(*self._predict(), strict=True))
+        action, probabilities = self._chunk.popleft()
+        self.info = {"probabilities": probabilities}
+        return action
+
+    def plan(self, observation: Observation) -> Array:
+        """The (k, D) float32 actions of a whole chunk, within the spec's bounds, for those who time them themselves.
+
+        Raises:
+            ValueError: the observation is not what the policy was trained on.
+        """
+        self._see(observation)
+        return self._predict()[0]
+
+    def _see(self, observation: Observation) -> None:
         if observation.instruction != self._instruction:
             self.reset(observation.instruction, 0)
         self._frames.append(self._frame(observation))
-        if not self._chunk:
-            self._predict()
-        action, probabilities = self._chunk.popleft()
-        self.info = {"probabilities": probabilities}
-        return np.clip(action, self._low, self._high)
 
     @torch.inference_mode()
-    def _predict(self) -> None:
+    def _predict(self) -> tuple[Array, Array]:
+        """Actions (k, D), clipped, and token probabilities (k, D, K)."""
         logits = self.model(self.window())["logits"][0, -1]  # (k, D, K)
         actions = self.model.tokenizer.read(logits).float().numpy()
-        probabilities = logits.float().softmax(-1).numpy()
-        self._chunk.extend(zip(actions, probabilities, strict=True))
+        return np.clip(actions, self._low, self._high), logits.float().softmax(-1).numpy()
 
     def window(self) -> Batch:
         """What the model is given now: the frames seen so far, at most its history, as a batch of one."""

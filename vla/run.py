@@ -20,6 +20,7 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
 
 from vla.check import JOBS, check, suggestion
+from vla.deploy import ros
 
 PACKAGE = Path(__file__).resolve().parent
 # Inside the package where it was installed from a wheel, beside it in a clone.
@@ -165,6 +166,7 @@ def main() -> None:
     """Do what the command line says; what the user can mend ends in one sentence, unless HYDRA_FULL_ERROR=1."""
     os.environ.setdefault(TRACEBACKS, os.environ.get("HYDRA_FULL_ERROR", "0"))
     os.environ["HYDRA_FULL_ERROR"] = "1"  # otherwise Hydra prints errors itself
+    sys.argv[1:], ros.arguments[:] = ros.split_arguments(sys.argv[1:])
     try:
         _compose()
     except KeyboardInterrupt:

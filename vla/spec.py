@@ -169,8 +169,12 @@ class Recorder(Protocol):
 
 
 class Deployment(Protocol):
-    """A way to put a policy to work outside the simulator; built as `Deployment(**yaml, policy=policy)`."""
+    """A way to put a policy to work; built as `Deployment(**yaml, policy=…, environment=…, output=…)`.
 
-    def run(self) -> None:
-        """Work until done or interrupted."""
+    `policy` and `environment` make the checkpoint's policy and its task's environment, for those who need them;
+    `output` is a folder to write to.
+    """
+
+    def run(self) -> Any:
+        """Work until done or interrupted; what is measured on the way comes back as a `vla.evaluate.Report`."""
         ...

@@ -28,6 +28,8 @@ HOME = np.array([0.0, 0.1, 0.0, -2.1, 0.0, 2.2, 0.785])  # gripper pointing down
 MAX_OPENING = 0.08  # between the fingertips [m], Franka Hand product manual
 DOWN = np.diag([1.0, -1.0, -1.0])  # rotation of a gripper that points straight down
 
+WORKSPACE = ((0.25, -0.40, 0.008), (0.75, 0.40, 0.50))  # corners of the box that the tool point stays in [m]
+
 DAMPING = 0.02  # of the least squares: bounds joint speed near singular poses
 POSTURE_GAIN = 0.1  # how fast the elbow drifts to the home posture in the null space
 ITERATIONS = 6

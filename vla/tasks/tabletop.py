@@ -13,7 +13,7 @@ from dm_env import specs
 
 from vla.spec import Array, Observation, Shape, Spec
 from vla.tasks.bound import BoundScene
-from vla.tasks.control import CartesianController
+from vla.tasks.control import WORKSPACE, CartesianController
 from vla.tasks.franka import DAMPING_RATIO, FINGER_SPEED, FINGER_TRAVEL
 from vla.tasks.goals import Goal, Progress
 from vla.tasks.language import instruction
@@ -25,7 +25,6 @@ from vla.tasks.scene import COLOURS, Scene
 CONTROL_HZ = 10.0
 TRANSLATION = 0.04  # largest translation per step [m]
 ROTATION = 0.25  # largest rotation per step [rad]
-WORKSPACE = ((0.25, -0.40, 0.008), (0.75, 0.40, 0.50))  # corners of the box that the tool point stays in [m]
 FINGER_STEP = FINGER_SPEED / CONTROL_HZ  # furthest a finger moves in one control period [m]
 
 
@@ -92,8 +91,21 @@ class TabletopTask(composer.Task):
         goal[7] = grip + np.clip(goal[7] - grip, -FINGER_STEP, FINGER_STEP)
         self._increment = (goal - self._command) / self.physics_steps_per_control_step
 
+    def follow(self, physics: mjcf.Physics, goal: Array, substeps: int) -> None:
+        """Step physics while the targets of joints and fingers approach `goal` (8,) [rad], [m] evenly."""
+        furthest = FINGER_SPEED * substeps * physics.timestep()
+        finger = self._command[7] + np.clip(goal[7] - self._command[7], -furthest, furthest)
+        self._increment = (np.append(goal[:7], finger) - self._command) / substeps
+        for _ in range(substeps):
+            self._move_targets(physics)
+            physics.step()
+
     def before_substep(self, physics: mjcf.Physics, action: Array, random_state: np.random.RandomState) -> None:
-        """Move the targets on, ahead by what the servo's damping takes back: it then follows without lag."""
+        """Move the joint targets on."""
+        self._move_targets(physics)
+
+    def _move_targets(self, physics: mjcf.Physics) -> None:
+        """One time step on, and ahead by what the servo's damping takes back: the arm then follows without lag."""
         self._command = self._command + self._increment
         lead = DAMPING_RATIO / physics.timestep() * self._increment
         physics.data.ctrl[:] = self._command
@@ -212,7 +224,8 @@ class Tabletop:
         unknown = sorted(set(cameras) - set(task.bound.cameras))
         if unknown or not cameras:
             raise ValueError(f"unknown cameras {unknown}; task.cameras may list {sorted(task.bound.cameras)}")
-        self.done, self.outcome = True, "timeout"
+        self.done, self.outcome, self.periods = True, "timeout", 0
+        self._time_limit = time_limit
         self.draws: dict[str, Any] = {}
         self._rendering: Renderer | None = None
         self._blind = False
@@ -221,7 +234,7 @@ class Tabletop:
         """Start the episode that `seed` names."""
         self.task.seed = seed
         self.dm_env.reset()
-        self.done, self.outcome, self.draws = False, self.task.judge.outcome, self.task.draws
+        self.done, self.outcome, self.draws, self.periods = False, self.task.judge.outcome, self.task.draws, 0
         return self._observe()
 
     def step(self, action: Array) -> Observation:
@@ -231,6 +244,30 @@ class Tabletop:
         timestep: dm_env.TimeStep = self.dm_env.step(action)
         self.done, self.outcome = timestep.last(), self.task.judge.outcome
         return self._observe()
+
+    def drive(self, joints: Array, opening: float, seconds: float) -> None:
+        """Move towards joint targets (7,) [rad] and an opening 0…1 for a stretch of time, as a robot's own interface
+        does; whoever drives calls `judge` once per control period."""
+        physics = self.dm_env.physics
+        substeps = round(seconds / physics.timestep())
+        self.task.follow(physics, np.append(joints, opening * FINGER_TRAVEL), substeps)
+
+    def judge(self) -> None:
+        """Note one control period of driving, which may end the episode."""
+        self.task.after_step(self.dm_env.physics, self.dm_env.random_state)
+        self.periods += 1
+        self.outcome = self.task.judge.outcome
+        self.done = self.task.judge.success or self.periods >= round(self._time_limit * CONTROL_HZ)
+
+    def look(self) -> Observation:
+        """What there is to see and feel now."""
+        return self._observe()
+
+    def posture(self) -> tuple[Array, Array, float]:
+        """Measured joints (7,) float32 [rad], their velocities [rad/s] and the gripper's opening [m]."""
+        bound = self.task.bound
+        joints, velocities = bound.data.qpos[bound.joints], bound.data.qvel[bound.velocities]
+        return joints.astype(np.float32), velocities.astype(np.float32), float(bound.data.qpos[bound.fingers].sum())
 
     def shapes(self) -> list[Shape]:
         """The visible solids of the current episode."""
@@ -269,12 +306,13 @@ class Tabletop:
         if not self._blind:
             for name in self.spec.cameras:
                 rgb[name], depth[name] = self.renderer.render(bound.data, bound.cameras[name])
+        joints, velocities, gripper = self.posture()
         return Observation(
             rgb=rgb,
             depth=depth,
-            joints=bound.data.qpos[bound.joints].astype(np.float32),
-            velocities=bound.data.qvel[bound.velocities].astype(np.float32),
-            gripper=float(bound.data.qpos[bound.fingers].sum()),
+            joints=joints,
+            velocities=velocities,
+            gripper=gripper,
             instruction=self.task.instruction,
             truth=self.task.truth(),
         )

@@ -1,0 +1,375 @@
+"""The policy as a ROS 2 node: real rclpy, real middleware on the loopback, a world on the other side of the topics."""
+
+from __future__ import annotations
+
+import itertools
+import os
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import rclpy
+from builtin_interfaces.msg import Time
+from diagnostic_msgs.msg import DiagnosticStatus
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState, GetState
+from rclpy.context import Context
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.parameter import Parameter
+from sensor_msgs.msg import Image, JointState
+from std_msgs.msg import Float64MultiArray, String
+from std_srvs.srv import Trigger
+from test_session import FORWARD, HOME, ROBOT, SPEC
+from trajectory_msgs.msg import JointTrajectory
+
+from vla.deploy import messages
+from vla.deploy.agent import Agent
+from vla.deploy.ros import NETWORKS, Network
+from vla.deploy.ros2 import Ros2, Topics
+from vla.deploy.session import State
+from vla.spec import Array, Observation
+
+pytestmark = pytest.mark.realtime
+
+FROZEN = Time(sec=5, nanosec=5)
+TOPICS = Topics({"front": "/front", "wrist": "/wrist"}, "/joint_states", "/words", "/commands", "/gripper")
+KINDS = {"joint_state": JointState, "trajectory": JointTrajectory, "forward": Float64MultiArray}
+WORKER = int(os.environ.get("PYTEST_XDIST_WORKER", "gw0").removeprefix("gw"))
+domains = itertools.count(1 + 20 * (WORKER % 5))
+
+
+class Forward:
+    """A policy that always goes on, and remembers what it was shown."""
+
+    spec = SPEC
+
+    def __init__(self) -> None:
+        self.seen: list[Observation] = []
+        self.fails, self.takes = False, 0.0
+
+    def reset(self, instruction: str, seed: int) -> None:
+        """Forget nothing: there is nothing to forget."""
+
+    def plan(self, observation: Observation) -> Array:
+        """One centimetre along x."""
+        self.seen.append(observation)
+        time.sleep(self.takes)
+        if self.fails:
+            raise RuntimeError("no idea")
+        return FORWARD
+
+
+class World:
+    """Cameras, an arm that does what it is told, and a person; the agent lives in the same thread."""
+
+    def __init__(self, domain: int, command: Any, arguments: list[str]) -> None:
+        Network("SYSTEM_DEFAULT", "loopback").apply()
+        self.contexts = [Context(), Context()]
+        for context, given in zip(self.contexts, (arguments, None), strict=True):
+            rclpy.init(args=given, context=context, domain_id=domain)
+        self.policy = Forward()
+        nothing: Any = None
+        self.settings = Ros2(
+            robot=ROBOT,
+            network=Network("SYSTEM_DEFAULT"),
+            topics=TOPICS,
+            command=command,
+            policy=nothing,
+            environment=nothing,
+            output=Path(),
+        )
+        self.agent = Agent(self.policy, self.settings, context=self.contexts[0])  # type: ignore[arg-type]
+        self.node = rclpy.create_node("world", context=self.contexts[1])
+        self.executors = [SingleThreadedExecutor(context=context) for context in self.contexts]
+        for executor, node in zip(self.executors, (self.agent, self.node), strict=True):
+            executor.add_node(node)
+        self.images = {camera: self.node.create_publisher(Image, f"/{camera}", 1) for camera in SPEC.cameras}
+        self.states = self.node.create_publisher(JointState, "/joint_states", 1)
+        self.words = self.node.create_publisher(String, "/words", 1)
+        self.commands: list[Any] = []
+        self.node.create_subscription(KINDS[command], "/commands", self.commands.append, 100)
+        self.statuses: list[DiagnosticStatus] = []
+        self.node.create_subscription(DiagnosticStatus, "/vla_agent/status", self.statuses.append, 100)
+        self.joints = HOME.copy()
+        self.cameras, self.feels = list(SPEC.cameras), True
+        self.changed: Callable[[Image], None] = lambda image: None
+
+    def spin(self, until: Callable[[], Any], seconds: float = 10.0) -> None:
+        """Let both sides live until something holds."""
+        give_up = time.monotonic() + seconds
+        while not until():
+            assert time.monotonic() < give_up, f"state {self.agent.session and self.agent.session.state}"
+            for executor in self.executors:
+                executor.spin_once(timeout_sec=0.001)
+
+    def _spin_for(self, seconds: float) -> None:
+        end = time.monotonic() + seconds
+        self.spin(lambda: time.monotonic() >= end)
+
+    def live(self, seconds: float) -> None:
+        """The world goes on: images at 10 Hz, joint states at 50 Hz."""
+        end, tick = time.monotonic() + seconds, 0
+        while time.monotonic() < end:
+            if self.feels:
+                if self.commands and isinstance(self.commands[-1], JointState):
+                    self.joints = np.array(self.commands[-1].position[:7])
+                self.states.publish(joint_state(self.joints))
+            if tick % 5 == 0:
+                for camera in self.cameras:
+                    image = messages.fill_image(Image(), np.zeros((8, 8, 3), np.uint8), camera)
+                    image.header.stamp = self.node.get_clock().now().to_msg()
+                    self.changed(image)
+                    self.images[camera].publish(image)
+            tick += 1
+            self._spin_for(0.02)
+
+    def ask(self, kind: Any, name: str, request: Any) -> Any:
+        """What a service of the agent answers."""
+        client = self.node.create_client(kind, f"/vla_agent/{name}")
+        self.spin(client.service_is_ready)
+        answer = client.call_async(request)
+        self.spin(answer.done)
+        return answer.result()
+
+    def change(self, transition: int) -> bool:
+        """Ask for a change of the lifecycle's state."""
+        request = ChangeState.Request(transition=Transition(id=transition))
+        return bool(self.ask(ChangeState, "change_state", request).success)
+
+    def start(self) -> None:
+        """Configure, activate, connect, and give the word."""
+        assert self.change(Transition.TRANSITION_CONFIGURE) and self.change(Transition.TRANSITION_ACTIVATE)
+        everybody = [*self.images.values(), self.states, self.words]
+        self.spin(lambda: all(publisher.get_subscription_count() for publisher in everybody))
+        self.live(0.3)
+        self.words.publish(String(data="put the red block on the pad"))
+        self.live(0.4)
+
+    @property
+    def state(self) -> State:
+        """What the agent is doing."""
+        assert self.agent.session is not None
+        return self.agent.session.state
+
+    def close(self) -> None:
+        """End both sides."""
+        for executor, node in zip(self.executors, (self.agent, self.node), strict=True):
+            executor.remove_node(node)
+            executor.shutdown()
+            node.destroy_node()
+        for context in self.contexts:
+            rclpy.try_shutdown(context=context)
+
+
+def joint_state(joints: Array) -> JointState:
+    names = [*reversed(ROBOT.joints), *ROBOT.fingers, "of_somebody_else"]
+    return JointState(name=names, position=[*joints[::-1].tolist(), 0.04, 0.04, 1.0])
+
+
+@pytest.fixture
+def make_world() -> Iterator[Callable[..., World]]:
+    """A world on a domain of its own."""
+    worlds: list[World] = []
+
+    def make(command: str = "joint_state", *arguments: str) -> World:
+        worlds.append(World(next(domains), command, list(arguments)))
+        return worlds[-1]
+
+    yield make
+    for world in worlds:
+        world.close()
+
+
+@pytest.fixture
+def world(make_world: Callable[..., World]) -> World:
+    """A world whose arm the agent moves."""
+    world = make_world()
+    world.start()
+    assert world.state is State.RUNNING, world.agent.session and world.agent.session.reason
+    return world
+
+
+def test_the_first_command_is_the_measured_pose_and_the_arm_then_moves(world: World) -> None:
+    first = world.commands[0]
+    assert first.name == [*ROBOT.joints, *ROBOT.fingers]
+    np.testing.assert_allclose(first.position[:7], HOME)
+    assert list(first.velocity) == list(first.effort) == []
+    world.live(0.5)
+    steps = np.diff([command.position[:7] for command in world.commands], axis=0)
+    assert np.abs(steps).sum() > 0.1
+    assert (np.abs(steps) <= ROBOT.fastest * 0.02 + 1e-9).all()
+
+
+def test_the_policy_sees_what_the_messages_say(world: World) -> None:
+    seen = world.policy.seen[-1]
+    assert seen.instruction == "put the red block on the pad" and set(seen.rgb) == {"front", "wrist"}
+    assert seen.gripper == pytest.approx(0.08) and seen.truth is None
+    assert np.abs(seen.joints - world.joints).max() < 0.2  # in the order of the spec, not of the message
+    world.live(1.0)
+    told = {pair.key: pair.value for pair in world.statuses[-1].values}
+    assert told["state"] == "running" and float(told["inference p99 [ms]"]) < 300
+
+
+def test_a_camera_that_goes_blind_holds_the_arm_until_it_sees_again(world: World) -> None:
+    world.cameras = ["front"]
+    world.live(0.9)
+    assert world.state is State.HOLDING
+    assert world.commands[-1].position == world.commands[-5].position
+    assert "wrist" in world.statuses[-1].message and world.statuses[-1].level == DiagnosticStatus.WARN
+    world.cameras = ["front", "wrist"]
+    world.live(0.6)
+    assert world.state is State.RUNNING
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda image: setattr(image, "data", image.data[:-1]), "bytes"),
+        (lambda image: setattr(image, "encoding", "mono8"), "encoding"),
+        (lambda image: setattr(image, "step", 7), "step"),
+        (lambda image: setattr(image.header, "stamp", FROZEN), "twice"),
+    ],
+    ids=["truncated", "encoding", "step", "frozen clock"],
+)
+def test_images_that_are_none_hold_the_arm(
+    world: World, change: Any, words: str, capfd: pytest.CaptureFixture[str]
+) -> None:
+    world.changed = change
+    world.live(0.8)
+    assert world.state is State.HOLDING
+    world.live(0.4)
+    assert int({pair.key: pair.value for pair in world.statuses[-1].values}["messages dropped"]) > 3
+    assert words in capfd.readouterr().err
+
+
+def test_joint_states_that_stop_hold_the_arm(world: World) -> None:
+    world.feels = False
+    world.live(0.7)
+    assert world.state is State.HOLDING
+
+
+def test_a_slow_policy_skips_ticks_and_a_stuck_one_holds_the_arm(world: World) -> None:
+    world.policy.takes = 0.15
+    world.live(1.0)
+    assert world.state is State.RUNNING
+    assert world.agent.session is not None and world.agent.session.overruns > 2
+    world.policy.takes = 2.0
+    world.live(0.9)
+    assert world.state is State.HOLDING
+
+
+def test_a_policy_that_fails_is_a_fault_that_only_deactivation_ends(world: World) -> None:
+    world.policy.fails = True
+    world.live(2.0)
+    assert world.state is State.FAULT
+    assert world.commands[-1].position == world.commands[-5].position
+    world.policy.fails = False
+    assert not world.ask(Trigger, "resume", Trigger.Request()).success
+    assert world.change(Transition.TRANSITION_DEACTIVATE) and world.change(Transition.TRANSITION_ACTIVATE)
+    world.live(0.3)
+    assert world.state is State.WAITING
+
+
+def test_stop_and_resume(world: World) -> None:
+    assert world.ask(Trigger, "stop", Trigger.Request()).success
+    world.live(0.6)
+    assert world.state is State.STOPPED
+    assert world.commands[-1].position == world.commands[-5].position
+    assert world.ask(Trigger, "resume", Trigger.Request()).success
+    world.live(0.6)
+    assert world.state is State.RUNNING
+
+
+def test_somebody_else_who_commands_the_arm_is_a_fault(world: World) -> None:
+    other = world.node.create_publisher(JointState, "/commands", 1)
+    world.live(1.5)
+    assert world.state is State.FAULT
+    assert world.change(Transition.TRANSITION_DEACTIVATE)
+    assert not world.change(Transition.TRANSITION_ACTIVATE)
+    world.node.destroy_publisher(other)
+
+
+def test_two_cameras_on_one_topic_hold_the_arm(world: World) -> None:
+    world.node.create_publisher(Image, "/front", 1)
+    world.live(1.3)
+    assert world.state is State.HOLDING
+
+
+def test_wrong_requests_of_the_lifecycle_are_refused_and_survived(world: World) -> None:
+    assert not world.change(Transition.TRANSITION_CONFIGURE)
+    assert not world.change(99)
+    world.live(0.2)
+    assert world.state is State.RUNNING
+    assert world.change(Transition.TRANSITION_DEACTIVATE)
+    assert not world.change(Transition.TRANSITION_DEACTIVATE)
+    assert world.change(Transition.TRANSITION_CLEANUP)
+    assert world.ask(GetState, "get_state", GetState.Request()).current_state.label == "unconfigured"
+    world.start()
+    assert world.state is State.RUNNING
+
+
+def test_deactivation_brakes_first(world: World) -> None:
+    world.live(0.4)
+    count = len(world.commands)
+    assert world.change(Transition.TRANSITION_DEACTIVATE)
+    world.spin(lambda: len(world.commands) > count + 1)
+    steps = np.diff([command.position[:7] for command in world.commands], axis=0)
+    assert np.abs(steps[-1]).max() < np.abs(steps[count - 2]).max()
+    change = np.abs(np.diff(steps, axis=0)).max(0)
+    assert (change <= ROBOT.hardest * 0.02**2 + 1e-9).all()
+
+
+def test_trajectories_end_at_rest(make_world: Callable[..., World]) -> None:
+    world = make_world("trajectory")
+    world.start()
+    message = max(world.commands, key=lambda command: len(command.points))
+    assert list(message.joint_names) == ROBOT.joints and len(message.points) > 3
+    assert not any(message.points[-1].velocities)
+    times = [point.time_from_start.sec + 1e-9 * point.time_from_start.nanosec for point in message.points]
+    assert (np.diff(times) > 0).all()
+
+
+def test_plain_positions_for_a_forward_controller(make_world: Callable[..., World]) -> None:
+    world = make_world("forward")
+    fingers: list[Float64MultiArray] = []
+    world.node.create_subscription(Float64MultiArray, "/gripper", fingers.append, 10)
+    world.start()
+    assert len(world.commands[-1].data) == 7 and list(fingers[-1].data) == [0.04, 0.04]
+
+
+def test_ros_arguments_remap_and_set_parameters(make_world: Callable[..., World]) -> None:
+    arguments = ["--ros-args", "-r", "/front:=/isaac/front", "-p", "command_hz:=25.0", "-p", "speed_share:=0.5"]
+    world = make_world("joint_state", *arguments)
+    assert world.change(Transition.TRANSITION_CONFIGURE)
+    assert world.agent.session is not None and world.agent.session.tick == 0.04
+    assert world.agent.session.robot.speed_share == 0.5
+    assert world.agent.resolve_topic_name("/front") == "/isaac/front"
+    assert any(name == "/isaac/front" for name, _ in world.agent.get_topic_names_and_types())
+
+
+def test_speed_is_lowered_at_any_time_and_raised_at_rest_only(world: World) -> None:
+    def set_share(value: float) -> Any:
+        return world.agent.set_parameters([Parameter("speed_share", value=value)])[0]
+
+    assert set_share(0.1).successful
+    assert world.agent.session is not None and world.agent.session.robot.speed_share == 0.1
+    assert "deactivate" in set_share(0.5).reason
+    assert not set_share(2.0).successful
+    result = world.agent.set_parameters([Parameter("command_hz", value=10.0)])[0]
+    assert not result.successful and "clean up" in result.reason
+    assert world.change(Transition.TRANSITION_DEACTIVATE)
+    assert set_share(0.5).successful
+
+
+def test_a_robot_that_does_not_fit_refuses_to_configure(make_world: Callable[..., World]) -> None:
+    world = make_world("joint_state", "--ros-args", "-p", "joints:=[one, two]")
+    assert not world.change(Transition.TRANSITION_CONFIGURE)
+    assert world.ask(GetState, "get_state", GetState.Request()).current_state.label == "unconfigured"
+
+
+def test_the_networks_have_their_options() -> None:
+    options = {path.stem for path in (Path(__file__).parents[1] / "conf/deploy/network").glob("*.yaml")}
+    assert options == set(NETWORKS)

@@ -1,0 +1,237 @@
+"""Deployment as a user types it: nodes in processes of their own, words, signals, bags."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import sysconfig
+import time
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import rclpy
+from rclpy.context import Context
+from rclpy.executors import SingleThreadedExecutor
+from sensor_msgs.msg import JointState
+from test_run import SMALL, vla
+
+from vla.deploy import messages
+from vla.deploy.governor import Robot
+from vla.deploy.ros import Network, split_arguments
+
+WORKER = int(os.environ.get("PYTEST_XDIST_WORKER", "gw0").removeprefix("gw"))
+DOMAIN = 15 + 20 * (WORKER % 5)
+CHECKPOINT = "checkpoint=run/checkpoints/last.ckpt"
+
+
+@pytest.fixture(scope="module")
+def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a small trained checkpoint."""
+    folder = tmp_path_factory.mktemp("deploy")
+    vla(folder, *SMALL, "job=train", "output=run")
+    return folder
+
+
+@pytest.fixture
+def start(home: Path) -> Iterator[Callable[..., subprocess.Popen[str]]]:
+    """Starts a module in `home`, on the domain of these tests, and ends it with the test."""
+    started: list[subprocess.Popen[str]] = []
+
+    def start(module: str, *arguments: str) -> subprocess.Popen[str]:
+        command = [sys.executable, "-u", "-m", module, *arguments]
+        options: Any = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
+        environment = {**os.environ, "ROS_DOMAIN_ID": str(DOMAIN)}
+        started.append(subprocess.Popen(command, cwd=home, env=environment, **options))
+        return started[-1]
+
+    yield start
+    for process in started:
+        process.kill()
+        process.wait()
+
+
+class Ear:
+    """Somebody who listens to joint states and commands."""
+
+    def __init__(self) -> None:
+        Network("SYSTEM_DEFAULT", "loopback").apply()
+        self._context = Context()
+        rclpy.init(context=self._context, domain_id=DOMAIN)
+        self.node = rclpy.create_node("ear", context=self._context)
+        self._executor = SingleThreadedExecutor(context=self._context)
+        self._executor.add_node(self.node)
+        self.states: list[JointState] = []
+        self.commands: list[JointState] = []
+        self.node.create_subscription(JointState, "/isaac/franka/joint_states", self.states.append, 10)
+        self.node.create_subscription(JointState, "/isaac/franka/joint_commands", self.commands.append, 10)
+
+    def until(self, true: Callable[[], Any], seconds: float = 60.0) -> None:
+        """Listen until something holds."""
+        give_up = time.monotonic() + seconds
+        while not true():
+            assert time.monotonic() < give_up
+            self._executor.spin_once(timeout_sec=0.02)
+
+    def listen(self, seconds: float) -> None:
+        """Listen for a while."""
+        end = time.monotonic() + seconds
+        self.until(lambda: time.monotonic() > end)
+
+    def moved(self) -> float:
+        """How far the joints went between the newest two joint states [rad]."""
+        if len(self.states) < 2:
+            return 0.0
+        return float(np.abs(np.subtract(self.states[-1].position, self.states[-2].position)).max())
+
+    def close(self) -> None:
+        """Stop listening."""
+        self._executor.shutdown()
+        self.node.destroy_node()
+        rclpy.try_shutdown(context=self._context)
+
+
+@pytest.fixture
+def ear() -> Iterator[Ear]:
+    """An ear on the domain of these tests."""
+    ear = Ear()
+    yield ear
+    ear.close()
+
+
+@pytest.mark.realtime
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_words_move_the_arm_and_a_signal_leaves_it_at_rest(
+    home: Path, start: Callable[..., subprocess.Popen[str]], ear: Ear, number: int
+) -> None:
+    simulator = start("vla.run", "job=deploy", "deploy=simulator", CHECKPOINT)
+    agent = start("vla.run", "job=deploy", "deploy=ros2", CHECKPOINT, "--ros-args", "-p", "speed_share:=0.3")
+    ear.until(lambda: ear.states and ear.commands)
+    np.testing.assert_allclose(ear.commands[0].position[:7], ear.states[0].position[:7], atol=1e-3)
+    watch = start("vla.deploy.watch")
+    said = start("vla.deploy.say", "put the red block on the pad")
+    assert said.wait(30) == 0
+    ear.until(lambda: ear.moved() > 1e-3)
+    agent.send_signal(number)
+    sent = time.monotonic()
+    assert agent.wait(10) == 0, agent.communicate()[0]
+    assert time.monotonic() - sent < 1.0
+    ear.listen(1.0)
+    last, before = ear.commands[-1].position, ear.commands[-2].position
+    assert np.abs(np.subtract(last, before)).max() < 0.02 and ear.moved() < 1e-3
+    simulator.send_signal(number)
+    watch.send_signal(number)
+    assert simulator.wait(10) == 0 and watch.wait(10) == 0
+    assert "running" in watch.communicate()[0]
+
+
+@pytest.mark.realtime
+def test_when_the_agent_is_killed_the_simulator_holds_the_arm(
+    home: Path, start: Callable[..., subprocess.Popen[str]], ear: Ear
+) -> None:
+    start("vla.run", "job=deploy", "deploy=simulator", CHECKPOINT)
+    agent = start("vla.run", "job=deploy", "deploy=ros2", CHECKPOINT)
+    ear.until(lambda: ear.commands)
+    assert start("vla.deploy.say", "put the red block on the pad").wait(30) == 0
+    ear.until(lambda: len(ear.states) > 1 and ear.moved() > 1e-3)
+    agent.kill()
+    ear.listen(1.2)
+    assert ear.moved() < 1e-3
+
+
+@pytest.mark.realtime
+def test_the_whole_loop_reports_and_its_bag_moves_an_agent_again(
+    home: Path, start: Callable[..., subprocess.Popen[str]], ear: Ear
+) -> None:
+    limit = "task.time_limit=1.5"
+    loop = start("vla.run", "job=deploy", "deploy=loop", CHECKPOINT, limit, "deploy.episodes=2", "output=loop")
+    printed = loop.communicate(timeout=100)[0]
+    assert loop.returncode == 0, printed
+    assert "/2 (" in printed.strip().splitlines()[-1]
+    report = json.loads((home / "loop/report.json").read_text())
+    assert report["seeds"] == [1_000_000, 1_000_001] and report["checkpoint"] == CHECKPOINT.partition("=")[2]
+    ear.commands.clear()
+    start("vla.run", "job=deploy", "deploy=ros2", CHECKPOINT, "deploy.safety.tracking=9")
+    player = start("vla.deploy.bag", "play", "loop/bag")
+    assert player.wait(60) == 0, player.communicate()[0]
+    ear.listen(0.2)
+    assert np.ptp([command.position[:7] for command in ear.commands], axis=0).max() > 0.01
+
+
+def test_what_the_node_thinks_is_what_the_evaluated_policy_does(home: Path) -> None:
+    """On the same observations, through messages and back, bit for bit."""
+    from vla import jobs
+    from vla.policy import read_checkpoint
+    from vla.spec import Observation
+
+    checkpoint = home / "run/checkpoints/last.ckpt"
+    environment = jobs.make_environment(read_checkpoint(checkpoint).config["task"])
+    evaluated, deployed = (jobs.make_policy(checkpoint, environment) for _ in range(2))
+    names = list(environment.spec.joints)
+    robot = Robot(names, [-9.0] * 7, [9.0] * 7, [1.0] * 7, [1.0] * 7, ["left", "right"])
+    observation = environment.reset(5)
+    for _ in range(6):
+        action = evaluated.act(observation)
+        images = {
+            camera: messages.fill_image(SimpleNamespace(header=SimpleNamespace()), image, camera)
+            for camera, image in observation.rgb.items()
+        }
+        fingers = [observation.gripper / 2] * 2
+        state = JointState(name=[*names, "left", "right"], position=[*observation.joints.tolist(), *fingers])
+        state.velocity = [*observation.velocities.tolist(), 0.0, 0.0]
+        joints, velocities, gripper = messages.joints_from(state, robot)
+        size = environment.spec.image_size
+        rgb = {camera: messages.image_from(message, size) for camera, message in images.items()}
+        seen = Observation(rgb, {}, joints.astype(np.float32), velocities, gripper, observation.instruction)
+        np.testing.assert_array_equal(deployed.plan(seen)[0], action)
+        observation = environment.step(action)
+    environment.close()
+
+
+def test_what_is_for_ros_is_kept_from_hydra() -> None:
+    line = ["job=deploy", "--ros-args", "-r", "a:=b", "-p", "c:=1", "--", "deploy=ros2"]
+    assert split_arguments(line) == (["job=deploy", "deploy=ros2"], ["--ros-args", "-r", "a:=b", "-p", "c:=1"])
+    assert split_arguments(["job=train"]) == (["job=train"], [])
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["deploy=ros2"], "checkpoint=FILE"),
+        (["deploy=ros2", "checkpoint=nowhere.ckpt"], "there is no checkpoint nowhere.ckpt"),
+        ([CHECKPOINT], "deploy=OPTION"),
+        ([CHECKPOINT, "deploy=ros2", "deploy.command=velocity"], "joint_state, trajectory, forward"),
+        ([CHECKPOINT, "deploy=ros2", "deploy.network.profile=nowhere.xml"], "nowhere.xml"),
+        ([CHECKPOINT, "deploy=ros2", "deploy.robot.speed_share=2"], "speed_share"),
+        ([CHECKPOINT, "deploy=ros2", "~deploy.topics.images.wrist"], "wrist"),
+    ],
+)
+def test_what_cannot_be_deployed_ends_in_one_sentence(home: Path, arguments: list[str], words: str) -> None:
+    done = vla(home, "job=deploy", *arguments, ok=False)
+    assert words in done.stderr and "Traceback" not in done.stderr
+
+
+def test_without_ros_the_way_out_is_named(home: Path) -> None:
+    (home / "without").mkdir()
+    (home / "without/rclpy.py").write_text("raise ImportError('not here')")
+    environment = {**os.environ, "PYTHONPATH": str(home / "without")}
+    command = [sys.executable, "-m", "vla.run", "job=deploy", "deploy=ros2", CHECKPOINT]
+    done = subprocess.run(command, cwd=home, env=environment, capture_output=True, text=True)
+    assert done.returncode == 1 and "vla[ros]" in done.stderr and "Traceback" not in done.stderr
+
+
+def test_a_ros_installation_finds_the_node() -> None:
+    prefix = Path(sysconfig.get_path("data"))
+    assert (prefix / "share/ament_index/resource_index/packages/vla").is_file()
+    package = ElementTree.parse(prefix / "share/vla/package.xml").getroot()
+    assert package.findtext("name") == "vla" and package.find("maintainer") is not None
+    compile((prefix / "share/vla/launch/agent.launch.py").read_text(), "agent.launch.py", "exec")
+    done = subprocess.run([prefix / "lib/vla/agent", "--help"], capture_output=True, text=True)
+    assert done.returncode == 0 and "deploy" in done.stdout

@@ -1,0 +1,113 @@
+"""Messages as arrays: what the middleware lets through, these functions do not."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from vla.deploy import messages
+from vla.deploy.governor import Robot
+from vla.deploy.session import Command
+
+ROBOT = Robot(
+    joints=["one", "two"],
+    low=[-1.0] * 2,
+    high=[1.0] * 2,
+    speed=[1.0] * 2,
+    acceleration=[1.0] * 2,
+    fingers=["left", "right"],
+)
+PIXELS = np.arange(2 * 3 * 3, dtype=np.uint8).reshape(2, 3, 3)  # (H, W, 3)
+
+
+def image(**changed: Any) -> Any:
+    """A message as the camera sends it."""
+    message = SimpleNamespace(header=SimpleNamespace(frame_id=""))
+    messages.fill_image(message, PIXELS, "camera")
+    return SimpleNamespace(**{**vars(message), **changed})
+
+
+def joints(**changed: Any) -> Any:
+    """Joint states in an order of their own, with one more joint than asked for."""
+    given = {
+        "name": ["left", "two", "elsewhere", "one", "right"],
+        "position": [0.03, 2.0, 9.0, 1.0, 0.01],
+        "velocity": [0.0, 0.2, 9.0, 0.1, 0.0],
+    }
+    return SimpleNamespace(**{**given, **changed})
+
+
+def test_an_image_goes_there_and_back() -> None:
+    np.testing.assert_array_equal(messages.image_from(image(), (2, 3)), PIXELS)
+
+
+def test_padded_rows_and_other_encodings_are_understood() -> None:
+    padded = np.full((2, 16), 255, np.uint8)
+    padded[:, :12] = np.concatenate([PIXELS[..., ::-1], np.zeros((2, 3, 1), np.uint8)], -1).reshape(2, 12)
+    message = image(encoding="bgra8", step=16, data=padded.tobytes())
+    np.testing.assert_array_equal(messages.image_from(message, (2, 3)), PIXELS)
+
+
+@pytest.mark.parametrize(
+    ("changed", "reason"),
+    [
+        ({"encoding": "16UC1"}, "encoding is '16UC1'"),
+        ({"data": b"abc"}, "3 bytes, 2 rows of 9 are 18"),
+        ({"step": 8}, "step is 8 bytes, 3 pixels of rgb8 need 9"),
+        ({"step": 10}, "2 rows of 10"),
+        ({"height": 1}, "1 by 3 pixels, the policy was trained on 2 by 3"),
+    ],
+)
+def test_an_image_that_is_none_is_refused(changed: dict, reason: str) -> None:
+    with pytest.raises(ValueError, match=reason):
+        messages.image_from(image(**changed), (2, 3))
+
+
+def test_joints_are_found_by_name() -> None:
+    position, velocity, opening = messages.joints_from(joints(), ROBOT)
+    assert (position.tolist(), velocity.tolist(), opening) == ([1.0, 2.0], [0.1, 0.2], pytest.approx(0.04))
+    assert messages.joints_from(joints(velocity=[]), ROBOT)[1].tolist() == [0.0, 0.0]
+
+
+@pytest.mark.parametrize(
+    ("changed", "reason"),
+    [
+        ({"name": ["left", "two", "elsewhere", "three", "right"]}, "lacks one; it has left, two"),
+        ({"name": ["left", "two", "one", "one", "right"]}, "twice"),
+        ({"position": [1.0]}, "5 names, 1 positions"),
+        ({"velocity": [1.0]}, "1 velocities"),
+        ({"position": [0.03, float("nan"), 9.0, 1.0, 0.01]}, "not finite"),
+    ],
+)
+def test_joint_states_that_do_not_fit_are_refused(changed: dict, reason: str) -> None:
+    with pytest.raises(ValueError, match=reason):
+        messages.joints_from(joints(**changed), ROBOT)
+
+
+def test_a_command_goes_there_and_back() -> None:
+    command = Command(np.array([0.1, 0.2]), np.array([1.0, 2.0]), 0.5)
+    message = messages.fill_joint_state(SimpleNamespace(velocity=[], effort=[]), ROBOT, command)
+    assert message.name == ["one", "two", "left", "right"] and message.velocity == message.effort == []
+    position, opening = messages.command_from(message, ROBOT)
+    assert position.tolist() == [0.1, 0.2] and opening == pytest.approx(0.5)
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"name": ["one"], "position": [0.0]}, {"name": ["one", "two"], "position": [0.0, float("inf")]}]
+)
+def test_a_command_that_does_not_fit_is_refused(wrong: dict) -> None:
+    with pytest.raises(ValueError, match="joint command"):
+        messages.command_from(SimpleNamespace(**wrong), ROBOT)
+
+
+def test_a_trajectory_is_timed_and_ends_at_rest() -> None:
+    commands = [Command(np.full(2, 0.1 * n), np.full(2, 0.5), 1.0) for n in range(1, 61)]
+    message = SimpleNamespace(points=[])
+    messages.fill_trajectory(message, SimpleNamespace, SimpleNamespace, ROBOT, commands, 0.02)
+    times = [point.time_from_start.sec + point.time_from_start.nanosec * 1e-9 for point in message.points]
+    assert times == pytest.approx(0.02 * np.arange(1, 61))
+    assert message.joint_names == ["one", "two"]
+    assert message.points[0].velocities == [0.5, 0.5] and message.points[-1].velocities == [0.0, 0.0]

@@ -1,0 +1,390 @@
+"""The policy as a managed ROS 2 node: images, joint states and words in, joint commands out."""
+
+from __future__ import annotations
+
+import time
+import traceback
+from collections import deque
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import asdict, replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+from builtin_interfaces.msg import Duration
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor, SetParametersResult
+from rclpy.clock import Clock, ClockType
+from rclpy.context import Context
+from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
+from rclpy.parameter import Parameter
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from sensor_msgs.msg import Image, JointState
+from std_msgs.msg import Float64MultiArray, String
+from std_srvs.srv import Trigger
+from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
+
+from vla.deploy import messages
+from vla.deploy.governor import Robot
+from vla.deploy.ros2 import Ros2
+from vla.deploy.session import Session, State
+from vla.policy import Policy
+from vla.spec import Array, Observation
+
+DONE, NOT_DONE = TransitionCallbackReturn.SUCCESS, TransitionCallbackReturn.FAILURE
+LEVELS = {
+    State.WAITING: DiagnosticStatus.OK,
+    State.RUNNING: DiagnosticStatus.OK,
+    State.HOLDING: DiagnosticStatus.WARN,
+    State.STOPPED: DiagnosticStatus.WARN,
+    State.FAULT: DiagnosticStatus.ERROR,
+}
+COMMANDS = {"joint_state": JointState, "trajectory": JointTrajectory, "forward": Float64MultiArray}
+
+
+class Agent(LifecycleNode):
+    """Configure makes room and warms up, activate takes the arm over where it stands, deactivate brakes and holds."""
+
+    def __init__(self, policy: Policy, settings: Ros2, context: Context | None = None) -> None:
+        super().__init__("vla_agent", context=context)
+        self.policy, self.settings = policy, settings
+        self.session: Session | None = None
+        self._steady = Clock(clock_type=ClockType.STEADY_TIME)  # goes on where simulated time stands still
+        self._made: list[tuple[Callable[[Any], Any], Any]] = []
+        self._timers: list[Any] = []
+        self._figures: dict[str, deque[float]] = {}
+        self._stamps: dict[str, tuple[int, int]] = {}
+        self._asked: tuple[Future[Array], float] | None = None
+        self._last_tick: float | None = None
+        self._told: tuple[State | None, str] = (None, "")
+        self._dropped = 0
+        self._declare()
+
+    # Parameters.
+
+    def _declare(self) -> None:
+        for name, value in asdict(self.settings.robot).items():
+            share = name.endswith("_share")
+            limits = [FloatingPointRange(from_value=0.01, to_value=1.0)] if share else []
+            value = list(value) if isinstance(value, (list, tuple)) else value
+            self.declare_parameter(name, value, ParameterDescriptor(floating_point_range=limits))
+        self.declare_parameter("command", self.settings.command)
+        self.declare_parameter("image_reliability", self.settings.image_reliability)
+        rate = FloatingPointRange(from_value=1.0, to_value=1000.0)
+        self.declare_parameter("command_hz", self.settings.command_hz, ParameterDescriptor(floating_point_range=[rate]))
+        self.add_on_set_parameters_callback(self._may_set)
+
+    def _may_set(self, parameters: list[Parameter]) -> SetParametersResult:
+        """While configured only the shares change, and while active they only sink."""
+        for parameter in parameters:
+            if self.session is None or not self.has_parameter(parameter.name) or parameter.name == "use_sim_time":
+                continue
+            if not parameter.name.endswith("_share"):
+                return SetParametersResult(successful=False, reason=f"clean up before {parameter.name} changes")
+            if self._timers and parameter.value > self.get_parameter(parameter.name).value:
+                return SetParametersResult(successful=False, reason=f"deactivate before {parameter.name} is raised")
+            governor = self.session.governor
+            governor.robot = replace(governor.robot, **{parameter.name: parameter.value})
+        return SetParametersResult(successful=True)
+
+    # Lifecycle.
+
+    def _LifecycleNodeMixin__on_change_state(self, request: Any, response: Any) -> Any:
+        """Refuse a transition that the state does not have; rclpy 7.1 would end the process (ros2/rclpy#1209)."""
+        known = {transition[0]: transition[1] for transition in self._state_machine.available_transitions}
+        label = request.transition.label
+        wanted = next((key for key, name in known.items() if name == label), None) if label else request.transition.id
+        if wanted not in known:
+            self.get_logger().error(f"there is no transition {label or wanted} now, only {', '.join(known.values())}")
+            response.success = False
+            return response
+        return super()._LifecycleNodeMixin__on_change_state(request, response)  # type: ignore[misc]
+
+    def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
+        return self._try("configure", self._configure)
+
+    def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        result = self._try("activate", self._activate)
+        return super().on_activate(state) if result is DONE else result
+
+    def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        result = self._try("deactivate", self.come_to_rest)
+        super().on_deactivate(state)
+        return result
+
+    def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
+        return self._try("clean up", self._clean_up)
+
+    def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
+        self._try("come to rest", self.come_to_rest)
+        return self._try("clean up", self._clean_up)
+
+    def _try(self, what: str, do: Callable[[], None]) -> TransitionCallbackReturn:
+        """rclpy swallows what a transition raises."""
+        try:
+            do()
+        except ValueError as error:
+            self.get_logger().error(f"cannot {what}: {error}")
+            return NOT_DONE
+        except Exception:
+            self.get_logger().error(f"cannot {what}: {traceback.format_exc()}")
+            return NOT_DONE
+        return DONE
+
+    def _configure(self) -> None:
+        spec, topics = self.policy.spec, self.settings.topics
+        unnamed = sorted(set(spec.cameras) - set(topics.images))
+        if unnamed:
+            raise ValueError(f"the policy looks through {', '.join(unnamed)}: name deploy.topics.images.{unnamed[0]}")
+        robot = Robot(**{name: self.get_parameter(name).value for name in asdict(self.settings.robot)})
+        self._kind = self.get_parameter("command").value
+        if self._kind not in COMMANDS:
+            raise ValueError(f"command is '{self._kind}', there are {', '.join(COMMANDS)}")
+        session = Session(spec, robot, self.settings.safety, self.get_parameter("command_hz").value)
+        self._warm_up()
+        reliable = self.get_parameter("image_reliability").value == "reliable"
+        newest = QoSProfile(
+            depth=1, reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT
+        )
+        latest = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
+        for camera in spec.cameras:
+            self._subscribe(Image, topics.images[camera], partial(self._on_image, camera), newest)
+        self._subscribe(JointState, topics.joint_states, self._on_joints, latest)
+        self._subscribe(String, topics.instruction, self._on_instruction, QoSProfile(depth=1))
+        self._commands = self._publish(COMMANDS[self._kind], topics.commands, managed=True)
+        self._gripper = self._publish(Float64MultiArray, topics.gripper, managed=True) if topics.gripper else None
+        self._status = self._publish(DiagnosticStatus, "~/status")
+        self._diagnostics = self._publish(DiagnosticArray, "/diagnostics")
+        for name, answer in (("~/stop", self._on_stop), ("~/resume", self._on_resume)):
+            service = self.create_service(Trigger, name, answer)
+            self._made.append((self.destroy_service, service))
+        self._pool = ThreadPoolExecutor(1, thread_name_prefix="policy")
+        self._figures, self._stamps, self._dropped = {}, {}, 0
+        self.session = session
+
+    def _warm_up(self) -> None:
+        """Ask the policy about nothing, three times: the first answers are slow."""
+        spec = self.policy.spec
+        nothing = Observation(
+            rgb={camera: np.zeros((*spec.image_size, 3), np.uint8) for camera in spec.cameras},
+            depth={},
+            joints=np.zeros(len(spec.joints), np.float32),
+            velocities=np.zeros(len(spec.joints), np.float32),
+            gripper=0.0,
+            instruction="",
+        )
+        for _ in range(3):
+            self.policy.reset("", 0)
+            self.policy.plan(nothing)
+        self.policy.reset("", 0)
+
+    def _activate(self) -> None:
+        assert self.session is not None
+        others = self.count_publishers(self._commands.topic_name) - 1
+        if others > 0:
+            raise ValueError(
+                f"{others} other publisher(s) command the arm on {self._commands.topic_name}: end them first"
+            )
+        self.session.restart()
+        self._asked, self._last_tick = None, None
+        self._timers = [
+            self.create_timer(self.session.tick, self._guard(self._tick), clock=self._steady),
+            self.create_timer(1.0, self._guard(self._report), clock=self._steady),
+        ]
+
+    def come_to_rest(self) -> None:
+        """Brake, publish the pose that is held, and end the timers."""
+        if not self._timers or self.session is None:
+            return
+        self.session.stop("deactivated")
+        while True:
+            self._send()
+            if self.session.governor.resting:
+                break
+            time.sleep(self.session.tick)
+        for timer in self._timers:
+            self.destroy_timer(timer)
+        self._timers = []
+        self._report()
+
+    def _clean_up(self) -> None:
+        self._pool.shutdown(cancel_futures=True)
+        for destroy, thing in self._made:
+            destroy(thing)
+        self._made, self.session = [], None
+
+    def _subscribe(self, kind: type, topic: str, callback: Callable[[Any], None], qos: QoSProfile) -> None:
+        subscription = self.create_subscription(kind, topic, self._guard(callback), qos)
+        self._made.append((self.destroy_subscription, subscription))
+
+    def _guard(self, callback: Callable[..., None]) -> Callable[..., None]:
+        """A bug must stop the arm, not the process that can stop it."""
+
+        def guarded(*arguments: Any) -> None:
+            try:
+                callback(*arguments)
+            except Exception:
+                self.get_logger().error(traceback.format_exc(), throttle_duration_sec=1.0)
+                if self.session is not None:
+                    self.session.fail("a bug in the agent, see its log")
+
+        return guarded
+
+    def _publish(self, kind: type, topic: str, managed: bool = False) -> Any:
+        create = self.create_lifecycle_publisher if managed else super(LifecycleNode, self).create_publisher
+        publisher = create(kind, topic, 1 if managed else 10)
+        self._made.append((self.destroy_publisher, publisher))
+        return publisher
+
+    # What comes in.
+
+    def _on_image(self, camera: str, message: Image) -> None:
+        now = time.monotonic()
+        stamp = (message.header.stamp.sec, message.header.stamp.nanosec)
+        if not self._timers or self.session is None:
+            return
+        if stamp != (0, 0) and stamp == self._stamps.get(camera):
+            return self._drop(f"an image of the camera {camera} came twice; does its clock stand still?")
+        self._stamps[camera] = stamp
+        try:
+            image = messages.image_from(message, self.policy.spec.image_size)
+        except ValueError as error:
+            return self._drop(f"camera {camera}: {error}")
+        age = self._age(stamp)
+        self._note("image age", age)
+        self.session.see(camera, image, now - age)
+        return self._advance()
+
+    def _on_joints(self, message: JointState) -> None:
+        now = time.monotonic()
+        if not self._timers or self.session is None:
+            return
+        try:
+            joints, velocities, opening = messages.joints_from(message, self.session.robot)
+        except ValueError as error:
+            return self._drop(str(error))
+        self.session.feel(joints, velocities, opening, now)
+
+    def _on_instruction(self, message: String) -> None:
+        if self._timers and self.session is not None:
+            self.session.listen(message.data, time.monotonic())
+            self.get_logger().info(f"instruction: '{message.data}'")
+
+    def _on_stop(self, request: Any, response: Any) -> Any:
+        response.success = bool(self._timers)
+        if self.session is not None:
+            self.session.stop("stopped by request")
+        return response
+
+    def _on_resume(self, request: Any, response: Any) -> Any:
+        response.success = bool(self._timers) and self.session is not None and self.session.resume(time.monotonic())
+        response.message = "" if response.success else "there is nothing to resume: the agent was not stopped"
+        return response
+
+    def _drop(self, why: str) -> None:
+        self._dropped += 1
+        self.get_logger().warning(why, throttle_duration_sec=1.0)
+
+    def _age(self, stamp: tuple[int, int]) -> float:
+        """Age [s] of a message by its stamp; 0 where the stamp cannot be of this clock."""
+        age = self.get_clock().now().nanoseconds * 1e-9 - (stamp[0] + stamp[1] * 1e-9)
+        return age if stamp != (0, 0) and 0 <= age < 10.0 else 0.0
+
+    # What goes out.
+
+    def _tick(self) -> None:
+        now = time.monotonic()
+        if self._last_tick is not None:
+            self._note("tick", now - self._last_tick)
+        self._last_tick = now
+        self._advance()
+        self._send()
+
+    def _advance(self) -> None:
+        """Take the policy's answer if there is one, and ask it again if it is time to."""
+        assert self.session is not None
+        if self._asked is not None and self._asked[0].done():
+            (future, started), self._asked = self._asked, None
+            try:
+                self.session.plan(future.result(), time.monotonic())
+                self._note("inference", time.monotonic() - started)
+            except Exception as error:
+                self.get_logger().error(f"the policy failed: {traceback.format_exc()}", throttle_duration_sec=1.0)
+                self.session.reject(f"the policy failed: {error}")
+        if self._asked is None:
+            observation = self.session.look(time.monotonic())
+            if observation is not None:
+                self._asked = (self._pool.submit(self._think, observation, self.session.resumed), time.monotonic())
+
+    def _think(self, observation: Observation, afresh: bool) -> Array:
+        if afresh:
+            self.policy.reset(observation.instruction, 0)
+        return self.policy.plan(observation)
+
+    def _send(self) -> None:
+        assert self.session is not None
+        now = time.monotonic()
+        command = self.session.command(now)
+        if command is None:
+            return
+        robot = self.session.robot
+        if self._kind == "joint_state":
+            message = messages.fill_joint_state(JointState(), robot, command)
+            message.header.stamp = self.get_clock().now().to_msg()
+        elif self._kind == "trajectory":
+            ahead = self.session.horizon(now)
+            message = messages.fill_trajectory(
+                JointTrajectory(), JointTrajectoryPoint, Duration, robot, ahead, self.session.tick
+            )
+        else:
+            message = Float64MultiArray(data=command.position.tolist())
+        self._commands.publish(message)
+        if self._gripper is not None:
+            self._gripper.publish(Float64MultiArray(data=messages.finger_positions(robot, command)))
+        if (self.session.state, self.session.reason) != self._told:
+            self._report()
+
+    def _note(self, name: str, seconds: float) -> None:
+        self._figures.setdefault(name, deque(maxlen=500)).append(seconds)
+
+    def _report(self) -> None:
+        """Status once a second and on every change; what others do to our topics is looked at here too."""
+        session = self.session
+        assert session is not None
+        if self._timers:
+            self._look_for_others()
+        if (session.state, session.reason) != self._told:
+            self._told = (session.state, session.reason)
+            words = f"{session.state}: {session.reason}" if session.reason else str(session.state)
+            # One line each: rclpy does not let one and the same line log with changing severity.
+            if LEVELS[session.state] == DiagnosticStatus.OK:
+                self.get_logger().info(words)
+            else:
+                self.get_logger().warning(words)
+        values = {
+            "state": session.state.value,
+            "instruction": session.instruction,
+            "messages dropped": str(self._dropped),
+            "ticks skipped": str(session.overruns),
+        }
+        for name, figures in self._figures.items():
+            middle, high = np.percentile(list(figures), [50, 99]) * 1000
+            values[f"{name} p50 [ms]"], values[f"{name} p99 [ms]"] = f"{middle:.1f}", f"{high:.1f}"
+        pairs = [KeyValue(key=key, value=value) for key, value in values.items()]
+        text = session.reason or session.state.value
+        status = DiagnosticStatus(level=LEVELS[session.state], name=self.get_name(), message=text, values=pairs)
+        self._status.publish(status)
+        array = DiagnosticArray(status=[status])
+        array.header.stamp = self.get_clock().now().to_msg()
+        self._diagnostics.publish(array)
+
+    def _look_for_others(self) -> None:
+        """Two who command one arm, or two cameras on one topic, are a fault that nobody else would notice."""
+        assert self.session is not None
+        if self.count_publishers(self._commands.topic_name) > 1:
+            self.session.fail(f"somebody else commands the arm on {self._commands.topic_name}")
+        for camera in self.policy.spec.cameras:
+            topic = self.resolve_topic_name(self.settings.topics.images[camera])
+            if self.count_publishers(topic) > 1:
+                self.session.hold(f"{self.count_publishers(topic)} publishers send images on {topic}")

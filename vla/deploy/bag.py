@@ -1,0 +1,155 @@
+"""Record what goes over the topics as a rosbag2 folder, and play one back.
+
+    python -m vla.deploy.bag record FOLDER      until interrupted; `rerun FOLDER/*.mcap` shows it
+    python -m vla.deploy.bag play FOLDER        images, joint states and words as they came, for an agent to act on
+
+Only messages go into a bag, never code, so a bag of somebody else's is as safe to play as to look at.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Callable
+from importlib import import_module
+from pathlib import Path
+from threading import Event
+from typing import Any
+
+from vla.deploy.ros import NETWORKS, Network, ros, spin
+
+PRIVATE = ("/rosout", "/parameter_events")  # of ROS itself
+LOOK_AROUND = 0.5  # how often new topics are looked for [s]
+MESSAGE_PACKAGES = ("sensor_msgs", "std_msgs", "trajectory_msgs", "diagnostic_msgs", "rosgraph_msgs")
+
+
+def message_class(name: str) -> Any:
+    """The class of a message type such as sensor_msgs/msg/Image; None for those that robots and agents do not use."""
+    package, _, kind = name.split("/")
+    return getattr(import_module(f"{package}.msg"), kind) if package in MESSAGE_PACKAGES else None
+
+
+class Recorder:
+    """Writes every message on every topic, as it came, into a bag; ends with `close`."""
+
+    def __init__(self, node: Any, folder: Path) -> None:
+        """Args: the node whose spinning records; the folder of the bag, which must not exist.
+
+        Raises:
+            ValueError: the folder exists.
+        """
+        from rosbags.rosbag2 import StoragePlugin, Writer
+        from rosbags.typesys import Stores, get_typestore
+
+        if folder.exists():
+            raise ValueError(f"there already is a {folder}: name a folder that does not exist")
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        self._types = get_typestore(Stores.ROS2_JAZZY)
+        self._writer = Writer(folder, version=9, storage_plugin=StoragePlugin.MCAP)
+        self._writer.open()
+        self._node, self._known = node, set(PRIVATE)
+        self._subscriptions: list[Any] = []
+        self.messages = 0
+        self._look_around()
+        self._timer = node.create_timer(LOOK_AROUND, self._look_around)
+
+    def _look_around(self) -> None:
+        from rclpy.qos import QoSProfile, ReliabilityPolicy
+
+        for topic, types in self._node.get_topic_names_and_types():
+            kind = message_class(types[0]) if topic not in self._known else None
+            self._known.add(topic)
+            if kind is None:
+                continue
+            connection = self._writer.add_connection(topic, types[0], typestore=self._types)
+            qos = QoSProfile(depth=50, reliability=ReliabilityPolicy.BEST_EFFORT)  # which hears everybody
+            write = self._write(connection)
+            self._subscriptions.append(self._node.create_subscription(kind, topic, write, qos, raw=True))
+
+    def _write(self, connection: Any) -> Callable[[bytes], None]:
+        def write(message: bytes) -> None:
+            self._writer.write(connection, time.time_ns(), message)
+            self.messages += 1
+
+        return write
+
+    def close(self) -> None:
+        """Finish the bag."""
+        self._node.destroy_timer(self._timer)
+        for subscription in self._subscriptions:
+            self._node.destroy_subscription(subscription)
+        self._writer.close()
+
+
+def play(node: Any, folder: Path, skip: set[str], stopped: Event, speed: float = 1.0) -> int:
+    """Publish the messages of a bag at the times they came, except on some topics; the number of messages.
+
+    Raises:
+        ValueError: there is no bag in the folder.
+    """
+    from rosbags.rosbag2 import Reader, ReaderError
+
+    published = 0
+    try:
+        reader = Reader(folder)
+        reader.open()
+    except ReaderError as error:
+        raise ValueError(f"{folder} is no bag: {error}") from error
+    try:
+        classes = {c.topic: message_class(c.msgtype) for c in reader.connections if c.topic not in skip}
+        publishers = {t: node.create_publisher(kind, t, 10) for t, kind in classes.items() if kind is not None}
+        give_up = time.monotonic() + 2.0  # somebody may need a moment to find these publishers
+        while time.monotonic() < give_up and not all(p.get_subscription_count() for p in publishers.values()):
+            stopped.wait(0.02)
+        begin = time.monotonic()
+        for connection, stamp, message in reader.messages():
+            if connection.topic not in publishers or stopped.is_set():
+                continue
+            stopped.wait(max(0.0, begin + (stamp - reader.start_time) * 1e-9 / speed - time.monotonic()))
+            publishers[connection.topic].publish(_stamped_now(node, message, classes[connection.topic]))
+            published += 1
+    finally:
+        reader.close()
+    return published
+
+
+def _stamped_now(node: Any, message: bytes, kind: Any) -> Any:
+    """The message as if it were made now: an agent rightly refuses to act on an old one."""
+    from rclpy.serialization import deserialize_message
+
+    made = deserialize_message(bytes(message), kind)
+    if hasattr(made, "header"):
+        made.header.stamp = node.get_clock().now().to_msg()
+    return made
+
+
+def main() -> None:
+    """Record or play."""
+    parser = argparse.ArgumentParser(prog="python -m vla.deploy.bag", description=__doc__.splitlines()[0])
+    parser.add_argument("do", choices=("record", "play"))
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--network", choices=NETWORKS, default="loopback")
+    parser.add_argument("--speed", type=float, default=1.0, help="of playing, against how it was recorded")
+    parser.add_argument(
+        "--skip", nargs="*", help="topics not to play", default=["/isaac/franka/joint_commands", "/vla_agent/status"]
+    )
+    options = parser.parse_args()
+    try:
+        with ros(Network.named(options.network)) as stopped:
+            import rclpy
+
+            node = rclpy.create_node("vla_bag")
+            if options.do == "play":
+                print(f"{play(node, options.folder, {*options.skip, '/diagnostics'}, stopped, options.speed)} messages")
+            else:
+                recorder = Recorder(node, options.folder)
+                spin(node, stopped)
+                recorder.close()
+                print(f"{recorder.messages} messages in {options.folder}")
+            node.destroy_node()
+    except ValueError as error:
+        parser.exit(1, f"error: {error}\n")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,114 @@
+"""Starting and ending ROS: the network, the arguments, the signals."""
+
+from __future__ import annotations
+
+import os
+import signal
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from threading import Event
+from types import FrameType
+from typing import Any, Literal
+
+LOOPBACK = Path(__file__).with_name("loopback.xml")
+
+# What stood behind --ros-args on the command line; it belongs to ROS, and Hydra must not see it.
+arguments: list[str] = []
+
+
+def split_arguments(argv: Sequence[str]) -> tuple[list[str], list[str]]:
+    """What is for Hydra, and the stretch from --ros-args to -- or the end, which is for ROS."""
+    if "--ros-args" not in argv:
+        return list(argv), []
+    start = list(argv).index("--ros-args")
+    end = list(argv).index("--", start) if "--" in argv[start:] else len(argv)
+    return [*argv[:start], *argv[end + 1 :]], list(argv[start:end])
+
+
+Range = Literal["SYSTEM_DEFAULT", "LOCALHOST", "SUBNET", "OFF"]
+NETWORKS: dict[str, Range] = {"loopback": "SYSTEM_DEFAULT", "localhost": "LOCALHOST", "site": "SUBNET"}
+
+
+class Network:
+    """Who can hear and be heard."""
+
+    def __init__(
+        self,
+        discovery: Range,
+        profile: str | None = None,
+        domain: int | None = None,
+    ) -> None:
+        """Args:
+        discovery: ROS_AUTOMATIC_DISCOVERY_RANGE.
+        profile: a Fast DDS profile; "loopback" is the one that comes with this package, on 127.0.0.1 only.
+        domain: ROS_DOMAIN_ID; None leaves it to the environment.
+        """
+        self.discovery, self.domain = discovery, domain
+        self.profile = str(LOOPBACK) if profile == "loopback" else profile
+
+    @classmethod
+    def named(cls, name: str) -> Network:
+        """One of the options of `deploy/network`, for the little tools that compose no configuration."""
+        return cls(NETWORKS[name], "loopback" if name == "loopback" else None)
+
+    def apply(self) -> None:
+        """Set the environment, which ROS reads when it starts.
+
+        Raises:
+            ValueError: there is no such profile.
+        """
+        os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = self.discovery
+        if self.profile is not None:
+            if not Path(self.profile).is_file():
+                raise ValueError(f"deploy.network.profile: there is no file {self.profile}")
+            os.environ["FASTRTPS_DEFAULT_PROFILES_FILE"] = self.profile
+        if self.domain is not None:
+            os.environ["ROS_DOMAIN_ID"] = str(self.domain)
+
+
+@contextmanager
+def ros(network: Network, log_folder: Path | None = None) -> Iterator[Event]:
+    """ROS, started; gives an event that SIGINT and SIGTERM set. ROS' own handlers would end it before a last word.
+
+    Raises:
+        ImportError: rclpy cannot be imported.
+    """
+    network.apply()
+    if log_folder is not None:
+        os.environ.setdefault("ROS_LOG_DIR", str(log_folder))
+    try:
+        import rclpy
+        from rclpy.signals import SignalHandlerOptions
+    except ImportError as error:
+        raise ImportError(
+            "ROS 2 is not here: install vla[ros] (Linux, x86-64), or source the setup.bash of a ROS 2 Jazzy whose "
+            f"Python is this one ({error})"
+        ) from error
+    stopped = Event()
+
+    def stop(number: int, frame: FrameType | None) -> None:
+        stopped.set()
+
+    before = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM)}
+    rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
+    try:
+        yield stopped
+    finally:
+        rclpy.try_shutdown()
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def spin(node: Any, stopped: Event) -> None:
+    """Serve a node's callbacks in this thread until stopped."""
+    from rclpy.executors import SingleThreadedExecutor
+
+    executor = SingleThreadedExecutor()
+    executor.add_node(node)
+    try:
+        while not stopped.is_set():
+            executor.spin_once(timeout_sec=0.05)
+    finally:
+        executor.remove_node(node)
+        executor.shutdown()

@@ -1,0 +1,35 @@
+"""See how a deployed policy is doing: python -m vla.deploy.watch"""
+
+from __future__ import annotations
+
+import argparse
+from typing import Any
+
+from vla.deploy.ros import NETWORKS, Network, ros, spin
+
+
+def main() -> None:
+    """Print every status of the agent until interrupted."""
+    parser = argparse.ArgumentParser(prog="python -m vla.deploy.watch", description=__doc__)
+    parser.add_argument("--agent", default="/vla_agent")
+    parser.add_argument("--network", choices=NETWORKS, default="loopback")
+    options = parser.parse_args()
+    with ros(Network.named(options.network)) as stopped:
+        import rclpy
+        from diagnostic_msgs.msg import DiagnosticStatus
+
+        def show(status: Any) -> None:
+            values = {pair.key: pair.value for pair in status.values}
+            figures = "  ".join(
+                f"{key} {value}" for key, value in values.items() if key not in ("state", "instruction")
+            )
+            print(f"{values['state']:8} {status.message:40} '{values['instruction']}'  {figures}", flush=True)
+
+        node = rclpy.create_node("vla_watch")
+        node.create_subscription(DiagnosticStatus, f"{options.agent}/status", show, 10)
+        spin(node, stopped)
+        node.destroy_node()
+
+
+if __name__ == "__main__":
+    main()
