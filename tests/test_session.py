@@ -29,7 +29,7 @@ ROBOT = Robot(
     low=JOINT_LOW.tolist(),
     high=JOINT_HIGH.tolist(),
     speed=[2.0] * 7,
-    acceleration=[10.0] * 7,
+    acceleration=[50.0] * 7,
     fingers=["left", "right"],
     speed_share=1.0,
     acceleration_share=1.0,
@@ -224,7 +224,9 @@ def test_an_arm_outside_its_limits_is_a_fault() -> None:
 
 
 def test_what_lies_ahead_ends_at_rest(world: World) -> None:
-    world.run(0.5)
+    ticks = world.ticks(1.0)
+    while not next(ticks).velocity.any():
+        pass
     ahead = world.session.horizon(world.now)
     assert not ahead[-1].velocity.any() and ahead[0].velocity.any()
     moved = np.diff([command.position for command in ahead], axis=0) / 0.02

@@ -153,11 +153,28 @@ def policy(config: DictConfig) -> Measure:
     return _measure(rate, "actions/s", steps, floor)
 
 
+def deployment(config: DictConfig) -> Measure:
+    """From taking an image to the command that follows, over ROS 2 between processes, against inference alone [ms].
+
+    Raises:
+        ValueError: no loop or no checkpoint is chosen.
+    """
+    from vla.jobs import deployed
+
+    if not config.deploy or config.deploy._target_ != "vla.deploy.loop.Loop":
+        raise ValueError("benchmark.names=[deploy] needs deploy=loop checkpoint=FILE")
+    loop = deployed(config)
+    episodes = loop.run().episodes
+    value, floor = (float(loop.figures[f"{name} p50 [ms]"]) for name in ("image to command", "inference"))
+    return _measure(value, "ms", episodes, floor)
+
+
 STAGES: dict[str, Callable[[DictConfig], Measure]] = {
     "collect": collection,
     "loader": loader,
     "train": training,
     "policy": policy,
+    "deploy": deployment,
 }
 
 

@@ -60,7 +60,7 @@ PLAIN: dict[str, Any] = {
     "evaluate": {"episodes": int, "seed": int, "workers": int | None, "recordings": int | None},
     "preview": {"episodes": int, "seed": int},
     "benchmark": {
-        "names": list[Literal["collect", "loader", "train", "policy"]],
+        "names": list[Literal["collect", "loader", "train", "policy", "deploy"]],
         "episodes": int,
         "batches": int,
         "steps": int,

@@ -116,20 +116,25 @@ def deploy(config: DictConfig) -> None:
     """
     from vla.report import plot_report, write_report
 
-    output = _output(config)
-    report = build(
-        config.deploy,
-        policy=partial(_deployed, config.checkpoint),
-        environment=partial(make_environment, plain(config.task)),
-        output=output,
-    ).run()
+    report = deployed(config).run()
     if report is not None:
+        output = _output(config)
         write_report(report, output / "report.json", config.checkpoint, plain(config))
         plot_report(report, output / "report.png")
         print(report)
 
 
-def _deployed(checkpoint: str | None) -> Policy:
+def deployed(config: DictConfig) -> Any:
+    """The deployment that `config.deploy` describes, ready to run."""
+    return build(
+        config.deploy,
+        policy=partial(_required_policy, config.checkpoint),
+        environment=partial(make_environment, plain(config.task)),
+        output=_output(config),
+    )
+
+
+def _required_policy(checkpoint: str | None) -> Policy:
     if checkpoint is None:
         raise ValueError("this deployment needs a trained policy: checkpoint=FILE")
     return make_policy(Path(checkpoint))

@@ -309,6 +309,7 @@ class Agent(LifecycleNode):
             try:
                 self.session.plan(future.result(), time.monotonic())
                 self._note("inference", time.monotonic() - started)
+                self._note("image to command", time.monotonic() - self.session.observed)
             except Exception as error:
                 self.get_logger().error(f"the policy failed: {traceback.format_exc()}", throttle_duration_sec=1.0)
                 self.session.reject(f"the policy failed: {error}")

@@ -6,7 +6,7 @@ import json
 import logging
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from multiprocessing import get_context
 from pathlib import Path
 from threading import Event
@@ -37,6 +37,7 @@ class Loop:
         episodes: how many.
         record: write all messages into a bag in the output folder, which Rerun opens.
         policy, environment, output: given by the job.
+        figures: what the agent said of itself at last, such as "image to command p50 [ms]".
     """
 
     agent: Callable[..., Ros2]
@@ -46,6 +47,7 @@ class Loop:
     policy: Callable[[], Policy]
     environment: Callable[[], Tabletop]
     output: Path
+    figures: dict[str, str] = field(init=False, default_factory=dict)
 
     def run(self) -> Report:
         """Play all episodes.
@@ -70,6 +72,8 @@ class Loop:
                 if recorder is not None:
                     recorder.close()
                     log.info("rerun %s shows what the nodes said", *(self.output / "bag").glob("*.mcap"))
+                self.figures = person.figures
+                log.info("%s", ", ".join(f"{key} {value}" for key, value in self.figures.items() if "[ms]" in key))
                 person.node.destroy_node()
         finally:
             for node in nodes:
@@ -85,6 +89,7 @@ class Person:
     def __init__(self, agent: Ros2, stopped: Event, alive: Callable[[], bool]) -> None:
         """Args: the agent's settings; set when interrupted; whether both nodes still run."""
         import rclpy
+        from diagnostic_msgs.msg import DiagnosticStatus
         from lifecycle_msgs.srv import ChangeState
         from rclpy.qos import DurabilityPolicy, QoSProfile
         from std_msgs.msg import String
@@ -97,7 +102,9 @@ class Person:
         self._say = self.node.create_publisher(String, agent.topics.instruction, 1)
         lasting = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         self.node.create_subscription(String, "/vla_simulator/episode", self._hear, lasting)
+        self.node.create_subscription(DiagnosticStatus, "/vla_agent/status", self._note, 10)
         self._episode: dict[str, Any] = {}
+        self.figures: dict[str, str] = {}
         self._until(lambda: self._change.service_is_ready() and self._reset.service_is_ready(), START, "the nodes")
         self._until(lambda: self._say.get_subscription_count() >= 2, START, "both nodes to listen")
 
@@ -123,6 +130,9 @@ class Person:
         self._until(lambda: bool(self._episode["done"]) or self._stopped.is_set(), EPISODE, "the end of an episode")
         seconds = round(10 * (time.monotonic() - started))
         return Result(self._episode["seed"], self._episode["outcome"], self._episode["instruction"], seconds)
+
+    def _note(self, status: Any) -> None:
+        self.figures = {pair.key: pair.value for pair in status.values}
 
     def _hear(self, message: Any) -> None:
         self._episode = json.loads(message.data)

@@ -17,7 +17,6 @@ from vla.spec import Array, Observation, Spec
 from vla.tasks.control import WORKSPACE, CartesianController
 
 ACTION = ("dx", "dy", "dz", "rx", "ry", "rz", "gripper")
-LEAD = 0.1  # furthest that goals may run ahead of the commands on their way there [rad]
 EARLY = 0.25  # share of a control period that a frame may come early and still be the one to act on
 TOGETHER = 0.05  # furthest that the frames of all cameras may lie apart [s]
 MEMORY = 1.0  # how long joint states and commands are remembered [s]
@@ -87,9 +86,9 @@ class Session:
         self._measured: deque[tuple[float, Array, Array, float]] = deque()
         self._commanded: deque[tuple[float, Array]] = deque()
         self._schedule: list[tuple[float, Array, float]] = []  # when due, goal, opening
-        self._goals: list[tuple[float, Array]] = []  # of the last plan
         self._pending: tuple[float, float, Array] | None = None  # asked at, observed at, commanded then
         self._next_look, self._opening = -np.inf, 1.0
+        self.observed = -np.inf  # when what was last looked at was seen
         self.resumed = True  # whether the last look was the first since it runs
         self._astray_since: float | None = None
 
@@ -154,8 +153,10 @@ class Session:
         if self._schedule and now > self._schedule[-1][0] + 0.5 / self.spec.control_hz:
             self.overruns += 1
         _, joints, velocities, opening = min(self._measured, key=lambda measured: abs(measured[0] - observed))
-        anchor = self._anchor(observed)
-        self.resumed, self._seen_until = np.isinf(self._seen_until), observed
+        # Where the arm was sent at that time: the measured pose lags, and goals would run away from an arm whose limits
+        # hold it back, which a policy that sees it lagging would then overshoot.
+        anchor = min(self._commanded, key=lambda command: abs(command[0] - observed))[1]
+        self.resumed, self._seen_until, self.observed = np.isinf(self._seen_until), observed, observed
         self._pending = (now, observed, anchor)
         return Observation(
             rgb={camera: self._frames[camera][1] for camera in self.spec.cameras},
@@ -169,7 +170,8 @@ class Session:
     def plan(self, actions: Array, now: float) -> None:
         """The policy's answer: actions (k, D), the first of which starts when the observation was made.
 
-        Each moves on from the goal of the one before; of those whose time has passed only the ends are made up for.
+        Each moves on from the goal of the one before, the first from what was commanded at the observation; of those
+        whose time has passed only the ends are made up for.
         """
         if self._pending is None:
             return
@@ -187,7 +189,6 @@ class Session:
         self._controller.reset(anchor)
         goals = [self._controller.step(action[:6]).copy() for action in actions]
         ends = observed + period * np.arange(1, len(actions) + 1)
-        self._goals = [(float(end), goal) for end, goal in zip(ends, goals, strict=True)]
         self._schedule = list(zip(ends.tolist(), goals, actions[:, 6].tolist(), strict=True))
         self._next_look = float(ends[-1])
         return None
@@ -293,20 +294,9 @@ class Session:
 
     def _enter(self, state: State, reason: str) -> None:
         if state is not self.state and state is not State.RUNNING:
-            self._fresh, self._schedule, self._goals = 0, [], []
+            self._fresh, self._schedule = 0, []
             self._next_look = self._seen_until = -np.inf
         self.state, self.reason = state, reason
-
-    def _anchor(self, observed: float) -> Array:
-        """Joints (J,) from which the motions that follow an observation count: the goal that was due then.
-
-        Neither the measured pose, which lags, nor the commanded one, which the limits may hold back: both would lose
-        a little of every motion. But goals do not run away from an arm that may not go so fast.
-        """
-        commanded = min(self._commanded, key=lambda command: abs(command[0] - observed))[1]
-        soon = observed + EARLY / self.spec.control_hz
-        due = [goal for end, goal in self._goals if end <= soon]
-        return commanded + np.clip(due[-1] - commanded, -LEAD, LEAD) if due else commanded
 
     def _observed_at(self) -> float | None:
         """When the newest frames of all cameras were taken, or None while they do not belong together."""
