@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 import traceback
 from collections import deque
-from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import asdict, replace
 from functools import partial
@@ -17,7 +16,6 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor, SetParametersResult
 from rclpy.clock import Clock, ClockType
 from rclpy.context import Context
-from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import Image, JointState
@@ -27,12 +25,12 @@ from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from vla.deploy import messages
 from vla.deploy.governor import Robot
+from vla.deploy.managed import Managed
 from vla.deploy.ros2 import Ros2
 from vla.deploy.session import Session, State
 from vla.policy import Policy
 from vla.spec import Array, Observation
 
-DONE, NOT_DONE = TransitionCallbackReturn.SUCCESS, TransitionCallbackReturn.FAILURE
 LEVELS = {
     State.WAITING: DiagnosticStatus.OK,
     State.RUNNING: DiagnosticStatus.OK,
@@ -43,7 +41,7 @@ LEVELS = {
 COMMANDS = {"joint_state": JointState, "trajectory": JointTrajectory, "forward": Float64MultiArray}
 
 
-class Agent(LifecycleNode):
+class Agent(Managed):
     """Configure makes room and warms up, activate takes the arm over where it stands, deactivate brakes and holds."""
 
     def __init__(self, policy: Policy, settings: Ros2, context: Context | None = None) -> None:
@@ -51,7 +49,6 @@ class Agent(LifecycleNode):
         self.policy, self.settings = policy, settings
         self.session: Session | None = None
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)  # goes on where simulated time stands still
-        self._made: list[tuple[Callable[[Any], Any], Any]] = []
         self._timers: list[Any] = []
         self._figures: dict[str, deque[float]] = {}
         self._stamps: dict[str, tuple[int, int]] = {}
@@ -90,49 +87,8 @@ class Agent(LifecycleNode):
 
     # Lifecycle.
 
-    def _LifecycleNodeMixin__on_change_state(self, request: Any, response: Any) -> Any:
-        """Refuse a transition that the state does not have; rclpy 7.1 would end the process (ros2/rclpy#1209)."""
-        known = {transition[0]: transition[1] for transition in self._state_machine.available_transitions}
-        label = request.transition.label
-        wanted = next((key for key, name in known.items() if name == label), None) if label else request.transition.id
-        if wanted not in known:
-            self.get_logger().error(f"there is no transition {label or wanted} now, only {', '.join(known.values())}")
-            response.success = False
-            return response
-        return super()._LifecycleNodeMixin__on_change_state(request, response)  # type: ignore[misc]
-
-    def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
-        return self._try("configure", self._configure)
-
-    def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        result = self._try("activate", self._activate)
-        return super().on_activate(state) if result is DONE else result
-
-    def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        result = self._try("deactivate", self.come_to_rest)
-        super().on_deactivate(state)
-        return result
-
-    def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
-        return self._try("clean up", self._clean_up)
-
-    def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
-        self._try("come to rest", self.come_to_rest)
-        return self._try("clean up", self._clean_up)
-
-    def _try(self, what: str, do: Callable[[], None]) -> TransitionCallbackReturn:
-        """rclpy swallows what a transition raises."""
-        try:
-            do()
-        except ValueError as error:
-            self.get_logger().error(f"cannot {what}: {error}")
-            return NOT_DONE
-        except Exception:
-            self.get_logger().error(f"cannot {what}: {traceback.format_exc()}")
-            return NOT_DONE
-        return DONE
-
-    def _configure(self) -> None:
+    def configure(self) -> None:
+        """Check that policy, robot and topics fit, warm the policy up, connect."""
         spec, topics = self.policy.spec, self.settings.topics
         unnamed = sorted(set(spec.cameras) - set(topics.images))
         if unnamed:
@@ -149,16 +105,15 @@ class Agent(LifecycleNode):
         )
         latest = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
         for camera in spec.cameras:
-            self._subscribe(Image, topics.images[camera], partial(self._on_image, camera), newest)
-        self._subscribe(JointState, topics.joint_states, self._on_joints, latest)
-        self._subscribe(String, topics.instruction, self._on_instruction, QoSProfile(depth=1))
-        self._commands = self._publish(COMMANDS[self._kind], topics.commands, managed=True)
-        self._gripper = self._publish(Float64MultiArray, topics.gripper, managed=True) if topics.gripper else None
-        self._status = self._publish(DiagnosticStatus, "~/status")
-        self._diagnostics = self._publish(DiagnosticArray, "/diagnostics")
-        for name, answer in (("~/stop", self._on_stop), ("~/resume", self._on_resume)):
-            service = self.create_service(Trigger, name, answer)
-            self._made.append((self.destroy_service, service))
+            self.subscribe(Image, topics.images[camera], partial(self._on_image, camera), newest)
+        self.subscribe(JointState, topics.joint_states, self._on_joints, latest)
+        self.subscribe(String, topics.instruction, self._on_instruction, QoSProfile(depth=1))
+        self._commands = self.publish(COMMANDS[self._kind], topics.commands, while_active=True)
+        self._gripper = self.publish(Float64MultiArray, topics.gripper, while_active=True) if topics.gripper else None
+        self._status = self.publish(DiagnosticStatus, "~/status")
+        self._diagnostics = self.publish(DiagnosticArray, "/diagnostics")
+        self.serve(Trigger, "~/stop", self._on_stop)
+        self.serve(Trigger, "~/resume", self._on_resume)
         self._pool = ThreadPoolExecutor(1, thread_name_prefix="policy")
         self._figures, self._stamps, self._dropped = {}, {}, 0
         self.session = session
@@ -179,7 +134,8 @@ class Agent(LifecycleNode):
             self.policy.plan(nothing)
         self.policy.reset("", 0)
 
-    def _activate(self) -> None:
+    def activate(self) -> None:
+        """Take the arm over where it stands."""
         assert self.session is not None
         others = self.count_publishers(self._commands.topic_name) - 1
         if others > 0:
@@ -189,8 +145,8 @@ class Agent(LifecycleNode):
         self.session.restart()
         self._asked, self._last_tick = None, None
         self._timers = [
-            self.create_timer(self.session.tick, self._guard(self._tick), clock=self._steady),
-            self.create_timer(1.0, self._guard(self._report), clock=self._steady),
+            self.create_timer(self.session.tick, self.guard(self._tick), clock=self._steady),
+            self.create_timer(1.0, self.guard(self._report), clock=self._steady),
         ]
 
     def come_to_rest(self) -> None:
@@ -208,34 +164,15 @@ class Agent(LifecycleNode):
         self._timers = []
         self._report()
 
-    def _clean_up(self) -> None:
+    def clean_up(self) -> None:
+        """Let everything go."""
         self._pool.shutdown(cancel_futures=True)
-        for destroy, thing in self._made:
-            destroy(thing)
-        self._made, self.session = [], None
+        self.session = None
 
-    def _subscribe(self, kind: type, topic: str, callback: Callable[[Any], None], qos: QoSProfile) -> None:
-        subscription = self.create_subscription(kind, topic, self._guard(callback), qos)
-        self._made.append((self.destroy_subscription, subscription))
-
-    def _guard(self, callback: Callable[..., None]) -> Callable[..., None]:
-        """A bug must stop the arm, not the process that can stop it."""
-
-        def guarded(*arguments: Any) -> None:
-            try:
-                callback(*arguments)
-            except Exception:
-                self.get_logger().error(traceback.format_exc(), throttle_duration_sec=1.0)
-                if self.session is not None:
-                    self.session.fail("a bug in the agent, see its log")
-
-        return guarded
-
-    def _publish(self, kind: type, topic: str, managed: bool = False) -> Any:
-        create = self.create_lifecycle_publisher if managed else super(LifecycleNode, self).create_publisher
-        publisher = create(kind, topic, 1 if managed else 10)
-        self._made.append((self.destroy_publisher, publisher))
-        return publisher
+    def broken(self, reason: str) -> None:
+        """Stand still until deactivated."""
+        if self.session is not None:
+            self.session.fail(reason)
 
     # What comes in.
 

@@ -79,7 +79,8 @@ class Ros2:
         """
         policy = self.policy()
         with ros(self.network, self.output) as stopped:
-            from vla.deploy.agent import DONE, Agent
+            from vla.deploy.agent import Agent
+            from vla.deploy.managed import DONE
 
             agent = Agent(policy, self)
             try:
