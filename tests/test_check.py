@@ -75,7 +75,11 @@ def test_an_unknown_key_is_named_with_what_was_probably_meant() -> None:
         ("seed", "first", "seed must be int, got 'first'"),
         ("task.meshes", "lite", "task.meshes must be one of light, full, got 'lite', did you mean light?"),
         ("job", "evalute", "job must be one of"),
-        ("benchmark.names", ["training"], "benchmark.names must be list[one of collect, loader, train, policy]"),
+        (
+            "benchmark.names",
+            ["training"],
+            "benchmark.names must be list[one of collect, loader, train",
+        ),
     ],
 )
 def test_a_wrong_value_is_named_with_what_is_allowed(key: str, value: Any, expected: str) -> None:

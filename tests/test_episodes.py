@@ -185,3 +185,11 @@ def test_what_cannot_be_read_is_named(tmp_path: Path) -> None:
         store.read(store.episodes[0])
     with pytest.raises(ValueError, match="has no field 'rgb'"):
         store.rows("rgb")
+
+
+@pytest.mark.parametrize("content", [b"{", b"{}", b"[]", b"\xff\xfe"])
+def test_a_garbled_description_is_named_with_the_way_out(tmp_path: Path, content: bytes) -> None:
+    store = EpisodeStore.create_or_open(tmp_path, SPEC, {})
+    (store.folder / "store.json").write_bytes(content)
+    with pytest.raises(ValueError, match=r"store\.json cannot be read .*collect again"):
+        EpisodeStore(store.folder)

@@ -31,6 +31,7 @@ PARTS = {
     "vla.report": ("vla.spec", "vla.evaluate"),
     "vla.deploy": ("vla.spec", "vla.policy", "vla.tasks", "vla.evaluate", "vla.deploy"),
     "vla.check": (),
+    "vla.training": ("vla.check",),
     "vla.benchmark": ("vla",),
     "vla.jobs": ("vla",),
     "vla.run": ("vla",),
@@ -39,11 +40,11 @@ PARTS = {
 # A library → the only parts that may import it.
 LIBRARIES = {
     "hydra": ("vla.run", "vla.jobs", "vla.check", "vla.benchmark"),
-    "omegaconf": ("vla.run", "vla.jobs", "vla.check", "vla.benchmark"),
+    "omegaconf": ("vla.run", "vla.jobs", "vla.check", "vla.training", "vla.benchmark"),
     "mujoco": ("vla.tasks", "vla.benchmark"),
     "dm_control": ("vla.tasks",),
     "dm_env": ("vla.tasks",),
-    "lightning": ("vla.models.learner", "vla.data.windows", "vla.jobs", "vla.benchmark"),
+    "lightning": ("vla.models.learner", "vla.data.windows", "vla.training", "vla.jobs", "vla.benchmark"),
     "rerun": ("vla.record",),
     "rclpy": ("vla.deploy",),
 }

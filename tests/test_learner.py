@@ -17,6 +17,7 @@ from toy import SPEC
 from vla.models.learner import Learner
 from vla.models.model import Model
 from vla.policy import read_checkpoint
+from vla.training import AtomicFiles
 
 CONFIG = {"model": {"_target_": "vla.models.bc.BC", "shift": [0, 0]}, "seed": 0}
 
@@ -159,3 +160,23 @@ def test_compiling_keeps_the_names_in_the_checkpoint() -> None:
     plain.load_state_dict(learner.model.state_dict())
     learner.configure_model()
     assert learner.model.state_dict().keys() == plain.state_dict().keys()
+
+
+def test_a_checkpoint_that_cannot_be_written_leaves_the_one_before(tmp_path: Path) -> None:
+    files = AtomicFiles()
+    files.save_checkpoint({"step": 1}, tmp_path / "last.ckpt")
+
+    class Unwritable:
+        def __reduce__(self) -> str:
+            raise OSError(28, "No space left on device")
+
+    with pytest.raises(OSError, match=r"last\.ckpt cannot be written, the one before is kept"):
+        files.save_checkpoint({"step": 2, "more": Unwritable()}, tmp_path / "last.ckpt")
+    assert torch.load(tmp_path / "last.ckpt", weights_only=True) == {"step": 1}
+    assert [path.name for path in tmp_path.iterdir()] == ["last.ckpt"]
+
+
+@pytest.mark.parametrize("wrong", [{"lr": -1.0}, {"weight_decay": -0.1}, {"ema": 1.0}])
+def test_a_learner_that_cannot_learn_is_refused(wrong: dict[str, float]) -> None:
+    with pytest.raises(ValueError, match=r"learner\.lr"):
+        Learner(**wrong, model=None, spec=None, config={})  # type: ignore[arg-type]

@@ -187,3 +187,25 @@ def test_benchmark_measures_against_floors(home: Path) -> None:
     assert set(measures) == {"collect", "loader", "train", "policy"}
     for measure in measures.values():
         assert set(measure) == {"value", "unit", "n", "floor", "ratio"} and measure["value"] > 0
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_training_that_is_interrupted_saves_and_goes_on(home: Path, number: int) -> None:
+    folder = f"stopped{number}"
+    arguments = [*SMALL, "job=train", "trainer.limit_val_batches=0", "trainer.val_check_interval=null"]
+    arguments += ["trainer.check_val_every_n_epoch=1"]
+    command = [sys.executable, "-u", "-m", "vla.run", *arguments, f"output={folder}", "trainer.max_steps=100000"]
+    process = subprocess.Popen(command, cwd=home, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+    metrics = home / folder / "metrics.csv"
+    give_up = time.monotonic() + 60
+    while not metrics.exists() or not metrics.stat().st_size:
+        assert process.poll() is None and time.monotonic() < give_up
+        time.sleep(0.05)
+    process.send_signal(number)
+    printed = process.communicate(timeout=30)[0]
+    assert process.returncode == 130, printed
+    checkpoint = f"{folder}/checkpoints/last.ckpt"
+    assert "interrupted after" in printed and checkpoint in printed
+    steps = int(printed.partition("interrupted after ")[2].split()[0])
+    done = vla(home, *arguments, f"checkpoint={checkpoint}", f"trainer.max_steps={steps + 2}", "output=on")
+    assert f"trained {steps + 2} steps" in done.stdout

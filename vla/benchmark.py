@@ -94,7 +94,10 @@ def training(config: DictConfig) -> Measure:
     import torch
     from lightning import Callback
 
-    from vla.jobs import collected, make_data, make_learner, make_trainer
+    from vla.jobs import collected, make_data, make_learner
+    from vla.training import make_trainer, quiet_lightning
+
+    quiet_lightning()
 
     store = collected(config)
     steps = config.benchmark.steps

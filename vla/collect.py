@@ -6,9 +6,7 @@ Seeds are tried in order and committed in order, until the store holds as many s
 from __future__ import annotations
 
 import logging
-import os
 import signal
-import threading
 import time
 from collections import Counter, deque
 from collections.abc import Callable, Iterator
@@ -16,7 +14,7 @@ from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, replace
-from multiprocessing import get_context, parent_process
+from multiprocessing import get_context
 from typing import Protocol
 
 import numpy as np
@@ -25,7 +23,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from vla.data.episodes import EpisodeStore
 from vla.rollout import rollout
 from vla.spec import Agent, Environment, Episode
-from vla.workers import one_thread_each
+from vla.workers import leave_with_parent, one_thread_each
 
 log = logging.getLogger(__name__)
 
@@ -227,15 +225,8 @@ _here: _Worker | None = None  # the worker of this process, where this process i
 
 def _enter(make_environment: MakeEnvironment, make_expert: MakeExpert) -> None:
     global _here
-    threading.Thread(target=_leave_with_parent, daemon=True).start()
+    leave_with_parent()
     _here = _Worker(make_environment, make_expert)
-
-
-def _leave_with_parent() -> None:
-    parent = parent_process()
-    assert parent is not None
-    parent.join()
-    os._exit(1)  # nobody is left to hand an episode to
 
 
 def _attempt(seed: int) -> Episode:

@@ -24,7 +24,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from vla.rollout import rollout
 from vla.spec import Agent, Environment, Recorder
-from vla.workers import cores, one_thread_each
+from vla.workers import cores, leave_with_parent, one_thread_each
 
 FIRST_SEED = 1_000_000  # evaluation seeds start here; collection, which starts at small ones, never gets this far
 ERROR = "error"  # outcome of an episode that could not be played to its end
@@ -232,6 +232,7 @@ _player: _Player | None = None
 def _start_worker(factories: _Factories) -> None:
     global _factories
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent process handles Ctrl-C
+    leave_with_parent()
     _factories = factories
 
 

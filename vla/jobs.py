@@ -6,8 +6,8 @@
 from __future__ import annotations
 
 import logging
+import sys
 import time
-import warnings
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -18,8 +18,6 @@ from omegaconf import DictConfig, OmegaConf
 from vla.check import build
 
 if TYPE_CHECKING:
-    from lightning import Callback, Trainer
-
     from vla.data.episodes import EpisodeStore
     from vla.data.windows import Windows
     from vla.models.learner import Learner
@@ -206,8 +204,11 @@ def collected(config: DictConfig) -> EpisodeStore:
     """The episode store of this configuration, with at least as many episodes as asked for."""
     from vla.collect import collect
     from vla.data.episodes import EpisodeStore
+    from vla.evaluate import FIRST_SEED
     from vla.workers import cores
 
+    if config.collect.seed + config.collect.episodes > FIRST_SEED:
+        raise ValueError(f"collect.seed={config.collect.seed}: seeds from {FIRST_SEED} on are kept for evaluation")
     environment = make_environment(plain(config.task))
     spec = environment.spec
     environment.close()
@@ -238,12 +239,15 @@ def _trained(config: DictConfig) -> Path:
     """Path of the checkpoint that training leaves behind."""
     import lightning
 
-    _quiet_lightning()
+    from vla.training import LAST, Interruption, make_trainer, quiet_lightning
+
+    quiet_lightning()
     checkpoints = _output(config) / "checkpoints"
+    interruption = Interruption(checkpoints)
     # Before anything is collected: the checkpoint to go on from may be unfit, the devices asked for may be missing.
     if config.checkpoint:
         _require_same_policy(config)
-    trainer = make_trainer(config, checkpoints)
+    trainer = make_trainer(config, checkpoints, interruption)
     store = collected(config)
     lightning.seed_everything(config.seed, verbose=False)
     learner = make_learner(config, store)
@@ -251,20 +255,30 @@ def _trained(config: DictConfig) -> Path:
     parameters = sum(parameter.numel() for parameter in learner.model.parameters())
     log.info("training %s with %.2f M parameters", type(learner.model).__name__, parameters / 1e6)
     started = time.monotonic()
-    trainer.fit(learner, datamodule=data, ckpt_path=config.checkpoint, weights_only=True)
-    if trainer.interrupted:
+    try:
+        with interruption.listening():
+            trainer.fit(learner, datamodule=data, ckpt_path=config.checkpoint, weights_only=True)
+    except SystemExit:  # at a SIGTERM Lightning leaves as if all were well
+        if not interruption.asked:
+            raise
+    if interruption.asked:
         raise KeyboardInterrupt
-    trainer.save_checkpoint(checkpoints / "last.ckpt", weights_only=False)
+    trainer.save_checkpoint(checkpoints / LAST, weights_only=False)
+    if not trainer.is_global_zero:
+        sys.exit()  # what follows training is done once
     log.info("trained %d steps in %.0f s: %s", trainer.global_step, time.monotonic() - started, checkpoints)
-    return checkpoints / "last.ckpt"
+    return checkpoints / LAST
 
 
 def _require_same_policy(config: DictConfig) -> None:
     from vla.policy import read_checkpoint
 
-    saved = read_checkpoint(config.checkpoint).config
+    saved = read_checkpoint(config.checkpoint)
+    environment = make_environment(plain(config.task))
+    saved.spec.require(environment.spec, f"the checkpoint {config.checkpoint}", "the task")
+    environment.close()
     for group in ("model", "tokenizer"):
-        if saved[group] != plain(config[group]):
+        if saved.config[group] != plain(config[group]):
             raise ValueError(
                 f"training cannot go on from {config.checkpoint}, which has another {group}: give the same overrides "
                 "as when it was started"
@@ -291,35 +305,6 @@ def make_data(config: DictConfig, store: EpisodeStore, model: Any) -> Windows:
         episodes=config.collect.episodes,
     )
     return windows
-
-
-def make_trainer(config: DictConfig, checkpoints: Path | None, *watching: Callback) -> Trainer:
-    """The trainer of a configuration, which averages the weights and keeps its last checkpoint, if there is a place."""
-    from lightning.pytorch.callbacks import EMAWeightAveraging, ModelCheckpoint, RichProgressBar
-    from lightning.pytorch.loggers import CSVLogger
-
-    callbacks: list[Callback] = [RichProgressBar(), *watching]
-    if config.learner.ema:
-        callbacks.append(EMAWeightAveraging(decay=config.learner.ema))
-    if checkpoints is None:
-        trainer: Trainer = build(config.trainer, callbacks=callbacks, logger=False, enable_checkpointing=False)
-        return trainer
-    # After the averaging, whose weights it saves.
-    callbacks.append(
-        ModelCheckpoint(checkpoints, filename="last", every_n_train_steps=500, enable_version_counter=False)
-    )
-    logger = CSVLogger(checkpoints.parent, name="", version="")
-    trainer = build(config.trainer, callbacks=callbacks, logger=logger)
-    return trainer
-
-
-def _quiet_lightning() -> None:
-    """Lightning prints advertisements and, through handlers of its own, every line twice under Hydra."""
-    for name in ("lightning", "lightning.pytorch", "lightning.fabric"):
-        logging.getLogger(name).handlers.clear()
-    logging.getLogger("lightning.pytorch.utilities.rank_zero").setLevel(logging.WARNING)
-    # What its own callbacks do with its own hooks is nothing that a user could change.
-    warnings.filterwarnings("ignore", module=r"lightning\.")
 
 
 def _output(config: DictConfig) -> Path:

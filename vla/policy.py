@@ -51,7 +51,7 @@ def read_checkpoint(path: str | Path) -> Checkpoint:
     """
     path = Path(path)
     if not path.is_file():
-        raise ValueError(f"there is no checkpoint {path}: give checkpoint=FILE, such as outputs/runs/…/last.ckpt")
+        raise ValueError(f"there is no checkpoint {path}: give checkpoint=FILE, as in outputs/runs/…/checkpoints")
     try:
         # Old pickles, which torch would read too, fail in any way they like.
         if not is_zipfile(path):

@@ -276,7 +276,12 @@ def _read_header(folder: Path) -> dict[str, Any]:
     path = folder / "store.json"
     if not path.exists():
         raise ValueError(f"there is no episode store in {folder} (no {path.name}): collect one first, with job=collect")
-    header = json.loads(path.read_text(encoding="utf-8"))
+    try:
+        header: dict[str, Any] = json.loads(path.read_bytes())
+        if not {"format", "spec"} <= set(header):
+            raise ValueError("it names no format and spec")
+    except (ValueError, TypeError) as error:
+        raise ValueError(f"{path} cannot be read ({error}): {REMEDY}") from error
     if header["format"] != FORMAT:
         raise ValueError(f"{path} has format {header['format']}, this version reads {FORMAT}: collect again")
     return header

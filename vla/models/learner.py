@@ -49,6 +49,11 @@ class Learner(LightningModule):
         config: dict[str, Any],
     ) -> None:
         super().__init__()
+        if not (lr > 0 and weight_decay >= 0 and 0 <= ema < 1):
+            raise ValueError(
+                f"learner.lr={lr} must be above 0, learner.weight_decay={weight_decay} at least 0, "
+                f"learner.ema={ema} from 0 up to 1"
+            )
         self.model, self._spec, self._config = model, spec, config
         self._lr, self._weight_decay, self._warmup, self._schedule = lr, weight_decay, warmup_steps, schedule
         self._compile, self.ema = compile, ema

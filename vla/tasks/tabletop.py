@@ -201,6 +201,8 @@ class Tabletop:
         Raises:
             ValueError: an unknown camera, or more blocks than there are colours to name them by.
         """
+        if min(image_size) < 1:
+            raise ValueError(f"task.image_size is a height and a width of at least 1 pixel, not {list(image_size)}")
         if not 1 <= blocks <= len(COLOURS):
             raise ValueError(f"task.blocks is from 1 to {len(COLOURS)}, one colour each, not {blocks}")
         low = np.array([-TRANSLATION] * 3 + [-ROTATION] * 3 + [0.0])
