@@ -26,6 +26,7 @@ from test_run import SMALL, vla
 from vla.deploy import messages
 from vla.deploy.governor import Robot
 from vla.deploy.ros import Network, split_arguments
+from vla.record import VIEWER
 
 WORKER = int(os.environ.get("PYTEST_XDIST_WORKER", "gw0").removeprefix("gw"))
 DOMAIN = 15 + 20 * (WORKER % 5)
@@ -157,6 +158,9 @@ def test_the_whole_loop_reports_and_its_bag_moves_an_agent_again(
     assert "/2 (" in printed.strip().splitlines()[-1]
     report = json.loads((home / "loop/report.json").read_text())
     assert report["seeds"] == [1_000_000, 1_000_001] and report["checkpoint"] == CHECKPOINT.partition("=")[2]
+    recorded = subprocess.run([VIEWER, "rrd", "stats", "loop/session.rrd"], cwd=home, capture_output=True, text=True)
+    for entity in ("camera/isaac/camera/image_raw", "joints/commanded/panda_joint7", "gripper/measured", "words"):
+        assert entity in recorded.stdout
     ear.commands.clear()
     start("vla.run", "job=deploy", "deploy=ros2", CHECKPOINT, "deploy.safety.tracking=9")
     player = start("vla.deploy.bag", "play", "loop/bag")

@@ -29,7 +29,7 @@ PARTS = {
     "vla.collect": ("vla.spec", "vla.rollout", "vla.data", "vla.workers"),
     "vla.evaluate": ("vla.spec", "vla.rollout", "vla.record", "vla.workers"),
     "vla.report": ("vla.spec", "vla.evaluate"),
-    "vla.deploy": ("vla.spec", "vla.policy", "vla.tasks", "vla.evaluate", "vla.deploy"),
+    "vla.deploy": ("vla.spec", "vla.policy", "vla.tasks", "vla.evaluate", "vla.record", "vla.deploy"),
     "vla.check": (),
     "vla.training": ("vla.check",),
     "vla.benchmark": ("vla",),
@@ -45,7 +45,7 @@ LIBRARIES = {
     "dm_control": ("vla.tasks",),
     "dm_env": ("vla.tasks",),
     "lightning": ("vla.models.learner", "vla.data.windows", "vla.training", "vla.jobs", "vla.benchmark"),
-    "rerun": ("vla.record",),
+    "rerun": ("vla.record", "vla.deploy.view"),
     "rclpy": ("vla.deploy",),
 }
 HEAVY = ("torch", "lightning", "mujoco", "dm_control", "rerun", "matplotlib")

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import pytest
 
+from vla.policy import read_checkpoint
 from vla.tasks.backend import TRIED
 
 SMALL = (
@@ -120,6 +121,8 @@ BAD_INPUT = {
     "misspelt key": (("colect.episodes=3",), "collect"),
     "misspelt option": (("model=rt2",), "rt1"),
     "wrong type": (("trainer.max_steps=many",), "trainer.max_steps"),
+    "too few episodes": (("evaluate.episodes=0",), "at least 1"),
+    "empty batches": (("data.batch_size=0",), "data.batch_size"),
     "unknown job": (("job=evalute",), "evaluate"),
     "missing checkpoint": (("checkpoint=nowhere.ckpt",), "nowhere.ckpt"),
     "no deployment": (("job=deploy", "checkpoint=run/checkpoints/last.ckpt"), "deploy="),
@@ -137,11 +140,16 @@ def test_bad_input_ends_in_one_clear_sentence(home: Path, name: str) -> None:
     assert "Traceback" not in done.stderr
 
 
-def test_a_checkpoint_that_is_cut_short_is_named(home: Path) -> None:
+def test_a_damaged_checkpoint_is_named(home: Path) -> None:
     whole = (home / "run/checkpoints/last.ckpt").read_bytes()
     (home / "cut.ckpt").write_bytes(whole[: len(whole) // 2])
     done = vla(home, "checkpoint=cut.ckpt", ok=False)
     assert "error: cut.ckpt" in done.stderr and "damaged" in done.stderr
+    flipped = bytearray(whole)
+    flipped[len(whole) // 2] ^= 1
+    (home / "flipped.ckpt").write_bytes(flipped)
+    with pytest.raises(ValueError, match="damaged"):
+        read_checkpoint(home / "flipped.ckpt")
 
 
 def test_training_goes_on_with_the_same_model_only(home: Path) -> None:

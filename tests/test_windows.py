@@ -236,5 +236,3 @@ def test_what_cannot_be_trained_on_is_refused(folder: Path) -> None:
         windows(folder, episodes=1)
     with pytest.raises(ValueError, match="a share from 0 up to 1, not 5"):
         windows(folder, validation_fraction=5)
-    with pytest.raises(ValueError, match="at least 1 each"):
-        windows(folder, batch_size=0)

@@ -27,7 +27,9 @@ def benchmark(config: DictConfig, output: Path) -> dict[str, Measure]:
     unknown = sorted(set(config.benchmark.names) - set(STAGES))
     if unknown:
         raise ValueError(f"benchmark.names has {unknown}, the stages are {sorted(STAGES)}")
-    measures = {name: STAGES[name](config) for name in config.benchmark.names}
+    measures: dict[str, Measure] = {}
+    for name in config.benchmark.names:
+        measures |= STAGES[name](config)
     draft = output / "benchmark.json.partial"
     draft.write_text(json.dumps(measures, indent=2), encoding="utf-8")
     os.replace(draft, output / "benchmark.json")
@@ -35,7 +37,7 @@ def benchmark(config: DictConfig, output: Path) -> dict[str, Measure]:
     return measures
 
 
-def collection(config: DictConfig) -> Measure:
+def collection(config: DictConfig) -> dict[str, Measure]:
     """Control steps of the expert in one process with all cameras, against bare physics and rendering of as many."""
     import mujoco
 
@@ -57,10 +59,10 @@ def collection(config: DictConfig) -> Measure:
             render(bound.data, bound.cameras[camera])
     floor = steps / (time.perf_counter() - started)
     environment.close()
-    return _measure(steps / seconds, "control steps/s", steps, floor)
+    return {"collect": _measure(steps / seconds, "control steps/s", steps, floor)}
 
 
-def loader(config: DictConfig) -> Measure:
+def loader(config: DictConfig) -> dict[str, Measure]:
     """Training windows through the loader, against a bare gather of the same rows from the memory-mapped images."""
     from vla.jobs import collected, make_data, make_learner
 
@@ -86,10 +88,10 @@ def loader(config: DictConfig) -> Measure:
         next(stream)
     seconds = time.perf_counter() - started
     windows = batches * data.batch_size
-    return _measure(windows / seconds, "windows/s", windows, windows / gather())
+    return {"loader": _measure(windows / seconds, "windows/s", windows, windows / gather())}
 
 
-def training(config: DictConfig) -> Measure:
+def training(config: DictConfig) -> dict[str, Measure]:
     """Samples through the trainer, against forward, backward and optimiser step alone on one resident batch."""
     import torch
     from lightning import Callback
@@ -124,10 +126,10 @@ def training(config: DictConfig) -> Measure:
         optimizer.step()
     floor = steps * data.batch_size / (time.perf_counter() - started)
     samples = steps * data.batch_size
-    return _measure(samples / seconds, "samples/s", samples, floor)
+    return {"train": _measure(samples / seconds, "samples/s", samples, floor)}
 
 
-def policy(config: DictConfig) -> Measure:
+def policy(config: DictConfig) -> dict[str, Measure]:
     """Actions of the policy per second, batch of one, against its network's forward pass alone."""
     import torch
 
@@ -153,11 +155,15 @@ def policy(config: DictConfig) -> Measure:
             model(batch)
     floor = steps / (time.perf_counter() - started)
     environment.close()
-    return _measure(rate, "actions/s", steps, floor)
+    return {"policy": _measure(rate, "actions/s", steps, floor)}
 
 
-def deployment(config: DictConfig) -> Measure:
-    """From taking an image to the command that follows, over ROS 2 between processes, against inference alone [ms].
+def deployment(config: DictConfig) -> dict[str, Measure]:
+    """The deployed loop over ROS 2 between processes, in real time: three measures.
+
+    From taking an image to the command that follows, at the median, against inference alone; the time between commands
+    at the 99th percentile, against what it should be; from a frozen simulator to a holding agent, at the median,
+    against the age at which a joint state counts as lost.
 
     Raises:
         ValueError: no loop or no checkpoint is chosen.
@@ -167,12 +173,22 @@ def deployment(config: DictConfig) -> Measure:
     if not config.deploy or config.deploy._target_ != "vla.deploy.loop.Loop":
         raise ValueError("benchmark.names=[deploy] needs deploy=loop checkpoint=FILE")
     loop = deployed(config)
-    episodes = loop.run().episodes
-    value, floor = (float(loop.figures[f"{name} p50 [ms]"]) for name in ("image to command", "inference"))
-    return _measure(value, "ms", episodes, floor)
+    with loop.playing() as person:
+        for _ in range(loop.episodes):
+            person.play()
+        figures = {key: float(value) for key, value in person.status.items() if key.endswith("[ms]")}
+        person.begin()
+        reactions = [1000 * person.react() for _ in range(config.benchmark.episodes)]
+    agent = config.deploy.agent
+    image, inference = (figures[f"{name} p50 [ms]"] for name in ("image to command", "inference"))
+    return {
+        "deploy: image to command": _measure(image, "ms", loop.episodes, inference),
+        "deploy: tick p99": _measure(figures["tick p99 [ms]"], "ms", loop.episodes, 1000 / agent.command_hz),
+        "deploy: watchdog": _measure(float(np.median(reactions)), "ms", len(reactions), 1000 * agent.safety.joints_age),
+    }
 
 
-STAGES: dict[str, Callable[[DictConfig], Measure]] = {
+STAGES: dict[str, Callable[[DictConfig], dict[str, Measure]]] = {
     "collect": collection,
     "loader": loader,
     "train": training,

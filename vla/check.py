@@ -1,6 +1,7 @@
 """A composed config against the signatures of the classes it names, before any work, and the objects it describes.
 
 The `__init__` of a class is the schema of its node: names, which of them are needed, types and allowed values.
+`Annotated[int, 1]` is a number that is at least 1.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from contextlib import suppress
 from difflib import get_close_matches
 from importlib import import_module
 from pathlib import Path
-from typing import Any, Literal, TypeVar, Union, get_args, get_origin
+from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
 
 from hydra.errors import InstantiationException
 from hydra.utils import instantiate
@@ -50,20 +51,23 @@ RUNTIME: dict[str, tuple[str, ...]] = {
     "deploy": ("policy", "environment", "output"),
 }
 
+Count = Annotated[int, 1]
+Seed = Annotated[int, 0]
+
 # The nodes that name no class.
 PLAIN: dict[str, Any] = {
     "job": Literal["preview", "collect", "train", "evaluate", "export", "deploy", "benchmark"],
-    "seed": int,
+    "seed": Seed,
     "checkpoint": str | None,
     "output": str,
-    "collect": {"episodes": int, "seed": int, "workers": int | None, "folder": str},
-    "evaluate": {"episodes": int, "seed": int, "workers": int | None, "recordings": int | None},
-    "preview": {"episodes": int, "seed": int},
+    "collect": {"episodes": Count, "seed": Seed, "workers": Count | None, "folder": str},
+    "evaluate": {"episodes": Count, "seed": Seed, "workers": Count | None, "recordings": Seed | None},
+    "preview": {"episodes": Count, "seed": Seed},
     "benchmark": {
         "names": list[Literal["collect", "loader", "train", "policy", "deploy"]],
-        "episodes": int,
-        "batches": int,
-        "steps": int,
+        "episodes": Count,
+        "batches": Count,
+        "steps": Count,
     },
 }
 GROUPS = tuple(dict.fromkeys(group for groups in JOBS.values() for group in groups))
@@ -237,6 +241,8 @@ def _matches(value: Any, annotation: Any) -> bool:
         return True
     if kind in (Union, types.UnionType):
         return any(_matches(value, argument) for argument in arguments)
+    if kind is Annotated:
+        return _matches(value, arguments[0]) and value >= arguments[1]
     if kind is Literal:
         return any(type(value) is type(choice) and value == choice for choice in arguments)
     if value is None:
@@ -265,6 +271,8 @@ def _describe(annotation: Any) -> str:
         return f"one of {', '.join(str(choice) for choice in arguments)}"
     if kind in (Union, types.UnionType):
         return " or ".join(_describe(argument) for argument in arguments)
+    if kind is Annotated:
+        return f"{_describe(arguments[0])}, at least {arguments[1]}"
     if annotation in (None, types.NoneType):
         return "null"
     if arguments:

@@ -18,6 +18,7 @@ from hydra.errors import ConfigCompositionException, HydraException, MissingConf
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
+from yaml import YAMLError
 
 from vla.check import JOBS, check, suggestion
 from vla.deploy import ros
@@ -92,7 +93,8 @@ def _meant_for_user(error: Exception) -> bool:
     """
     if isinstance(error, (OSError, HydraException, OmegaConfBaseException)):
         return True
-    if type(error).__name__ == "MisconfigurationException":  # Lightning's; importing it would take seconds
+    # Lightning's, which would take seconds to import, MuJoCo's for want of a display, and those about YAML files.
+    if type(error).__name__ in ("MisconfigurationException", "FatalError") or isinstance(error, YAMLError):
         return True
     remote = type(error.__cause__).__name__ == "_RemoteTraceback"
     text = str(error.__cause__) if remote else "".join(traceback.format_tb(error.__traceback__))

@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import torch
@@ -153,18 +153,16 @@ class Windows(LightningDataModule):
         history: int,
         chunk: int,
         seed: int,
-        batch_size: int,
+        batch_size: Annotated[int, 1],
         validation_fraction: float,
-        validation_windows: int,
+        validation_windows: Annotated[int, 1],
         depth: bool,
-        ahead: int,
+        ahead: Annotated[int, 0],
         episodes: int | None = None,
     ) -> None:
         super().__init__()
         if not 0 <= validation_fraction < 1:
             raise ValueError(f"data.validation_fraction is a share from 0 up to 1, not {validation_fraction}")
-        if min(batch_size, validation_windows, history, chunk) < 1:
-            raise ValueError("data.batch_size, data.validation_windows, the history and the chunk are at least 1 each")
         self.batch_size = batch_size
         self._folder, self._spec, self._episodes = Path(folder), spec, episodes
         self._history, self._chunk, self._depth = history, chunk, depth

@@ -11,26 +11,18 @@ from __future__ import annotations
 import argparse
 import time
 from collections.abc import Callable
-from importlib import import_module
 from pathlib import Path
 from threading import Event
 from typing import Any
 
+from vla.deploy.overhear import Eavesdropper, message_class
 from vla.deploy.ros import NETWORKS, Network, ros, spin
 
-PRIVATE = ("/rosout", "/parameter_events")  # of ROS itself
-LOOK_AROUND = 0.5  # how often new topics are looked for [s]
-MESSAGE_PACKAGES = ("sensor_msgs", "std_msgs", "trajectory_msgs", "diagnostic_msgs", "rosgraph_msgs")
 
-
-def message_class(name: str) -> Any:
-    """The class of a message type such as sensor_msgs/msg/Image; None for those that robots and agents do not use."""
-    package, _, kind = name.split("/")
-    return getattr(import_module(f"{package}.msg"), kind) if package in MESSAGE_PACKAGES else None
-
-
-class Recorder:
+class Recorder(Eavesdropper):
     """Writes every message on every topic, as it came, into a bag; ends with `close`."""
+
+    raw = True
 
     def __init__(self, node: Any, folder: Path) -> None:
         """Args: the node whose spinning records; the folder of the bag, which must not exist.
@@ -47,26 +39,13 @@ class Recorder:
         self._types = get_typestore(Stores.ROS2_JAZZY)
         self._writer = Writer(folder, version=9, storage_plugin=StoragePlugin.MCAP)
         self._writer.open()
-        self._node, self._known = node, set(PRIVATE)
-        self._subscriptions: list[Any] = []
         self.messages = 0
-        self._look_around()
-        self._timer = node.create_timer(LOOK_AROUND, self._look_around)
+        super().__init__(node)
 
-    def _look_around(self) -> None:
-        from rclpy.qos import QoSProfile, ReliabilityPolicy
+    def hearer(self, topic: str, kind: str) -> Callable[[bytes], None]:
+        """Write the messages of a topic."""
+        connection = self._writer.add_connection(topic, kind, typestore=self._types)
 
-        for topic, types in self._node.get_topic_names_and_types():
-            kind = message_class(types[0]) if topic not in self._known else None
-            self._known.add(topic)
-            if kind is None:
-                continue
-            connection = self._writer.add_connection(topic, types[0], typestore=self._types)
-            qos = QoSProfile(depth=50, reliability=ReliabilityPolicy.BEST_EFFORT)  # which hears everybody
-            write = self._write(connection)
-            self._subscriptions.append(self._node.create_subscription(kind, topic, write, qos, raw=True))
-
-    def _write(self, connection: Any) -> Callable[[bytes], None]:
         def write(message: bytes) -> None:
             self._writer.write(connection, time.time_ns(), message)
             self.messages += 1
@@ -75,9 +54,7 @@ class Recorder:
 
     def close(self) -> None:
         """Finish the bag."""
-        self._node.destroy_timer(self._timer)
-        for subscription in self._subscriptions:
-            self._node.destroy_subscription(subscription)
+        super().close()
         self._writer.close()
 
 
