@@ -6,7 +6,7 @@ import io
 import json
 import os
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 BLUE = "#3b76c4"
 ITEMS = (RED, GREEN, BLUE)  # of a triple: x, y, z or red, green, blue
-WORDS = 8  # bars in a panel
+WORDS, SENTENCES = 8, 12  # bars in a panel, of words and of instructions
 FRAMES = 4  # episodes whose first frames are shown
 WIDTH = 1600  # about, of the page [px]
 DPI = 100
@@ -41,11 +41,12 @@ def store_table(findings: Findings) -> Table:
     table = Table(title=escape(str(store.folder)), show_header=False)
     table.add_row("episodes", f"{len(findings.whole)} whole ones, of {len(store.tried)} seeds tried: {seeds}")
     table.add_row("steps", f"{sum(lengths)}, from {min(lengths)} to {max(lengths)} in an episode")
-    table.add_row("time", f"{findings.hours:.2f} h at {spec.control_hz:g} Hz")
-    table.add_row("success rate", f"{100 * findings.success_rate:.1f} %")
+    table.add_row("time", _time(findings))
+    if not store.derived:  # of episodes that were chosen, it would tell nothing
+        table.add_row("success rate", f"{100 * findings.success_rate:.1f} %")
     table.add_row("outcomes", "\n".join(f"{count} {escape(name)}" for name, count in findings.outcomes.items()))
     table.add_section()
-    instructions = _most(_instructions(findings))
+    instructions = _most(_instructions(findings), SENTENCES)
     table.add_row("instructions", "\n".join(f"{count} {escape(words)}" for words, count in instructions.items()))
     table.add_section()
     for name, size in findings.sizes.items():
@@ -79,66 +80,65 @@ def _replace(path: Path, content: bytes) -> None:
 
 
 def _summary(findings: Findings) -> str:
-    steps = len(findings.actions)
-    return (
-        f"{len(findings.whole)} episodes, {steps} steps, {findings.hours:.2f} h at "
-        f"{findings.store.spec.control_hz:g} Hz; success on {100 * findings.success_rate:.1f} % of the seeds tried"
-    )
+    store = findings.store
+    rate = "" if store.derived else f"; success on {100 * findings.success_rate:.1f} % of the seeds tried"
+    return f"{len(findings.whole)} episodes, {len(findings.actions)} steps, {_time(findings)}{rate}"
+
+
+def _time(findings: Findings) -> str:
+    hours = findings.hours
+    return f"{f'{hours:.2f} h' if hours >= 1 else f'{60 * hours:.1f} min'} at {findings.store.spec.control_hz:g} Hz"
 
 
 def _text(findings: Findings) -> str:
     store, spec = findings.store, findings.store.spec
-    action, bounds = findings.actions.astype(np.float64), zip(spec.low, spec.high, strict=True)
-    moments = [f"{action[:, i].mean():.4g} | {action[:, i].std():.4g}" for i in range(len(spec.action))]
-    names = zip(spec.action, spec.units, bounds, moments, strict=True)
-    sizes = findings.sizes.items()
-    made = [
+    fields = [(name, *store.fields[name], size) for name, size in findings.sizes.items()]
+    action = findings.actions.astype(np.float64)
+    moments = [[f"{number:.4g}" for number in numbers] for numbers in zip(action.mean(0), action.std(0), strict=True)]
+    components = zip(spec.action, spec.units, spec.low, spec.high, *zip(*moments, strict=True), strict=True)
+    conditions = [f"Chosen by `inspect.where={condition}`." for condition in store.config.get("where", ())]
+    configs = [
         f"{len(entries)} seeds, {listed([entry.seed for entry in entries])}:\n\n```json\n"
         f"{json.dumps(config, indent=1, ensure_ascii=False)}\n```"
         for config, entries in parts_of(store)
     ]
-    chosen = [f"Chosen by `inspect.where={condition}`." for condition in store.config.get("where", ())]
     paragraphs = [
         f"# {store.folder.name}",
         f"{_summary(findings)}.",
         "![What the cameras see, outcomes, actions and everything that was drawn](card.png)",
         "## Outcomes",
-        _markdown("outcome | seeds", [f"{name} | {count}" for name, count in findings.outcomes.items()]),
+        _markdown(("outcome", "seeds"), findings.outcomes.items()),
         "## Instructions",
-        _markdown("instruction | episodes", [f"{words} | {count}" for words, count in _instructions(findings).items()]),
+        _markdown(("instruction", "episodes"), _instructions(findings).most_common()),
         "## One step",
-        _markdown(
-            "field | shape | type | bytes in all",
-            [f"{name} | {store.fields[name][0]} | {store.fields[name][1].name} | {size}" for name, size in sizes],
-        ),
+        _markdown(("field", "shape", "type", "bytes in all"), fields),
         f"Depth in mm, joints ({', '.join(spec.joints)}) in rad, the gripper's opening in m. `action` is to be "
         f"imitated, `executed` was sent to the robot; in frame {spec.frame}:",
-        _markdown(
-            "component | unit | lowest | highest | mean | standard deviation",
-            [f"{name} | {unit} | {low:g} | {high:g} | {told}" for name, unit, (low, high), told in names],
-        ),
+        _markdown(("component", "unit", "lowest", "highest", "mean", "standard deviation"), components),
         "## What was drawn",
-        _markdown("draw | range", [f"{name} | {span}" for name, span in spans([_draws(findings.whole)]).items()]),
+        _markdown(("draw", "range"), spans([_draws(findings.whole)]).items()),
         "## How they were made",
-        *chosen,
-        *made,
+        *conditions,
+        *configs,
         "## How to train on them",
         f"```\npython -m vla.run job=train collect.folder=FOLDER collect.episodes={len(findings.whole)}\n```",
     ]
     return "\n\n".join(paragraphs) + "\n"
 
 
-def _markdown(head: str, rows: Sequence[str]) -> str:
-    return "\n".join([head, " | ".join("---" for _ in head.split("|")), *rows])
+def _markdown(head: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
+    """A table; what would end a cell or a row is written otherwise."""
+    cells = [[str(cell).replace("|", "\\|").replace("\n", " ") for cell in row] for row in rows]
+    return "\n".join(" | ".join(row) for row in [list(head), ["---"] * len(head), *cells])
 
 
 def _instructions(findings: Findings) -> Counter[str]:
     return Counter(entry.instruction for entry in findings.whole)
 
 
-def _most(counts: Counter[str]) -> dict[str, int]:
+def _most(counts: Counter[str], words: int = WORDS) -> dict[str, int]:
     """The most frequent, the last of which stands for all the others."""
-    shown = dict(counts.most_common(WORDS))
+    shown = dict(counts.most_common(words))
     others = len(counts) - len(shown)
     return shown if not others else {**shown, f"({others} others)": counts.total() - sum(shown.values())}
 
@@ -204,7 +204,7 @@ def _plot_episodes(figure: SubFigure, findings: Findings) -> None:
     steps = [entry.steps for entry in findings.whole]
     lengths.hist(steps, bins=np.arange(min(steps), max(steps) + 2) - 0.5 if np.ptp(steps) < 60 else 40, color=GREEN)
     lengths.set_title("length of episodes [steps]", fontsize=10)
-    _plot_counts(instructions, _most(_instructions(findings)), [BLUE])
+    _plot_counts(instructions, _most(_instructions(findings), SENTENCES), [BLUE])
     instructions.set_title("instructions", fontsize=10)
 
 
@@ -225,12 +225,11 @@ def _plot_draw(axes: Axes, values: Sequence[Any]) -> None:
     """What one axis of randomisation drew: words counted, pairs as points, all else as histograms."""
     rows = [row for value in values for row in _rows(value)]
     items = [item for row in rows for item in row]
-    whole = all(isinstance(item, (bool, int)) for item in items)
-    if whole and len(set(items)) <= WORDS:
-        _plot_counts(axes, {str(item): items.count(item) for item in sorted(set(items))}, [BLUE])
+    if all(isinstance(item, int) for item in items) and len(set(items)) <= WORDS:
+        _plot_counts(axes, {str(item): count for item, count in sorted(Counter(items).items())}, [BLUE])
         return
     if not all(isinstance(item, (int, float)) for item in items):
-        _plot_counts(axes, _most(Counter(str(item) for item in items)), [BLUE])
+        _plot_counts(axes, _most(Counter(map(str, items))), [BLUE])
         return
     axes.locator_params(nbins=4)
     widths = {len(row) for row in rows}
@@ -256,10 +255,10 @@ def _plot_counts(axes: Axes, counts: Mapping[str, int], colours: Sequence[str]) 
     most = max(counts.values())
     axes.barh(range(len(counts)), list(counts.values()), color=colours, alpha=0.45, height=0.8)
     for row, (name, count) in enumerate(counts.items()):
-        axes.text(most / 60, row, name, fontsize=8, verticalalignment="center", clip_on=True)
-        axes.text(1.12 * most, row, str(count), fontsize=8, verticalalignment="center", horizontalalignment="right")
+        axes.text(most / 60, row, name, fontsize=8, va="center", clip_on=True, parse_math=False)
+        axes.text(1.2 * most, row, str(count), fontsize=8, va="center", ha="right")
     axes.set_ylim(max(len(counts), 4) - 0.5, -0.5)
-    axes.set_xlim(0, 1.12 * most)
+    axes.set_xlim(0, 1.2 * most)
     axes.tick_params(left=False, labelleft=False, bottom=False, labelbottom=False)
     axes.spines["bottom"].set_visible(False)
 

@@ -27,11 +27,8 @@ from filelock import FileLock, Timeout
 from vla.spec import Array, Episode, Spec
 
 FORMAT = 1
-REMEDY = (
-    "copy the folder again from where it is whole, keep what is whole with job=inspect inspect.repair=true, or delete "
-    "it and collect again"
-)
-
+REMEDY = "copy the folder again from where it is whole, or delete it and collect again"
+SALVAGE = f"keep what is whole with job=inspect inspect.repair=true, {REMEDY}"
 LOST = "lost"  # outcome of a seed of which a damaged index tells nothing
 MOMENTS = {"low", "high", "sum", "square"}  # of the actions of an episode
 
@@ -162,7 +159,7 @@ class EpisodeStore:
         """Field → (steps, …) rows of one episode; a ValueError if they are not those that were written."""
         rows = {field: np.array(self.rows(field)[entry.start : entry.start + entry.steps]) for field in self.fields}
         if any(len(values) < entry.steps for values in rows.values()) or _crc(rows) != entry.crc:
-            raise ValueError(f"the rows of seed {entry.seed} in {self.folder} were changed on disk: {REMEDY}")
+            raise ValueError(f"the rows of seed {entry.seed} in {self.folder} were changed on disk: {SALVAGE}")
         return rows
 
     @contextmanager
@@ -234,7 +231,7 @@ class EpisodeStore:
             path, needed = self._path(field), self._size(field)
             size = path.stat().st_size if path.exists() else 0
             if size < needed and not self._damaged:
-                raise ValueError(f"{path} is shorter than the {needed} bytes that its index speaks of: {REMEDY}")
+                raise ValueError(f"{path} is shorter than the {needed} bytes that its index speaks of: {SALVAGE}")
             if size < needed:
                 self._rows = self._rows * size // needed
 
@@ -317,6 +314,7 @@ def _read_index(path: Path, any_seed: bool, damaged: bool) -> tuple[list[Entry],
 
     Unless `any_seed`, seeds are consecutive, so that it can be told which are `LOST` in a damaged index.
     """
+    remedy = REMEDY if any_seed else SALVAGE
     entries: list[Entry] = []
     size = rows = last = 0
     lines = path.read_bytes().split(b"\n") if path.exists() else [b""]
@@ -328,11 +326,11 @@ def _read_index(path: Path, any_seed: bool, damaged: bool) -> tuple[list[Entry],
                 break
             if damaged and not any_seed:
                 continue
-            raise ValueError(f"line {number} of {path} cannot be read: {REMEDY}") from error
+            raise ValueError(f"line {number} of {path} cannot be read: {remedy}") from error
         before = entries[-1].seed if entries else entry.seed - number
         if entry.start != rows or (entry.seed != before + 1 and not any_seed):
             if not damaged or any_seed:
-                raise ValueError(f"line {number} of {path} does not follow the line before it: {REMEDY}")
+                raise ValueError(f"line {number} of {path} does not follow the line before it: {remedy}")
             if not 1 <= entry.seed - before <= number - last + 1:  # a lost line end makes one line of two
                 continue
             entries += [Entry(seed, LOST, "", rows, 0, {}, 0, {}) for seed in range(max(before + 1, 0), entry.seed)]
