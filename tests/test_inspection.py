@@ -238,7 +238,7 @@ def test_conditions_that_cannot_be_meant_are_refused(tmp_path: Path) -> None:
     for condition in conditions:
         with pytest.raises(ValueError, match="colour must be a text"):
             put_together([store], tmp_path / "new", {"colour": condition})
-    with pytest.raises(ValueError, match=r"no episode in .* fits inspect\.where={'colour': 'green'}"):
+    with pytest.raises(ValueError, match=r"store: there are no episodes that fit inspect\.where={'colour': 'green'}"):
         put_together([store], tmp_path / "new", {"colour": "green"})
     assert not (tmp_path / "new").exists()
 
@@ -262,7 +262,7 @@ def test_nothing_is_overwritten_or_left_half_written(tmp_path: Path) -> None:
 def test_a_seed_that_is_not_there_is_named(tmp_path: Path) -> None:
     store = add(tmp_path, EPISODES)
     assert find(store, 2)[1].seed == 2
-    with pytest.raises(ValueError, match="has no seed 7: its seeds are 0 to 4"):
+    with pytest.raises(ValueError, match="has no seed 7: it holds 0 to 4"):
         find(store, 7)
     with pytest.raises(
         ValueError, match=r"seed 3 in .* ended as timeout, and only successes are kept: there is 2 or 4"

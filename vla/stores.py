@@ -72,7 +72,7 @@ def replay_into(output: Path, folder: Path, seed: int) -> None:
             f"{folder} does not say in which task seed {seed} was made, so there is no scene to replay it in"
         )
     choose_backend()  # before the check imports MuJoCo, which reads MUJOCO_GL at once
-    check_node("task", config["task"])
+    check_node(f"{folder / 'store.json'}: task", config["task"])
     environment = make_environment(config["task"])
     store.spec.require(environment.spec, f"the episode store {folder}", "its task as it is built now")
     with environment.blind():

@@ -109,7 +109,7 @@ def find(store: EpisodeStore, seed: int) -> tuple[dict[str, Any], Episode]:
     found = [(config, entry) for config, entries in parts_of(store) for entry in entries if entry.seed == seed]
     if not found:
         seeds = [entry.seed for entry in store.tried]
-        raise ValueError(f"{store.folder} has no seed {seed}: its seeds are {listed(seeds) or 'none'}")
+        raise ValueError(f"{store.folder} has no seed {seed}: it holds {listed(seeds) or 'none yet'}")
     stored = [(config, entry) for config, entry in found if entry.success]
     if not stored:
         seeds = sorted({entry.seed for entry in store.episodes}, key=lambda other: abs(other - seed))[:2]
@@ -185,8 +185,8 @@ def put_together(
     chosen = _choose(stores, where or {})
     episodes = sum(any(entry.success for _, entry in found) for seeds in chosen.values() for found in seeds.values())
     if not episodes:
-        folders = ", ".join(str(store.folder) for store in stores)
-        raise ValueError(f"no episode in {folders} fits inspect.where={dict(where or {})}")
+        fitting = f" that fit inspect.where={dict(where)}" if where else ""
+        raise ValueError(f"{', '.join(str(store.folder) for store in stores)}: there are no episodes{fitting}")
     draft = folder.with_name(f".{folder.name}.draft")
     shutil.rmtree(draft, ignore_errors=True)  # left by a process that was killed
     try:
