@@ -27,6 +27,7 @@ def config(**changes: Any) -> DictConfig:
             "evaluate": {"episodes": 5, "seed": 1_000_000, "workers": None, "recordings": 2},
             "preview": {"episodes": 1, "seed": 0},
             "benchmark": {"names": ["train"], "episodes": 1, "batches": 1, "steps": 1},
+            "inspect": dict.fromkeys(("stores", "where", "into", "episode")) | {"folder": "x", "repair": False},
             "task": {
                 "_target_": "vla.tasks.tabletop.Tabletop",
                 "goal": {"_target_": "vla.tasks.goals.Lift", "height": 0.1},
