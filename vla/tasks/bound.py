@@ -10,7 +10,7 @@ from dm_control import mjcf
 
 from vla.spec import Array, Shape
 from vla.tasks.control import HOME, MAX_OPENING
-from vla.tasks.scene import BLOCK_DENSITY, COLOURS, PAD_THICKNESS, Scene
+from vla.tasks.scene import BLOCK_DENSITY, COLOURS, PAD_THICKNESS, PADS, Scene
 
 
 class BoundScene:
@@ -18,6 +18,9 @@ class BoundScene:
 
     # Model fields that randomisation may change; everything else stays as compiled.
     RANDOMISABLE = (
+        "geom_type",
+        "geom_contype",
+        "geom_conaffinity",
         "geom_rgba",
         "geom_size",
         "geom_friction",
@@ -25,6 +28,9 @@ class BoundScene:
         "geom_aabb",
         "body_mass",
         "body_inertia",
+        "body_gravcomp",
+        "actuator_gainprm",
+        "actuator_biasprm",
         "light_pos",
         "light_dir",
         "light_diffuse",
@@ -49,7 +55,7 @@ class BoundScene:
         free = self.model.body_jntadr[self.block_bodies]
         self.block_positions = self.model.jnt_qposadr[free]  # of x y z, quaternion wxyz
         self.block_velocities = self.model.jnt_dofadr[free]
-        self.pad = int(self.model.body("pad").mocapid[0])
+        self.zones = [int(self.model.body(f"{name}_pad").mocapid[0]) for name in PADS]
         self.cameras = {"front": self.model.camera("front").id, "wrist": self.model.camera("panda/wrist").id}
         self._nominal = {name: getattr(self.model, name).copy() for name in self.RANDOMISABLE}
         self._scratch = mujoco.MjData(self.model)
