@@ -53,7 +53,9 @@ class Grammar:
             phrasings = tuple(one for one in phrasings if any(f"{{{slot}}}" in one for slot in self.held_out_words))
         phrasing = phrasings[random_state.randint(len(phrasings))]
         said = {**self.words, **(self.held_out_words if novelty == "words" else {})}
-        chosen = {slot: said[slot][random_state.randint(len(said[slot]))] for slot in sorted(_slots(phrasing) & set(said))}
+        chosen = {
+            slot: said[slot][random_state.randint(len(said[slot]))] for slot in sorted(_slots(phrasing) & set(said))
+        }
         return phrasing.format(**chosen, **slots)
 
 

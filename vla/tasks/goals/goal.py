@@ -15,6 +15,7 @@ from vla.tasks.language import Grammar
 AT_REST = 0.02  # speed below which a block counts as resting [m/s]
 
 Manner = Literal["place", "hold", "push"]
+MANNERS: tuple[Manner, ...] = ("place", "hold", "push")
 
 
 @dataclass(frozen=True)
@@ -67,12 +68,13 @@ class Subgoal:
 class Goal(ABC):
     """One kind of task.
 
-    Attributes: `named`, how many blocks the instruction names; `blocks`, the fewest that must lie on the table; `pads`,
-    how many pads do; `language`, whose slots {block} and {other} are the named blocks' colours, {pad} and {rest} those of
-    the pads; `hold_steps`, control steps in a row for which all subgoals must be done.
+    Attributes: `named`, how many blocks the instruction names; `moves`, how many of them are to be moved; `blocks`, the
+    fewest that must lie on the table; `pads`, how many pads do; `language`, whose slots {block} and {other} are the named
+    blocks' colours, {pad} and {rest} those of the pads; `hold_steps`, control steps in a row for which all subgoals must
+    be done.
     """
 
-    named, blocks, pads = 1, 2, 1
+    named, moves, blocks, pads = 1, 1, 2, 1
 
     def __init__(self, language: Grammar, hold_steps: int) -> None:
         self.language, self.hold_steps = language, hold_steps

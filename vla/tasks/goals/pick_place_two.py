@@ -13,7 +13,7 @@ CLEAR = 0.06  # distance of the tool from a block that is left alone [m]
 class PickPlaceTwo(Goal):
     """Put one named block on one named pad, then another one on the other."""
 
-    named, pads = 2, 2
+    named, moves, pads = 2, 2, 2
 
     def __init__(self, language: Grammar, radius: float = 0.04, hold_steps: int = 3) -> None:
         """Args: what is said; how far from a pad's centre a block's may rest [m]; steps both must rest."""

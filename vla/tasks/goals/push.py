@@ -11,9 +11,7 @@ class Push(Goal):
 
     pads = 2
 
-    def __init__(
-        self, language: Grammar, radius: float = 0.04, highest: float = 0.015, hold_steps: int = 3
-    ) -> None:
+    def __init__(self, language: Grammar, radius: float = 0.04, highest: float = 0.02, hold_steps: int = 3) -> None:
         """Args: what is said; how far from the pad's centre the block's may rest [m]; how far it may ever have left the
         table [m]; steps it must rest."""
         super().__init__(language, hold_steps)

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from vla.tasks.goals.goal import AT_REST, Aim, Facts, Goal, Subgoal
 from vla.tasks.language import Grammar
 
+UP = np.array([0.0, 0.0, 1.0])
 SAG = 0.006  # how far a stacked block may be from the height that its size says [m]
 
 
@@ -20,8 +23,8 @@ class Stack(Goal):
     def subgoals(self, facts: Facts, aim: Aim) -> list[Subgoal]:
         """On the top of the lower block, its centre above it."""
         upper, lower = aim.blocks
-        top = facts.positions[lower] + (0, 0, facts.extents[lower, 2])
-        destination = top + (0, 0, facts.extents[upper, 2])
+        top = facts.positions[lower] + UP * facts.extents[lower, 2]
+        destination = top + UP * facts.extents[upper, 2]
         free = facts.speeds[upper] < AT_REST and not facts.touched[upper]
         level = abs(facts.positions[upper, 2] - destination[2]) < SAG
         done = bool(free and level and facts.away(upper, top) < facts.extents[lower, 0])
