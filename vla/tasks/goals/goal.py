@@ -68,10 +68,14 @@ class Subgoal:
 class Goal(ABC):
     """One kind of task.
 
-    Attributes: `named`, how many blocks the instruction names; `moves`, how many of them are to be moved; `blocks`, the
-    fewest that must lie on the table; `pads`, how many pads do; `language`, whose slots {block} and {other} are the named
-    blocks' colours, {pad} and {rest} those of the pads; `hold_steps`, control steps in a row for which all subgoals must
-    be done.
+    Attributes:
+        named: how many blocks the instruction names.
+        moves: how many of them are to be moved.
+        blocks: the fewest that must lie on the table.
+        pads: how many lie there.
+        language: what is said; the slots {block} and {other} are the named blocks' colours, {pad} and {rest} those of
+            the pads.
+        hold_steps: control steps in a row for which all subgoals must be done.
     """
 
     named, moves, blocks, pads = 1, 1, 2, 1
