@@ -14,6 +14,8 @@ import numpy as np
 
 Array = np.ndarray
 
+FIRST_SEED = 1_000_000  # of evaluation; collection, which starts at small ones, never gets this far
+
 
 @dataclass(frozen=True)
 class Spec:
