@@ -11,7 +11,7 @@ from dm_control import mjcf
 
 from vla.spec import Array, Shape
 from vla.tasks.control import HOME, MAX_OPENING
-from vla.tasks.scene import BLOCK_DENSITY, BLOCK_HALF_SIZE, COLOURS, PAD_THICKNESS, PADS, TEXTURE, Scene
+from vla.tasks.scene import BLOCK_DENSITY, BLOCK_HALF_SIZE, COLOURS, PAD_THICKNESS, PADS, Scene
 
 AWAY = (-1.5, 0.0, -3.0)  # where things are that are not there [m]
 
@@ -31,6 +31,7 @@ class BoundScene:
     # Model fields that randomisation may change; everything else stays as compiled.
     RANDOMISABLE = (
         "geom_type",
+        "geom_matid",
         "geom_contype",
         "geom_conaffinity",
         "geom_rgba",
@@ -73,19 +74,16 @@ class BoundScene:
         self.robot_geoms = np.flatnonzero(
             [model_body.startswith("panda/") for model_body in map(self._body_of, range(self.model.ngeom))]
         )
+        self._materials = {name: int(self.model.geom_matid[self.model.geom(name).id]) for name in ("table", "floor")}
+        self.model.geom_matid[:] = -1  # what is plain is drawn faster without one
         self._nominal = {name: getattr(self.model, name).copy() for name in self.RANDOMISABLE}
         self._scratch = mujoco.MjData(self.model)
-        self._painted: set[int] = set()  # textures that are not plain
         self.stale_textures: set[int] = set()  # which a renderer has yet to take over
 
     def restore(self) -> None:
         """Undo every randomisation: nominal model, three blocks in a row, arm at home."""
         for name, value in self._nominal.items():
             getattr(self.model, name)[:] = value
-        for name in ("table", "floor"):
-            if self.model.texture(name).id in self._painted:
-                self.paint_texture(name, np.full((TEXTURE, TEXTURE, 3), 255, np.uint8))
-                self._painted.remove(self.model.texture(name).id)
         count = len(self.block_geoms)
         self.extents = np.full((count, 3), BLOCK_HALF_SIZE)  # half sizes of the blocks, upright [m]
         self.present = min(count, 3)  # blocks on the table, the first ones
@@ -108,11 +106,11 @@ class BoundScene:
         self.model.geom_rgba[self.block_geoms, :3] = rgb
 
     def paint_texture(self, name: str, picture: Array) -> None:
-        """Lay a picture (TEXTURE, TEXTURE, 3) uint8 on the table or the floor."""
+        """Lay a picture (H, W, 3) uint8 on the table or the floor; H and W are `TEXTURE`."""
         texture = self.model.texture(name).id
         start = self.model.tex_adr[texture]
         self.model.tex_data[start : start + picture.size] = picture.ravel()
-        self._painted.add(texture)
+        self.model.geom_matid[self.model.geom(name).id] = self._materials[name]
         self.stale_textures.add(texture)
 
     def set_block(self, index: int, half_size: Array, round: bool = False) -> None:

@@ -89,7 +89,7 @@ class Tabletop:
         self.task.seed = seed
         self.dm_env.reset()
         # Two streams: an episode that is replayed without images feels the same.
-        self._feeling, self._seeing = stream(seed, "joint noise"), stream(seed, "image noise")
+        self._feeling, self._seeing = stream(seed, "joint noise"), np.random.default_rng([seed, 1])
         self.done, self.outcome, self.draws = False, self.task.judge.outcome, self.task.draws
         return self._observe()
 
@@ -166,8 +166,8 @@ class Tabletop:
             for name in self.spec.cameras:
                 rgb[name], depth[name] = self.renderer.render(bound.data, bound.cameras[name])
                 if bound.noise.image:
-                    grain = bound.noise.image * self._seeing.standard_normal(rgb[name].shape)
-                    rgb[name] = np.clip(rgb[name] + grain, 0, 255).astype(np.uint8)
+                    grain = self._seeing.standard_normal(rgb[name].shape, dtype=np.float32)
+                    rgb[name] = np.clip(rgb[name] + bound.noise.image * grain, 0, 255).astype(np.uint8)
         joints, velocities, gripper = self.posture()
         return Observation(
             rgb=rgb,

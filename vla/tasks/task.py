@@ -79,6 +79,7 @@ class TabletopTask(composer.Task):
         data.ctrl[:] = self._command
         self._late: deque[Array] = deque()  # commands under way to the motors
         self._delay = round(self.bound.latency / physics.timestep())
+        self._known: tuple[float, Facts] | None = None  # the newest facts, and when they were true
         self._starts, self._lifts = self.bound.block_centres(), np.zeros(self.bound.present)
         self.judge = Judge(self.goal.hold_steps)
         self._periods, self._most_periods = 0, round(self._time_limit * self.goal.moves * CONTROL_HZ)
@@ -162,6 +163,12 @@ class TabletopTask(composer.Task):
 
     def facts(self) -> Facts:
         """The truth about everything on the table now."""
+        now = float(self.bound.data.time)
+        if self._known is None or self._known[0] != now:
+            self._known = now, self._look()
+        return self._known[1]
+
+    def _look(self) -> Facts:
         bound, present = self.bound, self.bound.present
         fingers: list[set[int]] = [set() for _ in range(present)]
         for finger, block in bound.touching():
