@@ -20,7 +20,7 @@ MODULES = {
 PARTS = {
     "vla.spec": (),
     "vla.tasks": ("vla.spec", "vla.tasks"),
-    "vla.data": ("vla.spec", "vla.data"),
+    "vla.data": ("vla.spec", "vla.data", "vla.workers"),
     "vla.models": ("vla.spec", "vla.models"),
     "vla.policy": ("vla.spec", "vla.models"),
     "vla.rollout": ("vla.spec",),
@@ -29,7 +29,7 @@ PARTS = {
     "vla.collect": ("vla.spec", "vla.rollout", "vla.data", "vla.workers"),
     "vla.evaluate": ("vla.spec", "vla.rollout", "vla.record", "vla.workers"),
     "vla.report": ("vla.spec", "vla.evaluate"),
-    "vla.deploy": ("vla.spec", "vla.policy", "vla.tasks", "vla.evaluate", "vla.record", "vla.deploy"),
+    "vla.deploy": ("vla.spec", "vla.policy", "vla.tasks", "vla.data", "vla.evaluate", "vla.record", "vla.deploy"),
     "vla.check": (),
     "vla.training": ("vla.check",),
     "vla.benchmark": ("vla",),

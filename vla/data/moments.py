@@ -1,0 +1,42 @@
+"""Statistics of a dataset as LeRobot wants them.
+
+Shapes: N steps, D components.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from vla.spec import Array
+
+QUANTILES = (0.01, 0.10, 0.50, 0.90, 0.99)
+
+Statistics = dict[str, Any]
+
+
+def moments(values: Array) -> Statistics:
+    """Moments and quantiles over the steps of (N,) or (N, D) values, each one number per component."""
+    values = values.reshape(len(values), -1).astype(np.float64)
+    found = {"min": values.min(0), "max": values.max(0), "mean": values.mean(0), "std": values.std(0)}
+    found |= {f"q{100 * share:02.0f}": np.quantile(values, share, axis=0) for share in QUANTILES}
+    return {name: value.tolist() for name, value in found.items()} | {"count": [len(values)]}
+
+
+def image_moments(counts: Array) -> Statistics:
+    """The same of images, whose values 0 … 255 occur `counts` (3, 256) times, as 0 … 1 and of shape (3, 1, 1).
+
+    `count` is the number of values per colour.
+    """
+    levels, total = np.arange(256) / 255, counts.sum(1)
+    mean = counts @ levels / total
+    rising = counts.cumsum(1) / total[:, None]
+    found = {
+        "min": levels[(counts > 0).argmax(1)],
+        "max": levels[255 - (counts[:, ::-1] > 0).argmax(1)],
+        "mean": mean,
+        "std": np.sqrt(np.maximum(counts @ levels**2 / total - mean**2, 0)),
+    }
+    found |= {f"q{100 * share:02.0f}": levels[(rising >= share).argmax(1)] for share in QUANTILES}
+    return {name: value.reshape(3, 1, 1).tolist() for name, value in found.items()} | {"count": [int(total[0])]}
