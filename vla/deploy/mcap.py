@@ -12,7 +12,7 @@ from typing import Annotated, Any
 
 import numpy as np
 
-from vla.data.episodes import Entry
+from vla.data.episodes import Entry, EpisodeStore
 from vla.data.export import Folders
 from vla.deploy.governor import Robot
 from vla.deploy.ros2 import Topics
@@ -62,15 +62,19 @@ class Mcap(Folders):
         except ImportError as error:
             raise ValueError("export=mcap needs the package rosbags: pip install 'vla[ros]' or rosbags") from error
 
-    def write(self, folder: Path, spec: Spec, entry: Entry, rows: dict[str, Array]) -> None:
-        """Write one bag.
+    def export(self, store: EpisodeStore) -> Path:
+        """Write the bags that are not there yet, each whole or not at all; returns the folder.
 
         Raises:
-            ValueError: a camera has no topic, or the robot another number of joints.
+            ValueError: a camera has no topic, the robot has another number of joints, or as for other formats.
         """
+        self._require_fit(store.spec)
+        return super().export(store)
+
+    def write(self, folder: Path, spec: Spec, entry: Entry, rows: dict[str, Array]) -> None:
+        """Write one bag."""
         from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 
-        self._require_fit(spec)
         writer = Writer(folder, version=9, storage_plugin=StoragePlugin.MCAP)
         writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
         types = _types()
