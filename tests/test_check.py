@@ -71,8 +71,8 @@ def test_an_unknown_key_is_named_with_what_was_probably_meant() -> None:
         ("task.goal", "lift", "task.goal must be Goal, got 'lift'"),
         ("task.randomize.mass.factor", [0.5, "a"], "task.randomize.mass.factor must be tuple[float, float], got"),
         ("expert.perturb.start", None, "expert.perturb.start must be float, got None"),
-        ("collect.workers", "all", "collect.workers must be int or null, got 'all'"),
-        ("seed", "first", "seed must be int, got 'first'"),
+        ("collect.workers", "all", "collect.workers must be int, at least 1 or null, got 'all'"),
+        ("seed", "first", "seed must be int, at least 0, got 'first'"),
         ("task.meshes", "lite", "task.meshes must be one of light, full, got 'lite', did you mean light?"),
         ("job", "evalute", "job must be one of"),
         (

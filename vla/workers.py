@@ -9,7 +9,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from multiprocessing import parent_process
 
-THREAD_SETTINGS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "LP_NUM_THREADS")
+# Mesa's renderer counts the threads beside the one that calls it.
+THREAD_SETTINGS = {"OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "LP_NUM_THREADS": "0"}
 
 
 def cores() -> int:
@@ -33,7 +34,7 @@ def leave_with_parent() -> None:
 def one_thread_each() -> Iterator[None]:
     """Within, numerical libraries use one thread: sums must not depend on how many workers share the machine."""
     before = {name: os.environ.get(name) for name in THREAD_SETTINGS}
-    os.environ.update(dict.fromkeys(THREAD_SETTINGS, "1"))  # read by libraries that are loaded from now on
+    os.environ.update(THREAD_SETTINGS)  # read by libraries that are loaded from now on
     torch = sys.modules.get("torch")  # was loaded already where this process trained the policy
     threads = torch.get_num_threads() if torch else 0
     if torch:
