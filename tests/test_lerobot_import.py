@@ -15,11 +15,12 @@ import pyarrow.parquet as pq
 import pytest
 from test_episodes import content
 from test_export import stored
-from toy import SPEC
+from toy import SPEC, ToyEnvironment
 
 from vla.data.episodes import EpisodeStore
 from vla.data.lerobot import LeRobot as Export
 from vla.data.lerobot_import import LeRobot
+from vla.jobs import make_expert
 from vla.spec import Spec
 
 
@@ -106,6 +107,12 @@ def test_what_other_people_leave_out_is_made_up_and_said(home: Path, tmp_path: P
 def test_the_first_difference_from_the_task_is_named(home: Path, spec: Spec, says: str) -> None:
     with pytest.raises(ValueError, match=says):
         LeRobot(str(home / "dataset"), spec=spec)
+
+
+def test_a_recording_does_not_act(home: Path) -> None:
+    node = {"_target_": "vla.data.lerobot_import.LeRobot", "folder": str(home / "dataset")}
+    with pytest.raises(ValueError, match="cannot act: this job needs another expert"):
+        make_expert(node, ToyEnvironment())
 
 
 def test_what_cannot_be_read_is_named(home: Path, tmp_path: Path) -> None:
