@@ -53,6 +53,16 @@ def test_what_was_exported_comes_back(home: Path, tmp_path: Path) -> None:
         assert here.draws == {"recorded": {"episode": here.seed, "lacks": ["depth"]}}
 
 
+def test_depth_comes_back_bit_for_bit_if_it_was_exported(home: Path, tmp_path: Path) -> None:
+    before = EpisodeStore(home / "store")
+    after = imported(Export(tmp_path / "dataset", depth=True, workers=1).export(before), tmp_path / "store")
+    for there, here in zip(before.episodes, after.episodes, strict=True):
+        expected, rows = before.read(there), after.read(here)
+        for camera in SPEC.cameras:
+            np.testing.assert_array_equal(rows[f"depth_{camera}"], expected[f"depth_{camera}"])
+        assert here.draws["recorded"]["lacks"] == []
+
+
 def test_an_import_goes_on_where_it_was(home: Path, tmp_path: Path) -> None:
     imported(home / "dataset", tmp_path / "store", episodes=1)
     imported(home / "dataset", tmp_path / "store")

@@ -12,6 +12,7 @@ import numpy as np
 from vla.spec import Array
 
 QUANTILES = (0.01, 0.10, 0.50, 0.90, 0.99)
+NAMES = ("q01", "q10", "q50", "q90", "q99")
 
 Statistics = dict[str, Any]
 
@@ -20,7 +21,7 @@ def moments(values: Array) -> Statistics:
     """Moments and quantiles over the steps of (N,) or (N, D) values, each one number per component."""
     values = values.reshape(len(values), -1).astype(np.float64)
     found = {"min": values.min(0), "max": values.max(0), "mean": values.mean(0), "std": values.std(0)}
-    found |= {f"q{100 * share:02.0f}": np.quantile(values, share, axis=0) for share in QUANTILES}
+    found |= zip(NAMES, np.quantile(values, QUANTILES, axis=0), strict=True)
     return {name: value.tolist() for name, value in found.items()} | {"count": [len(values)]}
 
 
@@ -38,5 +39,5 @@ def image_moments(counts: Array) -> Statistics:
         "mean": mean,
         "std": np.sqrt(np.maximum(counts @ levels**2 / total - mean**2, 0)),
     }
-    found |= {f"q{100 * share:02.0f}": levels[(rising >= share).argmax(1)] for share in QUANTILES}
+    found |= {name: levels[(rising >= share).argmax(1)] for name, share in zip(NAMES, QUANTILES, strict=True)}
     return {name: value.reshape(3, 1, 1).tolist() for name, value in found.items()} | {"count": [int(total[0])]}
