@@ -97,6 +97,7 @@ def test_statistics_are_those_of_all_rows_and_pixels(home: Path) -> None:
     first = pq.read_table(home / "dataset/meta/episodes/chunk-000/file-000.parquet").to_pylist()[0]
     np.testing.assert_allclose(first["stats/action/max"], store.read(store.episodes[0])["action"].max(0))
     assert np.shape(first["stats/observation.images.front/mean"]) == (3, 1, 1)
+    assert image["count"] == [len(action)] and first["stats/observation.images.front/count"] == [first["length"]]
 
 
 def test_rerun_opens_it(home: Path, tmp_path: Path) -> None:

@@ -70,6 +70,9 @@ def test_an_import_goes_on_where_it_was(home: Path, tmp_path: Path) -> None:
     assert content(tmp_path / "store") == content(tmp_path / "whole")
     with pytest.raises(ValueError, match=r"only 3 recorded episodes: set collect\.episodes=3"):
         imported(home / "dataset", tmp_path / "store", episodes=4)
+    other = Export(tmp_path / "other", workers=1).export(stored(tmp_path / "another", seeds=range(4, 7))[0])
+    with pytest.raises(ValueError, match=r"holds other episodes than are recorded now: choose another collect\.folder"):
+        imported(other, tmp_path / "store")
 
 
 def changed_info(home: Path, tmp_path: Path, change: Callable[[Any], None]) -> Path:

@@ -94,7 +94,8 @@ class LeRobot:
         episodes = [_episode(store, number, columns[number], counts) for number in range(len(columns))]
         whole = {name: np.concatenate([one[name] for one in columns]) for name in columns[0]}
         statistics = {name: moments(values) for name, values in whole.items()}
-        statistics |= {layout.image_key(camera): image_moments(np.sum(found, 0)) for camera, found in counts.items()}
+        for camera, found in counts.items():
+            statistics[layout.image_key(camera)] = image_moments(np.sum(found, 0), len(whole["index"]))
         layout.write_rows(_made(draft / layout.place(layout.DATA)), self._rows(store, columns))
         pq.write_table(pa.Table.from_pylist(episodes), _made(draft / layout.place(layout.EPISODES)))
         layout.write_tasks(draft / layout.TASKS, tasks)
@@ -192,5 +193,5 @@ def _episode(store: EpisodeStore, number: int, columns: Columns, counts: Mapping
         row |= {f"{video}/chunk_index": chunk, f"{video}/file_index": file}
         row |= {f"{video}/from_timestamp": float(before / layout.rate(store.spec))}
         row |= {f"{video}/to_timestamp": float((before + steps) / layout.rate(store.spec))}
-        statistics[layout.image_key(camera)] = image_moments(found[number])
+        statistics[layout.image_key(camera)] = image_moments(found[number], steps)
     return row | {f"stats/{key}/{name}": value for key, of in statistics.items() for name, value in of.items()}

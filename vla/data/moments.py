@@ -25,11 +25,8 @@ def moments(values: Array) -> Statistics:
     return {name: value.tolist() for name, value in found.items()} | {"count": [len(values)]}
 
 
-def image_moments(counts: Array) -> Statistics:
-    """The same of images, whose values 0 … 255 occur `counts` (3, 256) times, as 0 … 1 and of shape (3, 1, 1).
-
-    `count` is the number of values per colour.
-    """
+def image_moments(counts: Array, images: int) -> Statistics:
+    """The same of so many images, whose values 0 … 255 occur `counts` (3, 256) times: as 0 … 1, of shape (3, 1, 1)."""
     levels, total = np.arange(256) / 255, counts.sum(1)
     mean = counts @ levels / total
     rising = counts.cumsum(1) / total[:, None]
@@ -40,4 +37,4 @@ def image_moments(counts: Array) -> Statistics:
         "std": np.sqrt(np.maximum(counts @ levels**2 / total - mean**2, 0)),
     }
     found |= {name: levels[(rising >= share).argmax(1)] for name, share in zip(NAMES, QUANTILES, strict=True)}
-    return {name: value.reshape(3, 1, 1).tolist() for name, value in found.items()} | {"count": [int(total[0])]}
+    return {name: value.reshape(3, 1, 1).tolist() for name, value in found.items()} | {"count": [images]}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 
+import numpy as np
 from rich.progress import track
 
 from vla.data.episodes import EpisodeStore
@@ -27,11 +28,16 @@ class Recorded(ABC):
         """Append those that are missing until the store holds `episodes`; how many that were.
 
         Raises:
-            ValueError: there are not so many, one of them is damaged, or the disk is full.
+            ValueError: there are not so many, those in the store are others, one is damaged, or the disk is full.
         """
         if episodes > len(self):
             raise ValueError(
                 f"there are only {len(self)} recorded episodes: set collect.episodes={len(self)}, or fewer"
+            )
+        last = min(len(store.episodes), len(self)) - 1
+        if last >= 0 and not np.array_equal(store.read(store.episodes[last])["action"], self.episode(last).actions):
+            raise ValueError(
+                f"{store.folder} holds other episodes than are recorded now: choose another collect.folder"
             )
         if len(store.episodes) >= episodes:
             return 0
