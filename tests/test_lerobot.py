@@ -124,6 +124,8 @@ def test_a_dataset_that_is_there_is_left_alone_and_another_one_is_refused(home: 
     with pytest.raises(ValueError, match=r"dataset holds something else .*: choose another export\.folder"):
         LeRobot(home / "dataset").export(EpisodeStore(home / "store", episodes=3))
     assert content(home / "dataset") == before
+    with pytest.raises(ValueError, match=r"export\.crf is from 0 to 63, not 64"):
+        LeRobot(tmp_path / "none", crf=64)
     with pytest.raises(ValueError, match="no episodes yet"):
         LeRobot(tmp_path / "none").export(EpisodeStore.create_or_open(tmp_path / "empty", SPEC, {}))
     assert [path.name for path in tmp_path.iterdir()] == ["empty"]

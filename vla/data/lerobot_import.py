@@ -135,7 +135,7 @@ class LeRobot(Recorded):
                 self._require_fit(info)
         except FileNotFoundError as error:
             raise ValueError(f"there is no LeRobot dataset in {self._folder} (no meta/info.json)") from error
-        except (json.JSONDecodeError, UnicodeDecodeError, KeyError, TypeError, AttributeError) as error:
+        except (json.JSONDecodeError, UnicodeDecodeError, LookupError, TypeError, AttributeError) as error:
             raise ValueError(f"{path} cannot be read ({error!r}): {REMEDY}") from error
         if info["codebase_version"] != layout.VERSION:
             version = info["codebase_version"]
@@ -214,4 +214,4 @@ def _size(shape: Sequence[int]) -> list[int]:
 
 def _names(names: Any) -> list[str] | None:
     """The names of components: a list, a list within a dictionary, or none."""
-    return next(iter(names.values())) if isinstance(names, dict) else names
+    return next(iter(names.values()), None) if isinstance(names, dict) else names
