@@ -17,11 +17,10 @@ from dataclasses import dataclass, replace
 from multiprocessing import get_context
 from typing import Protocol
 
-import numpy as np
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from vla.data.episodes import EpisodeStore
-from vla.rollout import rollout
+from vla.rollout import replay, rollout
 from vla.spec import Agent, Environment, Episode
 from vla.workers import leave_with_parent, one_thread_each
 
@@ -79,12 +78,17 @@ def collect(
     for. Each of `workers` spawned processes calls the two factories once; a single worker is this process itself.
 
     Raises:
-        ValueError: the store starts at another seed, the expert is hopeless, a worker died, or the disk is full.
+        ValueError: the store starts at another seed or was not collected, the expert is hopeless, a worker died, or the
+            disk is full.
     """
     if workers < 1:
         raise ValueError(f"collect.workers is the number of processes, at least 1, not {workers}")
     started = time.monotonic()
     before = len(store.episodes)
+    if before < episodes and store.derived:
+        raise ValueError(
+            f"{store.folder} was put together from other stores and does not grow: set collect.episodes={before}"
+        )
     if before < episodes:
         with store.writing():
             before = len(store.episodes)  # another process may have added some while this one waited
@@ -212,12 +216,7 @@ class _Worker:
 def _repeats(environment: RepeatableEnvironment, episode: Episode) -> bool:
     """Whether the executed actions lead from the seed to success again, through the same joint angles bit for bit."""
     with environment.blind():
-        observation = environment.reset(episode.seed)
-        for seen, action in zip(episode.observations, episode.executed, strict=True):
-            if environment.done or not np.array_equal(observation.joints, seen.joints):
-                return False
-            observation = environment.step(action)
-    return environment.done and environment.outcome == episode.outcome
+        return replay(environment, episode) is None
 
 
 _here: _Worker | None = None  # the worker of this process, where this process is one of a pool

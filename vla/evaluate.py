@@ -24,12 +24,11 @@ from typing import Any, Protocol
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from vla.rollout import rollout
-from vla.spec import Agent, Environment, Recorder
+from vla.spec import FIRST_SEED, Agent, Environment, Recorder
 from vla.workers import cores, leave_with_parent, one_thread_each
 
 log = logging.getLogger(__name__)
 
-FIRST_SEED = 1_000_000  # evaluation seeds start here; collection, which starts at small ones, never gets this far
 ERROR = "error"  # outcome of an episode that could not be played to its end
 NORMAL_QUANTILE = 1.959964  # of 0.975: an interval of 95 %
 
