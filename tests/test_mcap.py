@@ -77,6 +77,14 @@ def test_rerun_converts_it(home: Path, tmp_path: Path) -> None:
     assert {"/isaac/camera/image_raw", "/isaac/wrist_camera/depth", "/vla/action"} <= seen
 
 
+def test_other_files_or_topics_are_told_from_the_same_ones(home: Path, tmp_path: Path) -> None:
+    store, again = EpisodeStore(home / "store"), ("export.workers=1",)
+    exporter("mcap", home / "bags", *again).export(store)
+    for name, options in (("mcap", ("export.action=/elsewhere",)), ("files", ())):
+        with pytest.raises(ValueError, match=r"or as other files: choose another export\.folder"):
+            exporter(name, home / "bags", *again, *options).export(store)
+
+
 def test_without_rosbags_the_sentence_says_what_to_install(tmp_path: Path) -> None:
     script = tmp_path / "export.py"
     script.write_text(

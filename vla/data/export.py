@@ -60,18 +60,28 @@ class Folders(ABC):
         folder = self._folder / f"episode_{number:05d}"
         if not folder.exists():
             return False
-        manifest = _manifest(store, store.episodes[number])
+        manifest = self._manifest(store, number)
         if json.loads((folder / "manifest.json").read_text(encoding="utf-8")) != manifest:
-            raise ValueError(f"{folder} was exported from other episodes: choose another export.folder")
+            raise ValueError(
+                f"{folder} was exported from other episodes, or as other files: choose another export.folder"
+            )
         return True
+
+    def _manifest(self, store: EpisodeStore, number: int) -> dict[str, Any]:
+        entry, layout = store.episodes[number], {"layout": type(self).__name__, **self.settings()}
+        return origin(entry) | layout | {"spec": store.spec.to_dict()}
 
     def _export(self, place: Path, store: EpisodeStore, number: int) -> None:
         entry = store.episodes[number]
         draft = place / f"episode_{number:05d}"
         shutil.rmtree(draft, ignore_errors=True)  # left by an export that was cut short
         self.write(draft, store.spec, entry, store.read(entry))
-        write_json(draft / "manifest.json", _manifest(store, entry))
+        write_json(draft / "manifest.json", self._manifest(store, number))
         os.rename(draft, self._folder / draft.name)
+
+    def settings(self) -> dict[str, Any]:
+        """What else the files depend on, fit for JSON."""
+        return {}
 
     @abstractmethod
     def write(self, folder: Path, spec: Spec, entry: Entry, rows: dict[str, Array]) -> None:
@@ -187,10 +197,6 @@ def _enter(folder: Path, episodes: int) -> None:
 def _in_worker(work: Callable[[EpisodeStore, Item], Result], item: Item) -> Result:
     assert _here is not None
     return work(_here, item)
-
-
-def _manifest(store: EpisodeStore, entry: Entry) -> dict[str, Any]:
-    return origin(entry) | {"spec": store.spec.to_dict()}
 
 
 def _numbers(values: Array) -> list[float]:

@@ -6,6 +6,7 @@ Shapes: H by W pixels, J joints, D action components.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from dataclasses import asdict
 from functools import cache
 from pathlib import Path
 from typing import Annotated, Any
@@ -70,6 +71,12 @@ class Mcap(Folders):
         """
         self._require_fit(store.spec)
         return super().export(store)
+
+    def settings(self) -> dict[str, Any]:
+        """Topics and names of joints."""
+        actions = {"action": self._action, "executed": self._executed}
+        joints = {"joints": self._robot.joints, "fingers": self._robot.fingers}
+        return {"topics": {**asdict(self._topics), "depths": self._depths, **actions}, **joints}
 
     def write(self, folder: Path, spec: Spec, entry: Entry, rows: dict[str, Array]) -> None:
         """Write one bag."""
