@@ -3,28 +3,55 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
+import signal
+import subprocess
+import sys
+import time
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from conftest import CONF
+from hydra import compose, initialize_config_dir
 from PIL import Image
 from toy import SPEC, ToyEnvironment, ToyExpert
 
+from vla.check import build
 from vla.data.episodes import EpisodeStore
-from vla.data.export import Files
+from vla.data.export import Files, unfinished
 from vla.rollout import rollout
 from vla.spec import Episode, Spec
 
+TESTS = os.pathsep.join([str(Path(__file__).parent), str(Path(__file__).parents[1])])
+
 
 def stored(folder: Path, spec: Spec = SPEC, seeds: range = range(2)) -> tuple[EpisodeStore, list[Episode]]:
+    """A store of toy episodes; seeds that are three more than a multiple of five fail."""
     episodes = [rollout(ToyEnvironment(), ToyExpert(), seed) for seed in seeds]
     store = EpisodeStore.create_or_open(folder, spec, {})
     with store.writing():
         for episode in episodes:
-            store.append(episode)
+            if episode.success:
+                store.append(episode)
+            else:
+                store.fail(episode.seed, episode.outcome, episode.draws)
     return store, episodes
+
+
+def exporter(name: str, folder: Path, *overrides: str) -> Any:
+    """What `export=name` and `overrides` compose to."""
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        config = compose("config", [f"output={folder}", f"export={name}", f"export.folder={folder}", *overrides])
+    return build(config.export)
+
+
+def content(folder: Path) -> dict[str, bytes]:
+    """Every file below a folder."""
+    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
 def test_the_files_say_what_the_episode_was(tmp_path: Path) -> None:
@@ -64,21 +91,71 @@ def test_one_camera_needs_no_folder_of_its_own(tmp_path: Path) -> None:
     ]
 
 
-def test_an_export_cut_short_is_completed(tmp_path: Path) -> None:
+def test_what_is_there_is_left_alone(tmp_path: Path) -> None:
     store, _ = stored(tmp_path / "store")
     folder = Files(tmp_path / "export").export(store)
-    untouched = (folder / "episode_00000" / "manifest.json").stat().st_mtime_ns
-    (folder / "episode_00001").rename(folder / ".episode_00001")
-    shutil.rmtree(folder / ".episode_00001" / "step_0003")
+    untouched = (folder / "episode_00000/manifest.json").stat().st_mtime_ns
+    shutil.rmtree(folder / "episode_00001")
     Files(folder).export(store)
-    assert (folder / "episode_00001" / "step_0003" / "front" / "rgb_image.png").exists()
-    assert not (folder / ".episode_00001").exists()
-    assert (folder / "episode_00000" / "manifest.json").stat().st_mtime_ns == untouched
+    assert (folder / "episode_00001/step_0003/front/rgb_image.png").exists()
+    assert (folder / "episode_00000/manifest.json").stat().st_mtime_ns == untouched
 
 
 def test_a_folder_with_other_episodes_is_refused(tmp_path: Path) -> None:
     folder = Files(tmp_path / "export").export(stored(tmp_path / "first")[0])
     with pytest.raises(
-        ValueError, match=r"episode_00000 was exported from other episodes: choose another export\.folder"
+        ValueError, match=r"episode_00000 was exported from other episodes, .*: choose another export\.folder"
     ):
         Files(folder).export(stored(tmp_path / "second", seeds=range(1, 2))[0])
+
+
+def test_only_as_many_episodes_as_the_store_shows_are_exported(tmp_path: Path) -> None:
+    stored(tmp_path / "store", seeds=range(3))
+    folder = Files(tmp_path / "export").export(EpisodeStore(tmp_path / "store", episodes=2))
+    assert sorted(path.name for path in folder.iterdir()) == ["episode_00000", "episode_00001"]
+
+
+def test_two_exports_at_once_do_not_disturb_each_other(tmp_path: Path) -> None:
+    store, _ = stored(tmp_path / "store")
+    with (
+        unfinished(tmp_path / "export"),
+        pytest.raises(ValueError, match=r"another export to .*export is under way"),
+    ):
+        Files(tmp_path / "export").export(store)
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory: pytest.TempPathFactory) -> EpisodeStore:
+    """Enough episodes to be interrupted among them."""
+    return stored(tmp_path_factory.mktemp("many") / "store", seeds=range(75))[0]
+
+
+def written(folder: Path) -> int:
+    """How many files there are below a folder in which others write and delete."""
+    return sum(len(files) for _, _, files in os.walk(folder))
+
+
+EXPORT = """
+from test_export import EpisodeStore, Path, exporter
+if __name__ == "__main__":  # worker processes import this file
+    work, store = exporter({name!r}, Path({folder!r}), "export.workers=2"), EpisodeStore({store!r})
+    work.export(store)
+"""
+
+
+@pytest.mark.parametrize("name", ["files", "lerobot", "mcap"])
+def test_a_killed_export_goes_on_and_ends_up_the_same(name: str, store: EpisodeStore, tmp_path: Path) -> None:
+    whole = exporter(name, tmp_path / "whole", "export.workers=1").export(store)
+    killed, script = tmp_path / "killed", tmp_path / "export.py"
+    script.write_text(EXPORT.format(name=name, folder=str(killed), store=str(store.folder)))
+    for share in sorted(np.random.default_rng().uniform(0, 1, 3)):
+        process = subprocess.Popen(
+            [sys.executable, str(script)], env={**os.environ, "PYTHONPATH": TESTS}, stdout=subprocess.DEVNULL
+        )
+        while process.poll() is None and written(tmp_path) < (1 + share) * written(whole):
+            time.sleep(0.002)
+        process.send_signal(signal.SIGKILL)
+        process.wait()
+    exporter(name, killed, "export.workers=1").export(store)
+    assert content(killed) == content(whole)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["export.py", "killed", "whole"]

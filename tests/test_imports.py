@@ -20,7 +20,7 @@ MODULES = {
 PARTS = {
     "vla.spec": (),
     "vla.tasks": ("vla.spec", "vla.tasks"),
-    "vla.data": ("vla.spec", "vla.data"),
+    "vla.data": ("vla.spec", "vla.data", "vla.workers"),
     "vla.models": ("vla.spec", "vla.models"),
     "vla.policy": ("vla.spec", "vla.models"),
     "vla.rollout": ("vla.spec",),
@@ -30,7 +30,7 @@ PARTS = {
     "vla.evaluate": ("vla.spec", "vla.rollout", "vla.record", "vla.workers"),
     "vla.report": ("vla.spec", "vla.evaluate"),
     "vla.card": ("vla.spec", "vla.data", "vla.report"),
-    "vla.deploy": ("vla.spec", "vla.policy", "vla.tasks", "vla.evaluate", "vla.record", "vla.deploy"),
+    "vla.deploy": ("vla.spec", "vla.policy", "vla.tasks", "vla.data", "vla.evaluate", "vla.record", "vla.deploy"),
     "vla.stores": ("vla",),
     "vla.check": (),
     "vla.training": ("vla.check",),

@@ -22,9 +22,10 @@ os.environ["ROS_DOMAIN_ID"] = str(18 + 20 * (int(os.environ.get("PYTEST_XDIST_WO
 
 @pytest.fixture(scope="module")
 def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with a small trained checkpoint, as FILE."""
+    """A folder with a small trained checkpoint, as FILE, and a small LeRobot dataset, as DATASET."""
     folder = tmp_path_factory.mktemp("readme")
     vla(folder, *SMALL, "job=train", "output=run")
+    vla(folder, *SMALL, "job=export", "export=lerobot", "export.folder=dataset")
     return folder
 
 
@@ -39,7 +40,8 @@ def serves(folder: Path, *arguments: str) -> None:
 
 @pytest.mark.parametrize("command", COMMANDS)
 def test_the_command_runs(home: Path, command: str) -> None:
-    arguments = shlex.split(command.replace("FILE", "run/checkpoints/last.ckpt").replace("DIR", "plain"))
+    command = command.replace("DATASET", "dataset").replace("DIR", f"new{COMMANDS.index(command)}")
+    arguments = shlex.split(command.replace("FILE", "run/checkpoints/last.ckpt"))
     if "--help" in arguments:
         assert "pick_place" in vla(home, *arguments).stdout
         return

@@ -45,7 +45,7 @@ def preview(config: DictConfig) -> None:
 
     output = _output(config)
     environment = make_environment(plain(config.task))
-    expert = build(config.expert, spec=environment.spec)
+    expert = make_expert(plain(config.expert), environment)
     seeds = range(config.preview.seed, config.preview.seed + config.preview.episodes)
     recorder = RerunRecorder(output / "recordings")
     episodes = [rollout(environment, expert, seed, recorder) for seed in seeds]
@@ -102,8 +102,12 @@ def evaluate(config: DictConfig) -> float:
 
 
 def export(config: DictConfig) -> None:
-    """Write the episode store in another format."""
-    log.info("wrote %s", build(config.export).export(collected(config)))
+    """Write the first `collect.episodes` of the episode store in another format."""
+    from vla.data.episodes import EpisodeStore
+
+    exporter = build(config.export)
+    store = EpisodeStore(collected(config).folder, config.collect.episodes)
+    log.info("wrote %s", exporter.export(store))
 
 
 def deploy(config: DictConfig) -> None:
@@ -179,8 +183,16 @@ def make_environment(task: Node) -> Tabletop:
 
 
 def make_expert(expert: Node, environment: Environment) -> Agent:
-    """The expert for an environment."""
+    """The expert for an environment.
+
+    Raises:
+        ValueError: the expert is a recording, which cannot act.
+    """
+    from vla.data.recorded import Recorded
+
     agent: Agent = build(expert, spec=environment.spec)
+    if isinstance(agent, Recorded):
+        raise ValueError("recorded demonstrations cannot act: this job needs another expert, such as expert=waypoint")
     return agent
 
 
@@ -200,7 +212,7 @@ def make_policy(checkpoint: Path, environment: Environment | None = None) -> Pol
 
     saved = read_checkpoint(checkpoint)
     if environment is not None:
-        saved.spec.require(environment.spec, f"the checkpoint {checkpoint}", "the task")
+        saved.spec.perceived.require(environment.spec.perceived, f"the checkpoint {checkpoint}", "the task")
     tokenizer = build(saved.config["tokenizer"], spec=saved.spec)
     # What the saved weights are, the pretrained ones would only be overwritten by.
     model = build(_without_pretraining(saved.config["model"]), spec=saved.spec, tokenizer=tokenizer)
@@ -217,6 +229,7 @@ def collected(config: DictConfig) -> EpisodeStore:
     """The episode store of this configuration, with at least as many episodes as asked for."""
     from vla.collect import collect
     from vla.data.episodes import EpisodeStore
+    from vla.data.recorded import Recorded
     from vla.evaluate import FIRST_SEED
     from vla.workers import cores
 
@@ -226,6 +239,12 @@ def collected(config: DictConfig) -> EpisodeStore:
     spec = environment.spec
     environment.close()
     source = {"task": plain(config.task), "expert": plain(config.expert)}
+    recorded = build(config.expert, spec=spec)
+    if isinstance(recorded, Recorded):
+        store = EpisodeStore.create_or_open(Path(config.collect.folder), recorded.spec, source)
+        added = recorded.fill(store, config.collect.episodes)
+        log.info("%s: %d recorded episodes, %d of them new", store.folder, len(store.episodes), added)
+        return store
     store = EpisodeStore.create_or_open(Path(config.collect.folder), spec, source)
     summary = collect(
         store,
@@ -288,7 +307,7 @@ def _require_same_policy(config: DictConfig) -> None:
 
     saved = read_checkpoint(config.checkpoint)
     environment = make_environment(plain(config.task))
-    saved.spec.require(environment.spec, f"the checkpoint {config.checkpoint}", "the task")
+    saved.spec.perceived.require(environment.spec.perceived, f"the checkpoint {config.checkpoint}", "the task")
     environment.close()
     for group in ("model", "tokenizer"):
         if saved.config[group] != plain(config[group]):

@@ -7,7 +7,7 @@ file and never each other.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
 from typing import Any, Literal, Protocol
 
 import numpy as np
@@ -36,6 +36,11 @@ class Spec:
     def truth_size(self) -> int:
         """Number of scalars in a flattened truth vector."""
         return sum(size for _, size in self.truth)
+
+    @property
+    def perceived(self) -> Spec:
+        """The same without the truth, which a policy never sees."""
+        return replace(self, truth=())
 
     def to_dict(self) -> dict[str, Any]:
         """Plain lists, numbers and strings, fit for JSON and for a checkpoint loaded with `weights_only=True`."""

@@ -1,24 +1,94 @@
-"""Exports of an episode store to layouts that other programs read."""
+"""Exports of an episode store to layouts that other programs read: what they share, and the plainest of them."""
 
 from __future__ import annotations
 
 import json
 import os
 import shutil
+import signal
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager, suppress
+from functools import partial
+from multiprocessing import get_context
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, TypeVar
 
 import numpy as np
+from filelock import FileLock, Timeout
 from PIL import Image
 from rich.progress import track
 
 from vla.data.episodes import Entry, EpisodeStore
-from vla.spec import Array
+from vla.spec import Array, Spec
+from vla.workers import cores, leave_with_parent
 
 MILLIMETRE = np.float32(0.001)  # [m]
 
+Item = TypeVar("Item")
+Result = TypeVar("Result")
 
-class Files:
+
+class Folders(ABC):
+    """A layout with one folder per episode, in which `manifest.json` says how the episode came about.
+
+    Args:
+        folder: where to write.
+        workers: processes; null: one per core. The files do not depend on it.
+    """
+
+    def __init__(self, folder: str | Path, workers: Annotated[int, 1] | None = None) -> None:
+        self._folder = Path(folder).resolve()
+        self._workers = workers
+
+    def export(self, store: EpisodeStore) -> Path:
+        """Write the episodes that are not there yet, each whole or not at all; returns the folder.
+
+        Raises:
+            ValueError: the folder holds an episode of another store, or the store is damaged.
+        """
+        self._folder.mkdir(parents=True, exist_ok=True)
+        with unfinished(self._folder) as place:
+            missing = [number for number in range(len(store.episodes)) if not self._is_there(store, number)]
+            for _ in each(partial(self._export, place), store, missing, self._workers):
+                pass
+        return self._folder
+
+    def _is_there(self, store: EpisodeStore, number: int) -> bool:
+        folder = self._folder / f"episode_{number:05d}"
+        if not folder.exists():
+            return False
+        manifest = self._manifest(store, number)
+        if json.loads((folder / "manifest.json").read_text(encoding="utf-8")) != manifest:
+            raise ValueError(
+                f"{folder} was exported from other episodes, or as other files: choose another export.folder"
+            )
+        return True
+
+    def _manifest(self, store: EpisodeStore, number: int) -> dict[str, Any]:
+        entry, layout = store.episodes[number], {"layout": type(self).__name__, **self.settings()}
+        return origin(entry) | layout | {"spec": store.spec.to_dict()}
+
+    def _export(self, place: Path, store: EpisodeStore, number: int) -> None:
+        entry = store.episodes[number]
+        draft = place / f"episode_{number:05d}"
+        shutil.rmtree(draft, ignore_errors=True)  # left by an export that was cut short
+        self.write(draft, store.spec, entry, store.read(entry))
+        write_json(draft / "manifest.json", self._manifest(store, number))
+        os.rename(draft, self._folder / draft.name)
+
+    def settings(self) -> dict[str, Any]:
+        """What else the files depend on, fit for JSON."""
+        return {}
+
+    @abstractmethod
+    def write(self, folder: Path, spec: Spec, entry: Entry, rows: dict[str, Array]) -> None:
+        """Write the (steps, …) rows of an episode's fields into `folder`, which does not exist yet."""
+
+
+class Files(Folders):
     """One folder per episode, one folder per step, plain files inside.
 
         episode_00000/manifest.json                  what the numbers below mean, and how the episode came about
@@ -30,31 +100,27 @@ class Files:
     With several cameras the two images of each stand in a folder of its name: `step_0000/front/rgb_image.png`.
     """
 
-    def __init__(self, folder: str | Path) -> None:
-        self._folder = Path(folder)
-
-    def export(self, store: EpisodeStore) -> Path:
-        """Write the episodes that are not there yet, each whole or not at all; returns the folder.
-
-        Raises:
-            ValueError: the folder holds an episode of another store, or the store is damaged.
-        """
-        self._folder.mkdir(parents=True, exist_ok=True)
-        for number, entry in enumerate(track(store.episodes, description="exporting")):
-            folder = self._folder / f"episode_{number:05d}"
-            manifest = _manifest(store, entry)
-            if not folder.exists():
-                draft = self._folder / f".{folder.name}"
-                shutil.rmtree(draft, ignore_errors=True)  # left by an export that was cut short
-                _write_episode(draft, store, entry)
-                _write_json(draft / "manifest.json", manifest)
-                os.rename(draft, folder)
-            elif json.loads((folder / "manifest.json").read_text(encoding="utf-8")) != manifest:
-                raise ValueError(f"{folder} was exported from other episodes: choose another export.folder")
-        return self._folder
+    def write(self, folder: Path, spec: Spec, entry: Entry, rows: dict[str, Array]) -> None:
+        """Write one episode."""
+        for step in range(entry.steps):
+            place = folder / f"step_{step:04d}"
+            for camera in spec.cameras:
+                images = place / camera if len(spec.cameras) > 1 else place
+                images.mkdir(parents=True)
+                Image.fromarray(rows[f"rgb_{camera}"][step]).save(images / "rgb_image.png", compress_level=1)
+                np.save(images / "depth_image.npy", rows[f"depth_{camera}"][step] * MILLIMETRE)
+            state = {
+                "joint_positions": _numbers(rows["joints"][step]),
+                "joint_velocities": _numbers(rows["velocities"][step]),
+                "gripper_opening": _numbers(rows["gripper"][step])[0],
+            }
+            write_json(place / "robot_state.json", state)
+            action = {"action": _numbers(rows["action"][step]), "executed": _numbers(rows["executed"][step])}
+            write_json(place / "expert_action.json", action)
 
 
-def _manifest(store: EpisodeStore, entry: Entry) -> dict[str, Any]:
+def origin(entry: Entry) -> dict[str, Any]:
+    """How an episode came about, and the checksum of what came of it, fit for JSON."""
     return {
         "seed": entry.seed,
         "instruction": entry.instruction,
@@ -62,33 +128,76 @@ def _manifest(store: EpisodeStore, entry: Entry) -> dict[str, Any]:
         "steps": entry.steps,
         "draws": entry.draws,
         "crc": entry.crc,
-        "spec": store.spec.to_dict(),
     }
 
 
-def _write_episode(folder: Path, store: EpisodeStore, entry: Entry) -> None:
-    rows = store.read(entry)
-    cameras = store.spec.cameras
-    for step in range(entry.steps):
-        place = folder / f"step_{step:04d}"
-        for camera in cameras:
-            images = place / camera if len(cameras) > 1 else place
-            images.mkdir(parents=True)
-            Image.fromarray(rows[f"rgb_{camera}"][step]).save(images / "rgb_image.png", compress_level=1)
-            np.save(images / "depth_image.npy", rows[f"depth_{camera}"][step] * MILLIMETRE)
-        state = {
-            "joint_positions": _numbers(rows["joints"][step]),
-            "joint_velocities": _numbers(rows["velocities"][step]),
-            "gripper_opening": _numbers(rows["gripper"][step])[0],
-        }
-        _write_json(place / "robot_state.json", state)
-        action = {"action": _numbers(rows["action"][step]), "executed": _numbers(rows["executed"][step])}
-        _write_json(place / "expert_action.json", action)
+def write_json(path: Path, value: Any) -> None:
+    """Write readable JSON."""
+    path.write_text(json.dumps(value, ensure_ascii=False, indent=1) + "\n", encoding="utf-8")
+
+
+@contextmanager
+def unfinished(folder: Path) -> Iterator[Path]:
+    """A hidden folder beside `folder` for what is not whole yet; it is removed at the end, and stays where that fails.
+
+    Raises:
+        ValueError: another process is exporting to `folder`.
+    """
+    place = folder.with_name(f".{folder.name}.unfinished")
+    place.mkdir(parents=True, exist_ok=True)
+    lock = FileLock(place / "lock")
+    try:
+        lock.acquire(timeout=0)
+    except Timeout as error:
+        raise ValueError(f"another export to {folder} is under way: wait, or choose another export.folder") from error
+    try:
+        yield place
+        shutil.rmtree(place)
+    finally:
+        with suppress(OSError):  # where nothing was begun, nothing needs to stay
+            (place / "lock").unlink()
+            place.rmdir()
+        lock.release()
+
+
+def each(
+    work: Callable[[EpisodeStore, Item], Result], store: EpisodeStore, items: Sequence[Item], workers: int | None
+) -> Iterator[Result]:
+    """What `work` makes of the store and each of the items, in their order; null workers: one process per core.
+
+    Raises:
+        ValueError: a process died; what `work` itself raises comes through.
+    """
+    workers = min(workers or cores(), len(items))
+    if workers <= 1:
+        yield from track((work(store, item) for item in items), "exporting", len(items))
+        return
+    pool = ProcessPoolExecutor(workers, get_context("spawn"), _enter, (store.folder, len(store.episodes)))
+    try:
+        yield from track(pool.map(partial(_in_worker, work), items), "exporting", len(items))
+    except BrokenProcessPool as error:
+        raise ValueError(
+            "an exporting process died, killed for its memory or by a crash outside Python: run again to go on, "
+            "with export.workers=1 to see the crash"
+        ) from error
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+_here: EpisodeStore | None = None  # the store, where this process is one of a pool
+
+
+def _enter(folder: Path, episodes: int) -> None:
+    global _here
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the process that was started by hand
+    leave_with_parent()
+    _here = EpisodeStore(folder, episodes)
+
+
+def _in_worker(work: Callable[[EpisodeStore, Item], Result], item: Item) -> Result:
+    assert _here is not None
+    return work(_here, item)
 
 
 def _numbers(values: Array) -> list[float]:
     return [float(value) for value in values]
-
-
-def _write_json(path: Path, value: Any) -> None:
-    path.write_text(json.dumps(value, ensure_ascii=False, indent=1) + "\n", encoding="utf-8")

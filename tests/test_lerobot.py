@@ -1,0 +1,131 @@
+"""A LeRobot dataset says the same as the store it came from, to whoever reads the layout."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from collections import Counter
+from fractions import Fraction
+from pathlib import Path
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+from rerun.chunk import RrdReader
+from test_export import content, stored
+from toy import SPEC
+
+from vla.data.episodes import EpisodeStore
+from vla.data.lerobot import LeRobot
+from vla.data.video import decode
+
+
+@pytest.fixture(scope="module")
+def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A `store` of 53 episodes, enough for two videos per camera, and the `dataset` made of it."""
+    home = tmp_path_factory.mktemp("home")
+    store, _ = stored(home / "store", seeds=range(66))
+    LeRobot(home / "dataset", workers=1).export(store)
+    return home
+
+
+def test_every_row_is_that_of_the_store(home: Path) -> None:
+    store = EpisodeStore(home / "store")
+    rows = pq.read_table(home / "dataset/data/chunk-000/file-000.parquet")
+    episodes = pq.read_table(home / "dataset/meta/episodes/chunk-000/file-000.parquet").to_pylist()
+    tasks = dict(
+        zip(*(column.to_pylist() for column in pq.read_table(home / "dataset/meta/tasks.parquet").columns), strict=True)
+    )
+    info = json.loads((home / "dataset/meta/info.json").read_text())
+    assert (info["codebase_version"], info["fps"]) == ("v3.0", 10)
+    assert (info["total_episodes"], info["total_frames"], info["total_tasks"]) == (53, len(rows), 2)
+    assert len(store.episodes) == len(episodes) == 53
+    for number, (entry, episode) in enumerate(zip(store.episodes, episodes, strict=True)):
+        expected, begin, end = store.read(entry), episode["dataset_from_index"], episode["dataset_to_index"]
+        here = rows.slice(begin, end - begin).to_pydict()
+        np.testing.assert_array_equal(
+            np.float32(here["observation.state"]), np.hstack([expected["joints"], expected["gripper"]])
+        )
+        for name in ("action", "executed", "velocities"):
+            np.testing.assert_array_equal(np.float32(here[name]), expected[name])
+        assert here["index"] == list(range(begin, end)) and here["frame_index"] == list(range(entry.steps))
+        assert here["episode_index"] == [number] * entry.steps and episode["length"] == entry.steps
+        np.testing.assert_allclose(here["timestamp"], np.arange(entry.steps) / 10, rtol=1e-6)
+        assert {tasks[index] for index in here["task_index"]} == {entry.instruction} == set(episode["tasks"])
+
+
+def test_every_image_is_close_to_that_of_the_store(home: Path) -> None:
+    store = EpisodeStore(home / "store")
+    episodes = pq.read_table(home / "dataset/meta/episodes/chunk-000/file-000.parquet").to_pylist()
+    assert {episode["videos/observation.images.front/file_index"] for episode in episodes} == {0, 1}
+    for number in (0, 1, 49, 50, 52):
+        expected, episode = store.read(store.episodes[number]), episodes[number]
+        for camera in SPEC.cameras:
+            video = f"videos/observation.images.{camera}"
+            file = home / "dataset" / video / f"chunk-000/file-{episode[f'{video}/file_index']:03d}.mp4"
+            begin, end = episode[f"{video}/from_timestamp"], episode[f"{video}/to_timestamp"]
+            assert end - begin == pytest.approx(episode["length"] / 10)
+            images = decode(file, begin, episode["length"], Fraction(10))
+            green = images[..., 1].mean((1, 2))  # counts the steps in the toy world
+            np.testing.assert_allclose(green, expected[f"rgb_{camera}"][..., 1].mean((1, 2)), atol=6)
+
+
+def test_statistics_are_those_of_all_rows_and_pixels(home: Path) -> None:
+    store = EpisodeStore(home / "store")
+    statistics = json.loads((home / "dataset/meta/stats.json").read_text())
+    action = store.rows("action").astype(float)
+    for name, value in {
+        "min": action.min(0),
+        "max": action.max(0),
+        "mean": action.mean(0),
+        "std": action.std(0),
+        "q10": np.quantile(action, 0.1, axis=0),
+    }.items():
+        np.testing.assert_allclose(statistics["action"][name], value, atol=1e-12)
+    assert statistics["action"]["count"] == [len(action)]
+    pixels = store.rows("rgb_wrist").reshape(-1, 3) / 255
+    image = statistics["observation.images.wrist"]
+    for name, value in {
+        "min": pixels.min(0),
+        "max": pixels.max(0),
+        "mean": pixels.mean(0),
+        "std": pixels.std(0),
+    }.items():
+        np.testing.assert_allclose(np.reshape(image[name], 3), value, atol=1e-6)
+    np.testing.assert_allclose(np.reshape(image["q90"], 3), np.quantile(pixels, 0.9, axis=0), atol=1 / 255)
+    first = pq.read_table(home / "dataset/meta/episodes/chunk-000/file-000.parquet").to_pylist()[0]
+    np.testing.assert_allclose(first["stats/action/max"], store.read(store.episodes[0])["action"].max(0))
+    assert np.shape(first["stats/observation.images.front/mean"]) == (3, 1, 1)
+    assert image["count"] == [len(action)] and first["stats/observation.images.front/count"] == [first["length"]]
+
+
+def test_rerun_opens_it(home: Path, tmp_path: Path) -> None:
+    store, _ = stored(tmp_path / "store", seeds=range(2))
+    folder, recording = LeRobot(tmp_path / "dataset", workers=1).export(store), tmp_path / "dataset.rrd"
+    command = [sys.executable, "-m", "rerun", str(folder), "--bind", "127.0.0.1", "--save", str(recording)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60)
+    assert done.returncode == 0 and "WARN" not in done.stdout + done.stderr, done.stdout + done.stderr
+    reader = RrdReader(recording)
+    assert len(reader.recordings()) == len(store.episodes)
+    for entry, one in zip(store.episodes, sorted(reader.recordings(), key=lambda one: one.recording_id), strict=True):
+        frames: Counter[str] = Counter()
+        for chunk in reader.stream(store=one):
+            if "VideoStream:sample" in chunk.to_record_batch().schema.names:
+                frames[chunk.entity_path] += chunk.num_rows
+        assert frames == {f"/observation.images.{camera}": entry.steps for camera in SPEC.cameras}
+
+
+def test_a_dataset_that_is_there_is_left_alone_and_another_one_is_refused(home: Path, tmp_path: Path) -> None:
+    store, before = EpisodeStore(home / "store"), content(home / "dataset")
+    stamp = (home / "dataset/meta/info.json").stat().st_mtime_ns
+    LeRobot(home / "dataset").export(store)
+    assert (home / "dataset/meta/info.json").stat().st_mtime_ns == stamp
+    with pytest.raises(ValueError, match=r"dataset holds something else .*: choose another export\.folder"):
+        LeRobot(home / "dataset").export(EpisodeStore(home / "store", episodes=3))
+    assert content(home / "dataset") == before
+    with pytest.raises(ValueError, match=r"export\.crf is from 0 to 63, not 64"):
+        LeRobot(tmp_path / "none", crf=64)
+    with pytest.raises(ValueError, match="no episodes yet"):
+        LeRobot(tmp_path / "none").export(EpisodeStore.create_or_open(tmp_path / "empty", SPEC, {}))
+    assert [path.name for path in tmp_path.iterdir()] == ["empty"]

@@ -1,0 +1,197 @@
+"""Demonstrations as a LeRobot dataset, without the package `lerobot`.
+
+Shapes: N steps, D components, H by W pixels.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from collections import deque
+from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from vla.data import lerobot_layout as layout
+from vla.data.episodes import EpisodeStore
+from vla.data.export import each, origin, unfinished, write_json
+from vla.data.moments import image_moments, moments
+from vla.data.video import encode
+from vla.spec import Array
+
+# Readers keep a video open and look frames up by 32-bit seconds: neither one file per episode nor a single one will do.
+EPISODES_PER_VIDEO = 50
+
+Columns = dict[str, Array]
+
+
+class LeRobot:
+    """A folder that `lerobot` and the Rerun viewer open: videos, joint positions and gripper, the action to imitate.
+
+    The instruction is the task; joint velocities and the executed action are further features. `meta/vla.json` says how
+    the episodes came about.
+
+    Args:
+        folder: where to write; it appears when all of it is there.
+        crf: quality of the videos, from 0, the best, to 63.
+        depth: add depth as numbers [mm], 0 where there is no return; reading a step then takes several times as long.
+        workers: processes; null: one per core. The files do not depend on it.
+    """
+
+    def __init__(
+        self,
+        folder: str | Path,
+        crf: Annotated[int, 0] = 30,
+        depth: bool = False,
+        workers: Annotated[int, 1] | None = None,
+    ) -> None:
+        if crf > 63:
+            raise ValueError(f"export.crf is from 0 to 63, not {crf}")
+        self._folder, self._workers = Path(folder).resolve(), workers
+        self._crf, self._depth = crf, depth
+
+    def export(self, store: EpisodeStore) -> Path:
+        """Write the dataset, or what an export that was cut short left to do; returns the folder.
+
+        Raises:
+            ValueError: the folder holds something else, or the store is damaged or empty.
+        """
+        source = self._source(store)
+        if not source["episodes"]:
+            raise ValueError(f"{store.folder} holds no episodes yet: collect some first")
+        if _is_of(self._folder, source):
+            return self._folder
+        if self._folder.exists() and (not self._folder.is_dir() or any(self._folder.iterdir())):
+            raise ValueError(f"{self._folder} holds something else than these episodes: choose another export.folder")
+        with unfinished(self._folder) as place:
+            draft = place / "dataset"
+            if not _is_of(draft, source):
+                shutil.rmtree(draft, ignore_errors=True)
+                (draft / "meta").mkdir(parents=True)
+                write_json(draft / "meta/vla.json", source)
+            self._write(draft, store)
+            os.rename(draft, self._folder)
+        return self._folder
+
+    def _source(self, store: EpisodeStore) -> dict[str, Any]:
+        episodes = [origin(entry) for entry in store.episodes]
+        return {"spec": store.spec.to_dict(), "crf": self._crf, "depth": self._depth, "episodes": episodes}
+
+    def _write(self, draft: Path, store: EpisodeStore) -> None:
+        files = range(-(-len(store.episodes) // EPISODES_PER_VIDEO))
+        units = [(camera, file) for camera in store.spec.cameras for file in files]
+        counts: dict[str, list[Array]] = {camera: [] for camera in store.spec.cameras}
+        work = partial(self._write_video, draft)
+        for (camera, _), found in zip(units, each(work, store, units, self._workers), strict=True):
+            counts[camera] += found
+        columns, tasks = list(_columns(store)), list(_tasks(store))
+        episodes = [_episode(store, number, columns[number], counts) for number in range(len(columns))]
+        whole = {name: np.concatenate([one[name] for one in columns]) for name in columns[0]}
+        statistics = {name: moments(values) for name, values in whole.items()}
+        for camera, found in counts.items():
+            statistics[layout.image_key(camera)] = image_moments(np.sum(found, 0), len(whole["index"]))
+        layout.write_rows(_made(draft / layout.place(layout.DATA)), self._rows(store, columns))
+        pq.write_table(pa.Table.from_pylist(episodes), _made(draft / layout.place(layout.EPISODES)))
+        layout.write_tasks(draft / layout.TASKS, tasks)
+        write_json(draft / "meta/stats.json", statistics)
+        info = layout.info(store.spec, self._depth, len(episodes), len(whole["index"]), len(tasks))
+        write_json(draft / "meta/info.json", info)
+
+    def _rows(self, store: EpisodeStore, columns: Sequence[Columns]) -> Iterator[Columns]:
+        """The columns of every episode, with depth if it is wanted."""
+        depths = {camera: store.rows(f"depth_{camera}") for camera in store.spec.cameras if self._depth}
+        for entry, numbers in zip(store.episodes, columns, strict=True):
+            rows = slice(entry.start, entry.start + entry.steps)
+            yield numbers | {layout.depth_key(camera): values[rows] for camera, values in depths.items()}
+
+    def _write_video(self, draft: Path, store: EpisodeStore, unit: tuple[str, int]) -> list[Array]:
+        """Write one file of a camera, if it is not there; how often each value occurs, (3, 256) per episode."""
+        camera, file = unit
+        counts: list[Array] = []
+
+        def clips() -> Iterator[Array]:
+            for entry in store.episodes[file * EPISODES_PER_VIDEO :][:EPISODES_PER_VIDEO]:
+                seen = store.read(entry)[f"rgb_{camera}"]
+                counts.append(np.stack([np.bincount(seen[..., colour].ravel(), minlength=256) for colour in range(3)]))
+                yield seen
+
+        path = _made(draft / layout.place(layout.VIDEOS, file, video_key=layout.image_key(camera)))
+        if path.exists():
+            deque(clips(), 0)  # counted all the same
+        else:
+            encode(path.with_suffix(".draft"), clips(), store.spec.image_size, layout.rate(store.spec), self._crf)
+            os.replace(path.with_suffix(".draft"), path)
+        return counts
+
+
+def _is_of(folder: Path, source: Mapping[str, Any]) -> bool:
+    path = folder / "meta/vla.json"
+    try:
+        return bool(json.loads(path.read_text(encoding="utf-8")) == source)
+    except (OSError, ValueError):  # not there, or cut short
+        return False
+
+
+def _made(path: Path) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    return path
+
+
+def _tasks(store: EpisodeStore) -> dict[str, int]:
+    """Instruction → index, in the order of their first appearance."""
+    return {task: index for index, task in enumerate(dict.fromkeys(entry.instruction for entry in store.episodes))}
+
+
+def _columns(store: EpisodeStore) -> Iterator[Columns]:
+    """The rows of `data/` of every episode."""
+    fields = {name: store.rows(name) for name in ("joints", "gripper", "velocities", "action", "executed")}
+    tasks, index = _tasks(store), 0
+    for number, entry in enumerate(store.episodes):
+        rows = {name: values[entry.start : entry.start + entry.steps] for name, values in fields.items()}
+        frames = np.arange(entry.steps)
+        yield {
+            layout.STATE: np.concatenate([rows["joints"], rows["gripper"]], 1),
+            layout.ACTION: np.array(rows["action"]),
+            layout.EXECUTED: np.array(rows["executed"]),
+            layout.VELOCITIES: np.array(rows["velocities"]),
+            "timestamp": (frames / store.spec.control_hz).astype(np.float32),
+            "frame_index": frames,
+            "episode_index": np.full_like(frames, number),
+            "index": frames + index,
+            "task_index": np.full_like(frames, tasks[entry.instruction]),
+        }
+        index += entry.steps
+
+
+def _episode(store: EpisodeStore, number: int, columns: Columns, counts: Mapping[str, list[Array]]) -> dict[str, Any]:
+    """The row of `meta/episodes/` of an episode."""
+    entries = store.episodes
+    file, place = divmod(number, EPISODES_PER_VIDEO)
+    before = sum(entry.steps for entry in entries[number - place : number])  # in the same video
+    begin, steps = int(columns["index"][0]), entries[number].steps
+    row: dict[str, Any] = {
+        "episode_index": number,
+        "tasks": [entries[number].instruction],
+        "length": steps,
+        "dataset_from_index": begin,
+        "dataset_to_index": begin + steps,
+        "data/chunk_index": 0,
+        "data/file_index": 0,
+        "meta/episodes/chunk_index": 0,
+        "meta/episodes/file_index": 0,
+    }
+    chunk, file = divmod(file, layout.FILES_PER_CHUNK)
+    statistics = {name: moments(values) for name, values in columns.items()}
+    for camera, found in counts.items():
+        video = f"videos/{layout.image_key(camera)}"
+        row |= {f"{video}/chunk_index": chunk, f"{video}/file_index": file}
+        row |= {f"{video}/from_timestamp": float(before / layout.rate(store.spec))}
+        row |= {f"{video}/to_timestamp": float((before + steps) / layout.rate(store.spec))}
+        statistics[layout.image_key(camera)] = image_moments(found[number], steps)
+    return row | {f"stats/{key}/{name}": value for key, of in statistics.items() for name, value in of.items()}
