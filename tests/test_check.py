@@ -33,6 +33,7 @@ def config(**changes: Any) -> DictConfig:
                 "randomize": {"mass": {"_target_": "vla.tasks.randomize.Masses", "factor": [0.5, 2.0]}, "size": None},
             },
             "expert": {"_target_": "vla.tasks.expert.Waypoint", "perturb": PERTURBATION},
+            "cluster": {"_target_": "vla.cluster.Local", "workers": None},
         }
     )
     for key, value in changes.items():

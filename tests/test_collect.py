@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 import toy
 
+from vla.cluster import Local
 from vla.collect import NOT_REPEATABLE, PATIENCE, MakeEnvironment, MakeExpert, Summary, collect
 from vla.data.episodes import EpisodeStore
 
@@ -21,12 +22,13 @@ TRIED = 37  # seeds 3, 8, 13, … fail
 
 SCRIPT = """
 import sys, toy
+from vla.cluster import Local
 from vla.collect import collect
 from vla.data.episodes import EpisodeStore
 
 if __name__ == "__main__":
     store = EpisodeStore.create_or_open(sys.argv[1], toy.SPEC, {})
-    collect(store, toy.make_slow_environment, toy.make_expert, episodes=30, workers=2, seed=0)
+    collect(store, toy.make_slow_environment, toy.make_expert, episodes=30, cluster=Local(2), seed=0)
 """
 
 
@@ -38,7 +40,7 @@ def gather(
     make_expert: MakeExpert = toy.make_expert,
 ) -> Summary:
     store = EpisodeStore.create_or_open(folder, toy.SPEC, {})
-    return collect(store, make_environment, make_expert, episodes, workers, seed=0)
+    return collect(store, make_environment, make_expert, episodes, Local(workers), seed=0)
 
 
 def content(folder: Path) -> dict[str, bytes]:
@@ -156,4 +158,4 @@ def test_a_success_that_cannot_be_replayed_is_a_failure(tmp_path: Path) -> None:
 def test_a_store_goes_on_from_its_own_first_seed(tmp_path: Path) -> None:
     gather(tmp_path, episodes=2)
     with pytest.raises(ValueError, match=r"starts at seed 0, not 7: set collect\.seed=0"):
-        collect(EpisodeStore(tmp_path), toy.make_environment, toy.make_expert, episodes=3, workers=1, seed=7)
+        collect(EpisodeStore(tmp_path), toy.make_environment, toy.make_expert, episodes=3, cluster=Local(1), seed=7)
