@@ -18,7 +18,7 @@ run: setup
 test: export OMP_NUM_THREADS = 1
 test: export MKL_NUM_THREADS = 1
 test: export OPENBLAS_NUM_THREADS = 1
-test: export LP_NUM_THREADS = 1
+test: export LP_NUM_THREADS = 0
 test: setup
 	.venv/bin/ruff format --check
 	.venv/bin/ruff check

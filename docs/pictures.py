@@ -56,13 +56,17 @@ def screenshot(recording: Path, picture: Path, step: int) -> None:
 
 
 def main(run: Path) -> None:
-    """Preview, one rollout in the viewer, and the report of `run`."""
+    """Preview, one rollout in the viewer, the card of a small store, and the report of `run`."""
     with tempfile.TemporaryDirectory() as folder:
         vla("job=preview", "preview.episodes=6", f"output={folder}")
         shutil.copy(Path(folder) / "preview.png", DOCS / "preview.png")
         checkpoint = run / "checkpoints/last.ckpt"
         vla(f"checkpoint={checkpoint}", "evaluate.episodes=1", "evaluate.workers=1", f"output={folder}")
         screenshot(Path(folder) / "rollouts.rrd", DOCS / "rollout.png", STEP)
+        store = f"collect.folder={folder}/episodes"
+        vla("job=collect", "collect.episodes=60", store)
+        vla("job=inspect", store)
+        shutil.copy(Path(folder) / "episodes/card.png", DOCS / "card.png")
     shutil.copy(run / "report.png", DOCS / "report.png")
 
 

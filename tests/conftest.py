@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from vla.tasks.backend import choose_backend
+from vla.workers import THREAD_SETTINGS
 
 if TYPE_CHECKING:
     from vla.tasks.tabletop import Tabletop
@@ -17,8 +18,8 @@ if TYPE_CHECKING:
 CONF = Path(__file__).parents[1] / "conf"
 
 # Read by libraries when they are first imported, which tests do after this file.
-for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "LP_NUM_THREADS"):
-    os.environ.setdefault(name, "1")
+for name, threads in THREAD_SETTINGS.items():
+    os.environ.setdefault(name, threads)
 choose_backend()
 
 

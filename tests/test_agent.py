@@ -19,6 +19,7 @@ from lifecycle_msgs.srv import ChangeState, GetState
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.parameter import Parameter
+from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import Image, JointState
 from std_msgs.msg import Float64MultiArray, String
 from std_srvs.srv import Trigger
@@ -96,6 +97,8 @@ class World:
         self.joints = HOME.copy()
         self.cameras, self.feels = list(SPEC.cameras), True
         self.changed: Callable[[Image], None] = lambda image: None
+        self.clock = self.node.create_publisher(Clock, "/clock", 1)
+        self.simulated: float | None = None  # time [s], where it is
 
     def spin(self, until: Callable[[], Any], seconds: float = 10.0) -> None:
         """Let both sides live until something holds."""
@@ -113,6 +116,9 @@ class World:
         """The world goes on: images at 10 Hz, joint states at 50 Hz."""
         end, tick = time.monotonic() + seconds, 0
         while time.monotonic() < end:
+            if self.simulated is not None:
+                self.simulated += 0.02
+                self.clock.publish(Clock(clock=self._now()))
             if self.feels:
                 if self.commands and isinstance(self.commands[-1], JointState):
                     self.joints = np.array(self.commands[-1].position[:7])
@@ -120,11 +126,17 @@ class World:
             if tick % 5 == 0:
                 for camera in self.cameras:
                     image = messages.fill_image(Image(), np.zeros((8, 8, 3), np.uint8), camera)
-                    image.header.stamp = self.node.get_clock().now().to_msg()
+                    image.header.stamp = self._now()
                     self.changed(image)
                     self.images[camera].publish(image)
             tick += 1
             self._spin_for(0.02)
+
+    def _now(self) -> Time:
+        if self.simulated is None:
+            return self.node.get_clock().now().to_msg()
+        seconds, rest = divmod(self.simulated, 1.0)
+        return Time(sec=int(seconds), nanosec=int(rest * 1e9))
 
     def ask(self, kind: Any, name: str, request: Any) -> Any:
         """What a service of the agent answers."""
@@ -243,6 +255,20 @@ def test_images_that_are_none_hold_the_arm(
     world.live(0.4)
     assert int({pair.key: pair.value for pair in world.statuses[-1].values}["messages dropped"]) > 3
     assert words in capfd.readouterr().err
+
+
+def test_simulated_time_dates_the_images_and_holds_the_arm_when_it_stands_still(
+    make_world: Callable[..., World],
+) -> None:
+    world = make_world("joint_state", "--ros-args", "-p", "use_sim_time:=true")
+    world.simulated = 50.0
+    world.start()
+    assert world.state is State.RUNNING, world.agent.session and world.agent.session.reason
+    assert world.agent.get_clock().now().nanoseconds * 1e-9 == pytest.approx(world.simulated, abs=0.2)
+    frozen = world.simulated
+    world.changed = lambda image: setattr(image.header, "stamp", Time(sec=int(frozen)))
+    world.live(0.8)
+    assert world.state is State.HOLDING
 
 
 def test_joint_states_that_stop_hold_the_arm(world: World) -> None:

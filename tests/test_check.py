@@ -12,6 +12,14 @@ from omegaconf import DictConfig, OmegaConf
 from vla.check import JOBS, PLAIN, build, check, digest, suggestion
 from vla.run import adopt, sentence
 
+GRAMMAR = {
+    "_target_": "vla.tasks.language.Grammar",
+    "phrasings": ["lift {block}"],
+    "words": {},
+    "held_out_phrasings": ["{block} up"],
+    "held_out_words": {"lift": ["raise"]},
+}
+MASSES = {"_target_": "vla.tasks.randomize.blocks.Masses", "factor": [0.5, 2.0]}
 PERTURBATION = {"_target_": "vla.tasks.expert.Perturbation", "start": 0.5, "steps": [2, 5]}
 
 
@@ -27,10 +35,11 @@ def config(**changes: Any) -> DictConfig:
             "evaluate": {"episodes": 5, "seed": 1_000_000, "workers": None, "recordings": 2},
             "preview": {"episodes": 1, "seed": 0},
             "benchmark": {"names": ["train"], "episodes": 1, "batches": 1, "steps": 1},
+            "inspect": dict.fromkeys(("stores", "where", "into", "episode")) | {"folder": "x", "repair": False},
             "task": {
                 "_target_": "vla.tasks.tabletop.Tabletop",
-                "goal": {"_target_": "vla.tasks.goals.Lift", "height": 0.1},
-                "randomize": {"mass": {"_target_": "vla.tasks.randomize.Masses", "factor": [0.5, 2.0]}, "size": None},
+                "goal": {"_target_": "vla.tasks.goals.lift.Lift", "language": GRAMMAR, "height": 0.1},
+                "randomize": {"mass": MASSES, "size": None},
             },
             "expert": {"_target_": "vla.tasks.expert.Waypoint", "perturb": PERTURBATION},
             "cluster": {"_target_": "vla.cluster.Local", "workers": None},
@@ -69,11 +78,11 @@ def test_an_unknown_key_is_named_with_what_was_probably_meant() -> None:
         ("task.shadows", 1, "task.shadows must be bool, got 1"),
         ("task.image_size", [96], "task.image_size must be tuple[int, int], got [96]"),
         ("task.image_size", [96, "x"], "task.image_size must be tuple[int, int], got [96, 'x']"),
-        ("task.goal", "lift", "task.goal must be Goal, got 'lift'"),
+        ("task.goal", "lift", "task.goal must be Goal or Mixed, got 'lift'"),
         ("task.randomize.mass.factor", [0.5, "a"], "task.randomize.mass.factor must be tuple[float, float], got"),
         ("expert.perturb.start", None, "expert.perturb.start must be float, got None"),
-        ("collect.workers", "all", "collect.workers must be int or null, got 'all'"),
-        ("seed", "first", "seed must be int, got 'first'"),
+        ("collect.workers", "all", "collect.workers must be int, at least 1 or null, got 'all'"),
+        ("seed", "first", "seed must be int, at least 0, got 'first'"),
         ("task.meshes", "lite", "task.meshes must be one of light, full, got 'lite', did you mean light?"),
         ("job", "evalute", "job must be one of"),
         (
@@ -127,7 +136,7 @@ def test_build_gives_plain_containers_runtime_arguments_and_nested_factories() -
     built = build(OmegaConf.create({"_target_": "torch.nn.Linear", "bias": False}), in_features=2, out_features=3)
     assert built.weight.shape == (3, 2)
     assert built.bias is None
-    masses = build(OmegaConf.create({"_target_": "vla.tasks.randomize.Masses", "factor": [0.5, 2.0]}))
+    masses = build(OmegaConf.create({"_target_": "vla.tasks.randomize.blocks.Masses", "factor": [0.5, 2.0]}))
     assert type(masses.factor) is list
     node = {"_target_": "vla.tasks.expert.Waypoint", "perturb": {**PERTURBATION, "_partial_": True}}
     spec = SimpleNamespace(low=(0.0,), high=(1.0,))
@@ -135,7 +144,7 @@ def test_build_gives_plain_containers_runtime_arguments_and_nested_factories() -
 
 
 def test_build_passes_on_what_a_nested_constructor_complains_about() -> None:
-    axis = {"_target_": "vla.tasks.randomize.Colours", "names": ["pink"]}
+    axis = {"_target_": "vla.tasks.randomize.blocks.Colours", "names": ["pink"]}
     with pytest.raises(ValueError, match="unknown colours"):
         build({"_target_": "vla.tasks.tabletop.Tabletop", "goal": None, "randomize": {"colour": axis}})
 

@@ -117,6 +117,7 @@ def test_words_move_the_arm_and_a_signal_leaves_it_at_rest(
     ear.until(lambda: ear.states and ear.commands)
     np.testing.assert_allclose(ear.commands[0].position[:7], ear.states[0].position[:7], atol=1e-3)
     watch = start("vla.deploy.watch")
+    view = start("vla.deploy.view", "--save", f"view{number}.rrd")
     said = start("vla.deploy.say", "put the red block on the pad")
     assert said.wait(30) == 0
     ear.until(lambda: ear.moved() > 1e-3)
@@ -129,7 +130,9 @@ def test_words_move_the_arm_and_a_signal_leaves_it_at_rest(
     assert np.abs(np.subtract(last, before)).max() < 0.02 and ear.moved() < 1e-3
     simulator.send_signal(number)
     watch.send_signal(number)
-    assert simulator.wait(10) == 0 and watch.wait(10) == 0
+    view.send_signal(number)
+    assert simulator.wait(10) == 0 and watch.wait(10) == 0 and view.wait(10) == 0
+    assert (home / f"view{number}.rrd").stat().st_size > 10_000
     assert "running" in watch.communicate()[0]
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -64,11 +65,18 @@ def test_an_episode_that_raises_is_an_error_and_the_others_go_on() -> None:
     assert "errors 1, the first at seed 1000001: ValueError: the block fell" in str(report)
 
 
-def test_a_worker_that_dies_is_an_error() -> None:
-    report = evaluate(toy.make_deadly_environment, toy.make_agent, None, SEEDS[:4], workers=2)
-    assert toy.DEADLY_SEED in [error.seed for error in report.errors]
-    assert "a worker process died" in report.errors[0].error
-    assert len(report.results) == 4
+def test_an_episode_that_kills_its_process_is_an_error_and_the_others_are_played() -> None:
+    report = evaluate(toy.make_deadly_environment, toy.make_agent, None, SEEDS, workers=2)
+    assert [error.seed for error in report.errors] == [toy.DEADLY_SEED]
+    assert "died, twice" in report.errors[0].error
+    assert len(report.results) == len(SEEDS)
+
+
+def test_a_process_that_dies_once_costs_nothing(tmp_path: Path) -> None:
+    expected = evaluate(toy.make_environment, toy.make_agent, None, SEEDS, workers=1)
+    make_environment = partial(toy.OnceDeadlyEnvironment, tmp_path / "died")
+    assert evaluate(make_environment, toy.make_agent, None, SEEDS, workers=2) == expected
+    assert (tmp_path / "died").exists()
 
 
 @pytest.mark.parametrize("workers", [1, 2])

@@ -16,24 +16,28 @@ if TYPE_CHECKING:
     from vla.tasks.tabletop import Tabletop
 
 
-@pytest.mark.parametrize("goal", ["pick_place", "lift"])
+GOALS = ("lift", "pick_place", "pick_place_two", "push", "stack")
+
+
+@pytest.mark.parametrize("goal", GOALS)
 @pytest.mark.parametrize("perturbed", [False, True])
 def test_the_expert_solves_every_goal(goal: str, perturbed: bool) -> None:
     environment = make_tabletop(f"goal={goal}")
     expert = Waypoint(environment.spec, Perturbation() if perturbed else None)
     with environment.blind():
-        episodes = [rollout(environment, expert, seed) for seed in range(40)]
+        episodes = [rollout(environment, expert, seed) for seed in range(25)]
     environment.close()
-    assert sum(episode.success for episode in episodes) >= 39
+    assert sum(episode.success for episode in episodes) >= (23 if perturbed else 24)
 
 
-def test_wide_randomisation_is_within_the_experts_reach() -> None:
-    environment = make_tabletop("randomize=wide")
+@pytest.mark.parametrize("goal", GOALS)
+def test_wide_randomisation_is_within_the_experts_reach(goal: str) -> None:
+    environment = make_tabletop(f"goal={goal}", "randomize=wide")
     expert = Waypoint(environment.spec)
     with environment.blind():
-        outcomes = [rollout(environment, expert, seed).outcome for seed in range(30)]
+        outcomes = [rollout(environment, expert, seed).outcome for seed in range(20)]
     environment.close()
-    assert outcomes.count("success") >= 28
+    assert outcomes.count("success") >= 18
 
 
 def test_the_clean_action_is_recorded_where_another_one_is_executed(tabletop: Tabletop) -> None:

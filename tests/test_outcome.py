@@ -3,17 +3,24 @@
 from __future__ import annotations
 
 import numpy as np
+from test_goals import facts
 
-from vla.tasks.goals import Progress
+from vla.tasks.goals.goal import Manner, Subgoal
 from vla.tasks.outcome import Judge
 
 
-def step(judge: Judge, height: float = 0.02, held: bool = False, near: bool = True, reached: bool = False) -> None:
+def step(
+    judge: Judge,
+    height: float = 0.02,
+    held: bool = False,
+    near: bool = True,
+    reached: bool = False,
+    manner: Manner = "place",
+) -> None:
     """One step with the named block's centre at `height`."""
-    block = np.array([0.5, 0.0, height])
-    progress = Progress(block, np.array([0.5, 0, 0.02]), 0.02, 0.0, held, held, np.array([0.4, 0.1, 0.0]))
-    tool = block if near else block + 0.2
-    judge.watch(progress, reached, tool, [height > 0.04, False], target=0)
+    positions = np.array([[0.5, 0.0, height], [0.4, 0.2, 0.02]])
+    seen = facts(positions, held=[held, False], tool=positions[0] if near else positions[0] + 0.2)
+    judge.watch(seen, [Subgoal(0, np.zeros(3), manner, reached)], named=[0])
 
 
 def test_success_must_be_held() -> None:
@@ -42,6 +49,26 @@ def test_failures_are_told_apart() -> None:
 
 def test_lifting_another_block_is_the_wrong_object() -> None:
     judge = Judge(3)
-    progress = Progress(np.array([0.5, 0, 0.02]), np.zeros(3), 0.02, 0.0, False, False, np.zeros(3))
-    judge.watch(progress, False, np.array([0.5, 0.2, 0.1]), [False, True], target=0)
+    positions = np.array([[0.5, 0.0, 0.02], [0.4, 0.2, 0.12]])
+    seen = facts(positions, held=[False, True], tool=positions[1])
+    judge.watch(seen, [Subgoal(0, np.zeros(3), "place", False)], named=[0])
     assert judge.outcome == "wrong_object"
+
+
+def test_what_was_pushed_astray_was_not_missed() -> None:
+    judge = Judge(3)
+    step(judge, manner="push")
+    assert judge.outcome == "not_placed"
+
+
+def test_with_two_subgoals_it_is_about_the_one_whose_turn_it_is() -> None:
+    judge = Judge(3)
+    positions = np.array([[0.5, 0.0, 0.12], [0.4, 0.2, 0.02]])
+    lifted = facts(positions, held=[True, False], tool=positions[0])
+    first, second = (Subgoal(block, np.zeros(3), "place", False) for block in (0, 1))
+    judge.watch(lifted, [first, second], named=[0, 1])
+    assert judge.outcome == "timeout"
+    done = Subgoal(0, np.zeros(3), "place", True)
+    positions = np.array([[0.5, 0.0, 0.02], [0.4, 0.2, 0.02]])
+    judge.watch(facts(positions, tool=positions[0]), [done, second], named=[0, 1])
+    assert judge.outcome == "never_reached"

@@ -3,54 +3,66 @@
 from __future__ import annotations
 
 import copy
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pytest
-from conftest import make_tabletop
+from conftest import CONF, make_tabletop
 
-from vla.tasks.randomize import Colours, Placement, stream
+from vla.spec import Array
+from vla.tasks.randomize.axis import stream
+from vla.tasks.randomize.blocks import Colours, Distractors, Placement, Shapes
+from vla.tasks.tabletop import Tabletop
 
-if TYPE_CHECKING:
-    from vla.tasks.tabletop import Tabletop
-
-AXES = ("colour", "size", "mass", "friction", "placement", "arm", "light", "camera", "table")
-VISIBLE = set(AXES) - {"mass", "friction"}
+DEFAULT = {"distractors", "colour", "size", "mass", "friction", "placement", "arm", "light", "camera", "table"}
+AXES = sorted(path.name for path in (CONF / "task/randomize").iterdir() if path.is_dir())
+INVISIBLE = {"mass", "friction", "gain", "latency", "phrasing"}  # until something moves, or speaks
 
 
-def test_the_default_randomises_every_axis_and_records_it(tabletop: Tabletop) -> None:
+@pytest.fixture(scope="module")
+def hard() -> Any:
+    """The tabletop with every axis at its hardest."""
+    environment = make_tabletop("randomize=hard")
+    yield environment
+    environment.close()
+
+
+def seen(environment: Tabletop, seed: int, **axes: Any) -> tuple[Array, dict[str, Any]]:
+    """Both cameras' first images and the draws, with some axes replaced."""
+    task = environment.task
+    kept, task.randomize = task.randomize, {**task.randomize, **axes}
+    try:
+        images = environment.reset(seed).rgb
+        return np.stack(list(images.values())), copy.deepcopy(environment.draws)
+    finally:
+        task.randomize = kept
+
+
+def test_the_default_randomises_its_axes_and_records_them(tabletop: Tabletop) -> None:
     tabletop.reset(0)
-    assert set(tabletop.draws) == {"named", *AXES, "language"}
+    assert set(tabletop.draws) == {"named", *DEFAULT, "language"}
 
 
-def test_draws_depend_on_the_seed_alone(tabletop: Tabletop) -> None:
-    with tabletop.blind():
-        tabletop.reset(4)
-        first = copy.deepcopy(tabletop.draws)
-        tabletop.reset(5)
-        assert tabletop.draws != first
-        tabletop.reset(4)
-    assert tabletop.draws == first
+def test_the_hardest_randomises_every_axis_that_there_is(hard: Tabletop) -> None:
+    hard.reset(0)
+    assert set(hard.draws) == {"named", *AXES, "language"}
+
+
+def test_draws_depend_on_the_seed_alone(hard: Tabletop) -> None:
+    first = seen(hard, 4)
+    assert seen(hard, 5)[1] != first[1]
+    again = seen(hard, 4)
+    np.testing.assert_array_equal(again[0], first[0])
+    assert again[1] == first[1]
 
 
 @pytest.mark.parametrize("axis", AXES)
-def test_switching_one_axis_off_leaves_the_draws_of_all_others(tabletop: Tabletop, axis: str) -> None:
-    tabletop.reset(7)
-    full, image = copy.deepcopy(tabletop.draws), tabletop.reset(7).rgb["front"]
-    task = tabletop.task
-    kept, task.randomize = task.randomize, {**task.randomize, axis: None}
-    try:
-        without = tabletop.reset(7).rgb["front"]
-        reduced = copy.deepcopy(tabletop.draws)
-    finally:
-        task.randomize = kept
-    ignored = {axis, "named"} | ({"language"} if axis == "colour" else set())  # the instruction names a colour
-    if axis == "size":
-        ignored |= {"placement"}  # room around a block depends on its size
-    assert {name: draw for name, draw in full.items() if name not in ignored} == {
-        name: draw for name, draw in reduced.items() if name not in ignored
-    }
-    assert (image != without).any() == (axis in VISIBLE)
+def test_switching_one_axis_off_shows_and_leaves_the_draws_of_all_others(hard: Tabletop, axis: str) -> None:
+    (image, full), (without, reduced) = seen(hard, 7), seen(hard, 7, **{axis: None})
+    ignored = {axis, "named"} | ({"language"} if axis in ("colour", "distractors", "phrasing") else set())
+    for name in set(full) - ignored:
+        assert full[name] == reduced[name], name
+    assert (image != without).any() == (axis not in INVISIBLE)
 
 
 def test_without_randomisation_all_episodes_start_alike() -> None:
@@ -61,14 +73,74 @@ def test_without_randomisation_all_episodes_start_alike() -> None:
     environment.close()
 
 
-def test_blocks_and_pad_keep_their_distance(tabletop: Tabletop) -> None:
+def test_blocks_and_pads_keep_their_distance(tabletop: Tabletop) -> None:
     with tabletop.blind():
         for seed in range(20):
             tabletop.reset(seed)
             draw: dict[str, Any] = tabletop.draws["placement"]
-            centres = np.array([draw["pad"], *draw["blocks"]])
+            centres = np.array([*draw["pads"], *draw["blocks"]])
             distances = np.linalg.norm(centres[:, None] - centres[None], axis=-1)
             assert distances[np.triu_indices(len(centres), 1)].min() > 0.08
+
+
+def test_what_is_not_there_is_nowhere_to_be_seen(hard: Tabletop) -> None:
+    bound = hard.task.bound
+    two, _ = seen(hard, 3, distractors=Distractors((2, 2)))
+    assert len(bound.block_centres()) == 3
+    one, draws = seen(hard, 3, distractors=Distractors((1, 1)))
+    assert draws["distractors"] == {"count": 1} and len(bound.block_centres()) == 2
+    assert (one != two).any()
+    with hard.blind():
+        for _ in range(5):
+            hard.step(np.zeros(7))
+    away = bound.data.geom_xpos[bound.block_geoms[2:]]
+    assert (away[:, 2] < -2).all() and np.abs(bound.data.qvel[bound.block_velocities[2]]) < 1e-6
+
+
+def test_every_shape_stands_on_the_table_and_weighs_what_its_volume_says() -> None:
+    environment = make_tabletop("randomize=none")
+    expected = {"cube": 8.0, "cylinder": 2 * np.pi, "tall": 8 * 1.25, "flat": 8 * 0.75}
+    with environment.blind():
+        for name, volume in expected.items():
+            environment.task.randomize = {"shape": Shapes([name])}
+            environment.reset(0)
+            bound = environment.task.bound
+            masses = bound.model.body_mass[bound.block_bodies[:3]]
+            np.testing.assert_allclose(masses, 600.0 * volume * 0.02**3)
+            start = bound.block_centres()
+            for _ in range(5):
+                environment.step(np.array([0, 0, 0, 0, 0, 0, 1.0]))
+            assert np.abs(bound.block_centres() - start).max() < 1e-3
+    environment.close()
+
+
+def test_commands_reach_the_motors_late(tabletop: Tabletop) -> None:
+    from vla.tasks.randomize.robot import Latency
+
+    up = np.array([0, 0, 0.04, 0, 0, 0, 1.0])
+    task = tabletop.task
+    kept, heights = task.randomize, []
+    with tabletop.blind():
+        for seconds in (0.0, 0.1):
+            task.randomize = {**kept, "latency": Latency((seconds, seconds))}
+            before = tabletop.reset(0).truth
+            after = tabletop.step(up).truth
+            assert before is not None and after is not None
+            heights.append(float((after["tcp"] - before["tcp"])[2]))
+    task.randomize = kept
+    assert heights[0] > 0.03 and abs(heights[1]) < 0.002
+
+
+def test_sensor_noise_is_the_same_in_a_replay_without_images() -> None:
+    environment = make_tabletop("randomize=hard", "image_size=[16,16]")
+    action = np.array([0.01, 0, 0, 0, 0, 0, 1.0])
+    looking = [environment.reset(2).joints, environment.step(action).joints]
+    with environment.blind():
+        blind = [environment.reset(2).joints, environment.step(action).joints]
+    np.testing.assert_array_equal(looking, blind)
+    bound = environment.task.bound
+    assert 0 < np.abs(blind[-1] - bound.data.qpos[bound.joints]).max() < 0.05
+    environment.close()
 
 
 def test_streams_differ_between_axes_and_seeds() -> None:
@@ -77,9 +149,16 @@ def test_streams_differ_between_axes_and_seeds() -> None:
 
 
 def test_bad_axes_are_explained(tabletop: Tabletop) -> None:
+    bound = tabletop.task.bound
     with pytest.raises(ValueError, match=r"unknown colours \['mauve'\]"):
         Colours(["mauve"])
-    with pytest.raises(ValueError, match="3 blocks need as many colours"):
-        Colours(["red"])(tabletop.task.bound, np.random.RandomState(0))
+    with pytest.raises(ValueError, match=r"unknown shapes \['ball'\]"):
+        Shapes(["ball"])
+    with pytest.raises(ValueError, match="4 blocks need as many colours"):
+        Colours(["red"])(bound, np.random.RandomState(0))
     with pytest.raises(ValueError, match="no room"):
-        Placement((0.5, 0.51), (0.0, 0.01))(tabletop.task.bound, np.random.RandomState(0))
+        Placement((0.5, 0.51), (0.0, 0.01))(bound, np.random.RandomState(0))
+    with pytest.raises(ValueError, match="at least 1"):
+        Distractors((0, 2))
+    with pytest.raises(ValueError, match=r"5 distractors need task\.blocks=6, it is 4"):
+        Distractors((1, 5))(bound, np.random.RandomState(0))

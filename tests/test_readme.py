@@ -68,7 +68,7 @@ def test_the_command_runs(home: Path, command: str, request: pytest.FixtureReque
     if not any(argument.startswith("checkpoint=") for argument in arguments):
         small = [*SMALL, *small]
     elif "deploy=loop" in arguments:
-        small = ["deploy.episodes=1", "task.time_limit=1"]
+        small = ["deploy.episodes=1", "task.time_limit=1", "benchmark.episodes=1"]
     elif "job=train" in arguments:
         small = [*SMALL, "trainer.max_steps=6"]
     if "cluster=dask" in arguments:

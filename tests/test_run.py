@@ -12,6 +12,7 @@ import time
 from pathlib import Path
 
 import pytest
+from rerun.chunk import RrdReader
 
 from vla.policy import read_checkpoint
 from vla.tasks.backend import TRIED
@@ -121,6 +122,29 @@ def test_a_collection_killed_again_and_again_goes_on_and_ends_up_the_same(home: 
     for file in reference.iterdir():
         if file.suffix in (".bin", ".jsonl"):
             assert (tmp_path / "store" / file.name).read_bytes() == file.read_bytes(), file.name
+
+
+def test_a_store_is_chosen_from_another_and_its_damage_is_named(home: Path, tmp_path: Path) -> None:
+    (whole,) = (home / "outputs/episodes").iterdir()
+    where = "inspect.where={seed: [3, 12], placement.yaw: [-2, 2], instruction: '*the*'}"
+    done = vla(home, "job=inspect", f"inspect.folder={whole}", where, f"inspect.into={tmp_path}/few")
+    assert "10 whole ones, of 10 seeds tried: 3 to 12" in done.stdout
+    assert (tmp_path / "few/card.png").stat().st_size > 10_000
+    with open(tmp_path / "few/rgb_front.bin", "r+b") as file:
+        file.truncate(file.seek(0, os.SEEK_END) - 1)
+    done = vla(home, "job=inspect", f"inspect.folder={tmp_path}/few", ok=False)
+    assert "9 whole ones" in done.stdout and "1 damaged episodes" in done.stderr and "Traceback" not in done.stderr
+
+
+def test_an_episode_is_replayed_into_a_recording(home: Path) -> None:
+    (store,) = (home / "outputs/episodes").iterdir()
+    replay = ("job=inspect", f"inspect.folder={store}", "output=replay")
+    assert "bit for bit" in vla(home, *replay, "inspect.episode=2").stdout
+    recorded = {chunk.entity_path for chunk in RrdReader(home / "replay/episode-2.rrd").stream().to_chunks()}
+    assert {"/camera/front/rgb", "/camera/wrist/depth", "/robot/joints", "/action/m/executed"} <= recorded
+    assert any(path.startswith("/world/panda") for path in recorded)
+    done = vla(home, *replay, "inspect.episode=99", ok=False)
+    assert "has no seed 99" in done.stderr and "Traceback" not in done.stderr
 
 
 BAD_INPUT = {

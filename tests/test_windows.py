@@ -18,6 +18,7 @@ from lightning.pytorch.callbacks import ModelCheckpoint
 from vla.cluster import Local
 from vla.collect import collect
 from vla.data.episodes import EpisodeStore
+from vla.data.inspection import put_together
 from vla.data.windows import Gather, Windows, held_out
 
 EPISODES = 30
@@ -91,6 +92,17 @@ def test_a_batch_is_what_a_loop_over_the_episodes_gives(folder: Path, history: i
         beyond = ~usable & expected["present"][:, None]
         np.testing.assert_array_equal(batch["action"][place].numpy()[beyond], expected["labels"][beyond])
         assert batch["instruction"][place] == expected["text"]
+
+
+def test_chosen_episodes_give_the_windows_that_they_gave(folder: Path, tmp_path: Path) -> None:
+    whole = EpisodeStore(folder)
+    put_together([whole], tmp_path / "chosen", {"colour": "red", "seed": [4, None]})
+    module, entry = windows(tmp_path / "chosen"), EpisodeStore(tmp_path / "chosen").episodes[0]
+    same = next(other for other in whole.episodes if other.seed == entry.seed)
+    one, other = module.gather(np.array([entry.start])), Gather(whole, 3, 2)(np.array([same.start]))
+    assert same.start > entry.start == 0
+    torch.testing.assert_close(one["action"], other["action"], rtol=0, atol=0)
+    torch.testing.assert_close(one["rgb"]["wrist"], other["rgb"]["wrist"], rtol=0, atol=0)
 
 
 def test_shapes_and_types_are_those_of_the_contract(folder: Path) -> None:

@@ -70,6 +70,20 @@ def make_deadly_environment() -> RecordableEnvironment:
     return RecordableEnvironment(deadly_seed=DEADLY_SEED)
 
 
+class OnceDeadlyEnvironment(RecordableEnvironment):
+    """A world that takes its process down with it at one seed, the first time only."""
+
+    def __init__(self, marker: Path) -> None:
+        super().__init__(deadly_seed=None if marker.exists() else DEADLY_SEED)
+        self._marker = marker
+
+    def reset(self, seed: int) -> Observation:
+        """As the toy does, after a note that death is near."""
+        if seed == DEADLY_SEED:
+            self._marker.touch()
+        return super().reset(seed)
+
+
 def make_impossible_environment() -> RecordableEnvironment:
     """A world that cannot be built."""
     raise ValueError("no such mesh")

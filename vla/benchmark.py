@@ -176,9 +176,9 @@ def deployment(config: DictConfig) -> dict[str, Measure]:
     with loop.playing() as person:
         for _ in range(loop.episodes):
             person.play()
-        figures = {key: float(value) for key, value in person.status.items() if key.endswith("[ms]")}
         person.begin()
         reactions = [1000 * person.react() for _ in range(config.benchmark.episodes)]
+        figures = {key: float(value) for key, value in person.status.items() if key.endswith("[ms]")}
     agent = config.deploy.agent
     image, inference = (figures[f"{name} p50 [ms]"] for name in ("image to command", "inference"))
     return {

@@ -35,6 +35,7 @@ JOBS: dict[str, tuple[str, ...]] = {
     "export": ("task", "expert", "cluster", "export"),
     "deploy": ("tokenizer", "model", "deploy"),
     "benchmark": TRAINING,
+    "inspect": (),
 }
 EVALUATION = ("task", "tokenizer", "model", "recorder")  # of a checkpoint, with nothing to train
 OPTIONAL = ("recorder",)  # groups that a job can do without
@@ -56,7 +57,7 @@ Seed = Annotated[int, 0]
 
 # The nodes that name no class.
 PLAIN: dict[str, Any] = {
-    "job": Literal["preview", "collect", "train", "evaluate", "export", "deploy", "benchmark"],
+    "job": Literal["preview", "collect", "train", "evaluate", "export", "deploy", "benchmark", "inspect"],
     "seed": Seed,
     "checkpoint": str | None,
     "output": str,
@@ -68,6 +69,14 @@ PLAIN: dict[str, Any] = {
         "episodes": Count,
         "batches": Count,
         "steps": Count,
+    },
+    "inspect": {
+        "folder": str,
+        "stores": list[str] | None,
+        "where": dict[str, Any] | None,
+        "repair": bool,
+        "into": str | None,
+        "episode": Seed | None,
     },
 }
 GROUPS = tuple(dict.fromkeys(group for groups in JOBS.values() for group in groups))
@@ -117,7 +126,7 @@ def check(cfg: DictConfig) -> None:
     for group in EVALUATION if cfg.job == "evaluate" and cfg.checkpoint is not None else JOBS[cfg.job]:
         if cfg.get(group) is not None:
             node = OmegaConf.to_container(cfg[group], resolve=True, throw_on_missing=True)
-            _check_node(group, node, RUNTIME.get(group, ()))
+            check_node(group, node, RUNTIME.get(group, ()))
         elif group not in OPTIONAL:
             raise ValueError(f"job={cfg.job} needs {group}=OPTION; --help lists the options")
 
@@ -171,7 +180,12 @@ def _locate(key: str, target: Any) -> type:
     return found
 
 
-def _check_node(key: str, node: Any, runtime: Sequence[str] = ()) -> None:
+def check_node(key: str, node: Any, runtime: Sequence[str] = ()) -> None:
+    """Bind a plain node, called `key`, to the signature of the class it names; `runtime` arguments come later.
+
+    Raises:
+        ValueError: an unknown, missing or ill-typed key, with its dotted name and what is allowed in its place.
+    """
     if not isinstance(node, dict) or "_target_" not in node:
         raise ValueError(f"{key} must be a node with a _target_, got {node!r}")
     target = _locate(f"{key}._target_", node["_target_"])
@@ -212,7 +226,7 @@ def _check_value(key: str, value: Any, annotation: Any) -> None:
         hint = suggestion(str(value), choices)
         raise ValueError(f"{key} must be {_describe(annotation)}, got {value!r}{hint}")
     if isinstance(value, dict) and "_target_" in value:
-        return _check_node(key, value)
+        return check_node(key, value)
     children = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
     for name, child in children:
         _check_value(f"{key}.{name}" if isinstance(value, dict) else f"{key}[{name}]", child, Any)

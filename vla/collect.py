@@ -14,12 +14,11 @@ from dataclasses import dataclass, replace
 from functools import partial
 from typing import Protocol
 
-import numpy as np
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from vla.cluster import Cluster, MakeWorker, Team, Wait, WorkersLost
 from vla.data.episodes import EpisodeStore
-from vla.rollout import rollout
+from vla.rollout import replay, rollout
 from vla.spec import Agent, Environment, Episode
 
 log = logging.getLogger(__name__)
@@ -75,10 +74,15 @@ def collect(
     for. Each process of `cluster` calls the two factories once.
 
     Raises:
-        ValueError: the store starts at another seed, the expert is hopeless, workers died, or the disk is full.
+        ValueError: the store starts at another seed or was not collected, the expert is hopeless, workers died, or the
+            disk is full.
     """
     started = time.monotonic()
     before = len(store.episodes)
+    if before < episodes and store.derived:
+        raise ValueError(
+            f"{store.folder} was put together from other stores and does not grow: set collect.episodes={before}"
+        )
     _require_first_seed(store, seed)
     if before < episodes:
         with store.writing():
@@ -92,7 +96,7 @@ def collect(
 
 
 def _require_first_seed(store: EpisodeStore, seed: int) -> None:
-    if store.tried and store.tried[0].seed != seed:
+    if store.tried and not store.derived and store.tried[0].seed != seed:
         first = store.tried[0].seed
         raise ValueError(f"{store.folder} starts at seed {first}, not {seed}: set collect.seed={first}")
 
@@ -167,9 +171,4 @@ class _Worker:
 def _repeats(environment: RepeatableEnvironment, episode: Episode) -> bool:
     """Whether the executed actions lead from the seed to success again, through the same joint angles bit for bit."""
     with environment.blind():
-        observation = environment.reset(episode.seed)
-        for seen, action in zip(episode.observations, episode.executed, strict=True):
-            if environment.done or not np.array_equal(observation.joints, seen.joints):
-                return False
-            observation = environment.step(action)
-    return environment.done and environment.outcome == episode.outcome
+        return replay(environment, episode) is None

@@ -6,6 +6,7 @@ An episode is a function of its seed alone, so a report is the same whatever the
 from __future__ import annotations
 
 import json
+import logging
 import signal
 import traceback
 from collections import Counter
@@ -23,10 +24,11 @@ from typing import Any, Protocol
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from vla.rollout import rollout
-from vla.spec import Agent, Environment, Recorder
+from vla.spec import FIRST_SEED, Agent, Environment, Recorder
 from vla.workers import cores, leave_with_parent, one_thread_each
 
-FIRST_SEED = 1_000_000  # evaluation seeds start here; collection, which starts at small ones, never gets this far
+log = logging.getLogger(__name__)
+
 ERROR = "error"  # outcome of an episode that could not be played to its end
 NORMAL_QUANTILE = 1.959964  # of 0.975: an interval of 95 %
 
@@ -141,7 +143,7 @@ def evaluate(
     if workers < 1:
         raise ValueError(f"evaluation needs at least one worker, got evaluate.workers={workers}")
     factories = _Factories(make_environment, make_agent, make_recorder)
-    play = _play_here(factories, seeds) if workers == 1 else _play_apart(factories, seeds, min(workers, len(seeds)))
+    play = _play_here(factories, seeds) if workers == 1 else _play_apart(factories, seeds, workers)
     columns = (TextColumn("evaluating"), BarColumn(), MofNCompleteColumn(), TextColumn("{task.fields[note]}"))
     results: dict[int, Result] = {}
     with one_thread_each(), closing(play), Progress(*columns, TimeRemainingColumn()) as bar:
@@ -211,16 +213,32 @@ def _play_here(factories: _Factories, seeds: Sequence[int]) -> Generator[Result]
 
 
 def _play_apart(factories: _Factories, seeds: Sequence[int], workers: int) -> Generator[Result]:
-    """Results in the order in which they come, from spawned processes: a GL context does not survive a fork."""
-    pool = ProcessPoolExecutor(workers, get_context("spawn"), _start_worker, (factories,))
+    """Results in the order in which they come, from other processes.
+
+    When one dies, the episodes that were under way are played again, one by one: a graphics driver may crash once in
+    thousands of episodes, and an episode that kills its process again is an error of its own.
+    """
+    left = list(seeds)
+    while left:
+        for result in _play_in_pool(factories, left, workers):
+            left.remove(result.seed)
+            yield result
+        suspects, left = left[:workers], left[workers:]
+        if suspects:
+            log.warning("a process died; playing the episodes that it may have been at again")
+        for seed in suspects:
+            what = "the process that played this episode died, twice; evaluate.workers=1 would show where"
+            yield from list(_play_in_pool(factories, [seed], 1)) or [Result(seed, ERROR, error=what)]
+
+
+def _play_in_pool(factories: _Factories, seeds: Sequence[int], workers: int) -> Generator[Result]:
+    """Results until all are there, or a process dies; they are spawned, as a GL context does not survive a fork."""
+    pool = ProcessPoolExecutor(min(workers, len(seeds)), get_context("spawn"), _start_worker, (factories,))
     try:
-        futures = {pool.submit(_play_in_worker, seed): seed for seed in seeds}
-        for future in as_completed(futures):
-            try:
-                yield future.result()
-            except BrokenProcessPool:
-                what = "a worker process died before this episode ended; evaluate.workers=1 would show where"
-                yield Result(futures[future], ERROR, error=what)
+        for future in as_completed([pool.submit(_play_in_worker, seed) for seed in seeds]):
+            yield future.result()
+    except BrokenProcessPool:
+        return
     finally:
         pool.shutdown(cancel_futures=True)
 

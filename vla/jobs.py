@@ -55,7 +55,7 @@ def preview(config: DictConfig) -> None:
     for file in files:
         file.unlink()
     (output / "recordings").rmdir()
-    contact_sheet(list(seeds), [episode.observations[0] for episode in episodes], output / "preview.png")
+    contact_sheet(list(seeds), [episode.observations[0] for episode in episodes]).save(output / "preview.png")
     show(draws_table(list(seeds), [episode.draws for episode in episodes]))
     log.info("wrote %s and %s", output / "preview.png", output / "preview.rrd")
 
@@ -145,6 +145,18 @@ def benchmark(config: DictConfig) -> None:
     benchmark(config, _output(config))
 
 
+def inspect(config: DictConfig) -> None:
+    """Verify and describe an episode store, which may first be put together from others; or replay one episode."""
+    from vla.stores import look_into, replay_into
+
+    asked = plain(config.inspect)
+    seed = asked.pop("episode")
+    if seed is None:
+        look_into(**asked)
+    else:
+        replay_into(_output(config), Path(asked["folder"]), seed)
+
+
 JOBS: dict[str, Callable[[DictConfig], float | None]] = {
     "preview": preview,
     "collect": collect,
@@ -153,6 +165,7 @@ JOBS: dict[str, Callable[[DictConfig], float | None]] = {
     "export": export,
     "deploy": deploy,
     "benchmark": benchmark,
+    "inspect": inspect,
 }
 
 

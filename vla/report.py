@@ -13,10 +13,11 @@ import numpy as np
 from rich.table import Table
 
 from vla.evaluate import ERROR, Report, Result, wilson_interval
-from vla.spec import Array, Observation
+from vla.spec import Array, Observation, flat, leaves
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from PIL import Image
 
 GREEN, RED, GREY = "#2e9e5b", "#d2483f", "#8a8f98"
 BINS = 5  # groups of equally many episodes into which a drawn number is cut
@@ -136,7 +137,7 @@ def _factors(played: Sequence[Result]) -> dict[str, list[Any]]:
     A pair of numbers is one factor, a point; longer lists are one factor per item.
     """
     rows = [
-        {name: value for axis, draw in _axes("", result.draws) for name, value in _items(axis, draw)}
+        {name: value for axis, draw in flat(result.draws).items() for name, value in _items(axis, draw)}
         for result in played
     ]
     names = [name for name in (rows[0] if rows else {}) if all(name in row for row in rows)]
@@ -179,8 +180,8 @@ def _association(values: Sequence[Any], played: Sequence[Result]) -> float:
     return float(squares / (rate * (1 - rate)) / (len(groups) - 1))
 
 
-def contact_sheet(seeds: Sequence[int], observations: Sequence[Observation], path: Path, columns: int = 2) -> None:
-    """Save what the cameras see right after resets as one PNG.
+def contact_sheet(seeds: Sequence[int], observations: Sequence[Observation], columns: int = 2) -> Image.Image:
+    """What the cameras see right after resets, on one picture.
 
     One block per reset, captioned with its seed and instruction: each camera's colours, then each camera's depth,
     from near (blue) to far (red) in the same range for all resets. Pixels are enlarged, never blended.
@@ -207,7 +208,7 @@ def contact_sheet(seeds: Sequence[int], observations: Sequence[Observation], pat
     legend = [f"{name} depth {low / 1000:.2f}-{high / 1000:.2f} m" for name, (low, high) in ranges.items()]
     names = ", ".join([f"{name} colour" for name in observations[0].rgb] + legend)
     draw.text((CAPTION, sheet.height - CAPTION - 4), f"from left to right: {names}", fill="black", font=font)
-    sheet.save(path)
+    return sheet
 
 
 def _depth_range(images: Sequence[Array]) -> tuple[float, float]:
@@ -224,27 +225,22 @@ def _framed(tile: Array) -> Array:
 def draws_table(seeds: Sequence[int], draws: Sequence[Mapping[str, Any]]) -> Table:
     """What was drawn in several resets: the range of every draw, or the words in it, and the first reset's values."""
     table = Table("draw", "range", f"seed {seeds[0]}", title=f"{len(draws)} resets")
-    named = [dict(_axes("", draw)) for draw in draws]
-    for name in dict.fromkeys(name for row in named for name in row):
-        leaves = [leaf for row in named if name in row for leaf in _leaves(row[name])]
-        numbers = all(isinstance(leaf, (int, float)) for leaf in leaves)
-        seen = (
-            f"{min(leaves):.4g} … {max(leaves):.4g}" if numbers else ", ".join(sorted({str(leaf) for leaf in leaves}))
-        )
-        first = " ".join(
-            f"{leaf:.3g}" if isinstance(leaf, float) else str(leaf) for leaf in _leaves(named[0].get(name))
-        )
-        table.add_row(name, seen, first)
+    first = flat(draws[0])
+    for name, seen in spans(draws).items():
+        values = [f"{leaf:.3g}" if isinstance(leaf, float) else str(leaf) for leaf in leaves(first.get(name))]
+        table.add_row(name, seen, " ".join(values))
     return table
 
 
-def _axes(name: str, value: Any) -> Iterator[tuple[str, Any]]:
-    if isinstance(value, Mapping):
-        for key, item in value.items():
-            yield from _axes(f"{name}.{key}" if name else str(key), item)
-    else:
-        yield name, value
-
-
-def _leaves(value: Any) -> list[Any]:
-    return [leaf.item() if isinstance(leaf, np.generic) else leaf for leaf in np.array(value, dtype=object).ravel()]
+def spans(draws: Sequence[Mapping[str, Any]]) -> dict[str, str]:
+    """Dotted name → the range of everything drawn under that name, or the words in it."""
+    seen: dict[str, list[Any]] = {}
+    for draw in draws:
+        for name, value in flat(draw).items():
+            seen.setdefault(name, []).extend(leaves(value))
+    return {
+        name: f"{min(values):.4g} … {max(values):.4g}"
+        if values and all(isinstance(value, (int, float)) for value in values)
+        else ", ".join(sorted({str(value) for value in values}))
+        for name, values in seen.items()
+    }

@@ -1,4 +1,4 @@
-"""The one loop: an agent acts in an environment while a recorder looks on."""
+"""The one loop: an agent acts in an environment while a recorder looks on; and the same again from its actions."""
 
 from __future__ import annotations
 
@@ -43,3 +43,27 @@ def rollout(environment: Environment, agent: Agent, seed: int, recorder: Recorde
     if recorder is not None:
         recorder.end(episode)
     return episode
+
+
+def replay(environment: Environment, episode: Episode, recorder: Recorder | None = None) -> int | None:
+    """Execute an episode's actions from its seed again; the recorder sees this world with the episode's observations.
+
+    Returns the first step at which the joints are not bit for bit as they were, N if only the end is another, or None.
+    """
+    observation = environment.reset(episode.seed)
+    if recorder is not None:
+        recorder.start(f"seed {episode.seed}", environment)
+    same = []
+    for seen, action in zip(episode.observations, episode.executed, strict=True):
+        if environment.done:
+            break
+        same.append(np.array_equal(observation.joints, seen.joints))
+        if recorder is not None:
+            recorder.step(seen, action, {})
+        observation = environment.step(action)
+    if recorder is not None:
+        recorder.end(episode)
+    if not all(same):
+        return same.index(False)
+    ended = len(same) == len(episode.executed) and environment.done and environment.outcome == episode.outcome
+    return None if ended else len(same)

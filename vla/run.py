@@ -27,7 +27,7 @@ PACKAGE = Path(__file__).resolve().parent
 # Inside the package where it was installed from a wheel, beside it in a clone.
 CONF = next(path for path in (PACKAGE / "conf", PACKAGE.parent / "conf") if (path / "config.yaml").is_file())
 
-ADOPTING = ("evaluate", "export", "deploy")  # jobs that use a checkpoint's own task, tokenizer and model
+ADOPTING = ("evaluate", "export", "deploy", "benchmark")  # jobs that use a checkpoint's own task, tokenizer and model
 TRACEBACKS = "VLA_TRACEBACKS"  # the user's wish for tracebacks, kept for the processes that a trainer starts
 
 

@@ -14,6 +14,8 @@ import numpy as np
 
 Array = np.ndarray
 
+FIRST_SEED = 1_000_000  # of evaluation; collection, which starts at small ones, never gets this far
+
 
 @dataclass(frozen=True)
 class Spec:
@@ -93,6 +95,23 @@ class Shape:
     rgba: Array  # (4,) 0…1
     vertices: Array | None = None  # (V, 3) float32 [m], meshes only
     faces: Array | None = None  # (F, 3) int32, meshes only
+
+
+def flat(draws: Mapping[str, Any]) -> dict[str, Any]:
+    """Dotted name → value of everything that was drawn in an episode."""
+    values: dict[str, Any] = {}
+    for name, draw in draws.items():
+        if isinstance(draw, Mapping):
+            values |= {f"{name}.{key}": value for key, value in flat(draw).items()}
+        else:
+            values[str(name)] = draw
+    return values
+
+
+def leaves(value: Any) -> list[Any]:
+    """The numbers and words in a draw, however deep they lie in lists."""
+    plain = value.tolist() if isinstance(value, (np.ndarray, np.generic)) else value
+    return [leaf for item in plain for leaf in leaves(item)] if isinstance(plain, (list, tuple)) else [plain]
 
 
 @dataclass

@@ -9,7 +9,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from multiprocessing import parent_process
 
-THREAD_SETTINGS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "LP_NUM_THREADS")
+# Mesa's renderer counts the threads beside the one that calls it.
+THREAD_SETTINGS = {"OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "LP_NUM_THREADS": "0"}
 
 
 def cores() -> int:
@@ -31,7 +32,7 @@ def leave_with_parent() -> None:
 
 def one_thread() -> None:
     """Numerical libraries use one thread from now on: sums must not depend on how many workers share the machine."""
-    os.environ.update(dict.fromkeys(THREAD_SETTINGS, "1"))  # read by libraries that are loaded from now on
+    os.environ.update(THREAD_SETTINGS)  # read by libraries that are loaded from now on
     if torch := sys.modules.get("torch"):  # loaded already where this process trained the policy
         torch.set_num_threads(1)
 

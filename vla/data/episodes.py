@@ -4,6 +4,9 @@ A folder holds `store.json` (what the rows mean), `<field>.bin` (the rows of eve
 `index.jsonl`. An episode exists once its index line does: its rows are flushed to disk before the line is, so a
 process killed at any moment leaves at most a tail that no line speaks of, and the next writer cuts it off. The bytes
 depend on the episodes only, never on when or by how many processes they were made.
+
+A store that was collected holds consecutive seeds of one config, and grows. One that was put together from others
+(`vla.data.inspection`) has their configs as `parts` in its own, holds whatever seeds were chosen, and does not grow.
 """
 
 from __future__ import annotations
@@ -25,6 +28,9 @@ from vla.spec import Array, Episode, Spec
 
 FORMAT = 1
 REMEDY = "copy the folder again from where it is whole, or delete it and collect again"
+SALVAGE = f"keep what is whole with job=inspect inspect.repair=true, {REMEDY}"
+LOST = "lost"  # outcome of a seed of which a damaged index tells nothing
+MOMENTS = {"low", "high", "sum", "square"}  # of the actions of an episode
 
 log = logging.getLogger(__name__)
 
@@ -77,16 +83,17 @@ class EpisodeStore:
 
     Attributes: `spec`; `config`, what made the episodes; `fields`, as `fields_of`; `tried`, one entry per seed.
     With `episodes` only the first so many are seen. Raises a ValueError where there is no store, its format is unknown,
-    it is damaged, or it holds fewer than `episodes`.
+    it is damaged, or it holds fewer than `episodes`. With `damaged` a store whose files are cut short or whose index
+    has unreadable lines is opened as well, to read what is left; the seeds of such lines are `LOST`.
     """
 
-    def __init__(self, folder: str | Path, episodes: int | None = None) -> None:
+    def __init__(self, folder: str | Path, episodes: int | None = None, damaged: bool = False) -> None:
         self.folder = Path(folder)
         header = _read_header(self.folder)
         self.spec = Spec.from_dict(header["spec"])
         self.config: dict[str, Any] = header["config"]
         self.fields = fields_of(self.spec)
-        self._limit = episodes
+        self._limit, self._damaged = episodes, damaged
         self._files: dict[str, BinaryIO] = {}
         self._refresh()
         if episodes is not None and len(self.episodes) < episodes:
@@ -107,7 +114,7 @@ class EpisodeStore:
         store = cls(folder)
         spec.require(store.spec, "this task", f"the episode store {folder}")
         different = sorted(key for key in {*plain, *store.config} if plain.get(key) != store.config.get(key))
-        if different:
+        if different and not store.derived:  # which was put together by somebody who knows why
             raise ValueError(f"{folder} was collected with another config for {different}: choose another folder")
         return store
 
@@ -117,9 +124,14 @@ class EpisodeStore:
         return [entry for entry in self.tried if entry.success][: self._limit]
 
     @property
+    def derived(self) -> bool:
+        """Whether the episodes were chosen from other stores, rather than collected."""
+        return "parts" in self.config
+
+    @property
     def next_seed(self) -> int | None:
-        """The seed to try next; None while none has been tried."""
-        return self.tried[-1].seed + 1 if self.tried else None
+        """The seed to try next; None while none has been tried, or where any may follow."""
+        return self.tried[-1].seed + 1 if self.tried and not self.derived else None
 
     @property
     def statistics(self) -> Statistics:
@@ -146,13 +158,14 @@ class EpisodeStore:
     def read(self, entry: Entry) -> dict[str, Array]:
         """Field → (steps, …) rows of one episode; a ValueError if they are not those that were written."""
         rows = {field: np.array(self.rows(field)[entry.start : entry.start + entry.steps]) for field in self.fields}
-        if _crc(rows) != entry.crc:
-            raise ValueError(f"the rows of seed {entry.seed} in {self.folder} were changed on disk: {REMEDY}")
+        if any(len(values) < entry.steps for values in rows.values()) or _crc(rows) != entry.crc:
+            raise ValueError(f"the rows of seed {entry.seed} in {self.folder} were changed on disk: {SALVAGE}")
         return rows
 
     @contextmanager
     def writing(self) -> Iterator[None]:
         """Hold the store for writing: waits for another writer, then cuts off what a killed one left unfinished."""
+        assert not self._damaged, "a damaged store is left as it is"
         lock = FileLock(self.folder / "lock")
         try:
             lock.acquire(timeout=0)
@@ -179,10 +192,9 @@ class EpisodeStore:
         """
         assert episode.success, "failures go to `fail`"
         rows = self._rows_of(episode)
-        action = rows["action"].astype(np.float64)
-        moments = {"low": action.min(0), "high": action.max(0), "sum": action.sum(0), "square": (action**2).sum(0)}
+        action = rows["action"]
         fixed = (episode.seed, episode.outcome, episode.instruction, self._rows, len(action), dict(episode.draws))
-        self._commit(Entry(*fixed, _crc(rows), {name: values.tolist() for name, values in moments.items()}), rows)
+        self._commit(Entry(*fixed, _crc(rows), moments(action)), rows)
 
     def fail(self, seed: int, outcome: str, draws: Mapping[str, Any]) -> None:
         """Note that `seed` was tried and why it failed; no rows are stored. Raises as `append` does."""
@@ -213,12 +225,15 @@ class EpisodeStore:
             os.truncate(self._path(field), self._size(field))
 
     def _refresh(self) -> None:
-        self.tried, self._index_size = _read_index(self._path("index"))
-        self._rows = sum(entry.steps for entry in self.tried)
+        self.tried, self._index_size = _read_index(self._path("index"), self.derived, self._damaged)
+        self._rows = max((entry.start + entry.steps for entry in self.tried), default=0)
         for field in self.fields if self._rows else ():
             path, needed = self._path(field), self._size(field)
-            if not path.exists() or path.stat().st_size < needed:
-                raise ValueError(f"{path} is shorter than the {needed} bytes that its index speaks of: {REMEDY}")
+            size = path.stat().st_size if path.exists() else 0
+            if size < needed and not self._damaged:
+                raise ValueError(f"{path} is shorter than the {needed} bytes that its index speaks of: {SALVAGE}")
+            if size < needed:
+                self._rows = self._rows * size // needed
 
     def _rows_of(self, episode: Episode) -> dict[str, Array]:
         seen = episode.observations
@@ -248,6 +263,13 @@ class EpisodeStore:
 
     def _path(self, name: str) -> Path:
         return self.folder / ("index.jsonl" if name == "index" else f"{name}.bin")
+
+
+def moments(actions: Array) -> dict[str, list[float]]:
+    """What an entry keeps of the actions (N, D) of its episode."""
+    wide = actions.astype(np.float64)
+    values = {"low": wide.min(0), "high": wide.max(0), "sum": wide.sum(0), "square": (wide**2).sum(0)}
+    return {name: value.tolist() for name, value in values.items()}
 
 
 def _crc(rows: Mapping[str, Array]) -> int:
@@ -306,21 +328,41 @@ def _read_header(folder: Path) -> dict[str, Any]:
     return header
 
 
-def _read_index(path: Path) -> tuple[list[Entry], int]:
-    """The entries and the number of bytes they take: a last line that was cut short does not count."""
+def _read_index(path: Path, any_seed: bool, damaged: bool) -> tuple[list[Entry], int]:
+    """The entries and the number of bytes they take: a last line that was cut short does not count.
+
+    Unless `any_seed`, seeds are consecutive, so that it can be told which are `LOST` in a damaged index.
+    """
+    remedy = REMEDY if any_seed else SALVAGE
     entries: list[Entry] = []
-    size = rows = 0
+    size = rows = last = 0
     lines = path.read_bytes().split(b"\n") if path.exists() else [b""]
     for number, line in enumerate(lines[:-1], start=1):
         try:
-            entry = Entry(**json.loads(line))
+            entry = _entry(line)
         except (ValueError, TypeError) as error:
             if number == len(lines) - 1:
                 break
-            raise ValueError(f"line {number} of {path} cannot be read: {REMEDY}") from error
-        if entry.start != rows or (entries and entry.seed != entries[-1].seed + 1):
-            raise ValueError(f"line {number} of {path} does not follow the line before it: {REMEDY}")
+            if damaged and not any_seed:
+                continue
+            raise ValueError(f"line {number} of {path} cannot be read: {remedy}") from error
+        before = entries[-1].seed if entries else entry.seed - number
+        if entry.start != rows or (entry.seed != before + 1 and not any_seed):
+            if not damaged or any_seed:
+                raise ValueError(f"line {number} of {path} does not follow the line before it: {remedy}")
+            if not 1 <= entry.seed - before <= number - last + 1:  # a lost line end makes one line of two
+                continue
+            entries += [Entry(seed, LOST, "", rows, 0, {}, 0, {}) for seed in range(max(before + 1, 0), entry.seed)]
         entries.append(entry)
-        rows += entry.steps
-        size += len(line) + 1
+        rows, size, last = entry.start + entry.steps, size + len(line) + 1, number
     return entries, size
+
+
+def _entry(line: bytes) -> Entry:
+    entry = Entry(**json.loads(line))
+    counts = (entry.seed, entry.start, entry.steps, entry.crc)
+    if not all(type(count) is int and count >= 0 for count in counts) or (
+        entry.success and set(entry.action) != MOMENTS
+    ):
+        raise ValueError("its numbers are no counts, or some are missing")
+    return entry

@@ -50,7 +50,7 @@ class View(Eavesdropper):
             "sensor_msgs/msg/JointState": lambda topic, m: self._joints(topic, m.name, m.position),
             "trajectory_msgs/msg/JointTrajectory": self._trajectory,
             "diagnostic_msgs/msg/DiagnosticStatus": self._status,
-            "std_msgs/msg/String": lambda topic, m: self._stream.log("words", rr.TextLog(f"{topic}: {m.data}")),
+            "std_msgs/msg/String": lambda topic, m: self._say(f"{topic}: {m.data}"),
         }
         if kind not in draw:
             return None
@@ -69,11 +69,14 @@ class View(Eavesdropper):
         if self._save is not None:
             os.replace(self._save.with_name(f"{self._save.name}.partial"), self._save)
 
+    def _say(self, words: str, level: rr.TextLogLevel = rr.TextLogLevel.INFO) -> None:
+        self._stream.log("words", rr.TextLog(words, level=level))
+
     def _image(self, topic: str, message: Any) -> None:
         try:
             pixels = messages.image_from(message, (message.height, message.width))
         except ValueError as error:
-            return self._stream.log("words", rr.TextLog(f"{topic}: {error}", level=rr.TextLogLevel.WARN))
+            return self._say(f"{topic}: {error}", rr.TextLogLevel.WARN)
         return self._stream.log(f"camera{topic}", rr.Image(pixels).compress(jpeg_quality=90))
 
     def _trajectory(self, topic: str, message: Any) -> None:
@@ -92,7 +95,7 @@ class View(Eavesdropper):
 
     def _status(self, topic: str, message: Any) -> None:
         level = LEVELS[min(int.from_bytes(message.level, "little"), len(LEVELS) - 1)]
-        self._stream.log("words", rr.TextLog(f"{message.name}: {message.message}", level=level))
+        self._say(f"{message.name}: {message.message}", level)
         for pair in message.values:
             if pair.key.endswith("[ms]"):
                 name = pair.key.removesuffix(" [ms]")
@@ -104,9 +107,10 @@ class View(Eavesdropper):
         """Cameras and words above, curves below."""
         views = [rrb.Spatial2DView(origin=f"camera{topic}", name=topic) for topic in self._cameras]
         words = rrb.TextLogView(origin="/words", name="words and states")
+        legend = rrb.PlotLegend(visible=False)
         curves = [
-            rrb.TimeSeriesView(origin="/joints", name="joints [rad], commanded thinner"),
-            rrb.TimeSeriesView(origin="/gripper", name="fingers [m]"),
+            rrb.TimeSeriesView(origin="/joints", name="joints [rad], commanded thinner", plot_legend=legend),
+            rrb.TimeSeriesView(origin="/gripper", name="fingers [m]", plot_legend=legend),
             rrb.TimeSeriesView(origin="/latency", name="latencies [ms]"),
         ]
         layout = rrb.Vertical(rrb.Horizontal(*views, words), rrb.Horizontal(*curves, column_shares=[2, 1, 1]))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Literal
 
 import mujoco
@@ -10,7 +11,18 @@ from dm_control import mjcf
 
 from vla.spec import Array, Shape
 from vla.tasks.control import HOME, MAX_OPENING
-from vla.tasks.scene import BLOCK_DENSITY, COLOURS, PAD_THICKNESS, Scene
+from vla.tasks.scene import BLOCK_DENSITY, BLOCK_HALF_SIZE, COLOURS, PAD_THICKNESS, PADS, TEXTURE, Scene
+
+AWAY = (-1.5, 0.0, -3.0)  # where things are that are not there [m]
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Standard deviations of what the sensors add."""
+
+    image: float = 0.0  # of a colour channel, 0…255
+    joints: float = 0.0  # [rad]
+    gripper: float = 0.0  # [m]
 
 
 class BoundScene:
@@ -18,6 +30,9 @@ class BoundScene:
 
     # Model fields that randomisation may change; everything else stays as compiled.
     RANDOMISABLE = (
+        "geom_type",
+        "geom_contype",
+        "geom_conaffinity",
         "geom_rgba",
         "geom_size",
         "geom_friction",
@@ -25,6 +40,9 @@ class BoundScene:
         "geom_aabb",
         "body_mass",
         "body_inertia",
+        "body_gravcomp",
+        "actuator_gainprm",
+        "actuator_biasprm",
         "light_pos",
         "light_dir",
         "light_diffuse",
@@ -49,48 +67,96 @@ class BoundScene:
         free = self.model.body_jntadr[self.block_bodies]
         self.block_positions = self.model.jnt_qposadr[free]  # of x y z, quaternion wxyz
         self.block_velocities = self.model.jnt_dofadr[free]
-        self.pad = int(self.model.body("pad").mocapid[0])
+        self.zones = [int(self.model.body(f"{name}_pad").mocapid[0]) for name in PADS]
         self.cameras = {"front": self.model.camera("front").id, "wrist": self.model.camera("panda/wrist").id}
+        self.arm_actuators = np.arange(len(self.joints))  # the fingers' comes after them
+        self.robot_geoms = np.flatnonzero(
+            [model_body.startswith("panda/") for model_body in map(self._body_of, range(self.model.ngeom))]
+        )
         self._nominal = {name: getattr(self.model, name).copy() for name in self.RANDOMISABLE}
         self._scratch = mujoco.MjData(self.model)
+        self._painted: set[int] = set()  # textures that are not plain
+        self.stale_textures: set[int] = set()  # which a renderer has yet to take over
 
     def restore(self) -> None:
-        """Undo every randomisation: nominal model, blocks in a row, arm at home."""
+        """Undo every randomisation: nominal model, three blocks in a row, arm at home."""
         for name, value in self._nominal.items():
             getattr(self.model, name)[:] = value
-
+        for name in ("table", "floor"):
+            if self.model.texture(name).id in self._painted:
+                self.paint_texture(name, np.full((TEXTURE, TEXTURE, 3), 255, np.uint8))
+                self._painted.remove(self.model.texture(name).id)
         count = len(self.block_geoms)
+        self.extents = np.full((count, 3), BLOCK_HALF_SIZE)  # half sizes of the blocks, upright [m]
+        self.present = min(count, 3)  # blocks on the table, the first ones
+        self.latency = 0.0  # from a command to the motors [s]
+        self.noise = Noise()
+        self.novelty: float = 0.0  # probability that an evaluation's instruction has something new in it
         self.paint_blocks(list(COLOURS)[:count], np.array(list(COLOURS.values()))[:count])
-        self.place_pad(0.4, 0.0)
+        for pad in range(len(PADS)):
+            self.place_pad(pad, 0.4, 0.15 * pad)
         for index in range(count):
-            self.place_block(index, 0.52, 0.12 * (index - (count - 1) / 2), 0.0)
+            self.place_block(index, 0.52, 0.12 * (index - (self.present - 1) / 2), 0.0)
         self.place_arm(HOME, MAX_OPENING)
+
+    def _body_of(self, geom: int) -> str:
+        return str(self.model.body(self.model.geom_bodyid[geom]).name)
 
     def paint_blocks(self, names: list[str], rgb: Array) -> None:
         """Give each block a colour (count, 3) and the name that instructions call it by."""
         self.block_names = names
         self.model.geom_rgba[self.block_geoms, :3] = rgb
 
-    def set_block(self, index: int, half_size: float) -> None:
-        """Resize block `index` to a cube of `half_size` [m], with its mass and all that MuJoCo derives from them."""
-        mass = BLOCK_DENSITY * (2 * half_size) ** 3
+    def paint_texture(self, name: str, picture: Array) -> None:
+        """Lay a picture (TEXTURE, TEXTURE, 3) uint8 on the table or the floor."""
+        texture = self.model.texture(name).id
+        start = self.model.tex_adr[texture]
+        self.model.tex_data[start : start + picture.size] = picture.ravel()
+        self._painted.add(texture)
+        self.stale_textures.add(texture)
+
+    def set_block(self, index: int, half_size: Array, round: bool = False) -> None:
+        """Make block `index` a box of half sizes (3,) [m], or a cylinder of that radius and height, with its mass and
+        all that MuJoCo derives from them."""
+        x, y, z = self.extents[index] = half_size
+        volume = 2 * np.pi * x**2 * z if round else 8 * x * y * z
+        mass = BLOCK_DENSITY * volume
         model, geom, body = self.model, self.block_geoms[index], self.block_bodies[index]
-        model.geom_size[geom] = half_size
-        model.geom_rbound[geom] = half_size * np.sqrt(3)
+        kind = mujoco.mjtGeom.mjGEOM_CYLINDER if round else mujoco.mjtGeom.mjGEOM_BOX
+        model.geom_type[geom] = int(kind)
+        model.geom_size[geom] = (x, z, 0.0) if round else half_size
+        model.geom_rbound[geom] = np.hypot(x, z) if round else np.linalg.norm(half_size)
         model.geom_aabb[geom, 3:] = half_size
         start, count = model.body_bvhadr[body], model.body_bvhnum[body]
         model.bvh_aabb[start : start + count, 3:] = half_size
         model.body_mass[body] = mass
-        model.body_inertia[body] = mass * (2 * half_size) ** 2 / 6
+        if round:  # a solid cylinder about its axis, and across it
+            model.body_inertia[body] = mass * np.array([x**2 / 4 + z**2 / 3, x**2 / 4 + z**2 / 3, x**2 / 2])
+        else:
+            model.body_inertia[body] = mass / 3 * (np.sum(self.extents[index] ** 2) - self.extents[index] ** 2)
 
-    def finish(self) -> None:
-        """Make model and state consistent after all changes."""
+    def finish(self, pads: int) -> None:
+        """Make model and state consistent after all changes; only so many pads lie on the table."""
+        for index in range(len(self.block_geoms)):
+            if index >= self.present:
+                self._take_away(index)
+        for pad in range(pads, len(PADS)):
+            self.data.mocap_pos[self.zones[pad]] = AWAY
         mujoco.mj_setConst(self.model, self._scratch)  # without it, physics explodes after a change of mass
-        self.data.qpos[self.block_positions + 2] = self.model.geom_size[self.block_geoms, 2]
+        here = self.block_positions[: self.present]
+        self.data.qpos[here + 2] = self.extents[: self.present, 2]
 
-    def place_pad(self, x: float, y: float) -> None:
-        """Put the target pad on the table at (x, y) [m]."""
-        self.data.mocap_pos[self.pad] = (x, y, PAD_THICKNESS)
+    def _take_away(self, index: int) -> None:
+        """Let a block float where nobody sees it and nothing touches it."""
+        geom = self.block_geoms[index]
+        self.model.geom_contype[geom] = self.model.geom_conaffinity[geom] = 0
+        self.model.body_gravcomp[self.block_bodies[index]] = 1.0
+        start = self.block_positions[index]
+        self.data.qpos[start : start + 7] = (*AWAY, 1, 0, 0, 0)
+
+    def place_pad(self, pad: int, x: float, y: float) -> None:
+        """Put pad number `pad` on the table at (x, y) [m]."""
+        self.data.mocap_pos[self.zones[pad]] = (x, y, PAD_THICKNESS)
 
     def place_arm(self, joints: Array, opening: float) -> None:
         """Put the arm at rest in `joints` (7,) [rad], with `opening` between the fingertips [m]."""
@@ -107,13 +173,12 @@ class BoundScene:
 
     def place_block(self, index: int, x: float, y: float, yaw: float) -> None:
         """Rest block `index` on the table at (x, y) [m], turned by `yaw` [rad]."""
-        height = self.model.geom_size[self.block_geoms[index], 2]
         start = self.block_positions[index]
-        self.data.qpos[start : start + 7] = (x, y, height, np.cos(yaw / 2), 0, 0, np.sin(yaw / 2))
+        self.data.qpos[start : start + 7] = (x, y, self.extents[index, 2], np.cos(yaw / 2), 0, 0, np.sin(yaw / 2))
 
-    def block_position(self, index: int) -> Array:
-        """(3,) centre of block `index` [m]."""
-        return self.data.geom_xpos[self.block_geoms[index]].copy()
+    def block_centres(self) -> Array:
+        """(count, 3) centres of the blocks that are on the table [m]."""
+        return self.data.geom_xpos[self.block_geoms[: self.present]].copy()
 
     def touching(self) -> set[tuple[int, int]]:
         """(pad number, block index) of every fingertip that touches a block."""

@@ -13,13 +13,19 @@ import numpy as np
 
 from vla.spec import Array, Observation, Spec
 from vla.tasks.control import DOWN, MAX_OPENING, rotation_z, vector_from_rotation
+from vla.tasks.goals.goal import MANNERS, Manner
 
 HOVER = 0.08  # height above the block from which it is approached [m]
 CARRY = 0.07  # height above the table at which it is carried [m]
 FUNNEL = 2.5  # height gained per metre of horizontal distance, so that approaches come from above
 # As loose as still works: a learner that is a centimetre off must not wait for ever to be exact.
 GRASP_XY, GRASP_Z = 0.012, 0.012  # tolerances at which the gripper closes, turned as it is [m]
-PLACE_XY, PLACE_Z = 0.02, 0.012  # tolerances at which it opens [m]
+PLACE_Z = 0.012  # tolerance of the height at which it opens [m]
+FINGERTIP = 0.012  # half the width of the closed fingertips [m]
+LOW = 0.012  # lowest tool point at which a fingertip clears the table [m]
+LANE = 0.010  # how far beside the line of a push the fingertips may be [m]
+PUSH_AT = 1.1  # where a block is pushed, as a share of half its height: it tips neither way
+PUSH = 0.015  # furthest that a block is pushed in one step [m]
 MAX_YAW = 0.9  # furthest turn from neutral from which the nearest faces are taken [rad]
 CLEARANCE = 0.012  # between open fingers and a block on both sides together [m]
 
@@ -56,9 +62,12 @@ class Waypoint:
 
     def _decide(self, truth: dict[str, Array], opening: float) -> Array:
         """(7,) unclipped action for this state."""
+        manner = MANNERS[int(truth["manner"][0])]
+        if manner == "push":
+            return self._push(truth)
         if truth["grasped"][0]:
-            return self._carry(truth)
-        if truth["releases"][0] and _placed(truth):
+            return self._carry(truth, manner)
+        if manner == "place" and _placed(truth):
             free = opening > 2 * truth["half_size"][0] + CLEARANCE / 2
             return self._action(truth, np.array([0.0, 0.0, HOVER if free else 0.0]), 0.0, 1.0)
         return self._reach(truth, opening)
@@ -78,21 +87,38 @@ class Waypoint:
         if opening < width + CLEARANCE:
             height = max(height, 0.045) if not between else HOVER
         offset[2] += height
-        if offset[2] > 0.01:  # too low: rise before moving sideways, so that nothing is pushed over
-            offset[:2] *= 0.02 / (0.02 + offset[2])
-        return self._action(truth, offset, yaw, 1.0)
+        return self._action(truth, _rising_first(offset), yaw, 1.0)
 
-    def _carry(self, truth: dict[str, Array]) -> Array:
-        offset = truth["destination"] - truth["block"]
+    def _carry(self, truth: dict[str, Array], manner: Manner) -> Array:
+        offset, tolerance = truth["destination"] - truth["block"], truth["tolerance"][0]
         away = float(np.hypot(offset[0], offset[1]))
-        if not truth["releases"][0]:
+        if manner == "hold":
             return self._action(truth, offset, 0.0, 0.0)
-        height = min(FUNNEL * max(away - PLACE_XY / 2, 0.0), CARRY)
-        opens = away < PLACE_XY and abs(offset[2]) < PLACE_Z
+        height = min(FUNNEL * max(away - tolerance / 2, 0.0), CARRY)
+        opens = away < tolerance and abs(offset[2]) < PLACE_Z
         offset[2] += height
-        if offset[2] > 0.01:
-            offset[:2] *= 0.02 / (0.02 + offset[2])
-        return self._action(truth, offset, 0.0, 1.0 if opens else 0.0)
+        return self._action(truth, _rising_first(offset), 0.0, 1.0 if opens else 0.0)
+
+    def _push(self, truth: dict[str, Array]) -> Array:
+        """Go behind the block, as seen from its destination, and drive through it with closed fingers."""
+        tool, block, (half, _, half_height) = truth["commanded"][:3, 3], truth["block"], truth["half_size"]
+        way = (truth["destination"] - block)[:2]
+        distance = float(np.hypot(*way))
+        ahead = way / max(distance, 1e-6)
+        aside = np.array([-ahead[1], ahead[0]])
+        along, across = (tool - block)[:2] @ ahead, (tool - block)[:2] @ aside
+        near = np.hypot(along, across) < half + FINGERTIP
+        if near and tool[2] < block[2] + half_height + FINGERTIP and tool[2] > LOW + half_height:
+            return self._action(truth, np.array([0.0, 0.0, HOVER]), 0.0, 1.0)  # around it: let go, and up
+        height = max(LOW, min(PUSH_AT * half, 0.9 * half_height))
+        behind = np.sqrt(2) * half + FINGERTIP + 0.006  # whatever the block's turn
+        if tool[2] < height + 0.012 and -behind - 0.03 < along < -half and abs(across) < LANE:
+            offset = np.append(min(distance, PUSH) * ahead - across * aside, height - tool[2])
+            return self._action(truth, offset, 0.0, 0.0)
+        offset = np.append(block[:2] - (behind + 0.004) * ahead, height) - tool
+        away = float(np.hypot(offset[0], offset[1]))
+        offset[2] += min(FUNNEL * max(away - LANE / 2, 0.0), HOVER)
+        return self._action(truth, _rising_first(offset), 0.0, 0.0)
 
     def _action(self, truth: dict[str, Array], offset: Array, yaw: float, gripper: float) -> Array:
         """Move by `offset`, scaled to what one step allows without bending the path, upright and turned by `yaw`."""
@@ -102,10 +128,17 @@ class Waypoint:
         return np.concatenate([offset / scale, vector_from_rotation(upright @ rotation.T), [gripper]])
 
 
+def _rising_first(offset: Array) -> Array:
+    """The same way, but up before sideways where the tool is too low, so that nothing is pushed over."""
+    if offset[2] > 0.01:
+        offset[:2] *= 0.02 / (0.02 + offset[2])
+    return offset
+
+
 def _placed(truth: dict[str, Array]) -> bool:
     """The block rests close enough to its destination."""
     offset = truth["destination"] - truth["block"]
-    return bool(np.hypot(offset[0], offset[1]) < PLACE_XY + 0.01 and abs(offset[2]) < PLACE_Z)
+    return bool(np.hypot(offset[0], offset[1]) < 1.5 * truth["tolerance"][0] and abs(offset[2]) < PLACE_Z)
 
 
 def _yaw_to_faces(truth: dict[str, Array]) -> float:

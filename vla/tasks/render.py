@@ -33,6 +33,13 @@ class Renderer:
         self._rgb = np.empty((height, width, 3), np.uint8)
         self._depth = np.empty((height, width), np.float32)
 
+    def take_over(self, textures: set[int]) -> None:
+        """Bring changed textures of the model, by number, to where images are made; empties the set."""
+        if textures:
+            self._gl.make_current()
+        while textures:
+            mujoco.mjr_uploadTexture(self._model, self._context, textures.pop())
+
     def render(self, data: mujoco.MjData, camera: int) -> tuple[Array, Array]:
         """(H, W, 3) uint8 colours and (H, W) uint16 depth along the optical axis [mm] of camera number `camera`."""
         self._gl.make_current()

@@ -22,10 +22,12 @@ COLOURS: dict[str, tuple[float, float, float]] = {
 }
 BLOCK_HALF_SIZE = 0.02  # nominal [m]
 BLOCK_DENSITY = 600.0  # of hardwood [kg/m³]
+PADS: dict[str, tuple[float, float, float]] = {"black": (0.12, 0.12, 0.14), "white": (0.93, 0.93, 0.90)}
 PAD_RADIUS = 0.05  # [m]
 PAD_THICKNESS = 0.001  # half [m]: painted on, it does not collide
 TABLE_HALF_SIZE = (0.6, 0.8, 0.03)  # [m]
 TABLE_CENTRE = (0.4, 0.0)  # [m]
+TEXTURE = 64  # edge of the pictures that lie on table and floor [px]
 BLOCK_CONTACT = {"contype": 1, "conaffinity": 3}
 
 
@@ -53,7 +55,7 @@ def look_at(position: Sequence[float] | Array, target: Sequence[float] | Array, 
 
 
 class Block(composer.Entity):
-    """A coloured cube."""
+    """A coloured block: a cube until randomisation makes it something else."""
 
     def _build(self, name: str) -> None:
         self._root = mjcf.RootElement(model=name)
@@ -79,8 +81,8 @@ class Block(composer.Entity):
 class Scene(composer.Entity):
     """The world with everything in it; `BoundScene` finds it again in the compiled model."""
 
-    def _build(self, blocks: int = 3, meshes: Literal["light", "full"] = "light", shadows: bool = True) -> None:
-        """Args: blocks on the table; what the robot is drawn with; whether the lamp casts shadows."""
+    def _build(self, blocks: int = 4, meshes: Literal["light", "full"] = "light", shadows: bool = True) -> None:
+        """Args: most blocks on the table; what the robot is drawn with; whether the lamp casts shadows."""
         self._root = mjcf.RootElement(model="tabletop")
         self._root.compiler.angle = "radian"
         self._set_physics()
@@ -135,21 +137,37 @@ class Scene(composer.Entity):
             rgba=(0.72, 0.66, 0.58, 1),
             friction=(1.0, 0.01, 0.0002),
             group=2,
+            material=self._add_material("table", repeat=(3, 4)),
         )
         world.add(
-            "geom", name="floor", type="plane", size=(3, 3, 0.1), pos=(0, 0, -0.75), rgba=(0.45, 0.46, 0.48, 1), group=2
-        )
-        self.pad = world.add("body", name="pad", mocap=True, pos=(0.5, 0, PAD_THICKNESS))
-        self.pad.add(
             "geom",
-            name="pad",
-            type="cylinder",
-            size=(PAD_RADIUS, PAD_THICKNESS),
-            rgba=(0.12, 0.12, 0.14, 1),
-            contype=0,
-            conaffinity=0,
+            name="floor",
+            type="plane",
+            size=(3, 3, 0.1),
+            pos=(0, 0, -0.75),
+            rgba=(0.45, 0.46, 0.48, 1),
             group=2,
+            material=self._add_material("floor", repeat=(6, 6)),
         )
+        for name, rgb in PADS.items():
+            pad = world.add("body", name=f"{name}_pad", mocap=True, pos=(0.5, 0, PAD_THICKNESS))
+            pad.add(
+                "geom",
+                name=f"{name}_pad",
+                type="cylinder",
+                size=(PAD_RADIUS, PAD_THICKNESS),
+                rgba=(*rgb, 1),
+                contype=0,
+                conaffinity=0,
+                group=2,
+            )
+
+    def _add_material(self, name: str, repeat: tuple[int, int]) -> mjcf.Element:
+        """A material with a picture of its own, plain white until randomisation paints it."""
+        texture = self._root.asset.add(
+            "texture", name=name, type="2d", builtin="flat", rgb1=(1, 1, 1), width=TEXTURE, height=TEXTURE
+        )
+        return self._root.asset.add("material", name=name, texture=texture, texrepeat=repeat, specular=0.0)
 
     def _add_lights(self, shadows: bool) -> None:
         self._root.worldbody.add(

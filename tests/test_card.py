@@ -1,0 +1,79 @@
+"""What the card of a store says, in a terminal, as text and as a picture."""
+
+from __future__ import annotations
+
+import io
+import shutil
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+from rich.console import Console
+from test_episodes import EPISODES, add
+
+from vla.card import store_table, write_card
+from vla.data.episodes import EpisodeStore
+from vla.data.inspection import examine, put_together
+
+DRAWS: list[dict[str, Any]] = [
+    {
+        "light": {"tint": [0.1 * seed, 0.2, 0.3], "on": seed > 1},
+        "names": ["red", f"$|[{seed}]"],
+        "far": 0.5,
+        "n": seed,
+    }
+    | {"pad": [0.1 * seed, -0.2], "blocks": [[0.1, 0.2], [0.3, 0.1 * seed]], "four": [1.0, 2.0, 3.0, float(seed)]}
+    | ({"nothing": None, "some": [0.5] * seed} if seed < 2 else {"nested": [[0.1, 0.2, 0.3], [0.4, 0.5, 0.1 * seed]]})
+    for seed in range(5)
+]
+
+
+def described(store: EpisodeStore) -> tuple[str, str, Image.Image]:
+    findings, console = examine(store), Console(width=120, record=True, file=io.StringIO())
+    console.print(store_table(findings))
+    card = write_card(findings)
+    return console.export_text(), card.read_text(encoding="utf-8"), Image.open(card.with_name("card.png"))
+
+
+def test_the_card_tells_what_is_there(tmp_path: Path) -> None:
+    table, text, page = described(add(tmp_path / "store", EPISODES))
+    steps = sum(len(episode.actions) for episode in EPISODES if episode.success)
+    for words in ("4 whole ones, of 5 seeds tried: 0 to 4", f"{steps}, from", "80.0 %", "1 timeout", "front, wrist"):
+        assert words in table
+    low, high = (ends for ends in zip(*(e.draws["point"] for e in EPISODES if e.success), strict=True))
+    numbers = [*low, *high]
+    assert (
+        f"# store\n\n4 episodes, {steps} steps, {steps / 600:.1f} min at 10 Hz; success on 80.0 % of the seeds tried."
+        in text
+    )
+    assert f"point | {min(numbers):.4g} … {max(numbers):.4g}" in text
+    assert "gripper | 1 | 0.0 | 1.0 | 1 | 0" in text
+    assert f"rgb_front | (16, 16, 3) | uint8 | {steps * 768}" in text
+    assert '"size": 1.0' in text and "collect.episodes=4" in text
+    assert page.width > 1000 and len(np.unique(np.array(page))) > 10
+
+
+def test_the_card_is_the_same_wherever_the_store_is(tmp_path: Path) -> None:
+    first = add(tmp_path / "store", EPISODES).folder
+    described(EpisodeStore(first))
+    second = Path(shutil.copytree(first, tmp_path / "elsewhere" / "store"))
+    before = {name: (second / name).read_bytes() for name in ("card.md", "card.png")}
+    described(EpisodeStore(second))
+    assert {name: (second / name).read_bytes() for name in before} == before
+    assert not list(second.glob("*.partial"))
+
+
+def test_anything_that_can_be_drawn_can_be_shown(tmp_path: Path) -> None:
+    episodes = [replace(episode, draws=draws) for episode, draws in zip(EPISODES, DRAWS, strict=True)]
+    _, text, _ = described(add(tmp_path, episodes))
+    assert "light.tint | 0 … 0.4" in text and r"names | $\|[0], $\|[1], $\|[2], $\|[4], red" in text
+    assert described(add(tmp_path / "one", episodes[:1]))[2].width > 1000
+
+
+def test_a_store_that_was_put_together_says_of_what(tmp_path: Path) -> None:
+    store = add(tmp_path / "store", EPISODES)
+    put_together([store], tmp_path / "chosen", {"seed": [1, 2]})
+    _, text, _ = described(EpisodeStore(tmp_path / "chosen"))
+    assert "Chosen by `inspect.where={'seed': [1, 2]}`." in text and "2 seeds, 1, 2:" in text

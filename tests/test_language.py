@@ -1,0 +1,90 @@
+"""What is said in training, and what only in evaluation."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from conftest import make_tabletop
+
+from vla.spec import FIRST_SEED
+from vla.tasks.language import Grammar, Novelty
+
+GRAMMAR = Grammar(
+    phrasings=["{put} the {block} block there", "the {block} block, please"],
+    words={"put": ["put", "place"]},
+    held_out_phrasings=["there goes the {block} block"],
+    held_out_words={"put": ["set"]},
+    held_out_colours=["red"],
+)
+
+
+def said(novelty: Novelty | None) -> set[str]:
+    return {GRAMMAR.say({"block": "blue"}, novelty, np.random.RandomState(seed)) for seed in range(50)}
+
+
+def test_training_hears_every_phrasing_and_word_that_is_not_held_out() -> None:
+    heard = {"put the blue block there", "place the blue block there", "the blue block, please"}
+    assert said(None) == said("combinations") == heard
+
+
+def test_what_is_held_out_is_new_in_one_way_at_a_time() -> None:
+    assert said("words") == {"set the blue block there"}
+    assert said("phrasings") == {"there goes the blue block"}
+    assert GRAMMAR.novelties == ("words", "phrasings", "combinations")
+
+
+def test_a_held_out_part_that_training_hears_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"also in the part that training hears: \['put'\]"):
+        Grammar(["{put} {block}"], {"put": ["put"]}, ["{block}"], {"put": ["put"]})
+    with pytest.raises(ValueError, match="empty"):
+        Grammar(["{put} {block}"], {"put": ["put"]}, [], {"put": ["set"]})
+
+
+def draws(goal: str, level: str, first: int, count: int) -> list[dict[str, Any]]:
+    environment = make_tabletop(f"goal={goal}", f"randomize={level}")
+    drawn = []
+    with environment.blind():
+        for seed in range(first, first + count):
+            environment.reset(seed)
+            drawn.append(environment.draws)
+    environment.close()
+    return drawn
+
+
+def test_wide_evaluation_says_only_what_training_never_says() -> None:
+    training = {draw["language"]["instruction"] for draw in draws("pick_place", "wide", 0, 150)}
+    evaluation = [draw["language"] for draw in draws("pick_place", "wide", FIRST_SEED, 60)]
+    assert not training & {language["instruction"] for language in evaluation}
+    assert {language["novelty"] for language in evaluation} == {"words", "phrasings"}
+    assert {draw["language"]["novelty"] for draw in draws("pick_place", "default", FIRST_SEED, 5)} == {"none"}
+
+
+def test_in_a_mixture_some_colours_are_named_with_some_goals_in_evaluation_only() -> None:
+    held_out = {"Lift": "yellow", "PickPlace": "blue", "Stack": "green", "Push": "red"}
+    training = draws("mixed", "wide", 0, 150)
+    assert {draw["named"]["goal"] for draw in training} == {*held_out, "PickPlaceTwo"}
+    assert all(draw["named"]["colour"] != held_out.get(draw["named"]["goal"]) for draw in training)
+    new = [draw for draw in draws("mixed", "wide", FIRST_SEED, 100) if draw["language"]["novelty"] == "combinations"]
+    assert new and all(draw["named"]["colour"] == held_out[draw["named"]["goal"]] for draw in new)
+
+
+def test_who_is_named_does_not_depend_on_how_it_is_said() -> None:
+    environment = make_tabletop("randomize=wide")
+    with environment.blind():
+        for seed in range(FIRST_SEED, FIRST_SEED + 10):
+            environment.reset(seed)
+            new = environment.draws
+            phrasing, environment.task.randomize = (
+                environment.task.randomize,
+                {
+                    **environment.task.randomize,
+                    "phrasing": None,
+                },
+            )
+            environment.reset(seed)
+            environment.task.randomize = phrasing
+            assert environment.draws["named"] == new["named"]
+            assert environment.draws["language"] != new["language"]
+    environment.close()

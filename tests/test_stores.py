@@ -1,0 +1,65 @@
+"""`job=inspect` as its arguments ask for it."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+from typing import Any
+
+import pytest
+from test_episodes import EPISODES, add, content
+from test_inspection import MORE, change, flip
+
+from vla.data.episodes import EpisodeStore
+from vla.stores import look_into, replay_into
+
+
+def inspect(folder: Path, **arguments: Any) -> None:
+    look_into(**{"folder": str(folder), "stores": None, "where": None, "repair": False, "into": None, **arguments})
+
+
+def stored(folder: Path) -> dict[str, bytes]:
+    return {name: data for name, data in content(folder).items() if not name.startswith("card")}
+
+
+def test_what_is_damaged_is_described_and_repaired_beside_it(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    store = add(tmp_path / "store", EPISODES)
+    change(store.folder / "action.bin", lambda data: flip(data, 0))
+    damaged = stored(store.folder)
+    with pytest.raises(ValueError, match=r"store has 1 damaged episodes \(seeds 0: rows changed or lost\)"):
+        inspect(store.folder)
+    assert "3 whole ones, of 5 seeds tried" in capsys.readouterr().out
+    inspect(store.folder, repair=True)
+    assert [entry.seed for entry in EpisodeStore(tmp_path / "store-repaired").episodes] == [1, 2, 4]
+    assert stored(store.folder) == damaged and (tmp_path / "store-repaired/card.md").exists()
+    with pytest.raises(ValueError, match="store-repaired exists already"):
+        inspect(store.folder, repair=True)
+
+
+def test_what_is_whole_is_not_repaired(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    store = add(tmp_path / "store", EPISODES)
+    with caplog.at_level(logging.INFO, "vla"):
+        inspect(store.folder, repair=True)
+    assert "nothing is repaired" in caplog.text and [path.name for path in tmp_path.iterdir()] == ["store"]
+
+
+def test_stores_are_merged(tmp_path: Path) -> None:
+    stores = [str(add(tmp_path / name, some).folder) for name, some in (("a", MORE[:4]), ("b", MORE[3:]))]
+    inspect(tmp_path / "nowhere", stores=stores, into=str(tmp_path / "merged"))
+    assert stored(tmp_path / "merged") == stored(add(tmp_path / "whole", MORE).folder)
+
+
+def test_a_new_store_needs_a_folder(tmp_path: Path) -> None:
+    for asked in ({"where": {"seed": 1}}, {"stores": ["a", "b"]}):
+        with pytest.raises(ValueError, match=r"say where, with inspect\.into=DIR"):
+            inspect(tmp_path, **asked)
+
+
+def test_an_episode_without_a_task_has_no_scene(tmp_path: Path) -> None:
+    store = EpisodeStore.create_or_open(tmp_path / "store", add(tmp_path / "other", []).spec, {})
+    with store.writing():
+        store.append(EPISODES[0])
+    with pytest.raises(ValueError, match="does not say in which task seed 0 was made"):
+        replay_into(tmp_path, store.folder, 0)

@@ -1,0 +1,28 @@
+"""One of several goals, drawn per episode."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from vla.tasks.goals.goal import Goal
+
+
+class Mixed:
+    """One of several goals, drawn per episode; `blocks` is the fewest that must lie on the table for any of them."""
+
+    def __init__(self, goals: Mapping[str, Goal | None]) -> None:
+        """Args: name → goal, or None to leave one out.
+
+        Raises:
+            ValueError: there is none.
+        """
+        self.goals = {name: goal for name, goal in goals.items() if goal is not None}
+        if not self.goals:
+            raise ValueError("task.goal.goals names no goal")
+        self.blocks = max(goal.blocks for goal in self.goals.values())
+
+    def draw(self, random_state: np.random.RandomState) -> Goal:
+        """One of them."""
+        return self.goals[str(random_state.choice(list(self.goals)))]
