@@ -42,6 +42,7 @@ def config(**changes: Any) -> DictConfig:
                 "randomize": {"mass": MASSES, "size": None},
             },
             "expert": {"_target_": "vla.tasks.expert.Waypoint", "perturb": PERTURBATION},
+            "cluster": {"_target_": "vla.cluster.Local", "workers": None},
         }
     )
     for key, value in changes.items():

@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import logging
 import os
+import resource
 import signal
 import subprocess
 import sys
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 import toy
 
+from vla.cluster import Local
 from vla.collect import NOT_REPEATABLE, PATIENCE, MakeEnvironment, MakeExpert, Summary, collect
 from vla.data.episodes import EpisodeStore
 
@@ -21,12 +24,14 @@ TRIED = 37  # seeds 3, 8, 13, … fail
 
 SCRIPT = """
 import sys, toy
+from vla.cluster import Local
 from vla.collect import collect
 from vla.data.episodes import EpisodeStore
 
 if __name__ == "__main__":
     store = EpisodeStore.create_or_open(sys.argv[1], toy.SPEC, {})
-    collect(store, toy.make_slow_environment, toy.make_expert, episodes=30, workers=2, seed=0)
+    workers, episodes = int(sys.argv[2]), int(sys.argv[3])
+    collect(store, toy.make_slow_environment, toy.make_expert, episodes, Local(workers), seed=0)
 """
 
 
@@ -38,7 +43,7 @@ def gather(
     make_expert: MakeExpert = toy.make_expert,
 ) -> Summary:
     store = EpisodeStore.create_or_open(folder, toy.SPEC, {})
-    return collect(store, make_environment, make_expert, episodes, workers, seed=0)
+    return collect(store, make_environment, make_expert, episodes, Local(workers), seed=0)
 
 
 def content(folder: Path) -> dict[str, bytes]:
@@ -58,13 +63,13 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def start(folder: Path, until: int) -> subprocess.Popen[str]:
-    """A process that collects with two workers, and has committed `until` seeds."""
+def start(folder: Path, until: int, workers: int = 2, episodes: int = EPISODES) -> subprocess.Popen[str]:
+    """A process that is collecting, and has committed `until` seeds."""
     script = folder.parent / "collecting.py"
     script.write_text(SCRIPT)
     places = [str(Path(toy.__file__).parent), str(Path(toy.__file__).parents[1])]
     process = subprocess.Popen(
-        [sys.executable, str(script), str(folder)],
+        [sys.executable, str(script), str(folder), str(workers), str(episodes)],
         env={**os.environ, "PYTHONPATH": os.pathsep.join(places)},
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
@@ -100,14 +105,23 @@ def test_a_larger_count_adds_only_what_is_missing(tmp_path: Path, whole: Path) -
     assert content(tmp_path) == content(whole)
 
 
-def test_killed_again_and_again_it_loses_and_doubles_nothing(tmp_path: Path, whole: Path) -> None:
-    folder = tmp_path / "episodes"
-    for until in (1, 9, 22):
-        process = start(folder, until)
+def test_killed_twenty_times_at_random_it_loses_and_doubles_nothing(tmp_path: Path) -> None:
+    folder, whole = tmp_path / "episodes", tmp_path / "whole"
+    random = np.random.default_rng(0)
+    for kill in range(20):
+        before = lines(folder)
+        # Every other one while it starts, or just after, the rest between two commits or within one.
+        process = start(folder, before + kill % 2, workers=1 + kill // 2 % 2, episodes=100)
+        time.sleep(random.uniform(0, 0.05 if kill % 2 else 0.8))
         process.kill()
         process.communicate(timeout=20)  # its workers hold the same pipe: this ends when they are gone too
-        assert until <= len(EpisodeStore(folder).tried) < TRIED
-    gather(folder)
+        assert before + kill % 2 <= lines(folder)
+        if (folder / "store.json").exists():
+            store = EpisodeStore(folder)
+            assert [entry.seed for entry in store.tried] == list(range(len(store.tried)))
+            assert all(store.read(entry)["action"].shape[0] == entry.steps for entry in store.episodes)
+    gather(folder, episodes=100)
+    gather(whole, episodes=100)
     assert content(folder) == content(whole)
 
 
@@ -153,7 +167,22 @@ def test_a_success_that_cannot_be_replayed_is_a_failure(tmp_path: Path) -> None:
     assert EpisodeStore(tmp_path).episodes == []
 
 
-def test_a_store_goes_on_from_its_own_first_seed(tmp_path: Path) -> None:
+@pytest.mark.parametrize("episodes", [1, 3])
+def test_a_store_goes_on_from_its_own_first_seed(tmp_path: Path, episodes: int) -> None:
     gather(tmp_path, episodes=2)
+    store = EpisodeStore(tmp_path)
     with pytest.raises(ValueError, match=r"starts at seed 0, not 7: set collect\.seed=0"):
-        collect(EpisodeStore(tmp_path), toy.make_environment, toy.make_expert, episodes=3, workers=1, seed=7)
+        collect(store, toy.make_environment, toy.make_expert, episodes, Local(1), seed=7)
+
+
+def test_a_disk_that_fills_up_costs_nothing_that_was_committed(tmp_path: Path, whole: Path) -> None:
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, ((whole / "rgb_front.bin").stat().st_size // 2, hard))
+    try:
+        with pytest.raises(ValueError, match=r"cannot take seed \d+ \(.*\): the \d+ episodes before it are safe"):
+            gather(tmp_path)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert len(EpisodeStore(tmp_path).episodes) > 5
+    gather(tmp_path)
+    assert content(tmp_path) == content(whole)

@@ -139,6 +139,31 @@ def test_a_full_disk_takes_back_the_half_written_episode_only(tmp_path: Path) ->
     assert content(full) == content(whole)
 
 
+def test_a_full_disk_takes_no_store(tmp_path: Path) -> None:
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100, hard))
+    try:
+        with pytest.raises(ValueError, match=r"cannot take a store \(.*\): make room there"):
+            add(tmp_path, [])
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    add(tmp_path, EPISODES)
+    assert "store.json" in content(tmp_path) and "store.json.draft" not in content(tmp_path)
+
+
+def test_episodes_that_have_lost_their_description_are_not_adopted(tmp_path: Path) -> None:
+    add(tmp_path, EPISODES)
+    description = (tmp_path / "store.json").read_bytes()
+    (tmp_path / "store.json").unlink()
+    before = content(tmp_path)
+    for config in (CONFIG, {**CONFIG, "task": {"size": 2.0}}):
+        with pytest.raises(ValueError, match=r"holds action\.bin without store\.json, which says what it means"):
+            EpisodeStore.create_or_open(tmp_path, SPEC, config)
+    assert content(tmp_path) == before
+    (tmp_path / "store.json").write_bytes(description)
+    assert len(EpisodeStore.create_or_open(tmp_path, SPEC, CONFIG).episodes) == 4
+
+
 def test_a_store_of_another_task_is_refused(tmp_path: Path) -> None:
     add(tmp_path, EPISODES)
     with pytest.raises(ValueError, match=r"this task has control_hz = 20\.0, but the episode store .* has 10\.0"):

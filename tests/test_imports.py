@@ -26,7 +26,8 @@ PARTS = {
     "vla.rollout": ("vla.spec",),
     "vla.record": ("vla.spec",),
     "vla.workers": (),
-    "vla.collect": ("vla.spec", "vla.rollout", "vla.data", "vla.workers"),
+    "vla.cluster": ("vla.workers",),
+    "vla.collect": ("vla.spec", "vla.rollout", "vla.data", "vla.cluster"),
     "vla.evaluate": ("vla.spec", "vla.rollout", "vla.record", "vla.workers"),
     "vla.report": ("vla.spec", "vla.evaluate"),
     "vla.card": ("vla.spec", "vla.data", "vla.report"),
@@ -49,8 +50,9 @@ LIBRARIES = {
     "lightning": ("vla.models.learner", "vla.data.windows", "vla.training", "vla.jobs", "vla.benchmark"),
     "rerun": ("vla.record", "vla.deploy.view"),
     "rclpy": ("vla.deploy",),
+    "distributed": ("vla.cluster",),
 }
-HEAVY = ("torch", "lightning", "mujoco", "dm_control", "rerun", "matplotlib")
+HEAVY = ("torch", "lightning", "mujoco", "dm_control", "rerun", "matplotlib", "distributed")
 
 
 def within(module: str, parts: tuple[str, ...]) -> bool:
@@ -93,7 +95,7 @@ def test_parts_import_only_what_they_may(module: str) -> None:
 
 def test_the_simulator_needs_no_torch() -> None:
     for module, path in MODULES.items():
-        if within(module, ("vla.tasks", "vla.spec", "vla.rollout", "vla.collect")):
+        if within(module, ("vla.tasks", "vla.spec", "vla.rollout", "vla.cluster", "vla.collect")):
             assert not {name.split(".")[0] for name in imports(ast.parse(path.read_text(encoding="utf-8")))} & {"torch"}
 
 

@@ -14,6 +14,7 @@ import pytest
 from test_episodes import CONFIG, EPISODES, add, content
 from toy import SPEC, ToyEnvironment, ToyExpert, make_environment, make_expert
 
+from vla.cluster import Local
 from vla.collect import collect
 from vla.data import inspection
 from vla.data.episodes import EpisodeStore
@@ -156,7 +157,7 @@ def test_collection_goes_on_in_a_repaired_store(tmp_path: Path) -> None:
     change(tmp_path / "store" / "action.bin", lambda data: flip(data, 0))
     put_together([EpisodeStore(store.folder, damaged=True)], tmp_path / "repaired", repair=True)
     repaired = EpisodeStore.create_or_open(tmp_path / "repaired", SPEC, CONFIG)
-    collect(repaired, make_environment, make_expert, episodes=4, workers=1, seed=0)
+    collect(repaired, make_environment, make_expert, episodes=4, cluster=Local(1), seed=0)
     assert [(entry.seed, entry.outcome) for entry in repaired.tried][::5] == [(0, "damaged"), (5, "success")]
 
 
@@ -197,9 +198,9 @@ def test_a_store_that_was_put_together_serves_training_and_does_not_grow(tmp_pat
     chosen = EpisodeStore.create_or_open(tmp_path / "chosen", SPEC, {"task": {"size": 3.0}})
     assert [entry.seed for entry in chosen.episodes] == [1, 2] and chosen.derived
     assert chosen.statistics.steps == len(EPISODES[1].actions) + len(EPISODES[2].actions)
-    assert collect(chosen, make_environment, make_expert, episodes=2, workers=1, seed=0).added == 0
+    assert collect(chosen, make_environment, make_expert, episodes=2, cluster=Local(1), seed=0).added == 0
     with pytest.raises(ValueError, match=r"does not grow: set collect\.episodes=2"):
-        collect(chosen, make_environment, make_expert, episodes=3, workers=1, seed=0)
+        collect(chosen, make_environment, make_expert, episodes=3, cluster=Local(1), seed=0)
     change(chosen.folder / "index.jsonl", lambda data: data[: data.index(b"\n") + 1])
     with pytest.raises(ValueError, match="has lost lines: put it together again"):
         examine(EpisodeStore(chosen.folder, damaged=True))

@@ -8,9 +8,11 @@ import shlex
 import signal
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from test_cluster import address_in, dask
 from test_run import SMALL, vla
 
 DOCS = Path(__file__).parents[1] / "docs"
@@ -38,9 +40,25 @@ def serves(folder: Path, *arguments: str) -> None:
     assert process.wait(30) == 0, process.stdout.read()
 
 
+@pytest.fixture(scope="module")
+def address(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    """Where a cluster listens that the README's commands start, on a free port."""
+    file = tmp_path_factory.mktemp("cluster") / "scheduler.json"
+    scheduler, worker = re.findall(
+        r"^dask (.*)$", README.replace("HOST", "127.0.0.1").replace("HERE", "127.0.0.1"), re.M
+    )
+    with dask(*shlex.split(scheduler), "--port", "0", "--scheduler-file", str(file)):
+        address = address_in(file)
+        with dask(*shlex.split(worker.replace("tcp://127.0.0.1:8786", address))):
+            yield address
+
+
 @pytest.mark.parametrize("command", COMMANDS)
-def test_the_command_runs(home: Path, command: str) -> None:
-    command = command.replace("DATASET", "dataset").replace("DIR", f"new{COMMANDS.index(command)}")
+def test_the_command_runs(home: Path, command: str, request: pytest.FixtureRequest) -> None:
+    number = COMMANDS.index(command)
+    if "cluster=dask" in command:
+        command = command.replace("tcp://HOST:8786", request.getfixturevalue("address"))
+    command = command.replace("DATASET", "dataset").replace("DIR", f"new{number}")
     arguments = shlex.split(command.replace("FILE", "run/checkpoints/last.ckpt"))
     if "--help" in arguments:
         assert "pick_place" in vla(home, *arguments).stdout
@@ -56,6 +74,8 @@ def test_the_command_runs(home: Path, command: str) -> None:
         small = ["deploy.episodes=1", "task.time_limit=1", "benchmark.episodes=1"]
     elif "job=train" in arguments:
         small = [*SMALL, "trainer.max_steps=6"]
+    if "cluster=dask" in arguments:
+        small += ["collect.folder=remote", "collect.episodes=4"]
     if "model=rt1" in arguments:  # a second per frame
         small += [
             "data.batch_size=1",

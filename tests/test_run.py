@@ -101,16 +101,22 @@ def test_export_writes_as_many_episodes_as_asked_for(home: Path) -> None:
     assert len(list((home / "plain").glob("episode_*/manifest.json"))) == 5
 
 
-def test_a_killed_collection_goes_on_and_ends_up_the_same(home: Path, tmp_path: Path) -> None:
+def test_a_collection_killed_again_and_again_goes_on_and_ends_up_the_same(home: Path, tmp_path: Path) -> None:
     arguments = [*SMALL, "job=collect", f"collect.folder={tmp_path}/store", "collect.workers=2"]
-    process = subprocess.Popen([sys.executable, "-m", "vla.run", *arguments], cwd=home, stdout=subprocess.DEVNULL)
     index = tmp_path / "store/index.jsonl"
-    deadline = time.monotonic() + 120
-    while time.monotonic() < deadline and (not index.exists() or index.read_text().count("\n") < 5):
-        time.sleep(0.02)
-    os.kill(process.pid, signal.SIGKILL)
-    process.wait()
-    assert 5 <= index.read_text().count("\n") < 24
+
+    def committed() -> int:
+        return index.read_bytes().count(b"\n") if index.exists() else 0
+
+    for until, pause in ((0, 1.5), (1, 0.0), (9, 0.1)):  # while it starts, at its first commit, on the way
+        process = subprocess.Popen([sys.executable, "-m", "vla.run", *arguments], cwd=home, stdout=subprocess.DEVNULL)
+        deadline = time.monotonic() + 120
+        while time.monotonic() < deadline and committed() < until:
+            time.sleep(0.02)
+        time.sleep(pause)
+        os.kill(process.pid, signal.SIGKILL)
+        process.wait()
+        assert until <= committed() < 24
     vla(home, *arguments)
     (reference,) = (home / "outputs/episodes").iterdir()
     for file in reference.iterdir():

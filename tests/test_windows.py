@@ -15,6 +15,7 @@ import toy
 from lightning import LightningModule, Trainer
 from lightning.pytorch.callbacks import ModelCheckpoint
 
+from vla.cluster import Local
 from vla.collect import collect
 from vla.data.episodes import EpisodeStore
 from vla.data.inspection import put_together
@@ -27,7 +28,7 @@ EPISODES = 30
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("episodes")
     store = EpisodeStore.create_or_open(folder, toy.SPEC, {})
-    collect(store, toy.make_environment, toy.make_expert, EPISODES, workers=1, seed=0)
+    collect(store, toy.make_environment, toy.make_expert, EPISODES, Local(1), seed=0)
     return folder
 
 

@@ -26,13 +26,13 @@ from omegaconf import DictConfig, OmegaConf
 ALLOWED = ("vla.", "torch.", "lightning.", "dm_control.composer.variation.")
 
 # The groups that each job builds something from; only these are checked, so only their modules are imported.
-TRAINING = ("task", "expert", "data", "tokenizer", "model", "learner", "trainer")
+TRAINING = ("task", "expert", "cluster", "data", "tokenizer", "model", "learner", "trainer")
 JOBS: dict[str, tuple[str, ...]] = {
     "preview": ("task", "expert"),
-    "collect": ("task", "expert"),
+    "collect": ("task", "expert", "cluster"),
     "train": TRAINING,
     "evaluate": (*TRAINING, "recorder"),
-    "export": ("task", "expert", "export"),
+    "export": ("task", "expert", "cluster", "export"),
     "deploy": ("tokenizer", "model", "deploy"),
     "benchmark": TRAINING,
     "inspect": (),

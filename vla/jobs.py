@@ -231,10 +231,10 @@ def collected(config: DictConfig) -> EpisodeStore:
     from vla.data.episodes import EpisodeStore
     from vla.data.recorded import Recorded
     from vla.evaluate import FIRST_SEED
-    from vla.workers import cores
 
     if config.collect.seed + config.collect.episodes > FIRST_SEED:
         raise ValueError(f"collect.seed={config.collect.seed}: seeds from {FIRST_SEED} on are kept for evaluation")
+    cluster = build(config.cluster)
     environment = make_environment(plain(config.task))
     spec = environment.spec
     environment.close()
@@ -251,7 +251,7 @@ def collected(config: DictConfig) -> EpisodeStore:
         partial(make_environment, source["task"]),
         partial(make_expert, source["expert"]),
         config.collect.episodes,
-        config.collect.workers or cores(),
+        cluster,
         config.collect.seed,
     )
     failures = ", ".join(f"{count} {cause}" for cause, count in summary.failures.items()) or "none"

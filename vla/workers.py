@@ -30,15 +30,20 @@ def leave_with_parent() -> None:
     threading.Thread(target=wait, daemon=True).start()
 
 
+def one_thread() -> None:
+    """Numerical libraries use one thread from now on: sums must not depend on how many workers share the machine."""
+    os.environ.update(THREAD_SETTINGS)  # read by libraries that are loaded from now on
+    if torch := sys.modules.get("torch"):  # loaded already where this process trained the policy
+        torch.set_num_threads(1)
+
+
 @contextmanager
 def one_thread_each() -> Iterator[None]:
-    """Within, numerical libraries use one thread: sums must not depend on how many workers share the machine."""
+    """Within, this process and those that it starts keep to `one_thread`."""
     before = {name: os.environ.get(name) for name in THREAD_SETTINGS}
-    os.environ.update(THREAD_SETTINGS)  # read by libraries that are loaded from now on
-    torch = sys.modules.get("torch")  # was loaded already where this process trained the policy
+    torch = sys.modules.get("torch")
     threads = torch.get_num_threads() if torch else 0
-    if torch:
-        torch.set_num_threads(1)
+    one_thread()
     try:
         yield
     finally:

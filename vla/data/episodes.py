@@ -101,16 +101,16 @@ class EpisodeStore:
 
     @classmethod
     def create_or_open(cls, folder: str | Path, spec: Spec, config: Mapping[str, Any]) -> EpisodeStore:
-        """The store in `folder`, made there if there is none; a ValueError if it has another spec or config."""
+        """The store in `folder`, made there if there is none; a ValueError if it has another spec or config.
+
+        Another is for episodes that lie there without the `store.json` that would say what they are.
+        """
         folder = Path(folder)
         plain = json.loads(_dumps(config))
         if not (folder / "store.json").exists():
-            fields = {name: {"shape": shape, "dtype": dtype.name} for name, (shape, dtype) in fields_of(spec).items()}
-            header = {"format": FORMAT, "spec": spec.to_dict(), "config": plain, "fields": fields}
             folder.mkdir(parents=True, exist_ok=True)
-            draft = folder / f"store.json.{os.getpid()}"
-            draft.write_text(_dumps(header), encoding="utf-8")
-            os.replace(draft, folder / "store.json")
+            with FileLock(folder / "lock"):
+                _write_header(folder, spec, plain)
         store = cls(folder)
         spec.require(store.spec, "this task", f"the episode store {folder}")
         different = sorted(key for key in {*plain, *store.config} if plain.get(key) != store.config.get(key))
@@ -292,6 +292,25 @@ def _plain(value: Any) -> Any:
     if isinstance(value, (np.ndarray, np.generic)):
         return value.tolist()
     raise ValueError(f"an episode store keeps numbers, strings, lists and dicts, not {value!r}")
+
+
+def _write_header(folder: Path, spec: Spec, config: dict[str, Any]) -> None:
+    path = folder / "store.json"
+    if path.exists():  # another process was faster
+        return
+    orphans = sorted(file.name for file in folder.iterdir() if file.suffix in (".bin", ".jsonl"))
+    if orphans:
+        raise ValueError(f"{folder} holds {orphans[0]} without {path.name}, which says what it means: {REMEDY}")
+    fields = {name: {"shape": shape, "dtype": dtype.name} for name, (shape, dtype) in fields_of(spec).items()}
+    header = {"format": FORMAT, "spec": spec.to_dict(), "config": config, "fields": fields}
+    draft = folder / "store.json.draft"
+    try:
+        draft.write_text(_dumps(header), encoding="utf-8")
+    except OSError as error:
+        raise ValueError(
+            f"{folder} cannot take a store ({error.strerror}): make room there, or set collect.folder"
+        ) from error
+    os.replace(draft, path)
 
 
 def _read_header(folder: Path) -> dict[str, Any]:
