@@ -19,7 +19,8 @@ from vla.cluster import Local
 from vla.collect import collect
 from vla.data.episodes import EpisodeStore
 from vla.data.inspection import put_together
-from vla.data.windows import Gather, Windows, held_out
+from vla.data.windows import Gather, Memory, Stream, Windows, held_out
+from vla.spec import Array
 
 EPISODES = 30
 
@@ -190,6 +191,36 @@ def test_the_stream_is_made_ahead_but_not_without_bound(folder: Path) -> None:
         pass
     stream.close()  # type: ignore[attr-defined]
     assert len(made) <= 4 + 2
+
+
+def test_what_is_kept_of_a_batch_does_not_change(folder: Path) -> None:
+    module = windows(folder)
+    stream = iter(module.train_dataloader())
+    kept = [next(stream)["rgb"]["front"][1:, 0].numpy()[:3] for _ in range(5)]
+    for _ in islice(stream, 10):
+        pass
+    for step, images in enumerate(kept):
+        expected = Gather(EpisodeStore(folder), 3, 2)(module.order(step))["rgb"]["front"][1:4, 0]
+        np.testing.assert_array_equal(images, expected)
+
+
+def test_memory_is_used_again_once_nothing_refers_to_it() -> None:
+    memory = Memory()
+    first = memory.empty((2, 3), np.uint8)
+    tensor = torch.from_numpy(first).view(3, 2)[1:]
+    place = first.__array_interface__["data"]
+    del first
+    assert memory.empty((2, 3), np.uint8).__array_interface__["data"] != place
+    del tensor
+    assert memory.empty((2, 3), np.uint8).__array_interface__["data"] == place
+
+
+def test_an_error_in_the_thread_is_raised_where_the_batch_is_waited_for() -> None:
+    def fail(rows: Array) -> dict[str, Any]:
+        raise ValueError(f"row {rows[0]} is gone")
+
+    with pytest.raises(ValueError, match="row 7 is gone"):
+        next(iter(Stream(fail, lambda: [np.array([7])], 2)))
 
 
 class Seen(LightningModule):

@@ -7,6 +7,7 @@ depend on the episodes only, never on when or by how many processes they were ma
 
 A store that was collected holds consecutive seeds of one config, and grows. One that was put together from others
 (`vla.data.inspection`) has their configs as `parts` in its own, holds whatever seeds were chosen, and does not grow.
+Nor does one with packed images (`vla.data.packed`), in which `store.json` says which field is packed how.
 """
 
 from __future__ import annotations
@@ -24,7 +25,10 @@ from typing import Any, BinaryIO
 import numpy as np
 from filelock import FileLock, Timeout
 
+from vla.data.pack import CODECS, JPEG, PackedRows, whole_rows
 from vla.spec import Array, Episode, Spec
+
+Rows = Array | PackedRows
 
 FORMAT = 1
 REMEDY = "copy the folder again from where it is whole, or delete it and collect again"
@@ -45,7 +49,7 @@ class Entry:
     start: int  # first row of the episode in every field file
     steps: int
     draws: dict[str, Any]  # randomisation axis → what was drawn
-    crc: int  # CRC-32 of the rows of all fields, in the order of `fields_of`
+    crc: int  # CRC-32 of the rows of all fields, in the order of `fields_of`; of JPEG, of the files
     action: dict[str, list[float]]  # "low" | "high" | "sum" | "square" → (D,) over the steps; empty for failures
 
     @property
@@ -81,10 +85,11 @@ def fields_of(spec: Spec) -> dict[str, tuple[tuple[int, ...], np.dtype]]:
 class EpisodeStore:
     """Episodes on disk, opened for reading; `create_or_open` and `writing` make it grow.
 
-    Attributes: `spec`; `config`, what made the episodes; `fields`, as `fields_of`; `tried`, one entry per seed.
-    With `episodes` only the first so many are seen. Raises a ValueError where there is no store, its format is unknown,
-    it is damaged, or it holds fewer than `episodes`. With `damaged` a store whose files are cut short or whose index
-    has unreadable lines is opened as well, to read what is left; the seeds of such lines are `LOST`.
+    Attributes: `spec`; `config`, what made the episodes; `fields`, as `fields_of`; `packed`, field of packed images →
+    codec; `tried`, one entry per seed. With `episodes` only the first so many are seen. Raises a ValueError where there
+    is no store, its format is unknown, it is damaged, or it holds fewer than `episodes`. With `damaged` a store whose
+    files are cut short or whose index has unreadable lines is opened as well, to read what is left; the seeds of such
+    lines are `LOST`.
     """
 
     def __init__(self, folder: str | Path, episodes: int | None = None, damaged: bool = False) -> None:
@@ -93,6 +98,7 @@ class EpisodeStore:
         self.spec = Spec.from_dict(header["spec"])
         self.config: dict[str, Any] = header["config"]
         self.fields = fields_of(self.spec)
+        self.packed: dict[str, str] = header.get("packed", {})
         self._limit, self._damaged = episodes, damaged
         self._files: dict[str, BinaryIO] = {}
         self._refresh()
@@ -146,26 +152,48 @@ class EpisodeStore:
         high = np.max([action["high"] for action in actions], axis=0)
         return Statistics(low=low, high=high, mean=mean, std=np.sqrt(np.maximum(variance, 0)), steps=steps)
 
-    def rows(self, field: str) -> Array:
-        """All committed rows of `field`, (N, …), memory-mapped: nothing is read until it is indexed."""
+    def rows(self, field: str) -> Rows:
+        """All committed rows of `field`, (N, …): nothing is read until it is indexed.
+
+        An array, memory-mapped, or `PackedRows`, which raise a ValueError that names the seed of what is damaged.
+        """
         if field not in self.fields:
             raise ValueError(f"{self.folder} has no field {field!r}: it has {sorted(self.fields)}")
         shape, dtype = self.fields[field]
         if self._rows == 0:
             return np.empty((0, *shape), dtype)
-        return np.memmap(self._path(field), dtype, mode="r", shape=(self._rows, *shape))
+        if field in self.packed:
+            return PackedRows(self.folder, field, self.packed[field], (self._rows, *shape), dtype, self._changed)
+        return np.asarray(np.memmap(self._path(field), dtype, mode="r", shape=(self._rows, *shape)))
 
     def read(self, entry: Entry) -> dict[str, Array]:
         """Field → (steps, …) rows of one episode; a ValueError if they are not those that were written."""
-        rows = {field: np.array(self.rows(field)[entry.start : entry.start + entry.steps]) for field in self.fields}
-        if any(len(values) < entry.steps for values in rows.values()) or _crc(rows) != entry.crc:
-            raise ValueError(f"the rows of seed {entry.seed} in {self.folder} were changed on disk: {SALVAGE}")
+        span = slice(entry.start, entry.start + entry.steps)
+        sources = {field: self.rows(field) for field in self.fields}
+        rows = {field: np.array(source[span]) for field, source in sources.items()}
+        # Decoders may differ in how they round, so what is checked of a JPEG is the file.
+        checked = {field: stored(sources[field], span) if self.lossy(field) else rows[field] for field in rows}
+        if any(len(values) < entry.steps for values in rows.values()) or checksum(checked) != entry.crc:
+            raise self._changed(entry.start)
         return rows
+
+    def lossy(self, field: str) -> bool:
+        """Whether the rows of `field` are only like those that were recorded."""
+        return self.packed.get(field) == JPEG
+
+    def _changed(self, row: int) -> ValueError:
+        seed = next((entry.seed for entry in self.episodes if row < entry.start + entry.steps), None)
+        return ValueError(f"the rows of seed {seed} in {self.folder} were changed on disk: {SALVAGE}")
 
     @contextmanager
     def writing(self) -> Iterator[None]:
         """Hold the store for writing: waits for another writer, then cuts off what a killed one left unfinished."""
         assert not self._damaged, "a damaged store is left as it is"
+        if self.packed:
+            raise ValueError(
+                f"{self.folder} is packed and does not grow: set collect.episodes={len(self.episodes)}, or collect "
+                "into another folder and pack that"
+            )
         lock = FileLock(self.folder / "lock")
         try:
             lock.acquire(timeout=0)
@@ -194,7 +222,7 @@ class EpisodeStore:
         rows = self._rows_of(episode)
         action = rows["action"]
         fixed = (episode.seed, episode.outcome, episode.instruction, self._rows, len(action), dict(episode.draws))
-        self._commit(Entry(*fixed, _crc(rows), moments(action)), rows)
+        self._commit(Entry(*fixed, checksum(rows), moments(action)), rows)
 
     def fail(self, seed: int, outcome: str, draws: Mapping[str, Any]) -> None:
         """Note that `seed` was tried and why it failed; no rows are stored. Raises as `append` does."""
@@ -204,7 +232,7 @@ class EpisodeStore:
         assert self._files, "append and fail work inside `with store.writing()`"
         if self.next_seed not in (None, entry.seed):
             raise ValueError(f"{self.folder} expects seed {self.next_seed} next, seed {entry.seed} came")
-        line = (_dumps(asdict(entry)) + "\n").encode()
+        line = index_line(entry)
         try:
             for name, values in rows.items():
                 _write(self._files[name], values.data.cast("B"))
@@ -228,12 +256,17 @@ class EpisodeStore:
         self.tried, self._index_size = _read_index(self._path("index"), self.derived, self._damaged)
         self._rows = max((entry.start + entry.steps for entry in self.tried), default=0)
         for field in self.fields if self._rows else ():
-            path, needed = self._path(field), self._size(field)
-            size = path.stat().st_size if path.exists() else 0
-            if size < needed and not self._damaged:
-                raise ValueError(f"{path} is shorter than the {needed} bytes that its index speaks of: {SALVAGE}")
-            if size < needed:
-                self._rows = self._rows * size // needed
+            whole = self._whole(field)
+            if whole < self._rows and not self._damaged:
+                raise ValueError(f"{self._path(field)} is shorter than its index says: {SALVAGE}")
+            self._rows = min(self._rows, whole)
+
+    def _whole(self, field: str) -> int:
+        if field in self.packed:
+            return whole_rows(self.folder, field, self._rows)
+        path, needed = self._path(field), self._size(field)
+        size = path.stat().st_size if path.exists() else 0
+        return self._rows if size >= needed else self._rows * size // needed
 
     def _rows_of(self, episode: Episode) -> dict[str, Array]:
         seen = episode.observations
@@ -262,6 +295,8 @@ class EpisodeStore:
         return self._rows * int(np.prod(shape)) * dtype.itemsize
 
     def _path(self, name: str) -> Path:
+        if name in self.packed:
+            return self.folder / f"{name}.pack"
         return self.folder / ("index.jsonl" if name == "index" else f"{name}.bin")
 
 
@@ -272,11 +307,22 @@ def moments(actions: Array) -> dict[str, list[float]]:
     return {name: value.tolist() for name, value in values.items()}
 
 
-def _crc(rows: Mapping[str, Array]) -> int:
+def stored(rows: Rows, span: slice) -> Array:
+    """Consecutive rows as they lie on the disk: themselves, or bytes (M,)."""
+    return rows[span] if isinstance(rows, np.ndarray) else rows.stored(span)
+
+
+def checksum(rows: Mapping[str, Array]) -> int:
+    """What an entry keeps of all rows of its episode."""
     crc = 0
     for values in rows.values():
         crc = zlib.crc32(values.data.cast("B"), crc)
     return crc
+
+
+def index_line(entry: Entry) -> bytes:
+    """An entry as the index has it."""
+    return (_dumps(asdict(entry)) + "\n").encode()
 
 
 def _write(file: BinaryIO, data: memoryview) -> None:
@@ -325,6 +371,8 @@ def _read_header(folder: Path) -> dict[str, Any]:
         raise ValueError(f"{path} cannot be read ({error}): {REMEDY}") from error
     if header["format"] != FORMAT:
         raise ValueError(f"{path} has format {header['format']}, this version reads {FORMAT}: collect again")
+    if unknown := sorted(set(header.get("packed", {}).values()) - set(CODECS)):
+        raise ValueError(f"{path} has images packed by {unknown}, this version reads {CODECS}: pack them again")
     return header
 
 

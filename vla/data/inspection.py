@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from rich.progress import track
 
-from vla.data.episodes import LOST, Entry, EpisodeStore, moments
+from vla.data.episodes import LOST, Entry, EpisodeStore, moments, stored
 from vla.data.selection import Selection
 from vla.spec import Array, Episode, Observation
 
@@ -64,8 +64,9 @@ class Findings:
     @property
     def sizes(self) -> dict[str, int]:
         """Field → bytes of the whole episodes."""
-        rows = {name: int(np.prod(shape)) * dtype.itemsize for name, (shape, dtype) in self.store.fields.items()}
-        return {name: row * len(self.actions) for name, row in rows.items()}
+        fields = {name: self.store.rows(name) for name in self.store.fields}
+        spans = [slice(entry.start, entry.start + entry.steps) for entry in self.whole]
+        return {name: sum(stored(rows, span).nbytes for span in spans) for name, rows in fields.items()}
 
 
 def examine(store: EpisodeStore) -> Findings:
@@ -228,7 +229,8 @@ def _config(chosen: Chosen, stores: Sequence[EpisodeStore], where: Mapping[str, 
     conditions = [condition for store in stores if store.derived for condition in store.config["where"]]
     conditions += [dict(where)] if where else []
     (config, seeds), *others = chosen.items()
-    if not others and not conditions and max(seeds) - min(seeds) == len(seeds) - 1:
+    exact = not any(store.lossy(field) for store in stores for field in store.fields)
+    if not others and not conditions and exact and max(seeds) - min(seeds) == len(seeds) - 1:
         collected: dict[str, Any] = json.loads(config)
         return collected
     parts = [{"config": json.loads(config), "entries": len(seeds)} for config, seeds in chosen.items()]

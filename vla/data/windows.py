@@ -9,21 +9,27 @@ on the seed and the number of the step alone, so a resumed run sees exactly what
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import suppress
 from functools import lru_cache
 from pathlib import Path
+from queue import Empty, SimpleQueue
+from sys import getrefcount
+from threading import Thread
 from typing import Annotated, Any
 
 import numpy as np
 import torch
 from lightning import LightningDataModule
 
-from vla.data.episodes import EpisodeStore
+from vla.data.episodes import EpisodeStore, Rows
 from vla.spec import Array, Spec
 
 Batch = dict[str, Any]
+
+# Of a field → of its tensor: torch computes little with uint16.
+TYPES = {np.dtype(np.uint8): torch.uint8, np.dtype(np.uint16): torch.int32, np.dtype(np.float32): torch.float32}
+NUMPY = {torch.uint8: np.uint8, torch.int32: np.int32, torch.float32: np.float32}
 
 # Multiplying by the golden ratio spreads consecutive seeds evenly over the circle of 32-bit numbers (Knuth, The Art of
 # Computer Programming 3, section 6.4): every stretch of seeds gets its share of held-out episodes.
@@ -33,6 +39,27 @@ GOLDEN = 2654435769
 def held_out(seed: int, fraction: float) -> bool:
     """Whether the episode of `seed` is kept for validation, whatever other episodes there are."""
     return seed * GOLDEN % 2**32 < fraction * 2**32
+
+
+class Memory:
+    """Arrays to write into, each used again once nothing else refers to it, not even a view or a tensor of it.
+
+    New memory costs more time than what is written there, because the system fills it with zeros first. There are never
+    more arrays than were in use at once.
+    """
+
+    def __init__(self) -> None:
+        self._arrays: dict[tuple[tuple[int, ...], type], list[Array]] = {}
+
+    def empty(self, shape: tuple[int, ...], dtype: type) -> Array:
+        """An array of any content."""
+        arrays = self._arrays.setdefault((shape, dtype), [])
+        for array in arrays:
+            # By the list, by `array` and by the argument: another thread that looks at it here makes four.
+            if getrefcount(array) == 3:
+                return array
+        arrays.append(np.empty(shape, dtype))
+        return arrays[-1]
 
 
 class Gather:
@@ -47,10 +74,11 @@ class Gather:
     """
 
     def __init__(self, store: EpisodeStore, history: int, chunk: int, depth: bool = False, pin: bool = False) -> None:
-        self._history, self._chunk, self._pin = history, chunk, pin
+        self._pin, self._memory = pin, Memory()
+        self._ages, self._aheads = np.arange(1 - history, 1), np.arange(chunk)
         kinds = ("rgb", "depth") if depth else ("rgb",)
         self._images = {kind: {name: store.rows(f"{kind}_{name}") for name in store.spec.cameras} for kind in kinds}
-        self._proprio = np.concatenate([store.rows(name) for name in ("joints", "velocities", "gripper")], axis=1)
+        self._proprio = np.concatenate([store.rows(name)[:] for name in ("joints", "velocities", "gripper")], axis=1)
         self._truth = store.rows("truth") if store.spec.truth else None
         self._action = store.rows("action")
         entries = store.episodes
@@ -64,13 +92,15 @@ class Gather:
         A frame before the start of the episode is all zeros, not present, and has no valid label; a label beyond the
         end repeats the last action and is not valid.
         """
-        episode = np.searchsorted(self._first, windows, side="right") - 1  # (B,)
+        episode = self._first.searchsorted(windows, side="right") - 1  # (B,)
         first, last = self._first[episode, None], self._last[episode, None]
-        frames = windows[:, None] + np.arange(1 - self._history, 1)  # (B, T)
-        absent = frames < first
-        labels = frames[:, :, None] + np.arange(self._chunk)  # (B, T, k)
-        valid = (labels <= last[:, :, None]) & ~absent[:, :, None]
+        frames = windows[:, None] + self._ages  # (B, T)
+        labels = frames[:, :, None] + self._aheads  # (B, T, k)
+        present = frames >= first
+        valid = (labels <= last[:, :, None]) & present[:, :, None]
+        labels = np.minimum(np.maximum(labels, first[:, :, None]), last[:, :, None])
         frames = np.maximum(frames, first)
+        absent = None if present.all() else ~present
         batch: Batch = {
             kind: {camera: self._take(rows, frames, absent) for camera, rows in cameras.items()}
             for kind, cameras in self._images.items()
@@ -78,23 +108,30 @@ class Gather:
         batch["proprio"] = self._take(self._proprio, frames, absent)
         if self._truth is not None:
             batch["truth"] = self._take(self._truth, frames, absent)
-        batch["action"] = self._take(self._action, np.clip(labels, first[:, :, None], last[:, :, None]))
-        batch["present"] = self._own(torch.from_numpy(~absent))
-        batch["valid"] = self._own(torch.from_numpy(valid))
-        batch["instruction"] = [self._instructions[number] for number in episode]
+        batch["action"] = self._take(self._action, labels)
+        batch["present"] = self._own(present)
+        batch["valid"] = self._own(valid)
+        batch["instruction"] = [self._instructions[number] for number in episode.tolist()]
         return batch
 
-    def _take(self, rows: Array, index: Array, absent: Array | None = None) -> torch.Tensor:
-        values = torch.empty(*index.shape, *rows.shape[1:], dtype=_torch_type(rows.dtype), pin_memory=self._pin)
-        if rows.dtype == np.uint16:  # torch computes little with uint16
-            values.numpy()[...] = rows[index]
+    def _take(self, rows: Rows, index: Array, absent: Array | None = None) -> torch.Tensor:
+        tensor = self._empty((*index.shape, *rows.shape[1:]), TYPES[rows.dtype])
+        values = tensor.numpy()
+        if values.dtype == rows.dtype:
+            rows.take(index, axis=0, out=values, mode="clip")  # "clip" writes into `out` directly
         else:
-            np.take(rows, index, axis=0, out=values.numpy(), mode="clip")  # "clip" writes into `out` directly
-        if absent is not None and absent.any():
-            values.numpy()[absent] = 0  # many times faster than through torch
-        return values
+            values[...] = rows.take(index, axis=0)
+        if absent is not None:
+            values[absent] = 0  # many times faster than through torch
+        return tensor
 
-    def _own(self, tensor: torch.Tensor) -> torch.Tensor:
+    def _empty(self, shape: tuple[int, ...], dtype: torch.dtype) -> torch.Tensor:
+        if self._pin:
+            return torch.empty(shape, dtype=dtype, pin_memory=True)
+        return torch.from_numpy(self._memory.empty(shape, NUMPY[dtype]))
+
+    def _own(self, values: Array) -> torch.Tensor:
+        tensor = torch.from_numpy(values)
         return tensor.pin_memory() if self._pin else tensor
 
 
@@ -105,14 +142,32 @@ class Stream:
         self._gather, self._plan, self._ahead = gather, plan, ahead
 
     def __iter__(self) -> Iterator[Batch]:
-        pending: deque[Future[Batch]] = deque()
-        with ThreadPoolExecutor(1, thread_name_prefix="windows") as thread:
+        wanted: SimpleQueue[Array | None] = SimpleQueue()
+        made: SimpleQueue[Batch | Exception] = SimpleQueue()
+
+        def make() -> None:
+            while (windows := wanted.get()) is not None:
+                try:
+                    made.put(self._gather(windows))
+                except Exception as error:  # is raised where the batch is waited for
+                    made.put(error)
+
+        Thread(target=make, name="windows", daemon=True).start()
+        under_way = 0
+        try:
             for windows in self._plan():
-                pending.append(thread.submit(self._gather, windows))
-                if len(pending) > self._ahead:
-                    yield pending.popleft().result()
-            while pending:
-                yield pending.popleft().result()
+                wanted.put(windows)
+                under_way += 1
+                if under_way > self._ahead:
+                    yield _result(made)
+                    under_way -= 1
+            for _ in range(under_way):
+                yield _result(made)
+        finally:
+            with suppress(Empty):
+                while True:
+                    wanted.get_nowait()
+            wanted.put(None)
 
 
 class CountedStream(Stream):
@@ -210,13 +265,12 @@ class Windows(LightningDataModule):
 
         The order is one shuffle of all windows after the other, dealt out in runs of B.
         """
-        places = np.arange(self.batch_size) + (step * processes + rank) * self.batch_size
-        shuffle, place = np.divmod(places, len(self.training_windows))
-        chosen = np.empty_like(places)
-        for number in np.unique(shuffle):
-            here = shuffle == number
-            chosen[here] = _shuffled(len(self.training_windows), self._seed, int(number))[place[here]]
-        return self.training_windows[chosen]
+        first = (step * processes + rank) * self.batch_size
+        count = len(self.training_windows)
+        shuffle, place = np.divmod(np.arange(first, first + self.batch_size), count)
+        numbers = range(shuffle[0], shuffle[-1] + 1)
+        chosen = [_shuffled(count, self._seed, number)[place[shuffle == number]] for number in numbers]
+        return self.training_windows[np.concatenate(chosen)]
 
     def _training_plan(self) -> Iterator[Array]:
         rank, processes = self._place()
@@ -237,5 +291,8 @@ def _shuffled(count: int, seed: int, number: int) -> Array:
     return np.random.default_rng([seed, number]).permutation(count)
 
 
-def _torch_type(dtype: np.dtype) -> torch.dtype:
-    return {"uint8": torch.uint8, "uint16": torch.int32, "float32": torch.float32}[dtype.name]
+def _result(made: SimpleQueue[Batch | Exception]) -> Batch:
+    batch = made.get()
+    if isinstance(batch, Exception):
+        raise batch
+    return batch

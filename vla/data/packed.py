@@ -1,0 +1,148 @@
+"""Export of an episode store to a smaller one that is read in its place."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+
+from vla.data.episodes import Entry, EpisodeStore, checksum, index_line
+from vla.data.export import each, unfinished
+from vla.data.pack import JPEG, OFFSET, ZLIB, pack
+from vla.spec import Array
+
+
+@dataclass(frozen=True)
+class Pieces:
+    """What one episode adds to every file."""
+
+    images: dict[str, list[bytes]]  # field → an image per step
+    rest: dict[str, Array]  # field → rows
+    crc: int
+
+
+class Packed:
+    """A store whose images are compressed one by one, for `collect.folder=DIR` and `inspect.folder=DIR`.
+
+    Depth is packed without loss, everything else stays as it is. Such a store does not grow.
+
+    Args:
+        folder: where to write; it appears when all of it is there.
+        codec: of colour images: "lossless", or "jpeg", which is smaller where cameras are noisy.
+        quality: of JPEG, 1…95; images without loss have none.
+        workers: processes; null: one per core. The files do not depend on it.
+    """
+
+    def __init__(
+        self,
+        folder: str | Path,
+        codec: Literal["lossless", "jpeg"] = "lossless",
+        quality: Annotated[int, 1] = 90,
+        workers: Annotated[int, 1] | None = None,
+    ) -> None:
+        if quality > 95:
+            raise ValueError(f"export.quality is from 1 to 95, not {quality}")
+        self._folder, self._workers = Path(folder).resolve(), workers
+        self._colour, self._quality = {"lossless": ZLIB, "jpeg": JPEG}[codec], quality
+
+    def export(self, store: EpisodeStore) -> Path:
+        """Write the store, all of it or nothing; returns the folder.
+
+        Raises:
+            ValueError: the folder holds something else, or the store is empty, damaged, or of JPEG itself.
+        """
+        if not store.episodes:
+            raise ValueError(f"{store.folder} holds no episodes yet: collect some first")
+        if any(map(store.lossy, store.fields)):
+            raise ValueError(f"{store.folder} holds JPEG, which gets no better: pack the store that it was made of")
+        tried = _tried(store)
+        header = self._header(store, len(tried))
+        if _is_of(self._folder, header, tried):
+            return self._folder
+        if self._folder.exists() and (not self._folder.is_dir() or any(self._folder.iterdir())):
+            raise ValueError(f"{self._folder} holds something else than these episodes: choose another export.folder")
+        with unfinished(self._folder) as place:
+            draft = place / "store"
+            shutil.rmtree(draft, ignore_errors=True)  # left by an export that was cut short
+            draft.mkdir()
+            (draft / "store.json").write_text(json.dumps(header, ensure_ascii=False), encoding="utf-8")
+            self._write(draft, store, tried)
+            os.rename(draft, self._folder)
+        return self._folder
+
+    def _codecs(self, store: EpisodeStore) -> dict[str, str]:
+        """Field of images → how they are packed."""
+        codecs = {f"rgb_{camera}": self._colour for camera in store.spec.cameras}
+        return codecs | {f"depth_{camera}": ZLIB for camera in store.spec.cameras}
+
+    def _header(self, store: EpisodeStore, tried: int) -> dict[str, Any]:
+        """What `store.json` of the new store says."""
+        header: dict[str, Any] = json.loads((store.folder / "store.json").read_bytes())
+        header |= {"config": _first(store.config, tried), "packed": self._codecs(store)}
+        return header | ({"quality": self._quality} if self._colour == JPEG else {})
+
+    def _write(self, folder: Path, store: EpisodeStore, tried: Sequence[Entry]) -> None:
+        lengths: dict[str, list[int]] = {name: [0] for name in self._codecs(store)}
+        lines = []
+        with ExitStack() as stack:
+            paths = {name: folder / f"{name}.{'pack' if name in lengths else 'bin'}" for name in store.fields}
+            files = {name: stack.enter_context(path.open("wb")) for name, path in paths.items()}
+            episodes = each(self._pieces, store, range(len(store.episodes)), self._workers)
+            for entry in tried:
+                if entry.success:
+                    pieces = next(episodes)
+                    entry = replace(entry, crc=pieces.crc)
+                    for name, images in pieces.images.items():
+                        files[name].writelines(images)
+                        lengths[name] += map(len, images)
+                    for name, rows in pieces.rest.items():
+                        files[name].write(rows.data)
+                lines.append(index_line(entry))
+            next(episodes, None)  # the progress bar ends
+        for name, sizes in lengths.items():
+            np.cumsum(sizes).astype(OFFSET).tofile(folder / f"{name}.offsets")
+        (folder / "index.jsonl").write_bytes(b"".join(lines))
+
+    def _pieces(self, store: EpisodeStore, number: int) -> Pieces:
+        rows = store.read(store.episodes[number])
+        codecs = self._codecs(store)
+        images = {name: [pack(image, codec, self._quality) for image in rows[name]] for name, codec in codecs.items()}
+        rest = {name: values for name, values in rows.items() if name not in images}
+        lossy = {name: np.frombuffer(b"".join(images[name]), np.uint8) for name in images if codecs[name] == JPEG}
+        return Pieces(images, rest, checksum(rows | lossy))
+
+
+def _tried(store: EpisodeStore) -> list[Entry]:
+    """The entries up to the last episode that `store` shows; all of them if it shows all."""
+    shown = store.episodes
+    every = len(shown) == sum(entry.success for entry in store.tried)
+    return store.tried if every else store.tried[: store.tried.index(shown[-1]) + 1]
+
+
+def _first(config: Mapping[str, Any], tried: int) -> dict[str, Any]:
+    """The config of the first so many entries of a store."""
+    if "parts" not in config:
+        return dict(config)
+    parts = []
+    for part in config["parts"]:
+        if entries := min(part["entries"], tried):
+            parts.append({**part, "entries": entries})
+            tried -= entries
+    return {**config, "parts": parts}
+
+
+def _is_of(folder: Path, header: Mapping[str, Any], tried: Sequence[Entry]) -> bool:
+    try:
+        same = json.loads((folder / "store.json").read_text(encoding="utf-8")) == header
+        return same and [replace(entry, crc=0) for entry in EpisodeStore(folder).tried] == [
+            replace(entry, crc=0) for entry in tried
+        ]
+    except (OSError, ValueError):  # not there, or damaged
+        return False
