@@ -69,6 +69,7 @@ PLAIN: dict[str, Any] = {
         "episodes": Count,
         "batches": Count,
         "steps": Count,
+        "robosuite": str | None,
     },
     "inspect": {
         "folder": str,
