@@ -65,7 +65,7 @@ def collection(config: DictConfig) -> dict[str, Measure]:
     steps = sum(len(episode.actions) for episode in episodes)
     bound, render = environment.task.bound, environment.renderer.render
     substeps, views = (
-        environment.task.physics_steps_per_control_step,
+        environment.task.substeps,
         [bound.cameras[c] for c in environment.spec.cameras],
     )
     _, physics = _timed(lambda: [mujoco.mj_step(bound.model, bound.data, substeps) for _ in range(steps)])
