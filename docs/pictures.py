@@ -56,10 +56,12 @@ def screenshot(recording: Path, picture: Path, step: int) -> None:
 
 
 def main(run: Path) -> None:
-    """Preview, one rollout in the viewer, the card of a small store, and the report of `run`."""
+    """Previews, one rollout in the viewer, the card of a small store, and the report of `run`."""
     with tempfile.TemporaryDirectory() as folder:
         vla("job=preview", "preview.episodes=6", f"output={folder}")
         shutil.copy(Path(folder) / "preview.png", DOCS / "preview.png")
+        vla("job=preview", "task/goal=mixed", "task/randomize=wide", "preview.seed=1000000", f"output={folder}")
+        shutil.copy(Path(folder) / "preview.png", DOCS / "wide.png")
         checkpoint = run / "checkpoints/last.ckpt"
         vla(f"checkpoint={checkpoint}", "evaluate.episodes=1", "evaluate.workers=1", f"output={folder}")
         screenshot(Path(folder) / "rollouts.rrd", DOCS / "rollout.png", STEP)

@@ -9,7 +9,7 @@ import pytest
 import torch
 from toy import SPEC
 
-from vla.models.action_tokenizer import RT1, ActionTokenizer, Uniform
+from vla.models.action_tokenizer import RT1, ActionTokenizer, Uniform, fidelity
 
 
 @dataclass(frozen=True)
@@ -130,3 +130,12 @@ def test_labels_that_are_not_valid_do_not_count(tokenizer: ActionTokenizer) -> N
 def test_a_single_bin_is_refused() -> None:
     with pytest.raises(ValueError, match="at least 2 bins"):
         Uniform(bins=1, spec=SPEC)
+
+
+def test_what_a_tokenizer_loses_is_told_in_the_units_of_people() -> None:
+    # Bins of 1 m and 1 rad: an action of 0.25 m rounds down to 0 m and so loses 250 mm, always to the same side.
+    tokenizer = RT1(bins=3, spec=SPEC)
+    told = fidelity(tokenizer, np.tile([0.25, 0.0, 1.0], (4, 1)), SPEC.units)
+    assert told.startswith("250.000 mm (bias 250.000)") and "1 to 1 of 3 bins used; 3 tokens per action" in told
+    fine = fidelity(Uniform(spec=SPEC, statistics=BOUNDS), np.array([BOUNDS.low, BOUNDS.high]), SPEC.units)
+    assert float(fine.split()[0]) < 0.2

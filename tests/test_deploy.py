@@ -174,13 +174,13 @@ def test_the_whole_loop_reports_and_its_bag_moves_an_agent_again(
 
 def test_what_the_node_thinks_is_what_the_evaluated_policy_does(home: Path) -> None:
     """On the same observations, through messages and back, bit for bit."""
-    from vla import jobs
+    from vla import parts
     from vla.policy import read_checkpoint
     from vla.spec import Observation
 
     checkpoint = home / "run/checkpoints/last.ckpt"
-    environment = jobs.make_environment(read_checkpoint(checkpoint).config["task"])
-    evaluated, deployed = (jobs.make_policy(checkpoint, environment) for _ in range(2))
+    environment = parts.make_environment(read_checkpoint(checkpoint).config["task"])
+    evaluated, deployed = (parts.make_policy(checkpoint, environment) for _ in range(2))
     names = list(environment.spec.joints)
     robot = Robot(names, [-9.0] * 7, [9.0] * 7, [1.0] * 7, [1.0] * 7, ["left", "right"])
     observation = environment.reset(5)

@@ -27,7 +27,7 @@ def test_the_expert_solves_every_goal(goal: str, perturbed: bool) -> None:
     with environment.blind():
         episodes = [rollout(environment, expert, seed) for seed in range(25)]
     environment.close()
-    assert sum(episode.success for episode in episodes) >= (23 if perturbed else 24)
+    assert sum(episode.success for episode in episodes) >= (22 if perturbed else 24)
 
 
 @pytest.mark.parametrize("goal", GOALS)
@@ -46,6 +46,15 @@ def test_the_clean_action_is_recorded_where_another_one_is_executed(tabletop: Ta
         episode = rollout(tabletop, expert, 3)
     differs = (episode.actions != episode.executed).any(axis=1)
     assert differs[:4].all() and not differs[4:].any()
+
+
+def test_a_grasp_that_is_made_to_miss_is_made_good(tabletop: Tabletop) -> None:
+    expert = Waypoint(tabletop.spec, Perturbation(start=0.0, noise=0.0, rate=0.0, missed=1.0))
+    with tabletop.blind():
+        episode = rollout(tabletop, expert, 3)
+    beside = (episode.actions[:, :2] != episode.executed[:, :2]).any(axis=1)
+    assert episode.success and beside.sum() >= 3
+    assert (episode.executed[beside, 6] == 0).all()
 
 
 def test_labels_depend_on_the_state_alone(tabletop: Tabletop) -> None:

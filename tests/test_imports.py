@@ -34,8 +34,10 @@ PARTS = {
     "vla.deploy": ("vla.spec", "vla.policy", "vla.tasks", "vla.data", "vla.evaluate", "vla.record", "vla.deploy"),
     "vla.stores": ("vla",),
     "vla.check": (),
+    "vla.peers": (),
     "vla.training": ("vla.check",),
     "vla.benchmark": ("vla",),
+    "vla.parts": ("vla",),
     "vla.jobs": ("vla",),
     "vla.run": ("vla",),
 }
@@ -43,7 +45,7 @@ PARTS = {
 # A library → the only parts that may import it.
 LIBRARIES = {
     "hydra": ("vla.run", "vla.jobs", "vla.check", "vla.benchmark"),
-    "omegaconf": ("vla.run", "vla.jobs", "vla.check", "vla.training", "vla.benchmark"),
+    "omegaconf": ("vla.run", "vla.jobs", "vla.parts", "vla.check", "vla.training", "vla.benchmark"),
     "mujoco": ("vla.tasks", "vla.benchmark"),
     "dm_control": ("vla.tasks",),
     "dm_env": ("vla.tasks",),
@@ -99,7 +101,7 @@ def test_the_simulator_needs_no_torch() -> None:
             assert not {name.split(".")[0] for name in imports(ast.parse(path.read_text(encoding="utf-8")))} & {"torch"}
 
 
-@pytest.mark.parametrize("module", ["vla.run", "vla.check", "vla.jobs"])
+@pytest.mark.parametrize("module", ["vla.run", "vla.check", "vla.jobs", "vla.parts"])
 def test_the_entry_imports_nothing_heavy_at_once(module: str) -> None:
     assert [name for name in imports_at_once(MODULES[module]) if within(name, HEAVY)] == []
 

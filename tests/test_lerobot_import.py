@@ -20,7 +20,7 @@ from toy import SPEC, ToyEnvironment
 from vla.data.episodes import EpisodeStore
 from vla.data.lerobot import LeRobot as Export
 from vla.data.lerobot_import import LeRobot
-from vla.jobs import make_expert
+from vla.parts import make_expert
 from vla.spec import Spec
 
 

@@ -8,21 +8,29 @@ from __future__ import annotations
 import json
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
+from subprocess import PIPE, Popen
+from tempfile import TemporaryDirectory
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from omegaconf import DictConfig
 
+from vla.workers import cores, one_thread_each
+
 if TYPE_CHECKING:
     from vla.data.episodes import EpisodeStore
     from vla.data.windows import Windows
+    from vla.spec import Episode
 
 Measure = dict[str, Any]  # value, unit, n, floor, ratio
 
 ROUNDS = 5  # of the loader and of its floor
+PATIENCE = 20.0  # with another project [s]
+PEER_EPISODES = 50  # that another project's loader gets
 
 
 def benchmark(config: DictConfig, output: Path) -> dict[str, Measure]:
@@ -45,44 +53,132 @@ def benchmark(config: DictConfig, output: Path) -> dict[str, Measure]:
 
 
 def collection(config: DictConfig) -> dict[str, Measure]:
-    """Control steps of the expert in one process with all cameras, against bare physics and rendering of as many."""
+    """Collection: of one process with all cameras against bare physics and rendering of as many steps, where its time
+    goes, of all processes, and where `config.benchmark.robosuite` names a Python, of robosuite on the same work."""
     import mujoco
 
+    from vla.collect import Demonstrator
+    from vla.data.episodes import EpisodeStore
     from vla.jobs import make_environment, make_expert, plain
-    from vla.rollout import rollout
+    from vla.rollout import replay, rollout
 
-    environment = make_environment(plain(config.task))
-    expert = make_expert(plain(config.expert), environment)
+    makers = partial(make_environment, plain(config.task)), partial(make_expert, plain(config.expert))
+    environment = makers[0]()
+    expert = makers[1](environment)
     rollout(environment, expert, 0)  # the first one compiles shaders
-    started = time.perf_counter()
-    steps = sum(len(rollout(environment, expert, seed).actions) for seed in range(config.benchmark.episodes))
-    seconds = time.perf_counter() - started
+    seeds = range(config.benchmark.episodes)
+    episodes, full = _timed(lambda: [rollout(environment, expert, seed) for seed in seeds])
+    steps = sum(len(episode.actions) for episode in episodes)
     bound, render = environment.task.bound, environment.renderer.render
-    substeps = environment.task.physics_steps_per_control_step
-    started = time.perf_counter()
-    for _ in range(steps):
-        mujoco.mj_step(bound.model, bound.data, substeps)
-        for camera in environment.spec.cameras:
-            render(bound.data, bound.cameras[camera])
-    floor = steps / (time.perf_counter() - started)
+    substeps, views = (
+        environment.task.substeps,
+        [bound.cameras[c] for c in environment.spec.cameras],
+    )
+    _, physics = _timed(lambda: [mujoco.mj_step(bound.model, bound.data, substeps) for _ in range(steps)])
+    _, rendering = _timed(lambda: [render(bound.data, view) for _ in range(steps) for view in views])
+    with environment.blind():
+        _, blind = _timed(lambda: [rollout(environment, expert, seed) for seed in seeds])
+        _, replaying = _timed(lambda: [replay(environment, episode) for episode in episodes])
+    with TemporaryDirectory() as folder:
+        store = EpisodeStore.create_or_open(folder, environment.spec, {})
+        with store.writing():
+            _, storing = _timed(partial(_keep, store, episodes))
     environment.close()
-    return {"collect": _measure(steps / seconds, "control steps/s", steps, floor)}
+    stages = {
+        "physics": physics,
+        "rendering": rendering,
+        "expert, controller, judge": blind - physics,
+        "images into arrays": full - blind - rendering,
+        "replay": replaying,
+        "storing": storing,
+    }
+    measures = {"collect": _measure(steps / full, "control steps/s", steps, steps / (physics + rendering))}
+    whole = 1000 * (full + replaying + storing) / steps
+    for name, seconds in stages.items():
+        measures[f"collect: {name}"] = _measure(1000 * seconds / steps, "ms/step", steps, whole)
+    alone, together = (_attempts(partial(Demonstrator, *makers), count, config) for count in (1, cores()))
+    measures[f"collect: {cores()} processes"] = _measure(*together, cores() * alone[0])
+    if config.benchmark.robosuite is not None:
+        size = environment.spec.image_size
+        for count, (rate, unit, n) in ((1, alone), (cores(), together)):
+            peer = _peer("robosuite", config.benchmark.robosuite, "robosuite_lift.py", (*size, PATIENCE), count)
+            measures[f"collect: {count} of robosuite's processes"] = _measure(rate, unit, n, peer)
+    return measures
+
+
+def _timed(work: Callable[[], Any]) -> tuple[Any, float]:
+    """What comes of some work, and how long it took [s]."""
+    started = time.perf_counter()
+    result = work()
+    return result, time.perf_counter() - started
+
+
+def _keep(store: EpisodeStore, episodes: list[Episode]) -> None:
+    for episode in episodes:
+        if episode.success:
+            store.append(episode)
+        else:
+            store.fail(episode.seed, episode.outcome, episode.draws)
+
+
+def _attempts(make: Callable[[], Any], processes: int, config: DictConfig) -> tuple[float, str, int]:
+    """Verified control steps per second of so many processes side by side, once they are warm; unit; how many."""
+    from vla.cluster import Local
+
+    with Local(processes).team(make) as team:
+        for wait in [team.submit(seed) for seed in range(2 * processes)]:
+            wait()
+        seeds = range(processes * config.benchmark.episodes)
+        episodes, seconds = _timed(lambda: [wait() for wait in [team.submit(seed) for seed in seeds]])
+    steps = sum(len(episode.actions) for episode in episodes)
+    return steps / seconds, "control steps/s", steps
+
+
+def _peer(name: str, python: str, script: str, arguments: Sequence[Any], processes: int = 1) -> float:
+    """What so many processes of a script in `vla/peers`, side by side, reach together.
+
+    Raises:
+        ValueError: it does not run with the Python that `benchmark.NAME` is.
+    """
+    command = [python, str(Path(__file__).parent / "peers" / script), *map(str, arguments)]
+    with one_thread_each():
+        try:
+            started = [Popen(command, stdout=PIPE, stderr=PIPE, text=True) for _ in range(processes)]
+        except OSError as error:
+            raise ValueError(f"benchmark.{name} is {python}, which cannot be run: {error.strerror}") from error
+        told = [process.communicate() for process in started]
+    if any(process.returncode for process in started):
+        last = told[0][1].strip().splitlines()[-1:] or ["it says nothing"]
+        raise ValueError(f"benchmark.{name} is {python}, with which {name} does not run: {last[0]}")
+    return sum(float(printed.split()[-1]) for printed, _ in told)
 
 
 def loader(config: DictConfig) -> dict[str, Measure]:
     """Training windows through the loader, against a bare gather of the same images; as the model wants them, and more.
 
-    The best of a few rounds, in turns, on pages that are in memory.
+    The best of a few rounds, in turns, on pages that are in memory. Where `config.benchmark.lerobot` names a Python,
+    the floor of two more measures is LeRobot's loader on the same episodes.
     """
+    from vla.data.episodes import EpisodeStore
+    from vla.data.lerobot import LeRobot
     from vla.jobs import collected, make_data, make_learner
 
     store = collected(config)
     model = make_learner(config, store).model
     measures = {"loader": _loading(make_data(config, store, model), store, model.history, config.benchmark.batches)}
-    for frames in (1, 6):
+    names = {1: "loader: 1 frame", 6: "loader: 6 frames"}
+    for frames, name in names.items():
         data = make_data(config, store, SimpleNamespace(history=frames, chunk=model.chunk))
-        name = f"loader: {frames} frame{'s' if frames > 1 else ''}"
         measures[name] = _loading(data, store, frames, config.benchmark.batches)
+    if config.benchmark.lerobot is not None:
+        some = EpisodeStore(store.folder, min(config.collect.episodes, PEER_EPISODES))
+        with TemporaryDirectory() as folder:
+            dataset = LeRobot(Path(folder) / "dataset").export(some)
+            for frames, name in names.items():
+                arguments = (dataset, frames, PATIENCE)
+                peer = _peer("lerobot", config.benchmark.lerobot, "lerobot_windows.py", arguments)
+                own = measures[name]
+                measures[f"{name}, against LeRobot"] = _measure(own["value"], own["unit"], own["n"], peer)
     return measures
 
 

@@ -69,6 +69,8 @@ PLAIN: dict[str, Any] = {
         "episodes": Count,
         "batches": Count,
         "steps": Count,
+        "robosuite": str | None,
+        "lerobot": str | None,
     },
     "inspect": {
         "folder": str,

@@ -89,7 +89,7 @@ def collect(
             before = len(store.episodes)  # another process may have added some while this one waited
             _require_first_seed(store, seed)
             if before < episodes:
-                _fill_with(cluster, partial(_Worker, make_environment, make_expert), store, episodes, seed)
+                _fill_with(cluster, partial(Demonstrator, make_environment, make_expert), store, episodes, seed)
     stored = len(store.episodes)
     failures = Counter(entry.outcome for entry in store.tried if not entry.success)
     return Summary(stored, stored - before, len(store.tried), dict(failures), time.monotonic() - started)
@@ -149,7 +149,7 @@ def _give_up_after(store: EpisodeStore, in_a_row: int) -> None:
         )
 
 
-class _Worker:
+class Demonstrator:
     """One environment and one expert."""
 
     def __init__(self, make_environment: MakeEnvironment, make_expert: MakeExpert) -> None:

@@ -60,7 +60,7 @@ def replay_into(output: Path, folder: Path, seed: int) -> None:
     Raises:
         ValueError: there is no such episode, or its store does not say in which task it was made.
     """
-    from vla.jobs import make_environment
+    from vla.parts import make_environment
     from vla.record import RerunRecorder, recording_name
     from vla.rollout import replay
     from vla.tasks.backend import choose_backend

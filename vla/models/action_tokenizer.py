@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from typing import Protocol
 
 import numpy as np
@@ -181,3 +182,22 @@ class RT1(ActionTokenizer):
 
 def _hard_cross_entropy(logits: Tensor, token: Tensor) -> Tensor:
     return F.cross_entropy(logits.flatten(0, -2), token.flatten(), reduction="none").view(token.shape)
+
+
+def fidelity(tokenizer: ActionTokenizer, actions: np.ndarray, units: Sequence[str]) -> str:
+    """What is lost between (N, D) actions and their tokens, in one line: errors and bias in the units of people.
+
+    The largest component of each unit counts; bins are used that at least one action falls into.
+    """
+    action = torch.as_tensor(actions, dtype=torch.float32)
+    tokens = tokenizer.encode(action)
+    error = tokenizer.decode(tokens) - action  # (N, D)
+    told = []
+    for unit, (name, scale) in {"m": ("mm", 1000.0), "rad": ("°", 180 / math.pi), "1": ("of the gripper", 1.0)}.items():
+        of_unit = [index for index, other in enumerate(units) if other == unit]
+        if of_unit:
+            part = error[:, of_unit]
+            told.append(f"{scale * part.abs().mean(0).max():.3f} {name} (bias {scale * part.mean(0).abs().max():.3f})")
+    used = [len(tokens[:, index].unique()) for index in range(tokens.shape[1])]
+    spread = f"{min(used)} to {max(used)} of {tokenizer.bins} bins used"
+    return f"{', '.join(told)} lost; {spread}; {len(units)} tokens per action"

@@ -23,6 +23,7 @@ JOINT_LOW = np.array([-2.8973, -1.7628, -2.8973, -3.0718, -2.8973, -0.0175, -2.8
 JOINT_HIGH = np.array([2.8973, 1.7628, 2.8973, -0.0698, 2.8973, 3.7525, 2.8973])  # [rad]
 JOINT_SPEED = np.array([2.175, 2.175, 2.175, 2.175, 2.61, 2.61, 2.61])  # [rad/s]
 LIMIT_MARGIN = 0.05  # kept from the joint limits [rad]
+LOWEST, HIGHEST = JOINT_LOW + LIMIT_MARGIN, JOINT_HIGH - LIMIT_MARGIN
 
 HOME = np.array([0.0, 0.1, 0.0, -2.1, 0.0, 2.2, 0.785])  # gripper pointing down over the table [rad]
 MAX_OPENING = 0.08  # between the fingertips [m], Franka Hand product manual
@@ -112,7 +113,7 @@ def solve(target: Array, joints: Array) -> Array:
         inverse = jacobian.T @ np.linalg.inv(jacobian @ jacobian.T + DAMPING**2 * np.eye(6))
         posture = POSTURE_GAIN * (HOME - joints)
         joints += inverse @ error + posture - inverse @ (jacobian @ posture)
-        joints = np.clip(joints, JOINT_LOW + LIMIT_MARGIN, JOINT_HIGH - LIMIT_MARGIN)
+        joints = np.minimum(np.maximum(joints, LOWEST), HIGHEST)
     return joints
 
 

@@ -27,6 +27,7 @@ LANE = 0.010  # how far beside the line of a push the fingertips may be [m]
 PUSH_AT = 1.1  # where a block is pushed, as a share of half its height: it tips neither way
 PUSH = 0.015  # furthest that a block is pushed in one step [m]
 MAX_YAW = 0.9  # furthest turn from neutral from which the nearest faces are taken [rad]
+MISS, MISS_STEPS = 0.03, 3  # how far beside the block a grasp is made to miss [m], and for how long [steps]
 CLEARANCE = 0.012  # between open fingers and a block on both sides together [m]
 
 
@@ -168,6 +169,7 @@ class Perturbation:
         noise: float = 0.2,
         closed: float = 0.3,
         unturned: float = 0.3,
+        missed: float = 0.1,
         low: Sequence[float] = (0.34, -0.26, 0.015),
         high: Sequence[float] = (0.66, 0.26, 0.34),
     ) -> None:
@@ -179,17 +181,18 @@ class Perturbation:
         noise: standard deviation of the noise on every executed motion, as a share of it.
         closed: probability that an excursion commands a closed gripper.
         unturned: probability that an episode carries no turn out, so that blocks are also held by their edges.
+        missed: probability that a grasp is made to miss: the gripper closes a few centimetres beside the block.
         low: lower corner of the box of points to go to, in the base frame [m].
         high: upper corner.
         """
         self._start, self._start_steps, self._rate, self._steps = start, tuple(start_steps), rate, tuple(steps)
-        self._noise, self._closed, self._unturned = noise, closed, unturned
+        self._noise, self._closed, self._unturned, self._missed = noise, closed, unturned, missed
         self._low, self._high = np.array(low), np.array(high)
 
     def reset(self, seed: int) -> None:
         """Draw whether and where this episode starts off."""
         self._random = np.random.default_rng([seed, 0x5EED])
-        self._left = 0
+        self._left, self._open = 0, True
         self._turns = self._random.uniform() >= self._unturned
         if self._random.uniform() < self._start:
             self._begin(self._start_steps)
@@ -202,8 +205,13 @@ class Perturbation:
 
     def __call__(self, clean: Array, commanded: Array) -> Array:
         """The (7,) action to execute instead of `clean`, given the commanded (4, 4) pose."""
+        grasps, self._open = self._open and clean[6] < 0.5, bool(clean[6] >= 0.5)
         if self._left == 0 and self._random.uniform() < self._rate:
             self._begin(self._steps)
+        elif self._left == 0 and grasps and self._random.uniform() < self._missed:
+            angle = self._random.uniform(-np.pi, np.pi)
+            self._left, self._turn, self._gripper = MISS_STEPS, 0.0, 0.0
+            self._point = commanded[:3, 3] + MISS * np.array([np.cos(angle), np.sin(angle), 0.0])
         action = clean.astype(float)
         if self._left > 0:
             self._left -= 1

@@ -27,6 +27,10 @@ PAD_RADIUS = 0.05  # [m]
 PAD_THICKNESS = 0.001  # half [m]: painted on, it does not collide
 TABLE_HALF_SIZE = (0.6, 0.8, 0.03)  # [m]
 TABLE_CENTRE = (0.4, 0.0)  # [m]
+LAMP_DIRECTION = np.array([-0.1, 0.25, -1.0]) / np.linalg.norm([-0.1, 0.25, -1.0])
+LAMP_DISTANCE = 2.0  # from the point around which things cast shadows [m]
+SHADOWED = (0.42, 0.0, 0.1)  # that point [m]
+SHADOW_REACH = 0.6  # how far around it [m]
 TEXTURE = 64  # edge of the pictures that lie on table and floor [px]
 BLOCK_CONTACT = {"contype": 1, "conaffinity": 3}
 
@@ -116,7 +120,7 @@ class Scene(composer.Entity):
         visual.map.znear, visual.map.zfar = 0.01, 10.0
         visual.headlight.ambient, visual.headlight.diffuse = (0.42,) * 3, (0.2,) * 3
         visual.headlight.specular = (0.0,) * 3
-        visual.map.shadowclip, visual.map.shadowscale = 0.9, 0.8
+        visual.map.shadowclip = SHADOW_REACH  # [m], as the extent is 1
         self._root.statistic.extent, self._root.statistic.center = 1.0, (0.4, 0, 0.2)
         self._root.asset.add(
             "texture",
@@ -175,8 +179,8 @@ class Scene(composer.Entity):
         self._root.worldbody.add(
             "light",
             name="lamp",
-            pos=(0.6, -0.4, 1.8),
-            dir=(-0.1, 0.25, -1),
+            pos=np.array(SHADOWED) - LAMP_DISTANCE * LAMP_DIRECTION,
+            dir=LAMP_DIRECTION,
             directional=True,
             castshadow=shadows,
             diffuse=(0.55,) * 3,

@@ -8,7 +8,6 @@ from typing import Any, Literal
 
 import dm_env
 import numpy as np
-from dm_control import composer
 
 from vla.spec import Array, Observation, Shape, Spec
 from vla.tasks.franka import FINGER_TRAVEL
@@ -17,7 +16,7 @@ from vla.tasks.goals.mixed import Mixed
 from vla.tasks.randomize.axis import Axis, stream
 from vla.tasks.render import Renderer
 from vla.tasks.scene import COLOURS, Scene
-from vla.tasks.task import CONTROL_HZ, TabletopTask
+from vla.tasks.task import CONTROL_HZ, BriskEnvironment, TabletopTask
 
 TRANSLATION = 0.04  # largest translation per step [m]
 ROTATION = 0.25  # largest rotation per step [rad]
@@ -73,8 +72,7 @@ class Tabletop:
         task = TabletopTask(
             goal, randomize, Scene(blocks=blocks, meshes=meshes, shadows=shadows), low, high, time_limit
         )
-        # The scene is compiled once: every reset writes into the compiled model.
-        self.dm_env = composer.Environment(task, recompile_mjcf_every_episode=False)
+        self.dm_env = BriskEnvironment(task)
         self.task = task
         unknown = sorted(set(cameras) - set(task.bound.cameras))
         if unknown or not cameras:

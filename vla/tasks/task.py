@@ -6,6 +6,7 @@ from collections import deque
 from collections.abc import Mapping
 from typing import Any
 
+import mujoco
 import numpy as np
 from dm_control import composer, mjcf
 from dm_env import specs
@@ -23,6 +24,17 @@ from vla.tasks.scene import PADS, Scene
 
 CONTROL_HZ = 10.0
 FINGER_STEP = FINGER_SPEED / CONTROL_HZ  # furthest a finger moves in one control period [m]
+
+
+class BriskEnvironment(composer.Environment):
+    """Composer's environment with all substeps in one loop: the hooks around each one take longer than MuJoCo does."""
+
+    def __init__(self, task: TabletopTask) -> None:
+        # Compiled once: every reset writes into the compiled model.
+        super().__init__(task, recompile_mjcf_every_episode=False)
+
+    def _substep(self, action: Array) -> None:
+        self._task.advance(self._physics, self._task.substeps)
 
 
 class TabletopTask(composer.Task):
@@ -43,6 +55,7 @@ class TabletopTask(composer.Task):
         self._time_limit = time_limit
         self._low, self._high = low, high
         self.control_timestep = 1 / CONTROL_HZ
+        self.substeps = round(self.control_timestep / self.physics_timestep)
         self.controller = CartesianController(self.control_timestep, *WORKSPACE)
         self.seed: int | None = None  # of the next episode; drawn from dm_control's random state when None
         self.draws: dict[str, Any] = {}
@@ -52,6 +65,11 @@ class TabletopTask(composer.Task):
     def root_entity(self) -> Scene:
         """The world."""
         return self.scene
+
+    @property
+    def physics_steps_per_control_step(self) -> int:
+        """One, as far as composer is concerned; see `BriskEnvironment`."""
+        return 1
 
     def after_compile(self, physics: mjcf.Physics, random_state: np.random.RandomState) -> None:
         """Find the scene's elements in the compiled model."""
@@ -130,29 +148,30 @@ class TabletopTask(composer.Task):
         grip = self._command[7]
         goal = np.append(self.controller.step(action[:6]), action[6] * FINGER_TRAVEL)
         goal[7] = grip + np.clip(goal[7] - grip, -FINGER_STEP, FINGER_STEP)
-        self._increment = (goal - self._command) / self.physics_steps_per_control_step
+        self._increment = (goal - self._command) / self.substeps
 
     def follow(self, physics: mjcf.Physics, goal: Array, substeps: int) -> None:
         """Step physics while the targets of joints and fingers approach `goal` (8,) [rad], [m] evenly."""
         furthest = FINGER_SPEED * substeps * physics.timestep()
         finger = self._command[7] + np.clip(goal[7] - self._command[7], -furthest, furthest)
         self._increment = (np.append(goal[:7], finger) - self._command) / substeps
-        for _ in range(substeps):
-            self._move_targets(physics)
-            physics.step()
+        self.advance(physics, substeps)
 
-    def before_substep(self, physics: mjcf.Physics, action: Array, random_state: np.random.RandomState) -> None:
-        """Move the joint targets on."""
-        self._move_targets(physics)
-
-    def _move_targets(self, physics: mjcf.Physics) -> None:
-        """One time step on, and ahead by what the servo's damping takes back: the arm then follows without lag."""
-        self._command = self._command + self._increment
-        target = self._command.copy()
-        target[:7] += DAMPING_RATIO / physics.timestep() * self._increment[:7]
-        self._late.append(target)
-        if len(self._late) > self._delay:
-            physics.data.ctrl[:] = self._late.popleft()
+    def advance(self, physics: mjcf.Physics, substeps: int) -> None:
+        """Step physics while the targets move on evenly, each ahead by what the servo's damping takes back: the arm
+        then follows without lag."""
+        commands = self._command + np.arange(1, substeps + 1)[:, None] * self._increment
+        targets = commands.copy()
+        targets[:, :7] += DAMPING_RATIO / physics.timestep() * self._increment[:7]
+        self._command = commands[-1]
+        model, data = physics.model.ptr, physics.data.ptr
+        with physics.check_invalid_state():
+            for target in targets:
+                self._late.append(target)
+                if len(self._late) > self._delay:
+                    data.ctrl[:] = self._late.popleft()
+                mujoco.mj_step2(model, data)
+                mujoco.mj_step1(model, data)
 
     def after_step(self, physics: mjcf.Physics, random_state: np.random.RandomState) -> None:
         """Judge what happened in this control period."""

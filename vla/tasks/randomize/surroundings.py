@@ -9,7 +9,7 @@ import numpy as np
 from vla.spec import Array
 from vla.tasks.bound import BoundScene
 from vla.tasks.randomize.axis import Range, rounded
-from vla.tasks.scene import TEXTURE
+from vla.tasks.scene import LAMP_DISTANCE, SHADOWED, TEXTURE
 
 PATTERNS = ("checks", "stripes", "patches")
 
@@ -22,11 +22,12 @@ class Light:
         self.brightness, self.tint, self.tilt = brightness, tint, tilt
 
     def __call__(self, scene: BoundScene, random_state: np.random.RandomState) -> dict[str, Any]:
-        """Draw a lamp; it shines from where its direction points back to."""
+        """Draw a lamp, far enough away that all of its rays are parallel."""
         diffuse = random_state.uniform(*self.brightness) + random_state.uniform(-self.tint, self.tint, 3)
         direction = scene.model.light_dir[0] + np.append(np.tan(random_state.uniform(-self.tilt, self.tilt, 2)), 0.0)
         scene.model.light_diffuse[0] = diffuse
         scene.model.light_dir[0] = direction / np.linalg.norm(direction)
+        scene.model.light_pos[0] = np.array(SHADOWED) - LAMP_DISTANCE * scene.model.light_dir[0]
         return {"diffuse": rounded(diffuse), "direction": rounded(scene.model.light_dir[0])}
 
 
