@@ -19,7 +19,7 @@ def windows_per_second(folder: Path, frames: int, seconds: float) -> float:
     info = json.loads((folder / "meta/info.json").read_text(encoding="utf-8"))
     times = [age / info["fps"] for age in range(1 - frames, 1)]
     seen = [name for name in info["features"] if name.startswith("observation.")]
-    dataset = LeRobotDataset("local", root=folder, delta_timestamps=dict.fromkeys(seen, times))
+    dataset = LeRobotDataset("local", root=folder, delta_timestamps=dict.fromkeys(seen, times), video_backend="pyav")
     order = np.random.default_rng(0).integers(0, len(dataset), 100_000).tolist()
     assert dataset[order[0]]
     count, started = 0, time.perf_counter()
