@@ -34,7 +34,14 @@ def config(**changes: Any) -> DictConfig:
             "collect": {"episodes": 5, "seed": 0, "workers": None, "folder": "outputs/episodes/x"},
             "evaluate": {"episodes": 5, "seed": 1_000_000, "workers": None, "recordings": 2},
             "preview": {"episodes": 1, "seed": 0},
-            "benchmark": {"names": ["train"], "episodes": 1, "batches": 1, "steps": 1, "robosuite": None},
+            "benchmark": {
+                "names": ["train"],
+                "episodes": 1,
+                "batches": 1,
+                "steps": 1,
+                "robosuite": None,
+                "lerobot": None,
+            },
             "inspect": dict.fromkeys(("stores", "where", "into", "episode")) | {"folder": "x", "repair": False},
             "task": {
                 "_target_": "vla.tasks.tabletop.Tabletop",
