@@ -34,7 +34,7 @@ PARTS = {
     "vla.deploy": ("vla.spec", "vla.policy", "vla.tasks", "vla.data", "vla.evaluate", "vla.record", "vla.deploy"),
     "vla.stores": ("vla",),
     "vla.check": (),
-    "vla.peers": (),
+    "vla.peers": ("vla.workers",),
     "vla.training": ("vla.check",),
     "vla.benchmark": ("vla",),
     "vla.parts": ("vla",),

@@ -8,10 +8,9 @@ from __future__ import annotations
 import json
 import os
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from subprocess import PIPE, Popen
 from tempfile import TemporaryDirectory
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
@@ -19,7 +18,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from omegaconf import DictConfig
 
-from vla.workers import cores, one_thread_each
+from vla.peers.peer import peer
+from vla.workers import cores
 
 if TYPE_CHECKING:
     from vla.data.episodes import EpisodeStore
@@ -101,8 +101,8 @@ def collection(config: DictConfig) -> dict[str, Measure]:
     if config.benchmark.robosuite is not None:
         size = environment.spec.image_size
         for count, (rate, unit, n) in ((1, alone), (cores(), together)):
-            peer = _peer("robosuite", config.benchmark.robosuite, "robosuite_lift.py", (*size, PATIENCE), count)
-            measures[f"collect: {count} of robosuite's processes"] = _measure(rate, unit, n, peer)
+            rival = peer("robosuite", config.benchmark.robosuite, "robosuite_lift.py", (*size, PATIENCE), count)
+            measures[f"collect: {count} of robosuite's processes"] = _measure(rate, unit, n, rival)
     return measures
 
 
@@ -134,25 +134,6 @@ def _attempts(make: Callable[[], Any], processes: int, config: DictConfig) -> tu
     return steps / seconds, "control steps/s", steps
 
 
-def _peer(name: str, python: str, script: str, arguments: Sequence[Any], processes: int = 1) -> float:
-    """What so many processes of a script in `vla/peers`, side by side, reach together.
-
-    Raises:
-        ValueError: it does not run with the Python that `benchmark.NAME` is.
-    """
-    command = [python, str(Path(__file__).parent / "peers" / script), *map(str, arguments)]
-    with one_thread_each():
-        try:
-            started = [Popen(command, stdout=PIPE, stderr=PIPE, text=True) for _ in range(processes)]
-        except OSError as error:
-            raise ValueError(f"benchmark.{name} is {python}, which cannot be run: {error.strerror}") from error
-        told = [process.communicate() for process in started]
-    if any(process.returncode for process in started):
-        last = told[0][1].strip().splitlines()[-1:] or ["it says nothing"]
-        raise ValueError(f"benchmark.{name} is {python}, with which {name} does not run: {last[0]}")
-    return sum(float(printed.split()[-1]) for printed, _ in told)
-
-
 def loader(config: DictConfig) -> dict[str, Measure]:
     """Training windows through the loader, against a bare gather of the same images; as the model wants them, and more.
 
@@ -176,9 +157,9 @@ def loader(config: DictConfig) -> dict[str, Measure]:
             dataset = LeRobot(Path(folder) / "dataset").export(some)
             for frames, name in names.items():
                 arguments = (dataset, frames, PATIENCE)
-                peer = _peer("lerobot", config.benchmark.lerobot, "lerobot_windows.py", arguments)
+                rival = peer("lerobot", config.benchmark.lerobot, "lerobot_windows.py", arguments)
                 own = measures[name]
-                measures[f"{name}, against LeRobot"] = _measure(own["value"], own["unit"], own["n"], peer)
+                measures[f"{name}, against LeRobot"] = _measure(own["value"], own["unit"], own["n"], rival)
     return measures
 
 

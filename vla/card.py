@@ -14,7 +14,7 @@ import numpy as np
 from rich.markup import escape
 from rich.table import Table
 
-from vla.data.episodes import Entry
+from vla.data.index import Entry
 from vla.data.inspection import Findings, episode_of, listed, parts_of
 from vla.report import GREEN, RED, contact_sheet, spans
 from vla.spec import flat

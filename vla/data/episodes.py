@@ -18,44 +18,22 @@ import os
 import zlib
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
 from filelock import FileLock, Timeout
 
+from vla.data.index import REMEDY, SALVAGE, Entry, dumps, index_line, moments, read_index
 from vla.data.pack import CODECS, JPEG, PackedRows, whole_rows
 from vla.spec import Array, Episode, Spec
 
 Rows = Array | PackedRows
 
 FORMAT = 1
-REMEDY = "copy the folder again from where it is whole, or delete it and collect again"
-SALVAGE = f"keep what is whole with job=inspect inspect.repair=true, {REMEDY}"
-LOST = "lost"  # outcome of a seed of which a damaged index tells nothing
-MOMENTS = {"low", "high", "sum", "square"}  # of the actions of an episode
 
 log = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True)
-class Entry:
-    """One index line: a seed that was tried; one that failed has no steps."""
-
-    seed: int
-    outcome: str  # "success" or the name of the failure
-    instruction: str
-    start: int  # first row of the episode in every field file
-    steps: int
-    draws: dict[str, Any]  # randomisation axis → what was drawn
-    crc: int  # CRC-32 of the rows of all fields, in the order of `fields_of`; of JPEG, of the files
-    action: dict[str, list[float]]  # "low" | "high" | "sum" | "square" → (D,) over the steps; empty for failures
-
-    @property
-    def success(self) -> bool:
-        """Whether the episode is stored."""
-        return self.outcome == "success"
 
 
 @dataclass(frozen=True)
@@ -112,7 +90,7 @@ class EpisodeStore:
         Another is for episodes that lie there without the `store.json` that would say what they are.
         """
         folder = Path(folder)
-        plain = json.loads(_dumps(config))
+        plain = json.loads(dumps(config))
         if not (folder / "store.json").exists():
             folder.mkdir(parents=True, exist_ok=True)
             with FileLock(folder / "lock"):
@@ -253,7 +231,7 @@ class EpisodeStore:
             os.truncate(self._path(field), self._size(field))
 
     def _refresh(self) -> None:
-        self.tried, self._index_size = _read_index(self._path("index"), self.derived, self._damaged)
+        self.tried, self._index_size = read_index(self._path("index"), self.derived, self._damaged)
         self._rows = max((entry.start + entry.steps for entry in self.tried), default=0)
         for field in self.fields if self._rows else ():
             whole = self._whole(field)
@@ -300,13 +278,6 @@ class EpisodeStore:
         return self.folder / ("index.jsonl" if name == "index" else f"{name}.bin")
 
 
-def moments(actions: Array) -> dict[str, list[float]]:
-    """What an entry keeps of the actions (N, D) of its episode."""
-    wide = actions.astype(np.float64)
-    values = {"low": wide.min(0), "high": wide.max(0), "sum": wide.sum(0), "square": (wide**2).sum(0)}
-    return {name: value.tolist() for name, value in values.items()}
-
-
 def stored(rows: Rows, span: slice) -> Array:
     """Consecutive rows as they lie on the disk: themselves, or bytes (M,)."""
     return rows[span] if isinstance(rows, np.ndarray) else rows.stored(span)
@@ -320,24 +291,9 @@ def checksum(rows: Mapping[str, Array]) -> int:
     return crc
 
 
-def index_line(entry: Entry) -> bytes:
-    """An entry as the index has it."""
-    return (_dumps(asdict(entry)) + "\n").encode()
-
-
 def _write(file: BinaryIO, data: memoryview) -> None:
     while data:  # an unbuffered write may take only a part
         data = data[file.write(data) :]
-
-
-def _dumps(value: Any) -> str:
-    return json.dumps(value, default=_plain, allow_nan=False, ensure_ascii=False)
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, (np.ndarray, np.generic)):
-        return value.tolist()
-    raise ValueError(f"an episode store keeps numbers, strings, lists and dicts, not {value!r}")
 
 
 def _write_header(folder: Path, spec: Spec, config: dict[str, Any]) -> None:
@@ -351,7 +307,7 @@ def _write_header(folder: Path, spec: Spec, config: dict[str, Any]) -> None:
     header = {"format": FORMAT, "spec": spec.to_dict(), "config": config, "fields": fields}
     draft = folder / "store.json.draft"
     try:
-        draft.write_text(_dumps(header), encoding="utf-8")
+        draft.write_text(dumps(header), encoding="utf-8")
     except OSError as error:
         raise ValueError(
             f"{folder} cannot take a store ({error.strerror}): make room there, or set collect.folder"
@@ -374,43 +330,3 @@ def _read_header(folder: Path) -> dict[str, Any]:
     if unknown := sorted(set(header.get("packed", {}).values()) - set(CODECS)):
         raise ValueError(f"{path} has images packed by {unknown}, this version reads {CODECS}: pack them again")
     return header
-
-
-def _read_index(path: Path, any_seed: bool, damaged: bool) -> tuple[list[Entry], int]:
-    """The entries and the number of bytes they take: a last line that was cut short does not count.
-
-    Unless `any_seed`, seeds are consecutive, so that it can be told which are `LOST` in a damaged index.
-    """
-    remedy = REMEDY if any_seed else SALVAGE
-    entries: list[Entry] = []
-    size = rows = last = 0
-    lines = path.read_bytes().split(b"\n") if path.exists() else [b""]
-    for number, line in enumerate(lines[:-1], start=1):
-        try:
-            entry = _entry(line)
-        except (ValueError, TypeError) as error:
-            if number == len(lines) - 1:
-                break
-            if damaged and not any_seed:
-                continue
-            raise ValueError(f"line {number} of {path} cannot be read: {remedy}") from error
-        before = entries[-1].seed if entries else entry.seed - number
-        if entry.start != rows or (entry.seed != before + 1 and not any_seed):
-            if not damaged or any_seed:
-                raise ValueError(f"line {number} of {path} does not follow the line before it: {remedy}")
-            if not 1 <= entry.seed - before <= number - last + 1:  # a lost line end makes one line of two
-                continue
-            entries += [Entry(seed, LOST, "", rows, 0, {}, 0, {}) for seed in range(max(before + 1, 0), entry.seed)]
-        entries.append(entry)
-        rows, size, last = entry.start + entry.steps, size + len(line) + 1, number
-    return entries, size
-
-
-def _entry(line: bytes) -> Entry:
-    entry = Entry(**json.loads(line))
-    counts = (entry.seed, entry.start, entry.steps, entry.crc)
-    if not all(type(count) is int and count >= 0 for count in counts) or (
-        entry.success and set(entry.action) != MOMENTS
-    ):
-        raise ValueError("its numbers are no counts, or some are missing")
-    return entry

@@ -21,7 +21,8 @@ from filelock import FileLock, Timeout
 from PIL import Image
 from rich.progress import track
 
-from vla.data.episodes import Entry, EpisodeStore
+from vla.data.episodes import EpisodeStore
+from vla.data.index import Entry
 from vla.spec import Array, Spec
 from vla.workers import cores, leave_with_parent
 

@@ -17,7 +17,8 @@ from typing import Any
 import numpy as np
 from rich.progress import track
 
-from vla.data.episodes import LOST, Entry, EpisodeStore, moments, stored
+from vla.data.episodes import EpisodeStore, stored
+from vla.data.index import LOST, Entry, moments
 from vla.data.selection import Selection
 from vla.spec import Array, Episode, Observation
 

@@ -13,8 +13,9 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 
-from vla.data.episodes import Entry, EpisodeStore, checksum, index_line
+from vla.data.episodes import EpisodeStore, checksum
 from vla.data.export import each, unfinished
+from vla.data.index import Entry, index_line
 from vla.data.pack import JPEG, OFFSET, ZLIB, pack
 from vla.spec import Array
 

@@ -12,7 +12,7 @@ from difflib import get_close_matches
 from fnmatch import fnmatchcase
 from typing import Any
 
-from vla.data.episodes import Entry
+from vla.data.index import Entry
 from vla.spec import flat, leaves
 
 FACTS = ("seed", "instruction", "outcome", "steps")

@@ -13,8 +13,9 @@ from typing import Annotated, Any
 
 import numpy as np
 
-from vla.data.episodes import Entry, EpisodeStore
+from vla.data.episodes import EpisodeStore
 from vla.data.export import Folders
+from vla.data.index import Entry
 from vla.deploy.governor import Robot
 from vla.deploy.ros2 import Topics
 from vla.spec import Array, Spec

@@ -189,7 +189,7 @@ def fidelity(tokenizer: ActionTokenizer, actions: np.ndarray, units: Sequence[st
 
     The largest component of each unit counts; bins are used that at least one action falls into.
     """
-    action = torch.as_tensor(actions, dtype=torch.float32)
+    action = torch.from_numpy(np.array(actions, np.float32))  # a copy: those of a store cannot be written to
     tokens = tokenizer.encode(action)
     error = tokenizer.decode(tokens) - action  # (N, D)
     told = []
