@@ -66,7 +66,7 @@ def test_the_instruction_matters(make: Callable[[], Model]) -> None:
 def test_without_weight_there_is_no_auxiliary_head() -> None:
     model = make_bc(auxiliary=0.0)
     losses = model.loss(with_text(model, make_batch(1)))
-    assert set(losses) == {"loss", "action_loss", "logits"}
+    assert set(losses) == {"loss", "action_loss"}
     assert losses["loss"] == losses["action_loss"]
 
 

@@ -76,7 +76,7 @@ class Policy:
         self.info: dict[str, Any] = {}
         self._low, self._high = np.array(spec.low, np.float32), np.array(spec.high, np.float32)
         self._frames: deque[dict[str, Tensor]] = deque(maxlen=model.history)
-        self._chunk: deque[tuple[Array, Array]] = deque()
+        self._chunk: deque[tuple[Array, dict[str, Any]]] = deque()
         self.reset("", 0)
 
     def reset(self, instruction: str, seed: int) -> None:
@@ -87,16 +87,17 @@ class Policy:
         self._text = self.model.text.tokenize([instruction])
 
     def act(self, observation: Observation) -> Array:
-        """The (D,) float32 action to execute, within the spec's bounds; `info` has its token probabilities (D, K).
+        """The (D,) float32 action to execute, within the spec's bounds; `info` may have its token probabilities (D, K).
 
         Raises:
             ValueError: the observation is not what the policy was trained on.
         """
         self._see(observation)
         if not self._chunk:
-            self._chunk.extend(zip(*self._predict(), strict=True))
-        action, probabilities = self._chunk.popleft()
-        self.info = {"probabilities": probabilities}
+            actions, probabilities = self._predict()
+            told = [{}] * len(actions) if probabilities is None else [{"probabilities": each} for each in probabilities]
+            self._chunk.extend(zip(actions, told, strict=True))
+        action, self.info = self._chunk.popleft()
         return action
 
     def plan(self, observation: Observation) -> Array:
@@ -114,11 +115,11 @@ class Policy:
         self._frames.append(self._frame(observation))
 
     @torch.inference_mode()
-    def _predict(self) -> tuple[Array, Array]:
-        """Actions (k, D), clipped, and token probabilities (k, D, K)."""
-        logits = self.model(self.window())["logits"][0, -1]  # (k, D, K)
-        actions = self.model.tokenizer.read(logits).float().numpy()
-        return np.clip(actions, self._low, self._high), logits.float().softmax(-1).numpy()
+    def _predict(self) -> tuple[Array, Array | None]:
+        """Actions (k, D), clipped, and token probabilities (k, D, K), where the model has them."""
+        prediction = self.model.predict(self.window())
+        probabilities = None if prediction.probabilities is None else prediction.probabilities[0].numpy()
+        return np.clip(prediction.actions[0].numpy(), self._low, self._high), probabilities
 
     def window(self) -> Batch:
         """What the model is given now: the frames seen so far, at most its history, as a batch of one."""

@@ -12,12 +12,12 @@ from torch import Tensor, nn
 
 from vla.models.action_tokenizer import ActionTokenizer
 from vla.models.image_tokenizer import ImageEncoder, Keypoints, RandomShift
-from vla.models.model import Batch, Model, Standardize, pixels
+from vla.models.model import Batch, Standardize, TokenModel, pixels
 from vla.models.text import TextEncoder
 from vla.spec import Spec
 
 
-class BC(Model):
+class BC(TokenModel):
     """Behaviour cloning from one frame: where things are in every image, how the arm stands, and what was said.
 
     Args:

@@ -57,7 +57,6 @@ class Learner(LightningModule):
         self.model, self._spec, self._config = model, spec, config
         self._lr, self._weight_decay, self._warmup, self._schedule = lr, weight_decay, warmup_steps, schedule
         self._compile, self.ema = compile, ema
-        self.accuracy = MeanMetric()
         self.errors = nn.ModuleList(MeanMetric() for _ in spec.action)
 
     def configure_model(self) -> None:
@@ -116,22 +115,14 @@ class Learner(LightningModule):
                 "learner.warmup_steps, or clip harder with trainer.gradient_clip_val; the last checkpoint is kept"
             )
         for name, value in losses.items():
-            if name != "logits":
-                self.log(f"train/{name}", value.detach(), prog_bar=name == "loss")
+            self.log(f"train/{name}", value.detach(), prog_bar=name == "loss")
         return loss
 
     def validation_step(self, batch: Batch, batch_idx: int) -> None:
-        """Token accuracy, and the error of the action that would be executed, per component."""
-        losses = self.model.loss(batch)
-        logits = losses["logits"]  # (B, T', k, D, K)
-        frames = logits.shape[1]
-        action, valid = batch["action"][:, -frames:], batch["valid"][:, -frames:]
-        tokenizer = self.model.tokenizer
-        right = logits.argmax(-1) == tokenizer.encode(action)  # (B, T', k, D)
-        error = (tokenizer.read(logits) - action).abs()[valid]  # (N, D)
-        self.accuracy.update(right[valid].float())
-        self.log("val/loss", losses["loss"], batch_size=len(action))
-        self.log("val/token_accuracy", self.accuracy)
+        """The losses, and the error of the actions that would be executed after the newest frame, per component."""
+        for name, value in self.model.loss(batch).items():
+            self.log(f"val/{name}", value, batch_size=len(batch["action"]))
+        error = (self.model.predict(batch).actions - batch["action"][:, -1]).abs()[batch["valid"][:, -1]]  # (N, D)
         for index, (name, unit) in enumerate(zip(self._spec.action, self._spec.units, strict=True)):
             factor, readable = READABLE[unit]
             metric = self.errors[index]

@@ -1,4 +1,4 @@
-"""What every model is: from a batch of windows to logits over action tokens.
+"""What every model is: from a batch of windows to actions, most of them by way of logits over action tokens.
 
 Shapes: B batch, T history frames, k action chunk, D action components, K bins, S truth scalars, P proprioception.
 """
@@ -6,7 +6,7 @@ Shapes: B batch, T history frames, k action chunk, D action components, K bins, 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -71,8 +71,15 @@ class Standardize(nn.Module):
         self.count.add_(added)
 
 
+class Prediction(NamedTuple):
+    """What a model would do after the newest frame of each window."""
+
+    actions: Tensor  # (B, k, D) float32, in the units of the spec, not yet clipped to its bounds
+    probabilities: Tensor | None = None  # (B, k, D, K) float32 of the tokens, if they are one per component
+
+
 class Model(nn.Module, ABC):
-    """A policy's network: a batch of windows → logits over action tokens; it knows no simulator.
+    """A policy's network: a batch of windows → actions; it knows no simulator.
 
     A batch is a dict:
         rgb: camera → (B, T, H, W, 3) uint8; proprio: (B, T, P) float32; present: (B, T) bool, false for padding;
@@ -86,7 +93,7 @@ class Model(nn.Module, ABC):
         auxiliary: weight of the loss of the head that predicts the truth; 0 leaves the head out.
         truth_width: length of the features which that head reads.
         spec: what a step looks like.
-        tokenizer: what the logits mean.
+        tokenizer: how actions and tokens belong together, and between which bounds actions lie.
     """
 
     def __init__(
@@ -103,7 +110,6 @@ class Model(nn.Module, ABC):
         self.history, self.chunk, self.auxiliary = history, chunk, auxiliary
         self.spec, self.tokenizer, self.text = spec, tokenizer, text
         self.posture_width = len(spec.joints) + 1
-        self.logits_shape = (chunk, len(spec.action), tokenizer.bins)
         self.truth_head: nn.Linear | None = None
         if auxiliary > 0 and spec.truth_size > 0:
             self.truth_head = nn.Linear(truth_width, spec.truth_size)
@@ -126,23 +132,66 @@ class Model(nn.Module, ABC):
 
     @abstractmethod
     def forward(self, batch: Batch) -> dict[str, Tensor]:
-        """logits: (B, T', k, D, K) for the last T' of the T frames; with an auxiliary head, truth: (B, T', S),
-        standardised."""
+        """What `action_loss` reads, for the last T' of the T frames; with an auxiliary head also truth: (B, T', S),
+        standardised. This is the part that compiles."""
+
+    @abstractmethod
+    def action_loss(self, output: dict[str, Tensor], batch: Batch) -> dict[str, Tensor]:
+        """The scalar `action_loss` of what `forward` made of a batch, and whatever else is worth logging."""
+
+    @abstractmethod
+    def predict(self, batch: Batch) -> Prediction:
+        """What to do after the newest frame, of which "text" and either images or "tokens" must be known."""
 
     def loss(self, batch: Batch) -> dict[str, Tensor]:
-        """The scalar `loss` to minimise, its parts by name, and the `logits`."""
+        """The scalar `loss` to minimise, and its parts by name."""
         output = self(batch)
-        logits = output["logits"]
-        frames = logits.shape[1]
-        action = self.tokenizer.loss(logits, batch["action"][:, -frames:], batch["valid"][:, -frames:])
-        losses = {"loss": action, "action_loss": action, "logits": logits}
+        losses = self.action_loss(output, batch)
+        losses["loss"] = losses["action_loss"]
         if self.truth_head is not None:
+            frames = output["truth"].shape[1]
             present = batch["present"][:, -frames:]
             target = self.truth_scale(batch["truth"][:, -frames:], present)
             error = (output["truth"].float() - target).square().mean(-1)  # (B, T')
             losses["truth_loss"] = (error * present).sum() / present.sum().clamp(min=1)
-            losses["loss"] = action + self.auxiliary * losses["truth_loss"]
+            losses["loss"] = losses["loss"] + self.auxiliary * losses["truth_loss"]
         return losses
+
+
+class TokenModel(Model):
+    """A model that scores, in one pass, every bin of every component of an action.
+
+    Its `forward` gives logits: (B, T', k, D, K).
+    """
+
+    def __init__(
+        self,
+        history: int,
+        chunk: int,
+        text: TextEncoder,
+        auxiliary: float,
+        truth_width: int,
+        spec: Spec,
+        tokenizer: ActionTokenizer,
+    ) -> None:
+        super().__init__(history, chunk, text, auxiliary, truth_width, spec, tokenizer)
+        self.logits_shape = (chunk, len(spec.action), tokenizer.bins)
+
+    def action_loss(self, output: dict[str, Tensor], batch: Batch) -> dict[str, Tensor]:
+        """The tokenizer's loss over all frames and, outside training, the share of tokens that are right."""
+        logits = output["logits"]
+        frames = logits.shape[1]
+        action, valid = batch["action"][:, -frames:], batch["valid"][:, -frames:]
+        losses = {"action_loss": self.tokenizer.loss(logits, action, valid)}
+        if not self.training:
+            right = logits.argmax(-1) == self.tokenizer.encode(action)  # (B, T', k, D)
+            losses["token_accuracy"] = right[valid].float().mean()
+        return losses
+
+    def predict(self, batch: Batch) -> Prediction:
+        """The actions that the tokenizer reads from the logits of the newest frame."""
+        logits = self(batch)["logits"][:, -1].float()  # (B, k, D, K)
+        return Prediction(self.tokenizer.read(logits), logits.softmax(-1))
 
 
 def pixels(images: Tensor, size: int | None = None) -> Tensor:

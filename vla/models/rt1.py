@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from vla.models.action_tokenizer import ActionTokenizer
 from vla.models.image_tokenizer import ImageEncoder, Keypoints, RandomShift, TokenLearner
-from vla.models.model import Batch, Model, Standardize, pixels
+from vla.models.model import Batch, Standardize, TokenModel, pixels
 from vla.models.text import TextEncoder
 from vla.spec import Spec
 
@@ -48,7 +48,7 @@ class Layer(nn.Module):
         return x + F.dropout(self.linear(self.linear_norm(x)), self.dropout, self.training)
 
 
-class RT1(Model):
+class RT1(TokenModel):
     """Image tokens of T frames through a causal transformer that never sees an action; every frame is read out.
 
     The sequence has, per frame, the tokens of every camera, the proprioception token if wanted, and A = k·D action
