@@ -180,7 +180,8 @@ def test_what_the_node_thinks_is_what_the_evaluated_policy_does(home: Path) -> N
 
     checkpoint = home / "run/checkpoints/last.ckpt"
     environment = parts.make_environment(read_checkpoint(checkpoint).config["task"])
-    evaluated, deployed = (parts.make_policy(checkpoint, environment) for _ in range(2))
+    node = {"_target_": "vla.policy.Policy"}
+    evaluated, deployed = (parts.make_policy(node, checkpoint, environment) for _ in range(2))
     names = list(environment.spec.joints)
     robot = Robot(names, [-9.0] * 7, [9.0] * 7, [1.0] * 7, [1.0] * 7, ["left", "right"])
     observation = environment.reset(5)

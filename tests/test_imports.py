@@ -23,6 +23,7 @@ PARTS = {
     "vla.data": ("vla.spec", "vla.data", "vla.workers"),
     "vla.models": ("vla.spec", "vla.models"),
     "vla.policy": ("vla.spec", "vla.models"),
+    "vla.program": ("vla.spec", "vla.models", "vla.policy"),
     "vla.rollout": ("vla.spec",),
     "vla.record": ("vla.spec",),
     "vla.workers": (),

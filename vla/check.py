@@ -31,13 +31,13 @@ JOBS: dict[str, tuple[str, ...]] = {
     "preview": ("task", "expert"),
     "collect": ("task", "expert", "cluster"),
     "train": TRAINING,
-    "evaluate": (*TRAINING, "recorder"),
-    "export": ("task", "expert", "cluster", "export"),
-    "deploy": ("tokenizer", "model", "deploy"),
-    "benchmark": TRAINING,
+    "evaluate": (*TRAINING, "policy", "recorder"),
+    "export": ("task", "expert", "cluster", "tokenizer", "model", "policy", "export"),
+    "deploy": ("tokenizer", "model", "policy", "deploy"),
+    "benchmark": (*TRAINING, "policy"),
     "inspect": (),
 }
-EVALUATION = ("task", "tokenizer", "model", "recorder")  # of a checkpoint, with nothing to train
+EVALUATION = ("task", "tokenizer", "model", "policy", "recorder")  # of a checkpoint, with nothing to train
 OPTIONAL = ("recorder",)  # groups that a job can do without
 
 # Constructor arguments that the jobs give, so that they never stand in YAML.
@@ -48,6 +48,7 @@ RUNTIME: dict[str, tuple[str, ...]] = {
     "model": ("spec", "tokenizer"),
     "learner": ("model", "spec", "config"),
     "trainer": ("callbacks", "logger"),
+    "policy": ("model", "spec"),
     "recorder": ("folder",),
     "deploy": ("policy", "environment", "output"),
 }

@@ -88,7 +88,7 @@ def evaluate(config: DictConfig) -> float:
     recordings = output / "recordings"
     report = evaluate(
         partial(make_environment, plain(config.task)),
-        partial(make_policy, checkpoint),
+        partial(make_policy, plain(config.policy), checkpoint),
         partial(make_recorder, plain(config.recorder), recordings) if config.recorder else None,
         seeds,
         config.evaluate.workers,
@@ -105,10 +105,17 @@ def evaluate(config: DictConfig) -> float:
 
 
 def export(config: DictConfig) -> None:
-    """Write the first `collect.episodes` of the episode store in another format."""
+    """Write the first `collect.episodes` of the episode store in another format, or a trained policy as programs.
+
+    Raises:
+        ValueError: programs are asked for, and there is no checkpoint.
+    """
+    exporter = build(config.export)
+    if config.export._target_.startswith("vla.program."):
+        log.info("wrote %s", exporter.export(_required_policy(config)))
+        return
     from vla.data.episodes import EpisodeStore
 
-    exporter = build(config.export)
     store = EpisodeStore(collected(config).folder, config.collect.episodes)
     log.info("wrote %s", exporter.export(store))
 
@@ -133,16 +140,16 @@ def deployed(config: DictConfig) -> Any:
     """The deployment that `config.deploy` describes, ready to run."""
     return build(
         config.deploy,
-        policy=partial(_required_policy, config.checkpoint),
+        policy=partial(_required_policy, config),
         environment=partial(make_environment, plain(config.task)),
         output=_output(config),
     )
 
 
-def _required_policy(checkpoint: str | None) -> Policy:
-    if checkpoint is None:
-        raise ValueError("this deployment needs a trained policy: checkpoint=FILE")
-    return make_policy(Path(checkpoint))
+def _required_policy(config: DictConfig) -> Policy:
+    if config.checkpoint is None:
+        raise ValueError("this needs a trained policy: checkpoint=FILE")
+    return make_policy(plain(config.policy), Path(config.checkpoint))
 
 
 def benchmark(config: DictConfig) -> None:
