@@ -31,6 +31,8 @@ PARTS = {
     "vla.collect": ("vla.spec", "vla.rollout", "vla.data", "vla.cluster"),
     "vla.evaluate": ("vla.spec", "vla.rollout", "vla.record", "vla.workers"),
     "vla.report": ("vla.spec", "vla.evaluate"),
+    "vla.suite": ("vla.evaluate", "vla.report"),
+    "vla.sweep": ("vla.evaluate",),
     "vla.card": ("vla.spec", "vla.data", "vla.report"),
     "vla.deploy": ("vla.spec", "vla.policy", "vla.tasks", "vla.data", "vla.evaluate", "vla.record", "vla.deploy"),
     "vla.stores": ("vla",),
@@ -45,8 +47,8 @@ PARTS = {
 
 # A library → the only parts that may import it.
 LIBRARIES = {
-    "hydra": ("vla.run", "vla.jobs", "vla.check", "vla.benchmark"),
-    "omegaconf": ("vla.run", "vla.jobs", "vla.parts", "vla.check", "vla.training", "vla.benchmark"),
+    "hydra": ("vla.run", "vla.jobs", "vla.check", "vla.benchmark", "vla.sweep"),
+    "omegaconf": ("vla.run", "vla.jobs", "vla.parts", "vla.check", "vla.training", "vla.benchmark", "vla.sweep"),
     "mujoco": ("vla.tasks", "vla.benchmark"),
     "dm_control": ("vla.tasks",),
     "dm_env": ("vla.tasks",),

@@ -63,7 +63,13 @@ PLAIN: dict[str, Any] = {
     "checkpoint": str | None,
     "output": str,
     "collect": {"episodes": Count, "seed": Seed, "workers": Count | None, "folder": str},
-    "evaluate": {"episodes": Count, "seed": Seed, "workers": Count | None, "recordings": Seed | None},
+    "evaluate": {
+        "episodes": Count,
+        "seed": Seed,
+        "workers": Count | None,
+        "recordings": Seed | None,
+        "conditions": dict[str, dict[str, Any]],
+    },
     "preview": {"episodes": Count, "seed": Seed},
     "benchmark": {
         "names": list[Literal["collect", "loader", "train", "policy", "deploy"]],

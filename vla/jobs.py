@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from omegaconf import DictConfig
+from rich import print as show
 
 from vla.check import build
 from vla.parts import (
@@ -40,8 +41,6 @@ def run(config: DictConfig) -> float | None:
 
 def preview(config: DictConfig) -> None:
     """Show randomised resets as a contact sheet, their draws as a table, and the expert at work as a recording."""
-    from rich import print as show
-
     from vla.record import RerunRecorder, merge
     from vla.report import contact_sheet, draws_table
     from vla.rollout import rollout
@@ -74,33 +73,44 @@ def train(config: DictConfig) -> None:
 
 
 def evaluate(config: DictConfig) -> float:
-    """Measure the success rate of a checkpoint, which is trained first if none is given.
+    """Measure the success rate of a checkpoint, which is trained first if none is given, and again under every
+    condition that the evaluation names, on the same seeds.
 
     Raises:
         ValueError: an episode could not be played to its end; the report, which is written, says why.
     """
     from vla.evaluate import evaluate, keep_recordings
+    from vla.policy import latency
     from vla.report import plot_report, write_report
+    from vla.suite import SEEN, plot_suite, suite_table
 
     output = _output(config)
     checkpoint = Path(config.checkpoint) if config.checkpoint else _trained(config)
     seeds = range(config.evaluate.seed, config.evaluate.seed + config.evaluate.episodes)
     recordings = output / "recordings"
-    report = evaluate(
-        partial(make_environment, plain(config.task)),
-        partial(make_policy, plain(config.policy), checkpoint),
-        partial(make_recorder, plain(config.recorder), recordings) if config.recorder else None,
-        seeds,
-        config.evaluate.workers,
-    )
+    make = partial(make_policy, plain(config.policy), checkpoint)
+    recorder = partial(make_recorder, plain(config.recorder), recordings) if config.recorder else None
+    task, reports = plain(config.task), {}
+    for name, changes in {SEEN: {}, **plain(config.evaluate.conditions)}.items():
+        environment = partial(make_environment, {**task, "randomize": {**task["randomize"], **changes}})
+        # Recordings are for what the policy was trained for; what fails elsewhere is counted.
+        watching = recorder if name == SEEN else None
+        reports[name] = evaluate(environment, make, watching, seeds, config.evaluate.workers, name)
+    report = reports.pop(SEEN)
     if config.recorder:
         keep_recordings(report, recordings, output / "rollouts.rrd", config.evaluate.recordings)
-    write_report(report, output / "report.json", str(checkpoint), plain(config))
+    policy = make()
+    size = {"parameters": sum(p.numel() for p in policy.model.parameters()), "latency_ms": latency(policy)}
+    write_report(report, output / "report.json", str(checkpoint), plain(config), size, reports)
     plot_report(report, output / "report.png")
     log.info("wrote %s, report.png%s", output / "report.json", " and rollouts.rrd" if config.recorder else "")
+    if reports:
+        plot_suite({SEEN: report, **reports}, output / "suite.png")
+        show(suite_table({SEEN: report, **reports}))
     print(report)
-    if report.errors:
-        raise ValueError(f"{len(report.errors)} episodes ended in an error, see {output / 'report.json'}")
+    errors = [error for each in (report, *reports.values()) for error in each.errors]
+    if errors:
+        raise ValueError(f"{len(errors)} episodes ended in an error, see {output / 'report.json'}")
     return report.success
 
 

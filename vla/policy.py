@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import time
 from collections import deque
 from dataclasses import dataclass
 from pathlib import Path
@@ -194,3 +195,21 @@ class Policy:
 
     def _tensor(self, values: Array) -> Tensor:
         return torch.from_numpy(values.copy())[None, None].to(self.device)
+
+
+def noise(spec: Spec, random: np.random.Generator) -> Observation:
+    """An observation in which everything is random but the instruction."""
+    rgb = {camera: random.integers(256, size=(*spec.image_size, 3), dtype=np.uint8) for camera in spec.cameras}
+    joints, velocities = random.uniform(-1, 1, (2, len(spec.joints))).astype(np.float32)
+    return Observation(rgb, {}, joints, velocities, random.uniform(0, 0.08), "lift the red block")
+
+
+def latency(policy: Policy, rounds: int = 20) -> float:
+    """Median time from an observation to its action [ms], with a full history."""
+    observation = noise(policy.spec, np.random.default_rng(0))
+    seconds = []
+    for _ in range(policy.model.history + rounds):
+        started = time.perf_counter()
+        policy.plan(observation)
+        seconds.append(time.perf_counter() - started)
+    return 1000 * float(np.median(seconds[-rounds:]))

@@ -19,8 +19,7 @@ from torch import Tensor, nn
 from torch.export import Dim, ExportedProgram
 
 from vla.models.model import Batch, Model
-from vla.policy import Policy
-from vla.spec import Observation, Spec
+from vla.policy import Policy, noise
 
 log = logging.getLogger(__name__)
 
@@ -28,7 +27,7 @@ Inputs = dict[str, Tensor]
 Run = Callable[[Inputs], Tensor]
 
 TOLERANCE = 1e-3  # largest difference between the actions of a program and of the model [range of a component]
-SENTENCES = ("lift the red block", "put the small green block on the blue pad")  # of different lengths
+SENTENCES = ("lift it", "put the small green block on the blue pad")  # of different lengths
 
 
 class Encode(nn.Module):
@@ -134,13 +133,6 @@ def played(policy: Policy) -> dict[str, list[Inputs]]:
             steps.setdefault("encode", []).append(_inputs(policy.frame(observation)))
         steps.setdefault("act", []).append(_inputs(window))
     return steps
-
-
-def noise(spec: Spec, random: np.random.Generator) -> Observation:
-    """An observation in which everything is random but the instruction."""
-    rgb = {camera: random.integers(256, size=(*spec.image_size, 3), dtype=np.uint8) for camera in spec.cameras}
-    joints, velocities = random.uniform(-1, 1, (2, len(spec.joints))).astype(np.float32)
-    return Observation(rgb, {}, joints, velocities, random.uniform(0, 0.08), SENTENCES[0])
 
 
 def capture(program: Encode | Act, inputs: Inputs) -> ExportedProgram:
