@@ -90,6 +90,12 @@ def test_a_grid_collects_once_and_trains_every_cell(home: Path) -> None:
     assert len(list((home / "outputs/sweeps").glob("*/*/checkpoints/last.ckpt"))) == 4
 
 
+def test_the_menu_is_what_hydra_would_list(home: Path) -> None:
+    menu = vla(home, "--help").stdout
+    assert "task/goal: lift, mixed, pick_place, pick_place_two, push, stack\n" in menu
+    assert menu == vla(home, "-h").stdout == vla(home, "--help", "job=train").stdout
+
+
 def test_preview_shows_resets_and_their_draws(home: Path) -> None:
     done = vla(home, "job=preview", "preview.episodes=2", "output=look")
     assert (home / "look/preview.png").stat().st_size > 10_000 and (home / "look/preview.rrd").stat().st_size > 100_000
