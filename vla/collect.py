@@ -102,7 +102,7 @@ def _require_first_seed(store: EpisodeStore, seed: int) -> None:
 
 
 def _fill_with(cluster: Cluster, make: MakeWorker, store: EpisodeStore, episodes: int, seed: int) -> None:
-    """Fill the store, with new workers if some died: a graphics driver may crash once in thousands of episodes."""
+    """Fill the store, with new workers if some died: in long collections a process was seen to crash outside Python."""
     while True:
         tried = len(store.tried)
         try:
