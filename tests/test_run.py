@@ -68,7 +68,9 @@ def test_the_main_job_collects_trains_evaluates_and_records(home: Path) -> None:
     assert report["config"]["collect"]["episodes"] == 24
     for name in ("report.png", "rollouts.rrd", "checkpoints/last.ckpt", "metrics.csv"):
         assert (home / "run" / name).stat().st_size > 0
-    last = (home / "printed.txt").read_text().strip().splitlines()[-1]
+    printed = (home / "printed.txt").read_text()
+    assert "\ntraining  " in printed and "Epoch" not in printed
+    last = printed.strip().splitlines()[-1]
     assert last.startswith(f"success {report['successes']}/2 (")
 
 
