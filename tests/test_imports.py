@@ -118,3 +118,9 @@ def test_questions_are_answered_without_heavy_imports(option: list[str]) -> None
     imported = {line.rpartition("|")[2].strip() for line in done.stderr.splitlines()}
     assert "vla.check" in imported
     assert imported.isdisjoint(HEAVY)
+
+
+def test_a_policy_acts_without_the_compiler() -> None:
+    """Which takes a second to import, and another one to leave: nodes and workers start and end without it."""
+    code = "import sys, vla.policy, vla.models.bc, vla.models.rt1; sys.exit('torch._dynamo' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], cwd=ROOT, timeout=60).returncode == 0

@@ -216,8 +216,8 @@ def _play_here(factories: _Factories, seeds: Sequence[int]) -> Generator[Result]
 def _play_apart(factories: _Factories, seeds: Sequence[int], workers: int) -> Generator[Result]:
     """Results in the order in which they come, from other processes.
 
-    When one dies, the episodes that were under way are played again, one by one: a graphics driver may crash once in
-    thousands of episodes, and an episode that kills its process again is an error of its own.
+    When one dies, the episodes that were under way are played again, one by one: in long runs a process was seen to
+    crash outside Python, and an episode that kills its process again is an error of its own.
     """
     left = list(seeds)
     while left:

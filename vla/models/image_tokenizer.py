@@ -269,6 +269,8 @@ def grid(features: Tensor) -> Tensor:
 class RandomShift(nn.Module):
     """Shifts the images of a clip by one random offset, filling with black; does nothing outside training.
 
+    Whoever compiles it leaves it out: offsets are numbers here, and every new one would be compiled anew.
+
     Args:
         vertical, horizontal: largest shift either way [1/256 of the image height].
     """
