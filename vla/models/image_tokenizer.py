@@ -281,10 +281,8 @@ class RandomShift(nn.Module):
 
     def forward(self, images: Tensor) -> Tensor:
         """(B, T, H, W, 3) images of B clips to the same shape and type."""
-        return self._shifted(images) if self.training else images
-
-    @torch.compiler.disable  # offsets are numbers here, and every new one would be compiled anew
-    def _shifted(self, images: Tensor) -> Tensor:
+        if not self.training:
+            return images
         clips, frames, height, width, _ = images.shape
         up, left = round(self.vertical * height / 256), round(self.horizontal * height / 256)
         padded = images.new_zeros(clips, frames, height + 2 * up, width + 2 * left, 3)
