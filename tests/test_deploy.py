@@ -195,7 +195,8 @@ def test_the_whole_loop_reports_and_its_bag_moves_an_agent_again(
         assert entity in recorded.stdout
     ear.commands.clear()
     start("vla.run", "job=deploy", "deploy=ros2", CHECKPOINT, "deploy.safety.tracking=9")
-    player = start("vla.deploy.bag", "play", "loop/bag")
+    ear.until(lambda: ear.node.count_subscribers("/isaac/franka/joint_states") > 1)  # the agent listens, too
+    player = start("vla.deploy.bag", "play", "loop/bag", "--speed", "2")
     assert player.wait(60) == 0, player.communicate()[0]
     ear.listen(0.2)
     assert np.ptp([command.position[:7] for command in ear.commands], axis=0).max() > 0.01
