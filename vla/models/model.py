@@ -12,7 +12,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from vla.models.action_tokenizer import ActionTokenizer
+from vla.models.action_tokenizer import ActionTokenizer, PerComponent
 from vla.models.text import TextEncoder
 from vla.spec import Spec
 
@@ -164,6 +164,8 @@ class TokenModel(Model):
     Its `forward` gives logits: (B, T', k, D, K).
     """
 
+    tokenizer: PerComponent
+
     def __init__(
         self,
         history: int,
@@ -172,7 +174,7 @@ class TokenModel(Model):
         auxiliary: float,
         truth_width: int,
         spec: Spec,
-        tokenizer: ActionTokenizer,
+        tokenizer: PerComponent,
     ) -> None:
         super().__init__(history, chunk, text, auxiliary, truth_width, spec, tokenizer)
         self.logits_shape = (chunk, len(spec.action), tokenizer.bins)
