@@ -6,11 +6,13 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any
 
+import numpy as np
 import torch
 from toy import SPEC
 
-from vla.models.action_tokenizer import Uniform
+from vla.models.action_tokenizer import ActionTokenizer, Uniform
 from vla.models.bc import BC
+from vla.models.decoder import Decoder
 from vla.models.image_tokenizer import FilmConv
 from vla.models.model import Model
 from vla.models.rt1 import RT1
@@ -19,6 +21,22 @@ from vla.spec import Spec
 
 TINY_IMAGE = partial(FilmConv, [8, 8], [5, 3], [2, 1])
 TINY_TEXT = partial(NGrams, vocabulary=64)
+
+
+class Motions:
+    """Statistics of smooth motions, mostly small, with a gripper that closes on the way, as of a store of them."""
+
+    def __init__(self, steps: int = 4000, seed: int = 0) -> None:
+        random = np.random.default_rng(seed)
+        moves = np.convolve(random.laplace(0, 0.012, 2 * steps + 18), np.hanning(11)[1:-1] / 5, "valid")
+        moves = np.clip(moves[: 2 * steps].reshape(2, steps).T, -0.05, 0.05)
+        closed = np.sin(np.arange(steps) / 9) > 0.3
+        self.actions = np.concatenate([moves, 1.0 - closed[:, None]], 1).astype(np.float32)
+        self.low, self.high = self.actions.min(0), self.actions.max(0)
+
+    def chunks(self, length: int) -> np.ndarray:
+        """Every chunk there is."""
+        return np.lib.stride_tricks.sliding_window_view(self.actions, length, 0).transpose(0, 2, 1)
 
 
 def make_batch(frames: int, chunk: int = 1, size: int = 4, spec: Spec = SPEC) -> dict[str, Any]:
@@ -79,6 +97,29 @@ def make_rt1(
         shift=(0, 0),
         spec=SPEC,
         tokenizer=Uniform(bins=64, spec=SPEC),
+    )
+
+
+def make_decoder(
+    history: int = 2, chunk: int = 1, auxiliary: float = 1.0, tokenizer: ActionTokenizer | None = None
+) -> Decoder:
+    """A small decoder without dropout and random shifts."""
+    return Decoder(
+        TINY_IMAGE,
+        TINY_TEXT,
+        history=history,
+        learned_tokens=2,
+        keypoints=8,
+        chunk=chunk,
+        auxiliary=auxiliary,
+        text_width=16,
+        width=32,
+        layers=2,
+        heads=2,
+        feedforward=64,
+        shift=(0, 0),
+        spec=SPEC,
+        tokenizer=tokenizer or Uniform(bins=64, spec=SPEC),
     )
 
 

@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from copy import deepcopy
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from fake_batch import Motions
 from toy import SPEC
 
-from vla.models.action_tokenizer import RT1, ActionTokenizer, Uniform, fidelity
+from vla.models.action_tokenizer import RT1, ActionTokenizer, PerComponent, Uniform
+from vla.models.fast import Fast, cosines
+from vla.models.fidelity import fidelity
+from vla.models.quantile import Quantile
 
 
 @dataclass(frozen=True)
@@ -17,22 +24,25 @@ class Bounds:
     low: np.ndarray
     high: np.ndarray
 
+    def chunks(self, length: int) -> np.ndarray:
+        return np.linspace(self.low, self.high, 999, dtype=np.float32)[:, None].repeat(length, 1)
+
 
 BOUNDS = Bounds(np.array([-0.02, -0.01, 0.0]), np.array([0.03, 0.04, 1.0]))
 
 
-def tokenizers() -> list[ActionTokenizer]:
+def tokenizers() -> list[PerComponent]:
     return [Uniform(spec=SPEC, statistics=BOUNDS), RT1(spec=SPEC)]
 
 
 @pytest.mark.parametrize("tokenizer", tokenizers(), ids=["uniform", "rt1"])
-def test_every_token_survives_the_round_trip(tokenizer: ActionTokenizer) -> None:
+def test_every_token_survives_the_round_trip(tokenizer: PerComponent) -> None:
     tokens = torch.arange(256)[:, None].expand(256, 3)
     assert torch.equal(tokenizer.encode(tokenizer.decode(tokens)), tokens)
 
 
 @pytest.mark.parametrize("tokenizer", tokenizers(), ids=["uniform", "rt1"])
-def test_actions_beyond_the_bounds_get_the_outermost_tokens(tokenizer: ActionTokenizer) -> None:
+def test_actions_beyond_the_bounds_get_the_outermost_tokens(tokenizer: PerComponent) -> None:
     assert tokenizer.encode(torch.full((3,), -9.0)).tolist() == [0, 0, 0]
     assert tokenizer.encode(torch.full((3,), 9.0)).tolist() == [255, 255, 255]
 
@@ -86,7 +96,7 @@ def test_statistics_of_other_actions_are_refused() -> None:
 
 
 @pytest.mark.parametrize("tokenizer", [*tokenizers(), Uniform(smoothing=0, spec=SPEC)], ids=["uniform", "rt1", "hard"])
-def test_minimising_the_loss_makes_the_action_the_one_that_is_read(tokenizer: ActionTokenizer) -> None:
+def test_minimising_the_loss_makes_the_action_the_one_that_is_read(tokenizer: PerComponent) -> None:
     action = torch.tensor([[0.0123, -0.0042, 0.9]])
     logits = torch.zeros(1, 3, 256, requires_grad=True)
     optimizer = torch.optim.Adam([logits], lr=0.3)
@@ -115,7 +125,7 @@ def test_two_ways_to_act_are_not_averaged() -> None:
 
 
 @pytest.mark.parametrize("tokenizer", tokenizers(), ids=["uniform", "rt1"])
-def test_labels_that_are_not_valid_do_not_count(tokenizer: ActionTokenizer) -> None:
+def test_labels_that_are_not_valid_do_not_count(tokenizer: PerComponent) -> None:
     logits, action = torch.randn(2, 3, 1, 3, 256), torch.zeros(2, 3, 1, 3)
     valid = torch.tensor([[True, True, False], [False, True, True]])[..., None]
     other = action + ~valid[..., None] * 0.5
@@ -135,7 +145,198 @@ def test_a_single_bin_is_refused() -> None:
 def test_what_a_tokenizer_loses_is_told_in_the_units_of_people() -> None:
     # Bins of 1 m and 1 rad: an action of 0.25 m rounds down to 0 m and so loses 250 mm, always to the same side.
     tokenizer = RT1(bins=3, spec=SPEC)
-    told = fidelity(tokenizer, np.tile([0.25, 0.0, 1.0], (4, 1)), SPEC.units)
+    told = fidelity(tokenizer, np.tile([0.25, 0.0, 1.0], (4, 1, 1)), SPEC.units)
     assert told.startswith("250.000 mm (bias 250.000)") and "1 to 1 of 3 bins used; 3 tokens per action" in told
-    fine = fidelity(Uniform(spec=SPEC, statistics=BOUNDS), np.array([BOUNDS.low, BOUNDS.high]), SPEC.units)
+    fine = fidelity(Uniform(spec=SPEC, statistics=BOUNDS), BOUNDS.chunks(1), SPEC.units)
     assert float(fine.split()[0]) < 0.2
+
+
+MOTIONS = Motions()
+CHUNKS = MOTIONS.chunks(8)
+
+
+KINDS: dict[str, Callable[..., ActionTokenizer]] = {"uniform": Uniform, "rt1": RT1, "quantile": Quantile, "fast": Fast}
+EVERY = {name: kind(spec=SPEC, statistics=MOTIONS) for name, kind in KINDS.items()}
+every = pytest.mark.parametrize("name", KINDS)
+
+
+@every
+def test_a_chunk_survives_as_a_sequence(name: str) -> None:
+    tokenizer = EVERY[name]
+    chunks = torch.from_numpy(CHUNKS[:6].copy()).view(2, 3, 8, 3)
+    tokens = tokenizer.tokenize(chunks)
+    assert tokens.shape[:2] == (2, 3) and tokens.dtype == torch.int64
+    assert tokens.shape[2] == tokenizer.length(8) or (name == "fast" and tokens.shape[2] < tokenizer.length(8))
+    assert tokens.min() >= 0 and tokens.max() < tokenizer.bins
+    assert tokenizer.detokenize(tokens).shape == chunks.shape
+    assert torch.equal(tokenizer.tokenize(tokenizer.detokenize(tokens)), tokens)
+
+
+@every
+def test_what_the_round_trip_costs_on_small_motions_at_10_hz(name: str) -> None:
+    tokenizer = EVERY[name]
+    error = tokenizer.detokenize(tokenizer.tokenize(torch.from_numpy(CHUNKS.copy()))).numpy() - CHUNKS
+    mean = 1000 * np.abs(error[..., :2]).mean()  # [mm]
+    bias = 1000 * np.abs(error[..., :2].mean((0, 1))).max()
+    least, most, most_bias = {
+        "uniform": (0.02, 0.15, 0.02),
+        "rt1": (3.0, 5.0, 5.0),  # bins of 8 mm, and always rounded down
+        "quantile": (0.01, 0.06, 1e-3),
+        "fast": (0.1, 0.6, 0.02),
+    }[name]
+    assert least < mean < most and bias < most_bias
+    assert np.abs(error[..., :2]).max() < 0.009, "no tail is cut off"
+    assert np.abs(error[..., 2]).mean() < 0.02
+
+
+@every
+def test_a_checkpoint_brings_all_that_was_fitted(name: str, tmp_path: Path) -> None:
+    tokenizer = EVERY[name]
+    file = tmp_path / "state.ckpt"
+    torch.save(tokenizer.state_dict(), file)
+    fresh = KINDS[name](spec=SPEC)
+    fresh.load_state_dict(torch.load(file, weights_only=True))
+    chunks = torch.from_numpy(CHUNKS[::50].copy())
+    tokens = tokenizer.tokenize(chunks)
+    assert torch.equal(fresh.tokenize(chunks), tokens)
+    assert torch.equal(fresh.detokenize(tokens), tokenizer.detokenize(tokens))
+
+
+@every
+def test_fitting_twice_gives_the_same(name: str) -> None:
+    tokenizer = EVERY[name]
+    again = KINDS[name](spec=SPEC, statistics=MOTIONS)
+    chunks = torch.from_numpy(CHUNKS.copy())
+    assert torch.equal(again.tokenize(chunks), tokenizer.tokenize(chunks))
+
+
+@every
+def test_a_copy_is_as_good(name: str) -> None:
+    tokenizer = EVERY[name]
+    chunks = torch.from_numpy(CHUNKS[::50].copy())
+    assert torch.equal(deepcopy(tokenizer).tokenize(chunks), tokenizer.tokenize(chunks))
+
+
+@every
+def test_all_tokenizers_say_what_they_lose(name: str) -> None:
+    tokenizer = EVERY[name]
+    told = fidelity(tokenizer, CHUNKS, SPEC.units)
+    assert " mm (bias " in told and " used; " in told and told.endswith(" tokens per action")
+    assert (float(told.split()[-4]) == 3) is isinstance(tokenizer, PerComponent)
+
+
+@every
+def test_a_component_without_a_range_is_refused_by_name(name: str) -> None:
+    spec = replace(SPEC, low=(-0.05, 0.05, 0.0))
+    with pytest.raises(ValueError, match="the spec allows y no range"):
+        KINDS[name](spec=spec, statistics=BOUNDS)
+
+
+def test_tokens_are_drawn_from_the_targets() -> None:
+    soft, hard = Uniform(spec=SPEC, statistics=MOTIONS), EVERY["quantile"]
+    chunks = torch.from_numpy(CHUNKS.copy())
+    tokens = soft.tokenize(chunks)
+    off = (soft.drawn(tokens, chunks) - tokens)[:, :2].double()
+    assert off.std().item() == pytest.approx(3.0, rel=0.1) and abs(off.mean().item()) < 0.2
+    assert torch.equal(hard.drawn(tokens, chunks), tokens)
+
+
+def test_quantile_bins_hold_as_many_actions_each() -> None:
+    tokenizer = Quantile(bins=64, spec=SPEC, statistics=MOTIONS)
+    tokens = tokenizer.encode(torch.from_numpy(MOTIONS.actions))
+    counts = tokens[:, 1].bincount(minlength=64)
+    assert counts.min() >= 4000 // 64 - 1 and counts.max() <= 4000 // 64 + 2
+
+
+def test_quantile_reads_a_bin_as_the_mean_of_its_data() -> None:
+    tokenizer = Quantile(bins=16, spec=SPEC, statistics=MOTIONS)
+    tokens = tokenizer.encode(torch.from_numpy(MOTIONS.actions))
+    for token in range(16):
+        inside = MOTIONS.actions[(tokens[:, 0] == token).numpy(), 0]
+        assert tokenizer.decode(torch.tensor([token] * 3))[0] == pytest.approx(inside.mean(), abs=1e-7)
+
+
+def test_values_that_occur_often_are_one_bin_each() -> None:
+    actions = np.array([[-0.05, 0.01, 0.0]] * 50 + [[0.02, 0.01, 1.0]] * 30 + [[0.05, 0.01, 1.0]] * 20, np.float32)
+    statistics = Motions()
+    statistics.actions, statistics.low, statistics.high = actions, actions.min(0), actions.max(0)
+    tokenizer = Quantile(bins=32, spec=SPEC, statistics=statistics)
+    tokens = tokenizer.encode(torch.from_numpy(actions))
+    assert [len(column.unique()) for column in tokens.T] == [3, 1, 2]
+    assert torch.allclose(tokenizer.decode(tokens), torch.from_numpy(actions), atol=1e-7)
+    near = tokenizer.encode(torch.tensor([[0.02 - 1e-4, 0.01, 1.0 - 1e-5]]))  # what rounding does changes nothing
+    assert torch.equal(near[0], tokens[60])
+
+
+def test_cosines_are_the_transform_of_the_book() -> None:
+    moments = np.arange(6)
+    for frequency, row in enumerate(cosines(6).numpy()):
+        wave = np.cos(np.pi * (moments + 0.5) * frequency / 6)
+        assert row == pytest.approx(wave / np.linalg.norm(wave), abs=1e-6)
+
+
+def test_fast_needs_fewer_tokens_than_there_are_components() -> None:
+    tokenizer = EVERY["fast"]
+    tokens = tokenizer.tokenize(torch.from_numpy(CHUNKS.copy()))
+    written = tokenizer.learned(tokens, torch.ones(len(CHUNKS), 8, dtype=torch.bool)).sum(1)
+    assert written.float().mean() < 0.6 * 8 * 3 and written.max() <= 25
+    ends = tokens.gather(1, written[:, None] - 1)
+    assert (ends == tokenizer.end).all()
+
+
+def test_fast_writes_the_same_in_mixed_precision() -> None:
+    tokenizer, chunks = EVERY["fast"], torch.from_numpy(CHUNKS.copy())
+    tokens = tokenizer.tokenize(chunks)
+    with torch.autocast("cpu", torch.bfloat16):
+        assert torch.equal(tokenizer.tokenize(chunks), tokens)
+        assert tokenizer.detokenize(tokens).dtype == torch.float32
+
+
+def test_fast_is_finer_with_a_larger_scale() -> None:
+    errors = []
+    for scale in (5.0, 20.0):
+        tokenizer = Fast(scale=scale, spec=SPEC, statistics=MOTIONS)
+        chunks = torch.from_numpy(CHUNKS.copy())
+        errors.append((tokenizer.detokenize(tokenizer.tokenize(chunks)) - chunks)[..., :2].abs().mean().item())
+    assert errors[1] < 0.4 * errors[0]
+
+
+def test_fast_makes_actions_of_whatever_a_model_writes() -> None:
+    tokenizer = EVERY["fast"]
+    random = torch.Generator().manual_seed(0)
+    anything = torch.randint(tokenizer.bins, (50, 25), generator=random)
+    assert torch.isfinite(tokenizer.detokenize(anything)).all()
+    nothing = torch.zeros(1, 1, dtype=torch.int64)
+    mean = tokenizer.detokenize(nothing)
+    assert mean.shape == (1, 8, 3) and torch.allclose(mean[0, 0], mean[0, 7])  # all coefficients are 0
+    whole = tokenizer.tokenize(torch.from_numpy(CHUNKS[:1].copy()))
+    short = whole[:, : int((whole != tokenizer.end).sum()) - 2]
+    longer = torch.cat([whole[whole != tokenizer.end][None], whole], 1)
+    assert torch.equal(tokenizer.detokenize(longer), tokenizer.detokenize(whole))
+    assert tokenizer.detokenize(short).shape == (1, 8, 3)
+
+
+def test_fast_takes_motions_that_the_data_never_had() -> None:
+    tokenizer = EVERY["fast"]
+    wild = torch.tensor([9.0, -9.0, 5.0]) * torch.tensor([1.0, -1.0] * 4)[:, None]
+    back = tokenizer.detokenize(tokenizer.tokenize(wild))
+    assert torch.isfinite(back).all() and back.shape == wild.shape
+
+
+def test_a_chunk_counts_as_a_whole() -> None:
+    tokenizer = EVERY["fast"]
+    tokens = tokenizer.tokenize(torch.from_numpy(CHUNKS[:2].copy()))
+    valid = torch.zeros(2, 8, dtype=torch.bool)
+    valid[0, :3] = True
+    counted = tokenizer.learned(tokens, valid)
+    assert counted[0].sum() == (tokens[0] != tokenizer.end).sum() + 1 and not counted[1].any()
+
+
+def test_too_few_tokens_for_the_coefficients_are_refused() -> None:
+    with pytest.raises(ValueError, match=r"more than tokenizer\.bins=8 can tell apart"):
+        Fast(bins=8, spec=SPEC, statistics=MOTIONS)
+
+
+def test_chunks_of_another_length_are_refused() -> None:
+    with pytest.raises(ValueError, match=r"predicts 4 actions, its tokenizer reads 8: set tokenizer\.chunk=4"):
+        EVERY["fast"].length(4)

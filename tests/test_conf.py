@@ -19,6 +19,10 @@ OPTIONS = [
 ]
 
 
+# Options that are only for some options of another group.
+TOGETHER = {("tokenizer", "fast"): ["model=decoder"]}
+
+
 def composed(*overrides: str) -> DictConfig:
     with initialize_config_dir(str(CONF), version_base="1.3"):
         return compose("config", overrides=["output=outputs/runs/now", *overrides])
@@ -28,7 +32,7 @@ def composed_with(group: str, option: str) -> DictConfig:
     """A config in which `option` stands, together with a parent that has such a nested group."""
     parent = group.rpartition("/")[0]
     parents = [f"{parent}={path.stem}" for path in sorted((CONF / parent).glob("*.yaml"))] if parent else []
-    for overrides in ([], *[[choice] for choice in parents]):
+    for overrides in (TOGETHER.get((group, option), []), *[[choice] for choice in parents]):
         try:
             return composed(*overrides, f"{group}={option}")
         except ConfigCompositionException as error:
@@ -53,6 +57,14 @@ def test_option(group: str, option: str) -> None:
     top = group.partition("/")[0]
     cfg.job = next((job for job in ("evaluate", "export", "deploy") if top in JOBS[job] and cfg.get(top)), "evaluate")
     check(cfg)
+
+
+def test_a_model_of_one_token_per_component_takes_no_other_tokens() -> None:
+    for model in ("bc", "rt1", "rt1_tiny"):
+        with pytest.raises(ValueError, match=r"one token per component, which Fast does not have: .* model=decoder"):
+            check(composed(f"model={model}", "tokenizer=fast"))
+    together = composed("model=decoder", "tokenizer=fast", "model.chunk=5")
+    assert together.tokenizer.chunk == 5
 
 
 def test_data_is_shared_by_everything_that_does_not_change_the_episodes() -> None:

@@ -81,6 +81,23 @@ def test_statistics_are_those_of_all_stored_actions(tmp_path: Path) -> None:
     assert statistics.steps == len(actions)
 
 
+def test_a_sample_of_chunks_stays_within_its_episodes_and_its_size(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    statistics = add(tmp_path, EPISODES).statistics
+    expected = [
+        episode.actions[np.minimum(np.arange(step, step + 4), len(episode.actions) - 1)]
+        for episode in EPISODES
+        if episode.success
+        for step in range(len(episode.actions))
+    ]
+    np.testing.assert_array_equal(statistics.chunks(4), expected)
+    monkeypatch.setattr("vla.data.statistics.SAMPLE", 40)
+    few = statistics.chunks(4)
+    np.testing.assert_array_equal(few[[0, -1]], [expected[0], expected[-1]])
+    assert few.shape == (10, 4, 3)
+
+
 def test_a_reader_can_keep_to_the_first_episodes(tmp_path: Path) -> None:
     add(tmp_path, EPISODES)
     assert [entry.seed for entry in EpisodeStore(tmp_path, episodes=2).episodes] == [0, 1]

@@ -9,7 +9,7 @@ from typing import Any
 import lightning
 import pytest
 import torch
-from fake_batch import make_batch, make_bc, make_rt1
+from fake_batch import make_batch, make_bc, make_decoder, make_rt1
 from lightning.pytorch.callbacks import EMAWeightAveraging
 from torch.utils.data import DataLoader
 from toy import SPEC
@@ -63,16 +63,17 @@ def test_training_lowers_the_loss_and_validation_reports_errors_in_readable_unit
 
 
 def test_the_error_of_a_component_is_the_mean_distance_over_what_is_valid() -> None:
-    learner = make_learner(make_bc(auxiliary=0.0)).eval()
+    model = make_bc(auxiliary=0.0)
+    learner = make_learner(model).eval()
     batch = make_batch(1)
     batch["valid"][0] = False
     metrics = make_trainer(1).validate(learner, loader(batch, 1), verbose=False)[0]
-    logits = learner.model(learner.prepare(batch))["logits"]
-    error = (learner.model.tokenizer.read(logits) - batch["action"]).abs()[1:, ..., 0].mean() * 1000
+    logits = model(learner.prepare(batch))["logits"]
+    error = (model.tokenizer.read(logits) - batch["action"]).abs()[1:, ..., 0].mean() * 1000
     assert metrics["val/error_x_mm"] == pytest.approx(error.item(), rel=1e-4)
 
 
-@pytest.mark.parametrize("model", [make_bc(), make_rt1()], ids=["bc", "rt1"])
+@pytest.mark.parametrize("model", [make_bc(), make_rt1(), make_decoder()], ids=["bc", "rt1", "decoder"])
 def test_bfloat16_trains(model: Model) -> None:
     metrics = fit(make_learner(model), make_batch(model.history), 2, precision="bf16").callback_metrics
     assert torch.isfinite(metrics["val/loss"])

@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from fake_batch import make_bc, make_rt1
+from fake_batch import make_bc, make_decoder, make_rt1
 from toy import SPEC, ToyEnvironment
 
-from vla.models.model import Model
+from vla.models.model import Model, TokenModel
 from vla.policy import Checkpoint, Policy, read_checkpoint
 from vla.rollout import rollout
 from vla.spec import Observation
@@ -48,7 +48,7 @@ def whole_window(model: Model, seen: list[Observation]) -> torch.Tensor:
     return logits
 
 
-@pytest.mark.parametrize("make", [make_bc, make_rt1], ids=["bc", "rt1"])
+@pytest.mark.parametrize("make", [make_bc, make_rt1, make_decoder], ids=["bc", "rt1", "decoder"])
 def test_plays_an_episode_within_the_limits(make: Callable[[], Model]) -> None:
     policy = Policy(model=make(), spec=replace(SPEC, high=(0.001, 0.05, 1.0)))
     episode = rollout(ToyEnvironment(), policy, seed=3)
@@ -106,7 +106,7 @@ def test_a_gpu_that_is_not_there_is_named() -> None:
             Policy(device="cuda", model=make_bc(), spec=SPEC)
 
 
-@pytest.mark.parametrize("make", [make_bc, make_rt1], ids=["bc", "rt1"])
+@pytest.mark.parametrize("make", [make_bc, make_rt1, make_decoder], ids=["bc", "rt1", "decoder"])
 def test_reset_forgets(make: Callable[[], Model]) -> None:
     policy = Policy(model=make(), spec=SPEC)
     seen = observations(4)
@@ -127,7 +127,7 @@ def test_another_instruction_starts_afresh() -> None:
 
 
 @pytest.mark.parametrize("make", [lambda: make_bc(chunk=3), lambda: make_rt1(chunk=3)], ids=["bc", "rt1"])
-def test_a_chunk_is_executed_action_by_action(make: Callable[[], Model]) -> None:
+def test_a_chunk_is_executed_action_by_action(make: Callable[[], TokenModel]) -> None:
     model = make()
     policy = Policy(model=model, spec=SPEC)
     seen = observations(4)

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from fake_batch import make_bc, make_rt1
+from fake_batch import make_bc, make_decoder, make_rt1
 from toy import SPEC, ToyEnvironment
 
 from vla.models.model import Model
@@ -18,7 +18,9 @@ from vla.program import Program
 
 
 @pytest.mark.parametrize(
-    "make", [lambda: make_bc(chunk=2), lambda: make_rt1(proprioception=True)], ids=["bc", "rt1 with kept tokens"]
+    "make",
+    [lambda: make_bc(chunk=2), lambda: make_rt1(proprioception=True), make_decoder],
+    ids=["bc", "rt1 with kept tokens", "decoder"],
 )
 def test_the_programs_act_like_the_policy_for_any_sentence(make: Callable[[], Model], tmp_path: Path) -> None:
     from onnxruntime import InferenceSession

@@ -132,12 +132,23 @@ def check(cfg: DictConfig) -> None:
     for name, annotation in PLAIN.items():
         node = OmegaConf.to_container(cfg[name], resolve=True) if OmegaConf.is_config(cfg[name]) else cfg[name]
         _check_plain(name, node, annotation)
-    for group in EVALUATION if cfg.job == "evaluate" and cfg.checkpoint is not None else JOBS[cfg.job]:
+    groups = EVALUATION if cfg.job == "evaluate" and cfg.checkpoint is not None else JOBS[cfg.job]
+    for group in groups:
         if cfg.get(group) is not None:
             node = OmegaConf.to_container(cfg[group], resolve=True, throw_on_missing=True)
             check_node(group, node, RUNTIME.get(group, ()))
         elif group not in OPTIONAL:
             raise ValueError(f"job={cfg.job} needs {group}=OPTION; --help lists the options")
+    if "model" in groups:
+        _require_together(*(_locate(f"{group}._target_", cfg[group]._target_) for group in ("tokenizer", "model")))
+
+
+def _require_together(tokenizer: type, model: type) -> None:
+    if not issubclass(tokenizer, _hints(model).get("tokenizer", object)):
+        raise ValueError(
+            f"{model.__name__} predicts one token per component, which {tokenizer.__name__} does not have: choose "
+            "another tokenizer, such as uniform, or model=decoder, which goes with all"
+        )
 
 
 def digest(*keys: str, _root_: DictConfig) -> str:

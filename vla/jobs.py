@@ -197,7 +197,7 @@ def _trained(config: DictConfig) -> Path:
     """Path of the checkpoint that training leaves behind."""
     import lightning
 
-    from vla.models.action_tokenizer import fidelity
+    from vla.models.fidelity import fidelity
     from vla.training import LAST, Interruption, make_trainer, quiet_lightning
 
     quiet_lightning()
@@ -212,7 +212,7 @@ def _trained(config: DictConfig) -> Path:
     learner = make_learner(config, store)
     data = make_data(config, store, learner.model)
     parameters = sum(parameter.numel() for parameter in learner.model.parameters())
-    tokens = fidelity(learner.model.tokenizer, store.rows("action")[:], store.spec.units)
+    tokens = fidelity(learner.model.tokenizer, store.statistics.chunks(learner.model.chunk), store.spec.units)
     log.info("%s: %s", type(learner.model.tokenizer).__name__, tokens)
     log.info("training %s with %.2f M parameters", type(learner.model).__name__, parameters / 1e6)
     started = time.monotonic()

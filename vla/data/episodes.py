@@ -18,7 +18,6 @@ import os
 import zlib
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -27,6 +26,7 @@ from filelock import FileLock, Timeout
 
 from vla.data.index import REMEDY, SALVAGE, Entry, dumps, index_line, moments, read_index
 from vla.data.pack import CODECS, JPEG, PackedRows, whole_rows
+from vla.data.statistics import Statistics, statistics_of
 from vla.spec import Array, Episode, Spec
 
 Rows = Array | PackedRows
@@ -34,17 +34,6 @@ Rows = Array | PackedRows
 FORMAT = 1
 
 log = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True)
-class Statistics:
-    """Moments of the actions over all stored steps, each (D,) float64."""
-
-    low: Array
-    high: Array
-    mean: Array
-    std: Array
-    steps: int
 
 
 def fields_of(spec: Spec) -> dict[str, tuple[tuple[int, ...], np.dtype]]:
@@ -119,16 +108,10 @@ class EpisodeStore:
 
     @property
     def statistics(self) -> Statistics:
-        """Moments of the actions in `episodes`, folded from the index alone; a ValueError if there are none."""
-        actions = [entry.action for entry in self.episodes]
-        if not actions:
+        """Moments of the actions in `episodes`, and a sample of them; a ValueError if there are none."""
+        if not self.episodes:
             raise ValueError(f"{self.folder} holds no episodes yet: collect some first")
-        steps = sum(entry.steps for entry in self.episodes)
-        mean = np.sum([action["sum"] for action in actions], axis=0) / steps
-        variance = np.sum([action["square"] for action in actions], axis=0) / steps - mean**2
-        low = np.min([action["low"] for action in actions], axis=0)
-        high = np.max([action["high"] for action in actions], axis=0)
-        return Statistics(low=low, high=high, mean=mean, std=np.sqrt(np.maximum(variance, 0)), steps=steps)
+        return statistics_of(self.episodes, np.asarray(self.rows("action")))
 
     def rows(self, field: str) -> Rows:
         """All committed rows of `field`, (N, …): nothing is read until it is indexed.

@@ -1,13 +1,13 @@
-"""Actions as tokens: every component of an action becomes one of K bins, and a network predicts which.
+"""Actions as tokens: a chunk of actions becomes a sequence of tokens out of K, and a network predicts which.
 
-Shapes: D action components, K bins, … any leading dimensions.
+Shapes: D action components, k actions of a chunk, L tokens of the longest sequence at hand, K bins, … any leading
+dimensions.
 """
 
 from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
 from typing import Protocol
 
 import numpy as np
@@ -25,7 +25,7 @@ LEAST_SPAN = 0.05
 
 
 class Statistics(Protocol):
-    """The smallest and largest action of a data set."""
+    """What a tokenizer is fitted on: the smallest and largest action of a data set, and a sample of its chunks."""
 
     @property
     def low(self) -> np.ndarray:
@@ -37,46 +37,135 @@ class Statistics(Protocol):
         """(D,) largest action."""
         ...
 
+    def chunks(self, length: int) -> np.ndarray:
+        """(N, length, D) float32 actions that follow each other."""
+        ...
+
 
 class ActionTokenizer(nn.Module, ABC):
-    """K bins per component between two bounds, which are buffers and so travel with a checkpoint.
+    """Chunks of actions as sequences of tokens; bounds and whatever else is fitted travel with a checkpoint.
 
     Args:
-        low, high: (D,) bounds of the bins in the units of the action.
-        bins: K, at least 2.
+        spec: names the components.
+        low, high: (D,) bounds of the actions that tokens stand for, in the units of the action.
+        bins: K, the size of the vocabulary, at least 2.
     """
 
     low: Tensor  # (D,)
     high: Tensor  # (D,)
+    end = -1  # the token that ends a sequence and fills it up; none where all are of one length
 
-    def __init__(self, low: np.ndarray, high: np.ndarray, bins: int) -> None:
+    def __init__(self, spec: Spec, low: np.ndarray, high: np.ndarray, bins: int) -> None:
         super().__init__()
         if bins < 2:
             raise ValueError(f"a tokenizer needs at least 2 bins, got bins={bins}")
-        self.bins = bins
+        ranges = zip(spec.action, spec.low, spec.high, strict=True)
+        empty = [name for name, least, most in ranges if not least < most]
+        if empty:
+            raise ValueError(f"the spec allows {', '.join(empty)} no range: its low must be smaller than its high")
+        self.bins, self.components = bins, len(spec.action)
         self.register_buffer("low", torch.as_tensor(low, dtype=torch.float32))
         self.register_buffer("high", torch.as_tensor(high, dtype=torch.float32))
+
+    @abstractmethod
+    def length(self, chunk: int) -> int:
+        """The largest L: the most tokens that a chunk of so many actions takes."""
+
+    @abstractmethod
+    def tokenize(self, actions: Tensor) -> Tensor:
+        """(…, k, D) float chunks, clipped to the bounds, as (…, L) int64 tokens."""
+
+    @abstractmethod
+    def detokenize(self, tokens: Tensor) -> Tensor:
+        """(…, L) tokens, whichever they are, as (…, k, D) float actions."""
+
+    @abstractmethod
+    def learned(self, tokens: Tensor, valid: Tensor) -> Tensor:
+        """(…, L) bool: which of the tokens of a chunk count, given which of its actions do, (…, k) bool."""
+
+    @abstractmethod
+    def used(self, tokens: Tensor) -> str:
+        """How much of the vocabulary appears in (N, L) tokens, for people."""
+
+    def token_losses(self, logits: Tensor, tokens: Tensor, actions: Tensor) -> Tensor:
+        """The (…, L) losses of (…, L, K) logits against the (…, L) tokens of the (…, k, D) actions."""
+        return _hard_cross_entropy(logits, tokens)
+
+    def drawn(self, tokens: Tensor, actions: Tensor) -> Tensor:
+        """(…, L) tokens that a model which has learned these (…, L) tokens of (…, k, D) actions may choose instead.
+
+        What is trained to go on from them goes on from its own as well.
+        """
+        return tokens
+
+    def actions(self, logits: Tensor, tokens: Tensor) -> Tensor:
+        """The (…, k, D) actions to execute after (…, L) tokens were chosen by (…, L, K) logits."""
+        return self.detokenize(tokens)
+
+
+class PerComponent(ActionTokenizer):
+    """One token per component of every action, in order, so that L is k·D and a token is one of D kinds of bins."""
 
     @abstractmethod
     def encode(self, action: Tensor) -> Tensor:
         """(…, D) float actions, clipped to the bounds, as (…, D) int64 tokens."""
 
     @abstractmethod
-    def read(self, logits: Tensor) -> Tensor:
-        """The (…, D) float action to execute for (…, D, K) logits."""
-
-    @abstractmethod
-    def cross_entropy(self, logits: Tensor, action: Tensor) -> Tensor:
-        """The (…, D) loss of (…, D, K) logits against (…, D) actions."""
-
     def decode(self, token: Tensor) -> Tensor:
-        """(…, D) tokens, whole or fractional, as (…, D) float actions."""
-        return token.to(self.low.dtype) / (self.bins - 1) * (self.high - self.low) + self.low
+        """(…, D) tokens as (…, D) float actions."""
+
+    def read(self, logits: Tensor) -> Tensor:
+        """The (…, D) float action to execute for (…, D, K) logits: that of the most likely tokens."""
+        return self.decode(logits.argmax(-1))
+
+    def cross_entropy(self, logits: Tensor, action: Tensor) -> Tensor:
+        """The (…, D) loss of (…, D, K) logits against (…, D) actions, of which one token each is right."""
+        return _hard_cross_entropy(logits, self.encode(action))
 
     def loss(self, logits: Tensor, action: Tensor, valid: Tensor) -> Tensor:
         """Mean cross-entropy of (…, D, K) logits against (…, D) actions where the (…) bool `valid` is true."""
         losses = self.cross_entropy(logits.float(), action).mean(-1)  # (…)
         return (losses * valid).sum() / valid.sum().clamp(min=1)
+
+    def length(self, chunk: int) -> int:
+        """k·D."""
+        return chunk * self.components
+
+    def tokenize(self, actions: Tensor) -> Tensor:
+        """(…, k, D) float chunks as (…, k·D) int64 tokens."""
+        return self.encode(actions).flatten(-2)
+
+    def detokenize(self, tokens: Tensor) -> Tensor:
+        """(…, k·D) tokens as (…, k, D) float actions."""
+        return self.decode(self._split(tokens, -1))
+
+    def learned(self, tokens: Tensor, valid: Tensor) -> Tensor:
+        """(…, k·D) bool: the tokens of the actions that count."""
+        return valid.repeat_interleave(self.components, -1)
+
+    def token_losses(self, logits: Tensor, tokens: Tensor, actions: Tensor) -> Tensor:
+        """The (…, k·D) losses of (…, k·D, K) logits against (…, k, D) actions."""
+        return self.cross_entropy(self._split(logits, -2), actions).flatten(-2)
+
+    def actions(self, logits: Tensor, tokens: Tensor) -> Tensor:
+        """The (…, k, D) actions that are read from (…, k·D, K) logits."""
+        return self.read(self._split(logits, -2))
+
+    def used(self, tokens: Tensor) -> str:
+        """Over the components, the fewest and the most bins that at least one action falls into."""
+        counts = [len(of_one.unique()) for of_one in self._split(tokens, -1).unbind(-1)]
+        return f"{min(counts)} to {max(counts)} of {self.bins} bins used"
+
+    def _split(self, values: Tensor, dim: int) -> Tensor:
+        return values.unflatten(dim, (-1, self.components))
+
+
+class EvenBins(PerComponent):
+    """K bins at even distances, the outermost on the bounds."""
+
+    def decode(self, token: Tensor) -> Tensor:
+        """(…, D) tokens, whole or fractional, as (…, D) float actions."""
+        return token.to(self.low.dtype) / (self.bins - 1) * (self.high - self.low) + self.low
 
     def _position(self, action: Tensor) -> Tensor:
         """(…, D) actions, clipped to the bounds, as positions on the scale of the tokens, 0 … K - 1."""
@@ -84,7 +173,7 @@ class ActionTokenizer(nn.Module, ABC):
         return (inside - self.low) / (self.high - self.low) * (self.bins - 1)
 
 
-class Uniform(ActionTokenizer):
+class Uniform(EvenBins):
     """Bins over the range of the data, nearest bin, and targets that also credit the neighbours of the right bin.
 
     The action is read as the expectation over the most likely stretch of bins, so it is finer than a bin and two
@@ -110,17 +199,7 @@ class Uniform(ActionTokenizer):
         spec: Spec,
         statistics: Statistics | None = None,
     ) -> None:
-        allowed_low, allowed_high = np.array(spec.low), np.array(spec.high)
-        low = allowed_low if statistics is None else np.asarray(statistics.low, dtype=np.float64)
-        high = allowed_high if statistics is None else np.asarray(statistics.high, dtype=np.float64)
-        if low.shape != allowed_low.shape:
-            raise ValueError(
-                f"the statistics describe actions of {low.size} components, the spec has {len(spec.action)}: "
-                f"{', '.join(spec.action)}"
-            )
-        span = np.maximum(high - low, LEAST_SPAN * (allowed_high - allowed_low))
-        half = (0.5 + margin) * span
-        super().__init__((low + high) / 2 - half, (low + high) / 2 + half, bins)
+        super().__init__(spec, *data_bounds(spec, statistics, margin), bins)
         self.smoothing, self.reach = smoothing, reach
 
     def encode(self, action: Tensor) -> Tensor:
@@ -135,6 +214,11 @@ class Uniform(ActionTokenizer):
         target = (-0.5 * distance.square()).softmax(-1)
         return -(target * logits.log_softmax(-1)).sum(-1)
 
+    def drawn(self, tokens: Tensor, actions: Tensor) -> Tensor:
+        """(…, k·D) tokens from the Gaussian that is the target of each component."""
+        position = self._position(actions).flatten(-2)
+        return (position + self.smoothing * torch.randn_like(position)).round().clamp(0, self.bins - 1).long()
+
     def read(self, logits: Tensor) -> Tensor:
         """The (…, D) expectation over the most likely stretch of bins."""
         probabilities = logits.float().softmax(-1)  # (…, D, K)
@@ -148,7 +232,7 @@ class Uniform(ActionTokenizer):
         return torch.arange(self.bins, device=logits.device, dtype=torch.float32)
 
 
-class RT1(ActionTokenizer):
+class RT1(EvenBins):
     """The rule of RT-1: fixed bounds by unit (1 m, π/2 rad, 1), rounding down, one right bin, most likely bin.
 
     Kept for fidelity: with small motions it uses few bins, and rounding down biases every action.
@@ -164,40 +248,32 @@ class RT1(ActionTokenizer):
         if unknown:
             raise ValueError(f"tokenizer=rt1 knows the units {sorted(RT1_BOUNDS)}, the spec has {unknown}")
         bound = np.array([RT1_BOUNDS[unit] for unit in spec.units])
-        super().__init__(-bound, bound, bins)
+        super().__init__(spec, -bound, bound, bins)
 
     def encode(self, action: Tensor) -> Tensor:
         """(…, D) float actions rounded down to a token, (…, D) int64."""
         # A decoded token lies within a rounding error of its own position and must not fall to the one below.
         return (self._position(action) + 1e-3).floor().long()
 
-    def cross_entropy(self, logits: Tensor, action: Tensor) -> Tensor:
-        """The (…, D) loss against the one right token."""
-        return _hard_cross_entropy(logits, self.encode(action))
 
-    def read(self, logits: Tensor) -> Tensor:
-        """The (…, D) action of the most likely token."""
-        return self.decode(logits.argmax(-1))
+def data_bounds(spec: Spec, statistics: Statistics | None, margin: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
+    """(D,) bounds of the data, `margin` times its range beyond it; without data, of the allowed actions.
+
+    Raises:
+        ValueError: the statistics are those of other actions.
+    """
+    allowed_low, allowed_high = np.array(spec.low), np.array(spec.high)
+    low = allowed_low if statistics is None else np.asarray(statistics.low, dtype=np.float64)
+    high = allowed_high if statistics is None else np.asarray(statistics.high, dtype=np.float64)
+    if low.shape != allowed_low.shape:
+        raise ValueError(
+            f"the statistics describe actions of {low.size} components, the spec has {len(spec.action)}: "
+            f"{', '.join(spec.action)}"
+        )
+    span = np.maximum(high - low, LEAST_SPAN * (allowed_high - allowed_low))
+    half = (0.5 + margin) * span
+    return (low + high) / 2 - half, (low + high) / 2 + half
 
 
 def _hard_cross_entropy(logits: Tensor, token: Tensor) -> Tensor:
     return F.cross_entropy(logits.flatten(0, -2), token.flatten(), reduction="none").view(token.shape)
-
-
-def fidelity(tokenizer: ActionTokenizer, actions: np.ndarray, units: Sequence[str]) -> str:
-    """What is lost between (N, D) actions and their tokens, in one line: errors and bias in the units of people.
-
-    The largest component of each unit counts; bins are used that at least one action falls into.
-    """
-    action = torch.from_numpy(np.array(actions, np.float32))  # a copy: those of a store cannot be written to
-    tokens = tokenizer.encode(action)
-    error = tokenizer.decode(tokens) - action  # (N, D)
-    told = []
-    for unit, (name, scale) in {"m": ("mm", 1000.0), "rad": ("°", 180 / math.pi), "1": ("of the gripper", 1.0)}.items():
-        of_unit = [index for index, other in enumerate(units) if other == unit]
-        if of_unit:
-            part = error[:, of_unit]
-            told.append(f"{scale * part.abs().mean(0).max():.3f} {name} (bias {scale * part.mean(0).abs().max():.3f})")
-    used = [len(tokens[:, index].unique()) for index in range(tokens.shape[1])]
-    spread = f"{min(used)} to {max(used)} of {tokenizer.bins} bins used"
-    return f"{', '.join(told)} lost; {spread}; {len(units)} tokens per action"

@@ -10,7 +10,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor, nn
 
-from vla.models.action_tokenizer import ActionTokenizer
+from vla.models.action_tokenizer import PerComponent
 from vla.models.image_tokenizer import ImageEncoder, Keypoints, RandomShift
 from vla.models.model import Batch, Standardize, TokenModel, pixels
 from vla.models.text import TextEncoder
@@ -45,7 +45,7 @@ class BC(TokenModel):
         auxiliary: float = 1.0,
         *,
         spec: Spec,
-        tokenizer: ActionTokenizer,
+        tokenizer: PerComponent,
     ) -> None:
         super().__init__(1, chunk, text(width=text_width), auxiliary, width, spec, tokenizer)
         self.shift = RandomShift(*shift)

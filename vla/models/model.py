@@ -12,7 +12,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from vla.models.action_tokenizer import ActionTokenizer
+from vla.models.action_tokenizer import ActionTokenizer, PerComponent
 from vla.models.text import TextEncoder
 from vla.spec import Spec
 
@@ -167,6 +167,8 @@ class TokenModel(Model):
     Its `forward` gives logits: (B, T', k, D, K).
     """
 
+    tokenizer: PerComponent
+
     def __init__(
         self,
         history: int,
@@ -175,7 +177,7 @@ class TokenModel(Model):
         auxiliary: float,
         truth_width: int,
         spec: Spec,
-        tokenizer: ActionTokenizer,
+        tokenizer: PerComponent,
     ) -> None:
         super().__init__(history, chunk, text, auxiliary, truth_width, spec, tokenizer)
         self.logits_shape = (chunk, len(spec.action), tokenizer.bins)
@@ -193,9 +195,14 @@ class TokenModel(Model):
 
     def predict(self, batch: Batch) -> Prediction:
         """The actions that the tokenizer reads from the logits of the newest frame."""
-        newest = (batch["present"] * torch.arange(1, self.history + 1, device=batch["present"].device)).argmax(1)
-        logits = self(batch)["logits"][torch.arange(len(newest)), newest].float()  # (B, k, D, K)
+        place = newest(batch["present"])
+        logits = self(batch)["logits"][torch.arange(len(place)), place].float()  # (B, k, D, K)
         return Prediction(self.tokenizer.read(logits), logits.softmax(-1))
+
+
+def newest(present: Tensor) -> Tensor:
+    """(B,) place of the last of the (B, T) frames that is present."""
+    return (present * torch.arange(1, present.shape[1] + 1, device=present.device)).argmax(1)
 
 
 def pixels(images: Tensor, size: int | None = None) -> Tensor:

@@ -12,9 +12,10 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from vla.models.action_tokenizer import ActionTokenizer
-from vla.models.image_tokenizer import ImageEncoder, Keypoints, RandomShift, TokenLearner
-from vla.models.model import Batch, Standardize, TokenModel, pixels
+from vla.models.action_tokenizer import PerComponent
+from vla.models.frames import FrameModel
+from vla.models.image_tokenizer import ImageEncoder
+from vla.models.model import Batch, TokenModel
 from vla.models.text import TextEncoder
 from vla.spec import Spec
 
@@ -48,7 +49,7 @@ class Layer(nn.Module):
         return x + F.dropout(self.linear(self.linear_norm(x)), self.dropout, self.training)
 
 
-class RT1(TokenModel):
+class RT1(FrameModel, TokenModel):
     """Image tokens of T frames through a causal transformer that never sees an action; every frame is read out.
 
     The sequence has, per frame, the tokens of every camera, the proprioception token if wanted, and A = k·D action
@@ -96,48 +97,31 @@ class RT1(TokenModel):
         shift: tuple[float, float] = (20, 50),
         *,
         spec: Spec,
-        tokenizer: ActionTokenizer,
+        tokenizer: PerComponent,
     ) -> None:
-        super().__init__(history, chunk, text(width=text_width), auxiliary, width, spec, tokenizer)
-        self.image_size = image_size
-        self.tokens = len(spec.cameras) * (learned_tokens + (keypoints > 0)) + proprioception  # N
+        super().__init__(
+            image,
+            text,
+            history,
+            image_size,
+            learned_tokens,
+            keypoints,
+            proprioception,
+            chunk,
+            auxiliary,
+            text_width,
+            width,
+            shift,
+            spec,
+            tokenizer,
+        )
         self.slots = chunk * len(spec.action)  # A
-        self.shift = RandomShift(*shift)
-        self.image = image(text_width=text_width)
-        self.token_learners = nn.ModuleList(TokenLearner(self.image.channels, learned_tokens) for _ in spec.cameras)
-        self.image_tokens = nn.Linear(self.image.channels, width)
-        if keypoints:
-            readers = [Keypoints(self.image.channels, keypoints) for _ in spec.cameras]
-            self.keypoints = nn.ModuleList(readers)
-            self.keypoint_tokens = nn.ModuleList(nn.Linear(keypoints * reader.width, width) for reader in readers)
-        if proprioception:
-            self.proprioception = Standardize(self.posture_width)
-            self.proprioception_token = nn.Linear(self.posture_width, width)
         length = history * (self.tokens + self.slots)
         self.positions = nn.Embedding(length, width)
         nn.init.normal_(self.positions.weight, std=0.05)  # where a token stands must not drown what it says
         self.layers = nn.ModuleList(Layer(width, heads, key_width, dropout) for _ in range(layers))
         self.head = nn.Linear(width, tokenizer.bins)
         self.register_buffer("mask", attention_mask(history, self.tokens, self.slots), persistent=False)
-
-    def encode(self, batch: Batch) -> Tensor:
-        """The (B, T, N, E) tokens of the frames, which depend on nothing but the frame and the instruction."""
-        text = self.text(batch["text"])  # (B, text_width)
-        frames = batch["present"].shape[1]
-        repeated = text.repeat_interleave(frames, 0)  # (B·T, text_width)
-        tokens = []
-        for index, camera in enumerate(self.spec.cameras):
-            images = pixels(self.shift(batch["rgb"][camera]), self.image_size)
-            features = self.image(images, repeated)  # (B·T, C, h, w)
-            learned = self.image_tokens(self.token_learners[index](features))
-            tokens.append(learned.unflatten(0, (-1, frames)))  # (B, T, learned_tokens, E)
-            if hasattr(self, "keypoints"):
-                positions = self.keypoint_tokens[index](self.keypoints[index](features).flatten(1))
-                tokens.append(positions.view(-1, frames, 1, positions.shape[-1]))
-        if hasattr(self, "proprioception"):
-            standard = self.proprioception(self.posture(batch), batch["present"])
-            tokens.append(self.proprioception_token(standard).unsqueeze(2))
-        return torch.cat(tokens, 2)
 
     def forward(self, batch: Batch) -> dict[str, Tensor]:
         """logits: (B, T, k, D, K) for every frame; with an auxiliary head, truth: (B, T, S), standardised.

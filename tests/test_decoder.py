@@ -1,0 +1,195 @@
+"""The decoder: one token after the other, with what it knows kept, is the same as all of them at once."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from fake_batch import TINY_IMAGE, TINY_TEXT, Motions, make_batch, make_decoder, overfit, with_text
+from lightning.pytorch.callbacks import EMAWeightAveraging
+from test_learner import loader, make_learner, make_trainer
+from test_policy import act, observations
+from toy import SPEC, ToyEnvironment
+
+from vla.models.action_tokenizer import RT1
+from vla.models.decoder import Decoder
+from vla.models.fast import Fast
+from vla.models.quantile import Quantile
+from vla.policy import Policy, read_checkpoint
+from vla.rollout import rollout
+
+MOTIONS = Motions()
+
+
+def make_fast(chunk: int = 4, seed: int = 0) -> Decoder:
+    """A decoder that writes chunks as FAST does."""
+    torch.manual_seed(seed)
+    return make_decoder(chunk=chunk, tokenizer=Fast(bins=256, chunk=chunk, spec=SPEC, statistics=MOTIONS))
+
+
+MODELS: dict[str, Callable[[], Decoder]] = {
+    "uniform": make_decoder,
+    "chunk": lambda: make_decoder(history=3, chunk=3),
+    "rt1": lambda: make_decoder(tokenizer=RT1(spec=SPEC)),
+    "quantile": lambda: make_decoder(tokenizer=Quantile(bins=64, spec=SPEC, statistics=MOTIONS)),
+    "fast": make_fast,
+}
+every_model = pytest.mark.parametrize("make", MODELS.values(), ids=MODELS.keys())
+
+
+def batch_for(model: Decoder, size: int = 4) -> dict[str, Any]:
+    """A batch of noise, with motions as labels."""
+    batch = with_text(model, make_batch(model.history, model.chunk, size))
+    chunks = MOTIONS.chunks(model.chunk)
+    rows = np.random.default_rng(0).integers(len(chunks), size=(size, model.history))
+    return {**batch, "action": torch.from_numpy(chunks[rows])}
+
+
+@every_model
+def test_shapes(make: Callable[[], Decoder]) -> None:
+    model = make()
+    output = model(batch_for(model))
+    assert output["logits"].shape == (4, output["tokens"].shape[1], model.tokenizer.bins)
+    assert 1 <= output["tokens"].shape[1] <= model.length
+    assert output["truth"].shape == (4, 1, SPEC.truth_size)
+    prediction = model.eval().predict(batch_for(model))
+    assert prediction.actions.shape == (4, model.chunk, 3)
+    if prediction.probabilities is not None:
+        assert prediction.probabilities.shape == (4, model.chunk, 3, model.tokenizer.bins)
+
+
+@every_model
+def test_overfits_one_batch(make: Callable[[], Decoder]) -> None:
+    torch.manual_seed(0)
+    model = make()
+    lost = 0.08 if model.tokenizer.low[0] <= -1 else 0.02  # the bins of RT-1 are 8 mm wide, of a range of 100 mm
+    assert overfit(model, batch_for(model)) < lost
+
+
+@every_model
+def test_saves_and_loads_equal(make: Callable[[], Decoder], tmp_path: Path) -> None:
+    model, other = make(), make()
+    batch = batch_for(model)
+    model.loss(batch)  # gathers statistics, which must travel too
+    torch.save(model.state_dict(), tmp_path / "model.ckpt")
+    other.load_state_dict(torch.load(tmp_path / "model.ckpt", weights_only=True))
+    assert torch.equal(model.eval()(batch)["logits"], other.eval()(batch)["logits"])
+    assert torch.equal(model.predict(batch).actions, other.predict(batch).actions)
+
+
+@every_model
+def test_predictions_ignore_truth_and_labels(make: Callable[[], Decoder]) -> None:
+    model = make().eval()
+    batch = batch_for(model)
+    seen = {name: value for name, value in batch.items() if name not in ("truth", "action", "valid", "instruction")}
+    assert torch.equal(model.predict(batch).actions, model.predict(seen).actions)
+
+
+@every_model
+def test_writing_with_a_cache_is_decoding_the_growing_sequence_again_and_again(make: Callable[[], Decoder]) -> None:
+    model = make()
+    with torch.no_grad():
+        for parameter in model.parameters():  # many biases are 0 at first, and would not be missed
+            parameter.add_(0.3 * torch.randn_like(parameter))
+    model.eval()
+    batch = batch_for(model)
+    batch["present"][:2, :-1] = False
+    with torch.inference_mode():
+        memory, absent = model.memory(batch)
+        logits, tokens = model.generate(memory, absent)
+        written = tokens[:, :0]
+        for place in range(tokens.shape[1]):
+            again = model.head(model.decode(written, memory, absent))
+            assert torch.allclose(again, logits[:, : place + 1], atol=1e-4, rtol=1e-4)
+            written = torch.cat([written, again[:, -1:].argmax(-1)], 1)
+        assert torch.equal(written, tokens)
+    assert len(tokens.unique()) > 1
+
+
+def test_a_token_depends_on_those_before_it_and_on_no_later_one() -> None:
+    model = make_decoder(chunk=2).eval()
+    memory, absent = model.memory(batch_for(model))
+    tokens = torch.randint(64, (4, 5))
+    embedded: list[torch.Tensor] = []
+
+    def keep(module: torch.nn.Module, inputs: object, output: torch.Tensor) -> torch.Tensor:
+        embedded.append(output.detach().requires_grad_())
+        return embedded[-1]
+
+    model.embedding.register_forward_hook(keep)
+    hidden = model.decode(tokens, memory, absent)
+    for place in range(6):
+        (gradient,) = torch.autograd.grad(hidden[:, place].square().sum(), embedded[0], retain_graph=True)
+        assert (gradient[:, place + 1 :] == 0).all()
+        assert (gradient[:, : place + 1].abs().sum((0, 2)) > 0).all()
+
+
+def test_the_instruction_and_every_frame_matter() -> None:
+    model = make_decoder(history=3).eval()
+    batch = batch_for(model)
+    logits = model(batch)["logits"]
+    assert not torch.allclose(model({**batch, "text": model.text.tokenize(["push the button"] * 4)})["logits"], logits)
+    for frame in range(3):
+        changed = {name: images.clone() for name, images in batch["rgb"].items()}
+        changed["wrist"][:, frame] = 0
+        assert not torch.allclose(model({**batch, "rgb": changed})["logits"], logits)
+
+
+def test_frames_that_are_missing_are_as_frames_that_are_padding() -> None:
+    model = make_decoder(history=3).eval()
+    batch = batch_for(model)
+    batch["present"][:, :2] = False
+    alone = {name: batch[name][:, 2:] for name in ("proprio", "present")}
+    rgb = {camera: images[:, 2:] for camera, images in batch["rgb"].items()}
+    prediction = model.predict({**alone, "rgb": rgb, "text": batch["text"]})
+    assert torch.allclose(prediction.actions, model.predict(batch).actions, atol=1e-6)
+
+
+def test_labels_that_are_not_valid_do_not_count() -> None:
+    model = make_decoder(chunk=3, auxiliary=0.0).eval()
+    batch = batch_for(model)
+    batch["valid"][:, -1, 1:] = False
+    other = {**batch, "action": batch["action"].clone()}
+    other["action"][:, -1, 1:] = 0.0
+    assert model.loss(batch)["loss"].item() == pytest.approx(model.loss(other)["loss"].item(), rel=1e-6)
+
+
+def test_writing_ends_when_all_have_ended() -> None:
+    model = make_fast().eval()
+    torch.nn.init.zeros_(model.head.weight)
+    with torch.no_grad():
+        model.head.bias.copy_(torch.eye(256)[model.tokenizer.end])
+    _, tokens = model.generate(*model.memory(batch_for(model)))
+    assert tokens.tolist() == [[model.tokenizer.end]] * 4
+
+
+def test_what_was_perceived_is_kept_while_the_window_moves_on() -> None:
+    model = make_decoder(history=3)
+    policy = Policy(model=model, spec=SPEC)
+    frames: list[int] = []
+    model.image.register_forward_pre_hook(lambda module, inputs: frames.append(len(inputs[0])))
+    actions = act(policy, observations(5))
+    assert frames == [1] * (5 * len(SPEC.cameras))
+    assert np.array_equal(act(Policy(model=model, spec=SPEC), observations(5)), actions)
+
+
+def test_a_trained_decoder_of_fast_tokens_plays_an_episode_from_its_checkpoint(tmp_path: Path) -> None:
+    model = make_fast(chunk=4)
+    trainer = make_trainer(3, EMAWeightAveraging(decay=0.9))
+    trainer.fit(make_learner(model), loader(make_batch(2, chunk=4), 3))
+    trainer.save_checkpoint(tmp_path / "fast.ckpt")
+    restored = make_decoder(chunk=4, tokenizer=Fast(bins=256, chunk=4, spec=SPEC))
+    read_checkpoint(tmp_path / "fast.ckpt").restore(restored)
+    episode = rollout(ToyEnvironment(), Policy(model=restored, spec=SPEC), seed=3)
+    assert episode.actions.shape == (40, 3)
+    expected = rollout(ToyEnvironment(), Policy(model=model, spec=SPEC), seed=3)
+    assert episode.actions == pytest.approx(expected.actions, abs=1e-6)
+
+
+def test_heads_that_do_not_divide_the_width_are_refused() -> None:
+    with pytest.raises(ValueError, match=r"model\.width=32 must be a multiple of model\.heads=5"):
+        Decoder(TINY_IMAGE, TINY_TEXT, width=32, heads=5, spec=SPEC, tokenizer=RT1(spec=SPEC))

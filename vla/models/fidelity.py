@@ -1,0 +1,34 @@
+"""What is lost when actions become tokens."""
+
+# N chunks, k actions of a chunk, D action components, L tokens of a sequence
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+
+from vla.models.action_tokenizer import ActionTokenizer
+
+READABLE = {"m": ("mm", 1000.0), "rad": ("°", 180 / math.pi), "1": ("of the gripper", 1.0)}  # unit → name and factor
+
+
+def fidelity(tokenizer: ActionTokenizer, chunks: np.ndarray, units: Sequence[str]) -> str:
+    """What is lost between (N, k, D) chunks and their tokens, in one line: errors and bias in the units of people.
+
+    The largest component of each unit counts.
+    """
+    actions = torch.from_numpy(np.array(chunks, np.float32))
+    tokens = tokenizer.tokenize(actions)  # (N, L)
+    error = (tokenizer.detokenize(tokens) - actions).flatten(0, 1)  # (N·k, D)
+    told = []
+    for unit, (name, scale) in READABLE.items():
+        of_unit = [index for index, other in enumerate(units) if other == unit]
+        if of_unit:
+            part = error[:, of_unit]
+            told.append(f"{scale * part.abs().mean(0).max():.3f} {name} (bias {scale * part.mean(0).abs().max():.3f})")
+    written = tokenizer.learned(tokens, torch.ones(actions.shape[:2], dtype=torch.bool)).sum()
+    per_action = f"{written / (len(chunks) * chunks.shape[1]):.3g} tokens per action"
+    return f"{', '.join(told)} lost; {tokenizer.used(tokens)}; {per_action}"
