@@ -58,11 +58,16 @@ def with_text(model: Model, batch: dict[str, Any]) -> dict[str, Any]:
     return {**batch, "text": model.text.tokenize(batch["instruction"])}
 
 
-def make_bc(chunk: int = 1, auxiliary: float = 1.0, image: Callable[..., Any] = TINY_IMAGE) -> BC:
+def make_bc(
+    chunk: int = 1,
+    auxiliary: float = 1.0,
+    image: Callable[..., Any] = TINY_IMAGE,
+    text: Callable[..., Any] = TINY_TEXT,
+) -> BC:
     """A small BC without random shifts."""
     return BC(
         image,
-        TINY_TEXT,
+        text,
         chunk=chunk,
         keypoints=8,
         text_width=16,

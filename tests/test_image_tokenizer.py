@@ -2,16 +2,10 @@
 
 from __future__ import annotations
 
-import logging
-from pathlib import Path
-from typing import Any
-
 import pytest
-import timm
 import torch
 
-from vla.models import image_tokenizer
-from vla.models.image_tokenizer import FiLM, FilmConv, FilmEfficientNet, Keypoints, RandomShift, TokenLearner
+from vla.models.image_tokenizer import FiLM, FilmConv, Keypoints, RandomShift, TokenLearner
 
 
 def test_film_starts_as_the_identity_where_it_should() -> None:
@@ -26,55 +20,6 @@ def test_film_scales_and_shifts_every_channel() -> None:
     film.beta.bias.data = torch.tensor([0.0, 5.0])
     out = film(torch.ones(1, 2, 1, 1), torch.zeros(1, 1)).flatten()
     assert out.tolist() == [2.0, 6.0]
-
-
-def test_at_the_start_the_efficientnet_is_the_plain_one_bit_for_bit() -> None:
-    torch.manual_seed(0)
-    plain: Any = timm.create_model("efficientnet_b0", num_classes=0).eval()
-    ours: Any = FilmEfficientNet("efficientnet_b0", pretrained=False, channels=32, text_width=8).eval()
-    blocks = torch.nn.ModuleList(block for stage in plain.blocks for block in stage)
-    for module, source in (
-        (ours.stem, torch.nn.Sequential(plain.conv_stem, plain.bn1)),
-        (ours.blocks, blocks),
-        (ours.top, torch.nn.Sequential(plain.conv_head, plain.bn2)),
-    ):
-        module.load_state_dict(source.state_dict())
-    images = torch.rand(2, 3, 64, 64)
-    plain.to(memory_format=torch.channels_last)
-    with torch.inference_mode():
-        expected = ours.projection(plain.forward_features((images - ours.mean) / ours.std))
-        assert torch.equal(ours(images, torch.randn(2, 8)), expected)
-    assert len(ours.films) == len(ours.blocks) == 16
-
-
-def test_weights_come_from_a_file(tmp_path: Path) -> None:
-    source: Any = timm.create_model("efficientnet_b0")
-    torch.save(source.state_dict(), tmp_path / "weights.pth")
-    net = image_tokenizer.load_efficientnet("efficientnet_b0", str(tmp_path / "weights.pth"))
-    assert torch.equal(net.get_parameter("conv_stem.weight"), source.conv_stem.weight)
-    with pytest.raises(ValueError, match="does not hold the weights of timm's efficientnet_b1"):
-        image_tokenizer.load_efficientnet("efficientnet_b1", str(tmp_path / "weights.pth"))
-
-
-def test_weights_are_never_random_in_silence(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
-    def unreachable(name: str) -> Path:
-        raise OSError("no network")
-
-    monkeypatch.setattr(image_tokenizer, "fetch_weights", unreachable)
-    with pytest.raises(ValueError, match=r"no network.*path of a weights file, or false"):
-        image_tokenizer.load_efficientnet("efficientnet_b0", True)
-    with caplog.at_level(logging.WARNING, logger=image_tokenizer.__name__):
-        image_tokenizer.load_efficientnet("efficientnet_b0", "auto")
-    assert "starts at RANDOM" in caplog.text
-
-
-@pytest.mark.parametrize(
-    ("name", "pretrained", "message"),
-    [("efficientnet_b33", False, "efficientnet_b3"), ("efficientnet_b0", "nowhere.pth", "no file nowhere.pth")],
-)
-def test_what_does_not_exist_is_named(name: str, pretrained: bool | str, message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        image_tokenizer.load_efficientnet(name, pretrained)
 
 
 def test_film_conv_listens_to_the_text() -> None:

@@ -56,6 +56,8 @@ LIBRARIES = {
     "rerun": ("vla.record", "vla.deploy.view"),
     "rclpy": ("vla.deploy",),
     "distributed": ("vla.cluster",),
+    "timm": ("vla.models.trunks",),
+    "transformers": ("vla.models.huggingface",),
 }
 HEAVY = ("torch", "lightning", "mujoco", "dm_control", "rerun", "matplotlib", "distributed")
 

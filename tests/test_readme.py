@@ -14,6 +14,7 @@ from pathlib import Path
 import pytest
 from test_cluster import address_in, dask
 from test_run import SMALL, vla
+from tiny_encoder import write_encoder
 
 DOCS = Path(__file__).parents[1] / "docs"
 README = (Path(__file__).parents[1] / "README.md").read_text(encoding="utf-8")
@@ -24,8 +25,9 @@ os.environ["ROS_DOMAIN_ID"] = str(18 + 20 * (int(os.environ.get("PYTEST_XDIST_WO
 
 @pytest.fixture(scope="module")
 def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with a small trained checkpoint, as FILE, and a small LeRobot dataset, as DATASET."""
+    """A folder with a small checkpoint, FILE, a small LeRobot dataset, DATASET, and a small encoder, ENCODER."""
     folder = tmp_path_factory.mktemp("readme")
+    write_encoder(folder / "encoder")
     vla(folder, *SMALL, "job=train", "output=run")
     vla(folder, *SMALL, "job=export", "export=lerobot", "export.folder=dataset")
     return folder
@@ -58,7 +60,7 @@ def test_the_command_runs(home: Path, command: str, request: pytest.FixtureReque
     number = COMMANDS.index(command)
     if "cluster=dask" in command:
         command = command.replace("tcp://HOST:8786", request.getfixturevalue("address"))
-    command = command.replace("DATASET", "dataset").replace("DIR", f"new{number}")
+    command = command.replace("DATASET", "dataset").replace("ENCODER", "encoder").replace("DIR", f"new{number}")
     arguments = shlex.split(command.replace("FILE", "run/checkpoints/last.ckpt"))
     if "--help" in arguments:
         assert "pick_place" in vla(home, *arguments).stdout

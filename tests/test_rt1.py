@@ -12,9 +12,9 @@ from fake_batch import make_batch, make_rt1, with_text
 from toy import SPEC
 
 from vla.models.action_tokenizer import RT1 as RT1Tokenizer
-from vla.models.image_tokenizer import FilmEfficientNet
 from vla.models.rt1 import RT1, attention_mask
 from vla.models.text import NGrams
+from vla.models.trunks import FilmEfficientNet
 
 
 def test_the_mask_is_causal_and_hides_actions_from_actions() -> None:

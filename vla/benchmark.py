@@ -143,7 +143,7 @@ def loader(config: DictConfig) -> dict[str, Measure]:
     """
     from vla.data.episodes import EpisodeStore
     from vla.data.lerobot import LeRobot
-    from vla.jobs import collected, make_data, make_learner
+    from vla.parts import collected, make_data, make_learner
 
     store = collected(config)
     model = make_learner(config, store).model
@@ -199,7 +199,7 @@ def training(config: DictConfig) -> dict[str, Measure]:
     import torch
     from lightning import Callback
 
-    from vla.jobs import collected, make_data, make_learner
+    from vla.parts import collected, make_data, make_learner
     from vla.training import make_trainer, quiet_lightning
 
     quiet_lightning()
@@ -237,7 +237,7 @@ def policy(config: DictConfig) -> dict[str, Measure]:
     the same network if it encoded every frame of its history anew, in 32 bits and uncompiled, against that time."""
     import torch
 
-    from vla.jobs import collected, make_environment, make_learner, plain
+    from vla.parts import collected, make_environment, make_learner, plain
 
     environment = make_environment(plain(config.task))
     observation = environment.reset(0)

@@ -19,13 +19,15 @@ from rich import print as show
 from vla.check import build
 from vla.parts import (
     collected,
+    demonstrated,
+    fit,
     make_data,
     make_environment,
     make_expert,
-    make_learner,
     make_policy,
     make_recorder,
     plain,
+    unfitted_learner,
 )
 
 if TYPE_CHECKING:
@@ -203,13 +205,15 @@ def _trained(config: DictConfig) -> Path:
     quiet_lightning()
     checkpoints = _output(config) / "checkpoints"
     interruption = Interruption(checkpoints)
-    # Before anything is collected: the checkpoint to go on from may be unfit, the devices asked for may be missing.
+    # Before anything is collected: the checkpoint to go on from may be unfit, the devices asked for may be missing, and
+    # so may be pretrained weights.
     if config.checkpoint:
         _require_same_policy(config)
     trainer = make_trainer(config, checkpoints, interruption)
-    store = collected(config)
     lightning.seed_everything(config.seed, verbose=False)
-    learner = make_learner(config, store)
+    learner = unfitted_learner(config, demonstrated(config))
+    store = collected(config)
+    fit(learner.model.tokenizer, config, store)
     data = make_data(config, store, learner.model)
     parameters = sum(parameter.numel() for parameter in learner.model.parameters())
     tokens = fidelity(learner.model.tokenizer, store.statistics.chunks(learner.model.chunk), store.spec.units)

@@ -14,7 +14,9 @@ from vla.spec import FIRST_SEED
 
 if TYPE_CHECKING:
     from vla.data.episodes import EpisodeStore
+    from vla.data.recorded import Recorded
     from vla.data.windows import Windows
+    from vla.models.action_tokenizer import ActionTokenizer
     from vla.models.learner import Learner
     from vla.policy import Policy
     from vla.spec import Agent, Environment, Recorder, Spec
@@ -73,7 +75,6 @@ def make_policy(policy: Node, checkpoint: Path, environment: Environment | None 
     if environment is not None:
         saved.spec.perceived.require(environment.spec.perceived, f"the checkpoint {checkpoint}", "the task")
     tokenizer = build(saved.config["tokenizer"], spec=saved.spec)
-    # What the saved weights are, the pretrained ones would only be overwritten by.
     model = build(_without_pretraining(saved.config["model"]), spec=saved.spec, tokenizer=tokenizer)
     saved.restore(model)
     made: Policy = build(policy, model=model, spec=saved.spec)
@@ -81,30 +82,44 @@ def make_policy(policy: Node, checkpoint: Path, environment: Environment | None 
 
 
 def _without_pretraining(model: Node) -> Node:
-    image = model.get("image") or {}
-    return {**model, "image": {**image, "pretrained": False}} if "pretrained" in image else model
+    """The node of a model whose weights all come out of a checkpoint, with none to be found or fetched before."""
+    nowhere = {("image", "pretrained"): False, ("text", "name"): ""}
+    changed = {
+        part: {**model[part], key: value} for (part, key), value in nowhere.items() if key in (model.get(part) or {})
+    }
+    return {**model, **changed}
+
+
+def demonstrated(config: DictConfig) -> Spec:
+    """What a step of the demonstrations looks like, whether they have been collected or not."""
+    return _source(config)[0]
+
+
+def _source(config: DictConfig) -> tuple[Spec, Recorded | None]:
+    """What a step looks like, and the recording that the demonstrations are taken from, if they are."""
+    from vla.data.recorded import Recorded
+
+    environment = make_environment(plain(config.task))
+    environment.close()
+    expert = build(config.expert, spec=environment.spec)
+    return (expert.spec, expert) if isinstance(expert, Recorded) else (environment.spec, None)
 
 
 def collected(config: DictConfig) -> EpisodeStore:
     """The episode store of this configuration, with at least as many episodes as asked for."""
     from vla.collect import collect
     from vla.data.episodes import EpisodeStore
-    from vla.data.recorded import Recorded
 
     if config.collect.seed + config.collect.episodes > FIRST_SEED:
         raise ValueError(f"collect.seed={config.collect.seed}: seeds from {FIRST_SEED} on are kept for evaluation")
     cluster = build(config.cluster)
-    environment = make_environment(plain(config.task))
-    spec = environment.spec
-    environment.close()
+    spec, recorded = _source(config)
     source = {"task": plain(config.task), "expert": plain(config.expert)}
-    recorded = build(config.expert, spec=spec)
-    if isinstance(recorded, Recorded):
-        store = EpisodeStore.create_or_open(Path(config.collect.folder), recorded.spec, source)
+    store = EpisodeStore.create_or_open(Path(config.collect.folder), spec, source)
+    if recorded is not None:
         added = recorded.fill(store, config.collect.episodes)
         log.info("%s: %d recorded episodes, %d of them new", store.folder, len(store.episodes), added)
         return store
-    store = EpisodeStore.create_or_open(Path(config.collect.folder), spec, source)
     summary = collect(
         store,
         partial(make_environment, source["task"]),
@@ -128,11 +143,22 @@ def collected(config: DictConfig) -> EpisodeStore:
 
 def make_learner(config: DictConfig, store: EpisodeStore) -> Learner:
     """The learner of a configuration's model, with a tokenizer fitted on the store's actions."""
-    spec: Spec = store.spec
-    tokenizer = build(config.tokenizer, spec=spec, statistics=store.statistics)
-    model = build(config.model, spec=spec, tokenizer=tokenizer)
+    learner = unfitted_learner(config, store.spec)
+    fit(learner.model.tokenizer, config, store)
+    return learner
+
+
+def unfitted_learner(config: DictConfig, spec: Spec) -> Learner:
+    """The learner of a configuration's model, which needs no demonstrations; its tokenizer has yet to be fitted."""
+    model = build(config.model, spec=spec, tokenizer=build(config.tokenizer, spec=spec))
     learner: Learner = build(config.learner, model=model, spec=spec, config=plain(config))
     return learner
+
+
+def fit(tokenizer: ActionTokenizer, config: DictConfig, store: EpisodeStore) -> None:
+    """Give the tokenizer of a configuration what it takes from a store's actions."""
+    fitted = build(config.tokenizer, spec=store.spec, statistics=store.statistics)
+    tokenizer.load_state_dict(fitted.state_dict())
 
 
 def make_data(config: DictConfig, store: EpisodeStore, model: Any) -> Windows:

@@ -1,6 +1,6 @@
 """Sentences as vectors.
 
-Shapes: B sentences, L n-grams of the longest of them.
+Shapes: B sentences, L numbers that stand for one of them, such as the n-grams of the longest.
 """
 
 from __future__ import annotations
@@ -29,11 +29,11 @@ class TextEncoder(nn.Module, ABC):
 
     @abstractmethod
     def tokenize(self, sentences: list[str]) -> Tensor:
-        """(B, L) int64 for B sentences, filled up with 0."""
+        """What `forward` reads of B sentences, (B, L)."""
 
     @abstractmethod
     def forward(self, tokens: Tensor) -> Tensor:
-        """(B, width) vectors for (B, L) tokens."""
+        """(B, width) vectors for the (B, L) of `tokenize`."""
 
 
 class NGrams(TextEncoder):

@@ -1,0 +1,99 @@
+"""Files from a hub that runs on this machine."""
+
+from __future__ import annotations
+
+import json
+import threading
+from collections.abc import Iterator
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+
+import pytest
+from huggingface_hub import constants
+
+from vla.models.hub import fetch
+
+FILES = {"config.json": b"{}", "model.safetensors": b"weights", "pytorch_model.bin": b"pickle"}
+COMMIT = "0" * 40
+MODEL = {
+    "/api/models/somebody/model/revision/main": {"id": "somebody/model", "sha": COMMIT, "siblings": []},
+    f"/api/models/somebody/model/tree/{COMMIT}": [
+        {"type": "file", "path": name, "size": len(content), "oid": name} for name, content in FILES.items()
+    ],
+}
+
+
+class Hub(BaseHTTPRequestHandler):
+    """As much of the hub as a download needs, with one model, `somebody/model`."""
+
+    downloads: list[str]
+
+    def do_HEAD(self) -> None:
+        self.answer()
+
+    def do_GET(self) -> None:
+        body = self.answer()
+        if "/resolve/" in self.path:
+            self.downloads.append(self.path.rpartition("/")[2])
+        self.wfile.write(body)
+
+    def answer(self) -> bytes:
+        """Send the headers; the body that belongs to them."""
+        path = self.path.partition("?")[0]
+        name = path.rpartition("/")[2]
+        known = path in MODEL or path == f"/somebody/model/resolve/{COMMIT}/{name}"
+        body = json.dumps(MODEL[path]).encode() if path in MODEL else FILES.get(name, b"")
+        headers = {"ETag": f'"{name}"', "X-Repo-Commit": COMMIT, "Content-Length": str(len(body))}
+        self.send_response(200 if known else 404)
+        for key, value in (headers if known else {"X-Error-Code": "RepoNotFound"}).items():
+            self.send_header(key, value)
+        self.end_headers()
+        return body if known else b""
+
+    def log_message(self, format: str, *arguments: object) -> None:
+        """Nothing."""
+
+
+@pytest.fixture
+def downloads(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[list[str]]:
+    """The names of the files that were downloaded from the hub while it runs."""
+    Hub.downloads = []
+    with ThreadingHTTPServer(("127.0.0.1", 0), Hub) as server:
+        thread = threading.Thread(target=server.serve_forever, args=(0.05,))
+        thread.start()
+        here = f"http://127.0.0.1:{server.server_port}"
+        monkeypatch.setattr(constants, "ENDPOINT", here)
+        monkeypatch.setattr(constants, "HUGGINGFACE_CO_URL_TEMPLATE", here + "/{repo_id}/resolve/{revision}/{filename}")
+        monkeypatch.setattr(constants, "HF_HUB_CACHE", str(tmp_path))
+        yield Hub.downloads
+        server.shutdown()
+        thread.join()
+
+
+def test_what_matches_is_downloaded_once_and_is_there_without_the_hub(
+    downloads: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = fetch("somebody/model", "*.json", "model*.safetensors")
+    assert (folder / "model.safetensors").read_bytes() == b"weights"
+    assert sorted(path.name for path in folder.iterdir()) == sorted(downloads) == ["config.json", "model.safetensors"]
+    assert fetch("somebody/model", "*.json", "model*.safetensors") == folder
+    monkeypatch.setattr(constants, "ENDPOINT", "http://127.0.0.1:9")
+    assert fetch("somebody/model", "*.json", "model*.safetensors") == folder
+    assert len(downloads) == 2
+
+
+@pytest.mark.parametrize("name", ["nobody/model", "no/name/at/all"])
+def test_a_model_that_the_hub_has_not_is_named(downloads: list[str], name: str) -> None:
+    with pytest.raises(OSError, match=f"it has no model {name}"):
+        fetch(name, "*")
+
+
+@pytest.mark.parametrize(("setting", "value"), [("ENDPOINT", "http://127.0.0.1:9"), ("HF_HUB_OFFLINE", True)])
+def test_out_of_reach_the_reason_is_one_line(
+    setting: str, value: str | bool, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(constants, setting, value)
+    monkeypatch.setattr(constants, "HF_HUB_CACHE", str(tmp_path))
+    with pytest.raises(OSError, match=r"refused|OFFLINE") as caught:
+        fetch("somebody/model", "*")
+    assert "\n" not in str(caught.value)

@@ -1,0 +1,105 @@
+"""What is built from a composed configuration, and what of it is known before anything is collected."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import lightning
+import numpy as np
+import pytest
+import timm
+import torch
+from fake_batch import make_batch
+from lightning.pytorch.callbacks import EMAWeightAveraging
+from safetensors.torch import save_file
+from test_conf import composed
+from tiny_encoder import write_encoder
+from torch.utils.data import DataLoader
+
+from vla import jobs
+from vla.parts import make_policy, unfitted_learner
+from vla.policy import Policy
+
+if TYPE_CHECKING:
+    from vla.tasks.tabletop import Tabletop
+
+CPU = {"_target_": "vla.policy.Policy", "device": "cpu"}
+SMALL = ("task.image_size=[32,32]", "trainer=cpu", "recorder=none")
+
+
+def trained(tmp_path: Path, tabletop: Tabletop, *overrides: str) -> tuple[Policy, Path]:
+    """A policy after two steps on noise, and the checkpoint of it."""
+    learner = unfitted_learner(composed(*SMALL, *overrides), tabletop.spec)
+    trainer = lightning.Trainer(
+        accelerator="cpu",
+        max_steps=2,
+        callbacks=[EMAWeightAveraging(decay=0.9)],
+        logger=False,
+        enable_checkpointing=False,
+        enable_progress_bar=False,
+        enable_model_summary=False,
+    )
+    batches: Any = [make_batch(learner.model.history, spec=tabletop.spec)] * 2
+    trainer.fit(learner, DataLoader(batches, batch_size=None))
+    trainer.save_checkpoint(tmp_path / "last.ckpt")
+    return Policy("cpu", model=learner.model, spec=tabletop.spec), tmp_path / "last.ckpt"
+
+
+def test_a_checkpoint_brings_the_encoder_of_its_instructions(tmp_path: Path, tabletop: Tabletop) -> None:
+    folder = write_encoder(tmp_path / "encoder")
+    policy, checkpoint = trained(tmp_path, tabletop, "model/text=huggingface", f"model.text.name={folder}")
+    shutil.rmtree(folder)
+    observation = tabletop.reset(0)
+    action = policy.act(observation)
+    assert np.array_equal(make_policy(CPU, checkpoint, tabletop).act(observation), action)
+    # The averaged weights lie there beside the newest ones; the frozen encoder is the same in both, and written once.
+    saved = torch.load(checkpoint, weights_only=True)
+    averaged, newest = (saved[name]["model.text._extra_state"] for name in ("state_dict", "current_model_state"))
+    for name, weight in averaged["weights"].items():
+        assert weight.data_ptr() == newest["weights"][name].data_ptr()
+
+
+def test_a_checkpoint_brings_the_weights_that_its_training_started_from(tmp_path: Path, tabletop: Tabletop) -> None:
+    weights = tmp_path / "weights.safetensors"
+    save_file(timm.create_model("test_vit").state_dict(), weights)
+    image = ["name=test_vit", f"pretrained={weights}", "size=32", "channels=8"]
+    policy, checkpoint = trained(
+        tmp_path, tabletop, "model/image=timm", *(f"model.image.{setting}" for setting in image)
+    )
+    weights.unlink()
+    observation = tabletop.reset(0)
+    action = policy.act(observation)
+    assert np.array_equal(make_policy(CPU, checkpoint, tabletop).act(observation), action)
+
+
+def unknown_name(folder: Path) -> list[str]:
+    return ["model/image=timm", "model.image.name=vit_smal_patch16_dinov3"]
+
+
+def no_folder(folder: Path) -> list[str]:
+    return ["model/text=huggingface", "model.text.name=/nowhere/at/all"]
+
+
+def wrong_weights(folder: Path) -> list[str]:
+    save_file(timm.create_model("test_resnet").state_dict(), folder / "weights.safetensors")
+    return ["model/image=timm", "model.image.name=test_vit", f"model.image.pretrained={folder}/weights.safetensors"]
+
+
+@pytest.mark.parametrize(
+    ("prepare", "message"),
+    [
+        (unknown_name, "it has vit_small_patch16_dinov3"),
+        (no_folder, "/nowhere/at/all is no folder"),
+        (wrong_weights, "does not hold the weights of timm's test_vit"),
+    ],
+)
+def test_what_cannot_be_built_is_named_before_anything_is_collected(
+    prepare: Callable[[Path], list[str]], message: str, tmp_path: Path
+) -> None:
+    overrides = [f"collect.folder={tmp_path}/store", f"output={tmp_path}/run", "job=train", *prepare(tmp_path)]
+    with pytest.raises(ValueError, match=message):
+        jobs.run(composed(*SMALL, *overrides))
+    assert not (tmp_path / "store").exists()
