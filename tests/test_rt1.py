@@ -93,6 +93,10 @@ def test_the_tokens_of_the_cameras_stand_side_by_side(cameras: tuple[str, ...]) 
     assert model(batch)["logits"].shape == (4, 2, 1, 3, 256)
 
 
+def parameters_of(module: torch.nn.Module) -> int:
+    return sum(parameter.numel() for parameter in module.parameters())
+
+
 def test_the_paper_network_has_its_size_and_its_81_positions() -> None:
     spec = replace(
         SPEC,
@@ -105,8 +109,12 @@ def test_the_paper_network_has_its_size_and_its_81_positions() -> None:
     )
     image = partial(FilmEfficientNet, pretrained=False)
     model: Any = RT1(image, NGrams, spec=spec, tokenizer=RT1Tokenizer(spec=spec)).eval()
-    language = sum(parameter.numel() for parameter in model.text.parameters())  # a frozen encoder in the paper
-    assert sum(parameter.numel() for parameter in model.parameters()) - language == pytest.approx(35.25e6, rel=0.005)
+    language = parameters_of(model.text)  # a frozen encoder in the paper
+    assert parameters_of(model) - language == pytest.approx(35.25e6, rel=0.005)
+    assert parameters_of(model.image) == pytest.approx(15.71e6, rel=0.002)
+    assert parameters_of(model.token_learners) == pytest.approx(0.034e6, rel=0.02)
+    transformer = [model.image_tokens, model.positions, model.layers, model.head]
+    assert sum(map(parameters_of, transformer)) == pytest.approx(19.38e6, rel=0.005)
     assert len(model.image.films) + 1 == 27
     assert model.mask.shape == (114, 114)
     positions = []

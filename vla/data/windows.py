@@ -78,8 +78,10 @@ class Gather:
         self._ages, self._aheads = np.arange(1 - history, 1), np.arange(chunk)
         kinds = ("rgb", "depth") if depth else ("rgb",)
         self._images = {kind: {name: store.rows(f"{kind}_{name}") for name in store.spec.cameras} for kind in kinds}
-        self._proprio = np.concatenate([store.rows(name)[:] for name in ("joints", "velocities", "gripper")], axis=1)
-        self._truth = store.rows("truth") if store.spec.truth else None
+        # One array, because looking rows up costs more than copying so few numbers.
+        names = ("joints", "velocities", "gripper", *(("truth",) if store.spec.truth else ()))
+        self._numbers = np.concatenate([store.rows(name)[:] for name in names], axis=1)
+        self._truth_size = store.spec.truth_size
         self._action = store.rows("action")
         entries = store.episodes
         self._instructions = [entry.instruction for entry in entries]
@@ -105,9 +107,11 @@ class Gather:
             kind: {camera: self._take(rows, frames, absent) for camera, rows in cameras.items()}
             for kind, cameras in self._images.items()
         }
-        batch["proprio"] = self._take(self._proprio, frames, absent)
-        if self._truth is not None:
-            batch["truth"] = self._take(self._truth, frames, absent)
+        numbers = self._take(self._numbers, frames, absent)
+        proprio = self._numbers.shape[1] - self._truth_size
+        batch["proprio"] = numbers[..., :proprio]
+        if self._truth_size:
+            batch["truth"] = numbers[..., proprio:]
         batch["action"] = self._take(self._action, labels)
         batch["present"] = self._own(present)
         batch["valid"] = self._own(valid)

@@ -102,7 +102,7 @@ class Learner(LightningModule):
         return self.prepare(batch)
 
     def prepare(self, batch: Batch) -> Batch:
-        """The batch with the tokens of its instructions, (B, L) int64, as `text`."""
+        """The batch with what the text encoder reads of its instructions as `text`."""
         return {**batch, "text": self.model.text.tokenize(batch["instruction"]).to(batch["proprio"].device)}
 
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:

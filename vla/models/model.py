@@ -83,7 +83,7 @@ class Model(nn.Module, ABC):
 
     A batch is a dict:
         rgb: camera → (B, T, H, W, 3) uint8; proprio: (B, T, P) float32; present: (B, T) bool, false for padding;
-        text: (B, L) int64 from `model.text.tokenize`; and to learn from, action: (B, T, k, D) float32,
+        text: from `model.text.tokenize`; and to learn from, action: (B, T, k, D) float32,
         valid: (B, T, k) bool, truth: (B, T, S) float32.
 
     Args:
