@@ -9,8 +9,11 @@ from typing import Any
 import torch
 from toy import SPEC
 
+from vla.models.act import ACT
 from vla.models.action_tokenizer import Uniform
 from vla.models.bc import BC
+from vla.models.diffusion import Diffusion
+from vla.models.flow import Flow
 from vla.models.image_tokenizer import FilmConv
 from vla.models.model import Model
 from vla.models.rt1 import RT1
@@ -79,6 +82,66 @@ def make_rt1(
         shift=(0, 0),
         spec=SPEC,
         tokenizer=Uniform(bins=64, spec=SPEC),
+    )
+
+
+def make_act(chunk: int = 4, execute: int = 2, auxiliary: float = 1.0, kl_weight: float = 10.0) -> ACT:
+    """A small ACT without random shifts."""
+    return ACT(
+        TINY_IMAGE,
+        TINY_TEXT,
+        chunk=chunk,
+        execute=execute,
+        keypoints=8,
+        text_width=16,
+        width=32,
+        heads=2,
+        latent=4,
+        kl_weight=kl_weight,
+        shift=(0, 0),
+        auxiliary=auxiliary,
+        spec=SPEC,
+        tokenizer=Uniform(spec=SPEC),
+    )
+
+
+def make_diffusion(chunk: int = 4, execute: int = 2, auxiliary: float = 1.0, copies: int = 8) -> Diffusion:
+    """A small diffusion policy without random shifts."""
+    return Diffusion(
+        TINY_IMAGE,
+        TINY_TEXT,
+        chunk=chunk,
+        execute=execute,
+        keypoints=8,
+        text_width=16,
+        width=32,
+        layers=2,
+        heads=2,
+        copies=copies,
+        shift=(0, 0),
+        auxiliary=auxiliary,
+        spec=SPEC,
+        tokenizer=Uniform(spec=SPEC),
+    )
+
+
+def make_flow(chunk: int = 4, execute: int = 2, auxiliary: float = 1.0, copies: int = 8) -> Flow:
+    """A small flow-matching policy without random shifts."""
+    return Flow(
+        TINY_IMAGE,
+        TINY_TEXT,
+        chunk=chunk,
+        execute=execute,
+        keypoints=8,
+        text_width=16,
+        width=32,
+        layers=2,
+        heads=2,
+        copies=copies,
+        shift=(0, 0),
+        auxiliary=auxiliary,
+        spec=SPEC,
+        tokenizer=Uniform(spec=SPEC),
     )
 
 

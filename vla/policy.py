@@ -68,7 +68,7 @@ def read_checkpoint(path: str | Path) -> Checkpoint:
 
 
 class Policy:
-    """Acts with a model: keeps its history, executes chunks of actions one by one."""
+    """Acts with a model: keeps its history, executes of each chunk as many actions as the model says, one by one."""
 
     def __init__(self, model: Model, spec: Spec) -> None:
         """Args: the model, with its tokenizer; what a step looks like."""
@@ -80,7 +80,8 @@ class Policy:
         self.reset("", 0)
 
     def reset(self, instruction: str, seed: int) -> None:
-        """Forget the past; a policy draws nothing, so `seed` is not used."""
+        """Forget the past; what the model draws from now on follows from `seed`."""
+        self._random = torch.Generator().manual_seed(seed)
         self._frames.clear()
         self._chunk.clear()
         self._instruction = instruction
@@ -96,7 +97,7 @@ class Policy:
         if not self._chunk:
             actions, probabilities = self._predict()
             told = [{}] * len(actions) if probabilities is None else [{"probabilities": each} for each in probabilities]
-            self._chunk.extend(zip(actions, told, strict=True))
+            self._chunk.extend(list(zip(actions, told, strict=True))[: self.model.execute])
         action, self.info = self._chunk.popleft()
         return action
 
@@ -117,7 +118,8 @@ class Policy:
     @torch.inference_mode()
     def _predict(self) -> tuple[Array, Array | None]:
         """Actions (k, D), clipped, and token probabilities (k, D, K), where the model has them."""
-        prediction = self.model.predict(self.window())
+        noise = torch.randn(1, self.model.chunk, len(self.spec.action), generator=self._random)
+        prediction = self.model.predict({**self.window(), "noise": noise})
         probabilities = None if prediction.probabilities is None else prediction.probabilities[0].numpy()
         return np.clip(prediction.actions[0].numpy(), self._low, self._high), probabilities
 
