@@ -12,8 +12,7 @@ from toy import SPEC
 from vla.models.act import ACT
 from vla.models.action_tokenizer import Uniform
 from vla.models.bc import BC
-from vla.models.diffusion import Diffusion
-from vla.models.flow import Flow
+from vla.models.denoiser import DenoisingModel
 from vla.models.image_tokenizer import FilmConv
 from vla.models.model import Model
 from vla.models.rt1 import RT1
@@ -105,9 +104,11 @@ def make_act(chunk: int = 4, execute: int = 2, auxiliary: float = 1.0, kl_weight
     )
 
 
-def make_diffusion(chunk: int = 4, execute: int = 2, auxiliary: float = 1.0, copies: int = 8) -> Diffusion:
-    """A small diffusion policy without random shifts."""
-    return Diffusion(
+def make_denoising(
+    kind: type[DenoisingModel], chunk: int = 4, execute: int = 2, auxiliary: float = 1.0
+) -> DenoisingModel:
+    """A small model that starts from noise, without random shifts."""
+    return kind(
         TINY_IMAGE,
         TINY_TEXT,
         chunk=chunk,
@@ -117,27 +118,7 @@ def make_diffusion(chunk: int = 4, execute: int = 2, auxiliary: float = 1.0, cop
         width=32,
         layers=2,
         heads=2,
-        copies=copies,
-        shift=(0, 0),
-        auxiliary=auxiliary,
-        spec=SPEC,
-        tokenizer=Uniform(spec=SPEC),
-    )
-
-
-def make_flow(chunk: int = 4, execute: int = 2, auxiliary: float = 1.0, copies: int = 8) -> Flow:
-    """A small flow-matching policy without random shifts."""
-    return Flow(
-        TINY_IMAGE,
-        TINY_TEXT,
-        chunk=chunk,
-        execute=execute,
-        keypoints=8,
-        text_width=16,
-        width=32,
-        layers=2,
-        heads=2,
-        copies=copies,
+        copies=8,
         shift=(0, 0),
         auxiliary=auxiliary,
         spec=SPEC,

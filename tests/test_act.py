@@ -20,7 +20,7 @@ def test_the_divergence_is_that_of_two_normal_distributions() -> None:
     losses = model.action_loss({"actions": actions + 0.25, "mean": mean, "log_variance": log_variance}, batch)
     normal = torch.distributions.Normal
     posterior, prior = normal(mean, (log_variance / 2).exp()), normal(0.0, 1.0)
-    expected = torch.distributions.kl_divergence(posterior, prior).sum(-1).mean()  # type: ignore[no-untyped-call]
+    expected = torch.distributions.kl_divergence(posterior, prior).sum(-1).mean()
     assert torch.isclose(losses["divergence"], expected)
     assert torch.isclose(losses["action_loss"], 0.25 + 10 * expected)
 

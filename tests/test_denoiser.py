@@ -7,11 +7,12 @@ from collections.abc import Callable
 
 import pytest
 import torch
-from fake_batch import make_batch, make_diffusion, make_flow, with_text
+from fake_batch import make_batch, make_denoising, with_text
 from torch import Tensor, nn
 
 from vla.models.denoiser import Denoiser, DenoisingModel
-from vla.models.diffusion import LEVELS, kept
+from vla.models.diffusion import LEVELS, Diffusion, kept
+from vla.models.flow import Flow
 
 
 class Told(nn.Module):
@@ -53,7 +54,7 @@ def test_the_schedule_is_what_its_steps_multiply_to() -> None:
 
 
 def test_a_level_of_noise_keeps_its_share_of_the_variance() -> None:
-    model = make_diffusion()
+    model = make_denoising(Diffusion)
     action, noise = torch.full((3, 4, 3), 0.5), torch.full((3, 4, 3), -2.0)
     noisy, time, target = model.corrupt(action, noise, torch.tensor([0.0, 0.505, 1.0]))
     assert time.tolist() == pytest.approx([0.0, 0.5, 0.99]) and torch.equal(target, noise)
@@ -64,7 +65,7 @@ def test_a_level_of_noise_keeps_its_share_of_the_variance() -> None:
 
 @pytest.mark.parametrize("steps", [1, 3, 10])
 def test_who_knows_the_noise_finds_the_actions(steps: int) -> None:
-    model = make_diffusion()
+    model = make_denoising(Diffusion)
     model.steps = steps
     action = 2 * torch.rand(2, 4, 3) - 1
 
@@ -77,14 +78,14 @@ def test_who_knows_the_noise_finds_the_actions(steps: int) -> None:
 
 
 def test_a_constant_velocity_leads_exactly_there() -> None:
-    model = make_flow()
+    model = make_denoising(Flow)
     noise, velocity = torch.randn(2, 4, 3), torch.randn(2, 4, 3)
     model.denoiser = Told(lambda noisy, time: velocity)  # type: ignore[assignment]
     assert torch.allclose(model.sample(noise, torch.zeros(2, 1, 32)), noise + velocity, atol=1e-5)
 
 
 def test_flow_leads_straight_from_noise_to_actions() -> None:
-    model = make_flow()
+    model = make_denoising(Flow)
     action, noise = torch.rand(3, 4, 3), torch.randn(3, 4, 3)
     noisy, time, velocity = model.corrupt(action, noise, torch.tensor([0.0, 0.5, 1.0]))
     assert time.tolist() == pytest.approx([0.999, 0.999 * (1 - 0.5 ** (2 / 3)), 0.0])
@@ -92,11 +93,14 @@ def test_flow_leads_straight_from_noise_to_actions() -> None:
     assert torch.equal(noisy[2], noise[2])
 
 
-@pytest.mark.parametrize("make", [make_diffusion, make_flow], ids=["diffusion", "flow"])
-def test_what_is_done_follows_from_the_noise(make: Callable[[], DenoisingModel]) -> None:
-    model = make().eval()
+@pytest.mark.parametrize("kind", [Diffusion, Flow])
+def test_what_is_done_follows_from_the_noise(kind: type[DenoisingModel]) -> None:
+    model = make_denoising(kind).eval()
     batch = with_text(model, make_batch(1, 4))
     one, other = torch.randn(4, 4, 3), torch.randn(4, 4, 3)
     with_one = model.predict({**batch, "noise": one}).actions
     assert torch.equal(with_one, model.predict({**batch, "noise": one}).actions)
     assert not torch.allclose(with_one, model.predict({**batch, "noise": other}).actions)
+    model.temperature = 0.0
+    middle = model.predict({**batch, "noise": one}).actions
+    assert torch.equal(middle, model.predict({**batch, "noise": other}).actions)

@@ -3,20 +3,27 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from fake_batch import make_act, make_batch, make_diffusion, make_flow, overfit, with_text
+from fake_batch import make_act, make_batch, make_denoising, overfit, with_text
 from test_policy import observations
 from toy import SPEC, ToyEnvironment
 
+from vla.models.diffusion import Diffusion
+from vla.models.flow import Flow
 from vla.models.trunk import ChunkModel
 from vla.policy import Policy
 from vla.rollout import rollout
 
-MODELS: dict[str, Callable[..., ChunkModel]] = {"act": make_act, "diffusion": make_diffusion, "flow": make_flow}
+MODELS: dict[str, Callable[..., ChunkModel]] = {
+    "act": make_act,
+    "diffusion": partial(make_denoising, Diffusion),
+    "flow": partial(make_denoising, Flow),
+}
 every_model = pytest.mark.parametrize("make", MODELS.values(), ids=MODELS.keys())
 
 
@@ -119,10 +126,12 @@ def test_plays_an_episode_that_follows_from_the_seed(make: Callable[..., ChunkMo
 
 @every_model
 def test_looks_again_after_the_actions_that_are_executed(make: Callable[..., ChunkModel]) -> None:
-    policy = Policy(make(chunk=4, execute=2), SPEC)
-    looks = []
-    policy.model.shift.register_forward_pre_hook(lambda module, inputs: looks.append(len(acted)))
-    seen, acted = observations(6), []
+    model = make(chunk=4, execute=2)
+    policy = Policy(model, SPEC)
+    looks: list[int] = []
+    acted: list[np.ndarray] = []
+    model.shift.register_forward_pre_hook(lambda module, inputs: looks.append(len(acted)))
+    seen = observations(6)
     policy.reset(seen[0].instruction, 0)
     for observation in seen:
         acted.append(policy.act(observation))

@@ -76,7 +76,7 @@ class ACT(ChunkModel):
         image: Callable[..., ImageEncoder],
         text: Callable[..., TextEncoder],
         chunk: int = 8,
-        execute: Annotated[int, 1] = 4,
+        execute: Annotated[int, 1] = 2,
         keypoints: int = 32,
         text_width: int = 64,
         width: int = 128,

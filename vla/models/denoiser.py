@@ -75,6 +75,8 @@ class DenoisingModel(ChunkModel):
         layers, heads: of the denoiser.
         copies: R, how often each chunk of a training batch is made noisy; all copies share the work on its images.
         steps: in which noise becomes actions.
+        temperature: factor of the noise at the start: 1 draws from what was learned, 0 always takes its middle, and
+            what is between is steadier than the one and more varied than the other.
         shift, auxiliary: as in `ChunkModel`.
         spec: what a step looks like.
         tokenizer: between which bounds actions lie.
@@ -85,7 +87,7 @@ class DenoisingModel(ChunkModel):
         image: Callable[..., ImageEncoder],
         text: Callable[..., TextEncoder],
         chunk: int = 8,
-        execute: Annotated[int, 1] = 4,
+        execute: Annotated[int, 1] = 2,
         keypoints: int = 32,
         text_width: int = 64,
         width: int = 128,
@@ -93,6 +95,7 @@ class DenoisingModel(ChunkModel):
         heads: int = 4,
         copies: Annotated[int, 1] = 2,
         steps: Annotated[int, 1] = 10,
+        temperature: float = 0.5,
         shift: tuple[float, float] = (12, 12),
         auxiliary: float = 1.0,
         *,
@@ -100,7 +103,7 @@ class DenoisingModel(ChunkModel):
         tokenizer: ActionTokenizer,
     ) -> None:
         super().__init__(image, text, chunk, execute, keypoints, text_width, width, shift, auxiliary, spec, tokenizer)
-        self.copies, self.steps = copies, steps
+        self.copies, self.steps, self.temperature = copies, steps, temperature
         self.denoiser = Denoiser(len(spec.action), chunk, width, layers, heads)
 
     @abstractmethod
@@ -134,4 +137,4 @@ class DenoisingModel(ChunkModel):
         context = self(batch)["context"]
         shape = len(context), self.chunk, len(self.spec.action)
         noise = batch["noise"] if "noise" in batch else torch.randn(shape, generator=torch.Generator().manual_seed(0))
-        return Prediction(self.unscaled(self.sample(noise.to(context.device), context)))
+        return Prediction(self.unscaled(self.sample(self.temperature * noise.to(context.device), context)))

@@ -17,7 +17,7 @@ from vla.models.model import Batch, Model, Standardize, pixels
 from vla.models.text import TextEncoder
 from vla.spec import Spec
 
-HIDDEN = 2  # width of the layer between the features and the first token, in widths of a token
+HIDDEN = 2  # width of the layers in which all features meet, in widths of a token
 
 
 class ChunkModel(Model):
@@ -59,7 +59,8 @@ class ChunkModel(Model):
         spec: Spec,
         tokenizer: ActionTokenizer,
     ) -> None:
-        super().__init__(1, chunk, text(width=text_width), auxiliary, width, spec, tokenizer)
+        hidden = HIDDEN * width
+        super().__init__(1, chunk, text(width=text_width), auxiliary, hidden, spec, tokenizer)
         if execute > chunk:
             raise ValueError(f"model.execute={execute} is more than the model.chunk={chunk} actions that are predicted")
         self.execute = execute
@@ -71,10 +72,8 @@ class ChunkModel(Model):
         self.proprioception = Standardize(self.posture_width)
         widths = [*[keypoints * reader.width for reader in readers], self.posture_width, text_width]
         self.tokens = nn.ModuleList(nn.Linear(features, width) for features in widths)
-        hidden = HIDDEN * width
-        self.meet = nn.Sequential(
-            nn.Linear(sum(widths), hidden), nn.ReLU(), nn.Linear(hidden, hidden), nn.ReLU(), nn.Linear(hidden, width)
-        )
+        self.meet = nn.Sequential(nn.Linear(sum(widths), hidden), nn.ReLU(), nn.Linear(hidden, hidden), nn.ReLU())
+        self.first_token = nn.Linear(hidden, width)
 
     def standing(self, batch: Batch) -> Tensor:
         """(B, posture_width) standardised joints and gripper opening of the newest frame."""
@@ -87,11 +86,11 @@ class ChunkModel(Model):
         for camera, encoder, keypoints in zip(self.spec.cameras, self.images, self.keypoints, strict=True):
             seen.append(keypoints(encoder(pixels(self.shift(batch["rgb"][camera][:, -1:])), text)).flatten(1))
         features = [*seen, standing, text]
-        first = self.meet(torch.cat(features, -1))  # (B, E)
+        hidden = self.meet(torch.cat(features, -1))  # (B, HIDDEN · E)
         others = [linear(feature) for linear, feature in zip(self.tokens, features, strict=True)]
-        output = {"context": torch.stack([first, *others], 1)}
+        output = {"context": torch.stack([self.first_token(hidden), *others], 1)}
         if self.truth_head is not None:
-            output["truth"] = self.truth_head(first.relu()).unsqueeze(1)
+            output["truth"] = self.truth_head(hidden).unsqueeze(1)
         return output
 
     def scaled(self, action: Tensor) -> Tensor:
