@@ -112,10 +112,10 @@ class World:
         end = time.monotonic() + seconds
         self.spin(lambda: time.monotonic() >= end)
 
-    def live(self, seconds: float) -> None:
-        """The world goes on: images at 10 Hz, joint states at 50 Hz."""
+    def live(self, seconds: float, until: Callable[[], Any] = lambda: False) -> None:
+        """The world goes on, images at 10 Hz and joint states at 50 Hz, for so long or until something holds."""
         end, tick = time.monotonic() + seconds, 0
-        while time.monotonic() < end:
+        while time.monotonic() < end and not until():
             if self.simulated is not None:
                 self.simulated += 0.02
                 self.clock.publish(Clock(clock=self._now()))
@@ -156,9 +156,15 @@ class World:
         assert self.change(Transition.TRANSITION_CONFIGURE) and self.change(Transition.TRANSITION_ACTIVATE)
         everybody = [*self.images.values(), self.states, self.words]
         self.spin(lambda: all(publisher.get_subscription_count() for publisher in everybody))
-        self.live(0.3)
+        self.live(2.0, until=lambda: self.commands)
         self.words.publish(String(data="put the red block on the pad"))
-        self.live(0.4)
+        self.live(2.0, until=lambda: self.policy.seen[-1].instruction)
+        self.live(0.1)
+
+    def becomes(self, state: State) -> bool:
+        """Whether the agent gets there, within some seconds of the world's life."""
+        self.live(5.0, until=lambda: self.state is state)
+        return self.state is state
 
     @property
     def state(self) -> State:
@@ -227,13 +233,12 @@ def test_the_policy_sees_what_the_messages_say(world: World) -> None:
 
 def test_a_camera_that_goes_blind_holds_the_arm_until_it_sees_again(world: World) -> None:
     world.cameras = ["front"]
-    world.live(0.9)
-    assert world.state is State.HOLDING
+    assert world.becomes(State.HOLDING)
+    world.live(0.4)
     assert world.commands[-1].position == world.commands[-5].position
     assert "wrist" in world.statuses[-1].message and world.statuses[-1].level == DiagnosticStatus.WARN
     world.cameras = ["front", "wrist"]
-    world.live(0.6)
-    assert world.state is State.RUNNING
+    assert world.becomes(State.RUNNING)
 
 
 @pytest.mark.parametrize(
@@ -273,8 +278,7 @@ def test_simulated_time_dates_the_images_and_holds_the_arm_when_it_stands_still(
 
 def test_joint_states_that_stop_hold_the_arm(world: World) -> None:
     world.feels = False
-    world.live(0.7)
-    assert world.state is State.HOLDING
+    assert world.becomes(State.HOLDING)
 
 
 def test_a_slow_policy_skips_ticks_and_a_stuck_one_holds_the_arm(world: World) -> None:
@@ -282,21 +286,19 @@ def test_a_slow_policy_skips_ticks_and_a_stuck_one_holds_the_arm(world: World) -
     world.live(1.0)
     assert world.state is State.RUNNING
     assert world.agent.session is not None and world.agent.session.overruns > 2
-    world.policy.takes = 2.0
-    world.live(0.9)
-    assert world.state is State.HOLDING
+    world.policy.takes = 1.0
+    assert world.becomes(State.HOLDING)
 
 
 def test_a_policy_that_fails_is_a_fault_that_only_deactivation_ends(world: World) -> None:
     world.policy.fails = True
-    world.live(2.0)
-    assert world.state is State.FAULT
+    assert world.becomes(State.FAULT)
+    world.live(0.4)
     assert world.commands[-1].position == world.commands[-5].position
     world.policy.fails = False
     assert not world.ask(Trigger, "resume", Trigger.Request()).success
     assert world.change(Transition.TRANSITION_DEACTIVATE) and world.change(Transition.TRANSITION_ACTIVATE)
-    world.live(0.3)
-    assert world.state is State.WAITING
+    assert world.becomes(State.WAITING)
 
 
 def test_stop_and_resume(world: World) -> None:
@@ -305,14 +307,12 @@ def test_stop_and_resume(world: World) -> None:
     assert world.state is State.STOPPED
     assert world.commands[-1].position == world.commands[-5].position
     assert world.ask(Trigger, "resume", Trigger.Request()).success
-    world.live(0.6)
-    assert world.state is State.RUNNING
+    assert world.becomes(State.RUNNING)
 
 
 def test_somebody_else_who_commands_the_arm_is_a_fault(world: World) -> None:
     other = world.node.create_publisher(JointState, "/commands", 1)
-    world.live(1.5)
-    assert world.state is State.FAULT
+    assert world.becomes(State.FAULT)
     assert world.change(Transition.TRANSITION_DEACTIVATE)
     assert not world.change(Transition.TRANSITION_ACTIVATE)
     world.node.destroy_publisher(other)
@@ -320,8 +320,7 @@ def test_somebody_else_who_commands_the_arm_is_a_fault(world: World) -> None:
 
 def test_two_cameras_on_one_topic_hold_the_arm(world: World) -> None:
     world.node.create_publisher(Image, "/front", 1)
-    world.live(1.3)
-    assert world.state is State.HOLDING
+    assert world.becomes(State.HOLDING)
 
 
 def test_wrong_requests_of_the_lifecycle_are_refused_and_survived(world: World) -> None:
@@ -352,6 +351,7 @@ def test_deactivation_brakes_first(world: World) -> None:
 def test_trajectories_end_at_rest(make_world: Callable[..., World]) -> None:
     world = make_world("trajectory")
     world.start()
+    world.live(0.3)
     message = max(world.commands, key=lambda command: len(command.points))
     assert list(message.joint_names) == ROBOT.joints and len(message.points) > 3
     assert not any(message.points[-1].velocities)

@@ -119,6 +119,7 @@ def test_a_job_needs_its_groups_and_looks_at_no_others() -> None:
         job="deploy",
         tokenizer={"_target_": "vla.models.action_tokenizer.Uniform"},
         model={"_target_": "torch.nn.Identity"},
+        policy={"_target_": "vla.policy.Policy"},
         deploy={"_target_": "vla.nowhere.Nothing"},
     )
 

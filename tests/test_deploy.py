@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -21,6 +22,7 @@ import rclpy
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from sensor_msgs.msg import JointState
+from std_msgs.msg import String
 from test_run import SMALL, vla
 
 from vla.deploy import messages
@@ -37,7 +39,8 @@ CHECKPOINT = "checkpoint=run/checkpoints/last.ckpt"
 def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with a small trained checkpoint."""
     folder = tmp_path_factory.mktemp("deploy")
-    vla(folder, *SMALL, "job=train", "output=run")
+    few = ["collect.episodes=4", "data.validation_fraction=0", "trainer.limit_val_batches=0"]
+    vla(folder, *SMALL, *few, "job=train", "output=run")
     return folder
 
 
@@ -60,7 +63,7 @@ def start(home: Path) -> Iterator[Callable[..., subprocess.Popen[str]]]:
 
 
 class Ear:
-    """Somebody who listens to joint states and commands."""
+    """Somebody who listens to joint states and commands, and may speak."""
 
     def __init__(self) -> None:
         Network("SYSTEM_DEFAULT", "loopback").apply()
@@ -73,6 +76,7 @@ class Ear:
         self.commands: list[JointState] = []
         self.node.create_subscription(JointState, "/isaac/franka/joint_states", self.states.append, 10)
         self.node.create_subscription(JointState, "/isaac/franka/joint_commands", self.commands.append, 10)
+        self._words = self.node.create_publisher(String, "/user/command", 1)
 
     def until(self, true: Callable[[], Any], seconds: float = 60.0) -> None:
         """Listen until something holds."""
@@ -85,6 +89,11 @@ class Ear:
         """Listen for a while."""
         end = time.monotonic() + seconds
         self.until(lambda: time.monotonic() > end)
+
+    def say(self, words: str) -> None:
+        """Speak, once agent and simulator listen."""
+        self.until(lambda: self._words.get_subscription_count() >= 2)
+        self._words.publish(String(data=words))
 
     def moved(self) -> float:
         """How far the joints went between the newest two joint states [rad]."""
@@ -114,10 +123,10 @@ def test_words_move_the_arm_and_a_signal_leaves_it_at_rest(
 ) -> None:
     simulator = start("vla.run", "job=deploy", "deploy=simulator", CHECKPOINT)
     agent = start("vla.run", "job=deploy", "deploy=ros2", CHECKPOINT, "--ros-args", "-p", "speed_share:=0.3")
-    ear.until(lambda: ear.states and ear.commands)
-    np.testing.assert_allclose(ear.commands[0].position[:7], ear.states[0].position[:7], atol=1e-3)
     watch = start("vla.deploy.watch")
     view = start("vla.deploy.view", "--save", f"view{number}.rrd")
+    ear.until(lambda: ear.states and ear.commands)
+    np.testing.assert_allclose(ear.commands[0].position[:7], ear.states[0].position[:7], atol=1e-3)
     said = start("vla.deploy.say", "put the red block on the pad")
     assert said.wait(30) == 0
     ear.until(lambda: ear.moved() > 1e-3)
@@ -143,11 +152,31 @@ def test_when_the_agent_is_killed_the_simulator_holds_the_arm(
     start("vla.run", "job=deploy", "deploy=simulator", CHECKPOINT)
     agent = start("vla.run", "job=deploy", "deploy=ros2", CHECKPOINT)
     ear.until(lambda: ear.commands)
-    assert start("vla.deploy.say", "put the red block on the pad").wait(30) == 0
-    ear.until(lambda: len(ear.states) > 1 and ear.moved() > 1e-3)
+    ear.say("put the red block on the pad")
+    ear.until(lambda: ear.moved() > 1e-3)
     agent.kill()
     ear.listen(1.2)
     assert ear.moved() < 1e-3
+
+
+@pytest.mark.realtime
+def test_when_the_simulator_is_killed_the_agent_holds_the_arm_and_says_why(
+    start: Callable[..., subprocess.Popen[str]], ear: Ear
+) -> None:
+    simulator = start("vla.run", "job=deploy", "deploy=simulator", CHECKPOINT)
+    agent = start("vla.run", "job=deploy", "deploy=ros2", CHECKPOINT)
+    ear.until(lambda: ear.commands)
+    ear.say("put the red block on the pad")
+    ear.until(lambda: ear.moved() > 1e-3)
+    simulator.kill()
+    ear.listen(1.0)
+    ear.commands.clear()
+    ear.listen(0.3)
+    assert ear.commands and not np.ptp([command.position[:7] for command in ear.commands], axis=0).any()
+    agent.send_signal(signal.SIGINT)
+    printed = agent.communicate(timeout=10)[0]
+    assert agent.returncode == 0, printed
+    assert re.search(r"holding: the newest (image of the camera \w+|joint state) is older than", printed), printed
 
 
 @pytest.mark.realtime
@@ -166,7 +195,8 @@ def test_the_whole_loop_reports_and_its_bag_moves_an_agent_again(
         assert entity in recorded.stdout
     ear.commands.clear()
     start("vla.run", "job=deploy", "deploy=ros2", CHECKPOINT, "deploy.safety.tracking=9")
-    player = start("vla.deploy.bag", "play", "loop/bag")
+    ear.until(lambda: ear.node.count_subscribers("/isaac/franka/joint_states") > 1)  # the agent listens, too
+    player = start("vla.deploy.bag", "play", "loop/bag", "--speed", "2")
     assert player.wait(60) == 0, player.communicate()[0]
     ear.listen(0.2)
     assert np.ptp([command.position[:7] for command in ear.commands], axis=0).max() > 0.01
@@ -180,7 +210,8 @@ def test_what_the_node_thinks_is_what_the_evaluated_policy_does(home: Path) -> N
 
     checkpoint = home / "run/checkpoints/last.ckpt"
     environment = parts.make_environment(read_checkpoint(checkpoint).config["task"])
-    evaluated, deployed = (parts.make_policy(checkpoint, environment) for _ in range(2))
+    node = {"_target_": "vla.policy.Policy"}
+    evaluated, deployed = (parts.make_policy(node, checkpoint, environment) for _ in range(2))
     names = list(environment.spec.joints)
     robot = Robot(names, [-9.0] * 7, [9.0] * 7, [1.0] * 7, [1.0] * 7, ["left", "right"])
     observation = environment.reset(5)
@@ -223,6 +254,15 @@ def test_what_is_for_ros_is_kept_from_hydra() -> None:
 def test_what_cannot_be_deployed_ends_in_one_sentence(home: Path, arguments: list[str], words: str) -> None:
     done = vla(home, "job=deploy", *arguments, ok=False)
     assert words in done.stderr and "Traceback" not in done.stderr
+
+
+def test_a_damaged_checkpoint_is_named_before_anything_starts(home: Path) -> None:
+    whole = (home / "run/checkpoints/last.ckpt").read_bytes()
+    (home / "cut.ckpt").write_bytes(whole[: len(whole) // 2])
+    for option in ("ros2", "loop"):
+        done = vla(home, "job=deploy", f"deploy={option}", "checkpoint=cut.ckpt", "output=cut", ok=False)
+        assert done.returncode == 1 and done.stdout == "" and not (home / "cut").exists()
+        assert re.fullmatch(r"error: cut\.ckpt .*damaged.*\n", done.stderr)
 
 
 def test_without_ros_the_way_out_is_named(home: Path) -> None:

@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 from conftest import CONF
 from hydra import compose, initialize_config_dir
+from omegaconf import OmegaConf
 from PIL import Image
 from toy import SPEC, ToyEnvironment, ToyExpert
 
@@ -42,11 +43,15 @@ def stored(folder: Path, spec: Spec = SPEC, seeds: range = range(2)) -> tuple[Ep
     return store, episodes
 
 
-def exporter(name: str, folder: Path, *overrides: str) -> Any:
-    """What `export=name` and `overrides` compose to."""
+def composed(name: str, folder: Path, *overrides: str) -> Any:
+    """The configuration of `export=name` and `overrides`."""
     with initialize_config_dir(str(CONF), version_base="1.3"):
-        config = compose("config", [f"output={folder}", f"export={name}", f"export.folder={folder}", *overrides])
-    return build(config.export)
+        return compose("config", [f"output={folder}", f"export={name}", f"export.folder={folder}", *overrides]).export
+
+
+def exporter(name: str, folder: Path, *overrides: str) -> Any:
+    """What `export=name` and `overrides` describe."""
+    return build(composed(name, folder, *overrides))
 
 
 def content(folder: Path) -> dict[str, bytes]:
@@ -131,28 +136,34 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> EpisodeStore:
 
 
 def written(folder: Path) -> int:
-    """How many files there are below a folder in which others write and delete."""
-    return sum(len(files) for _, _, files in os.walk(folder))
+    """How many files an export to a folder has written so far, while it goes on."""
+    places = (folder, folder.with_name(f".{folder.name}.unfinished"))
+    return sum(len(files) for place in places for _, _, files in os.walk(place))
 
 
 EXPORT = """
-from test_export import EpisodeStore, Path, exporter
 if __name__ == "__main__":  # worker processes import this file
-    work, store = exporter({name!r}, Path({folder!r}), "export.workers=2"), EpisodeStore({store!r})
-    work.export(store)
+    from pathlib import Path
+    from vla.check import build
+    from vla.data.episodes import EpisodeStore
+    build({config}).export(EpisodeStore(Path({store!r}), {episodes}))
 """
 
 
-@pytest.mark.parametrize("name", ["files", "lerobot", "mcap"])
-def test_a_killed_export_goes_on_and_ends_up_the_same(name: str, store: EpisodeStore, tmp_path: Path) -> None:
+@pytest.mark.parametrize(("name", "episodes"), [("files", 30), ("lerobot", 60), ("mcap", 60)])
+def test_killed_seven_times_at_random_an_export_goes_on_and_ends_up_the_same(
+    name: str, episodes: int, store: EpisodeStore, tmp_path: Path
+) -> None:
+    store = EpisodeStore(store.folder, episodes)
     whole = exporter(name, tmp_path / "whole", "export.workers=1").export(store)
     killed, script = tmp_path / "killed", tmp_path / "export.py"
-    script.write_text(EXPORT.format(name=name, folder=str(killed), store=str(store.folder)))
-    for share in sorted(np.random.default_rng().uniform(0, 1, 3)):
+    config = OmegaConf.to_container(composed(name, killed, "export.workers=2"))
+    script.write_text(EXPORT.format(config=config, store=str(store.folder), episodes=episodes))
+    for share in sorted(np.random.default_rng().uniform(0, 1, 7)):
         process = subprocess.Popen(
             [sys.executable, str(script)], env={**os.environ, "PYTHONPATH": TESTS}, stdout=subprocess.DEVNULL
         )
-        while process.poll() is None and written(tmp_path) < (1 + share) * written(whole):
+        while process.poll() is None and written(killed) < share * written(whole):
             time.sleep(0.002)
         process.send_signal(signal.SIGKILL)
         process.wait()

@@ -23,6 +23,7 @@ PARTS = {
     "vla.data": ("vla.spec", "vla.data", "vla.workers"),
     "vla.models": ("vla.spec", "vla.models"),
     "vla.policy": ("vla.spec", "vla.models"),
+    "vla.program": ("vla.spec", "vla.models", "vla.policy"),
     "vla.rollout": ("vla.spec",),
     "vla.record": ("vla.spec",),
     "vla.workers": (),
@@ -30,6 +31,8 @@ PARTS = {
     "vla.collect": ("vla.spec", "vla.rollout", "vla.data", "vla.cluster"),
     "vla.evaluate": ("vla.spec", "vla.rollout", "vla.record", "vla.workers"),
     "vla.report": ("vla.spec", "vla.evaluate"),
+    "vla.suite": ("vla.evaluate", "vla.report"),
+    "vla.sweep": ("vla.evaluate",),
     "vla.card": ("vla.spec", "vla.data", "vla.report"),
     "vla.deploy": ("vla.spec", "vla.policy", "vla.tasks", "vla.data", "vla.evaluate", "vla.record", "vla.deploy"),
     "vla.stores": ("vla",),
@@ -44,8 +47,8 @@ PARTS = {
 
 # A library → the only parts that may import it.
 LIBRARIES = {
-    "hydra": ("vla.run", "vla.jobs", "vla.check", "vla.benchmark"),
-    "omegaconf": ("vla.run", "vla.jobs", "vla.parts", "vla.check", "vla.training", "vla.benchmark"),
+    "hydra": ("vla.run", "vla.jobs", "vla.check", "vla.benchmark", "vla.sweep"),
+    "omegaconf": ("vla.run", "vla.jobs", "vla.parts", "vla.check", "vla.training", "vla.benchmark", "vla.sweep"),
     "mujoco": ("vla.tasks", "vla.benchmark"),
     "dm_control": ("vla.tasks",),
     "dm_env": ("vla.tasks",),
@@ -115,3 +118,9 @@ def test_questions_are_answered_without_heavy_imports(option: list[str]) -> None
     imported = {line.rpartition("|")[2].strip() for line in done.stderr.splitlines()}
     assert "vla.check" in imported
     assert imported.isdisjoint(HEAVY)
+
+
+def test_a_policy_acts_without_the_compiler() -> None:
+    """Which takes a second to import, and another one to leave: nodes and workers start and end without it."""
+    code = "import sys, vla.policy, vla.models.bc, vla.models.rt1; sys.exit('torch._dynamo' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], cwd=ROOT, timeout=60).returncode == 0

@@ -157,7 +157,8 @@ def test_collection_goes_on_in_a_repaired_store(tmp_path: Path) -> None:
     change(tmp_path / "store" / "action.bin", lambda data: flip(data, 0))
     put_together([EpisodeStore(store.folder, damaged=True)], tmp_path / "repaired", repair=True)
     repaired = EpisodeStore.create_or_open(tmp_path / "repaired", SPEC, CONFIG)
-    collect(repaired, make_environment, make_expert, episodes=4, cluster=Local(1), seed=0)
+    summary = collect(repaired, make_environment, make_expert, episodes=4, cluster=Local(1), seed=0)
+    assert (summary.tried, summary.failures) == (5, {"timeout": 1}) and summary.success_rate == 0.8
     assert [(entry.seed, entry.outcome) for entry in repaired.tried][::5] == [(0, "damaged"), (5, "success")]
 
 

@@ -50,7 +50,7 @@ def whole_window(model: Model, seen: list[Observation]) -> torch.Tensor:
 
 @pytest.mark.parametrize("make", [make_bc, make_rt1], ids=["bc", "rt1"])
 def test_plays_an_episode_within_the_limits(make: Callable[[], Model]) -> None:
-    policy = Policy(make(), replace(SPEC, high=(0.001, 0.05, 1.0)))
+    policy = Policy(model=make(), spec=replace(SPEC, high=(0.001, 0.05, 1.0)))
     episode = rollout(ToyEnvironment(), policy, seed=3)
     assert episode.actions.shape == (40, 3) and episode.actions.dtype == np.float32
     assert episode.actions[:, 0].max() <= np.float32(0.001)
@@ -62,7 +62,7 @@ def test_plays_an_episode_within_the_limits(make: Callable[[], Model]) -> None:
 @pytest.mark.parametrize("proprioception", [False, True])
 def test_kept_tokens_give_what_the_whole_window_gives(proprioception: bool) -> None:
     model = make_rt1(history=3, proprioception=proprioception)
-    policy = Policy(model, SPEC)
+    policy = Policy(model=model, spec=SPEC)
     seen = observations(6)
     policy.reset(seen[0].instruction, 0)
     for step, observation in enumerate(seen):
@@ -73,16 +73,42 @@ def test_kept_tokens_give_what_the_whole_window_gives(proprioception: bool) -> N
 
 def test_only_the_newest_frame_is_encoded() -> None:
     model = make_rt1(history=3)
-    policy = Policy(model, SPEC)
+    policy = Policy(model=model, spec=SPEC)
     frames = []
     model.image.register_forward_pre_hook(lambda module, inputs: frames.append(len(inputs[0])))
     act(policy, observations(5))
     assert frames == [1] * (5 * len(SPEC.cameras))
 
 
+def test_compiled_it_acts_the_same() -> None:
+    torch.manual_seed(0)
+    model = make_rt1(history=2)
+    seen = observations(4)
+    eager = act(Policy(model=model, spec=SPEC), seen)
+    assert act(Policy(compile=True, model=model, spec=SPEC), seen) == pytest.approx(eager, abs=1e-5)
+
+
+def test_in_half_precision_it_sees_about_the_same() -> None:
+    torch.manual_seed(0)
+    model = make_bc()
+    exact, half = Policy(model=model, spec=SPEC), Policy(precision="bf16", model=model, spec=SPEC)
+    (seen,) = observations(1)
+    exact.act(seen), half.act(seen)
+    assert half.info["probabilities"] == pytest.approx(exact.info["probabilities"], abs=0.01)
+    assert not np.array_equal(half.info["probabilities"], exact.info["probabilities"])
+
+
+def test_a_gpu_that_is_not_there_is_named() -> None:
+    if torch.cuda.is_available():
+        assert Policy(device="cuda", model=make_bc(), spec=SPEC).device.type == "cuda"
+    else:
+        with pytest.raises(ValueError, match=r"policy\.device=cuda, but PyTorch finds no GPU"):
+            Policy(device="cuda", model=make_bc(), spec=SPEC)
+
+
 @pytest.mark.parametrize("make", [make_bc, make_rt1], ids=["bc", "rt1"])
 def test_reset_forgets(make: Callable[[], Model]) -> None:
-    policy = Policy(make(), SPEC)
+    policy = Policy(model=make(), spec=SPEC)
     seen = observations(4)
     policy.reset(seen[0].instruction, 0)
     first = act(policy, seen)
@@ -92,7 +118,7 @@ def test_reset_forgets(make: Callable[[], Model]) -> None:
 
 def test_another_instruction_starts_afresh() -> None:
     model = make_rt1(history=3)
-    policy, fresh = Policy(model, SPEC), Policy(model, SPEC)
+    policy, fresh = Policy(model=model, spec=SPEC), Policy(model=model, spec=SPEC)
     seen = observations(4)
     act(policy, seen[:3])
     changed = replace(seen[3], instruction="push the button")
@@ -103,7 +129,7 @@ def test_another_instruction_starts_afresh() -> None:
 @pytest.mark.parametrize("make", [lambda: make_bc(chunk=3), lambda: make_rt1(chunk=3)], ids=["bc", "rt1"])
 def test_a_chunk_is_executed_action_by_action(make: Callable[[], Model]) -> None:
     model = make()
-    policy = Policy(model, SPEC)
+    policy = Policy(model=model, spec=SPEC)
     seen = observations(4)
     actions = act(policy, seen)
     planned = [
@@ -115,7 +141,7 @@ def test_a_chunk_is_executed_action_by_action(make: Callable[[], Model]) -> None
 
 
 def test_predictions_ignore_truth() -> None:
-    policy = Policy(make_bc(), SPEC)
+    policy = Policy(model=make_bc(), spec=SPEC)
     (seen,) = observations(1)
     with_truth = policy.act(seen)
     assert np.array_equal(policy.act(replace(seen, truth=None)), with_truth)
@@ -130,7 +156,7 @@ def test_predictions_ignore_truth() -> None:
     ids=["camera", "size"],
 )
 def test_observations_of_another_kind_are_refused(rgb: dict[str, np.ndarray]) -> None:
-    policy = Policy(make_bc(), SPEC)
+    policy = Policy(model=make_bc(), spec=SPEC)
     with pytest.raises(ValueError, match="wrist"):
         policy.act(replace(observations(1)[0], rgb=rgb))
 

@@ -10,7 +10,7 @@ import pytest
 from conftest import CONF, make_tabletop
 
 from vla.spec import Array
-from vla.tasks.randomize.axis import stream
+from vla.tasks.randomize.axis import Streams
 from vla.tasks.randomize.blocks import Colours, Distractors, Placement, Shapes
 from vla.tasks.tabletop import Tabletop
 
@@ -144,8 +144,10 @@ def test_sensor_noise_is_the_same_in_a_replay_without_images() -> None:
 
 
 def test_streams_differ_between_axes_and_seeds() -> None:
-    draws = {(seed, axis): stream(seed, axis).uniform() for seed in (0, 1, 2**40) for axis in ("size", "mass")}
+    streams = Streams()
+    draws = {(seed, axis): streams(seed, axis).normal() for seed in (0, 1, 2**40) for axis in ("size", "mass")}
     assert len(set(draws.values())) == len(draws)
+    assert all(Streams()(*place).normal() == draw for place, draw in draws.items())  # whatever was drawn before
 
 
 def test_bad_axes_are_explained(tabletop: Tabletop) -> None:

@@ -76,6 +76,8 @@ def test_the_command_runs(home: Path, command: str, request: pytest.FixtureReque
         small = [*SMALL, "trainer.max_steps=6"]
     if "cluster=dask" in arguments:
         small += ["collect.folder=remote", "collect.episodes=4"]
+    if "experiment=ablation" in arguments:
+        small += ["variant=no_transformer,no_history", "seed=0", "hydra.sweep.dir=ablation"]
     if "model=rt1" in arguments:  # a second per frame
         small += [
             "data.batch_size=1",
@@ -84,6 +86,10 @@ def test_the_command_runs(home: Path, command: str, request: pytest.FixtureReque
             "trainer.limit_val_batches=0",
         ]
     vla(home, *arguments, *small)
+    if "experiment=ablation" in arguments:
+        lines = (home / "ablation/sweep.md").read_text().splitlines()
+        assert "| variant | seen [%] | instructions [%] | distractors [%] | backgrounds [%] |" in lines[0]
+        assert [line.split()[1] for line in lines[2:]] == ["no_transformer", "no_history"]
 
 
 def test_the_two_commands_are_what_ci_runs() -> None:

@@ -68,7 +68,9 @@ def test_the_main_job_collects_trains_evaluates_and_records(home: Path) -> None:
     assert report["config"]["collect"]["episodes"] == 24
     for name in ("report.png", "rollouts.rrd", "checkpoints/last.ckpt", "metrics.csv"):
         assert (home / "run" / name).stat().st_size > 0
-    last = (home / "printed.txt").read_text().strip().splitlines()[-1]
+    printed = (home / "printed.txt").read_text()
+    assert "\ntraining  " in printed and "Epoch" not in printed
+    last = printed.strip().splitlines()[-1]
     assert last.startswith(f"success {report['successes']}/2 (")
 
 
@@ -88,6 +90,12 @@ def test_a_grid_collects_once_and_trains_every_cell(home: Path) -> None:
     assert sorted((home / "outputs/episodes").iterdir()) == before
     assert done.stdout.count("24 episodes, 0 of them new") == 4
     assert len(list((home / "outputs/sweeps").glob("*/*/checkpoints/last.ckpt"))) == 4
+
+
+def test_the_menu_is_what_hydra_would_list(home: Path) -> None:
+    menu = vla(home, "--help").stdout
+    assert "task/goal: lift, mixed, pick_place, pick_place_two, push, stack\n" in menu
+    assert menu == vla(home, "-h").stdout == vla(home, "--help", "job=train").stdout
 
 
 def test_preview_shows_resets_and_their_draws(home: Path) -> None:

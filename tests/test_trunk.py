@@ -118,7 +118,7 @@ def test_validation_leaves_the_random_numbers_of_training_alone(make: Callable[.
 
 @every_model
 def test_plays_an_episode_that_follows_from_the_seed(make: Callable[..., ChunkModel]) -> None:
-    policy = Policy(make(), SPEC)
+    policy = Policy(model=make(), spec=SPEC)
     first, other, again = (rollout(ToyEnvironment(), policy, seed).actions for seed in (3, 8, 3))
     assert first.shape == (40, 3) and first.dtype == np.float32
     assert np.array_equal(first, again) and not np.array_equal(first, other)
@@ -127,7 +127,7 @@ def test_plays_an_episode_that_follows_from_the_seed(make: Callable[..., ChunkMo
 @every_model
 def test_looks_again_after_the_actions_that_are_executed(make: Callable[..., ChunkModel]) -> None:
     model = make(chunk=4, execute=2)
-    policy = Policy(model, SPEC)
+    policy = Policy(model=model, spec=SPEC)
     looks: list[int] = []
     acted: list[np.ndarray] = []
     model.shift.register_forward_pre_hook(lambda module, inputs: looks.append(len(acted)))

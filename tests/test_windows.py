@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import os
+import shutil
+import subprocess
+import sys
 from collections.abc import Iterator
 from dataclasses import replace
 from itertools import islice
@@ -266,11 +270,18 @@ class Seen(LightningModule):
         return torch.optim.Adam(self.parameters(), lr=0.1)
 
 
-def fit(folder: Path, steps: int, accumulate: int, checkpoint: Path | None = None, save: Path | None = None) -> Seen:
+def fit(
+    folder: Path,
+    steps: int,
+    accumulate: int = 1,
+    checkpoint: Path | None = None,
+    save: Path | None = None,
+    devices: int = 1,
+) -> Seen:
     model = Seen()
     trainer = Trainer(
         accelerator="cpu",
-        devices=1,
+        devices=devices,
         max_steps=steps,
         accumulate_grad_batches=accumulate,
         val_check_interval=4,
@@ -295,6 +306,53 @@ def test_a_resumed_training_sees_what_an_uninterrupted_one_sees(folder: Path, tm
         tail = whole.seen[step * accumulate :]
         assert all(torch.equal(one, two) for one, two in zip(resumed.seen, tail, strict=True))
         assert torch.equal(resumed.weight, whole.weight)
+
+
+TWO = """
+import sys
+from pathlib import Path
+import numpy as np
+from test_windows import fit
+model = fit(Path(sys.argv[1]), int(sys.argv[2]), devices=2)
+np.save(f"seen{model.global_rank}.npy", np.stack(model.seen))
+"""
+
+
+def test_two_processes_of_a_trainer_see_every_window_once_between_them(folder: Path, tmp_path: Path) -> None:
+    module = windows(folder)
+    count = len(module.training_windows)
+    steps = -(-count // (8 * 2))
+    (tmp_path / "two.py").write_text(TWO)
+    tests = Path(__file__).parent
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(tests), str(tests.parent)])}
+    command = [sys.executable, "two.py", str(folder), str(steps)]
+    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr
+    seen = np.stack([np.load(tmp_path / f"seen{rank}.npy") for rank in (0, 1)], axis=1)  # (steps, 2, B, …)
+    drawn = seen.reshape(steps * 2 * 8, -1)[:count]
+    every = module.gather(module.training_windows)["proprio"].numpy().reshape(count, -1)
+    assert len(np.unique(every, axis=0)) == count  # no two windows look alike
+    np.testing.assert_array_equal(np.unique(drawn, axis=0), np.unique(every, axis=0))
+
+
+def test_training_leaves_the_store_as_it_is(folder: Path, tmp_path: Path) -> None:
+    """Also where nothing could be written; who runs this may be root, whom no permission keeps from it."""
+    store = tmp_path / "store"
+    shutil.copytree(folder, store)
+    for path in (*store.iterdir(), store):
+        path.chmod(0o555 if path.is_dir() else 0o444)
+    before = {path.name: path.stat() for path in store.iterdir()} | {".": store.stat()}
+    # What job=train does: it looks whether there are episodes enough, and trains on them.
+    complete = EpisodeStore.create_or_open(store, toy.SPEC, {})
+    assert collect(complete, toy.make_environment, toy.make_expert, EPISODES, Local(1), seed=0).added == 0
+    seen = fit(store, 5).seen
+    assert all(torch.equal(one, two) for one, two in zip(seen, fit(folder, 5).seen, strict=True))
+    after = {path.name: path.stat() for path in store.iterdir()} | {".": store.stat()}
+    assert before.keys() == after.keys()
+    assert all(after[name].st_mtime_ns == stat.st_mtime_ns for name, stat in before.items())
+    opened = EpisodeStore(store)
+    assert all(isinstance(rows, np.ndarray) and not rows.flags.writeable for rows in map(opened.rows, opened.fields))
+    store.chmod(0o755)  # so that it can be tidied away
 
 
 def test_what_cannot_be_trained_on_is_refused(folder: Path) -> None:

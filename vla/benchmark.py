@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from omegaconf import DictConfig
 
+from vla.check import build
 from vla.peers.peer import peer
 from vla.workers import cores
 
@@ -232,32 +233,37 @@ def training(config: DictConfig) -> dict[str, Measure]:
 
 
 def policy(config: DictConfig) -> dict[str, Measure]:
-    """Actions of the policy per second, batch of one, against its network's forward pass alone."""
+    """The time from an observation to an action, as `config.policy` computes it, against its network alone; and of
+    the same network if it encoded every frame of its history anew, in 32 bits and uncompiled, against that time."""
     import torch
 
     from vla.jobs import collected, make_environment, make_learner, plain
-    from vla.policy import Policy
 
     environment = make_environment(plain(config.task))
     observation = environment.reset(0)
-    store = collected(config)
-    model = make_learner(config, store).model.eval()
-    agent = Policy(model, environment.spec)
-    agent.reset(observation.instruction, 0)
-    agent.act(observation)
-    steps = config.benchmark.steps
-    started = time.perf_counter()
-    for _ in range(steps):
-        agent.act(observation)
-    rate = steps / (time.perf_counter() - started)
-    batch = agent.window()
-    with torch.inference_mode():
-        started = time.perf_counter()
-        for _ in range(steps):
-            model(batch)
-    floor = steps / (time.perf_counter() - started)
     environment.close()
-    return {"policy": _measure(rate, "actions/s", steps, floor)}
+    model = make_learner(config, collected(config)).model
+    agent = build(config.policy, model=model, spec=environment.spec)
+    for _ in range(model.history + 1):  # the first ones compile and allocate
+        agent.act(observation)
+    frame = agent.frame(observation)
+    rgb = {camera: images.expand(1, model.history, -1, -1, -1) for camera, images in frame["rgb"].items()}
+    frames = {name: frame[name].expand(1, model.history, *frame[name].shape[2:]) for name in ("proprio", "present")}
+    whole = {"rgb": rgb, "text": frame["text"], **frames}
+    steps = config.benchmark.steps
+    acting = _median(lambda: agent.plan(observation), steps)
+    with torch.inference_mode():
+        network = _median(partial(model.predict, agent.window()), steps)
+        naive = _median(partial(model.predict, whole), steps)
+    return {
+        "policy": _measure(acting, "ms", steps, network),
+        "policy: every frame anew": _measure(naive, "ms", steps, acting),
+    }
+
+
+def _median(work: Callable[[], object], rounds: int) -> float:
+    """Median time [ms] that `work` takes."""
+    return 1000 * float(np.median([_timed(work)[1] for _ in range(rounds)]))
 
 
 def deployment(config: DictConfig) -> dict[str, Measure]:

@@ -31,13 +31,13 @@ JOBS: dict[str, tuple[str, ...]] = {
     "preview": ("task", "expert"),
     "collect": ("task", "expert", "cluster"),
     "train": TRAINING,
-    "evaluate": (*TRAINING, "recorder"),
-    "export": ("task", "expert", "cluster", "export"),
-    "deploy": ("tokenizer", "model", "deploy"),
-    "benchmark": TRAINING,
+    "evaluate": (*TRAINING, "policy", "recorder"),
+    "export": ("task", "expert", "cluster", "tokenizer", "model", "policy", "export"),
+    "deploy": ("tokenizer", "model", "policy", "deploy"),
+    "benchmark": (*TRAINING, "policy"),
     "inspect": (),
 }
-EVALUATION = ("task", "tokenizer", "model", "recorder")  # of a checkpoint, with nothing to train
+EVALUATION = ("task", "tokenizer", "model", "policy", "recorder")  # of a checkpoint, with nothing to train
 OPTIONAL = ("recorder",)  # groups that a job can do without
 
 # Constructor arguments that the jobs give, so that they never stand in YAML.
@@ -48,6 +48,7 @@ RUNTIME: dict[str, tuple[str, ...]] = {
     "model": ("spec", "tokenizer"),
     "learner": ("model", "spec", "config"),
     "trainer": ("callbacks", "logger"),
+    "policy": ("model", "spec"),
     "recorder": ("folder",),
     "deploy": ("policy", "environment", "output"),
 }
@@ -62,7 +63,13 @@ PLAIN: dict[str, Any] = {
     "checkpoint": str | None,
     "output": str,
     "collect": {"episodes": Count, "seed": Seed, "workers": Count | None, "folder": str},
-    "evaluate": {"episodes": Count, "seed": Seed, "workers": Count | None, "recordings": Seed | None},
+    "evaluate": {
+        "episodes": Count,
+        "seed": Seed,
+        "workers": Count | None,
+        "recordings": Seed | None,
+        "conditions": dict[str, dict[str, Any]],
+    },
     "preview": {"episodes": Count, "seed": Seed},
     "benchmark": {
         "names": list[Literal["collect", "loader", "train", "policy", "deploy"]],

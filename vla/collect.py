@@ -18,6 +18,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from vla.cluster import Cluster, MakeWorker, Team, Wait, WorkersLost
 from vla.data.episodes import EpisodeStore
+from vla.data.index import DAMAGED
 from vla.rollout import replay, rollout
 from vla.spec import Agent, Environment, Episode
 
@@ -50,7 +51,7 @@ class Summary:
 
     episodes: int  # successes stored
     added: int  # of which were added now
-    tried: int  # seeds
+    tried: int  # seeds whose outcome is known: an episode that a repair gave up says nothing about the expert
     failures: dict[str, int]  # outcome → seeds
     seconds: float  # of this call
 
@@ -92,7 +93,8 @@ def collect(
                 _fill_with(cluster, partial(Demonstrator, make_environment, make_expert), store, episodes, seed)
     stored = len(store.episodes)
     failures = Counter(entry.outcome for entry in store.tried if not entry.success)
-    return Summary(stored, stored - before, len(store.tried), dict(failures), time.monotonic() - started)
+    tried = len(store.tried) - failures.pop(DAMAGED, 0)
+    return Summary(stored, stored - before, tried, dict(failures), time.monotonic() - started)
 
 
 def _require_first_seed(store: EpisodeStore, seed: int) -> None:
@@ -102,7 +104,7 @@ def _require_first_seed(store: EpisodeStore, seed: int) -> None:
 
 
 def _fill_with(cluster: Cluster, make: MakeWorker, store: EpisodeStore, episodes: int, seed: int) -> None:
-    """Fill the store, with new workers if some died: a graphics driver may crash once in thousands of episodes."""
+    """Fill the store, with new workers if some died: in long collections a process was seen to crash outside Python."""
     while True:
         tried = len(store.tried)
         try:
@@ -117,6 +119,7 @@ def _fill_with(cluster: Cluster, make: MakeWorker, store: EpisodeStore, episodes
 def _fill(store: EpisodeStore, team: Team, episodes: int, seed: int) -> None:
     stored = before = len(store.episodes)
     next_seed = seed if store.next_seed is None else store.next_seed
+    damaged = sum(entry.outcome == DAMAGED for entry in store.tried)
     in_a_row = 0  # failures
     started = time.monotonic()
     pending: deque[Wait] = deque()
@@ -137,7 +140,7 @@ def _fill(store: EpisodeStore, team: Team, episodes: int, seed: int) -> None:
                 in_a_row += 1
                 _give_up_after(store, in_a_row)
             speed = (stored - before) / (time.monotonic() - started)
-            note = f"{speed:.1f} episodes/s, expert {stored / len(store.tried):.0%}"
+            note = f"{speed:.1f} episodes/s, expert {stored / (len(store.tried) - damaged):.0%}"
             progress.update(task, completed=stored, description=note)
 
 

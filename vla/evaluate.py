@@ -128,8 +128,9 @@ def evaluate(
     make_recorder: MakeRecorder | None,
     seeds: Sequence[int],
     workers: int | None = None,
+    name: str = "evaluating",
 ) -> Report:
-    """Play the episodes that the seeds name.
+    """Play the episodes that the seeds name; `name` stands beside the progress.
 
     The factories are called once in each of `workers` spawned processes (None: one per core); a single worker is this
     process itself. What they raise ends the evaluation; what an episode raises is reported as its error.
@@ -144,7 +145,7 @@ def evaluate(
         raise ValueError(f"evaluation needs at least one worker, got evaluate.workers={workers}")
     factories = _Factories(make_environment, make_agent, make_recorder)
     play = _play_here(factories, seeds) if workers == 1 else _play_apart(factories, seeds, workers)
-    columns = (TextColumn("evaluating"), BarColumn(), MofNCompleteColumn(), TextColumn("{task.fields[note]}"))
+    columns = (TextColumn(name), BarColumn(), MofNCompleteColumn(), TextColumn("{task.fields[note]}"))
     results: dict[int, Result] = {}
     with one_thread_each(), closing(play), Progress(*columns, TimeRemainingColumn()) as bar:
         task = bar.add_task("", total=len(seeds), note="")
@@ -215,8 +216,8 @@ def _play_here(factories: _Factories, seeds: Sequence[int]) -> Generator[Result]
 def _play_apart(factories: _Factories, seeds: Sequence[int], workers: int) -> Generator[Result]:
     """Results in the order in which they come, from other processes.
 
-    When one dies, the episodes that were under way are played again, one by one: a graphics driver may crash once in
-    thousands of episodes, and an episode that kills its process again is an error of its own.
+    When one dies, the episodes that were under way are played again, one by one: in long runs a process was seen to
+    crash outside Python, and an episode that kills its process again is an error of its own.
     """
     left = list(seeds)
     while left:

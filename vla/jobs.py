@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from omegaconf import DictConfig
+from rich import print as show
 
 from vla.check import build
 from vla.parts import (
@@ -40,8 +41,6 @@ def run(config: DictConfig) -> float | None:
 
 def preview(config: DictConfig) -> None:
     """Show randomised resets as a contact sheet, their draws as a table, and the expert at work as a recording."""
-    from rich import print as show
-
     from vla.record import RerunRecorder, merge
     from vla.report import contact_sheet, draws_table
     from vla.rollout import rollout
@@ -74,41 +73,59 @@ def train(config: DictConfig) -> None:
 
 
 def evaluate(config: DictConfig) -> float:
-    """Measure the success rate of a checkpoint, which is trained first if none is given.
+    """Measure the success rate of a checkpoint, which is trained first if none is given, and again under every
+    condition that the evaluation names, on the same seeds.
 
     Raises:
         ValueError: an episode could not be played to its end; the report, which is written, says why.
     """
     from vla.evaluate import evaluate, keep_recordings
+    from vla.policy import latency
     from vla.report import plot_report, write_report
+    from vla.suite import SEEN, plot_suite, suite_table
 
     output = _output(config)
     checkpoint = Path(config.checkpoint) if config.checkpoint else _trained(config)
     seeds = range(config.evaluate.seed, config.evaluate.seed + config.evaluate.episodes)
     recordings = output / "recordings"
-    report = evaluate(
-        partial(make_environment, plain(config.task)),
-        partial(make_policy, checkpoint),
-        partial(make_recorder, plain(config.recorder), recordings) if config.recorder else None,
-        seeds,
-        config.evaluate.workers,
-    )
+    make = partial(make_policy, plain(config.policy), checkpoint)
+    recorder = partial(make_recorder, plain(config.recorder), recordings) if config.recorder else None
+    task, reports = plain(config.task), {}
+    for name, changes in {SEEN: {}, **plain(config.evaluate.conditions)}.items():
+        environment = partial(make_environment, {**task, "randomize": {**task["randomize"], **changes}})
+        # Recordings are for what the policy was trained for; what fails elsewhere is counted.
+        watching = recorder if name == SEEN else None
+        reports[name] = evaluate(environment, make, watching, seeds, config.evaluate.workers, name)
+    report = reports.pop(SEEN)
     if config.recorder:
         keep_recordings(report, recordings, output / "rollouts.rrd", config.evaluate.recordings)
-    write_report(report, output / "report.json", str(checkpoint), plain(config))
+    policy = make()
+    size = {"parameters": sum(p.numel() for p in policy.model.parameters()), "latency_ms": latency(policy)}
+    write_report(report, output / "report.json", str(checkpoint), plain(config), size, reports)
     plot_report(report, output / "report.png")
     log.info("wrote %s, report.png%s", output / "report.json", " and rollouts.rrd" if config.recorder else "")
+    if reports:
+        plot_suite({SEEN: report, **reports}, output / "suite.png")
+        show(suite_table({SEEN: report, **reports}))
     print(report)
-    if report.errors:
-        raise ValueError(f"{len(report.errors)} episodes ended in an error, see {output / 'report.json'}")
+    errors = [error for each in (report, *reports.values()) for error in each.errors]
+    if errors:
+        raise ValueError(f"{len(errors)} episodes ended in an error, see {output / 'report.json'}")
     return report.success
 
 
 def export(config: DictConfig) -> None:
-    """Write the first `collect.episodes` of the episode store in another format."""
+    """Write the first `collect.episodes` of the episode store in another format, or a trained policy as programs.
+
+    Raises:
+        ValueError: programs are asked for, and there is no checkpoint.
+    """
+    exporter = build(config.export)
+    if config.export._target_.startswith("vla.program."):
+        log.info("wrote %s", exporter.export(_required_policy(config)))
+        return
     from vla.data.episodes import EpisodeStore
 
-    exporter = build(config.export)
     store = EpisodeStore(collected(config).folder, config.collect.episodes)
     log.info("wrote %s", exporter.export(store))
 
@@ -133,16 +150,16 @@ def deployed(config: DictConfig) -> Any:
     """The deployment that `config.deploy` describes, ready to run."""
     return build(
         config.deploy,
-        policy=partial(_required_policy, config.checkpoint),
+        policy=partial(_required_policy, config),
         environment=partial(make_environment, plain(config.task)),
         output=_output(config),
     )
 
 
-def _required_policy(checkpoint: str | None) -> Policy:
-    if checkpoint is None:
-        raise ValueError("this deployment needs a trained policy: checkpoint=FILE")
-    return make_policy(Path(checkpoint))
+def _required_policy(config: DictConfig) -> Policy:
+    if config.checkpoint is None:
+        raise ValueError("this needs a trained policy: checkpoint=FILE")
+    return make_policy(plain(config.policy), Path(config.checkpoint))
 
 
 def benchmark(config: DictConfig) -> None:

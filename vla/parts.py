@@ -61,13 +61,13 @@ def make_recorder(recorder: Node, folder: Path) -> Recorder:
     return made
 
 
-def make_policy(checkpoint: Path, environment: Environment | None = None) -> Policy:
-    """The policy in a checkpoint.
+def make_policy(policy: Node, checkpoint: Path, environment: Environment | None = None) -> Policy:
+    """The policy in a checkpoint, computing as a policy node says.
 
     Raises:
         ValueError: no checkpoint is there, or it was trained for another kind of step than the environment has.
     """
-    from vla.policy import Policy, read_checkpoint
+    from vla.policy import read_checkpoint
 
     saved = read_checkpoint(checkpoint)
     if environment is not None:
@@ -76,7 +76,8 @@ def make_policy(checkpoint: Path, environment: Environment | None = None) -> Pol
     # What the saved weights are, the pretrained ones would only be overwritten by.
     model = build(_without_pretraining(saved.config["model"]), spec=saved.spec, tokenizer=tokenizer)
     saved.restore(model)
-    return Policy(model, saved.spec)
+    made: Policy = build(policy, model=model, spec=saved.spec)
+    return made
 
 
 def _without_pretraining(model: Node) -> Node:

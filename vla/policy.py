@@ -4,11 +4,12 @@
 
 from __future__ import annotations
 
+import time
 from collections import deque
 from dataclasses import dataclass
 from pathlib import Path
 from pickle import UnpicklingError
-from typing import Any
+from typing import Any, Literal
 from zipfile import BadZipFile, ZipFile
 
 import numpy as np
@@ -68,12 +69,43 @@ def read_checkpoint(path: str | Path) -> Checkpoint:
 
 
 class Policy:
-    """Acts with a model: keeps its history, executes of each chunk as many actions as the model says, one by one."""
+    """Acts with a model: keeps its history, encodes every frame once, executes as much of each chunk as the model says.
 
-    def __init__(self, model: Model, spec: Spec) -> None:
-        """Args: the model, with its tokenizer; what a step looks like."""
-        self.model, self.spec = model.eval(), spec
+    Args:
+        device: where to compute; "auto" takes a GPU if there is one.
+        precision: 32, or "bf16" for matrix products in bfloat16.
+        compile: compile the model, which takes up to a minute at the first action and needs g++ on a CPU: there its
+            constants are folded into its weights, on a GPU it becomes CUDA graphs.
+        model: the network, with its tokenizer.
+        spec: what a step looks like.
+
+    Raises:
+        ValueError: a GPU is asked for where there is none.
+    """
+
+    def __init__(
+        self,
+        device: Literal["auto", "cpu", "cuda"] = "auto",
+        precision: Literal[32, "bf16"] = 32,
+        compile: bool = False,
+        *,
+        model: Model,
+        spec: Spec,
+    ) -> None:
+        if device == "cuda" and not torch.cuda.is_available():
+            raise ValueError("policy.device=cuda, but PyTorch finds no GPU here: policy.device=auto does with the CPU")
+        usable = "cuda" if torch.cuda.is_available() else "cpu"
+        self.device = torch.device(usable if device == "auto" else device)
+        self.model, self.spec = model.eval().to(self.device), spec
         self.info: dict[str, Any] = {}
+        self._half = precision == "bf16"
+        self._encode, self._decide = self.model.encode, self.model.predict
+        if compile:
+            how: dict[str, Any] = {"options": {"freezing": True}}
+            if self.device.type == "cuda":
+                how = {"mode": "reduce-overhead"}
+            self._encode = torch.compile(self.model.encode, **how)
+            self._decide = torch.compile(self.model.predict, **how)
         self._low, self._high = np.array(spec.low, np.float32), np.array(spec.high, np.float32)
         self._frames: deque[dict[str, Tensor]] = deque(maxlen=model.history)
         self._chunk: deque[tuple[Array, dict[str, Any]]] = deque()
@@ -85,7 +117,7 @@ class Policy:
         self._frames.clear()
         self._chunk.clear()
         self._instruction = instruction
-        self._text = self.model.text.tokenize([instruction])
+        self._text = self.model.text.tokenize([instruction]).to(self.device)
 
     def act(self, observation: Observation) -> Array:
         """The (D,) float32 action to execute, within the spec's bounds; `info` may have its token probabilities (D, K).
@@ -113,33 +145,73 @@ class Policy:
     def _see(self, observation: Observation) -> None:
         if observation.instruction != self._instruction:
             self.reset(observation.instruction, 0)
-        self._frames.append(self._frame(observation))
+        self._frames.append(self._kept(self.frame(observation)))
 
     @torch.inference_mode()
     def _predict(self) -> tuple[Array, Array | None]:
         """Actions (k, D), clipped, and token probabilities (k, D, K), where the model has them."""
-        noise = torch.randn(1, self.model.chunk, len(self.spec.action), generator=self._random)
-        prediction = self.model.predict({**self.window(), "noise": noise})
-        probabilities = None if prediction.probabilities is None else prediction.probabilities[0].numpy()
-        return np.clip(prediction.actions[0].numpy(), self._low, self._high), probabilities
+        drawn = torch.randn(1, self.model.chunk, len(self.spec.action), generator=self._random)
+        with self._computing():
+            actions, probabilities = self._decide({**self.window(), "noise": drawn.to(self.device)})
+        told = None if probabilities is None else probabilities[0].float().cpu().numpy()
+        return np.clip(actions[0].float().cpu().numpy(), self._low, self._high), told
+
+    def _computing(self) -> torch.autocast:
+        return torch.autocast(self.device.type, torch.bfloat16, enabled=self._half)
 
     def window(self) -> Batch:
-        """What the model is given now: the frames seen so far, at most its history, as a batch of one."""
-        joined = {name: torch.cat([frame[name] for frame in self._frames], 1) for name in self._frames[0]}
+        """What the model is given now, a batch of one: the frames seen so far, and absent ones up to its history."""
+        absent = {name: torch.zeros_like(values) for name, values in self._frames[0].items()}
+        frames = [*self._frames, *[absent] * (self.model.history - len(self._frames))]
+        joined = {name: torch.cat([frame[name] for frame in frames], 1) for name in absent}
         rgb = {name: joined.pop(name) for name in self.spec.cameras if name in joined}
         return {**joined, "rgb": rgb, "text": self._text}
 
-    @torch.inference_mode()
-    def _frame(self, observation: Observation) -> dict[str, Tensor]:
-        """One observation as tensors (1, 1, …): its tokens where the model can keep them, else all of it."""
+    def frame(self, observation: Observation) -> Batch:
+        """One observation as a batch of one frame.
+
+        Raises:
+            ValueError: the observation is not what the policy was trained on.
+        """
         shape = (*self.spec.image_size, 3)
         seen = {camera: image.shape for camera, image in observation.rgb.items()}
         if any(seen.get(camera) != shape for camera in self.spec.cameras):
             raise ValueError(f"the policy looks through {self.spec.cameras} in {shape}, the observation has {seen}")
         proprio = np.concatenate([observation.joints, observation.velocities, [observation.gripper]])
-        frame = {camera: torch.from_numpy(observation.rgb[camera].copy())[None, None] for camera in self.spec.cameras}
-        frame["proprio"] = torch.from_numpy(proprio.astype(np.float32))[None, None]
-        frame["present"] = torch.ones(1, 1, dtype=torch.bool)
-        rgb = {camera: frame[camera] for camera in self.spec.cameras}
-        tokens = self.model.encode({**frame, "rgb": rgb, "text": self._text})
-        return frame if tokens is None else {"tokens": tokens, "present": frame["present"]}
+        return {
+            "rgb": {camera: self._tensor(observation.rgb[camera]) for camera in self.spec.cameras},
+            "proprio": self._tensor(proprio.astype(np.float32)),
+            "present": torch.ones(1, 1, dtype=torch.bool, device=self.device),
+            "text": self._text,
+        }
+
+    @torch.inference_mode()
+    def _kept(self, frame: Batch) -> dict[str, Tensor]:
+        """What is kept of a frame, (1, 1, …): its tokens where the model can do with them, else all of it."""
+        with self._computing():
+            tokens = self._encode(frame)
+        if tokens is None:
+            return {**frame["rgb"], "proprio": frame["proprio"], "present": frame["present"]}
+        # A CUDA graph writes its next result where it wrote this one.
+        return {"tokens": tokens.clone(), "present": frame["present"]}
+
+    def _tensor(self, values: Array) -> Tensor:
+        return torch.from_numpy(values.copy())[None, None].to(self.device)
+
+
+def noise(spec: Spec, random: np.random.Generator) -> Observation:
+    """An observation in which everything is random but the instruction."""
+    rgb = {camera: random.integers(256, size=(*spec.image_size, 3), dtype=np.uint8) for camera in spec.cameras}
+    joints, velocities = random.uniform(-1, 1, (2, len(spec.joints))).astype(np.float32)
+    return Observation(rgb, {}, joints, velocities, random.uniform(0, 0.08), "lift the red block")
+
+
+def latency(policy: Policy, rounds: int = 20) -> float:
+    """Median time from an observation to its action [ms], with a full history."""
+    observation = noise(policy.spec, np.random.default_rng(0))
+    seconds = []
+    for _ in range(policy.model.history + rounds):
+        started = time.perf_counter()
+        policy.plan(observation)
+        seconds.append(time.perf_counter() - started)
+    return 1000 * float(np.median(seconds[-rounds:]))

@@ -27,10 +27,39 @@ TILE = 144  # smallest height of an image on a contact sheet [px]
 CAPTION = 18  # height of a line of text on it [px]
 
 
-def write_report(report: Report, path: Path, checkpoint: str | None, config: Mapping[str, Any]) -> None:
-    """Write a report as JSON, all of it or nothing: rate and interval, outcomes, what was evaluated, every episode."""
-    low, high = report.interval
+def write_report(
+    report: Report,
+    path: Path,
+    checkpoint: str | None,
+    config: Mapping[str, Any],
+    policy: Mapping[str, float] | None = None,
+    conditions: Mapping[str, Report] | None = None,
+) -> None:
+    """Write a report as JSON, all of it or nothing: rate and interval, outcomes, what was evaluated, every episode.
+
+    `policy` says how large and how fast what was evaluated is; `conditions` are reports on the same seeds, by name.
+    """
     content = {
+        **summary(report),
+        "seeds": [result.seed for result in report.results],
+        "checkpoint": checkpoint,
+        **(policy or {}),
+        "conditions": {
+            name: {**summary(other), "outcomes": [result.outcome for result in other.results]}
+            for name, other in (conditions or {}).items()
+        },
+        "config": config,
+        "per_episode": [asdict(result) for result in report.results],
+    }
+    partial = path.with_name(f"{path.name}.partial")
+    partial.write_text(json.dumps(content, indent=1, allow_nan=False, ensure_ascii=False) + "\n", encoding="utf-8")
+    os.replace(partial, path)
+
+
+def summary(report: Report) -> dict[str, Any]:
+    """Rate, interval and outcomes of a report, fit for JSON."""
+    low, high = report.interval
+    return {
         "success": report.success,
         "ci_low": low,
         "ci_high": high,
@@ -38,14 +67,7 @@ def write_report(report: Report, path: Path, checkpoint: str | None, config: Map
         "successes": report.successes,
         "errors": len(report.errors),
         "taxonomy": report.taxonomy,
-        "seeds": [result.seed for result in report.results],
-        "checkpoint": checkpoint,
-        "config": config,
-        "per_episode": [asdict(result) for result in report.results],
     }
-    partial = path.with_name(f"{path.name}.partial")
-    partial.write_text(json.dumps(content, indent=1, allow_nan=False, ensure_ascii=False) + "\n", encoding="utf-8")
-    os.replace(partial, path)
 
 
 def plot_report(report: Report, path: Path) -> None:

@@ -9,6 +9,7 @@ import sys
 import traceback
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from string import Template
 from typing import Any, NoReturn
 
 import hydra
@@ -164,8 +165,24 @@ def _compose(cfg: DictConfig) -> float | None:
         _end(error)
 
 
+def _menu() -> str:
+    """What --help prints. Hydra asks each of its sources for every group anew, several times, which takes most of a
+    second."""
+    groups: dict[str, list[str]] = {}
+    for file in CONF.rglob("*.yaml"):
+        group = file.parent.relative_to(CONF)
+        if group.parts[:1] not in ((), ("hydra",)):
+            groups.setdefault(group.as_posix(), []).append(file.stem)
+    lines = [f"{group}: {', '.join(sorted(options))}\n" for group, options in sorted(groups.items())]
+    template = OmegaConf.select(OmegaConf.load(CONF / "config.yaml"), "hydra.help.template")
+    return Template(template).substitute(APP_CONFIG_GROUPS="".join(lines))
+
+
 def main() -> None:
     """Do what the command line says; what the user can mend ends in one sentence, unless HYDRA_FULL_ERROR=1."""
+    if sys.argv[1:] in (["--help"], ["-h"]):  # with overrides or other folders of options, Hydra looks for itself
+        print(_menu())
+        return
     os.environ.setdefault(TRACEBACKS, os.environ.get("HYDRA_FULL_ERROR", "0"))
     os.environ["HYDRA_FULL_ERROR"] = "1"  # otherwise Hydra prints errors itself
     sys.argv[1:], ros.arguments[:] = ros.split_arguments(sys.argv[1:])

@@ -87,13 +87,20 @@ class AtomicFiles(TorchCheckpointIO):
             draft.unlink(missing_ok=True)
 
 
+class Progress(RichProgressBar):
+    """The progress of a training that counts steps: Lightning's own bar calls an endless one "Epoch 0/-2"."""
+
+    def _get_train_description(self, current_epoch: int) -> str:
+        return "training".ljust(len(self.validation_description))  # bars of one length do not flicker
+
+
 def make_trainer(config: DictConfig, checkpoints: Path | None, *watching: Callback) -> Trainer:
     """The trainer of a configuration, which averages the weights and keeps its last checkpoint, if there is a place.
 
     Raises:
         ValueError: the machine has not what it asks for.
     """
-    callbacks: list[Callback] = [RichProgressBar(), *watching]
+    callbacks: list[Callback] = [Progress(), *watching]
     options: dict[str, Any] = {"logger": False, "enable_checkpointing": False}
     if config.learner.ema:
         callbacks.insert(1, EMAWeightAveraging(decay=config.learner.ema))

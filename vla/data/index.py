@@ -13,6 +13,7 @@ from vla.spec import Array
 
 REMEDY = "copy the folder again from where it is whole, or delete it and collect again"
 SALVAGE = f"keep what is whole with job=inspect inspect.repair=true, {REMEDY}"
+DAMAGED = "damaged"  # outcome of a seed whose episode could not be kept by a repair
 LOST = "lost"  # outcome of a seed of which a damaged index tells nothing
 MOMENTS = {"low", "high", "sum", "square"}  # of the actions of an episode
 

@@ -18,13 +18,12 @@ import numpy as np
 from rich.progress import track
 
 from vla.data.episodes import EpisodeStore, stored
-from vla.data.index import LOST, Entry, moments
+from vla.data.index import DAMAGED, LOST, Entry, moments
 from vla.data.selection import Selection
 from vla.spec import Array, Episode, Observation
 
 # N steps, D action components
 
-DAMAGED = "damaged"  # outcome of a seed whose episode could not be kept
 LISTED = 8  # seeds in a sentence
 
 Found = tuple[EpisodeStore, Entry]

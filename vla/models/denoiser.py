@@ -53,7 +53,7 @@ class Denoiser(nn.Module):
         """(B, k, D) at (B,) times in 0 … 1, with (B, M, E) of what is seen, to (B, k, D)."""
         when = self.time(waves(time, self.width)).unsqueeze(1)  # (B, 1, E)
         tokens = self.action(noisy) + self.positions.weight + when
-        hidden: Tensor = self.head(self.transformer(tokens, context, tgt_mask=self.mask))
+        hidden: Tensor = self.head(self.transformer(tokens, context, self.mask, tgt_is_causal=True))
         return hidden
 
 
@@ -82,6 +82,8 @@ class DenoisingModel(ChunkModel):
         tokenizer: between which bounds actions lie.
     """
 
+    noise: Tensor
+
     def __init__(
         self,
         image: Callable[..., ImageEncoder],
@@ -105,6 +107,8 @@ class DenoisingModel(ChunkModel):
         super().__init__(image, text, chunk, execute, keypoints, text_width, width, shift, auxiliary, spec, tokenizer)
         self.copies, self.steps, self.temperature = copies, steps, temperature
         self.denoiser = Denoiser(len(spec.action), chunk, width, layers, heads)
+        noise = torch.randn(chunk, len(spec.action), generator=torch.Generator().manual_seed(0))
+        self.register_buffer("noise", noise, persistent=False)
 
     @abstractmethod
     def corrupt(self, action: Tensor, noise: Tensor, uniform: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -135,6 +139,5 @@ class DenoisingModel(ChunkModel):
     def predict(self, batch: Batch) -> Prediction:
         """What becomes of the batch's "noise", or of noise that is always the same."""
         context = self(batch)["context"]
-        shape = len(context), self.chunk, len(self.spec.action)
-        noise = batch["noise"] if "noise" in batch else torch.randn(shape, generator=torch.Generator().manual_seed(0))
-        return Prediction(self.unscaled(self.sample(self.temperature * noise.to(context.device), context)))
+        noise = batch["noise"] if "noise" in batch else self.noise.expand(len(context), -1, -1)
+        return Prediction(self.unscaled(self.sample(self.temperature * noise, context)))

@@ -269,6 +269,8 @@ def grid(features: Tensor) -> Tensor:
 class RandomShift(nn.Module):
     """Shifts the images of a clip by one random offset, filling with black; does nothing outside training.
 
+    Whoever compiles it leaves it out: offsets are numbers here, and every new one would be compiled anew.
+
     Args:
         vertical, horizontal: largest shift either way [1/256 of the image height].
     """
@@ -277,7 +279,6 @@ class RandomShift(nn.Module):
         super().__init__()
         self.vertical, self.horizontal = vertical, horizontal
 
-    @torch.compiler.disable  # offsets are numbers here, and every new one would be compiled anew
     def forward(self, images: Tensor) -> Tensor:
         """(B, T, H, W, 3) images of B clips to the same shape and type."""
         if not self.training:

@@ -12,6 +12,7 @@ from lightning import LightningModule
 from torch import Tensor, nn
 from torchmetrics import MeanMetric
 
+from vla.models.image_tokenizer import RandomShift
 from vla.models.model import Model
 from vla.spec import Spec
 
@@ -62,6 +63,9 @@ class Learner(LightningModule):
     def configure_model(self) -> None:
         """Compile in place, so that the names in a checkpoint stay those of the model."""
         if self._compile:
+            for part in self.model.modules():
+                if isinstance(part, RandomShift):
+                    part.forward = torch.compiler.disable(part.forward)  # type: ignore[method-assign]
             self.model.compile()
             self._compile = False  # Lightning may call this hook again
 

@@ -145,7 +145,10 @@ class Model(nn.Module, ABC):
 
     @abstractmethod
     def predict(self, batch: Batch) -> Prediction:
-        """What to do after the newest frame, of which "text" and either images or "tokens" must be known."""
+        """What to do after the newest frame, the last one that is present: what follows it must not matter.
+
+        Needs "present", "text", and the images and joints or the "tokens" of all frames.
+        """
 
     def loss(self, batch: Batch) -> dict[str, Tensor]:
         """The scalar `loss` to minimise, and its parts by name."""
@@ -194,7 +197,8 @@ class TokenModel(Model):
 
     def predict(self, batch: Batch) -> Prediction:
         """The actions that the tokenizer reads from the logits of the newest frame."""
-        logits = self(batch)["logits"][:, -1].float()  # (B, k, D, K)
+        newest = (batch["present"] * torch.arange(1, self.history + 1, device=batch["present"].device)).argmax(1)
+        logits = self(batch)["logits"][torch.arange(len(newest)), newest].float()  # (B, k, D, K)
         return Prediction(self.tokenizer.read(logits), logits.softmax(-1))
 
 

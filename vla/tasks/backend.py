@@ -21,7 +21,7 @@ def choose_backend() -> None:
         RuntimeError: no GL implementation works on this machine.
     """
     if not Path("/dev/nvidiactl").exists():
-        # Mesa's software renderer and Triton each bring an LLVM, and a process with both crashes sooner or later.
+        # Mesa's software renderer and Triton each bring an LLVM, and processes with both were seen to crash.
         # Without an NVIDIA GPU, PyTorch imports Triton but has no use for it.
         sys.modules.setdefault("triton", None)  # type: ignore[arg-type]
         logging.getLogger("torch.utils.flop_counter").setLevel(logging.ERROR)  # would complain

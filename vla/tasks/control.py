@@ -5,6 +5,8 @@ The simulator and a robot node share this file, so it needs neither MuJoCo nor t
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -32,6 +34,7 @@ DOWN = np.diag([1.0, -1.0, -1.0])  # rotation of a gripper that points straight 
 WORKSPACE = ((0.25, -0.40, 0.008), (0.75, 0.40, 0.50))  # corners of the box that the tool point stays in [m]
 
 DAMPING = 0.02  # of the least squares: bounds joint speed near singular poses
+_DAMPING = DAMPING**2 * np.eye(6)
 POSTURE_GAIN = 0.1  # how fast the elbow drifts to the home posture in the null space
 ITERATIONS = 6
 TOLERANCE = 1e-4  # [m] and [rad]
@@ -44,7 +47,7 @@ def _link(index: int) -> Array:
     return np.array([[1, 0, 0, a], [0, cosine, -sine, -d * sine], [0, sine, cosine, d * cosine], [0, 0, 0, 1.0]])
 
 
-_LINKS = [_link(index) for index in range(7)]
+_LINKS = np.stack([_link(index) for index in range(7)])
 
 
 def rotation_z(angle: float) -> Array:
@@ -70,12 +73,13 @@ def rotation_from_vector(vector: ArrayLike) -> Array:
 
 def vector_from_rotation(rotation: Array) -> Array:
     """(3,) rotation vector [rad] of a (3, 3) rotation whose angle is below pi."""
-    skew = np.array([rotation[2, 1] - rotation[1, 2], rotation[0, 2] - rotation[2, 0], rotation[1, 0] - rotation[0, 1]])
-    sine = np.linalg.norm(skew) / 2
+    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = rotation.tolist()
+    x, y, z = zy - yz, xz - zx, yx - xy
+    sine = math.sqrt(x * x + y * y + z * z) / 2
     if sine < 1e-12:
         return np.zeros(3)
-    angle = np.arctan2(sine, (np.trace(rotation) - 1) / 2)
-    return skew / (2 * sine) * angle
+    scale = math.atan2(sine, (xx + yy + zz - 1) / 2) / (2 * sine)
+    return np.array([x * scale, y * scale, z * scale])
 
 
 def forward(joints: Array) -> tuple[Array, Array]:
@@ -84,19 +88,17 @@ def forward(joints: Array) -> tuple[Array, Array]:
     Returns:
         (4, 4) homogeneous pose [m] and (6, 7) Jacobian, linear rows [m/rad] before angular rows.
     """
-    pose = np.eye(4)
-    axes, origins = np.empty((7, 3)), np.empty((7, 3))
-    for index, (link, angle) in enumerate(zip(_LINKS, joints, strict=True)):
-        pose = pose @ link
-        axes[index], origins[index] = pose[:3, 2], pose[:3, 3]
-        cosine, sine = np.cos(angle), np.sin(angle)
-        x, y = pose[:, 0].copy(), pose[:, 1].copy()
-        pose[:, 0], pose[:, 1] = cosine * x + sine * y, cosine * y - sine * x
-    pose = pose @ _TOOL
-    (ax, ay, az), (x, y, z) = axes.T, (pose[:3, 3] - origins).T
+    cosine, sine = np.cos(joints)[:, None], np.sin(joints)[:, None]
+    moved = _LINKS.copy()
+    x, y = _LINKS[:, :, 0], _LINKS[:, :, 1]
+    moved[:, :, 0], moved[:, :, 1] = cosine * x + sine * y, cosine * y - sine * x
+    for index in range(1, 7):
+        np.matmul(moved[index - 1], moved[index], out=moved[index])
+    pose = moved[6] @ _TOOL
+    # Turning about its own axis moves neither a joint's axis nor its origin.
+    (ax, ay, az), (x, y, z) = moved[:, :3, 2].T, pose[:3, 3:] - moved[:, :3, 3].T
     # The linear rows are the axis crossed with the lever, written out: numpy's cross takes longer than all the rest.
-    jacobian = np.stack([ay * z - az * y, az * x - ax * z, ax * y - ay * x, ax, ay, az])
-    return pose, jacobian
+    return pose, np.array([ay * z - az * y, az * x - ax * z, ax * y - ay * x, ax, ay, az])
 
 
 def solve(target: Array, joints: Array) -> Array:
@@ -110,7 +112,7 @@ def solve(target: Array, joints: Array) -> Array:
         error = np.concatenate([target[:3, 3] - pose[:3, 3], vector_from_rotation(target[:3, :3] @ pose[:3, :3].T)])
         if np.abs(error).max() < TOLERANCE:
             break
-        inverse = jacobian.T @ np.linalg.inv(jacobian @ jacobian.T + DAMPING**2 * np.eye(6))
+        inverse = jacobian.T @ np.linalg.inv(jacobian @ jacobian.T + _DAMPING)
         posture = POSTURE_GAIN * (HOME - joints)
         joints += inverse @ error + posture - inverse @ (jacobian @ posture)
         joints = np.minimum(np.maximum(joints, LOWEST), HIGHEST)

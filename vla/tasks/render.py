@@ -53,10 +53,11 @@ class Renderer:
 
     def _millimetres(self, reading: Array) -> Array:
         """Depth of a reverse-z buffer: 1 at the near plane, 0 at the far one (inverse of the perspective map)."""
-        near = self._model.vis.map.znear * self._model.stat.extent
-        far = self._model.vis.map.zfar * self._model.stat.extent
-        metres = near * far / (near + reading * (far - near))
-        return np.rint(np.where(reading > 0, metres, 0.0) * MILLIMETRES).astype(np.uint16)
+        near = float(self._model.vis.map.znear * self._model.stat.extent) * MILLIMETRES
+        far = float(self._model.vis.map.zfar * self._model.stat.extent) * MILLIMETRES
+        depth = near * far / (near + reading * (far - near))
+        depth *= reading > 0
+        return np.rint(depth, out=depth).astype(np.uint16)
 
     def close(self) -> None:
         """Free the GL context; without it a traceback is printed when Python exits."""

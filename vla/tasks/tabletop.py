@@ -13,7 +13,7 @@ from vla.spec import Array, Observation, Shape, Spec
 from vla.tasks.franka import FINGER_TRAVEL
 from vla.tasks.goals.goal import Goal
 from vla.tasks.goals.mixed import Mixed
-from vla.tasks.randomize.axis import Axis, stream
+from vla.tasks.randomize.axis import Axis
 from vla.tasks.render import Renderer
 from vla.tasks.scene import COLOURS, Scene
 from vla.tasks.task import CONTROL_HZ, BriskEnvironment, TabletopTask
@@ -87,7 +87,7 @@ class Tabletop:
         self.task.seed = seed
         self.dm_env.reset()
         # Two streams: an episode that is replayed without images feels the same.
-        self._feeling, self._seeing = stream(seed, "joint noise"), np.random.default_rng([seed, 1])
+        self._feeling, self._seeing = self.task.streams(seed, "joint noise"), np.random.default_rng([seed, 1])
         self.done, self.outcome, self.draws = False, self.task.judge.outcome, self.task.draws
         return self._observe()
 

@@ -19,7 +19,7 @@ from vla.tasks.goals.goal import MANNERS, Aim, Facts, Goal
 from vla.tasks.goals.mixed import Mixed
 from vla.tasks.language import Novelty
 from vla.tasks.outcome import Judge
-from vla.tasks.randomize.axis import Axis, stream
+from vla.tasks.randomize.axis import Axis, Streams
 from vla.tasks.scene import PADS, Scene
 
 CONTROL_HZ = 10.0
@@ -60,6 +60,7 @@ class TabletopTask(composer.Task):
         self.seed: int | None = None  # of the next episode; drawn from dm_control's random state when None
         self.draws: dict[str, Any] = {}
         self.instruction = ""
+        self.streams = Streams()
 
     @property
     def root_entity(self) -> Scene:
@@ -79,16 +80,15 @@ class TabletopTask(composer.Task):
         """Randomise the compiled model in place, then choose what to ask for."""
         seed = int(random_state.randint(2**31)) if self.seed is None else self.seed
         self.bound.restore()
-        draws = {
-            name: axis(self.bound, stream(seed, name)) for name, axis in self.randomize.items() if axis is not None
-        }
-        self.goal = self.goals.draw(stream(seed, "goal"))
+        axes = {name: axis for name, axis in self.randomize.items() if axis is not None}
+        draws = {name: axis(self.bound, self.streams(seed, name)) for name, axis in axes.items()}
+        self.goal = self.goals.draw(self.streams(seed, "goal"))
         self.bound.present = max(self.bound.present, self.goal.blocks)
         self.bound.finish(self.goal.pads)
         physics.forward()
         novelty = self._novelty(seed)
-        self.aim = self._choose(novelty, stream(seed, "named"))
-        self.instruction = self.goal.language.say(self._slots(), novelty, stream(seed, "language"))
+        self.aim = self._choose(novelty, self.streams(seed, "named"))
+        self.instruction = self.goal.language.say(self._slots(), novelty, self.streams(seed, "language"))
         language = {"instruction": self.instruction, "novelty": novelty or "none"}
         self.draws = {"named": self._named(), **draws, "language": language}
         data = self.bound.data
@@ -104,8 +104,10 @@ class TabletopTask(composer.Task):
 
     def _novelty(self, seed: int) -> Novelty | None:
         """What is new in this episode's instruction: nothing in training, something in some evaluations."""
-        random_state = stream(seed, "novelty")
-        if seed < FIRST_SEED or random_state.uniform() >= self.bound.novelty:
+        if seed < FIRST_SEED:
+            return None
+        random_state = self.streams(seed, "novelty")
+        if random_state.uniform() >= self.bound.novelty:
             return None
         present = set(self.bound.block_names[: self.bound.present])
         possible = present & set(self.goal.language.held_out_colours)

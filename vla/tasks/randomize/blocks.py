@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from math import dist
 from typing import Any
 
 import numpy as np
 
-from vla.spec import Array
 from vla.tasks.bound import BoundScene
 from vla.tasks.randomize.axis import Range, rounded
 from vla.tasks.scene import COLOURS, PAD_RADIUS, PADS
@@ -164,19 +164,19 @@ class Placement:
         for index, (x, y) in enumerate(blocks):
             scene.place_block(index, x, y, yaws[index])
         return {
-            "pad": rounded(pads[0]),
+            "pad": rounded(np.array(pads[0])),
             "pads": rounded(np.array(pads)),
             "blocks": rounded(np.array(blocks)),
             "yaw": rounded(yaws),
         }
 
-    def _scattered(self, radii: Sequence[float], random_state: np.random.RandomState) -> list[Array]:
-        """Centres of discs that lie apart, (2,) each; fewer where the next one found no room."""
-        centres: list[Array] = []
+    def _scattered(self, radii: Sequence[float], random_state: np.random.RandomState) -> list[tuple[float, float]]:
+        """Centres x, y of discs that lie apart; fewer where the next one found no room."""
+        centres: list[tuple[float, float]] = []
         for radius in radii:
             for _ in range(100):
-                centre = np.array([random_state.uniform(*self.x), random_state.uniform(*self.y)])
-                apart = [np.hypot(*(centre - other)) - near for other, near in zip(centres, radii, strict=False)]
+                centre = random_state.uniform(*self.x), random_state.uniform(*self.y)
+                apart = (dist(centre, other) - near for other, near in zip(centres, radii, strict=False))
                 if all(gap > radius + self.clearance for gap in apart):
                     centres.append(centre)
                     break

@@ -1,0 +1,61 @@
+"""Trained policies as programs that do what the model does."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from fake_batch import make_bc, make_rt1
+from toy import SPEC, ToyEnvironment
+
+from vla.models.model import Model
+from vla.policy import Policy
+from vla.program import Program
+
+
+@pytest.mark.parametrize(
+    "make", [lambda: make_bc(chunk=2), lambda: make_rt1(proprioception=True)], ids=["bc", "rt1 with kept tokens"]
+)
+def test_the_programs_act_like_the_policy_for_any_sentence(make: Callable[[], Model], tmp_path: Path) -> None:
+    from onnxruntime import InferenceSession
+
+    policy = Policy(model=make(), spec=SPEC)
+    folder = Program(tmp_path / "program").export(policy)
+    told = json.loads((folder / "program.json").read_text())
+    assert told["spec"] == SPEC.to_dict()
+    assert all(run["difference"] < 1e-3 and run["ms"] > 0 for run in told["act"]["runs"].values())
+    assert set(told["act"]["runs"]) == {"model", "act.pt2", "act.onnx"}
+
+    observation = ToyEnvironment().reset(0)
+    instruction = "please do something that takes a good many more words than the example had"
+    policy.reset(instruction, 0)
+    observation = observation.__class__(**{**vars(observation), "instruction": instruction})
+    expected = policy.plan(observation)
+    window = policy.window()
+    inputs = {**window.pop("rgb"), **window}
+    loaded = torch.export.load(folder / "act.pt2").module()
+    session = InferenceSession(folder / "act.onnx")
+    given = {node.name: inputs[node.name].numpy() for node in session.get_inputs()}
+    with torch.inference_mode():
+        outputs = loaded(inputs).numpy(), session.run(None, given)[0]
+    for actions in outputs:
+        assert np.clip(actions[0], SPEC.low, SPEC.high) == pytest.approx(expected, abs=1e-5)
+
+
+def test_models_that_keep_tokens_encode_one_frame_at_a_time(tmp_path: Path) -> None:
+    folder = Program(tmp_path / "program", onnx=False).export(Policy(model=make_rt1(), spec=SPEC))
+    assert sorted(path.name for path in folder.iterdir()) == ["act.pt2", "encode.pt2", "program.json"]
+    told = json.loads((folder / "program.json").read_text())
+    assert told["encode"]["inputs"]["front"] == {"dtype": "uint8", "shape": [1, 1, *SPEC.image_size, 3]}
+    assert told["act"]["inputs"]["tokens"]["shape"] == [1, 3, 6, 32]
+
+
+def test_nothing_is_written_over(tmp_path: Path) -> None:
+    (tmp_path / "program").mkdir()
+    with pytest.raises(ValueError, match=r"exists already: choose another export\.folder"):
+        Program(tmp_path / "program").export(Policy(model=make_bc(), spec=SPEC))
+    assert [path.name for path in tmp_path.iterdir()] == ["program"]

@@ -1,0 +1,67 @@
+"""The table of a sweep."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+
+import pytest
+from PIL import Image
+
+from vla.sweep import pareto, tabulate
+
+
+def cell(sweep: Path, number: int, overrides: list[str], successes: int, latency: float = 2.0, dark: int = 1) -> None:
+    """A cell as a run leaves it: 10 episodes, and 5 in the dark."""
+    folder = sweep / str(number)
+    (folder / ".hydra").mkdir(parents=True)
+    (folder / ".hydra/overrides.yaml").write_text("".join(f"- {one}\n" for one in overrides))
+    report = {
+        "success": successes / 10,
+        "successes": successes,
+        "episodes": 10,
+        "parameters": 2_000_000,
+        "latency_ms": latency,
+        "conditions": {"dark": {"successes": dark, "episodes": 5}},
+    }
+    (folder / "report.json").write_text(json.dumps(report))
+
+
+def test_seeds_are_put_together_and_the_rest_is_told_apart(tmp_path: Path) -> None:
+    for number, (model, seed, successes) in enumerate([("bc", 0, 9), ("bc", 1, 7), ("rt1", 0, 10), ("rt1", 1, 8)]):
+        cell(tmp_path, number, ["trainer.max_steps=5", f"model={model}", f"seed={seed}"], successes)
+    bc, rt1 = tabulate(tmp_path)
+    assert (bc.choices, rt1.choices) == ({"model": "bc"}, {"model": "rt1"})
+    assert (bc.successes, bc.episodes) == ({"seen": 16, "dark": 2}, {"seen": 20, "dark": 10})
+    assert bc.rates == [0.9, 0.7]
+    lines = (tmp_path / "sweep.md").read_text().splitlines()
+    assert lines[0] == "| model | seen [%] | dark [%] | each seed [%] | parameters [M] | action [ms] |"
+    # Wilson's interval of 16 of 20
+    assert lines[2] == "| bc | 80.0 (58.4-91.9) | 20.0 (5.7-51.0) | 90.0, 70.0 | 2.00 | 2.0 |"
+    rows = list(csv.DictReader((tmp_path / "sweep.csv").open()))
+    assert [(row["model"], row["condition"]) for row in rows] == [
+        ("bc", "seen"),
+        ("bc", "dark"),
+        ("rt1", "seen"),
+        ("rt1", "dark"),
+    ]
+    assert float(rows[0]["success"]) == pytest.approx(0.8) and rows[0]["cells"] == "2"
+    assert Image.open(tmp_path / "sweep.png").width > 500
+    assert not list(tmp_path.glob(".*"))
+
+
+def test_cells_that_failed_are_left_out_and_a_sweep_without_any_writes_nothing(tmp_path: Path) -> None:
+    (tmp_path / "0/.hydra").mkdir(parents=True)
+    assert tabulate(tmp_path) == []
+    assert not list(tmp_path.glob("sweep.*"))
+    cell(tmp_path, 1, ["model=bc", "seed=0"], 9)
+    (row,) = tabulate(tmp_path)
+    assert row.choices == {} and row.name == "all"
+
+
+def test_what_is_slower_and_no_better_is_off_the_front(tmp_path: Path) -> None:
+    cell(tmp_path, 0, ["model=a"], 7, latency=1.0)
+    cell(tmp_path, 1, ["model=b"], 7, latency=3.0)
+    cell(tmp_path, 2, ["model=c"], 9, latency=10.0)
+    assert [row.name for row in pareto(tabulate(tmp_path))] == ["a", "c"]

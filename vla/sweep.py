@@ -1,0 +1,162 @@
+"""What a sweep found, as one table that grows with every cell: CSV, Markdown and a picture.
+
+A cell is a folder of the sweep; cells that differ in nothing but the seed of training make one row.
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from hydra.core.utils import JobReturn
+from hydra.experimental.callback import Callback
+from hydra.types import RunMode
+from omegaconf import DictConfig
+
+SEEN = "seen"  # the condition that a policy was trained for
+SEED = "seed"  # the override that distinguishes the cells of one row
+
+
+@dataclass
+class Row:
+    """Cells that differ in their seeds alone."""
+
+    choices: dict[str, str]  # the overrides that distinguish it from the other rows
+    parameters: int
+    latencies: list[float] = field(default_factory=list)  # [ms], of each cell
+    rates: list[float] = field(default_factory=list)  # success, of each cell
+    successes: dict[str, int] = field(default_factory=dict)  # condition → of all cells
+    episodes: dict[str, int] = field(default_factory=dict)
+
+    @property
+    def name(self) -> str:
+        """What stands in the table, and beside the point in the picture."""
+        return " ".join(self.choices.values()) or "all"
+
+    @property
+    def latency(self) -> float:
+        """Median over the cells [ms]."""
+        return sorted(self.latencies)[len(self.latencies) // 2]
+
+    def interval(self, condition: str) -> tuple[float, float, float]:
+        """Success rate of all cells together and its 95 % confidence interval, which takes episodes for independent."""
+        from vla.evaluate import wilson_interval
+
+        won, played = self.successes[condition], self.episodes[condition]
+        return (won / max(played, 1), *wilson_interval(won, played))
+
+
+class Tabulate(Callback):
+    """Writes `sweep.csv`, `sweep.md` and `sweep.png` into the folder of a sweep, anew after every cell."""
+
+    def on_job_end(self, config: DictConfig, job_return: JobReturn, **kwargs: Any) -> None:
+        """Write the table of all cells that have a report by now."""
+        if config.hydra.mode == RunMode.MULTIRUN:
+            tabulate(Path(config.hydra.sweep.dir))
+
+
+def tabulate(folder: Path) -> list[Row]:
+    """Write the table of a sweep's folder, and return its rows; nothing is written where no cell has a report yet."""
+    rows = read_rows(folder)
+    if rows:
+        _whole(folder / "sweep.csv", lambda path: _write_csv(rows, path))
+        _whole(folder / "sweep.md", lambda path: path.write_text(markdown(rows), encoding="utf-8"))
+        _whole(folder / "sweep.png", lambda path: plot(rows, path))
+    return rows
+
+
+def read_rows(folder: Path) -> list[Row]:
+    """The cells that have a report, put together, in the order of the sweep."""
+    from hydra.core.override_parser.overrides_parser import OverridesParser
+    from yaml import safe_load
+
+    parser = OverridesParser.create()
+    cells = []
+    for path in sorted(folder.glob("*/report.json"), key=lambda path: (len(path.parent.name), path.parent.name)):
+        said = parser.parse_overrides(safe_load((path.parent / ".hydra/overrides.yaml").read_text(encoding="utf-8")))
+        overrides = {one.key_or_group: one.get_value_element_as_str() for one in said}
+        cells.append((overrides, json.loads(path.read_text(encoding="utf-8"))))
+    keys = dict.fromkeys(key for overrides, _ in cells for key in overrides if key != SEED)
+    telling = [key for key in keys if len({overrides.get(key) for overrides, _ in cells}) > 1]
+    rows: dict[tuple[str, ...], Row] = {}
+    for overrides, report in cells:
+        choices = {key: overrides.get(key, "default") for key in telling}
+        row = rows.setdefault(tuple(choices.values()), Row(choices, report["parameters"]))
+        row.latencies.append(report["latency_ms"])
+        row.rates.append(report["success"])
+        for condition, part in {SEEN: report, **report["conditions"]}.items():
+            row.successes[condition] = row.successes.get(condition, 0) + part["successes"]
+            row.episodes[condition] = row.episodes.get(condition, 0) + part["episodes"]
+    return list(rows.values())
+
+
+def markdown(rows: list[Row]) -> str:
+    """The table for people: success under every condition with its interval, then what each row costs."""
+    conditions = list(dict.fromkeys(condition for row in rows for condition in row.successes))
+    head = [*rows[0].choices, *(f"{name} [%]" for name in conditions), "each seed [%]", "parameters [M]", "action [ms]"]
+    lines = [head, ["---"] * len(head)]
+    for row in rows:
+        shares = []
+        for condition in conditions:
+            rate, low, high = (100 * value for value in row.interval(condition))
+            shares.append(f"{rate:.1f} ({low:.1f}-{high:.1f})")
+        seeds = ", ".join(f"{100 * rate:.1f}" for rate in row.rates)
+        lines.append([*row.choices.values(), *shares, seeds, f"{row.parameters / 1e6:.2f}", f"{row.latency:.1f}"])
+    return "".join(f"| {' | '.join(line)} |\n" for line in lines)
+
+
+def plot(rows: list[Row], path: Path) -> None:
+    """Draw success over the time of an action; the area of a point grows with the parameters, and a line joins what
+    nothing else beats in both."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(8, 5), layout="constrained")
+    axes = figure.add_subplot()
+    axes.set_xscale("log")
+    for row in rows:
+        rate, low, high = row.interval(SEEN)
+        axes.errorbar(row.latency, rate, [[rate - low], [high - rate]], color="#8a8f98", capsize=3, zorder=1)
+        axes.scatter(row.latency, rate, s=40 + 60 * (row.parameters / 1e6) ** 0.5, color="#2e9e5b", alpha=0.8)
+        label = f"{row.name}, {row.parameters / 1e6:.2f} M"
+        axes.annotate(label, (row.latency, rate), (9, 5), textcoords="offset points", fontsize=9)
+    best = pareto(rows)
+    axes.plot([row.latency for row in best], [row.interval(SEEN)[0] for row in best], color="#2e9e5b", linewidth=0.8)
+    axes.margins(x=0.25)
+    axes.set_xlabel("time of an action [ms]")
+    axes.set_ylabel("success, 95 % CI")
+    axes.grid(alpha=0.3)
+    axes.spines[["top", "right"]].set_visible(False)
+    figure.savefig(path, dpi=110, format="png")
+
+
+def pareto(rows: list[Row]) -> list[Row]:
+    """The rows that no faster one matches in success, fastest first."""
+    best: list[Row] = []
+    for row in sorted(rows, key=lambda row: (row.latency, -row.interval(SEEN)[0])):
+        if not best or row.interval(SEEN)[0] > best[-1].interval(SEEN)[0]:
+            best.append(row)
+    return best
+
+
+def _write_csv(rows: list[Row], path: Path) -> None:
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        columns = ["condition", "success", "ci_low", "ci_high", "successes", "episodes", "cells"]
+        writer.writerow([*rows[0].choices, *columns, "parameters", "latency_ms"])
+        for row in rows:
+            for condition in row.successes:
+                counts = [row.successes[condition], row.episodes[condition], len(row.rates)]
+                costs = [row.parameters, round(row.latency, 3)]
+                writer.writerow([*row.choices.values(), condition, *row.interval(condition), *counts, *costs])
+
+
+def _whole(path: Path, write: Callable[[Path], Any]) -> None:
+    """Let `write` make a file that appears when it is complete; cells may end at the same time."""
+    draft = path.with_name(f".{path.name}.{os.getpid()}")
+    write(draft)
+    os.replace(draft, path)
