@@ -10,9 +10,11 @@ import numpy as np
 import torch
 from toy import SPEC
 
+from vla.models.act import ACT
 from vla.models.action_tokenizer import ActionTokenizer, Uniform
 from vla.models.bc import BC
 from vla.models.decoder import Decoder
+from vla.models.denoiser import DenoisingModel
 from vla.models.image_tokenizer import FilmConv
 from vla.models.model import Model
 from vla.models.rt1 import RT1
@@ -125,6 +127,48 @@ def make_decoder(
         shift=(0, 0),
         spec=SPEC,
         tokenizer=tokenizer or Uniform(bins=64, spec=SPEC),
+    )
+
+
+def make_act(chunk: int = 4, execute: int = 2, auxiliary: float = 1.0, kl_weight: float = 10.0) -> ACT:
+    """A small ACT without random shifts."""
+    return ACT(
+        TINY_IMAGE,
+        TINY_TEXT,
+        chunk=chunk,
+        execute=execute,
+        keypoints=8,
+        text_width=16,
+        width=32,
+        heads=2,
+        latent=4,
+        kl_weight=kl_weight,
+        shift=(0, 0),
+        auxiliary=auxiliary,
+        spec=SPEC,
+        tokenizer=Uniform(spec=SPEC),
+    )
+
+
+def make_denoising(
+    kind: type[DenoisingModel], chunk: int = 4, execute: int = 2, auxiliary: float = 1.0
+) -> DenoisingModel:
+    """A small model that starts from noise, without random shifts."""
+    return kind(
+        TINY_IMAGE,
+        TINY_TEXT,
+        chunk=chunk,
+        execute=execute,
+        keypoints=8,
+        text_width=16,
+        width=32,
+        layers=2,
+        heads=2,
+        copies=8,
+        shift=(0, 0),
+        auxiliary=auxiliary,
+        spec=SPEC,
+        tokenizer=Uniform(spec=SPEC),
     )
 
 

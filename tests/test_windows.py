@@ -23,7 +23,7 @@ from vla.cluster import Local
 from vla.collect import collect
 from vla.data.episodes import EpisodeStore
 from vla.data.inspection import put_together
-from vla.data.windows import Gather, Memory, Stream, Windows, held_out
+from vla.data.windows import Gather, Memory, Stream, Windows, disturbed, held_out
 from vla.spec import Array
 
 EPISODES = 30
@@ -74,7 +74,10 @@ def naive(store: EpisodeStore, row: int, history: int, chunk: int) -> dict[str, 
         labels = [min(max(step + ahead, 0), entry.steps - 1) if present else 0 for ahead in range(chunk)]
         seen["proprio"] = np.concatenate([seen["joints"], seen["velocities"], seen["gripper"]])
         seen["labels"] = [rows["action"][label] for label in labels]
-        seen["valid"] = [present and step + ahead < entry.steps for ahead in range(chunk)]
+        off = disturbed(rows["action"], rows["executed"], store.spec)
+        seen["valid"] = [
+            present and step + ahead < entry.steps and not off[step : step + ahead].any() for ahead in range(chunk)
+        ]
         seen["present"] = present
         frames.append(seen)
     return {name: np.stack([frame[name] for frame in frames]) for name in frames[0]} | {"text": entry.instruction}
@@ -97,6 +100,20 @@ def test_a_batch_is_what_a_loop_over_the_episodes_gives(folder: Path, history: i
         beyond = ~usable & expected["present"][:, None]
         np.testing.assert_array_equal(batch["action"][place].numpy()[beyond], expected["labels"][beyond])
         assert batch["instruction"][place] == expected["text"]
+
+
+def test_what_follows_an_excursion_is_no_label_for_what_came_before() -> None:
+    label = np.array([0.04, -0.01, 1.0])
+    executed = [
+        label,
+        label * [1.4, 0.7, 1],
+        label + np.array([0, 0.004, 0]),
+        [0.0, -0.01, 1.0],
+        label * [1, -1, 1],
+        [0.04, 0, 0],
+    ]
+    off = disturbed(np.tile(label, (6, 1)), np.array(executed), toy.SPEC)
+    assert off.tolist() == [False, False, False, True, True, True]
 
 
 def test_chosen_episodes_give_the_windows_that_they_gave(folder: Path, tmp_path: Path) -> None:
@@ -129,8 +146,15 @@ def test_shapes_and_types_are_those_of_the_contract(folder: Path) -> None:
 
 
 def test_nothing_is_labelled_before_the_start_or_beyond_the_end(folder: Path) -> None:
-    entry = EpisodeStore(folder).episodes[1]
-    batch = Gather(EpisodeStore(folder), history=3, chunk=2)(np.array([entry.start, entry.start + entry.steps - 1]))
+    store = EpisodeStore(folder)
+    off = disturbed(store.rows("action")[:], store.rows("executed")[:], store.spec)
+    entry = next(
+        entry
+        for entry in store.episodes
+        for last in [entry.start + entry.steps - 1]
+        if not off[[entry.start, last - 2, last - 1, last]].any()
+    )
+    batch = Gather(store, history=3, chunk=2)(np.array([entry.start, entry.start + entry.steps - 1]))
     assert batch["present"].tolist() == [[False, False, True], [True, True, True]]
     assert batch["valid"][0].tolist() == [[False, False], [False, False], [True, True]]
     assert batch["valid"][1].tolist() == [[True, True], [True, True], [True, False]]

@@ -69,7 +69,7 @@ def read_checkpoint(path: str | Path) -> Checkpoint:
 
 
 class Policy:
-    """Acts with a model: keeps its history, encodes every frame once, executes chunks of actions one by one.
+    """Acts with a model: keeps its history, encodes every frame once, executes as much of each chunk as the model says.
 
     Args:
         device: where to compute; "auto" takes a GPU if there is one.
@@ -112,7 +112,8 @@ class Policy:
         self.reset("", 0)
 
     def reset(self, instruction: str, seed: int) -> None:
-        """Forget the past; a policy draws nothing, so `seed` is not used."""
+        """Forget the past; what the model draws from now on follows from `seed`."""
+        self._random = torch.Generator().manual_seed(seed)
         self._frames.clear()
         self._chunk.clear()
         self._instruction = instruction
@@ -128,7 +129,7 @@ class Policy:
         if not self._chunk:
             actions, probabilities = self._predict()
             told = [{}] * len(actions) if probabilities is None else [{"probabilities": each} for each in probabilities]
-            self._chunk.extend(zip(actions, told, strict=True))
+            self._chunk.extend(list(zip(actions, told, strict=True))[: self.model.execute])
         action, self.info = self._chunk.popleft()
         return action
 
@@ -149,8 +150,9 @@ class Policy:
     @torch.inference_mode()
     def _predict(self) -> tuple[Array, Array | None]:
         """Actions (k, D), clipped, and token probabilities (k, D, K), where the model has them."""
+        drawn = torch.randn(1, self.model.chunk, len(self.spec.action), generator=self._random)
         with self._computing():
-            actions, probabilities = self._decide(self.window())
+            actions, probabilities = self._decide({**self.window(), "noise": drawn.to(self.device)})
         told = None if probabilities is None else probabilities[0].float().cpu().numpy()
         return np.clip(actions[0].float().cpu().numpy(), self._low, self._high), told
 

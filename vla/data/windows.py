@@ -31,9 +31,22 @@ Batch = dict[str, Any]
 TYPES = {np.dtype(np.uint8): torch.uint8, np.dtype(np.uint16): torch.int32, np.dtype(np.float32): torch.float32}
 NUMPY = {torch.uint8: np.uint8, torch.int32: np.int32, torch.float32: np.float32}
 
+# An action was disturbed where another was executed instead: off by more than this part of it, and of its range.
+PART, OF_RANGE = 0.6, 0.05
+
 # Multiplying by the golden ratio spreads consecutive seeds evenly over the circle of 32-bit numbers (Knuth, The Art of
 # Computer Programming 3, section 6.4): every stretch of seeds gets its share of held-out episodes.
 GOLDEN = 2654435769
+
+
+def disturbed(action: Array, executed: Array, spec: Spec) -> Array:
+    """(N,) bool: whether something else than the (N, D) labels was executed, more than noise in proportion to them.
+
+    What the expert did from then on answers what nobody could foresee.
+    """
+    least = OF_RANGE * (np.array(spec.high) - np.array(spec.low))
+    off: Array = (np.abs(executed - action) > np.maximum(PART * np.abs(action), least)).any(1)
+    return off
 
 
 def held_out(seed: int, fraction: float) -> bool:
@@ -83,6 +96,8 @@ class Gather:
         self._numbers = np.concatenate([store.rows(name)[:] for name in names], axis=1)
         self._truth_size = store.spec.truth_size
         self._action = store.rows("action")
+        off = disturbed(self._action[:], store.rows("executed")[:], store.spec)
+        self._disturbances = np.append(0, off.cumsum())  # before each row
         entries = store.episodes
         self._instructions = [entry.instruction for entry in entries]
         self._first = np.array([entry.start for entry in entries])
@@ -91,8 +106,9 @@ class Gather:
     def __call__(self, windows: Array) -> Batch:
         """The batch of `windows` (B,), row numbers.
 
-        A frame before the start of the episode is all zeros, not present, and has no valid label; a label beyond the
-        end repeats the last action and is not valid.
+        A frame before the start of the episode is all zeros, not present, and has no valid label. A label is not valid
+        either if a step between its frame and itself was disturbed, or if it lies beyond the end, where it repeats the
+        last action. So the valid labels of a frame come first.
         """
         episode = self._first.searchsorted(windows, side="right") - 1  # (B,)
         first, last = self._first[episode, None], self._last[episode, None]
@@ -102,6 +118,7 @@ class Gather:
         valid = (labels <= last[:, :, None]) & present[:, :, None]
         labels = np.minimum(np.maximum(labels, first[:, :, None]), last[:, :, None])
         frames = np.maximum(frames, first)
+        valid &= self._disturbances[labels] == self._disturbances[frames][:, :, None]
         absent = None if present.all() else ~present
         batch: Batch = {
             kind: {camera: self._take(rows, frames, absent) for camera, rows in cameras.items()}

@@ -84,7 +84,10 @@ class Model(nn.Module, ABC):
     A batch is a dict:
         rgb: camera → (B, T, H, W, 3) uint8; proprio: (B, T, P) float32; present: (B, T) bool, false for padding;
         text: from `model.text.tokenize`; and to learn from, action: (B, T, k, D) float32,
-        valid: (B, T, k) bool, truth: (B, T, S) float32.
+        valid: (B, T, k) bool, true for the first so many of a frame, truth: (B, T, S) float32. A model that draws its
+        actions draws them with noise: (B, k, D) float32, standard normal, where it is given.
+
+    Of the k actions a policy executes `execute`, all unless a model says otherwise, before it looks again.
 
     Args:
         history: T, the frames the model looks at.
@@ -108,6 +111,7 @@ class Model(nn.Module, ABC):
     ) -> None:
         super().__init__()
         self.history, self.chunk, self.auxiliary = history, chunk, auxiliary
+        self.execute = chunk
         self.spec, self.tokenizer, self.text = spec, tokenizer, text
         self.posture_width = len(spec.joints) + 1
         self.truth_head: nn.Linear | None = None
