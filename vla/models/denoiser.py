@@ -15,10 +15,10 @@ import torch
 from torch import Tensor, nn
 
 from vla.models.action_tokenizer import ActionTokenizer
+from vla.models.chunks import ChunkModel, mean_where
 from vla.models.image_tokenizer import ImageEncoder
 from vla.models.model import Batch, Prediction
 from vla.models.text import TextEncoder
-from vla.models.trunk import ChunkModel, mean_where
 from vla.spec import Spec
 
 FASTEST, SLOWEST = 100.0, 1.0  # frequencies of the embedding of time, which runs from 0 to 1 [rad]

@@ -13,9 +13,9 @@ from fake_batch import make_act, make_batch, make_denoising, overfit, with_text
 from test_policy import observations
 from toy import SPEC, ToyEnvironment
 
+from vla.models.chunks import ChunkModel
 from vla.models.diffusion import Diffusion
 from vla.models.flow import Flow
-from vla.models.trunk import ChunkModel
 from vla.policy import Policy
 from vla.rollout import rollout
 
