@@ -160,12 +160,13 @@ def test_killed_seven_times_at_random_an_export_goes_on_and_ends_up_the_same(
     config = OmegaConf.to_container(composed(name, killed, "export.workers=2"))
     script.write_text(EXPORT.format(config=config, store=str(store.folder), episodes=episodes))
     for share in sorted(np.random.default_rng().uniform(0, 1, 7)):
+        environment = {**os.environ, "PYTHONPATH": TESTS}
         process = subprocess.Popen(
-            [sys.executable, str(script)], env={**os.environ, "PYTHONPATH": TESTS}, stdout=subprocess.DEVNULL
+            [sys.executable, str(script)], env=environment, stdout=subprocess.DEVNULL, start_new_session=True
         )
         while process.poll() is None and written(killed) < share * written(whole):
             time.sleep(0.002)
-        process.send_signal(signal.SIGKILL)
+        os.killpg(process.pid, signal.SIGKILL)  # with its workers, which would otherwise write on for a moment
         process.wait()
     exporter(name, killed, "export.workers=1").export(store)
     assert content(killed) == content(whole)
