@@ -6,8 +6,10 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
 from dm_control import composer, mjcf
 
+from vla.spec import Array
 from vla.tasks.control import HAND_TO_TCP, HAND_YAW, JOINT_HIGH, JOINT_LOW
 
 # Body placement in its parent: offset [m] and quaternion wxyz (the Denavit-Hartenberg chain of control.py).
@@ -76,6 +78,7 @@ FINGER_SPEED = 0.2  # of each finger [m/s], ibid.
 GRIP_STIFFNESS, GRIP_DAMPING = 1000.0, 40.0  # of the finger servo [N/m], [N s/m]
 GRIP_FORCE = 20.0  # of both fingers together [N]; the Franka Hand gives up to 70 N continuously
 
+CORNERS = 64  # of every part of the robot that is drawn lightly
 SHELL = (0.93, 0.94, 0.95, 1.0)
 DARK = (0.22, 0.23, 0.25, 1.0)
 # Robot geometry collides with the world but not with itself.
@@ -95,11 +98,27 @@ def mesh_folder() -> Path:
     return Path(found.origin).parent / "envs/assets/kitchen_franka/franka_assets/meshes"
 
 
+def read_corners(path: Path) -> Array:
+    """(N, 3) corners of the triangles in a binary STL file [m], each of them once."""
+    triangle = np.dtype([("normal", "<3f4"), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
+    return np.unique(np.fromfile(path, triangle, offset=84)["corners"].reshape(-1, 3), axis=0)
+
+
+def spread(points: Array, count: int) -> Array:
+    """At most `count` of the (N, 3) points, each the farthest from those before it."""
+    chosen = [int(np.linalg.norm(points - points.mean(0), axis=1).argmax())]
+    nearest = np.linalg.norm(points - points[chosen[0]], axis=1)
+    while len(chosen) < min(count, len(points)):
+        chosen.append(int(nearest.argmax()))
+        nearest = np.minimum(nearest, np.linalg.norm(points - points[chosen[-1]], axis=1))
+    return points[chosen]
+
+
 class Panda(composer.Entity):
     """Seven position-servoed joints with gravity compensation and a gripper whose fingers share one servo."""
 
     def _build(self, meshes: Literal["light", "full"] = "light") -> None:
-        """Args: meshes: what is drawn, "light" (2 300 faces) or "full" (134 000). Collisions are the same."""
+        """Args: meshes: what is drawn, "light" (1 200 faces) or "full" (134 000). Collisions are the same."""
         self._mjcf_root = mjcf.RootElement(model="panda")
         self._mjcf_root.compiler.angle = "radian"
         self._meshes = meshes
@@ -119,22 +138,17 @@ class Panda(composer.Entity):
         names = [*(f"link{index}" for index in range(8)), "hand", "finger"]
         for name in names:
             self._mjcf_root.asset.add("mesh", name=name, file=str(folder / "collision" / f"{name}.stl"))
-        if self._meshes == "full":
-            for name in names:
-                file = folder / "visual" / f"{name}.stl"
-                if file.is_file():
-                    self._mjcf_root.asset.add("mesh", name=f"{name}_full", file=str(file))
+            if self._meshes == "light":
+                # Convex, like what they are made of; every face is drawn twice per camera, for the shadows too.
+                corners = spread(read_corners(folder / "collision" / f"{name}.stl"), CORNERS)
+                self._mjcf_root.asset.add("mesh", name=f"{name}_seen", vertex=corners.ravel())
+            else:
+                self._mjcf_root.asset.add("mesh", name=f"{name}_seen", file=str(folder / "visual" / f"{name}.stl"))
 
     def _add_mesh(self, body: mjcf.Element, mesh: str, rgba: tuple[float, ...], collide: bool = True) -> None:
-        contact = ROBOT_CONTACT if collide else NO_CONTACT
-        full = self._mjcf_root.find("mesh", f"{mesh}_full")
-        visible = {"rgba": rgba, "mass": 0}
-        if full is None:
-            body.add("geom", type="mesh", mesh=mesh, group=2, **visible, **contact)
-            return
-        body.add("geom", type="mesh", mesh=full, group=2, **visible, **NO_CONTACT)
+        body.add("geom", type="mesh", mesh=f"{mesh}_seen", group=2, rgba=rgba, mass=0, **NO_CONTACT)
         if collide:
-            body.add("geom", type="mesh", mesh=mesh, group=3, mass=0, **contact)
+            body.add("geom", type="mesh", mesh=mesh, group=3, mass=0, **ROBOT_CONTACT)
 
     def _add_link(self, parent: mjcf.Element, index: int, link: dict[str, Any]) -> mjcf.Element:
         body = parent.add("body", name=f"link{index + 1}", pos=link["pos"], quat=link["quat"], gravcomp=1)
