@@ -136,20 +136,19 @@ class Gather:
         return batch
 
     def _take(self, rows: Rows, index: Array, absent: Array | None = None) -> torch.Tensor:
-        tensor = self._empty((*index.shape, *rows.shape[1:]), TYPES[rows.dtype])
-        values = tensor.numpy()
+        values = self._empty((*index.shape, *rows.shape[1:]), TYPES[rows.dtype])
         if values.dtype == rows.dtype:
             rows.take(index, axis=0, out=values, mode="clip")  # "clip" writes into `out` directly
         else:
             values[...] = rows.take(index, axis=0)
         if absent is not None:
             values[absent] = 0  # many times faster than through torch
-        return tensor
+        return torch.from_numpy(values)
 
-    def _empty(self, shape: tuple[int, ...], dtype: torch.dtype) -> torch.Tensor:
+    def _empty(self, shape: tuple[int, ...], dtype: torch.dtype) -> Array:
         if self._pin:
-            return torch.empty(shape, dtype=dtype, pin_memory=True)
-        return torch.from_numpy(self._memory.empty(shape, NUMPY[dtype]))
+            return torch.empty(shape, dtype=dtype, pin_memory=True).numpy()
+        return self._memory.empty(shape, NUMPY[dtype])
 
     def _own(self, values: Array) -> torch.Tensor:
         tensor = torch.from_numpy(values)
