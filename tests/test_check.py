@@ -32,7 +32,7 @@ def config(**changes: Any) -> DictConfig:
             "checkpoint": None,
             "output": "outputs/runs/now",
             "collect": {"episodes": 5, "seed": 0, "workers": None, "folder": "outputs/episodes/x"},
-            "evaluate": {"episodes": 5, "seed": 1_000_000, "workers": None, "recordings": 2},
+            "evaluate": {"episodes": 5, "seed": 1_000_000, "workers": None, "recordings": 2, "conditions": {}},
             "preview": {"episodes": 1, "seed": 0},
             "benchmark": {
                 "names": ["train"],

@@ -14,9 +14,9 @@ from toy import SPEC, make_environment, make_expert
 from vla.cluster import Local
 from vla.collect import collect
 from vla.data.episodes import EpisodeStore
+from vla.data.gather import Gather
 from vla.data.inspection import examine, put_together, require_whole
 from vla.data.packed import Packed
-from vla.data.windows import Gather
 
 
 def packed(tmp_path: Path, **settings: Any) -> EpisodeStore:

@@ -22,8 +22,9 @@ from lightning.pytorch.callbacks import ModelCheckpoint
 from vla.cluster import Local
 from vla.collect import collect
 from vla.data.episodes import EpisodeStore
+from vla.data.gather import Gather, Memory, disturbed
 from vla.data.inspection import put_together
-from vla.data.windows import Gather, Memory, Stream, Windows, disturbed, held_out
+from vla.data.windows import Stream, Windows, held_out
 from vla.spec import Array
 
 EPISODES = 30

@@ -1,7 +1,6 @@
 """A composed config against the signatures of the classes it names, before any work, and the objects it describes.
 
 The `__init__` of a class is the schema of its node: names, which of them are needed, types and allowed values.
-`Annotated[int, 1]` is a number that is at least 1.
 """
 
 from __future__ import annotations
@@ -9,18 +8,17 @@ from __future__ import annotations
 import hashlib
 import inspect
 import json
-import os
-import types
-from collections.abc import Collection, Iterable, Iterator, Mapping, MutableMapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from difflib import get_close_matches
 from importlib import import_module
-from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
+from typing import Annotated, Any, Literal, get_args, get_origin
 
 from hydra.errors import InstantiationException
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
+
+from vla.annotations import describe, matches
 
 # What a `_target_` may name: configs also come out of checkpoints, which may come from anybody.
 ALLOWED = ("vla.", "torch.", "lightning.", "dm_control.composer.variation.")
@@ -91,14 +89,6 @@ PLAIN: dict[str, Any] = {
 GROUPS = tuple(dict.fromkeys(group for groups in JOBS.values() for group in groups))
 
 HYDRA_KEYS = ("_target_", "_partial_", "_convert_", "_recursive_")
-LISTS = (list, Sequence, Collection, Iterable, object)
-MAPPINGS = (dict, Mapping, MutableMapping, object)
-SCALARS: dict[type, tuple[Any, ...]] = {
-    bool: (bool, object),
-    int: (int, float, object),
-    float: (float, object),
-    str: (str, Path, os.PathLike, object),
-}
 
 
 def build(node: DictConfig | Mapping[str, Any], **runtime: Any) -> Any:
@@ -241,10 +231,10 @@ def _check_plain(key: str, value: Any, annotation: Any) -> None:
 
 
 def _check_value(key: str, value: Any, annotation: Any) -> None:
-    if not _matches(value, annotation):
+    if not matches(value, annotation):
         choices = [str(choice) for choice in get_args(annotation)] if get_origin(annotation) is Literal else []
         hint = suggestion(str(value), choices)
-        raise ValueError(f"{key} must be {_describe(annotation)}, got {value!r}{hint}")
+        raise ValueError(f"{key} must be {describe(annotation)}, got {value!r}{hint}")
     if isinstance(value, dict) and "_target_" in value:
         return check_node(key, value)
     children = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
@@ -267,52 +257,6 @@ def _hints(target: type) -> dict[str, Any]:
         with suppress(NameError):  # a name that exists for type checkers only
             hints[name] = eval(annotation, init.__globals__) if isinstance(annotation, str) else annotation
     return hints
-
-
-def _matches(value: Any, annotation: Any) -> bool:
-    kind, arguments = get_origin(annotation) or annotation, get_args(annotation)
-    if kind is Any or isinstance(kind, TypeVar):
-        return True
-    if kind in (Union, types.UnionType):
-        return any(_matches(value, argument) for argument in arguments)
-    if kind is Annotated:
-        return _matches(value, arguments[0]) and value >= arguments[1]
-    if kind is Literal:
-        return any(type(value) is type(choice) and value == choice for choice in arguments)
-    if value is None:
-        return kind in (None, types.NoneType, object)
-    if isinstance(value, dict):
-        if "_target_" in value:
-            return kind not in (bool, int, float, str, Path)
-        of = arguments[1] if arguments else Any
-        return kind in MAPPINGS and all(_matches(item, of) for item in value.values())
-    if isinstance(value, list):
-        return _matches_list(value, kind, arguments)
-    return kind in SCALARS.get(type(value), ())
-
-
-def _matches_list(value: list[Any], kind: Any, arguments: tuple[Any, ...]) -> bool:
-    if kind is tuple and arguments and arguments[-1] is not Ellipsis:
-        pairs = zip(value, arguments, strict=False)
-        return len(value) == len(arguments) and all(_matches(item, argument) for item, argument in pairs)
-    arrays = getattr(kind, "__name__", "") == "ndarray"
-    return arrays or (kind in (*LISTS, tuple) and all(_matches(item, arguments[0]) for item in value if arguments))
-
-
-def _describe(annotation: Any) -> str:
-    kind, arguments = get_origin(annotation), get_args(annotation)
-    if kind is Literal:
-        return f"one of {', '.join(str(choice) for choice in arguments)}"
-    if kind in (Union, types.UnionType):
-        return " or ".join(_describe(argument) for argument in arguments)
-    if kind is Annotated:
-        return f"{_describe(arguments[0])}, at least {arguments[1]}"
-    if annotation in (None, types.NoneType):
-        return "null"
-    if arguments:
-        inner = ", ".join("…" if argument is Ellipsis else _describe(argument) for argument in arguments)
-        return f"{getattr(kind, '__name__', kind)}[{inner}]"
-    return str(getattr(annotation, "__name__", annotation))
 
 
 OmegaConf.register_new_resolver("digest", digest, replace=True)
