@@ -173,18 +173,10 @@ class TokenModel(Model):
 
     tokenizer: PerComponent
 
-    def __init__(
-        self,
-        history: int,
-        chunk: int,
-        text: TextEncoder,
-        auxiliary: float,
-        truth_width: int,
-        spec: Spec,
-        tokenizer: PerComponent,
-    ) -> None:
-        super().__init__(history, chunk, text, auxiliary, truth_width, spec, tokenizer)
-        self.logits_shape = (chunk, len(spec.action), tokenizer.bins)
+    @property
+    def logits_shape(self) -> tuple[int, int, int]:
+        """k, D and K."""
+        return self.chunk, len(self.spec.action), self.tokenizer.bins
 
     def action_loss(self, output: dict[str, Tensor], batch: Batch) -> dict[str, Tensor]:
         """The tokenizer's loss over all frames and, outside training, the share of tokens that are right."""
