@@ -98,7 +98,8 @@ class Gather:
         valid = (labels <= last[:, :, None]) & present[:, :, None]
         labels = np.minimum(np.maximum(labels, first[:, :, None]), last[:, :, None])
         frames = np.maximum(frames, first)
-        valid &= self._disturbances[labels] == self._disturbances[frames][:, :, None]
+        if len(self._aheads) > 1:  # nothing lies between a frame and its own label
+            valid &= self._disturbances[labels] == self._disturbances[frames][:, :, None]
         absent = None if present.all() else ~present
         batch: Batch = {
             kind: {camera: self._take(rows, frames, absent) for camera, rows in cameras.items()}
