@@ -1,6 +1,6 @@
 """A transformer decoder that writes a chunk of actions token by token, looking at images, posture and sentence.
 
-Shapes: B batch, T frames, N tokens per frame, M = T·N + 1 tokens of memory, k action chunk, L action tokens, K bins,
+Shapes: B batch, T frames, N tokens per frame, M = T·N + 2 tokens of memory, k action chunk, L action tokens, K bins,
 E width of a token.
 """
 
@@ -65,6 +65,9 @@ def _attend(
 
 class Decoder(FrameModel):
     """`nn.TransformerDecoder` over action tokens, each of which sees those before it and all that was perceived.
+
+    Before the first token stands one in which all of the newest frame and the sentence have met in an MLP: attention
+    alone, which starts out looking everywhere, takes several times as long to find what counts.
 
     It learns from the newest frame of a window, with the right tokens before the one that it has to guess. When it
     acts, the most likely token is what the next one follows, while the action is read by the tokenizer.
@@ -134,8 +137,14 @@ class Decoder(FrameModel):
         self.length = tokenizer.length(chunk)  # L
         self.sentence_token = nn.Linear(text_width, width)
         self.memory_norm = nn.LayerNorm(width)
-        self.start = tokenizer.bins  # stands before the first token
-        self.embedding = nn.Embedding(tokenizer.bins + 1, width)
+        self.meet = nn.Sequential(
+            nn.Linear((self.tokens + 1) * width, 2 * width),
+            nn.ReLU(),
+            nn.Linear(2 * width, 2 * width),
+            nn.ReLU(),
+            nn.Linear(2 * width, width),
+        )
+        self.embedding = nn.Embedding(tokenizer.bins, width)
         self.memory_positions = nn.Embedding(history * self.tokens, width)
         self.positions = nn.Embedding(self.length, width)
         for embedding in (self.embedding, self.memory_positions, self.positions):
@@ -156,10 +165,10 @@ class Decoder(FrameModel):
         """
         tokens = self.tokenizer.tokenize(batch["action"][:, -1])
         before = self.tokenizer.drawn(tokens, batch["action"][:, -1]) if self.training else tokens
-        hidden = self.decode(before[:, :-1], *self.memory(batch))
-        output = {"logits": self.head(hidden), "tokens": tokens}
+        memory, absent = self.memory(batch)
+        output = {"logits": self.head(self.decode(before[:, :-1], memory, absent)), "tokens": tokens}
         if self.truth_head is not None:
-            output["truth"] = self.truth_head(hidden[:, :1])  # where no action was seen yet
+            output["truth"] = self.truth_head(memory[:, -1:])
         return output
 
     def action_loss(self, output: dict[str, Tensor], batch: Batch) -> dict[str, Tensor]:
@@ -183,7 +192,8 @@ class Decoder(FrameModel):
     def memory(self, batch: Batch) -> tuple[Tensor, Tensor]:
         """What the decoder looks at, (B, M, E), and (B, M) bool, true where there is nothing.
 
-        There may be fewer frames than `history`: where a token stands counts from the newest.
+        The last token is the one in which all have met. There may be fewer frames than `history`: where a token stands
+        counts from the newest.
         """
         frames = batch["tokens"] if "tokens" in batch else self.encode(batch)
         present = batch["present"]
@@ -194,15 +204,16 @@ class Decoder(FrameModel):
         seen = frames.flatten(1, 2)  # (B, T·N, E)
         seen = seen + self.memory_positions.weight[-seen.shape[1] :]
         sentence = self.sentence_token(self.text(batch["text"])).unsqueeze(1)
+        met = self.meet(torch.cat([frames[:, -1], sentence], 1).flatten(1)).unsqueeze(1)
         absent = ~present.gather(1, places).repeat_interleave(self.tokens, 1)
-        return self.memory_norm(torch.cat([seen, sentence], 1)), F.pad(absent, (0, 1))
+        return self.memory_norm(torch.cat([seen, sentence, met], 1)), F.pad(absent, (0, 2))
 
     def decode(self, tokens: Tensor, memory: Tensor, absent: Tensor) -> Tensor:
         """(B, n) tokens, the first n of a sequence, to what precedes each of the first n + 1: (B, n + 1, E)."""
-        started = F.pad(tokens, (1, 0), value=self.start)
+        started = torch.cat([memory[:, -1:], self.embedding(tokens)], 1)
         length = started.shape[1]
         hidden = self.decoder(
-            self._embed(started, 0),
+            started + self.positions.weight[:length],
             memory,
             tgt_mask=self.mask[:length, :length],
             memory_key_padding_mask=absent,
@@ -217,22 +228,18 @@ class Decoder(FrameModel):
         They are L, or fewer if all sequences of the batch have ended.
         """
         layers = [CachedLayer(layer, memory, absent) for layer in self.decoder.layers]
-        token = torch.full((len(memory), 1), self.start, device=memory.device)
-        ended = torch.zeros_like(token, dtype=torch.bool)
+        following = memory[:, -1:]
+        ended = torch.zeros(len(memory), 1, dtype=torch.bool, device=memory.device)
         logits, tokens = [], []
         for place in range(self.length):
-            x = self._embed(token, place)
+            x = following + self.positions.weight[place]
             for layer in layers:
                 x = layer(x)
             logits.append(self.head(self.norm(x)).float())
             token = logits[-1].argmax(-1)
             tokens.append(token)
+            following = self.embedding(token)
             ended = ended | (token == self.tokenizer.end)
             if self.tokenizer.end >= 0 and ended.all():
                 break
         return torch.cat(logits, 1), torch.cat(tokens, 1)
-
-    def _embed(self, tokens: Tensor, place: int) -> Tensor:
-        """(B, n) tokens, of which the first stands at `place`, to (B, n, E)."""
-        embedded: Tensor = self.embedding(tokens)
-        return embedded + self.positions.weight[place : place + tokens.shape[1]]
