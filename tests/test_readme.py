@@ -80,8 +80,10 @@ def test_the_command_runs(home: Path, command: str, request: pytest.FixtureReque
         small += ["collect.folder=remote", "collect.episodes=4"]
     if "experiment=ablation" in arguments:
         small += ["variant=no_transformer,no_history", "seed=0", "hydra.sweep.dir=ablation"]
-    if "model=rt1" in arguments:  # a second per frame
+    if "model=rt1" in arguments:  # at full size a second per frame
         small += [
+            "model.history=2",
+            "model.image_size=96",
             "data.batch_size=1",
             "data.validation_windows=1",
             "trainer.max_steps=1",
