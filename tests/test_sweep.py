@@ -63,5 +63,6 @@ def test_cells_that_failed_are_left_out_and_a_sweep_without_any_writes_nothing(t
 def test_what_is_slower_and_no_better_is_off_the_front(tmp_path: Path) -> None:
     cell(tmp_path, 0, ["model=a"], 7, latency=1.0)
     cell(tmp_path, 1, ["model=b"], 7, latency=3.0)
-    cell(tmp_path, 2, ["model=c"], 9, latency=10.0)
+    cell(tmp_path, 2, ["model=c"], 10, latency=10.0)
+    cell(tmp_path, 3, ["model=d"], 0, latency=20.0)
     assert [row.name for row in pareto(tabulate(tmp_path))] == ["a", "c"]

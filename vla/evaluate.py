@@ -119,7 +119,9 @@ def wilson_interval(successes: int, trials: int) -> tuple[float, float]:
     share, spread = successes / trials, NORMAL_QUANTILE**2 / trials
     centre = (share + spread / 2) / (1 + spread)
     half_width = sqrt(spread * (share * (1 - share) + spread / 4)) / (1 + spread)
-    return max(0.0, centre - half_width), min(1.0, centre + half_width)
+    # At the ends the interval begins or ends exactly there, but for rounding.
+    low = centre - half_width if successes else 0.0
+    return low, centre + half_width if successes < trials else 1.0
 
 
 def evaluate(
