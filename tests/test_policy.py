@@ -82,8 +82,8 @@ def test_only_the_newest_frame_is_encoded() -> None:
 
 def test_compiled_it_acts_the_same() -> None:
     torch.manual_seed(0)
-    model = make_rt1(history=2)
-    seen = observations(4)
+    model = make_bc()
+    seen = observations(3)
     eager = act(Policy(model=model, spec=SPEC), seen)
     assert act(Policy(compile=True, model=model, spec=SPEC), seen) == pytest.approx(eager, abs=1e-5)
 
