@@ -14,7 +14,7 @@ from fake_batch import Motions
 from toy import SPEC
 
 from vla.models.action_tokenizer import RT1, ActionTokenizer, PerComponent, Uniform
-from vla.models.fast import Fast, cosines
+from vla.models.fast import Fast
 from vla.models.fidelity import fidelity
 from vla.models.quantile import Quantile
 
@@ -239,104 +239,3 @@ def test_tokens_are_drawn_from_the_targets() -> None:
     off = (soft.drawn(tokens, chunks) - tokens)[:, :2].double()
     assert off.std().item() == pytest.approx(3.0, rel=0.1) and abs(off.mean().item()) < 0.2
     assert torch.equal(hard.drawn(tokens, chunks), tokens)
-
-
-def test_quantile_bins_hold_as_many_actions_each() -> None:
-    tokenizer = Quantile(bins=64, spec=SPEC, statistics=MOTIONS)
-    tokens = tokenizer.encode(torch.from_numpy(MOTIONS.actions))
-    counts = tokens[:, 1].bincount(minlength=64)
-    assert counts.min() >= 4000 // 64 - 1 and counts.max() <= 4000 // 64 + 2
-
-
-def test_quantile_reads_a_bin_as_the_mean_of_its_data() -> None:
-    tokenizer = Quantile(bins=16, spec=SPEC, statistics=MOTIONS)
-    tokens = tokenizer.encode(torch.from_numpy(MOTIONS.actions))
-    for token in range(16):
-        inside = MOTIONS.actions[(tokens[:, 0] == token).numpy(), 0]
-        assert tokenizer.decode(torch.tensor([token] * 3))[0] == pytest.approx(inside.mean(), abs=1e-7)
-
-
-def test_values_that_occur_often_are_one_bin_each() -> None:
-    actions = np.array([[-0.05, 0.01, 0.0]] * 50 + [[0.02, 0.01, 1.0]] * 30 + [[0.05, 0.01, 1.0]] * 20, np.float32)
-    statistics = Motions()
-    statistics.actions, statistics.low, statistics.high = actions, actions.min(0), actions.max(0)
-    tokenizer = Quantile(bins=32, spec=SPEC, statistics=statistics)
-    tokens = tokenizer.encode(torch.from_numpy(actions))
-    assert [len(column.unique()) for column in tokens.T] == [3, 1, 2]
-    assert torch.allclose(tokenizer.decode(tokens), torch.from_numpy(actions), atol=1e-7)
-    near = tokenizer.encode(torch.tensor([[0.02 - 1e-4, 0.01, 1.0 - 1e-5]]))  # what rounding does changes nothing
-    assert torch.equal(near[0], tokens[60])
-
-
-def test_cosines_are_the_transform_of_the_book() -> None:
-    moments = np.arange(6)
-    for frequency, row in enumerate(cosines(6).numpy()):
-        wave = np.cos(np.pi * (moments + 0.5) * frequency / 6)
-        assert row == pytest.approx(wave / np.linalg.norm(wave), abs=1e-6)
-
-
-def test_fast_needs_fewer_tokens_than_there_are_components() -> None:
-    tokenizer = EVERY["fast"]
-    tokens = tokenizer.tokenize(torch.from_numpy(CHUNKS.copy()))
-    written = tokenizer.learned(tokens, torch.ones(len(CHUNKS), 8, dtype=torch.bool)).sum(1)
-    assert written.float().mean() < 0.6 * 8 * 3 and written.max() <= 25
-    ends = tokens.gather(1, written[:, None] - 1)
-    assert (ends == tokenizer.end).all()
-
-
-def test_fast_writes_the_same_in_mixed_precision() -> None:
-    tokenizer, chunks = EVERY["fast"], torch.from_numpy(CHUNKS.copy())
-    tokens = tokenizer.tokenize(chunks)
-    with torch.autocast("cpu", torch.bfloat16):
-        assert torch.equal(tokenizer.tokenize(chunks), tokens)
-        assert tokenizer.detokenize(tokens).dtype == torch.float32
-
-
-def test_fast_is_finer_with_a_larger_scale() -> None:
-    errors = []
-    for scale in (5.0, 20.0):
-        tokenizer = Fast(scale=scale, spec=SPEC, statistics=MOTIONS)
-        chunks = torch.from_numpy(CHUNKS.copy())
-        errors.append((tokenizer.detokenize(tokenizer.tokenize(chunks)) - chunks)[..., :2].abs().mean().item())
-    assert errors[1] < 0.4 * errors[0]
-
-
-def test_fast_makes_actions_of_whatever_a_model_writes() -> None:
-    tokenizer = EVERY["fast"]
-    random = torch.Generator().manual_seed(0)
-    anything = torch.randint(tokenizer.bins, (50, 25), generator=random)
-    assert torch.isfinite(tokenizer.detokenize(anything)).all()
-    nothing = torch.zeros(1, 1, dtype=torch.int64)
-    mean = tokenizer.detokenize(nothing)
-    assert mean.shape == (1, 8, 3) and torch.allclose(mean[0, 0], mean[0, 7])  # all coefficients are 0
-    whole = tokenizer.tokenize(torch.from_numpy(CHUNKS[:1].copy()))
-    short = whole[:, : int((whole != tokenizer.end).sum()) - 2]
-    longer = torch.cat([whole[whole != tokenizer.end][None], whole], 1)
-    assert torch.equal(tokenizer.detokenize(longer), tokenizer.detokenize(whole))
-    assert tokenizer.detokenize(short).shape == (1, 8, 3)
-
-
-def test_fast_takes_motions_that_the_data_never_had() -> None:
-    tokenizer = EVERY["fast"]
-    wild = torch.tensor([9.0, -9.0, 5.0]) * torch.tensor([1.0, -1.0] * 4)[:, None]
-    back = tokenizer.detokenize(tokenizer.tokenize(wild))
-    assert torch.isfinite(back).all() and back.shape == wild.shape
-
-
-def test_a_chunk_counts_as_a_whole() -> None:
-    tokenizer = EVERY["fast"]
-    tokens = tokenizer.tokenize(torch.from_numpy(CHUNKS[:2].copy()))
-    valid = torch.zeros(2, 8, dtype=torch.bool)
-    valid[0, :3] = True
-    counted = tokenizer.learned(tokens, valid)
-    assert counted[0].sum() == (tokens[0] != tokenizer.end).sum() + 1 and not counted[1].any()
-
-
-def test_too_few_tokens_for_the_coefficients_are_refused() -> None:
-    with pytest.raises(ValueError, match=r"more than tokenizer\.bins=8 can tell apart"):
-        Fast(bins=8, spec=SPEC, statistics=MOTIONS)
-
-
-def test_chunks_of_another_length_are_refused() -> None:
-    with pytest.raises(ValueError, match=r"predicts 4 actions, its tokenizer reads 8: set tokenizer\.chunk=4"):
-        EVERY["fast"].length(4)

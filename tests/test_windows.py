@@ -22,7 +22,7 @@ from lightning.pytorch.callbacks import ModelCheckpoint
 from vla.cluster import Local
 from vla.collect import collect
 from vla.data.episodes import EpisodeStore
-from vla.data.gather import Gather, Memory, disturbed
+from vla.data.gather import Gather, disturbed
 from vla.data.inspection import put_together
 from vla.data.windows import Stream, Windows, held_out
 from vla.spec import Array
@@ -101,20 +101,6 @@ def test_a_batch_is_what_a_loop_over_the_episodes_gives(folder: Path, history: i
         beyond = ~usable & expected["present"][:, None]
         np.testing.assert_array_equal(batch["action"][place].numpy()[beyond], expected["labels"][beyond])
         assert batch["instruction"][place] == expected["text"]
-
-
-def test_what_follows_an_excursion_is_no_label_for_what_came_before() -> None:
-    label = np.array([0.04, -0.01, 1.0])
-    executed = [
-        label,
-        label * [1.4, 0.7, 1],
-        label + np.array([0, 0.004, 0]),
-        [0.0, -0.01, 1.0],
-        label * [1, -1, 1],
-        [0.04, 0, 0],
-    ]
-    off = disturbed(np.tile(label, (6, 1)), np.array(executed), toy.SPEC)
-    assert off.tolist() == [False, False, False, True, True, True]
 
 
 def test_chosen_episodes_give_the_windows_that_they_gave(folder: Path, tmp_path: Path) -> None:
@@ -231,17 +217,6 @@ def test_what_is_kept_of_a_batch_does_not_change(folder: Path) -> None:
     for step, images in enumerate(kept):
         expected = Gather(EpisodeStore(folder), 3, 2)(module.order(step))["rgb"]["front"][1:4, 0]
         np.testing.assert_array_equal(images, expected)
-
-
-def test_memory_is_used_again_once_nothing_refers_to_it() -> None:
-    memory = Memory()
-    first = memory.empty((2, 3), np.uint8)
-    tensor = torch.from_numpy(first).view(3, 2)[1:]
-    place = first.__array_interface__["data"]
-    del first
-    assert memory.empty((2, 3), np.uint8).__array_interface__["data"] != place
-    del tensor
-    assert memory.empty((2, 3), np.uint8).__array_interface__["data"] == place
 
 
 def test_an_error_in_the_thread_is_raised_where_the_batch_is_waited_for() -> None:

@@ -29,6 +29,7 @@ from vla.workers import cores, leave_with_parent, one_thread_each
 
 log = logging.getLogger(__name__)
 
+SEEN = "seen"  # the condition that a policy was trained for
 ERROR = "error"  # outcome of an episode that could not be played to its end
 NORMAL_QUANTILE = 1.959964  # of 0.975: an interval of 95 %
 

@@ -81,10 +81,10 @@ def evaluate(config: DictConfig) -> float:
     Raises:
         ValueError: an episode could not be played to its end; the report, which is written, says why.
     """
-    from vla.evaluate import evaluate, keep_recordings
+    from vla.evaluate import SEEN, evaluate, keep_recordings
     from vla.policy import latency
     from vla.report import plot_report, write_report
-    from vla.suite import SEEN, plot_suite, suite_table
+    from vla.suite import plot_suite, suite_table
 
     output = _output(config)
     checkpoint = Path(config.checkpoint) if config.checkpoint else _trained(config)

@@ -12,8 +12,6 @@ from rich.table import Table
 from vla.evaluate import ERROR, Report
 from vla.report import GREEN, GREY
 
-SEEN = "seen"  # the condition that a policy was trained for
-
 
 def mcnemar(one: Report, other: Report) -> float:
     """Two-sided exact p-value for equal success of two reports on the same seeds (McNemar 1947).
@@ -58,6 +56,7 @@ def plot_suite(reports: Mapping[str, Report], path: Path) -> None:
     axes.errorbar(rates, rows, xerr=reach, fmt="o", color=GREEN, ecolor=GREY, capsize=3)
     axes.set_yticks(rows, [name.replace("_", " ") for name in reports])
     axes.set_xlim(-0.02, 1.02)
+    axes.set_ylim(-0.6, len(reports) - 0.4)
     axes.set_xlabel("success, 95 % CI")
     axes.grid(axis="x", alpha=0.3)
     axes.spines[["top", "right"]].set_visible(False)

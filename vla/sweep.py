@@ -18,7 +18,6 @@ from hydra.experimental.callback import Callback
 from hydra.types import RunMode
 from omegaconf import DictConfig
 
-SEEN = "seen"  # the condition that a policy was trained for
 SEED = "seed"  # the override that distinguishes the cells of one row
 
 
@@ -42,6 +41,11 @@ class Row:
     def latency(self) -> float:
         """Median over the cells [ms]."""
         return sorted(self.latencies)[len(self.latencies) // 2]
+
+    @property
+    def seen(self) -> tuple[float, float, float]:
+        """`interval` under the condition that the policies were trained for, which every cell has."""
+        return self.interval(next(iter(self.successes)))
 
     def interval(self, condition: str) -> tuple[float, float, float]:
         """Success rate of all cells together and its 95 % confidence interval, which takes episodes for independent."""
@@ -74,6 +78,8 @@ def read_rows(folder: Path) -> list[Row]:
     """The cells that have a report, put together, in the order of the sweep."""
     from hydra.core.override_parser.overrides_parser import OverridesParser
     from yaml import safe_load
+
+    from vla.evaluate import SEEN
 
     parser = OverridesParser.create()
     cells = []
@@ -119,13 +125,13 @@ def plot(rows: list[Row], path: Path) -> None:
     axes = figure.add_subplot()
     axes.set_xscale("log")
     for row in rows:
-        rate, low, high = row.interval(SEEN)
+        rate, low, high = row.seen
         axes.errorbar(row.latency, rate, [[rate - low], [high - rate]], color="#8a8f98", capsize=3, zorder=1)
         axes.scatter(row.latency, rate, s=40 + 60 * (row.parameters / 1e6) ** 0.5, color="#2e9e5b", alpha=0.8)
         label = f"{row.name}, {row.parameters / 1e6:.2f} M"
         axes.annotate(label, (row.latency, rate), (9, 5), textcoords="offset points", fontsize=9)
     best = pareto(rows)
-    axes.plot([row.latency for row in best], [row.interval(SEEN)[0] for row in best], color="#2e9e5b", linewidth=0.8)
+    axes.plot([row.latency for row in best], [row.seen[0] for row in best], color="#2e9e5b", linewidth=0.8)
     axes.margins(x=0.3)
     axes.xaxis.set_major_formatter("{x:g}")
     close = max(row.latency for row in rows) < 10 * min(row.latency for row in rows)
@@ -140,8 +146,8 @@ def plot(rows: list[Row], path: Path) -> None:
 def pareto(rows: list[Row]) -> list[Row]:
     """The rows that no faster one matches in success, fastest first."""
     best: list[Row] = []
-    for row in sorted(rows, key=lambda row: (row.latency, -row.interval(SEEN)[0])):
-        if not best or row.interval(SEEN)[0] > best[-1].interval(SEEN)[0]:
+    for row in sorted(rows, key=lambda row: (row.latency, -row.seen[0])):
+        if not best or row.seen[0] > best[-1].seen[0]:
             best.append(row)
     return best
 

@@ -1,0 +1,89 @@
+"""Chunks as byte pairs of their frequencies."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from fake_batch import Motions
+from toy import SPEC
+
+from vla.models.fast import Fast, cosines
+
+MOTIONS = Motions()
+CHUNKS = MOTIONS.chunks(8)
+TOKENIZER = Fast(spec=SPEC, statistics=MOTIONS)
+
+
+def test_cosines_are_the_transform_of_the_book() -> None:
+    moments = np.arange(6)
+    for frequency, row in enumerate(cosines(6).numpy()):
+        wave = np.cos(np.pi * (moments + 0.5) * frequency / 6)
+        assert row == pytest.approx(wave / np.linalg.norm(wave), abs=1e-6)
+
+
+def test_fast_needs_fewer_tokens_than_there_are_components() -> None:
+    tokenizer = TOKENIZER
+    tokens = tokenizer.tokenize(torch.from_numpy(CHUNKS.copy()))
+    written = tokenizer.learned(tokens, torch.ones(len(CHUNKS), 8, dtype=torch.bool)).sum(1)
+    assert written.float().mean() < 0.6 * 8 * 3 and written.max() <= 25
+    ends = tokens.gather(1, written[:, None] - 1)
+    assert (ends == tokenizer.end).all()
+
+
+def test_fast_writes_the_same_in_mixed_precision() -> None:
+    tokenizer, chunks = TOKENIZER, torch.from_numpy(CHUNKS.copy())
+    tokens = tokenizer.tokenize(chunks)
+    with torch.autocast("cpu", torch.bfloat16):
+        assert torch.equal(tokenizer.tokenize(chunks), tokens)
+        assert tokenizer.detokenize(tokens).dtype == torch.float32
+
+
+def test_fast_is_finer_with_a_larger_scale() -> None:
+    errors = []
+    for scale in (5.0, 20.0):
+        tokenizer = Fast(scale=scale, spec=SPEC, statistics=MOTIONS)
+        chunks = torch.from_numpy(CHUNKS.copy())
+        errors.append((tokenizer.detokenize(tokenizer.tokenize(chunks)) - chunks)[..., :2].abs().mean().item())
+    assert errors[1] < 0.4 * errors[0]
+
+
+def test_fast_makes_actions_of_whatever_a_model_writes() -> None:
+    tokenizer = TOKENIZER
+    random = torch.Generator().manual_seed(0)
+    anything = torch.randint(tokenizer.bins, (50, 25), generator=random)
+    assert torch.isfinite(tokenizer.detokenize(anything)).all()
+    nothing = torch.zeros(1, 1, dtype=torch.int64)
+    mean = tokenizer.detokenize(nothing)
+    assert mean.shape == (1, 8, 3) and torch.allclose(mean[0, 0], mean[0, 7])  # all coefficients are 0
+    whole = tokenizer.tokenize(torch.from_numpy(CHUNKS[:1].copy()))
+    short = whole[:, : int((whole != tokenizer.end).sum()) - 2]
+    longer = torch.cat([whole[whole != tokenizer.end][None], whole], 1)
+    assert torch.equal(tokenizer.detokenize(longer), tokenizer.detokenize(whole))
+    assert tokenizer.detokenize(short).shape == (1, 8, 3)
+
+
+def test_fast_takes_motions_that_the_data_never_had() -> None:
+    tokenizer = TOKENIZER
+    wild = torch.tensor([9.0, -9.0, 5.0]) * torch.tensor([1.0, -1.0] * 4)[:, None]
+    back = tokenizer.detokenize(tokenizer.tokenize(wild))
+    assert torch.isfinite(back).all() and back.shape == wild.shape
+
+
+def test_a_chunk_counts_as_a_whole() -> None:
+    tokenizer = TOKENIZER
+    tokens = tokenizer.tokenize(torch.from_numpy(CHUNKS[:2].copy()))
+    valid = torch.zeros(2, 8, dtype=torch.bool)
+    valid[0, :3] = True
+    counted = tokenizer.learned(tokens, valid)
+    assert counted[0].sum() == (tokens[0] != tokenizer.end).sum() + 1 and not counted[1].any()
+
+
+def test_too_few_tokens_for_the_coefficients_are_refused() -> None:
+    with pytest.raises(ValueError, match=r"more than tokenizer\.bins=8 can tell apart"):
+        Fast(bins=8, spec=SPEC, statistics=MOTIONS)
+
+
+def test_chunks_of_another_length_are_refused() -> None:
+    with pytest.raises(ValueError, match=r"predicts 4 actions, its tokenizer reads 8: set tokenizer\.chunk=4"):
+        TOKENIZER.length(4)
