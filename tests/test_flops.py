@@ -1,0 +1,82 @@
+"""What a training step costs, counted by hand, and what a device can do."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+import torch
+from fake_batch import make_act, make_batch, make_bc, make_decoder, make_rt1, with_text
+from torch import nn
+
+from vla.models.flops import matmul_flops, peak_flops, training_flops
+from vla.models.model import Model
+
+CPU = torch.device("cpu")
+
+
+class Linear(nn.Module):
+    """Just enough of a model: one matrix."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.matrix = nn.Linear(3, 5)
+
+    def loss(self, batch: Any) -> Any:
+        return {"loss": self.matrix(batch["action"]).square().mean()}
+
+
+def test_a_matrix_takes_a_product_forward_and_one_for_its_gradient() -> None:
+    """The action needs no gradient, which would take another."""
+    flops = training_flops(Linear(), {"action": torch.randn(6, 3), "deeper": {"list": [""] * 6}})  # type: ignore[arg-type]
+    assert flops == 2 * (2 * 6 * 3 * 5)
+
+
+@pytest.mark.parametrize(
+    "model", [make_bc(), make_rt1(), make_decoder(), make_act()], ids=["bc", "rt1", "decoder", "act"]
+)
+def test_counting_changes_nothing_and_grows_with_the_batch(model: Model) -> None:
+    batch = with_text(model, make_batch(model.history, model.chunk, 4))
+    before = {name: value.clone() for name, value in model.state_dict().items()}
+    state = torch.random.get_rng_state()
+    flops = training_flops(model, batch)
+    assert flops > 1e5
+    assert torch.equal(state, torch.random.get_rng_state())
+    assert all(torch.equal(value, before[name]) for name, value in model.state_dict().items())
+    assert all(parameter.grad is None for parameter in model.parameters())
+    half = with_text(model, make_batch(model.history, model.chunk, 2))
+    assert flops == 2 * training_flops(model, half)
+
+
+def test_a_compiled_model_is_counted_like_any_other() -> None:
+    model = make_bc()
+    batch = with_text(model, make_batch(1))
+    flops = training_flops(model, batch)
+    model.compile()
+    assert training_flops(model, batch) == flops
+
+
+@pytest.mark.parametrize(
+    ("name", "half", "tensor_float"),
+    [
+        ("NVIDIA H100 80GB HBM3", 989e12, 494e12),
+        ("NVIDIA H100 PCIe", 756e12, 378e12),
+        ("NVIDIA H200", 989e12, 494e12),
+        ("NVIDIA A100-SXM4-40GB", 312e12, 156e12),
+        ("NVIDIA H100 80GB HBM3 MIG 1g.10gb", None, None),
+        ("NVIDIA RTX A1000", None, None),
+    ],
+)
+def test_peaks_are_those_of_the_data_sheets(
+    name: str, half: float | None, tensor_float: float | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(torch.cuda, "get_device_name", lambda device: name)
+    device = torch.device("cuda")
+    assert peak_flops(device, "bf16-mixed") == half
+    monkeypatch.setattr(torch, "get_float32_matmul_precision", lambda: "high")
+    assert peak_flops(device, "32-true") == tensor_float
+
+
+def test_a_processor_has_no_peak_but_a_rate() -> None:
+    assert peak_flops(CPU, "32-true") is None
+    assert matmul_flops(CPU, "32-true", 0.1) > 1e9

@@ -1,0 +1,88 @@
+"""How much arithmetic a training step takes, and how much a device can do.
+
+The model FLOPs utilisation of a training is `training_flops` times batches per second, over the peak of its device.
+"""
+
+from __future__ import annotations
+
+import copy
+import re
+import time
+from typing import Any
+
+import torch
+from torch.utils.flop_counter import FlopCounterMode
+
+from vla.models.model import Batch, Model
+
+WINDOWS = 2  # to count on: batch normalisation wants more than one value
+
+# Rates of dense matrix multiplication [FLOP/s], bfloat16 or float16, TensorFloat-32, float32 without tensor cores, from
+# NVIDIA's data sheets of H100, H200, A100 and L40S, which print twice these rates for tensor cores where they assume
+# sparsity. The first whose words are all in the device's name counts.
+PEAKS = (
+    ("H100 PCIe", 756e12, 378e12, 51e12),
+    ("H100 NVL", 835e12, 417e12, 60e12),
+    ("H100", 989e12, 494e12, 67e12),  # SXM, which calls itself H100 80GB HBM3
+    ("H200 NVL", 835e12, 417e12, 60e12),
+    ("H200", 989e12, 494e12, 67e12),
+    ("A100", 312e12, 156e12, 19.5e12),
+    ("L40S", 362e12, 183e12, 91.6e12),
+)
+
+
+def training_flops(model: Model, batch: Batch) -> float:
+    """FLOPs of forward and backward over a batch that has its "text": one multiply-add is two.
+
+    Counted are matrix products, convolutions and attention. Left out is what is not made of them: elementwise
+    functions, normalisation, softmax, pooling, the shifting of images, sums of gradients, the optimiser's step. A copy
+    of the model computes a few windows of the batch in 32 bits, so that neither its weights and statistics nor the
+    random numbers of the training change.
+    """
+    windows = min(len(batch["action"]), WINDOWS)
+    trial = copy.deepcopy(model).float().train()
+    device = batch["action"].device
+    with torch.random.fork_rng([device] if device.type == "cuda" else []), FlopCounterMode(display=False) as counter:
+        trial.loss(_first(batch, windows))["loss"].backward()
+    return counter.get_total_flops() * len(batch["action"]) / windows
+
+
+def _first(batch: Any, count: int) -> Any:
+    """The first so many windows of a batch, whose values are tensors and lists, in dicts."""
+    return {name: _first(value, count) for name, value in batch.items()} if isinstance(batch, dict) else batch[:count]
+
+
+def peak_flops(device: torch.device, precision: str) -> float | None:
+    """What a device can do at most [FLOP/s] in a precision of Lightning's trainer, such as "bf16-mixed".
+
+    In 32 bits it depends on `torch.get_float32_matmul_precision()`. None for what no data sheet is known of: a CPU,
+    another GPU, a slice of one, another precision; `matmul_flops` measures that.
+    """
+    words = set(re.split("[ -]", torch.cuda.get_device_name(device))) if device.type == "cuda" else set()
+    if "MIG" in words:
+        return None
+    for name, half, tensor_float, full in PEAKS:
+        if words.issuperset(name.split()):
+            if precision.startswith(("bf16", "16")):
+                return half
+            if precision.startswith("32"):
+                return full if torch.get_float32_matmul_precision() == "highest" else tensor_float
+    return None
+
+
+def matmul_flops(device: torch.device, precision: str, seconds: float = 1.0) -> float:
+    """What a device does at best [FLOP/s] in one large matrix product after the other, for some seconds.
+
+    On a device of no known peak this is the one to compare with: nothing that is made of matrix products is faster.
+    """
+    size = 8192 if device.type == "cuda" else 2048
+    types = {"bf16": torch.bfloat16, "16": torch.float16, "64": torch.float64}
+    matrix = torch.randn(size, size, device=device, dtype=types.get(precision.partition("-")[0], torch.float32))
+    shortest, end = float("inf"), time.perf_counter() + seconds
+    while time.perf_counter() < end:
+        started = time.perf_counter()
+        matrix @ matrix
+        if device.type == "cuda":
+            torch.cuda.synchronize(device)
+        shortest = min(shortest, time.perf_counter() - started)
+    return 2 * size**3 / shortest
