@@ -40,3 +40,11 @@ def tabletop() -> Iterator[Tabletop]:
     environment = make_tabletop()
     yield environment
     environment.close()
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A small store of the toy world."""
+    import toy
+
+    return Path(toy.make_store(tmp_path_factory.mktemp("episodes")).folder)

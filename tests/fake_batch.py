@@ -65,8 +65,9 @@ def make_bc(
     auxiliary: float = 1.0,
     image: Callable[..., Any] = TINY_IMAGE,
     text: Callable[..., Any] = TINY_TEXT,
+    shift: tuple[float, float] = (0, 0),
 ) -> BC:
-    """A small BC without random shifts."""
+    """A small BC."""
     return BC(
         image,
         text,
@@ -74,7 +75,7 @@ def make_bc(
         keypoints=8,
         text_width=16,
         width=64,
-        shift=(0, 0),
+        shift=shift,
         auxiliary=auxiliary,
         spec=SPEC,
         tokenizer=Uniform(bins=64, spec=SPEC),
@@ -82,9 +83,14 @@ def make_bc(
 
 
 def make_rt1(
-    history: int = 3, chunk: int = 1, proprioception: bool = False, keypoints: int = 8, auxiliary: float = 1.0
+    history: int = 3,
+    chunk: int = 1,
+    proprioception: bool = False,
+    keypoints: int = 8,
+    auxiliary: float = 1.0,
+    dropout: float = 0.0,
 ) -> RT1:
-    """A small RT-1 without dropout and random shifts."""
+    """A small RT-1 without random shifts."""
     return RT1(
         TINY_IMAGE,
         TINY_TEXT,
@@ -100,7 +106,7 @@ def make_rt1(
         layers=2,
         heads=2,
         key_width=16,
-        dropout=0.0,
+        dropout=dropout,
         shift=(0, 0),
         spec=SPEC,
         tokenizer=Uniform(bins=64, spec=SPEC),

@@ -10,7 +10,8 @@ import pytest
 from omegaconf import DictConfig, OmegaConf
 
 from vla.check import JOBS, PLAIN, build, check, digest, suggestion
-from vla.run import adopt, sentence
+from vla.resume import adopt
+from vla.run import sentence
 
 GRAMMAR = {
     "_target_": "vla.tasks.language.Grammar",
@@ -30,9 +31,11 @@ def config(**changes: Any) -> DictConfig:
             "job": "collect",
             "seed": 0,
             "checkpoint": None,
+            "resume": False,
             "output": "outputs/runs/now",
             "collect": {"episodes": 5, "seed": 0, "workers": None, "folder": "outputs/episodes/x"},
             "evaluate": {"episodes": 5, "seed": 1_000_000, "workers": None, "recordings": 2, "conditions": {}},
+            "validate": {"episodes": 0, "seed": 2_000_000},
             "preview": {"episodes": 1, "seed": 0},
             "benchmark": {
                 "names": ["train"],

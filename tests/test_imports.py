@@ -39,7 +39,10 @@ PARTS = {
     "vla.annotations": (),
     "vla.check": ("vla.annotations",),
     "vla.peers": ("vla.workers",),
-    "vla.training": ("vla.check",),
+    "vla.resume": ("vla.policy",),
+    "vla.progress": ("vla.models",),
+    "vla.validation": ("vla.spec", "vla.models", "vla.rollout", "vla.evaluate"),
+    "vla.training": ("vla.check", "vla.progress", "vla.resume"),
     "vla.benchmark": ("vla",),
     "vla.parts": ("vla",),
     "vla.jobs": ("vla",),
@@ -48,12 +51,17 @@ PARTS = {
 
 # A library → the only parts that may import it.
 LIBRARIES = {
-    "hydra": ("vla.run", "vla.jobs", "vla.check", "vla.benchmark", "vla.sweep"),
-    "omegaconf": ("vla.run", "vla.jobs", "vla.parts", "vla.check", "vla.training", "vla.benchmark", "vla.sweep"),
+    "hydra": ("vla.run", "vla.jobs", "vla.check", "vla.benchmark", "vla.sweep", "vla.resume"),
+    "omegaconf": (
+        *("vla.run", "vla.jobs", "vla.parts", "vla.check", "vla.training", "vla.benchmark", "vla.sweep", "vla.resume"),
+    ),
     "mujoco": ("vla.tasks", "vla.benchmark"),
     "dm_control": ("vla.tasks",),
     "dm_env": ("vla.tasks",),
-    "lightning": ("vla.models.learner", "vla.data.windows", "vla.training", "vla.jobs", "vla.benchmark"),
+    "lightning": (
+        *("vla.models.learner", "vla.data.windows", "vla.training", "vla.progress", "vla.validation", "vla.resume"),
+        *("vla.jobs", "vla.benchmark"),
+    ),
     "rerun": ("vla.record", "vla.deploy.view"),
     "rclpy": ("vla.deploy",),
     "distributed": ("vla.cluster",),

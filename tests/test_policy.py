@@ -177,7 +177,7 @@ def test_a_checkpoint_is_read_as_it_was_written(tmp_path: Path) -> None:
 def test_weights_of_another_model_are_refused(tmp_path: Path) -> None:
     checkpoint = read_checkpoint(save(tmp_path / "a.ckpt"))
     with pytest.raises(ValueError, match="does not fit the model"):
-        Checkpoint(checkpoint.path, checkpoint.config, checkpoint.spec, checkpoint.state).restore(make_rt1())
+        Checkpoint(checkpoint.path, checkpoint.config, checkpoint.spec, checkpoint.state, True).restore(make_rt1())
 
 
 def test_files_that_are_no_checkpoint_are_refused_in_one_sentence(tmp_path: Path) -> None:

@@ -12,12 +12,14 @@ import time
 from pathlib import Path
 
 import pytest
+import torch
 from rerun.chunk import RrdReader
 
 from vla.policy import read_checkpoint
 from vla.tasks.backend import TRIED
 
 SMALL = (
+    "validate.episodes=0",
     "task.image_size=[32,32]",
     "task.shadows=false",
     "collect.episodes=24",
@@ -46,7 +48,7 @@ def vla(folder: Path, *arguments: str, ok: bool = True) -> subprocess.CompletedP
 def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """An empty folder to work in, with the outcome of one small main job in it, in `run`."""
     folder = tmp_path_factory.mktemp("home")
-    done = vla(folder, *SMALL, "output=run", "hydra.run.dir=run")
+    done = vla(folder, *SMALL, "validate.episodes=1", "output=run", "hydra.run.dir=run")
     (folder / "printed.txt").write_text(done.stdout)
     return folder
 
@@ -66,8 +68,12 @@ def test_the_main_job_collects_trains_evaluates_and_records(home: Path) -> None:
     } <= set(report)
     assert report["episodes"] == 2 and report["errors"] == 0
     assert report["config"]["collect"]["episodes"] == 24
-    for name in ("report.png", "rollouts.rrd", "checkpoints/last.ckpt", "metrics.csv"):
+    for name in ("report.png", "rollouts.rrd", "checkpoints/last.ckpt", "checkpoints/best.ckpt", "metrics.csv"):
         assert (home / "run" / name).stat().st_size > 0
+    assert list((home / "run/tensorboard").glob("events.out.tfevents.*"))
+    header, *rows = (home / "run/metrics.csv").read_text().splitlines()
+    success = header.split(",").index("val/success")
+    assert [row.split(",")[success] for row in rows if row.split(",")[success]] == ["0.0", "0.0"]  # hardly trained
     printed = (home / "printed.txt").read_text()
     assert "\ntraining  " in printed and "Epoch" not in printed
     last = printed.strip().splitlines()[-1]
@@ -191,12 +197,13 @@ def test_a_damaged_checkpoint_is_named(home: Path) -> None:
         read_checkpoint(home / "flipped.ckpt")
 
 
-def test_training_goes_on_with_the_same_model_only(home: Path) -> None:
+def test_training_goes_on_as_what_it_was(home: Path) -> None:
     arguments = ("job=train", "checkpoint=run/checkpoints/last.ckpt")
-    done = vla(home, *SMALL, *arguments, "trainer.max_steps=6", "output=longer")
+    done = vla(home, *arguments, "trainer.max_steps=6", "output=longer")
     assert "trained 6 steps" in done.stdout
-    refused = vla(home, *SMALL, *arguments, "model.width=32", ok=False)
-    assert "another model" in refused.stderr and "Traceback" not in refused.stderr
+    for other in ("model.width=32", "task/goal=lift", "learner.lr=1"):
+        refused = vla(home, *arguments, other, ok=False)
+        assert f"{other} cannot be combined with going on" in refused.stderr and "Traceback" not in refused.stderr
 
 
 def test_a_checkpoint_of_other_cameras_is_refused(home: Path) -> None:
@@ -238,10 +245,10 @@ def test_benchmark_measures_against_floors(home: Path) -> None:
         assert set(measure) == {"value", "unit", "n", "floor", "ratio"} and measure["floor"] > 0
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
 def test_training_that_is_interrupted_saves_and_goes_on(home: Path, number: int) -> None:
-    folder = f"stopped{number}"
-    arguments = [*SMALL, "job=train", "trainer.limit_val_batches=0", "trainer.val_check_interval=null"]
+    folder = f"outputs/runs/stopped{number}"
+    arguments = [*SMALL, "trainer.limit_val_batches=0", "trainer.val_check_interval=null", "learner.schedule=constant"]
     arguments += ["trainer.check_val_every_n_epoch=1"]
     command = [sys.executable, "-u", "-m", "vla.run", *arguments, f"output={folder}", "trainer.max_steps=100000"]
     process = subprocess.Popen(command, cwd=home, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
@@ -255,6 +262,14 @@ def test_training_that_is_interrupted_saves_and_goes_on(home: Path, number: int)
     assert process.returncode == 130, printed
     checkpoint = f"{folder}/checkpoints/last.ckpt"
     assert "interrupted after" in printed and checkpoint in printed
+    if number == signal.SIGTERM:
+        return  # what follows is the same
     steps = int(printed.partition("interrupted after ")[2].split()[0])
-    done = vla(home, *arguments, f"checkpoint={checkpoint}", f"trainer.max_steps={steps + 2}", "output=on")
-    assert f"trained {steps + 2} steps" in done.stdout
+    done = vla(home, "checkpoint=last", f"trainer.max_steps={steps + 2}")
+    assert f"trained {steps + 2} steps" in done.stdout and done.stdout.strip().splitlines()[-1].startswith("success ")
+    assert (home / folder / "report.json").exists()
+    vla(home, *arguments, "job=train", f"trainer.max_steps={steps + 2}", "output=whole")
+    ends = [torch.load(home / run / "checkpoints/last.ckpt", weights_only=True) for run in (folder, "whole")]
+    assert all(torch.equal(value, ends[1]["state_dict"][name]) for name, value in ends[0]["state_dict"].items())
+    nothing = vla(home, "checkpoint=last", ok=False)
+    assert "was interrupted" in nothing.stderr and nothing.stderr.count("\n") == 1

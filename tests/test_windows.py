@@ -6,7 +6,6 @@ import os
 import shutil
 import subprocess
 import sys
-from collections.abc import Iterator
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
@@ -27,23 +26,7 @@ from vla.data.inspection import put_together
 from vla.data.windows import Stream, Windows, held_out
 from vla.spec import Array
 
-EPISODES = 30
-
-
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("episodes")
-    store = EpisodeStore.create_or_open(folder, toy.SPEC, {})
-    collect(store, toy.make_environment, toy.make_expert, EPISODES, Local(1), seed=0)
-    return folder
-
-
-@pytest.fixture(autouse=True)
-def one_thread() -> Iterator[None]:
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
+EPISODES = toy.EPISODES
 
 
 def windows(folder: Path, **changes: Any) -> Windows:

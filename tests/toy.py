@@ -6,10 +6,14 @@ import os
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from vla.cluster import Local
+from vla.collect import collect
+from vla.data.episodes import EpisodeStore
 from vla.spec import Array, Environment, Observation, Shape, Spec
 
 SPEC = Spec(
@@ -24,6 +28,8 @@ SPEC = Spec(
     control_hz=10.0,
     truth=(("target", 2), ("point", 2)),
 )
+
+EPISODES = 30  # of `make_store`
 
 
 class ToyEnvironment:
@@ -149,3 +155,10 @@ def make_forgetful_environment() -> ToyEnvironment:
 def make_lost_expert(environment: Environment) -> ToyExpert:
     """An expert that never succeeds."""
     return ToyExpert(noise=0.0, lost=True)
+
+
+def make_store(folder: Path) -> EpisodeStore:
+    """A store of the expert's first episodes."""
+    store = EpisodeStore.create_or_open(folder, SPEC, {})
+    collect(store, make_environment, make_expert, EPISODES, Local(1), seed=0)
+    return store

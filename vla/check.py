@@ -24,7 +24,7 @@ from vla.annotations import describe, matches
 ALLOWED = ("vla.", "torch.", "lightning.", "dm_control.composer.variation.")
 
 # The groups that each job builds something from; only these are checked, so only their modules are imported.
-TRAINING = ("task", "expert", "cluster", "data", "tokenizer", "model", "learner", "trainer")
+TRAINING = ("task", "expert", "cluster", "data", "tokenizer", "model", "learner", "trainer", "logger")
 JOBS: dict[str, tuple[str, ...]] = {
     "preview": ("task", "expert"),
     "collect": ("task", "expert", "cluster"),
@@ -36,7 +36,8 @@ JOBS: dict[str, tuple[str, ...]] = {
     "inspect": (),
 }
 EVALUATION = ("task", "tokenizer", "model", "policy", "recorder")  # of a checkpoint, with nothing to train
-OPTIONAL = ("recorder",)  # groups that a job can do without
+OPTIONAL = ("recorder", "logger")  # groups that a job can do without
+SEVERAL = ("logger",)  # groups whose options are several nodes by name
 
 # Constructor arguments that the jobs give, so that they never stand in YAML.
 RUNTIME: dict[str, tuple[str, ...]] = {
@@ -46,6 +47,7 @@ RUNTIME: dict[str, tuple[str, ...]] = {
     "model": ("spec", "tokenizer"),
     "learner": ("model", "spec", "config"),
     "trainer": ("callbacks", "logger"),
+    "logger": ("save_dir",),
     "policy": ("model", "spec"),
     "recorder": ("folder",),
     "deploy": ("policy", "environment", "output"),
@@ -59,6 +61,7 @@ PLAIN: dict[str, Any] = {
     "job": Literal["preview", "collect", "train", "evaluate", "export", "deploy", "benchmark", "inspect"],
     "seed": Seed,
     "checkpoint": str | None,
+    "resume": bool,
     "output": str,
     "collect": {"episodes": Count, "seed": Seed, "workers": Count | None, "folder": str},
     "evaluate": {
@@ -68,6 +71,7 @@ PLAIN: dict[str, Any] = {
         "recordings": Seed | None,
         "conditions": dict[str, dict[str, Any]],
     },
+    "validate": {"episodes": Seed, "seed": Seed},
     "preview": {"episodes": Count, "seed": Seed},
     "benchmark": {
         "names": list[Literal["collect", "loader", "train", "policy", "deploy"]],
@@ -122,11 +126,15 @@ def check(cfg: DictConfig) -> None:
     for name, annotation in PLAIN.items():
         node = OmegaConf.to_container(cfg[name], resolve=True) if OmegaConf.is_config(cfg[name]) else cfg[name]
         _check_plain(name, node, annotation)
-    groups = EVALUATION if cfg.job == "evaluate" and cfg.checkpoint is not None else JOBS[cfg.job]
+    trained = cfg.checkpoint is not None and not cfg.resume
+    groups = EVALUATION if cfg.job == "evaluate" and trained else JOBS[cfg.job]
     for group in groups:
         if cfg.get(group) is not None:
             node = OmegaConf.to_container(cfg[group], resolve=True, throw_on_missing=True)
-            check_node(group, node, RUNTIME.get(group, ()))
+            assert isinstance(node, dict)
+            nodes = {f"{group}.{name!s}": each for name, each in node.items()} if group in SEVERAL else {group: node}
+            for key, each in nodes.items():
+                check_node(key, each, RUNTIME.get(group, ()))
         elif group not in OPTIONAL:
             raise ValueError(f"job={cfg.job} needs {group}=OPTION; --help lists the options")
     if "model" in groups:

@@ -21,6 +21,7 @@ from vla.parts import (
     collected,
     demonstrated,
     fit,
+    in_training,
     make_data,
     make_environment,
     make_expert,
@@ -87,7 +88,7 @@ def evaluate(config: DictConfig) -> float:
     from vla.suite import plot_suite, suite_table
 
     output = _output(config)
-    checkpoint = Path(config.checkpoint) if config.checkpoint else _trained(config)
+    checkpoint = Path(config.checkpoint) if config.checkpoint and not config.resume else _trained(config)
     seeds = range(config.evaluate.seed, config.evaluate.seed + config.evaluate.episodes)
     recordings = output / "recordings"
     make = partial(make_policy, plain(config.policy), checkpoint)
@@ -196,58 +197,48 @@ JOBS: dict[str, Callable[[DictConfig], float | None]] = {
 
 
 def _trained(config: DictConfig) -> Path:
-    """Path of the checkpoint that training leaves behind."""
+    """Path of the checkpoint that training leaves behind, and does best in validation."""
     import lightning
 
     from vla.models.fidelity import fidelity
-    from vla.training import LAST, Interruption, make_trainer, quiet_lightning
+    from vla.resume import LAST, alone
+    from vla.training import Interruption, keep_metrics, make_trainer, quiet_lightning
+    from vla.validation import ClosedLoop
 
     quiet_lightning()
     checkpoints = _output(config) / "checkpoints"
     interruption = Interruption(checkpoints)
-    # Before anything is collected: the checkpoint to go on from may be unfit, the devices asked for may be missing, and
-    # so may be pretrained weights.
-    if config.checkpoint:
-        _require_same_policy(config)
-    trainer = make_trainer(config, checkpoints, interruption)
-    lightning.seed_everything(config.seed, verbose=False)
-    learner = unfitted_learner(config, demonstrated(config))
-    store = collected(config)
-    fit(learner.model.tokenizer, config, store)
-    data = make_data(config, store, learner.model)
-    parameters = sum(parameter.numel() for parameter in learner.model.parameters())
-    tokens = fidelity(learner.model.tokenizer, store.statistics.chunks(learner.model.chunk), store.spec.units)
-    log.info("%s: %s", type(learner.model.tokenizer).__name__, tokens)
-    log.info("training %s with %.2f M parameters", type(learner.model).__name__, parameters / 1e6)
-    started = time.monotonic()
-    try:
-        with interruption.listening():
-            trainer.fit(learner, datamodule=data, ckpt_path=config.checkpoint, weights_only=True)
-    except SystemExit:  # at a SIGTERM Lightning leaves as if all were well
-        if not interruption.asked:
-            raise
-    if interruption.asked:
-        raise KeyboardInterrupt
-    trainer.save_checkpoint(checkpoints / LAST, weights_only=False)
+    seeds = range(config.validate.seed, config.validate.seed + config.validate.episodes)
+    makers = partial(make_environment, plain(config.task)), partial(in_training, plain(config.policy))
+    closed_loop = ClosedLoop(*makers, seeds, checkpoints)
+    with alone(checkpoints):
+        # Before anything is collected: the devices asked for may be missing, and so may be pretrained weights.
+        trainer = make_trainer(config, checkpoints, *([closed_loop] if seeds else []), interruption)
+        lightning.seed_everything(config.seed, verbose=False)
+        learner = unfitted_learner(config, demonstrated(config))
+        store = collected(config)
+        fit(learner.model.tokenizer, config, store)
+        data = make_data(config, store, learner.model)
+        parameters = sum(parameter.numel() for parameter in learner.model.parameters())
+        tokens = fidelity(learner.model.tokenizer, store.statistics.chunks(learner.model.chunk), store.spec.units)
+        log.info("%s: %s", type(learner.model.tokenizer).__name__, tokens)
+        log.info("training %s with %.2f M parameters", type(learner.model).__name__, parameters / 1e6)
+        if config.checkpoint:
+            keep_metrics(trainer, Path(config.checkpoint))
+        started = time.monotonic()
+        try:
+            with interruption.listening():
+                trainer.fit(learner, datamodule=data, ckpt_path=config.checkpoint, weights_only=True)
+        except SystemExit:  # at a SIGTERM Lightning leaves as if all were well
+            if not interruption.asked:
+                raise
+        if interruption.asked:
+            raise KeyboardInterrupt
+        trainer.save_checkpoint(checkpoints / LAST, weights_only=False)
     if not trainer.is_global_zero:
         sys.exit()  # what follows training is done once
     log.info("trained %d steps in %.0f s: %s", trainer.global_step, time.monotonic() - started, checkpoints)
-    return checkpoints / LAST
-
-
-def _require_same_policy(config: DictConfig) -> None:
-    from vla.policy import read_checkpoint
-
-    saved = read_checkpoint(config.checkpoint)
-    environment = make_environment(plain(config.task))
-    saved.spec.perceived.require(environment.spec.perceived, f"the checkpoint {config.checkpoint}", "the task")
-    environment.close()
-    for group in ("model", "tokenizer"):
-        if saved.config[group] != plain(config[group]):
-            raise ValueError(
-                f"training cannot go on from {config.checkpoint}, which has another {group}: give the same overrides "
-                "as when it was started"
-            )
+    return closed_loop.chosen(checkpoints / LAST)
 
 
 def _output(config: DictConfig) -> Path:

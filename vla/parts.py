@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from vla.data.windows import Windows
     from vla.models.action_tokenizer import ActionTokenizer
     from vla.models.learner import Learner
+    from vla.models.model import Model
     from vla.policy import Policy
     from vla.spec import Agent, Environment, Recorder, Spec
     from vla.tasks.tabletop import Tabletop
@@ -78,6 +79,14 @@ def make_policy(policy: Node, checkpoint: Path, environment: Environment | None 
     model = build(_without_pretraining(saved.config["model"]), spec=saved.spec, tokenizer=tokenizer)
     saved.restore(model)
     made: Policy = build(policy, model=model, spec=saved.spec)
+    return made
+
+
+def in_training(policy: Node, model: Model) -> Policy:
+    """The policy of a model that is being trained, on its device, not compiled once more."""
+    made: Policy = build(
+        {**policy, "device": next(model.parameters()).device.type, "compile": False}, model=model, spec=model.spec
+    )
     return made
 
 

@@ -30,6 +30,7 @@ class Checkpoint:
     config: dict[str, Any]  # the configuration that trained it
     spec: Spec
     state: dict[str, Tensor]  # of the model
+    finished: bool  # whether the training came to its end
 
     def restore(self, model: torch.nn.Module) -> None:
         """Load the weights.
@@ -65,7 +66,8 @@ def read_checkpoint(path: str | Path) -> Checkpoint:
         raise ValueError(f"{path} is no checkpoint of this project: it carries no configuration and spec")
     prefix = "model."
     state = {key[len(prefix) :]: value for key, value in content["state_dict"].items() if key.startswith(prefix)}
-    return Checkpoint(path, content["config"], Spec.from_dict(content["spec"]), state)
+    finished = content.get("finished", False)
+    return Checkpoint(path, content["config"], Spec.from_dict(content["spec"]), state, finished)
 
 
 class Policy:

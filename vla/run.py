@@ -2,27 +2,25 @@
 
 from __future__ import annotations
 
-import copy
 import os
 import re
 import sys
 import traceback
-from collections.abc import Mapping, Sequence
 from pathlib import Path
 from string import Template
-from typing import Any, NoReturn
+from typing import NoReturn
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
-from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import ConfigCompositionException, HydraException, MissingConfigException, OverrideParseException
 from hydra.types import RunMode
-from omegaconf import DictConfig, OmegaConf, open_dict
+from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
 from vla.check import JOBS, check, suggestion
 from vla.deploy import ros
+from vla.resume import adopt, go_on
 
 PACKAGE = Path(__file__).resolve().parent
 # Inside the package where it was installed from a wheel, beside it in a clone.
@@ -30,34 +28,6 @@ CONF = next(path for path in (PACKAGE / "conf", PACKAGE.parent / "conf") if (pat
 
 ADOPTING = ("evaluate", "export", "deploy", "benchmark")  # jobs that use a checkpoint's own task, tokenizer and model
 TRACEBACKS = "VLA_TRACEBACKS"  # the user's wish for tracebacks, kept for the processes that a trainer starts
-
-
-def adopt(cfg: DictConfig, saved: Mapping[str, Any], overrides: Sequence[str]) -> DictConfig:
-    """`cfg` with the task, tokenizer and model of a checkpoint's config `saved`.
-
-    What the command line `overrides` say about the task, as in `task/randomize=wide task.blocks=4`, applies on top.
-
-    Raises:
-        ValueError: an override of the tokenizer or the model, which the weights were trained with.
-    """
-    adopted = copy.deepcopy(cfg)
-    with open_dict(adopted):
-        for group in ("task", "tokenizer", "model"):
-            adopted[group] = saved[group]
-        for override in OverridesParser.create().parse_overrides(list(overrides)):
-            path = override.key_or_group.replace("/", ".")
-            group = path.partition(".")[0]
-            if group in ("tokenizer", "model"):
-                raise ValueError(
-                    f"{override.input_line} cannot be combined with a checkpoint, whose weights belong to the {group} "
-                    "they were trained with: leave one of the two out"
-                )
-            if group == "task" and override.is_delete():
-                parent, _, name = path.rpartition(".")
-                OmegaConf.select(adopted, parent).pop(name, None)
-            elif group == "task":
-                OmegaConf.update(adopted, path, OmegaConf.select(cfg, path), merge=False, force_add=True)
-    return adopted
 
 
 def sentence(error: Exception) -> str:
@@ -136,10 +106,13 @@ def _do(cfg: DictConfig) -> float | None:
     from vla import jobs
 
     _require_sweepable(cfg)
-    if cfg.checkpoint is not None and cfg.job in ADOPTING:
+    said = HydraConfig.get().overrides.task
+    if cfg.checkpoint is not None and (cfg.checkpoint == "last" or cfg.resume or cfg.job == "train"):
+        cfg = go_on(cfg, said)
+    elif cfg.checkpoint is not None and cfg.job in ADOPTING:
         from vla.policy import read_checkpoint
 
-        cfg = adopt(cfg, read_checkpoint(cfg.checkpoint).config, HydraConfig.get().overrides.task)
+        cfg = adopt(cfg, read_checkpoint(cfg.checkpoint).config, said)
     if "task" in JOBS.get(cfg.job, ()):
         from vla.tasks.backend import choose_backend
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import logging
 import os
 import signal
@@ -13,24 +14,30 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
+import numpy as np
 import torch
 from lightning import Callback, LightningModule, Trainer
-from lightning.pytorch.callbacks import EMAWeightAveraging, ModelCheckpoint, RichProgressBar
-from lightning.pytorch.loggers import CSVLogger
+from lightning.pytorch.callbacks import Checkpoint, EMAWeightAveraging, ModelCheckpoint
+from lightning.pytorch.loggers import CSVLogger, Logger
 from lightning.pytorch.plugins import TorchCheckpointIO
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 from omegaconf import DictConfig
 
 from vla.check import build
+from vla.progress import Pace, Progress
+from vla.resume import LAST
 
 log = logging.getLogger(__name__)
 
-LAST = "last.ckpt"
 SAVE_EVERY = 500  # steps
 
 
-class Interruption(Callback):
-    """At the first SIGINT or SIGTERM training saves and stops after the current step, at the second one at once."""
+class Interruption(Checkpoint):
+    """At the first SIGINT or SIGTERM training saves and stops after the current step, at the second one at once.
+
+    As one of Lightning's checkpoints it comes after all other callbacks. Every checkpoint says whether training was
+    `finished`.
+    """
 
     def __init__(self, checkpoints: Path) -> None:
         self._path = checkpoints / LAST
@@ -54,12 +61,20 @@ class Interruption(Callback):
             raise KeyboardInterrupt
         self.asked = True
 
-    def on_train_batch_end(self, trainer: Trainer, pl_module: LightningModule, *_: Any) -> None:
-        """Save while everything that goes on from here is still at hand."""
-        if self.asked and not trainer.should_stop:
+    def on_train_batch_end(
+        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
+    ) -> None:
+        """Save while everything that goes on from here is still at hand, and no gradient half gathered."""
+        stepped = (batch_idx + 1) % trainer.accumulate_grad_batches == 0
+        if self.asked and stepped and not trainer.should_stop:
             trainer.save_checkpoint(self._path, weights_only=False)
             trainer.should_stop = True
-            log.info("interrupted after %d steps; job=train checkpoint=%s goes on", trainer.global_step, self._path)
+            trainer.limit_val_batches = 0  # else Lightning validates once more before it stops
+            log.info("interrupted after %d steps, see %s; checkpoint=last goes on", trainer.global_step, self._path)
+
+    def on_save_checkpoint(self, trainer: Trainer, pl_module: LightningModule, checkpoint: dict[str, Any]) -> None:
+        """A checkpoint of a training that is over is not to be gone on from."""
+        checkpoint["finished"] = trainer.state.finished
 
 
 class AtomicFiles(TorchCheckpointIO):
@@ -87,29 +102,41 @@ class AtomicFiles(TorchCheckpointIO):
             draft.unlink(missing_ok=True)
 
 
-class Progress(RichProgressBar):
-    """The progress of a training that counts steps: Lightning's own bar calls an endless one "Epoch 0/-2"."""
+class Draws(Callback):
+    """What a step of training draws follows from the seed, the number of the step and the process alone.
 
-    def _get_train_description(self, current_epoch: int) -> str:
-        return "training".ljust(len(self.validation_description))  # bars of one length do not flicker
+    So nothing that happened before it, such as a validation or an interruption, changes it.
+    """
+
+    def __init__(self, seed: int) -> None:
+        self._seed = seed
+
+    def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, batch: Any, batch_idx: int) -> None:
+        """Seed everything that torch draws, on all devices."""
+        parts = trainer.accumulate_grad_batches
+        step = trainer.global_step * parts + batch_idx % parts
+        numbers = np.random.SeedSequence([self._seed, step, trainer.global_rank]).generate_state(1, np.uint64)
+        torch.manual_seed(int(numbers[0]))
 
 
 def make_trainer(config: DictConfig, checkpoints: Path | None, *watching: Callback) -> Trainer:
-    """The trainer of a configuration, which averages the weights and keeps its last checkpoint, if there is a place.
+    """The trainer of a configuration, which averages the weights, and logs and keeps its last checkpoint if there is a
+    place; in validation those who watch see the averaged weights.
 
     Raises:
-        ValueError: the machine has not what it asks for.
+        ValueError: the machine has not what it asks for, or a logger's package is missing.
     """
     callbacks: list[Callback] = [Progress(), *watching]
     options: dict[str, Any] = {"logger": False, "enable_checkpointing": False}
     if config.learner.ema:
-        callbacks.insert(1, EMAWeightAveraging(decay=config.learner.ema))
+        callbacks.append(EMAWeightAveraging(decay=config.learner.ema))
     if checkpoints is not None:
-        # After the averaging, whose weights it saves.
-        callbacks.append(
-            ModelCheckpoint(checkpoints, filename="last", every_n_train_steps=SAVE_EVERY, enable_version_counter=False)
-        )
-        options = {"logger": CSVLogger(checkpoints.parent, name="", version="")}
+        callbacks += [
+            Pace(),
+            ModelCheckpoint(checkpoints, filename="last", every_n_train_steps=SAVE_EVERY, enable_version_counter=False),
+        ]
+        options = {"logger": _loggers(config, checkpoints.parent)}
+    callbacks.append(Draws(config.seed))  # after all that might draw something itself
     try:
         trainer: Trainer = build(config.trainer, callbacks=callbacks, **options)
     except MisconfigurationException as error:
@@ -117,6 +144,32 @@ def make_trainer(config: DictConfig, checkpoints: Path | None, *watching: Callba
         raise ValueError(f"{' '.join(asked)} cannot be had here ({error}): try trainer=cpu or trainer=auto") from error
     trainer.strategy.checkpoint_io = AtomicFiles()
     return trainer
+
+
+def keep_metrics(trainer: Trainer, checkpoint: Path) -> None:
+    """Let the metrics of a training that goes on begin with those that led to its checkpoint."""
+    source = checkpoint.parent.parent / "metrics.csv"
+    writers = [logger for logger in trainer.loggers if isinstance(logger, CSVLogger)]
+    if not writers or not source.exists() or not trainer.is_global_zero:
+        return
+    steps = torch.load(checkpoint, map_location="cpu", weights_only=True, mmap=True)["global_step"]
+    with source.open(newline="", encoding="utf-8") as file:
+        rows = [{name: value for name, value in row.items() if value} for row in csv.DictReader(file)]
+    # Lightning begins with an empty file.
+    writers[0].experiment.metrics = [row for row in rows if int(row["step"]) < steps]
+    writers[0].save()
+
+
+def _loggers(config: DictConfig, folder: Path) -> list[Logger]:
+    loggers = []
+    for name, node in (config.logger or {}).items():
+        try:
+            loggers.append(build(node, save_dir=str(folder)))
+        except ModuleNotFoundError as error:
+            raise ValueError(
+                f"logger.{name} needs a package that is not installed: pip install 'vla[{name}]'"
+            ) from error
+    return loggers
 
 
 def quiet_lightning() -> None:

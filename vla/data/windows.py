@@ -9,6 +9,8 @@ on the seed and the number of the step alone, so a resumed run sees exactly what
 
 from __future__ import annotations
 
+import hashlib
+import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from functools import lru_cache
@@ -35,10 +37,14 @@ def held_out(seed: int, fraction: float) -> bool:
 
 
 class Stream:
-    """Batches of `gather` for the windows that `plan` names, made by one thread a few batches ahead."""
+    """Batches of `gather` for the windows that `plan` names, made by one thread a few batches ahead.
+
+    `waited` is how long it was waited for them [s].
+    """
 
     def __init__(self, gather: Callable[[Array], Batch], plan: Callable[[], Iterable[Array]], ahead: int) -> None:
         self._gather, self._plan, self._ahead = gather, plan, ahead
+        self.waited = 0.0
 
     def __iter__(self) -> Iterator[Batch]:
         wanted: SimpleQueue[Array | None] = SimpleQueue()
@@ -58,15 +64,23 @@ class Stream:
                 wanted.put(windows)
                 under_way += 1
                 if under_way > self._ahead:
-                    yield _result(made)
+                    yield self._next(made)
                     under_way -= 1
             for _ in range(under_way):
-                yield _result(made)
+                yield self._next(made)
         finally:
             with suppress(Empty):
                 while True:
                     wanted.get_nowait()
             wanted.put(None)
+
+    def _next(self, made: SimpleQueue[Batch | Exception]) -> Batch:
+        started = time.perf_counter()
+        batch = made.get()
+        self.waited += time.perf_counter() - started
+        if isinstance(batch, Exception):
+            raise batch
+        return batch
 
 
 class CountedStream(Stream):
@@ -139,9 +153,27 @@ class Windows(LightningDataModule):
                 f"{len(store.episodes)} episodes leave {len(sides[False])} for training and {len(sides[True])} for "
                 f"validation: raise collect.episodes, or set data.validation_fraction (now {self._fraction})"
             )
+        entries = repr([(entry.seed, entry.steps, entry.crc) for entry in store.episodes])
+        self._digest = hashlib.sha256(entries.encode()).hexdigest()[:12]
         self.training_windows = np.concatenate(sides[False])  # row numbers
         self.held_out_windows = np.concatenate(sides[True]) if sides[True] else np.empty(0, np.int64)
         self.gather = Gather(store, self._history, self._chunk, self._depth, self._on_gpu())
+
+    def state_dict(self) -> dict[str, str]:
+        """What tells the demonstrations of a training from others; saved with its checkpoints."""
+        return {"windows": self._digest}
+
+    def load_state_dict(self, state: dict[str, str]) -> None:
+        """Compare with the demonstrations of the training that is to go on.
+
+        Raises:
+            ValueError: these are others.
+        """
+        if state["windows"] != self._digest:
+            raise ValueError(
+                f"the training that is to go on was started with other demonstrations than those in {self._folder}: "
+                "give collect.folder=DIR where they are, or start a training without checkpoint="
+            )
 
     def train_dataloader(self) -> Stream:
         """Batches without end, from the trainer's current step on."""
@@ -188,10 +220,3 @@ class Windows(LightningDataModule):
 @lru_cache(maxsize=2)
 def _shuffled(count: int, seed: int, number: int) -> Array:
     return np.random.default_rng([seed, number]).permutation(count)
-
-
-def _result(made: SimpleQueue[Batch | Exception]) -> Batch:
-    batch = made.get()
-    if isinstance(batch, Exception):
-        raise batch
-    return batch

@@ -1,0 +1,192 @@
+"""A training that is interrupted and gone on with is, bit for bit, the one that was not; and what it says meanwhile."""
+
+from __future__ import annotations
+
+import csv
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import lightning
+import pytest
+import torch
+import toy
+from fake_batch import make_act, make_bc, make_denoising, make_rt1
+from lightning import Callback
+from omegaconf import DictConfig, OmegaConf
+from test_windows import windows
+
+from vla.models.diffusion import Diffusion
+from vla.models.learner import Learner
+from vla.models.model import Model
+from vla.training import Interruption, keep_metrics, make_trainer
+
+MODELS: dict[str, Callable[[], Model]] = {
+    "bc": lambda: make_bc(shift=(64, 64)),
+    "rt1 with dropout": lambda: make_rt1(dropout=0.2),
+    "act, which draws": make_act,
+    "diffusion, which draws": lambda: make_denoising(Diffusion),
+}
+STEPS, STOP = 11, 6
+
+
+def config(**trainer: Any) -> DictConfig:
+    defaults = {
+        "accelerator": "cpu",
+        "max_steps": STEPS,
+        "max_epochs": -1,
+        "val_check_interval": 4,
+        "check_val_every_n_epoch": None,
+        "num_sanity_val_steps": 0,
+        "log_every_n_steps": 2,
+        "gradient_clip_val": 1.0,
+        "enable_model_summary": False,
+    }
+    csv_logger = {"_target_": "lightning.pytorch.loggers.CSVLogger", "name": "", "version": ""}
+    return OmegaConf.create(
+        {
+            "seed": 3,
+            "learner": {"ema": 0.9},
+            "logger": {"csv": csv_logger},
+            "trainer": {"_target_": "lightning.Trainer", **defaults, **trainer},
+        }
+    )
+
+
+class StopAfter(Callback):
+    """Interrupts a training, as a signal would, during the batch after which so many steps are done."""
+
+    def __init__(self, interruption: Interruption, steps: int) -> None:
+        self._interruption, self._steps = interruption, steps
+
+    def on_train_batch_start(self, trainer: lightning.Trainer, *_: Any) -> None:
+        self._interruption.asked = trainer.global_step + 1 >= self._steps
+
+
+def train(
+    model: Model, store: Path, output: Path, stop: int | None = None, checkpoint: Path | None = None, **trainer: Any
+) -> dict[str, Any]:
+    """What the checkpoint holds that a training leaves behind."""
+    lightning.seed_everything(0 if checkpoint is None else 1, verbose=False)  # what came before must not matter
+    interruption = Interruption(output / "checkpoints")
+    watching = [interruption, *([StopAfter(interruption, stop)] if stop else [])]
+    made = make_trainer(config(**trainer), output / "checkpoints", *watching)
+    if checkpoint:
+        keep_metrics(made, checkpoint)
+    learner = Learner(warmup_steps=3, model=model, spec=toy.SPEC, config={})
+    data = windows(store, history=model.history, chunk=model.chunk)
+    made.fit(learner, datamodule=data, ckpt_path=checkpoint, weights_only=True)
+    path = output / "checkpoints/last.ckpt"
+    if not interruption.asked:
+        made.save_checkpoint(path)
+    content: dict[str, Any] = torch.load(path, weights_only=True)
+    return content
+
+
+def logged(output: Path) -> list[dict[str, str]]:
+    """What was logged, but for how fast it was."""
+    with (output / "metrics.csv").open(newline="") as file:
+        rows = [{key: row[key] for key in sorted(row) if not key.startswith("pace/")} for row in csv.DictReader(file)]
+    return [row for row in rows if any(value for key, value in row.items() if key not in ("step", "epoch"))]
+
+
+def same(one: Any, other: Any) -> bool:
+    if isinstance(one, dict):
+        return one.keys() == other.keys() and all(same(one[key], other[key]) for key in one)
+    if isinstance(one, (list, tuple)):
+        return len(one) == len(other) and all(map(same, one, other))
+    return torch.equal(one, other) if isinstance(one, torch.Tensor) else bool(one == other)
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_going_on_after_an_interruption_gives_the_same_bits(name: str, folder: Path, tmp_path: Path) -> None:
+    torch.manual_seed(0)
+    start = MODELS[name]().state_dict()
+
+    def fresh() -> Model:
+        model = MODELS[name]()
+        model.load_state_dict(start)
+        return model
+
+    whole = train(fresh(), folder, tmp_path / "whole")
+    half = train(fresh(), folder, tmp_path / "half", stop=STOP)
+    assert half["global_step"] == STOP and not half["finished"] and whole["finished"]
+    rest = train(MODELS[name](), folder, tmp_path / "half", checkpoint=tmp_path / "half/checkpoints/last.ckpt")
+    for part in ("state_dict", "current_model_state", "averaging_state", "optimizer_states", "lr_schedulers"):
+        assert same(whole[part], rest[part]), part
+    assert not same(half["state_dict"], rest["state_dict"])
+    assert logged(tmp_path / "half") == logged(tmp_path / "whole") != []
+
+
+def test_gradients_that_are_gathered_over_batches_are_not_cut_in_half(folder: Path, tmp_path: Path) -> None:
+    torch.manual_seed(0)
+    model = make_bc()
+    start = {name: value.clone() for name, value in model.state_dict().items()}
+    whole = train(model, folder, tmp_path / "whole", accumulate_grad_batches=3)
+    model.load_state_dict(start)
+    half = train(model, folder, tmp_path / "half", stop=STOP, accumulate_grad_batches=3)
+    assert half["global_step"] == STOP
+    checkpoint = tmp_path / "half/checkpoints/last.ckpt"
+    rest = train(make_bc(), folder, tmp_path / "rest", checkpoint=checkpoint, accumulate_grad_batches=3)
+    assert same(whole["current_model_state"], rest["current_model_state"])
+
+
+def test_other_demonstrations_are_refused(folder: Path, tmp_path: Path) -> None:
+    train(make_bc(), folder, tmp_path, stop=2)
+    learner = Learner(model=make_bc(), spec=toy.SPEC, config={})
+    with pytest.raises(ValueError, match="was started with other demonstrations"):
+        make_trainer(config(), None).fit(
+            learner, datamodule=windows(folder, episodes=8), ckpt_path=tmp_path / "checkpoints/last.ckpt"
+        )
+
+
+TWO = """
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import torch
+from fake_batch import make_rt1
+from test_training import STEPS, STOP, same, train
+
+options = {"devices": 2, "strategy": "ddp"}
+store = Path(sys.argv[1])
+torch.manual_seed(0)
+start = make_rt1(dropout=0.2).state_dict()
+ends = []
+for output, stop, checkpoint in (
+    ("whole", None, None),
+    ("half", STOP, None),
+    ("rest", None, Path("half/checkpoints/last.ckpt")),
+):
+    model = make_rt1(dropout=0.2)
+    model.load_state_dict(start)
+    ends.append(train(model, store, Path(output), stop, checkpoint, **options))
+whole, half, rest = ends
+assert half["global_step"] == STOP
+for part in ("state_dict", "current_model_state", "optimizer_states"):
+    assert same(whole[part], rest[part]), part
+assert not same(whole["state_dict"], half["state_dict"])
+"""
+
+
+def test_two_processes_go_on_with_the_same_bits(folder: Path, tmp_path: Path) -> None:
+    (tmp_path / "two.py").write_text(TWO)
+    tests = Path(__file__).parent
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(tests), str(tests.parent)])}
+    command = [sys.executable, "two.py", str(folder)]
+    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr
+
+
+def test_it_logs_how_fast_it_is_and_what_it_waits_for(folder: Path, tmp_path: Path) -> None:
+    train(make_bc(), folder, tmp_path)
+    with (tmp_path / "metrics.csv").open(newline="") as file:
+        pace = [row for row in csv.DictReader(file) if row["pace/samples_per_s"]]
+    assert len(pace) == STEPS // 2
+    for row in pace:
+        assert float(row["pace/samples_per_s"]) > 0
+        assert 0 <= float(row["pace/waiting"]) < 1 and 0 < float(row["pace/mfu"]) < 1

@@ -1,0 +1,158 @@
+"""Going on with a training that was interrupted: which one, with which configuration, and alone."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from filelock import FileLock, Timeout
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import Override
+from omegaconf import DictConfig, OmegaConf, open_dict
+
+LAST = "last.ckpt"
+LOCK = ".training"  # held by the process that trains into a folder of checkpoints
+
+OF_POLICY = ("task", "tokenizer", "model")
+# What training follows from, apart from where and how fast it runs.
+OF_TRAINING = (
+    *("task", "expert", "collect.episodes", "collect.seed", "data", "tokenizer", "model", "learner", "seed"),
+    *("experiment", "variant"),
+)
+
+
+def adopt(cfg: DictConfig, saved: Mapping[str, Any], overrides: Sequence[str]) -> DictConfig:
+    """`cfg` with the task, tokenizer and model of a checkpoint's config `saved`.
+
+    What the command line `overrides` say about the task, as in `task/randomize=wide task.blocks=4`, applies on top.
+
+    Raises:
+        ValueError: an override of the tokenizer or the model, which the weights were trained with.
+    """
+    said = _parsed(overrides)
+    for override in said:
+        group = _path(override).partition(".")[0]
+        if group in ("tokenizer", "model"):
+            raise ValueError(
+                f"{override.input_line} cannot be combined with a checkpoint, whose weights belong to the {group} "
+                "they were trained with: leave one of the two out"
+            )
+    return _on_top(cfg, {group: saved[group] for group in OF_POLICY}, said)
+
+
+def go_on(cfg: DictConfig, overrides: Sequence[str]) -> DictConfig:
+    """The configuration of the training that made `cfg.checkpoint`, to go on with it.
+
+    "last" stands for the newest interrupted run among the neighbours of `cfg.output`, in whose folder it goes on; if
+    its training was finished, what comes after that is done. What the command line `overrides` say about anything but
+    what the training follows from applies on top.
+
+    Raises:
+        ValueError: there is none, or an override would make it another training.
+    """
+    from vla.policy import read_checkpoint
+
+    last = cfg.checkpoint == "last"
+    path = newest_interrupted(Path(cfg.output).parent) if last else Path(cfg.checkpoint)
+    saved = read_checkpoint(path)
+    said = _parsed(overrides)
+    for override in said:
+        if f"{_path(override)}.".startswith(tuple(f"{name}." for name in OF_TRAINING)):
+            raise ValueError(
+                f"{override.input_line} cannot be combined with going on from {path}: with other data, another "
+                "model or learner it is another training, so leave it out, or start one without checkpoint="
+            )
+    adopted = {name: value for name, value in saved.config.items() if name in cfg and name not in ("job", "output")}
+    resumed = _on_top(cfg, adopted, said)
+    resumed.checkpoint, resumed.resume = str(path), not saved.finished
+    named = {_path(override) for override in said}
+    if last and "output" not in named:
+        resumed.output = str(path.parent.parent)
+    if last and "job" not in named:
+        resumed.job = saved.config["job"]
+    return resumed
+
+
+def newest_interrupted(runs: Path) -> Path:
+    """The checkpoint of the newest run in a folder whose training, or the evaluation after it, did not come to its end.
+
+    Raises:
+        ValueError: there is none.
+    """
+    from vla.policy import read_checkpoint
+
+    files = sorted(runs.glob(f"*/checkpoints/{LAST}"), key=lambda path: path.stat().st_mtime, reverse=True)
+    for path in files:
+        if _held(path.parent):
+            continue
+        saved = read_checkpoint(path)
+        unreported = saved.config["job"] == "evaluate" and not (path.parent.parent / "report.json").exists()
+        if not saved.finished or unreported:
+            return path
+    raise ValueError(
+        f"checkpoint=last: none of the {len(files)} trainings in {runs} was interrupted; checkpoint=FILE names one"
+    )
+
+
+@contextmanager
+def alone(checkpoints: Path) -> Iterator[None]:
+    """Within, no other training writes into this folder; the processes of one training count as one.
+
+    Raises:
+        ValueError: another one does.
+    """
+    from lightning.pytorch.utilities import rank_zero_only
+
+    if rank_zero_only.rank != 0:  # type: ignore[attr-defined]
+        yield
+        return
+    checkpoints.mkdir(parents=True, exist_ok=True)
+    lock = FileLock(checkpoints / LOCK, blocking=False)
+    try:
+        lock.acquire()
+    except Timeout as error:
+        raise ValueError(
+            f"another process is training into {checkpoints}: give it time, or another output=DIR"
+        ) from error
+    try:
+        yield
+    finally:
+        lock.release()
+
+
+def _held(checkpoints: Path) -> bool:
+    """Whether a training is writing there now."""
+    try:
+        with FileLock(checkpoints / LOCK, blocking=False):
+            return False
+    except Timeout:
+        return True
+
+
+def _parsed(overrides: Sequence[str]) -> list[Override]:
+    return OverridesParser.create().parse_overrides(list(overrides))
+
+
+def _path(override: Override) -> str:
+    return override.key_or_group.replace("/", ".")
+
+
+def _on_top(cfg: DictConfig, saved: Mapping[str, Any], said: Sequence[Override]) -> DictConfig:
+    """`cfg` with the saved nodes, and on top of these what was said on the command line."""
+    adopted = copy.deepcopy(cfg)
+    with open_dict(adopted):
+        for name, node in saved.items():
+            adopted[name] = node
+        for override in said:
+            path = _path(override)
+            if path.partition(".")[0] not in saved:
+                continue
+            if override.is_delete():
+                parent, _, name = path.rpartition(".")
+                OmegaConf.select(adopted, parent).pop(name, None)
+            else:
+                OmegaConf.update(adopted, path, OmegaConf.select(cfg, path), merge=False, force_add=True)
+    return adopted
