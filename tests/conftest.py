@@ -1,4 +1,5 @@
-"""Shared by all tests: headless rendering, one thread per process, and the tabletop as the configuration builds it."""
+"""Shared by all tests: headless rendering, one thread per process, the tabletop as the configuration builds it, and a
+store of episodes of the toy world."""
 
 from __future__ import annotations
 
