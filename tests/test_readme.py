@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+import torch
 from test_cluster import address_in, dask
 from test_run import SMALL, vla
 from tiny_encoder import write_encoder
@@ -25,10 +26,13 @@ os.environ["ROS_DOMAIN_ID"] = str(18 + 20 * (int(os.environ.get("PYTEST_XDIST_WO
 
 @pytest.fixture(scope="module")
 def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with a small checkpoint, FILE, a small LeRobot dataset, DATASET, and a small encoder, ENCODER."""
+    """A folder with a small checkpoint, FILE, an interrupted run, a LeRobot dataset, DATASET, and an encoder, ENCODER."""
     folder = tmp_path_factory.mktemp("readme")
     write_encoder(folder / "encoder")
     vla(folder, *SMALL, "job=train", "output=run")
+    half = torch.load(folder / "run/checkpoints/last.ckpt", weights_only=True) | {"finished": False}
+    (folder / "outputs/runs/half/checkpoints").mkdir(parents=True)
+    torch.save(half, folder / "outputs/runs/half/checkpoints/last.ckpt")
     vla(folder, *SMALL, "job=export", "export=lerobot", "export.folder=dataset")
     return folder
 
@@ -74,8 +78,8 @@ def test_the_command_runs(home: Path, command: str, request: pytest.FixtureReque
         small = [*SMALL, *small]
     elif "deploy=loop" in arguments:
         small = ["deploy.episodes=1", "task.time_limit=1", "benchmark.episodes=1"]
-    elif "job=train" in arguments:
-        small = [*SMALL, "trainer.max_steps=6"]
+    elif {"job=train", "checkpoint=last", "resume=true"} & set(arguments):
+        small = ["trainer.max_steps=6"]
     if "cluster=dask" in arguments:
         small += ["collect.folder=remote", "collect.episodes=4"]
     if "experiment=ablation" in arguments:
