@@ -8,12 +8,14 @@ from __future__ import annotations
 import logging
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from omegaconf import DictConfig
+from hydra import compose
+from omegaconf import DictConfig, OmegaConf
 from rich import print as show
 
 from vla.check import build
@@ -31,6 +33,8 @@ from vla.parts import (
 )
 
 if TYPE_CHECKING:
+    from lightning import Trainer
+
     from vla.policy import Policy
 
 log = logging.getLogger(__name__)
@@ -82,6 +86,7 @@ def evaluate(config: DictConfig) -> float:
         ValueError: an episode could not be played to its end; the report, which is written, says why.
     """
     from vla.evaluate import SEEN, evaluate, keep_recordings
+    from vla.page import PAGE, optional, write_page
     from vla.policy import latency
     from vla.report import plot_report, write_report
     from vla.suite import plot_suite, suite_table
@@ -103,12 +108,15 @@ def evaluate(config: DictConfig) -> float:
         keep_recordings(report, recordings, output / "rollouts.rrd", config.evaluate.recordings)
     policy = make()
     size = {"parameters": sum(p.numel() for p in policy.model.parameters()), "latency_ms": latency(policy)}
+    _note_config(config)
     write_report(report, output / "report.json", str(checkpoint), plain(config), size, reports)
     plot_report(report, output / "report.png")
-    log.info("wrote %s, report.png%s", output / "report.json", " and rollouts.rrd" if config.recorder else "")
     if reports:
         plot_suite({SEEN: report, **reports}, output / "suite.png")
         show(suite_table({SEEN: report, **reports}))
+    with optional(output / PAGE):
+        write_page(output)
+    log.info("wrote %s, report.json, report.png%s", output / PAGE, " and rollouts.rrd" if config.recorder else "")
     print(report)
     errors = [error for each in (report, *reports.values()) for error in each.errors]
     if errors:
@@ -183,6 +191,13 @@ def inspect(config: DictConfig) -> None:
         replay_into(_output(config), Path(asked["folder"]), seed)
 
 
+def report(config: DictConfig) -> None:
+    """Compare runs in one page."""
+    from vla.page import write_comparison
+
+    log.info("wrote %s", write_comparison([Path(run) for run in config.report.runs], Path(config.output)))
+
+
 JOBS: dict[str, Callable[[DictConfig], float | None]] = {
     "preview": preview,
     "collect": collect,
@@ -192,6 +207,7 @@ JOBS: dict[str, Callable[[DictConfig], float | None]] = {
     "deploy": deploy,
     "benchmark": benchmark,
     "inspect": inspect,
+    "report": report,
 }
 
 
@@ -200,6 +216,8 @@ def _trained(config: DictConfig) -> Path:
     import lightning
 
     from vla.models.fidelity import fidelity
+    from vla.page import optional
+    from vla.samples import FILE, SHOWN, draw_samples
     from vla.training import LAST, Interruption, make_trainer, quiet_lightning
 
     quiet_lightning()
@@ -219,20 +237,56 @@ def _trained(config: DictConfig) -> Path:
     tokens = fidelity(learner.model.tokenizer, store.statistics.chunks(learner.model.chunk), store.spec.units)
     log.info("%s: %s", type(learner.model.tokenizer).__name__, tokens)
     log.info("training %s with %.2f M parameters", type(learner.model).__name__, parameters / 1e6)
+    data.setup()
+    with optional(_output(config) / FILE):
+        draw_samples(data.gather(data.order(0)[:SHOWN]), store.spec, _output(config) / FILE)
     started = time.monotonic()
-    try:
-        with interruption.listening():
-            trainer.fit(learner, datamodule=data, ckpt_path=config.checkpoint, weights_only=True)
-    except SystemExit:  # at a SIGTERM Lightning leaves as if all were well
-        if not interruption.asked:
-            raise
-    if interruption.asked:
-        raise KeyboardInterrupt
-    trainer.save_checkpoint(checkpoints / LAST, weights_only=False)
+    with _told(config, trainer, parameters):
+        try:
+            with interruption.listening():
+                trainer.fit(learner, datamodule=data, ckpt_path=config.checkpoint, weights_only=True)
+        except SystemExit:  # at a SIGTERM Lightning leaves as if all were well
+            if not interruption.asked:
+                raise
+        if interruption.asked:
+            raise KeyboardInterrupt
+        trainer.save_checkpoint(checkpoints / LAST, weights_only=False)
     if not trainer.is_global_zero:
         sys.exit()  # what follows training is done once
     log.info("trained %d steps in %.0f s: %s", trainer.global_step, time.monotonic() - started, checkpoints)
     return checkpoints / LAST
+
+
+@contextmanager
+def _told(config: DictConfig, trainer: Trainer, parameters: int) -> Iterator[None]:
+    """However the training within ends, its page tells how it did."""
+    from vla.page import PAGE, optional, write_page
+    from vla.results import note_training
+
+    output = _output(config)
+    _note_config(config)
+    started, ended = time.monotonic(), "done"
+    try:
+        yield
+    except BaseException as error:
+        ended = "interrupted" if isinstance(error, KeyboardInterrupt) else str(error) or type(error).__name__
+        raise
+    finally:
+        if trainer.is_global_zero:
+            note_training(output, parameters, trainer.global_step, time.monotonic() - started, ended)
+            with optional(output / PAGE):
+                write_page(output)
+
+
+def _note_config(config: DictConfig) -> None:
+    """Leave beside the results what they came from, and what of that is not as it would be without any choice."""
+    from vla.results import differences, note_config
+
+    chosen, default = (OmegaConf.to_container(each, resolve=False) for each in (config, compose("config")))
+    changes = [
+        {"key": key, "here": here, "default": by_default} for key, here, by_default in differences(chosen, default)
+    ]
+    note_config(_output(config), plain(config), changes)
 
 
 def _require_same_policy(config: DictConfig) -> None:
