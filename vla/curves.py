@@ -13,11 +13,12 @@ from vla.report import BLUE, GREEN, GREY, RED
 from vla.results import Curve
 
 COLOURS = (GREEN, BLUE, RED, "#d9942b", "#8a5bb8", "#2f9fa3", "#b5628f", GREY)  # of runs, or of components
-SIZE = (4.0, 2.5)  # of a picture [inch]
+SIZE = (3.4, 2.3)  # of a picture [inch]
+AXES = (0.16, 0.12, 0.82, 0.81)  # left, bottom, width and height of a picture's axes, as shares of it
 INK = "#010203"  # stands for the colour of the page's text, which only the page knows
 DECADE = 10.0  # a loss that changes by more is drawn over a logarithmic axis
 
-Lines = list[tuple[str, bool, str, Curve]]  # label or nothing, whether it is of training, colour, curve
+Lines = list[tuple[str, bool, str, Curve]]  # label or nothing, whether it is of training steps, colour, curve
 
 
 def draw_run(metrics: Mapping[str, Curve]) -> dict[str, str]:
@@ -30,7 +31,7 @@ def draw_run(metrics: Mapping[str, Curve]) -> dict[str, str]:
         known = components.setdefault(family, [])
         if component not in known:
             known.append(component)
-        training = name.startswith("train/")
+        training = not name.startswith("val/")
         colour = GREY if training and not component else COLOURS[known.index(component) % len(COLOURS)]
         families.setdefault(family, []).append((component, training, colour, curve))
     return {title: _draw(title, lines) for title, lines in _ordered(families).items()}
@@ -41,7 +42,7 @@ def draw_runs(runs: Mapping[str, Mapping[str, Curve]]) -> dict[str, str]:
     families: dict[str, Lines] = {}
     for colour, metrics in zip(colours(len(runs)), runs.values(), strict=True):
         for name, curve in metrics.items():
-            families.setdefault(_title(_bare(name)), []).append(("", name.startswith("train/"), colour, curve))
+            families.setdefault(_title(_bare(name)), []).append(("", not name.startswith("val/"), colour, curve))
     return {title: _draw(title, lines) for title, lines in _ordered(families).items()}
 
 
@@ -83,8 +84,8 @@ def _draw(title: str, lines: Lines) -> str:
     settings |= {f"{part}.color": INK for part in ("text", "xtick", "ytick")}
     settings |= {"axes.edgecolor": INK, "axes.labelcolor": INK, "grid.color": INK, "axes.linewidth": 0.6}
     with matplotlib.rc_context(settings):
-        figure = Figure(figsize=SIZE, layout="constrained")
-        axes = figure.add_subplot()
+        figure = Figure(figsize=SIZE)
+        axes = figure.add_axes(AXES)
         for label, training, colour, (steps, values) in lines:
             few = "o" if len(steps) < 30 and not training else ""
             look = {"linewidth": 1.0, "alpha": 0.8} if training else {"linewidth": 1.7, "marker": few, "markersize": 3}

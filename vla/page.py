@@ -80,7 +80,7 @@ def write_comparison(folders: Sequence[Path], target: Path) -> Path:
         ValueError: there is nothing to compare, a folder is no run, or a file in it is damaged.
     """
     if not folders:
-        raise ValueError("name the runs to compare, as in report.runs=[DIR,DIR]")
+        raise ValueError("name the runs to compare, as in report.runs=[RUN,RUN]")
     runs = dict(zip(_names(folders), map(require_run, folders), strict=True))
     lines = [
         Line([name], _intervals(run), _costs(run), _links(run.folder, target), colour)

@@ -55,7 +55,7 @@ def _plot_action(axes: Axes, action: Array, spec: Spec) -> None:
     axes.barh(places, shares, color=GREEN, height=0.6)
     for place, (value, unit) in enumerate(zip(action, spec.units, strict=True)):
         factor, readable = READABLE[unit]
-        text = readable.format(round(factor * float(value), 2) + 0.0)  # never "-0.0"
+        text = readable.format(round(factor * float(value), 1) + 0.0)  # never "-0.0"
         axes.text(1.12, place, text, va="center", fontsize=7.5)
     axes.set_yticks(places, spec.action, fontsize=7.5)
     axes.set_xlim(-1.05, 1.75)
