@@ -212,9 +212,10 @@ def test_runs_with_nothing_to_compare_are_refused(tmp_path: Path) -> None:
     ):
         with pytest.raises(ValueError, match=says):
             write_comparison(folders, tmp_path / "new")
-    (run / "report.json").write_text("{")
-    with pytest.raises(ValueError, match=r"report\.json is damaged"):
-        write_comparison([run], tmp_path / "new")
+    for file, says in (("rollouts.rrd", "cannot be read"), ("report.json", "is damaged")):
+        (run / file).write_text("{")
+        with pytest.raises(ValueError, match=f"{file} {says}"):
+            write_comparison([run], tmp_path / "new")
     assert not (tmp_path / "new").exists()
 
 

@@ -38,7 +38,7 @@ def draw_run(metrics: Mapping[str, Curve]) -> dict[str, str]:
 
 
 def draw_runs(runs: Mapping[str, Mapping[str, Curve]]) -> dict[str, str]:
-    """Title → SVG, one for every metric that more than nothing was logged of, with all runs in the same axes."""
+    """Title → SVG, one for every metric that any of them logged, with all runs in the same axes."""
     families: dict[str, Lines] = {}
     for colour, metrics in zip(colours(len(runs)), runs.values(), strict=True):
         for name, curve in metrics.items():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -34,10 +35,17 @@ def read_strips(file: Path, failures: int, successes: int) -> list[Strip]:
     Raises:
         ValueError: the file cannot be read.
     """
-    reader = RrdReader(file)
+    try:
+        reader = RrdReader(file)
+        return [_strip(reader, entry) for entry in _chosen(reader.recordings(), failures, successes)]
+    except RuntimeError as error:  # of the library
+        raise ValueError(f"{file} cannot be read: {error}") from error
+
+
+def _chosen(entries: Sequence[StoreEntry], failures: int, successes: int) -> list[StoreEntry]:
     failed, succeeded = [], []
     seen: Counter[str] = Counter()
-    for entry in sorted(reader.recordings(), key=lambda entry: entry.recording_id):
+    for entry in sorted(entries, key=lambda entry: entry.recording_id):
         kind, _, *outcome = entry.recording_id.split("-")[:-1]  # see `vla.record.recording_name`
         if kind == "success":
             succeeded.append(entry)
@@ -45,7 +53,7 @@ def read_strips(file: Path, failures: int, successes: int) -> list[Strip]:
             failed.append((seen["-".join(outcome)], entry))
             seen["-".join(outcome)] += 1
     failed.sort(key=lambda one: one[0])
-    return [_strip(reader, entry) for entry in [*(entry for _, entry in failed[:failures]), *succeeded[:successes]]]
+    return [*(entry for _, entry in failed[:failures]), *succeeded[:successes]]
 
 
 def _strip(reader: RrdReader, entry: StoreEntry) -> Strip:

@@ -251,9 +251,10 @@ def _trained(config: DictConfig) -> Path:
         if interruption.asked:
             raise KeyboardInterrupt
         trainer.save_checkpoint(checkpoints / LAST, weights_only=False)
+        seconds = time.monotonic() - started
     if not trainer.is_global_zero:
         sys.exit()  # what follows training is done once
-    log.info("trained %d steps in %.0f s: %s", trainer.global_step, time.monotonic() - started, checkpoints)
+    log.info("trained %d steps in %.0f s: %s", trainer.global_step, seconds, checkpoints)
     return checkpoints / LAST
 
 
@@ -273,8 +274,9 @@ def _told(config: DictConfig, trainer: Trainer, parameters: int) -> Iterator[Non
         raise
     finally:
         if trainer.is_global_zero:
-            note_training(output, parameters, trainer.global_step, time.monotonic() - started, ended)
+            seconds = time.monotonic() - started
             with optional(output / PAGE):
+                note_training(output, parameters, trainer.global_step, seconds, ended)
                 write_page(output)
 
 

@@ -91,7 +91,7 @@ def write_comparison(folders: Sequence[Path], target: Path) -> Path:
         "comparison.html",
         title=f"{len(runs)} runs" if len(runs) > 1 else next(iter(runs)),
         lines=lines,
-        heads=(["run"], ["model", "parameters [M]", "action [ms]", "steps", "training"], ""),
+        heads=(["run"], ["model", "parameters [M]", "action [ms]", "steps", "time"], ""),
         curves=draw_runs({name: run.metrics for name, run in runs.items()}),
         pairs=_pairs(runs),
         differences=_between(runs),
@@ -184,11 +184,12 @@ def _intervals(run: Run) -> dict[str, tuple[float, float, float]]:
 
 
 def _costs(run: Run) -> list[str]:
+    logged = max((steps[-1] + 1 for steps, _ in run.metrics.values()), default=ABSENT)
     return [
         run.model or ABSENT,
         ABSENT if run.parameters is None else f"{run.parameters / 1e6:.2f}",
         f"{run.report['latency_ms']:.1f}" if "latency_ms" in run.report else ABSENT,
-        str(max((steps[-1] + 1 for steps, _ in run.metrics.values()), default=ABSENT)),
+        str(run.training.get("steps", logged)),
         _duration(run.training["seconds"]) if run.training else ABSENT,
     ]
 

@@ -19,13 +19,8 @@ from vla.spec import Array
 Node = dict[str, Any]
 Curve = tuple[Array, Array]  # steps (N,) and values (N,)
 
-CONFIG, CHANGES, TRAINING, METRICS, REPORT = (
-    "config.yaml",
-    "changes.yaml",
-    "training.json",
-    "metrics.csv",
-    "report.json",
-)
+CONFIG, CHANGES, TRAINING = "config.yaml", "changes.yaml", "training.json"
+METRICS, REPORT = "metrics.csv", "report.json"
 # Where a run writes, and what other jobs would do: in these configurations differ without the runs being different.
 ASIDE = ("output", "job", "preview", "inspect", "export", "benchmark", "report")
 ABSENT = "-"  # stands for a key that one of two configurations does not have

@@ -12,6 +12,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 from hydra.core.utils import JobReturn
 from hydra.experimental.callback import Callback
@@ -164,7 +165,7 @@ def _write_page(rows: list[Row], folder: Path) -> None:
             list(row.choices.values()),
             {condition: row.interval(condition) for condition in row.successes},
             [", ".join(f"{100 * rate:.1f}" for rate in row.rates), f"{row.parameters / 1e6:.2f}", f"{row.latency:.1f}"],
-            {cell.name: f"{cell.name}/report.html" for cell in row.cells},
+            {cell.name: f"{quote(cell.name)}/report.html" for cell in row.cells},
         )
         for row in rows
     ]
