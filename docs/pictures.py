@@ -1,7 +1,7 @@
 """Make the README's pictures anew, with the README's commands: python docs/pictures.py RUN_FOLDER
 
 RUN_FOLDER is what a main job left, `outputs/runs/<time>`. The viewer is photographed without a display, for which it
-needs Vulkan: on Debian the packages libvulkan1 and mesa-vulkan-drivers.
+needs Vulkan: on Debian the packages libvulkan1 and mesa-vulkan-drivers. Pages are photographed by chromium.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from rerun.experimental import ViewerClient
 from vla.record import VIEWER
 
 DOCS = Path(__file__).parent
+HEIGHT = 1460  # of the page, as far as it is shown [px]
 STEP = 12  # at which the rollout is shown: about to grasp
 
 
@@ -55,8 +56,16 @@ def screenshot(recording: Path, picture: Path, step: int) -> None:
         viewer.wait(timeout=10)
 
 
+def photograph(page: Path, picture: Path, height: int) -> None:
+    """Save the top of a page as PNG, 1200 pixels wide and so high."""
+    options = ["--headless", "--no-sandbox", "--disable-gpu", "--hide-scrollbars", f"--window-size=1200,{height}"]
+    subprocess.run(
+        ["chromium", *options, f"--screenshot={picture}", page.resolve().as_uri()], check=True, capture_output=True
+    )
+
+
 def main(run: Path) -> None:
-    """Previews, one rollout in the viewer, the card of a small store, and the report of `run`."""
+    """Previews, one rollout in the viewer, the card of a small store, the report of `run` and its page."""
     with tempfile.TemporaryDirectory() as folder:
         vla("job=preview", "preview.episodes=6", f"output={folder}")
         shutil.copy(Path(folder) / "preview.png", DOCS / "preview.png")
@@ -70,6 +79,7 @@ def main(run: Path) -> None:
         vla("job=inspect", store)
         shutil.copy(Path(folder) / "episodes/card.png", DOCS / "card.png")
     shutil.copy(run / "report.png", DOCS / "report.png")
+    photograph(run / "report.html", DOCS / "page.png", HEIGHT)
 
 
 if __name__ == "__main__":

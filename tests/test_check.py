@@ -46,6 +46,7 @@ def config(**changes: Any) -> DictConfig:
                 "lerobot": None,
             },
             "inspect": dict.fromkeys(("stores", "where", "into", "episode")) | {"folder": "x", "repair": False},
+            "report": {"runs": []},
             "task": {
                 "_target_": "vla.tasks.tabletop.Tabletop",
                 "goal": {"_target_": "vla.tasks.goals.lift.Lift", "language": GRAMMAR, "height": 0.1},

@@ -26,7 +26,7 @@ os.environ["ROS_DOMAIN_ID"] = str(18 + 20 * (int(os.environ.get("PYTEST_XDIST_WO
 
 @pytest.fixture(scope="module")
 def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with a small checkpoint, FILE, an interrupted run, a LeRobot dataset, DATASET, and an encoder, ENCODER."""
+    """A folder with a small RUN and its checkpoint, FILE, an interrupted run, a LeRobot DATASET and an ENCODER."""
     folder = tmp_path_factory.mktemp("readme")
     write_encoder(folder / "encoder")
     vla(folder, *SMALL, "job=train", "output=run")
@@ -65,6 +65,7 @@ def test_the_command_runs(home: Path, command: str, request: pytest.FixtureReque
     if "cluster=dask" in command:
         command = command.replace("tcp://HOST:8786", request.getfixturevalue("address"))
     command = command.replace("DATASET", "dataset").replace("ENCODER", "encoder").replace("DIR", f"new{number}")
+    command = command.replace("RUN,RUN", "run")
     arguments = shlex.split(command.replace("FILE", "run/checkpoints/last.ckpt"))
     if "--help" in arguments:
         assert "pick_place" in vla(home, *arguments).stdout

@@ -14,6 +14,7 @@ from pathlib import Path
 import pytest
 import torch
 import warm
+import yaml
 from rerun.chunk import RrdReader
 
 from vla.policy import read_checkpoint
@@ -67,12 +68,17 @@ def test_the_main_job_collects_trains_evaluates_and_records(home: Path) -> None:
     } <= set(report)
     assert report["episodes"] == 2 and report["errors"] == 0
     assert report["config"]["collect"]["episodes"] == 24
-    for name in ("report.png", "rollouts.rrd", "checkpoints/last.ckpt", "checkpoints/best.ckpt", "metrics.csv"):
+    names = ("report.html", "report.png", "rollouts.rrd", "samples.png", "metrics.csv", "checkpoints/last.ckpt")
+    for name in (*names, "checkpoints/best.ckpt"):
         assert (home / "run" / name).stat().st_size > 0
     assert list((home / "run/tensorboard").glob("events.out.tfevents.*"))
     header, *rows = (home / "run/metrics.csv").read_text().splitlines()
     success = header.split(",").index("val/success")
     assert [row.split(",")[success] for row in rows if row.split(",")[success]] == ["0.0", "0.0"]  # hardly trained
+    page = (home / "run/report.html").read_text()
+    for words in ("4 steps", "collect.episodes", ">1500<", "What training began with", 'href="rollouts.rrd"'):
+        assert words in page, words
+    assert yaml.safe_load((home / "run/config.yaml").read_text()) == report["config"]
     printed = (home / "printed.txt").read_text()
     assert "\ntraining  " in printed and "Epoch" not in printed
     last = printed.strip().splitlines()[-1]
@@ -87,6 +93,11 @@ def test_a_checkpoint_brings_its_task_and_model_and_takes_harder_scenes(home: Pa
     assert "purple" in report["config"]["task"]["randomize"]["colour"]["names"]
     refused = vla(home, *arguments, "model=rt1_tiny", ok=False)
     assert refused.stderr.count("\n") == 1 and "model=rt1_tiny" in refused.stderr
+
+
+def test_runs_are_compared_in_one_page(home: Path) -> None:
+    vla(home, "job=report", "report.runs=[run]", "output=compared")
+    assert 'href="../run/report.html"' in (home / "compared/comparison.html").read_text()
 
 
 def test_a_grid_collects_once_and_trains_every_cell(home: Path) -> None:
@@ -175,6 +186,8 @@ BAD_INPUT = {
     ),
     "no room on the table": (("job=preview", "task.blocks=4", "task.randomize.placement.x=[0.5,0.5]"), "no room"),
     "no dataset": (("job=collect", "expert=lerobot", "expert.folder=nowhere"), "no LeRobot dataset in nowhere"),
+    "nothing to compare": (("job=report",), "report.runs=[RUN,RUN]"),
+    "no run": (("job=report", "report.runs=[run,outputs]"), "outputs is no run"),
     "no GPU": (("trainer=gpu", *(item for item in SMALL if "accelerator" not in item)), "gpu"),
 }
 
@@ -248,6 +261,12 @@ def test_benchmark_measures_against_floors(home: Path) -> None:
         assert set(measure) == {"value", "unit", "n", "floor", "ratio"} and measure["floor"] > 0
 
 
+def test_training_that_fails_says_so_in_its_page(home: Path) -> None:
+    done = vla(home, *SMALL, "job=train", "learner.lr=1e30", "learner.warmup_steps=0", "output=failed", ok=False)
+    assert "error: the loss is nan" in done.stderr and "Traceback" not in done.stderr
+    assert "Training failed: the loss is nan" in (home / "failed/report.html").read_text()
+
+
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
 def test_training_that_is_interrupted_saves_and_goes_on(home: Path, number: int) -> None:
     folder = f"outputs/runs/stopped{number}"
@@ -265,6 +284,7 @@ def test_training_that_is_interrupted_saves_and_goes_on(home: Path, number: int)
     assert process.returncode == 130, printed
     checkpoint = f"{folder}/checkpoints/last.ckpt"
     assert "interrupted after" in printed and checkpoint in printed
+    assert "Training was interrupted after" in (home / folder / "report.html").read_text()
     if number == signal.SIGTERM:
         return  # what follows is the same
     steps = int(printed.partition("interrupted after ")[2].split()[0])

@@ -16,14 +16,13 @@ from rich.table import Table
 
 from vla.data.index import Entry
 from vla.data.inspection import Findings, episode_of, listed, parts_of
-from vla.report import GREEN, RED, contact_sheet, spans
+from vla.report import BLUE, GREEN, RED, contact_sheet, spans
 from vla.spec import flat
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import SubFigure
 
-BLUE = "#3b76c4"
 ITEMS = (RED, GREEN, BLUE)  # of a triple: x, y, z or red, green, blue
 WORDS, SENTENCES = 8, 12  # bars in a panel, of words and of instructions
 FRAMES = 4  # episodes whose first frames are shown

@@ -34,6 +34,7 @@ JOBS: dict[str, tuple[str, ...]] = {
     "deploy": ("tokenizer", "model", "policy", "deploy"),
     "benchmark": (*TRAINING, "policy"),
     "inspect": (),
+    "report": (),
 }
 EVALUATION = ("task", "tokenizer", "model", "policy", "recorder")  # of a checkpoint, with nothing to train
 OPTIONAL = ("recorder", "logger")  # groups that a job can do without
@@ -58,7 +59,7 @@ Seed = Annotated[int, 0]
 
 # The nodes that name no class.
 PLAIN: dict[str, Any] = {
-    "job": Literal["preview", "collect", "train", "evaluate", "export", "deploy", "benchmark", "inspect"],
+    "job": Literal["preview", "collect", "train", "evaluate", "export", "deploy", "benchmark", "inspect", "report"],
     "seed": Seed,
     "checkpoint": str | None,
     "resume": bool,
@@ -89,6 +90,7 @@ PLAIN: dict[str, Any] = {
         "into": str | None,
         "episode": Seed | None,
     },
+    "report": {"runs": list[str]},
 }
 GROUPS = tuple(dict.fromkeys(group for groups in JOBS.values() for group in groups))
 

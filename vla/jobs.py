@@ -6,8 +6,6 @@
 from __future__ import annotations
 
 import logging
-import sys
-import time
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -19,16 +17,13 @@ from rich import print as show
 from vla.check import build
 from vla.parts import (
     collected,
-    demonstrated,
-    fit,
-    in_training,
-    make_data,
     make_environment,
     make_expert,
     make_policy,
     make_recorder,
+    note_config,
+    output_folder,
     plain,
-    unfitted_learner,
 )
 
 if TYPE_CHECKING:
@@ -48,7 +43,7 @@ def preview(config: DictConfig) -> None:
     from vla.report import contact_sheet, draws_table
     from vla.rollout import rollout
 
-    output = _output(config)
+    output = output_folder(config)
     environment = make_environment(plain(config.task))
     expert = make_expert(plain(config.expert), environment)
     seeds = range(config.preview.seed, config.preview.seed + config.preview.episodes)
@@ -72,7 +67,9 @@ def collect(config: DictConfig) -> None:
 
 def train(config: DictConfig) -> None:
     """Train a model on the episode store, which is filled first; a checkpoint is gone on from."""
-    _trained(config)
+    from vla.train import trained
+
+    trained(config)
 
 
 def evaluate(config: DictConfig) -> float:
@@ -83,12 +80,14 @@ def evaluate(config: DictConfig) -> float:
         ValueError: an episode could not be played to its end; the report, which is written, says why.
     """
     from vla.evaluate import SEEN, evaluate, keep_recordings
+    from vla.page import PAGE, optional, write_page
     from vla.policy import latency
     from vla.report import plot_report, write_report
     from vla.suite import plot_suite, suite_table
+    from vla.train import trained
 
-    output = _output(config)
-    checkpoint = Path(config.checkpoint) if config.checkpoint and not config.resume else _trained(config)
+    output = output_folder(config)
+    checkpoint = Path(config.checkpoint) if config.checkpoint and not config.resume else trained(config)
     seeds = range(config.evaluate.seed, config.evaluate.seed + config.evaluate.episodes)
     recordings = output / "recordings"
     make = partial(make_policy, plain(config.policy), checkpoint)
@@ -104,12 +103,15 @@ def evaluate(config: DictConfig) -> float:
         keep_recordings(report, recordings, output / "rollouts.rrd", config.evaluate.recordings)
     policy = make()
     size = {"parameters": sum(p.numel() for p in policy.model.parameters()), "latency_ms": latency(policy)}
+    note_config(config)
     write_report(report, output / "report.json", str(checkpoint), plain(config), size, reports)
     plot_report(report, output / "report.png")
-    log.info("wrote %s, report.png%s", output / "report.json", " and rollouts.rrd" if config.recorder else "")
     if reports:
         plot_suite({SEEN: report, **reports}, output / "suite.png")
         show(suite_table({SEEN: report, **reports}))
+    with optional(output / PAGE):
+        write_page(output)
+    log.info("wrote %s, report.json, report.png%s", output / PAGE, " and rollouts.rrd" if config.recorder else "")
     print(report)
     errors = [error for each in (report, *reports.values()) for error in each.errors]
     if errors:
@@ -143,7 +145,7 @@ def deploy(config: DictConfig) -> None:
 
     report = deployed(config).run()
     if report is not None:
-        output = _output(config)
+        output = output_folder(config)
         write_report(report, output / "report.json", config.checkpoint, plain(config))
         plot_report(report, output / "report.png")
         print(report)
@@ -155,7 +157,7 @@ def deployed(config: DictConfig) -> Any:
         config.deploy,
         policy=partial(_required_policy, config),
         environment=partial(make_environment, plain(config.task)),
-        output=_output(config),
+        output=output_folder(config),
     )
 
 
@@ -169,7 +171,7 @@ def benchmark(config: DictConfig) -> None:
     """Time the stages against their floors and write `benchmark.json`."""
     from vla.benchmark import benchmark
 
-    benchmark(config, _output(config))
+    benchmark(config, output_folder(config))
 
 
 def inspect(config: DictConfig) -> None:
@@ -181,7 +183,14 @@ def inspect(config: DictConfig) -> None:
     if seed is None:
         look_into(**asked)
     else:
-        replay_into(_output(config), Path(asked["folder"]), seed)
+        replay_into(output_folder(config), Path(asked["folder"]), seed)
+
+
+def report(config: DictConfig) -> None:
+    """Compare runs in one page."""
+    from vla.page import write_comparison
+
+    log.info("wrote %s", write_comparison([Path(run) for run in config.report.runs], Path(config.output)))
 
 
 JOBS: dict[str, Callable[[DictConfig], float | None]] = {
@@ -193,55 +202,5 @@ JOBS: dict[str, Callable[[DictConfig], float | None]] = {
     "deploy": deploy,
     "benchmark": benchmark,
     "inspect": inspect,
+    "report": report,
 }
-
-
-def _trained(config: DictConfig) -> Path:
-    """Path of the checkpoint that training leaves behind, and does best in validation."""
-    import lightning
-
-    from vla.models.fidelity import fidelity
-    from vla.resume import LAST, alone
-    from vla.training import Interruption, keep_metrics, make_trainer, quiet_lightning
-    from vla.validation import ClosedLoop
-
-    quiet_lightning()
-    checkpoints = _output(config) / "checkpoints"
-    interruption = Interruption(checkpoints)
-    seeds = range(config.validate.seed, config.validate.seed + config.validate.episodes)
-    makers = partial(make_environment, plain(config.task)), partial(in_training, plain(config.policy))
-    closed_loop = ClosedLoop(*makers, seeds, checkpoints)
-    with alone(checkpoints):
-        # Before anything is collected: the devices asked for may be missing, and so may be pretrained weights.
-        trainer = make_trainer(config, checkpoints, *([closed_loop] if seeds else []), interruption)
-        lightning.seed_everything(config.seed, verbose=False)
-        learner = unfitted_learner(config, demonstrated(config))
-        store = collected(config)
-        fit(learner.model.tokenizer, config, store)
-        data = make_data(config, store, learner.model)
-        parameters = sum(parameter.numel() for parameter in learner.model.parameters())
-        tokens = fidelity(learner.model.tokenizer, store.statistics.chunks(learner.model.chunk), store.spec.units)
-        log.info("%s: %s", type(learner.model.tokenizer).__name__, tokens)
-        log.info("training %s with %.2f M parameters", type(learner.model).__name__, parameters / 1e6)
-        if config.checkpoint:
-            keep_metrics(trainer, Path(config.checkpoint))
-        started = time.monotonic()
-        try:
-            with interruption.listening():
-                trainer.fit(learner, datamodule=data, ckpt_path=config.checkpoint, weights_only=True)
-        except SystemExit:  # at a SIGTERM Lightning leaves as if all were well
-            if not interruption.asked:
-                raise
-        if interruption.asked:
-            raise KeyboardInterrupt
-        trainer.save_checkpoint(checkpoints / LAST, weights_only=False)
-    if not trainer.is_global_zero:
-        sys.exit()  # what follows training is done once
-    log.info("trained %d steps in %.0f s: %s", trainer.global_step, time.monotonic() - started, checkpoints)
-    return closed_loop.chosen(checkpoints / LAST)
-
-
-def _output(config: DictConfig) -> Path:
-    folder = Path(config.output)
-    folder.mkdir(parents=True, exist_ok=True)
-    return folder

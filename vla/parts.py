@@ -7,6 +7,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from hydra import compose
 from omegaconf import DictConfig, OmegaConf
 
 from vla.check import build
@@ -33,6 +34,24 @@ def plain(node: DictConfig) -> Node:
     plain = OmegaConf.to_container(node, resolve=True)
     assert isinstance(plain, dict)
     return {str(key): value for key, value in plain.items()}
+
+
+def output_folder(config: DictConfig) -> Path:
+    """Where the results of a run lie, made if it is not there."""
+    folder = Path(config.output)
+    folder.mkdir(parents=True, exist_ok=True)
+    return folder
+
+
+def note_config(config: DictConfig) -> None:
+    """Leave beside the results what they came from, and what of that is not as it would be without any choice."""
+    from vla.results import differences, write_config
+
+    chosen, default = (OmegaConf.to_container(each, resolve=False) for each in (config, compose("config")))
+    changes = [
+        {"key": key, "here": here, "default": by_default} for key, here, by_default in differences(chosen, default)
+    ]
+    write_config(output_folder(config), plain(config), changes)
 
 
 def make_environment(task: Node) -> Tabletop:

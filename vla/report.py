@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from PIL import Image
 
-GREEN, RED, GREY = "#2e9e5b", "#d2483f", "#8a8f98"
+GREEN, RED, BLUE, GREY = "#2e9e5b", "#d2483f", "#3b76c4", "#8a8f98"
 BINS = 5  # groups of equally many episodes into which a drawn number is cut
 GROUPS = 8  # most words between which a factor's panel can tell
 PANELS = 8  # drawn factors on the page

@@ -1,4 +1,4 @@
-"""What a sweep found, as one table that grows with every cell: CSV, Markdown and a picture.
+"""What a sweep found, as one table that grows with every cell: CSV, Markdown, a picture, and a page with all of it.
 
 A cell is a folder of the sweep; cells that differ in nothing but the seed of training make one row.
 """
@@ -12,6 +12,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 from hydra.core.utils import JobReturn
 from hydra.experimental.callback import Callback
@@ -27,6 +28,7 @@ class Row:
 
     choices: dict[str, str]  # the overrides that distinguish it from the other rows
     parameters: int
+    cells: list[Path] = field(default_factory=list)
     latencies: list[float] = field(default_factory=list)  # [ms], of each cell
     rates: list[float] = field(default_factory=list)  # success, of each cell
     successes: dict[str, int] = field(default_factory=dict)  # condition → of all cells
@@ -56,7 +58,7 @@ class Row:
 
 
 class Tabulate(Callback):
-    """Writes `sweep.csv`, `sweep.md` and `sweep.png` into the folder of a sweep, anew after every cell."""
+    """Writes `sweep.html` and what it shows, `sweep.csv`, `sweep.md` and `sweep.png`, anew after every cell."""
 
     def on_job_end(self, config: DictConfig, job_return: JobReturn, **kwargs: Any) -> None:
         """Write the table of all cells that have a report by now."""
@@ -71,6 +73,7 @@ def tabulate(folder: Path) -> list[Row]:
         _whole(folder / "sweep.csv", lambda path: _write_csv(rows, path))
         _whole(folder / "sweep.md", lambda path: path.write_text(markdown(rows), encoding="utf-8"))
         _whole(folder / "sweep.png", lambda path: plot(rows, path))
+        _write_page(rows, folder)
     return rows
 
 
@@ -86,13 +89,14 @@ def read_rows(folder: Path) -> list[Row]:
     for path in sorted(folder.glob("*/report.json"), key=lambda path: (len(path.parent.name), path.parent.name)):
         said = parser.parse_overrides(safe_load((path.parent / ".hydra/overrides.yaml").read_text(encoding="utf-8")))
         overrides = {one.key_or_group: one.get_value_element_as_str() for one in said}
-        cells.append((overrides, json.loads(path.read_text(encoding="utf-8"))))
-    keys = dict.fromkeys(key for overrides, _ in cells for key in overrides if key != SEED)
-    telling = [key for key in keys if len({overrides.get(key) for overrides, _ in cells}) > 1]
+        cells.append((overrides, path.parent, json.loads(path.read_text(encoding="utf-8"))))
+    keys = dict.fromkeys(key for overrides, _, _ in cells for key in overrides if key != SEED)
+    telling = [key for key in keys if len({overrides.get(key) for overrides, _, _ in cells}) > 1]
     rows: dict[tuple[str, ...], Row] = {}
-    for overrides, report in cells:
+    for overrides, cell, report in cells:
         choices = {key: overrides.get(key, "default") for key in telling}
         row = rows.setdefault(tuple(choices.values()), Row(choices, report["parameters"]))
+        row.cells.append(cell)
         row.latencies.append(report["latency_ms"])
         row.rates.append(report["success"])
         for condition, part in {SEEN: report, **report["conditions"]}.items():
@@ -150,6 +154,23 @@ def pareto(rows: list[Row]) -> list[Row]:
         if not best or row.seen[0] > best[-1].seen[0]:
             best.append(row)
     return best
+
+
+def _write_page(rows: list[Row], folder: Path) -> None:
+    """What the other files say, with the curves of the cells and the way to their pages."""
+    from vla.page import SWEEP, Line, optional, write_sweep
+
+    lines = [
+        Line(
+            list(row.choices.values()),
+            {condition: row.interval(condition) for condition in row.successes},
+            [", ".join(f"{100 * rate:.1f}" for rate in row.rates), f"{row.parameters / 1e6:.2f}", f"{row.latency:.1f}"],
+            {cell.name: f"{quote(cell.name)}/report.html" for cell in row.cells},
+        )
+        for row in rows
+    ]
+    with optional(folder / SWEEP):
+        write_sweep(folder, list(rows[0].choices), lines, [cell for row in rows for cell in row.cells])
 
 
 def _write_csv(rows: list[Row], path: Path) -> None:

@@ -1,0 +1,240 @@
+"""Pages of a run, of several runs and of a sweep, from small files as real parts write them."""
+
+from __future__ import annotations
+
+import base64
+import io
+import json
+import logging
+import re
+from html import unescape
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+from toy_recordable import ThinkingAgent, make_environment
+
+from vla.curves import draw_run, draw_runs
+from vla.evaluate import FIRST_SEED, Report, Result, keep_recordings
+from vla.film import MOMENTS, read_strips
+from vla.page import optional, write_comparison, write_page
+from vla.record import RerunRecorder
+from vla.report import plot_report, write_report
+from vla.results import differences, note_training, read_run, write_config
+from vla.rollout import rollout
+from vla.samples import draw_samples
+from vla.sweep import tabulate
+
+SAID = "lift the <script>alert('red')</script> block"
+SEEN = [FIRST_SEED, FIRST_SEED + 1, FIRST_SEED + 3]  # the toy world fails at the last
+CONFIG = {"model": {"_target_": "vla.models.bc.BC", "width": 16}, "trainer": {"max_steps": 400}, "output": "there"}
+CURVES = """\
+epoch,step,lr,train/loss,train/truth_loss,val/error_dx_mm,val/error_dy_mm,val/error_gripper,val/loss
+0,9,0.001,4.5,1.0,,,,
+0,19,0.0005,1.5,0.5,,,,
+0,19,,,,3.0,4.0,0.1,2.5
+0,29,0.0001,0.1,0.1,,,,
+0,39,,,,1.0,2.0,0.05,0.125
+"""
+
+
+def a_report(*outcomes: str) -> Report:
+    return Report(tuple(Result(FIRST_SEED + n, outcome, SAID, 20, {"n": n}) for n, outcome in enumerate(outcomes)))
+
+
+def a_run(folder: Path, outcomes: str = "ssss", width: int = 16, curves: str = CURVES) -> Path:
+    """A folder as an evaluation leaves it, without pictures and recordings; s is a success, d a drop."""
+    folder.mkdir(parents=True)
+    report = a_report(*({"s": "success", "d": "dropped"}[outcome] for outcome in outcomes))
+    config = {**CONFIG, "model": {"_target_": "vla.models.bc.BC", "width": width}}
+    size = {"parameters": 1_500_000, "latency_ms": 2.5}
+    dark = a_report(*["dropped"] * len(outcomes))
+    write_report(report, folder / "report.json", f"{folder}/checkpoints/last.ckpt", config, size, {"dark": dark})
+    (folder / "metrics.csv").write_text(curves)
+    write_config(folder, config, [{"key": "model.width", "here": width, "default": 32}])
+    return folder
+
+
+def text(page: Path) -> str:
+    """What a reader sees, on one line."""
+    body = re.sub(r"<style>.*?</style>|<title>.*?</title>", "", page.read_text(), flags=re.DOTALL)
+    return " ".join(unescape(re.sub(r"<[^>]*>", " ", body)).split())
+
+
+def pictures(page: Path) -> list[Image.Image]:
+    found = re.findall(r'src="data:image/\w+;base64,([^"]+)"', page.read_text())
+    return [Image.open(io.BytesIO(base64.b64decode(content))) for content in found]
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run that left everything, of the toy world."""
+    folder = a_run(tmp_path_factory.mktemp("runs") / "whole", "sssdsd")
+    note_training(folder, 1_500_000, 40, 400.0, "done")
+    environment, recorder = make_environment(), RerunRecorder(folder / "recordings")
+    episodes = [rollout(environment, ThinkingAgent(), seed, recorder) for seed in SEEN]
+    report = Report(tuple(Result(each.seed, each.outcome, each.instruction) for each in episodes))
+    keep_recordings(report, folder / "recordings", folder / "rollouts.rrd", None)
+    plot_report(a_report("success", "dropped"), folder / "report.png")
+    first = [episode.observations[0] for episode in episodes]
+    batch: dict[str, Any] = {
+        "rgb": {name: np.stack([seen.rgb[name] for seen in first])[:, None] for name in first[0].rgb},
+        "action": np.stack([episode.actions[0] for episode in episodes])[:, None, None],
+        "instruction": [SAID] * len(first),
+    }
+    draw_samples(batch, environment.spec, folder / "samples.png")
+    write_page(folder)
+    return folder
+
+
+def test_the_page_tells_everything_that_lies_in_the_folder(whole: Path) -> None:
+    told = text(whole / "report.html")
+    for words in (
+        "66.7 % success: 4 of 6, 95 % CI 30.0-90.3",
+        "parameters 1.50 M",
+        "time of an action 2.5 ms",
+        "40 steps in 6 min 40 s",
+        "checkpoint checkpoints/last.ckpt",
+        "dark 0.0 (0.0-39.0) 0/6 0.12",  # four lost, none won: 2 / 2^4
+        "success 4 dropped 2",
+        "timeout",
+        "seed 1000003, 40 steps",
+        "model.width 16 32",
+    ):
+        assert words in told, words
+    assert not list(whole.glob(".*"))
+
+
+def test_failures_come_first_and_every_camera_is_shown_at_eight_moments(whole: Path) -> None:
+    strips = read_strips(whole / "rollouts.rrd", failures=2, successes=1)
+    assert [(strip.seed, strip.outcome) for strip in strips] == [(SEEN[2], "timeout"), (SEEN[0], "success")]
+    failure = strips[0]
+    assert (failure.length, failure.steps[0], failure.steps[-1], len(failure.steps)) == (40, 0, 39, MOMENTS)
+    assert set(failure.pictures) == {"front", "wrist"}
+    first = make_environment().reset(SEEN[2])
+    assert failure.instruction == first.instruction
+    shown = np.array(Image.open(io.BytesIO(failure.pictures["front"][0])), dtype=int)
+    assert np.abs(shown - first.rgb["front"]).mean() < 20  # a JPEG
+    page = (whole / "report.html").read_text()
+    assert page.index(">timeout<") < page.index(f"seed {SEEN[0]}")
+    assert 'href="rollouts.rrd"' in page
+    shown_twice = [len(strip.steps) for strip in read_strips(whole / "rollouts.rrd", 9, 9)]
+    assert len(pictures(whole / "report.html")) == 2 * sum(shown_twice) + 2  # and two plots
+
+
+def test_a_page_refers_to_nothing_outside_and_runs_nothing(whole: Path, tmp_path: Path) -> None:
+    other = a_run(tmp_path / "a <b>", "ssssds")
+    for page in (whole / "report.html", write_comparison([whole, other], tmp_path)):
+        markup = page.read_text()
+        assert "http" not in markup and "<script" not in markup and "<link" not in markup and "@import" not in markup
+        for address in re.findall(r'(?:src|href)="([^"]*)"', markup):
+            assert address.startswith(("#", "data:image/")) or not re.match(r"\w+:|/", address), address
+        assert "a <b>" not in markup
+
+
+def test_words_of_others_are_escaped(tmp_path: Path) -> None:
+    folder = a_run(tmp_path / "run")
+    write_config(folder, CONFIG, [{"key": "task.said", "here": SAID, "default": "<b>"}])
+    note_training(folder, 1, 1, 1.0, "the loss is <nan>")
+    page = write_page(folder)
+    assert SAID in text(page) and "Training failed: the loss is <nan>" in text(page)
+    assert "<script" not in page.read_text() and "<nan>" not in page.read_text()
+
+
+def test_what_is_missing_is_left_out(tmp_path: Path) -> None:
+    told = text(write_page(tmp_path))
+    assert told.startswith(tmp_path.name)
+    for section in ("success", "Training", "Rollouts", "conditions", "differs"):
+        assert section not in told
+    (tmp_path / "metrics.csv").write_text(CURVES)
+    note_training(tmp_path, 1, 39, 3.0, "interrupted")
+    told = text(write_page(tmp_path))
+    assert "Training was interrupted after 39 steps" in told and "Rollouts" not in told
+
+
+def test_every_family_of_metrics_is_one_panel(tmp_path: Path) -> None:
+    run = read_run(a_run(tmp_path / "run"))
+    panels = draw_run(run.metrics)
+    assert list(panels) == ["loss", "error [mm]", "error gripper", "lr", "truth loss"]
+    assert ">dx<" in panels["error [mm]"] and ">dy<" in panels["error [mm]"]
+    # from 0.1 to 4.5 the axis is logarithmic
+    assert ">0.2<" in panels["loss"] and ">0.5<" in panels["loss"] and ">1<" in panels["loss"]
+    assert list(draw_runs({"a": run.metrics, "b": {}})) == [
+        "loss",
+        "error dx [mm]",
+        "error dy [mm]",
+        "error gripper",
+        "lr",
+        "truth loss",
+    ]
+
+
+def test_a_step_that_was_logged_twice_counts_as_it_was_last(tmp_path: Path) -> None:
+    run = read_run(a_run(tmp_path / "run", curves="step,train/loss\n9,1\n19,2\n19,3\n29,4\n"))
+    steps, values = run.metrics["train/loss"]
+    assert (steps.tolist(), values.tolist()) == ([9, 19, 29], [1, 3, 4])
+
+
+def test_configurations_differ_leaf_by_leaf() -> None:
+    one = {"output": "a", "model": {"width": 1, "image": {"name": "x", "size": 2}}, "seed": 0}
+    other = {"output": "b", "model": {"width": 2, "layers": [1]}, "seed": 0}
+    assert differences(one, other) == [
+        ("model.width", 1, 2),
+        ("model.image", {"name": "x", "size": 2}, "-"),
+        ("model.layers", "-", [1]),
+    ]
+
+
+def test_runs_are_compared_on_the_seeds_they_share(tmp_path: Path) -> None:
+    good, bad = a_run(tmp_path / "good/run", "ssssssss"), a_run(tmp_path / "bad/run", "ddddddsd", width=8)
+    short = a_run(tmp_path / "short/run", "ds")
+    write_page(good)
+    page = write_comparison([good, bad, short], tmp_path / "new")
+    told, markup = text(page), page.read_text()
+    assert page == tmp_path / "new/comparison.html" and told.startswith("3 runs")
+    assert "good/run 100.0 (67.6-100.0)" in told
+    assert "good/run bad/run 8 7 0 0.016" in told  # seven lost, none won: 2 / 2^7
+    assert "good/run short/run 2 1 0 1" in told
+    assert "model.width 16 8 16" in told
+    assert 'href="../good/run/report.html"' in markup and "bad/run/report.html" not in markup
+    assert markup.count("<svg") == 6
+
+
+def test_runs_with_nothing_to_compare_are_refused(tmp_path: Path) -> None:
+    run = a_run(tmp_path / "run")
+    (tmp_path / "empty").mkdir()
+    for folders, says in (
+        ([], r"report\.runs=\[RUN,RUN\]"),
+        ([run, tmp_path / "empty"], "empty is no run: it has neither report.json nor metrics.csv"),
+        ([run, tmp_path / "run/../run"], "names a folder twice"),
+    ):
+        with pytest.raises(ValueError, match=says):
+            write_comparison(folders, tmp_path / "new")
+    for file, says in (("rollouts.rrd", "cannot be read"), ("report.json", "is damaged")):
+        (run / file).write_text("{")
+        with pytest.raises(ValueError, match=f"{file} {says}"):
+            write_comparison([run], tmp_path / "new")
+    assert not (tmp_path / "new").exists()
+
+
+def test_a_page_that_cannot_be_made_is_a_warning(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    (tmp_path / "report.json").write_text("{")
+    with caplog.at_level(logging.WARNING), optional(tmp_path / "report.html"):
+        write_page(tmp_path)
+    assert "report.html could not be made" in caplog.text and "report.json is damaged" in caplog.text
+    assert [file.name for file in tmp_path.iterdir()] == ["report.json"]
+
+
+def test_the_page_of_a_sweep_leads_to_every_cell(tmp_path: Path) -> None:
+    for number, (model, outcomes) in enumerate([("bc", "ssss"), ("bc", "sssd"), ("rt1", "sddd")]):
+        cell = a_run(tmp_path / str(number), outcomes)
+        (cell / ".hydra").mkdir()
+        (cell / ".hydra/overrides.yaml").write_text(f"- model={model}\n- seed={number}\n")
+    tabulate(tmp_path)
+    markup, told = (tmp_path / "sweep.html").read_text(), text(tmp_path / "sweep.html")
+    assert re.findall(r'href="([^"]*)"', markup.partition("<svg")[0]) == [f"{n}/report.html" for n in range(3)]
+    assert "bc 87.5 (52.9-97.8)" in told and "0: bc 1: bc 2: rt1" in told
+    assert markup.count("<svg") == 6 and len(pictures(tmp_path / "sweep.html")) == 1
+    assert json.loads((tmp_path / "0/report.json").read_text())["success"] == 1.0

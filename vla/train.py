@@ -1,0 +1,104 @@
+"""The stage in between: a model is trained on an episode store, which is filled first; the page tells how it went."""
+
+from __future__ import annotations
+
+import logging
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import partial
+from pathlib import Path
+
+import lightning
+from lightning import Trainer
+from omegaconf import DictConfig
+
+from vla.models.fidelity import fidelity
+from vla.models.learner import Learner
+from vla.page import PAGE, optional, write_page
+from vla.parts import (
+    collected,
+    demonstrated,
+    fit,
+    in_training,
+    make_data,
+    make_environment,
+    note_config,
+    output_folder,
+    plain,
+    unfitted_learner,
+)
+from vla.results import note_training
+from vla.resume import LAST, alone
+from vla.samples import FILE, SHOWN, draw_samples
+from vla.training import Interruption, keep_metrics, make_trainer, quiet_lightning
+from vla.validation import ClosedLoop
+
+log = logging.getLogger(__name__)
+
+
+def trained(config: DictConfig) -> Path:
+    """Path of the checkpoint that training leaves behind, and that does best in validation."""
+    quiet_lightning()
+    output = output_folder(config)
+    checkpoints = output / "checkpoints"
+    interruption = Interruption(checkpoints)
+    closed_loop = _closed_loop(config, checkpoints)
+    with alone(checkpoints):
+        # Before anything is collected: the devices asked for may be missing, and so may be pretrained weights.
+        trainer = make_trainer(config, checkpoints, *([closed_loop] if closed_loop else []), interruption)
+        lightning.seed_everything(config.seed, verbose=False)
+        learner = unfitted_learner(config, demonstrated(config))
+        store = collected(config)
+        fit(learner.model.tokenizer, config, store)
+        data = make_data(config, store, learner.model)
+        tokens = fidelity(learner.model.tokenizer, store.statistics.chunks(learner.model.chunk), store.spec.units)
+        log.info("%s: %s", type(learner.model.tokenizer).__name__, tokens)
+        data.setup()
+        with optional(output / FILE):
+            draw_samples(data.gather(data.order(0)[:SHOWN]), store.spec, output / FILE)
+        if config.checkpoint:
+            keep_metrics(trainer, Path(config.checkpoint))
+        with _told(config, trainer, learner):
+            try:
+                with interruption.listening():
+                    trainer.fit(learner, datamodule=data, ckpt_path=config.checkpoint, weights_only=True)
+            except SystemExit:  # at a SIGTERM Lightning leaves as if all were well
+                if not interruption.asked:
+                    raise
+            if interruption.asked:
+                raise KeyboardInterrupt
+            trainer.save_checkpoint(checkpoints / LAST, weights_only=False)
+    if not trainer.is_global_zero:
+        sys.exit()  # what follows training is done once
+    return closed_loop.chosen(checkpoints / LAST) if closed_loop else checkpoints / LAST
+
+
+def _closed_loop(config: DictConfig, checkpoints: Path) -> ClosedLoop | None:
+    """What lets the policy act in every validation, if it is to."""
+    seeds = range(config.validate.seed, config.validate.seed + config.validate.episodes)
+    makers = partial(make_environment, plain(config.task)), partial(in_training, plain(config.policy))
+    return ClosedLoop(*makers, seeds, checkpoints) if seeds else None
+
+
+@contextmanager
+def _told(config: DictConfig, trainer: Trainer, learner: Learner) -> Iterator[None]:
+    """However the training within ends, its page and the log tell how it did."""
+    output = output_folder(config)
+    note_config(config)
+    parameters = sum(parameter.numel() for parameter in learner.model.parameters())
+    log.info("training %s with %.2f M parameters", type(learner.model).__name__, parameters / 1e6)
+    started, ended = time.monotonic(), "done"
+    try:
+        yield
+    except BaseException as error:
+        ended = "interrupted" if isinstance(error, KeyboardInterrupt) else str(error) or type(error).__name__
+        raise
+    finally:
+        seconds = time.monotonic() - started
+        if trainer.is_global_zero:
+            with optional(output / PAGE):
+                note_training(output, parameters, trainer.global_step, seconds, ended)
+                write_page(output)
+    log.info("trained %d steps in %.0f s: %s", trainer.global_step, seconds, output / "checkpoints")
