@@ -6,7 +6,6 @@
 from __future__ import annotations
 
 import logging
-import sys
 import time
 from collections.abc import Callable
 from functools import partial
@@ -74,7 +73,7 @@ def train(config: DictConfig) -> None:
     _trained(config)
 
 
-def evaluate(config: DictConfig) -> float:
+def evaluate(config: DictConfig) -> float | None:
     """Measure the success rate of a checkpoint, which is trained first if none is given, and again under every
     condition that the evaluation names, on the same seeds.
 
@@ -88,6 +87,8 @@ def evaluate(config: DictConfig) -> float:
 
     output = _output(config)
     checkpoint = Path(config.checkpoint) if config.checkpoint else _trained(config)
+    if checkpoint is None:
+        return None
     seeds = range(config.evaluate.seed, config.evaluate.seed + config.evaluate.episodes)
     recordings = output / "recordings"
     make = partial(make_policy, plain(config.policy), checkpoint)
@@ -195,8 +196,8 @@ JOBS: dict[str, Callable[[DictConfig], float | None]] = {
 }
 
 
-def _trained(config: DictConfig) -> Path:
-    """Path of the checkpoint that training leaves behind."""
+def _trained(config: DictConfig) -> Path | None:
+    """Path of the checkpoint that training leaves behind; None in all but the first of the processes that train."""
     import lightning
 
     from vla.models.fidelity import fidelity
@@ -210,6 +211,8 @@ def _trained(config: DictConfig) -> Path:
     if config.checkpoint:
         _require_same_policy(config)
     trainer = make_trainer(config, checkpoints, interruption)
+    if not trainer.is_global_zero:
+        logging.getLogger("vla").setLevel(logging.WARNING)  # the first process speaks for all
     lightning.seed_everything(config.seed, verbose=False)
     learner = unfitted_learner(config, demonstrated(config))
     store = collected(config)
@@ -226,11 +229,12 @@ def _trained(config: DictConfig) -> Path:
     except SystemExit:  # at a SIGTERM Lightning leaves as if all were well
         if not interruption.asked:
             raise
-    if interruption.asked:
+    if interruption.asked and trainer.is_global_zero:
         raise KeyboardInterrupt
-    trainer.save_checkpoint(checkpoints / LAST, weights_only=False)
+    if not interruption.asked:
+        trainer.save_checkpoint(checkpoints / LAST, weights_only=False)
     if not trainer.is_global_zero:
-        sys.exit()  # what follows training is done once
+        return None  # what follows training is done once
     log.info("trained %d steps in %.0f s: %s", trainer.global_step, time.monotonic() - started, checkpoints)
     return checkpoints / LAST
 

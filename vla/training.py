@@ -15,12 +15,13 @@ from typing import Any
 
 import torch
 from lightning import Callback, LightningModule, Trainer
-from lightning.pytorch.callbacks import EMAWeightAveraging, ModelCheckpoint, RichProgressBar
+from lightning.pytorch.callbacks import ModelCheckpoint, RichProgressBar
 from lightning.pytorch.loggers import CSVLogger
 from lightning.pytorch.plugins import TorchCheckpointIO
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 from omegaconf import DictConfig
 
+from vla.averaging import Averaging
 from vla.check import build
 
 log = logging.getLogger(__name__)
@@ -30,7 +31,10 @@ SAVE_EVERY = 500  # steps
 
 
 class Interruption(Callback):
-    """At the first SIGINT or SIGTERM training saves and stops after the current step, at the second one at once."""
+    """At the first SIGINT or SIGTERM training saves and stops after the current step, at the second one at once.
+
+    Processes that train together stop together, whichever of them was asked to.
+    """
 
     def __init__(self, checkpoints: Path) -> None:
         self._path = checkpoints / LAST
@@ -42,12 +46,20 @@ class Interruption(Callback):
         if threading.current_thread() is not threading.main_thread():
             yield
             return
-        before = {number: signal.signal(number, self._hear) for number in (signal.SIGINT, signal.SIGTERM)}
+        before = self._listen()
         try:
             yield
         finally:
             for number, handler in before.items():
                 signal.signal(number, handler)
+
+    def _listen(self) -> dict[signal.Signals, Any]:
+        return {number: signal.signal(number, self._hear) for number in (signal.SIGINT, signal.SIGTERM)}
+
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Lightning's own handler waits for the other processes wherever it is called, and they for it."""
+        if signal.getsignal(signal.SIGINT) == self._hear:
+            self._listen()
 
     def _hear(self, number: int, frame: FrameType | None) -> None:
         if self.asked:
@@ -56,6 +68,7 @@ class Interruption(Callback):
 
     def on_train_batch_end(self, trainer: Trainer, pl_module: LightningModule, *_: Any) -> None:
         """Save while everything that goes on from here is still at hand."""
+        self.asked = trainer.strategy.reduce_boolean_decision(self.asked, all=False)
         if self.asked and not trainer.should_stop:
             trainer.save_checkpoint(self._path, weights_only=False)
             trainer.should_stop = True
@@ -103,7 +116,7 @@ def make_trainer(config: DictConfig, checkpoints: Path | None, *watching: Callba
     callbacks: list[Callback] = [Progress(), *watching]
     options: dict[str, Any] = {"logger": False, "enable_checkpointing": False}
     if config.learner.ema:
-        callbacks.insert(1, EMAWeightAveraging(decay=config.learner.ema))
+        callbacks.insert(1, Averaging(config.learner.ema))
     if checkpoints is not None:
         # After the averaging, whose weights it saves.
         callbacks.append(
