@@ -70,7 +70,7 @@ class Averaging(Callback):
         checkpoint["state_dict"] = {name: average.get(name, value) for name, value in current.items()}
 
     def on_load_checkpoint(self, trainer: Trainer, pl_module: LightningModule, checkpoint: dict[str, Any]) -> None:
-        """Take the average out of the model, which has been given the `state_dict` by now, and put in what is trained."""
+        """Take the average out of the model, which has got the `state_dict` by now, and put in what is trained."""
         self._average = [one.detach().clone() for one in _learned(pl_module).values()]
         if "current_model_state" in checkpoint:
             options = StateDictOptions(full_state_dict=True)

@@ -18,6 +18,7 @@ from lightning import Callback, LightningModule, Trainer
 from lightning.pytorch.callbacks import ModelCheckpoint, RichProgressBar
 from lightning.pytorch.loggers import CSVLogger
 from lightning.pytorch.plugins import TorchCheckpointIO
+from lightning.pytorch.strategies import ParallelStrategy
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 from omegaconf import DictConfig
 
@@ -125,8 +126,13 @@ def make_trainer(config: DictConfig, checkpoints: Path | None, *watching: Callba
         options = {"logger": CSVLogger(checkpoints.parent, name="", version="")}
     try:
         trainer: Trainer = build(config.trainer, callbacks=callbacks, **options)
-    except MisconfigurationException as error:
-        asked = [f"trainer.{name}={config.trainer.get(name)}" for name in ("accelerator", "devices", "precision")]
+        if isinstance(trainer.strategy, ParallelStrategy) and trainer.strategy.cluster_environment:
+            # As many processes as a cluster started, of which Lightning would not speak before the training.
+            trainer.strategy.cluster_environment.validate_settings(trainer.num_devices, trainer.num_nodes)
+    except (MisconfigurationException, ValueError) as error:
+        names = ("accelerator", "devices", "num_nodes", "strategy", "precision")
+        said = {name: config.trainer[name] for name in names if name in config.trainer}
+        asked = [f"trainer.{name}={value}" for name, value in said.items() if not isinstance(value, DictConfig)]
         raise ValueError(f"{' '.join(asked)} cannot be had here ({error}): try trainer=cpu or trainer=auto") from error
     trainer.strategy.checkpoint_io = AtomicFiles()
     return trainer
@@ -139,3 +145,4 @@ def quiet_lightning() -> None:
     logging.getLogger("lightning.pytorch.utilities.rank_zero").setLevel(logging.WARNING)
     # What its own callbacks do with its own hooks is nothing that a user could change.
     warnings.filterwarnings("ignore", module=r"lightning\.")
+    warnings.filterwarnings("ignore", "FSDP2-wrapped module .* returned a view")  # which nobody here writes into
