@@ -10,7 +10,6 @@ import lightning
 import pytest
 import torch
 from fake_batch import make_batch, make_bc, make_decoder, make_rt1
-from lightning.pytorch.callbacks import EMAWeightAveraging
 from torch.utils.data import DataLoader
 from toy import SPEC
 
@@ -117,12 +116,9 @@ def test_weight_decay_spares_biases_norms_and_embeddings() -> None:
     assert len(decayed["params"]) + len(spared["params"]) == len(names)
 
 
-@pytest.mark.parametrize("averaging", [[], [EMAWeightAveraging(decay=0.9)]], ids=["plain", "averaged"])
-def test_a_checkpoint_holds_what_it_takes_to_build_the_policy(
-    averaging: list[lightning.Callback], tmp_path: Path
-) -> None:
+def test_a_checkpoint_holds_what_it_takes_to_build_the_policy(tmp_path: Path) -> None:
     learner = make_learner()
-    trainer = make_trainer(3, *averaging)
+    trainer = make_trainer(3)
     trainer.fit(learner, loader(make_batch(1), 3))
     trainer.save_checkpoint(tmp_path / "last.ckpt")
 

@@ -72,7 +72,7 @@ def train(config: DictConfig) -> None:
     trained(config)
 
 
-def evaluate(config: DictConfig) -> float:
+def evaluate(config: DictConfig) -> float | None:
     """Measure the success rate of a checkpoint, which is trained first if none is given, and again under every
     condition that the evaluation names, on the same seeds.
 
@@ -88,6 +88,8 @@ def evaluate(config: DictConfig) -> float:
 
     output = output_folder(config)
     checkpoint = Path(config.checkpoint) if config.checkpoint and not config.resume else trained(config)
+    if checkpoint is None:
+        return None
     seeds = range(config.evaluate.seed, config.evaluate.seed + config.evaluate.episodes)
     recordings = output / "recordings"
     make = partial(make_policy, plain(config.policy), checkpoint)

@@ -42,7 +42,7 @@ class Pace(Callback):
     def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, batch: Any, batch_idx: int) -> None:
         """Count once what a batch takes, all of which are of one size."""
         assert isinstance(pl_module, Learner)
-        if not self._flops:
+        if not self._flops and pl_module.device_mesh is None:
             device = pl_module.device
             self._flops = training_flops(pl_module.model, batch)
             self._peak = peak_flops(device, trainer.precision) or matmul_flops(device, trainer.precision, PEAK_SECONDS)
@@ -60,8 +60,9 @@ class Pace(Callback):
         pace = {
             "pace/samples_per_s": samples / seconds,
             "pace/waiting": (_waited(trainer) - self._waited) / seconds,
-            "pace/mfu": self._flops * self._batches / seconds / self._peak,
         }
+        if self._flops:  # not where weights are shared out, of which no copy can be made to count on
+            pace["pace/mfu"] = self._flops * self._batches / seconds / self._peak
         if pl_module.device.type == "cuda":
             pace["pace/memory_gb"] = torch.cuda.max_memory_allocated(pl_module.device) / 1e9
         pl_module.log_dict(pace)

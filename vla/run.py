@@ -21,12 +21,14 @@ from yaml import YAMLError
 from vla.check import JOBS, check, suggestion
 from vla.deploy import ros
 from vla.resume import adopt, go_on
+from vla.sweep import failures, note_failure
 
 PACKAGE = Path(__file__).resolve().parent
 # Inside the package where it was installed from a wheel, beside it in a clone.
 CONF = next(path for path in (PACKAGE / "conf", PACKAGE.parent / "conf") if (path / "config.yaml").is_file())
 
 ADOPTING = ("evaluate", "export", "deploy", "benchmark")  # jobs that use a checkpoint's own task, tokenizer and model
+SWEEP = "in the sweep "  # note on the error of a cell
 TRACEBACKS = "VLA_TRACEBACKS"  # the user's wish for tracebacks, kept for the processes that a trainer starts
 
 
@@ -80,12 +82,12 @@ def _meant_for_user(error: Exception) -> bool:
 def _require_sweepable(cfg: DictConfig) -> None:
     """Processes that a trainer starts repeat the command line, which under -m would be the whole sweep."""
     choices = HydraConfig.get().runtime.choices
-    if HydraConfig.get().mode != RunMode.MULTIRUN or choices["hydra/launcher"] != "basic":
+    if HydraConfig.get().mode != RunMode.MULTIRUN or choices["hydra/launcher"] == "submitit_slurm":
         return
     if "trainer" in JOBS.get(cfg.job, ()) and cfg.trainer is not None and _devices(cfg.trainer) > 1:
         raise ValueError(
             "-m cannot train on several devices in this launcher: add trainer.devices=1, "
-            "or a launcher that gives every job its own processes, such as hydra/launcher=submitit_slurm"
+            "or hydra/launcher=submitit_slurm, which starts every process of a cell by itself"
         )
 
 
@@ -121,7 +123,22 @@ def _do(cfg: DictConfig) -> float | None:
     return jobs.run(cfg)
 
 
+def _fail(error: Exception) -> NoReturn:
+    """Raise the error of a cell, which may be in another process than the sweep and leave its traceback there."""
+    cell = Path(HydraConfig.get().runtime.output_dir)
+    if _meant_for_user(error):
+        note_failure(cell, sentence(error))
+    else:
+        note_failure(cell, "".join([*traceback.format_exception_only(error), *traceback.format_exception(error)]))
+    error.add_note(f"{SWEEP}{cell.parent}")
+    raise error
+
+
 def _end(error: Exception) -> NoReturn:
+    for note in getattr(error, "__notes__", ()):
+        if note.startswith(SWEEP):
+            print(f"error: {failures(Path(note.removeprefix(SWEEP)))}", file=sys.stderr)
+            sys.exit(1)
     if os.environ[TRACEBACKS] == "1" or not _meant_for_user(error):
         raise error
     print(f"error: {sentence(error)}", file=sys.stderr)
@@ -134,7 +151,7 @@ def _compose(cfg: DictConfig) -> float | None:
         return _do(cfg)
     except Exception as error:
         if HydraConfig.get().mode == RunMode.MULTIRUN:
-            raise  # a sweeper may want to go on with the next job
+            _fail(error)  # a sweeper may want to go on with the next job
         _end(error)
 
 

@@ -14,12 +14,15 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
+from filelock import FileLock
 from hydra.core.utils import JobReturn
 from hydra.experimental.callback import Callback
 from hydra.types import RunMode
 from omegaconf import DictConfig
 
 SEED = "seed"  # the override that distinguishes the cells of one row
+OVERRIDES = ".hydra/overrides.yaml"  # what Hydra leaves in the folder of every cell
+FAILURE = "error.txt"  # in the folder of a cell that failed
 
 
 @dataclass
@@ -60,10 +63,33 @@ class Row:
 class Tabulate(Callback):
     """Writes `sweep.html` and what it shows, `sweep.csv`, `sweep.md` and `sweep.png`, anew after every cell."""
 
+    def on_job_start(self, config: DictConfig, **kwargs: Any) -> None:
+        """Forget how the cell failed before."""
+        (Path(config.hydra.runtime.output_dir) / FAILURE).unlink(missing_ok=True)
+
     def on_job_end(self, config: DictConfig, job_return: JobReturn, **kwargs: Any) -> None:
         """Write the table of all cells that have a report by now."""
         if config.hydra.mode == RunMode.MULTIRUN:
-            tabulate(Path(config.hydra.sweep.dir))
+            folder = Path(config.hydra.sweep.dir)
+            with FileLock(folder / ".lock"):  # the last cell to get it sees all others
+                tabulate(folder)
+
+
+def note_failure(cell: Path, reason: str) -> None:
+    """Leave in the folder of a cell why it failed; the first line is for the list of all that did."""
+    (cell / FAILURE).write_text(f"{reason}\n", encoding="utf-8")
+
+
+def failures(folder: Path) -> str:
+    """What there is to say of the cells of a sweep that failed: how many, then each with its choices and its reason."""
+    cells = {cell: _overrides(cell) for cell in _cells(folder, OVERRIDES)}
+    telling = _telling(list(cells.values()))
+    lines = []
+    for cell in _cells(folder, FAILURE):
+        choices = "".join(f" {key}={cells[cell][key]}" for key in telling if key in cells[cell])
+        reason = (cell / FAILURE).read_text(encoding="utf-8").partition("\n")[0]
+        lines.append(f"\n  {cell.name}{choices}: {reason}")
+    return f"{len(lines)} of {len(cells)} cells failed, see {FAILURE} of each in {folder}{''.join(lines)}"
 
 
 def tabulate(folder: Path) -> list[Row]:
@@ -79,19 +105,13 @@ def tabulate(folder: Path) -> list[Row]:
 
 def read_rows(folder: Path) -> list[Row]:
     """The cells that have a report, put together, in the order of the sweep."""
-    from hydra.core.override_parser.overrides_parser import OverridesParser
-    from yaml import safe_load
-
     from vla.evaluate import SEEN
 
-    parser = OverridesParser.create()
-    cells = []
-    for path in sorted(folder.glob("*/report.json"), key=lambda path: (len(path.parent.name), path.parent.name)):
-        said = parser.parse_overrides(safe_load((path.parent / ".hydra/overrides.yaml").read_text(encoding="utf-8")))
-        overrides = {one.key_or_group: one.get_value_element_as_str() for one in said}
-        cells.append((overrides, path.parent, json.loads(path.read_text(encoding="utf-8"))))
-    keys = dict.fromkeys(key for overrides, _, _ in cells for key in overrides if key != SEED)
-    telling = [key for key in keys if len({overrides.get(key) for overrides, _, _ in cells}) > 1]
+    cells = [
+        (_overrides(cell), cell, json.loads((cell / "report.json").read_text(encoding="utf-8")))
+        for cell in _cells(folder, "report.json")
+    ]
+    telling = [key for key in _telling([overrides for overrides, _, _ in cells]) if key != SEED]
     rows: dict[tuple[str, ...], Row] = {}
     for overrides, cell, report in cells:
         choices = {key: overrides.get(key, "default") for key in telling}
@@ -103,6 +123,26 @@ def read_rows(folder: Path) -> list[Row]:
             row.successes[condition] = row.successes.get(condition, 0) + part["successes"]
             row.episodes[condition] = row.episodes.get(condition, 0) + part["episodes"]
     return list(rows.values())
+
+
+def _cells(folder: Path, having: str) -> list[Path]:
+    """The cells that have a file, in the order of the sweep."""
+    cells = [cell for cell in folder.iterdir() if (cell / having).exists()]
+    return sorted(cells, key=lambda cell: (len(cell.name), cell.name))
+
+
+def _overrides(cell: Path) -> dict[str, str]:
+    from hydra.core.override_parser.overrides_parser import OverridesParser
+    from yaml import safe_load
+
+    said = OverridesParser.create().parse_overrides(safe_load((cell / OVERRIDES).read_text(encoding="utf-8")))
+    return {one.key_or_group: one.get_value_element_as_str() for one in said}
+
+
+def _telling(cells: list[dict[str, str]]) -> list[str]:
+    """The overrides that are not the same in all cells."""
+    keys = dict.fromkeys(key for overrides in cells for key in overrides)
+    return [key for key in keys if len({overrides.get(key) for overrides in cells}) > 1]
 
 
 def markdown(rows: list[Row]) -> str:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -38,8 +37,9 @@ from vla.validation import ClosedLoop
 log = logging.getLogger(__name__)
 
 
-def trained(config: DictConfig) -> Path:
-    """Path of the checkpoint that training leaves behind, and that does best in validation."""
+def trained(config: DictConfig) -> Path | None:
+    """Path of the checkpoint that training leaves behind, and that does best in validation; None in all but the first
+    of the processes that train."""
     quiet_lightning()
     output = output_folder(config)
     checkpoints = output / "checkpoints"
@@ -48,6 +48,8 @@ def trained(config: DictConfig) -> Path:
     with alone(checkpoints):
         # Before anything is collected: the devices asked for may be missing, and so may be pretrained weights.
         trainer = make_trainer(config, checkpoints, *([closed_loop] if closed_loop else []), interruption)
+        if not trainer.is_global_zero:
+            logging.getLogger("vla").setLevel(logging.WARNING)  # the first process speaks for all
         lightning.seed_everything(config.seed, verbose=False)
         learner = unfitted_learner(config, demonstrated(config))
         store = collected(config)
@@ -67,11 +69,12 @@ def trained(config: DictConfig) -> Path:
             except SystemExit:  # at a SIGTERM Lightning leaves as if all were well
                 if not interruption.asked:
                     raise
-            if interruption.asked:
+            if interruption.asked and trainer.is_global_zero:
                 raise KeyboardInterrupt
-            trainer.save_checkpoint(checkpoints / LAST, weights_only=False)
+            if not interruption.asked:
+                trainer.save_checkpoint(checkpoints / LAST, weights_only=False)
     if not trainer.is_global_zero:
-        sys.exit()  # what follows training is done once
+        return None  # what follows training is done once
     return closed_loop.chosen(checkpoints / LAST) if closed_loop else checkpoints / LAST
 
 

@@ -17,12 +17,14 @@ from typing import Any
 import numpy as np
 import torch
 from lightning import Callback, LightningModule, Trainer
-from lightning.pytorch.callbacks import Checkpoint, EMAWeightAveraging, ModelCheckpoint
+from lightning.pytorch.callbacks import Checkpoint, ModelCheckpoint
 from lightning.pytorch.loggers import CSVLogger, Logger
 from lightning.pytorch.plugins import TorchCheckpointIO
+from lightning.pytorch.strategies import ParallelStrategy
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 from omegaconf import DictConfig
 
+from vla.averaging import Averaging
 from vla.check import build
 from vla.progress import Pace, Progress
 from vla.resume import LAST
@@ -35,8 +37,8 @@ SAVE_EVERY = 500  # steps
 class Interruption(Checkpoint):
     """At the first SIGINT or SIGTERM training saves and stops after the current step, at the second one at once.
 
-    As one of Lightning's checkpoints it comes after all other callbacks. Every checkpoint says whether training was
-    `finished`.
+    Processes that train together stop together, whichever of them was asked to. As one of Lightning's checkpoints it
+    comes after all other callbacks. Every checkpoint says whether training was `finished`.
     """
 
     def __init__(self, checkpoints: Path) -> None:
@@ -49,12 +51,20 @@ class Interruption(Checkpoint):
         if threading.current_thread() is not threading.main_thread():
             yield
             return
-        before = {number: signal.signal(number, self._hear) for number in (signal.SIGINT, signal.SIGTERM)}
+        before = self._listen()
         try:
             yield
         finally:
             for number, handler in before.items():
                 signal.signal(number, handler)
+
+    def _listen(self) -> dict[signal.Signals, Any]:
+        return {number: signal.signal(number, self._hear) for number in (signal.SIGINT, signal.SIGTERM)}
+
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Lightning's own handler waits for the other processes wherever it is called, and they for it."""
+        if signal.getsignal(signal.SIGINT) == self._hear:
+            self._listen()
 
     def _hear(self, number: int, frame: FrameType | None) -> None:
         if self.asked:
@@ -65,8 +75,10 @@ class Interruption(Checkpoint):
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
     ) -> None:
         """Save while everything that goes on from here is still at hand, and no gradient half gathered."""
-        stepped = (batch_idx + 1) % trainer.accumulate_grad_batches == 0
-        if self.asked and stepped and not trainer.should_stop:
+        if (batch_idx + 1) % trainer.accumulate_grad_batches:
+            return
+        self.asked = trainer.strategy.reduce_boolean_decision(self.asked, all=False)
+        if self.asked and not trainer.should_stop:
             trainer.save_checkpoint(self._path, weights_only=False)
             trainer.should_stop = True
             trainer.limit_val_batches = 0  # else Lightning validates once more before it stops
@@ -129,7 +141,7 @@ def make_trainer(config: DictConfig, checkpoints: Path | None, *watching: Callba
     callbacks: list[Callback] = [Progress(), *watching]
     options: dict[str, Any] = {"logger": False, "enable_checkpointing": False}
     if config.learner.ema:
-        callbacks.append(EMAWeightAveraging(decay=config.learner.ema))
+        callbacks.append(Averaging(config.learner.ema))
     if checkpoints is not None:
         callbacks += [
             Pace(),
@@ -139,8 +151,13 @@ def make_trainer(config: DictConfig, checkpoints: Path | None, *watching: Callba
     callbacks.append(Draws(config.seed))  # after all that might draw something itself
     try:
         trainer: Trainer = build(config.trainer, callbacks=callbacks, **options)
-    except MisconfigurationException as error:
-        asked = [f"trainer.{name}={config.trainer.get(name)}" for name in ("accelerator", "devices", "precision")]
+        if isinstance(trainer.strategy, ParallelStrategy) and trainer.strategy.cluster_environment:
+            # As many processes as a cluster started, of which Lightning would not speak before the training.
+            trainer.strategy.cluster_environment.validate_settings(trainer.num_devices, trainer.num_nodes)
+    except (MisconfigurationException, ValueError) as error:
+        names = ("accelerator", "devices", "num_nodes", "strategy", "precision")
+        said = {name: config.trainer[name] for name in names if name in config.trainer}
+        asked = [f"trainer.{name}={value}" for name, value in said.items() if not isinstance(value, DictConfig)]
         raise ValueError(f"{' '.join(asked)} cannot be had here ({error}): try trainer=cpu or trainer=auto") from error
     trainer.strategy.checkpoint_io = AtomicFiles()
     return trainer
@@ -179,3 +196,4 @@ def quiet_lightning() -> None:
     logging.getLogger("lightning.pytorch.utilities.rank_zero").setLevel(logging.WARNING)
     # What its own callbacks do with its own hooks is nothing that a user could change.
     warnings.filterwarnings("ignore", module=r"lightning\.")
+    warnings.filterwarnings("ignore", "FSDP2-wrapped module .* returned a view")  # which nobody here writes into

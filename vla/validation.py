@@ -25,7 +25,7 @@ class ClosedLoop(Callback):
     """In every validation, plays episodes with the weights that would be saved, and logs `val/success`, 0…1.
 
     The processes of a training share the episodes. The newest weights of those that succeeded most often are kept as
-    `best.ckpt`.
+    `best.ckpt`. Where the weights are shared out among processes, which then act in step only, nothing is played.
 
     Args:
         make_environment: makes the environment, in which every process plays.
@@ -48,9 +48,11 @@ class ClosedLoop(Callback):
 
     def on_validation_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Play; the averaged weights are in place until callbacks that come later put the others back."""
+        assert isinstance(pl_module, Learner)
+        if pl_module.device_mesh is not None:
+            return
         if self._environment is None:
             self._environment = self._make_environment()
-        assert isinstance(pl_module, Learner)
         policy = self._make_policy(pl_module.model)
         mine = self._seeds[trainer.global_rank :: trainer.world_size]
         with torch.compiler.set_stance("force_eager"):  # one window is not the shape that was compiled
@@ -60,8 +62,8 @@ class ClosedLoop(Callback):
 
     def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Keep what is as good as the best so far: of equals, what was trained longer."""
-        self.success = float(trainer.callback_metrics["val/success"])
-        if self.success >= self.best:
+        self.success = float(trainer.callback_metrics.get("val/success", -1.0))
+        if self.success >= max(self.best, 0.0):
             self.best = self.success
             trainer.save_checkpoint(self._path, weights_only=False)
 

@@ -14,6 +14,7 @@ from torchmetrics import MeanMetric
 
 from vla.models.image_tokenizer import RandomShift
 from vla.models.model import Model
+from vla.models.sharding import gathered, shard
 from vla.spec import Spec
 
 Batch = dict[str, Any]
@@ -61,13 +62,16 @@ class Learner(LightningModule):
         self.errors = nn.ModuleList(MeanMetric() for _ in spec.action)
 
     def configure_model(self) -> None:
-        """Compile in place, so that the names in a checkpoint stay those of the model."""
+        """Compile in place, so that the names in a checkpoint stay those of the model; share its weights out where
+        the trainer's strategy asks for it."""
         if self._compile:
             for part in self.model.modules():
                 if isinstance(part, RandomShift):
                     part.forward = torch.compiler.disable(part.forward)  # type: ignore[method-assign]
             self.model.compile()
             self._compile = False  # Lightning may call this hook again
+        if self.device_mesh is not None:
+            shard(self.model, self.device_mesh)
 
     def on_fit_start(self) -> None:
         """On a CPU, do without flash attention: its backward pass in bfloat16 is pathologically slow there."""
@@ -125,8 +129,10 @@ class Learner(LightningModule):
     def validation_step(self, batch: Batch, batch_idx: int) -> None:
         """The losses, and the error of the actions that would be executed after the newest frame, per component."""
         for name, value in self.model.loss(batch).items():
-            self.log(f"val/{name}", value, batch_size=len(batch["action"]))
-        error = (self.model.predict(batch).actions - batch["action"][:, -1]).abs()[batch["valid"][:, -1]]  # (N, D)
+            self.log(f"val/{name}", value, batch_size=len(batch["action"]), sync_dist=True)
+        with gathered(self.model):
+            actions = self.model.predict(batch).actions
+        error = (actions - batch["action"][:, -1]).abs()[batch["valid"][:, -1]]  # (N, D)
         for index, (name, unit) in enumerate(zip(self._spec.action, self._spec.units, strict=True)):
             factor, readable = READABLE[unit]
             metric = self.errors[index]

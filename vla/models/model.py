@@ -13,6 +13,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from vla.models.action_tokenizer import ActionTokenizer, PerComponent
+from vla.models.sharding import summed
 from vla.models.text import TextEncoder
 from vla.spec import Spec
 
@@ -23,7 +24,7 @@ class Standardize(nn.Module):
     """Zero mean and unit variance by statistics that are gathered in training and kept in the checkpoint.
 
     Unlike batch normalisation it never uses the statistics of the current batch alone, whose noise would blur what
-    a joint angle means.
+    a joint angle means. Processes that train together gather what all of them see.
 
     Args:
         width: number of components.
@@ -59,10 +60,10 @@ class Standardize(nn.Module):
         return standard * self.deviation + self.mean
 
     def _gather(self, values: Tensor, weight: Tensor) -> None:
-        added = weight.sum()
+        added = summed(weight.sum())
         total = (self.count + added).clamp(min=1)
-        mean = (values * weight).sum((0, 1)) / added.clamp(min=1)
-        square = ((values - mean).square() * weight).sum((0, 1))
+        mean = summed((values * weight).sum((0, 1))) / added.clamp(min=1)
+        square = summed(((values - mean).square() * weight).sum((0, 1)))
         # Two groups merged into one (Chan et al. 1979).
         shift = mean - self.mean
         between = shift.square() * self.count * added / total
