@@ -12,7 +12,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 from rich import print as show
 
 from vla.check import build
@@ -252,6 +252,13 @@ def _require_same_policy(config: DictConfig) -> None:
                 f"training cannot go on from {config.checkpoint}, which has another {group}: give the same overrides "
                 "as when it was started"
             )
+    # Where weights are shared out, Lightning numbers what the optimiser remembers in another order.
+    sharing = OmegaConf.is_dict(config.trainer.get("strategy"))
+    if sharing and not isinstance(saved.config["trainer"].get("strategy"), dict):
+        raise ValueError(
+            f"trainer=fsdp cannot go on from {config.checkpoint}, which was trained without it: use "
+            "trainer=ddp, or start anew"
+        )
 
 
 def _output(config: DictConfig) -> Path:
