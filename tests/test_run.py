@@ -108,6 +108,24 @@ def test_a_grid_collects_once_and_trains_every_cell(home: Path) -> None:
     assert len(list((home / "outputs/sweeps").glob("*/*/checkpoints/last.ckpt"))) == 4
 
 
+def test_cells_run_at_the_same_time_and_one_that_fails_leaves_the_others_alone(home: Path) -> None:
+    launcher = ("-m", "hydra/launcher=joblib", "hydra.launcher.n_jobs=2", "hydra.sweep.dir=grid")
+    done = vla(home, *launcher, "checkpoint=run/checkpoints/last.ckpt", "evaluate.workers=1",
+               "evaluate.episodes=0,1,-2", ok=False)  # fmt: skip
+    errors = done.stderr[done.stderr.index("error: ") :].splitlines()
+    assert errors[0].startswith("error: 2 of 3 cells failed") and "Traceback" not in done.stderr
+    assert errors[1].startswith("  0 evaluate.episodes=0: evaluate.episodes must be") and "=-2: " in errors[2]
+    assert json.loads((home / "grid/1/report.json").read_text())["episodes"] == 1
+    assert (home / "grid/sweep.md").exists() and "at least 1" in (home / "grid/2/error.txt").read_text()
+
+
+@pytest.mark.parametrize("launcher", ["basic", "joblib"])
+def test_a_grid_whose_cells_want_several_processes_is_refused(home: Path, launcher: str) -> None:
+    several = ("trainer=ddp", "trainer.accelerator=cpu", "trainer.devices=2", "seed=0")
+    done = vla(home, "-m", f"hydra/launcher={launcher}", *several, ok=False)
+    assert "trainer.devices=1" in done.stderr and "submitit_slurm" in done.stderr and "Traceback" not in done.stderr
+
+
 def test_the_menu_is_what_hydra_would_list(home: Path) -> None:
     menu = vla(home, "--help").stdout
     assert "task/goal: lift, mixed, pick_place, pick_place_two, push, stack\n" in menu

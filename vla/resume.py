@@ -67,6 +67,12 @@ def go_on(cfg: DictConfig, overrides: Sequence[str]) -> DictConfig:
             )
     adopted = {name: value for name, value in saved.config.items() if name in cfg and name not in ("job", "output")}
     resumed = _on_top(cfg, adopted, said)
+    # Where weights are shared out, Lightning numbers what the optimiser remembers in another order.
+    sharing = OmegaConf.is_dict(OmegaConf.select(resumed, "trainer.strategy"))
+    if sharing and not isinstance(saved.config["trainer"].get("strategy"), dict):
+        raise ValueError(
+            f"trainer=fsdp cannot go on from {path}, which was trained without it: use trainer=ddp, or start anew"
+        )
     resumed.checkpoint, resumed.resume = str(path), not saved.finished
     named = {_path(override) for override in said}
     if last and "output" not in named:

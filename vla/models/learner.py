@@ -14,7 +14,7 @@ from torchmetrics import MeanMetric
 
 from vla.models.image_tokenizer import RandomShift
 from vla.models.model import Model
-from vla.models.sharding import gathered, shard
+from vla.models.sharding import gathered, shard, share
 from vla.spec import Spec
 
 Batch = dict[str, Any]
@@ -77,6 +77,16 @@ class Learner(LightningModule):
         """On a CPU, do without flash attention: its backward pass in bfloat16 is pathologically slow there."""
         if self.device.type == "cpu":
             torch.backends.cuda.enable_flash_sdp(False)
+
+    @torch.no_grad()
+    def on_train_start(self) -> None:
+        """Lay what the optimiser was given by a checkpoint out in memory like the weights: its one kernel for all of
+        them relies on it, and processes that share weights out leave everything in the usual order."""
+        for optimizer in self.trainer.optimizers:
+            for weight, state in optimizer.state.items():
+                for name, value in state.items():
+                    if value.shape == weight.shape and share(value).stride() != share(weight).stride():
+                        state[name] = torch.empty_like(weight).copy_(value)
 
     def configure_optimizers(self) -> Any:
         """AdamW, decaying only what has more than one dimension and is no embedding."""
