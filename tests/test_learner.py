@@ -10,14 +10,13 @@ import lightning
 import pytest
 import torch
 from fake_batch import make_batch, make_bc, make_decoder, make_rt1
-from lightning.pytorch.callbacks import EMAWeightAveraging
 from torch.utils.data import DataLoader
 from toy import SPEC
 
 from vla.models.learner import Learner
 from vla.models.model import Model
 from vla.policy import read_checkpoint
-from vla.training import AtomicFiles
+from vla.training import AtomicFiles, Averaging
 
 CONFIG = {"model": {"_target_": "vla.models.bc.BC", "shift": [0, 0]}, "seed": 0}
 
@@ -86,6 +85,23 @@ def test_a_loss_that_is_not_finite_stops_training_and_names_the_step() -> None:
         fit(make_learner(), batch, 1)
 
 
+def test_the_step_is_named_whose_loss_was_the_first_that_was_not_finite(tmp_path: Path) -> None:
+    """Though it is looked for less often than every step, nothing is saved in between."""
+    good, bad = make_batch(1), make_batch(1)
+    bad["proprio"][:] = math.nan
+    batches: DataLoader[Any] = DataLoader([good, good, bad, good, good], batch_size=None)  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="at step 2: lower"):
+        make_trainer(5).fit(make_learner(), batches)
+
+    class Save(lightning.Callback):
+        def on_train_batch_end(self, trainer: Any, *_: Any) -> None:
+            trainer.save_checkpoint(tmp_path / f"{trainer.global_step}.ckpt")
+
+    with pytest.raises(ValueError, match="at step 2: lower"):
+        make_trainer(5, Save()).fit(make_learner(), batches)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["1.ckpt", "2.ckpt"]
+
+
 def test_schedules() -> None:
     def rates(schedule: Any) -> list[float]:
         seen: list[float] = []
@@ -117,7 +133,7 @@ def test_weight_decay_spares_biases_norms_and_embeddings() -> None:
     assert len(decayed["params"]) + len(spared["params"]) == len(names)
 
 
-@pytest.mark.parametrize("averaging", [[], [EMAWeightAveraging(decay=0.9)]], ids=["plain", "averaged"])
+@pytest.mark.parametrize("averaging", [[], [Averaging(0.9)]], ids=["plain", "averaged"])
 def test_a_checkpoint_holds_what_it_takes_to_build_the_policy(
     averaging: list[lightning.Callback], tmp_path: Path
 ) -> None:

@@ -200,7 +200,7 @@ def _trained(config: DictConfig) -> Path:
     import lightning
 
     from vla.models.fidelity import fidelity
-    from vla.training import LAST, Interruption, make_trainer, quiet_lightning
+    from vla.training import LAST, Interruption, enough_memory, make_trainer, quiet_lightning
 
     quiet_lightning()
     checkpoints = _output(config) / "checkpoints"
@@ -211,7 +211,8 @@ def _trained(config: DictConfig) -> Path:
         _require_same_policy(config)
     trainer = make_trainer(config, checkpoints, interruption)
     lightning.seed_everything(config.seed, verbose=False)
-    learner = unfitted_learner(config, demonstrated(config))
+    with enough_memory(config):
+        learner = unfitted_learner(config, demonstrated(config))
     store = collected(config)
     fit(learner.model.tokenizer, config, store)
     data = make_data(config, store, learner.model)
@@ -221,7 +222,7 @@ def _trained(config: DictConfig) -> Path:
     log.info("training %s with %.2f M parameters", type(learner.model).__name__, parameters / 1e6)
     started = time.monotonic()
     try:
-        with interruption.listening():
+        with enough_memory(config), interruption.listening():
             trainer.fit(learner, datamodule=data, ckpt_path=config.checkpoint, weights_only=True)
     except SystemExit:  # at a SIGTERM Lightning leaves as if all were well
         if not interruption.asked:

@@ -15,7 +15,7 @@ from typing import Any
 
 import torch
 from lightning import Callback, LightningModule, Trainer
-from lightning.pytorch.callbacks import EMAWeightAveraging, ModelCheckpoint, RichProgressBar
+from lightning.pytorch.callbacks import ModelCheckpoint, RichProgressBar, WeightAveraging
 from lightning.pytorch.loggers import CSVLogger
 from lightning.pytorch.plugins import TorchCheckpointIO
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
@@ -27,6 +27,7 @@ log = logging.getLogger(__name__)
 
 LAST = "last.ckpt"
 SAVE_EVERY = 500  # steps
+SIZES = ("history", "image_size", "chunk", "width")  # of a model, as far as it has them, that memory grows with
 
 
 class Interruption(Callback):
@@ -87,8 +88,58 @@ class AtomicFiles(TorchCheckpointIO):
             draft.unlink(missing_ok=True)
 
 
+class Averaging(WeightAveraging):
+    """Keeps an exponential average of the weights beside them, updated in one operation after every step.
+
+    Lightning's own would leave it in the memory of the CPU, where all weights would have to go after every step.
+
+    Args:
+        decay: per step.
+    """
+
+    def __init__(self, decay: float) -> None:
+        super().__init__()
+        self._decay = decay
+
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Follow the weights to their device, and note which average belongs to which."""
+        assert self._average_model is not None
+        average = self._average_model.to(pl_module.device).module
+        both = ((*module.parameters(), *module.buffers()) for module in (average, pl_module))
+        pairs = [(kept.detach(), current.detach()) for kept, current in zip(*both, strict=True)]
+        floats = [pair for pair in pairs if pair[0].is_floating_point()]
+        self._averages, self._weights = [kept for kept, _ in floats], [current for _, current in floats]
+        self._counts = [pair for pair in pairs if not pair[0].is_floating_point()]
+
+    def on_train_batch_end(self, trainer: Trainer, pl_module: LightningModule, *_: Any) -> None:
+        """The first weights are their own average."""
+        if trainer.global_step > self._latest_update_step:
+            torch._foreach_lerp_(self._averages, self._weights, 1.0 if trainer.global_step == 1 else 1 - self._decay)
+            for kept, current in self._counts:
+                kept.copy_(current)
+            self._latest_update_step = trainer.global_step
+
+
 class Progress(RichProgressBar):
     """The progress of a training that counts steps: Lightning's own bar calls an endless one "Epoch 0/-2"."""
+
+    READ_EVERY = 10  # steps; each time a GPU is waited for
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._shown: dict[str, Any] = {}
+
+    def on_train_batch_end(
+        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
+    ) -> None:
+        """Move on; now and then read the loss off the device."""
+        if batch_idx % self.READ_EVERY == 0:
+            self._shown = {"train/loss": outputs["loss"].item()}
+        super().on_train_batch_end(trainer, pl_module, outputs, batch, batch_idx)
+
+    def get_metrics(self, trainer: Trainer, pl_module: LightningModule) -> dict[str, Any]:
+        """What is shown beside the bar."""
+        return self._shown
 
     def _get_train_description(self, current_epoch: int) -> str:
         return "training".ljust(len(self.validation_description))  # bars of one length do not flicker
@@ -103,7 +154,7 @@ def make_trainer(config: DictConfig, checkpoints: Path | None, *watching: Callba
     callbacks: list[Callback] = [Progress(), *watching]
     options: dict[str, Any] = {"logger": False, "enable_checkpointing": False}
     if config.learner.ema:
-        callbacks.insert(1, EMAWeightAveraging(decay=config.learner.ema))
+        callbacks.insert(1, Averaging(config.learner.ema))
     if checkpoints is not None:
         # After the averaging, whose weights it saves.
         callbacks.append(
@@ -117,6 +168,26 @@ def make_trainer(config: DictConfig, checkpoints: Path | None, *watching: Callba
         raise ValueError(f"{' '.join(asked)} cannot be had here ({error}): try trainer=cpu or trainer=auto") from error
     trainer.strategy.checkpoint_io = AtomicFiles()
     return trainer
+
+
+@contextmanager
+def enough_memory(config: DictConfig) -> Iterator[None]:
+    """Within, whoever runs out of memory is told what to lower.
+
+    Raises:
+        ValueError: the memory, of the GPU or of the machine, is not enough.
+    """
+    try:
+        yield
+    except (MemoryError, RuntimeError) as error:
+        if not isinstance(error, (MemoryError, torch.OutOfMemoryError)) and "can't allocate memory" not in str(error):
+            raise
+        keys = [f"data.batch_size (now {config.data.batch_size})"]
+        keys += [f"model.{name} (now {config.model[name]})" for name in SIZES if config.model.get(name)]
+        raise ValueError(
+            f"training takes more memory than there is: lower {', '.join(keys)}; trainer.precision=bf16 takes less, "
+            "and trainer.accumulate_grad_batches=2 makes one step of two batches of half the size"
+        ) from error
 
 
 def quiet_lightning() -> None:
