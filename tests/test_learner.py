@@ -85,6 +85,23 @@ def test_a_loss_that_is_not_finite_stops_training_and_names_the_step() -> None:
         fit(make_learner(), batch, 1)
 
 
+def test_the_step_is_named_whose_loss_was_the_first_that_was_not_finite(tmp_path: Path) -> None:
+    """Though it is looked for less often than every step, nothing is saved in between."""
+    good, bad = make_batch(1), make_batch(1)
+    bad["proprio"][:] = math.nan
+    batches: DataLoader[Any] = DataLoader([good, good, bad, good, good], batch_size=None)  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="at step 2: lower"):
+        make_trainer(5).fit(make_learner(), batches)
+
+    class Save(lightning.Callback):
+        def on_train_batch_end(self, trainer: Any, *_: Any) -> None:
+            trainer.save_checkpoint(tmp_path / f"{trainer.global_step}.ckpt")
+
+    with pytest.raises(ValueError, match="at step 2: lower"):
+        make_trainer(5, Save()).fit(make_learner(), batches)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["1.ckpt", "2.ckpt"]
+
+
 def test_schedules() -> None:
     def rates(schedule: Any) -> list[float]:
         seen: list[float] = []

@@ -13,15 +13,15 @@ import pytest
 import timm
 import torch
 from fake_batch import make_batch
-from lightning.pytorch.callbacks import EMAWeightAveraging
 from safetensors.torch import save_file
 from test_conf import composed
 from tiny_encoder import write_encoder
 from torch.utils.data import DataLoader
 
 from vla import jobs
+from vla.averaging import Averaging
 from vla.parts import make_policy, unfitted_learner
-from vla.policy import Policy
+from vla.policy import Policy, read_checkpoint
 
 if TYPE_CHECKING:
     from vla.tasks.tabletop import Tabletop
@@ -36,7 +36,7 @@ def trained(tmp_path: Path, tabletop: Tabletop, *overrides: str) -> tuple[Policy
     trainer = lightning.Trainer(
         accelerator="cpu",
         max_steps=2,
-        callbacks=[EMAWeightAveraging(decay=0.9)],
+        callbacks=[Averaging(0.9)],
         logger=False,
         enable_checkpointing=False,
         enable_progress_bar=False,
@@ -45,6 +45,7 @@ def trained(tmp_path: Path, tabletop: Tabletop, *overrides: str) -> tuple[Policy
     batches: Any = [make_batch(learner.model.history, spec=tabletop.spec)] * 2
     trainer.fit(learner, DataLoader(batches, batch_size=None))
     trainer.save_checkpoint(tmp_path / "last.ckpt")
+    read_checkpoint(tmp_path / "last.ckpt").restore(learner.model)  # the averages
     return Policy("cpu", model=learner.model, spec=tabletop.spec), tmp_path / "last.ckpt"
 
 

@@ -75,6 +75,7 @@ def test_the_command_runs(home: Path, command: str, request: pytest.FixtureReque
         return
     small = ["evaluate.episodes=1", "evaluate.workers=1", "preview.episodes=1", "collect.workers=1"]
     small += ["benchmark.episodes=1", "benchmark.batches=2", "benchmark.steps=2"]
+    small += ["benchmark.rounds=1", "benchmark.compile=[false]"]
     if not any(argument.startswith("checkpoint=") for argument in arguments):
         small = [*SMALL, *small]
     elif "deploy=loop" in arguments:

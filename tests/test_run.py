@@ -270,19 +270,31 @@ def test_without_gl_the_error_says_what_to_install(home: Path) -> None:
 
 def test_benchmark_measures_against_floors(home: Path) -> None:
     vla(home, *SMALL, "job=benchmark", "benchmark.episodes=1", "benchmark.batches=4", "benchmark.steps=4",
-        "output=speed")  # fmt: skip
+        "benchmark.rounds=2", "benchmark.compile=[false]", "output=speed")  # fmt: skip
     measures = json.loads((home / "speed/benchmark.json").read_text())
     assert {name.partition(":")[0] for name in measures} == {"collect", "loader", "train", "policy"}
     shares = [measures[f"collect: {stage}"]["ratio"] for stage in ("physics", "rendering", "replay", "storing")]
     assert 0 < sum(shares) < 1
     for measure in measures.values():
         assert set(measure) == {"value", "unit", "n", "floor", "ratio"} and measure["floor"] > 0
+    for precision in ("fp32", "bf16"):
+        assert measures[f"train: {precision}"]["n"] == 4 * 8
+        assert 0 < measures[f"train: {precision}: data-wait"]["ratio"] < 1
+        assert 0 < measures[f"train: {precision}: MFU"]["ratio"] < 1
+        assert measures[f"train: {precision}: memory"]["ratio"] > 1
+        assert measures[f"train: {precision}: loss"]["ratio"] == pytest.approx(1, abs=0.01)
+
+
+def test_a_model_that_memory_cannot_hold_is_refused_in_one_sentence(home: Path) -> None:
+    done = vla(home, *SMALL, "job=train", f"model.width={10**12}", "output=huge", ok=False)
+    assert done.stderr.startswith("error: training takes more memory than there is: lower data.batch_size (now 8)")
+    assert "model.width (now 1000000000000)" in done.stderr and len(done.stderr.splitlines()) == 1
 
 
 def test_training_that_fails_says_so_in_its_page(home: Path) -> None:
     done = vla(home, *SMALL, "job=train", "learner.lr=1e30", "learner.warmup_steps=0", "output=failed", ok=False)
-    assert "error: the loss is nan" in done.stderr and "Traceback" not in done.stderr
-    assert "Training failed: the loss is nan" in (home / "failed/report.html").read_text()
+    assert "error: the loss is not a finite number at step 1" in done.stderr and "Traceback" not in done.stderr
+    assert "Training failed: the loss is not a finite number" in (home / "failed/report.html").read_text()
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])

@@ -1,4 +1,5 @@
-"""A training that is interrupted and gone on with is, bit for bit, the one that was not; and what it says meanwhile."""
+"""A training that is interrupted and gone on with is, bit for bit, the one that was not; what it says meanwhile, and
+where it ends for want of memory."""
 
 from __future__ import annotations
 
@@ -14,15 +15,16 @@ import lightning
 import pytest
 import torch
 import toy
-from fake_batch import make_act, make_bc, make_denoising, make_rt1
+from fake_batch import make_act, make_batch, make_bc, make_denoising, make_rt1
 from lightning import Callback
 from omegaconf import DictConfig, OmegaConf
+from test_learner import fit, make_learner
 from test_windows import windows
 
 from vla.models.diffusion import Diffusion
 from vla.models.learner import Learner
 from vla.models.model import Model
-from vla.training import Interruption, keep_metrics, make_trainer
+from vla.training import Interruption, enough_memory, keep_metrics, make_trainer
 
 MODELS: dict[str, Callable[[], Model]] = {
     "bc": lambda: make_bc(shift=(64, 64)),
@@ -190,3 +192,25 @@ def test_it_logs_how_fast_it_is_and_what_it_waits_for(folder: Path, tmp_path: Pa
     for row in pace:
         assert float(row["pace/samples_per_s"]) > 0
         assert 0 <= float(row["pace/waiting"]) < 1 and 0 < float(row["pace/mfu"]) < 1
+
+
+def test_want_of_memory_names_what_to_lower() -> None:
+    """Images larger than all addresses, none of which is there before the model wants to compute with them."""
+    batch = make_batch(3)
+    batch["rgb"] = {name: image[:, :, :1, :1].expand(-1, -1, 10**8, 10**8, -1) for name, image in batch["rgb"].items()}
+    sizes = OmegaConf.create({"data": {"batch_size": 4}, "model": {"history": 3, "image_size": None, "width": 32}})
+    wanted = r"lower data\.batch_size \(now 4\), model\.history \(now 3\), model\.width"
+    with pytest.raises(ValueError, match=wanted), enough_memory(sizes):
+        fit(make_learner(make_rt1()), batch, 1)
+
+
+@pytest.mark.parametrize("error", [torch.OutOfMemoryError("CUDA out of memory"), MemoryError()])
+def test_memory_of_a_gpu_or_of_the_loader_is_named_alike(error: Exception) -> None:
+    sizes = OmegaConf.create({"data": {"batch_size": 4}, "model": {}})
+    with pytest.raises(ValueError, match=r"trainer\.precision=bf16"), enough_memory(sizes):
+        raise error
+
+
+def test_other_errors_stay_what_they_are() -> None:
+    with pytest.raises(RuntimeError, match="shapes"), enough_memory(OmegaConf.create({})):
+        raise RuntimeError("shapes differ")

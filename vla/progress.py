@@ -81,6 +81,20 @@ class Progress(RichProgressBar):
     """The progress of a training that counts steps: Lightning's own bar calls an endless one "Epoch 0/-2", and begins
     to count anew when one goes on."""
 
+    READ_EVERY = 10  # steps; each time a GPU is waited for
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._loss = float("nan")
+
+    def on_train_batch_end(
+        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
+    ) -> None:
+        """Move on; now and then read the loss off the device."""
+        if batch_idx % self.READ_EVERY == 0:
+            self._loss = outputs["loss"].item()
+        super().on_train_batch_end(trainer, pl_module, outputs, batch, batch_idx)
+
     @property
     def total_train_batches(self) -> int | float:
         """Of the whole training, or infinity where only time bounds it."""
@@ -92,9 +106,7 @@ class Progress(RichProgressBar):
     ) -> dict[str, int | str | float | dict[str, float]]:
         """What stands beside the bar: the loss, samples per second, the share of waiting for data, success."""
         logged = trainer.callback_metrics
-        shown: dict[str, int | str | float | dict[str, float]] = {}
-        if "train/loss" in logged:
-            shown["loss"] = f"{logged['train/loss']:.3f}"
+        shown: dict[str, int | str | float | dict[str, float]] = {"loss": f"{self._loss:.3f}"}
         if "pace/samples_per_s" in logged:
             shown["samples/s"] = f"{logged['pace/samples_per_s']:.0f}"
             shown["waiting"] = f"{logged['pace/waiting']:.0%}"

@@ -31,7 +31,7 @@ from vla.parts import (
 from vla.results import note_training
 from vla.resume import LAST, alone
 from vla.samples import FILE, SHOWN, draw_samples
-from vla.training import Interruption, keep_metrics, make_trainer, quiet_lightning
+from vla.training import Interruption, enough_memory, keep_metrics, make_trainer, quiet_lightning
 from vla.validation import ClosedLoop
 
 log = logging.getLogger(__name__)
@@ -51,7 +51,8 @@ def trained(config: DictConfig) -> Path | None:
         if not trainer.is_global_zero:
             logging.getLogger("vla").setLevel(logging.WARNING)  # the first process speaks for all
         lightning.seed_everything(config.seed, verbose=False)
-        learner = unfitted_learner(config, demonstrated(config))
+        with enough_memory(config):
+            learner = unfitted_learner(config, demonstrated(config))
         store = collected(config)
         fit(learner.model.tokenizer, config, store)
         data = make_data(config, store, learner.model)
@@ -64,7 +65,7 @@ def trained(config: DictConfig) -> Path | None:
             keep_metrics(trainer, Path(config.checkpoint))
         with _told(config, trainer, learner):
             try:
-                with interruption.listening():
+                with enough_memory(config), interruption.listening():
                     trainer.fit(learner, datamodule=data, ckpt_path=config.checkpoint, weights_only=True)
             except SystemExit:  # at a SIGTERM Lightning leaves as if all were well
                 if not interruption.asked:

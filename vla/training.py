@@ -32,6 +32,7 @@ from vla.resume import LAST
 log = logging.getLogger(__name__)
 
 SAVE_EVERY = 500  # steps
+SIZES = ("history", "image_size", "chunk", "width")  # of a model, as far as it has them, that memory grows with
 
 
 class Interruption(Checkpoint):
@@ -161,6 +162,26 @@ def make_trainer(config: DictConfig, checkpoints: Path | None, *watching: Callba
         raise ValueError(f"{' '.join(asked)} cannot be had here ({error}): try trainer=cpu or trainer=auto") from error
     trainer.strategy.checkpoint_io = AtomicFiles()
     return trainer
+
+
+@contextmanager
+def enough_memory(config: DictConfig) -> Iterator[None]:
+    """Within, whoever runs out of memory is told what to lower.
+
+    Raises:
+        ValueError: the memory, of the GPU or of the machine, is not enough.
+    """
+    try:
+        yield
+    except (MemoryError, RuntimeError) as error:
+        if not isinstance(error, (MemoryError, torch.OutOfMemoryError)) and "can't allocate memory" not in str(error):
+            raise
+        keys = [f"data.batch_size (now {config.data.batch_size})"]
+        keys += [f"model.{name} (now {config.model[name]})" for name in SIZES if config.model.get(name)]
+        raise ValueError(
+            f"training takes more memory than there is: lower {', '.join(keys)}; trainer.precision=bf16 takes less, "
+            "and trainer.accumulate_grad_batches=2 makes one step of two batches of half the size"
+        ) from error
 
 
 def keep_metrics(trainer: Trainer, checkpoint: Path) -> None:

@@ -19,6 +19,9 @@ from vla.spec import Spec
 
 Batch = dict[str, Any]
 
+LOOK_EVERY = 50  # steps, at whether all losses were finite
+FINITE = torch.iinfo(torch.int64).max  # the step at which the loss was not, as long as it always was
+
 READABLE = {"m": (1000.0, "mm"), "rad": (180 / math.pi, "deg"), "1": (1.0, "")}  # unit → factor and unit of the logs
 
 
@@ -59,6 +62,7 @@ class Learner(LightningModule):
         self.model, self._spec, self._config = model, spec, config
         self._lr, self._weight_decay, self._warmup, self._schedule = lr, weight_decay, warmup_steps, schedule
         self._compile, self.ema = compile, ema
+        self._broken: Tensor | None = None  # () the first step whose loss is not finite, where the loss is
         self.errors = nn.ModuleList(MeanMetric() for _ in spec.action)
 
     def configure_model(self) -> None:
@@ -74,9 +78,12 @@ class Learner(LightningModule):
             shard(self.model, self.device_mesh)
 
     def on_fit_start(self) -> None:
-        """On a CPU, do without flash attention: its backward pass in bfloat16 is pathologically slow there."""
+        """On a CPU, do without flash attention: its backward pass in bfloat16 is pathologically slow there. On a GPU,
+        let 32-bit matrix products use tensor cores, as convolutions do by default."""
         if self.device.type == "cpu":
             torch.backends.cuda.enable_flash_sdp(False)
+        else:
+            torch.set_float32_matmul_precision("high")
 
     @torch.no_grad()
     def on_train_start(self) -> None:
@@ -95,9 +102,10 @@ class Learner(LightningModule):
         decayed = [p for p in trained if p.dim() > 1 and id(p) not in embeddings]
         others = [p for p in trained if p.dim() <= 1 or id(p) in embeddings]
         groups = [{"params": decayed, "weight_decay": self._weight_decay}, {"params": others, "weight_decay": 0.0}]
-        # One kernel per step instead of a dozen per weight; in mixed precision Lightning would refuse to clip for it.
-        fused = not self.trainer.precision.endswith("mixed")
-        optimizer = torch.optim.AdamW(groups, lr=self._lr, fused=fused)
+        # One kernel per step instead of a dozen per weight; where gradients are scaled, Lightning would refuse to clip.
+        optimizer = torch.optim.AdamW(groups, lr=self._lr, fused=self.trainer.precision != "16-mixed")
+        if self.trainer.precision == "bf16-mixed":  # takes it for scaled as well, by this mark
+            optimizer._step_supports_amp_scaling = False
         scheduler = torch.optim.lr_scheduler.LambdaLR(optimizer, self._share)
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": scheduler, "interval": "step"}}
 
@@ -111,6 +119,12 @@ class Learner(LightningModule):
         done = (step - self._warmup) / max(total - self._warmup, 1)
         return 0.5 * (1 + math.cos(math.pi * min(done, 1.0)))
 
+    def transfer_batch_to_device(self, batch: Batch, device: torch.device, dataloader_idx: int) -> Batch:
+        """Move all but the sentences, each of which Lightning would look into for what it could move."""
+        numbers = {name: value for name, value in batch.items() if name != "instruction"}
+        moved: Batch = super().transfer_batch_to_device(numbers, device, dataloader_idx)
+        return {**moved, "instruction": batch["instruction"]}
+
     def on_after_batch_transfer(self, batch: Batch, dataloader_idx: int) -> Batch:
         """Add what the text encoder reads: sentences become numbers outside the part that compiles."""
         return self.prepare(batch)
@@ -123,18 +137,37 @@ class Learner(LightningModule):
         """The loss of a batch.
 
         Raises:
-            ValueError: the loss is not a finite number.
+            ValueError: the loss of this step or of one before is not a finite number.
         """
         losses = self.model.loss(batch)
-        loss = losses["loss"]
-        if not torch.isfinite(loss):
+        self._watch(losses["loss"].detach())
+        every = self.trainer.log_every_n_steps  # type: ignore[attr-defined]
+        if every and (self.global_step + 1) % every == 0:  # when loggers take it; to keep it for them takes time, too
+            for name, value in losses.items():
+                self.log(f"train/{name}", value.detach())
+        return losses["loss"]
+
+    def _watch(self, loss: Tensor) -> None:
+        """Note, beside the loss, whether it is finite: to look at it in every step would stop a GPU as often."""
+        step = torch.where(loss.isfinite(), FINITE, self.global_step)
+        self._broken = step if self._broken is None else torch.minimum(self._broken, step)
+        if self.global_step % LOOK_EVERY == 0:
+            self._require_finite()
+
+    def _require_finite(self) -> None:
+        if self._broken is not None and (step := int(self._broken)) != FINITE:
             raise ValueError(
-                f"the loss is {loss.item()} at step {self.global_step}: lower learner.lr (now {self._lr}), raise "
+                f"the loss is not a finite number at step {step}: lower learner.lr (now {self._lr}), raise "
                 "learner.warmup_steps, or clip harder with trainer.gradient_clip_val; the last checkpoint is kept"
             )
-        for name, value in losses.items():
-            self.log(f"train/{name}", value.detach(), prog_bar=name == "loss")
-        return loss
+
+    def on_train_end(self) -> None:
+        """Let no loss go unseen.
+
+        Raises:
+            ValueError: one was not a finite number.
+        """
+        self._require_finite()
 
     def validation_step(self, batch: Batch, batch_idx: int) -> None:
         """The losses, and the error of the actions that would be executed after the newest frame, per component."""
@@ -151,5 +184,10 @@ class Learner(LightningModule):
             self.log(f"val/error_{name}{f'_{readable}' if readable else ''}", metric)
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """A checkpoint says what made it, in plain dicts that load without running code."""
+        """A checkpoint says what made it, in plain dicts that load without running code.
+
+        Raises:
+            ValueError: a loss was not a finite number, nor are the weights since.
+        """
+        self._require_finite()
         checkpoint["config"], checkpoint["spec"] = self._config, self._spec.to_dict()

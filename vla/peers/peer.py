@@ -9,6 +9,8 @@ from typing import Any
 
 from vla.workers import one_thread_each
 
+PATIENCE = 20.0  # with another project [s]
+
 
 def peer(name: str, python: str, script: str, arguments: Sequence[Any], processes: int = 1) -> float:
     """What so many processes of a script in `vla/peers`, side by side, reach together.

@@ -1,0 +1,47 @@
+"""How fast the stages run, each against a floor that was measured on the same work in the same run.
+
+A floor is what the stage could not do without: a ratio of 1 would mean that everything around it costs nothing. A stage
+is a module that is called as the user calls it.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from importlib import import_module
+from pathlib import Path
+
+from omegaconf import DictConfig
+
+from vla.benchmark.measure import Measure
+
+STAGES = ("collect", "loader", "train", "policy", "deploy")
+
+
+def benchmark(config: DictConfig, output: Path) -> dict[str, Measure]:
+    """Measure what `config.benchmark.names` lists, print a table, write `benchmark.json`; name → measure.
+
+    Raises:
+        ValueError: a name that is no stage.
+    """
+    unknown = sorted(set(config.benchmark.names) - set(STAGES))
+    if unknown:
+        raise ValueError(f"benchmark.names has {unknown}, the stages are {sorted(STAGES)}")
+    measures: dict[str, Measure] = {}
+    for name in config.benchmark.names:
+        measures |= import_module(f"vla.benchmark.{name}").measures(config)
+    draft = output / "benchmark.json.partial"
+    draft.write_text(json.dumps(measures, indent=2), encoding="utf-8")
+    os.replace(draft, output / "benchmark.json")
+    _show(measures)
+    return measures
+
+
+def _show(measures: dict[str, Measure]) -> None:
+    from rich import print as show
+    from rich.table import Table
+
+    table = Table("stage", "value", "unit", "n", "floor", "ratio")
+    for name, measure in measures.items():
+        table.add_row(name, *(str(measure[key]) for key in ("value", "unit", "n", "floor", "ratio")))
+    show(table)
