@@ -69,7 +69,8 @@ class Interruption(Callback):
 
     def on_train_batch_end(self, trainer: Trainer, pl_module: LightningModule, *_: Any) -> None:
         """Save while everything that goes on from here is still at hand."""
-        self.asked = trainer.strategy.reduce_boolean_decision(self.asked, all=False)
+        if trainer.strategy.reduce_boolean_decision(self.asked, all=False):
+            self.asked = True  # and never False: a signal may have come meanwhile, which the next step hears of
         if self.asked and not trainer.should_stop:
             trainer.save_checkpoint(self._path, weights_only=False)
             trainer.should_stop = True
