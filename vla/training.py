@@ -78,8 +78,9 @@ class Interruption(Checkpoint):
         """Save while everything that goes on from here is still at hand, and no gradient half gathered."""
         if (batch_idx + 1) % trainer.accumulate_grad_batches:
             return
-        self.asked = trainer.strategy.reduce_boolean_decision(self.asked, all=False)
-        if self.asked and not trainer.should_stop:
+        # A signal that comes after this, and so to one process only, is heard of in the next step.
+        if trainer.strategy.reduce_boolean_decision(self.asked, all=False) and not trainer.should_stop:
+            self.asked = True
             trainer.save_checkpoint(self._path, weights_only=False)
             trainer.should_stop = True
             trainer.limit_val_batches = 0  # else Lightning validates once more before it stops
