@@ -38,14 +38,17 @@ def measures(config: DictConfig) -> dict[str, Measure]:
       batch that is there, of the same precision, compiled alike;
     - how long a step waits for its batch, against how long it takes;
     - the arithmetic of the model, against the peak of the device: the ratio is the model FLOPs utilisation;
-    - the memory at its fullest, against weights, gradients and the optimiser's two moments;
+    - the memory at its fullest, on a CPU what training adds to the process, against gradients and the optimiser's two
+      moments;
     - the mean loss of the later half of the steps, against that of the first kind: start and batches are the same.
 
     Rounds go in turns and the best one counts, so that a busy moment of the machine falls on none of them alone.
 
     Raises:
-        ValueError: there is no compiler, or not enough memory.
+        ValueError: nothing is asked for, there is no compiler, or not enough memory.
     """
+    if not config.benchmark.precisions or not config.benchmark.compile:
+        raise ValueError("training is timed in each of benchmark.precisions and benchmark.compile: both need an entry")
     on_gpu = torch.cuda.is_available() and config.trainer.accelerator != "cpu"
     if any(config.benchmark.compile) and not on_gpu and not shutil.which(os.environ.get("CXX", "g++")):
         raise ValueError("to compile for a CPU takes a C++ compiler: install g++, or set benchmark.compile=[false]")
@@ -143,7 +146,7 @@ class Trial(lightning.Callback):
 
     def on_train_start(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
         """What was before does not count."""
-        forget_peak(pl_module.device)
+        self._held = forget_peak(pl_module.device)
 
     def on_train_batch_end(
         self, trainer: lightning.Trainer, pl_module: lightning.LightningModule, outputs: Any, batch: Any, batch_idx: int
@@ -157,7 +160,7 @@ class Trial(lightning.Callback):
     def on_train_end(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
         """While model and batch are where they were trained: the floors."""
         device, model = self._learner.device, self._learner.model
-        self._memory = peak(device)
+        self._memory = peak(device) - self._held
         optimizer = torch.optim.AdamW(model.parameters(), fused=True)
         for step in range(WARM_UP + self.steps):
             if step == WARM_UP:
@@ -178,7 +181,7 @@ class Trial(lightning.Callback):
     def measures(self, peak: float, loss: float) -> dict[str, Measure]:
         """Of the best round, by name, given the peak of the device [FLOP/s] and the loss to compare with."""
         best, alone = self.best, min(each.alone for each in self._rounds)
-        weights = [parameter.nbytes for parameter in self._learner.parameters() if parameter.requires_grad]
+        weights = sum(each.nbytes for each in self._learner.parameters() if each.requires_grad)
         rate, megabytes = self.samples / best.seconds, min(each.memory for each in self._rounds) / 1e6
         flops = self._flops * self.steps / best.seconds
         found = {
@@ -187,7 +190,7 @@ class Trial(lightning.Callback):
                 1000 * best.waiting / self.steps, "ms/step", self.steps, 1000 * best.seconds / self.steps
             ),
             ": MFU": measure(flops / 1e9, f"GFLOP/s, peak of {self._whose}", self.steps, peak / 1e9),
-            ": memory": measure(megabytes, "MB", self.steps, 4 * sum(weights) / 1e6),
+            ": memory": measure(megabytes, "MB", self.steps, 3 * weights / 1e6),
             ": loss": measure(self.loss, "mean", self.steps, loss),
         }
         return {f"train: {self.name}{what}": value for what, value in found.items()}
