@@ -32,6 +32,23 @@ def test_a_matrix_takes_a_product_forward_and_one_for_its_gradient() -> None:
     assert flops == 2 * (2 * 6 * 3 * 5)
 
 
+@pytest.mark.parametrize(("groups", "products"), [(1, 8 * 8), (4, 8 * 2), (8, 8)])
+def test_channels_in_groups_meet_only_their_own(groups: int, products: int) -> None:
+    """3 by 3 weights at each of 5 by 5 places, forward and for the gradients of weights and images."""
+
+    class Convolution(nn.Module):
+        def __init__(self) -> None:
+            super().__init__()
+            self.first = nn.Parameter(torch.ones(()))  # so that the images need a gradient
+            self.layer = nn.Conv2d(8, 8, 3, padding=1, groups=groups)
+
+        def loss(self, batch: Any) -> Any:
+            return {"loss": self.layer(batch["action"] * self.first).sum()}
+
+    flops = training_flops(Convolution(), {"action": torch.randn(2, 8, 5, 5)})  # type: ignore[arg-type]
+    assert flops == 3 * 2 * (2 * 5 * 5 * 9 * products)
+
+
 @pytest.mark.parametrize(
     "model", [make_bc(), make_rt1(), make_decoder(), make_act()], ids=["bc", "rt1", "decoder", "act"]
 )

@@ -11,7 +11,7 @@ import time
 from typing import Any
 
 import torch
-from torch.utils.flop_counter import FlopCounterMode
+from torch.utils.flop_counter import FlopCounterMode, conv_flop_count
 
 from vla.models.model import Batch, Model
 
@@ -42,9 +42,33 @@ def training_flops(model: Model, batch: Batch) -> float:
     windows = min(len(batch["action"]), WINDOWS)
     trial = copy.deepcopy(model).float().train()
     device = batch["action"].device
-    with torch.random.fork_rng([device] if device.type == "cuda" else []), FlopCounterMode(display=False) as counter:
+    counter = FlopCounterMode(
+        display=False, custom_mapping={torch.ops.aten.convolution_backward: _convolution_backward}
+    )
+    with torch.random.fork_rng([device] if device.type == "cuda" else []), counter:
         trial.loss(_first(batch, windows))["loss"].backward()
     return counter.get_total_flops() * len(batch["action"]) / windows
+
+
+def _convolution_backward(
+    gradient: list[int],
+    images: list[int],
+    weight: list[int],
+    bias: Any,
+    stride: Any,
+    padding: Any,
+    dilation: Any,
+    transposed: bool,
+    output_padding: Any,
+    groups: int,
+    wanted: list[bool],
+    **_: Any,
+) -> int:
+    """FLOPs of the gradients, given shapes: each of them takes as many as the convolution itself.
+
+    torch counts the weights' as if every channel met every other one, also where they are in groups.
+    """
+    return conv_flop_count(images, weight, gradient, transposed) * sum(wanted[:2])
 
 
 def _first(batch: Any, count: int) -> Any:
