@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import shlex
@@ -10,6 +11,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -59,6 +61,21 @@ def address(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
             yield address
 
 
+def require_floors(measures: dict[str, dict[str, Any]]) -> None:
+    """Every stage was measured, against a floor of its own."""
+    assert {name.partition(":")[0] for name in measures} == {"collect", "loader", "train", "policy"}
+    shares = [measures[f"collect: {stage}"]["ratio"] for stage in ("physics", "rendering", "replay", "storing")]
+    assert 0 < sum(shares) < 1
+    for measure in measures.values():
+        assert set(measure) == {"value", "unit", "n", "floor", "ratio"} and measure["floor"] > 0
+    for precision in ("fp32", "bf16"):
+        assert measures[f"train: {precision}"]["n"] == 2 * 8
+        assert 0 < measures[f"train: {precision}: data-wait"]["ratio"] < 1
+        assert 0 < measures[f"train: {precision}: MFU"]["ratio"] < 1
+        assert measures[f"train: {precision}: memory"]["ratio"] > 1
+        assert measures[f"train: {precision}: loss"]["ratio"] == pytest.approx(1, abs=0.01)
+
+
 @pytest.mark.parametrize("command", COMMANDS)
 def test_the_command_runs(home: Path, command: str, request: pytest.FixtureRequest) -> None:
     number = COMMANDS.index(command)
@@ -88,14 +105,21 @@ def test_the_command_runs(home: Path, command: str, request: pytest.FixtureReque
         small += ["variant=no_transformer,no_history", "seed=0", "hydra.sweep.dir=ablation"]
     if "model=rt1" in arguments:  # at full size a second per frame
         small += [
-            "model.history=2",
-            "model.image_size=96",
+            "model.history=1",
+            "model.image_size=64",
             "data.batch_size=1",
             "data.validation_windows=1",
             "trainer.max_steps=1",
             "trainer.limit_val_batches=0",
         ]
-    vla(home, *arguments, *small)
+    if arguments == ["job=benchmark"]:
+        small += ["output=speed"]
+    done = vla(home, *arguments, *small)
+    if arguments == ["job=benchmark"]:
+        require_floors(json.loads((home / "speed/benchmark.json").read_text()))
+    if "seed=0,1" in arguments and "learner.lr=1e-3,3e-4" in arguments:
+        assert done.stdout.count("24 episodes, 0 of them new") == 4
+        assert done.stdout.count("\ntrained 4 steps") == 4
     if "experiment=ablation" in arguments:
         lines = (home / "ablation/sweep.md").read_text().splitlines()
         assert "| variant | seen [%] | instructions [%] | distractors [%] | backgrounds [%] |" in lines[0]

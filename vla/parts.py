@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -47,11 +47,17 @@ def note_config(config: DictConfig) -> None:
     """Leave beside the results what they came from, and what of that is not as it would be without any choice."""
     from vla.results import differences, write_config
 
-    chosen, default = (OmegaConf.to_container(each, resolve=False) for each in (config, compose("config")))
+    chosen, default = OmegaConf.to_container(config, resolve=False), _defaults()
     changes = [
         {"key": key, "here": here, "default": by_default} for key, here, by_default in differences(chosen, default)
     ]
     write_config(output_folder(config), plain(config), changes)
+
+
+@cache
+def _defaults() -> Any:
+    """What is configured without any choice."""
+    return OmegaConf.to_container(compose("config"), resolve=False)
 
 
 def make_environment(task: Node) -> Tabletop:

@@ -12,7 +12,7 @@ from lightning.pytorch.callbacks import RichProgressBar
 from vla.models.flops import matmul_flops, peak_flops, training_flops
 from vla.models.learner import Learner
 
-PEAK_SECONDS = 0.3  # for which a device of unknown peak is measured
+PEAK_SECONDS = 0.1  # for which a device of unknown peak is measured
 
 
 class Pace(Callback):
