@@ -19,7 +19,7 @@ from rerun.experimental import ViewerClient
 from vla.record import VIEWER
 
 DOCS = Path(__file__).parent
-HEIGHT = 1460  # of the page, as far as it is shown [px]
+HEIGHT = 1670  # of the page, as far as it is shown [px]
 STEP = 12  # at which the rollout is shown: about to grasp
 
 

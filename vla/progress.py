@@ -53,7 +53,8 @@ class Pace(Callback):
     ) -> None:
         """Log as often as the trainer logs."""
         self._batches += 1
-        if (batch_idx + 1) % trainer.log_every_n_steps:  # type: ignore[attr-defined]
+        every = trainer.log_every_n_steps  # type: ignore[attr-defined]
+        if not every or (batch_idx + 1) % every:
             return
         seconds = time.perf_counter() - self._began
         samples = self._batches * trainer.world_size * len(batch["action"])
