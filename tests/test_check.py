@@ -33,6 +33,7 @@ def config(**changes: Any) -> DictConfig:
             "checkpoint": None,
             "resume": False,
             "output": "outputs/runs/now",
+            "chosen": {"experiment": None, "model": "bc", "randomize": "default"},
             "collect": {"episodes": 5, "seed": 0, "workers": None, "folder": "outputs/episodes/x"},
             "evaluate": {"episodes": 5, "seed": 1_000_000, "workers": None, "recordings": 2, "conditions": {}},
             "validate": {"episodes": 0, "seed": 2_000_000},
@@ -201,6 +202,7 @@ def test_a_suggestion_is_made_only_where_something_is_close() -> None:
 
 
 SAVED = {
+    "chosen": {"experiment": "standard", "model": "rt1", "randomize": "wide"},
     "task": {"_target_": "vla.tasks.tabletop.Tabletop", "blocks": 4, "randomize": {"mass": None, "light": {"x": 1}}},
     "tokenizer": {"bins": 64},
     "model": {"history": 6},
@@ -216,6 +218,8 @@ def test_a_checkpoint_brings_its_task_tokenizer_and_model_and_task_overrides_app
     harder = adopt(cfg, SAVED, ["task/randomize=wide", "~task.goal"])
     assert OmegaConf.to_container(harder.task.randomize) == {"mass": {"a": 1}}
     assert harder.task.blocks == 4
+    assert untouched.chosen == SAVED["chosen"]
+    assert harder.chosen == {"experiment": "standard", "model": "rt1", "randomize": "default"}
     assert "light" not in adopt(cfg, SAVED, ["~task.randomize.light"]).task.randomize
 
 

@@ -16,7 +16,7 @@ import pytest
 import toy
 
 from vla.cluster import Local
-from vla.collect import NOT_REPEATABLE, PATIENCE, MakeEnvironment, MakeExpert, Summary, collect
+from vla.collect import EFFORT, NOT_REPEATABLE, PATIENCE, MakeEnvironment, MakeExpert, Summary, collect, effort
 from vla.data.episodes import EpisodeStore
 
 EPISODES = 30
@@ -47,7 +47,7 @@ def gather(
 
 
 def content(folder: Path) -> dict[str, bytes]:
-    return {path.name: path.read_bytes() for path in folder.iterdir() if path.name != "lock"}
+    return {path.name: path.read_bytes() for path in folder.iterdir() if path.name not in ("lock", EFFORT)}
 
 
 def lines(folder: Path) -> int:
@@ -103,6 +103,16 @@ def test_a_larger_count_adds_only_what_is_missing(tmp_path: Path, whole: Path) -
     assert content(tmp_path) == content(whole)
     assert gather(tmp_path, episodes=5).added == 0
     assert content(tmp_path) == content(whole)
+
+
+def test_how_long_it_took_is_added_up_and_shared_out_among_the_episodes(tmp_path: Path) -> None:
+    seconds = gather(tmp_path, episodes=4).seconds
+    seconds += gather(tmp_path, episodes=8).seconds
+    store = EpisodeStore(tmp_path)
+    assert effort(store, 8) == pytest.approx(seconds, abs=0.2)
+    assert effort(store, 2) == pytest.approx(seconds / 4, abs=0.1)
+    (tmp_path / EFFORT).unlink()
+    assert effort(store, 8) is None
 
 
 def test_killed_twenty_times_at_random_it_loses_and_doubles_nothing(tmp_path: Path) -> None:

@@ -32,9 +32,11 @@ def composed_with(group: str, option: str) -> DictConfig:
     """A config in which `option` stands, together with a parent that has such a nested group."""
     parent = group.rpartition("/")[0]
     parents = [f"{parent}={path.stem}" for path in sorted((CONF / parent).glob("*.yaml"))] if parent else []
-    for overrides in (TOGETHER.get((group, option), []), *[[choice] for choice in parents]):
+    chosen = [TOGETHER.get((group, option), []), *[[choice] for choice in parents]]
+    attempts = [[*overrides, f"{group}={option}"] for overrides in chosen]
+    for attempt in (*attempts, [f"+{group}={option}"]):  # the last where no option is chosen by default
         try:
-            return composed(*overrides, f"{group}={option}")
+            return composed(*attempt)
         except ConfigCompositionException as error:
             problem = error
     raise problem

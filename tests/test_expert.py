@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from vla.tasks.tabletop import Tabletop
 
 
-GOALS = ("lift", "pick_place", "pick_place_two", "push", "stack")
+GOALS = ("lift", "pick_place", "pick_place_two", "push", "stack", "stay")
 
 
 @pytest.mark.parametrize("goal", GOALS)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from vla.tasks.goals.pick_place import PickPlace
 from vla.tasks.goals.pick_place_two import PickPlaceTwo
 from vla.tasks.goals.push import Push
 from vla.tasks.goals.stack import Stack
+from vla.tasks.goals.stay import Stay
 from vla.tasks.language import Grammar
 
 GRAMMAR = Grammar(["move {block}"], {}, ["{block}"], {"move": ["shift"]})
@@ -95,6 +97,14 @@ def test_two_blocks_are_placed_one_after_the_other() -> None:
     assert not reached(goal, Aim((0, 1), (0, 1)), facts(both))
     first, second = goal.subgoals(facts(both, tool=both[0]), aim)
     assert not first.done and second.done  # the hand is still around the first
+
+
+def test_staying_is_to_move_no_block_and_to_rest() -> None:
+    goal, aim = Stay(GRAMMAR), Aim((1,), (0,))
+    untouched = facts(at((0.4, 0.2, HALF), (0.4, 0.2, HALF)))
+    assert reached(goal, aim, untouched)
+    assert not reached(goal, aim, replace(untouched, arm_speed=0.2))
+    assert not reached(goal, aim, facts(at((0.42, 0.2, HALF), (0.4, 0.2, HALF))))
 
 
 def test_a_mixture_draws_all_of_its_goals_and_needs_the_room_of_the_largest() -> None:

@@ -7,9 +7,11 @@ from typing import Any
 import numpy as np
 import pytest
 from conftest import make_tabletop
+from hydra.errors import InstantiationException
 
 from vla.spec import FIRST_SEED
 from vla.tasks.language import Grammar, Novelty
+from vla.tasks.scene import COLOURS
 
 GRAMMAR = Grammar(
     phrasings=["{put} the {block} block there", "the {block} block, please"],
@@ -88,3 +90,29 @@ def test_who_is_named_does_not_depend_on_how_it_is_said() -> None:
             assert environment.draws["named"] == new["named"]
             assert environment.draws["language"] != new["language"]
     environment.close()
+
+
+def test_the_same_scene_is_asked_for_another_block() -> None:
+    one = make_tabletop("randomize=wide")
+    other = make_tabletop("randomize=wide", "+randomize/naming=swapped")
+    for seed in range(FIRST_SEED, FIRST_SEED + 10):
+        first, second = one.reset(seed), other.reset(seed)
+        np.testing.assert_array_equal(first.rgb["front"], second.rgb["front"])
+        named = [environment.draws["named"]["colour"] for environment in (one, other)]
+        assert named[0] != named[1]
+        assert all(colour in seen.instruction for colour, seen in zip(named, (first, second), strict=True))
+    one.close()
+    other.close()
+
+
+def test_what_cannot_be_done_is_about_a_block_that_is_not_there() -> None:
+    environment = make_tabletop("goal=stay", "randomize=wide")
+    with environment.blind():
+        for seed in range(20):
+            instruction = environment.reset(seed).instruction
+            bound = environment.task.bound
+            assert not any(colour in instruction for colour in bound.block_names[: bound.present])
+            assert any(colour in instruction for colour in COLOURS)
+    environment.close()
+    with pytest.raises(InstantiationException, match=r"task\.blocks is from 2 to 5"):
+        make_tabletop("goal=stay", "blocks=6")

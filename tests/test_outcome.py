@@ -72,3 +72,9 @@ def test_with_two_subgoals_it_is_about_the_one_whose_turn_it_is() -> None:
     positions = np.array([[0.5, 0.0, 0.02], [0.4, 0.2, 0.02]])
     judge.watch(facts(positions, tool=positions[0]), [done, second], named=[0, 1])
     assert judge.outcome == "never_reached"
+
+
+def test_who_should_have_stayed_did_not() -> None:
+    judge = Judge(3)
+    step(judge, height=0.12, held=True, manner="stay")
+    assert judge.outcome == "did_not_stay"

@@ -15,7 +15,8 @@ from vla.tasks.randomize.blocks import Colours, Distractors, Placement, Shapes
 from vla.tasks.tabletop import Tabletop
 
 DEFAULT = {"distractors", "colour", "size", "mass", "friction", "placement", "arm", "light", "camera", "table"}
-AXES = sorted(path.name for path in (CONF / "task/randomize").iterdir() if path.is_dir())
+# What is asked for, which "naming" changes, is no draw.
+AXES = sorted({path.name for path in (CONF / "task/randomize").iterdir() if path.is_dir()} - {"naming"})
 INVISIBLE = {"mass", "friction", "gain", "latency", "phrasing"}  # until something moves, or speaks
 
 

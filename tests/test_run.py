@@ -66,6 +66,9 @@ def test_the_main_job_collects_trains_evaluates_and_records(home: Path) -> None:
         "checkpoint",
         "config",
     } <= set(report)
+    assert (report["experiment"], report["model"], report["randomize"]) == (None, "bc", "default")
+    training = json.loads((home / "run/training.json").read_text())
+    assert report["budget_s"] > training["collection_s"] + training["seconds"] > training["collection_s"] > 1
     assert report["episodes"] == 2 and report["errors"] == 0
     assert report["config"]["collect"]["episodes"] == 24
     names = ("report.html", "report.png", "rollouts.rrd", "samples.png", "metrics.csv", "checkpoints/last.ckpt")
@@ -91,6 +94,7 @@ def test_a_checkpoint_brings_its_task_and_model_and_takes_harder_scenes(home: Pa
     report = json.loads((home / "again/report.json").read_text())
     assert report["config"]["task"]["image_size"] == [32, 32]
     assert "purple" in report["config"]["task"]["randomize"]["colour"]["names"]
+    assert (report["model"], report["randomize"]) == ("bc", "wide") and report["budget_s"] > 0
     refused = vla(home, *arguments, "model=rt1_tiny", ok=False)
     assert refused.stderr.count("\n") == 1 and "model=rt1_tiny" in refused.stderr
 

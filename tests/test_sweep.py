@@ -66,3 +66,16 @@ def test_what_is_slower_and_no_better_is_off_the_front(tmp_path: Path) -> None:
     cell(tmp_path, 2, ["model=c"], 10, latency=10.0)
     cell(tmp_path, 3, ["model=d"], 0, latency=20.0)
     assert [row.name for row in pareto(tabulate(tmp_path))] == ["a", "c"]
+
+
+def test_over_the_number_of_demonstrations_success_is_a_curve_under_each_condition(tmp_path: Path) -> None:
+    for number, (level, count) in enumerate([("default", 1000), ("default", 50), ("wide", 50), ("wide", 1000)]):
+        cell(tmp_path, number, [f"task/randomize={level}", f"collect.episodes={count}"], 5)
+    tabulate(tmp_path)
+    wide = Image.open(tmp_path / "sweep.png").width
+    cell(tmp_path, 4, ["task/randomize=wide", "collect.episodes=50", "trainer.max_steps=1"], 5)
+    (tmp_path / "one").mkdir()
+    cell(tmp_path / "one", 0, ["collect.episodes=50"], 5)
+    cell(tmp_path / "one", 1, ["collect.episodes=70"], 5)
+    tabulate(tmp_path / "one")
+    assert wide == Image.open(tmp_path / "one/sweep.png").width  # two conditions, side by side

@@ -48,3 +48,22 @@ def test_all_tokens_have_a_vector() -> None:
 def test_impossible_sizes_are_refused() -> None:
     with pytest.raises(ValueError, match="words=0"):
         NGrams(words=0, width=4)
+
+
+def test_sentences_go_without_a_share_of_their_n_grams_in_training_only() -> None:
+    encoder = NGrams(forget=0.5, width=8)
+    tokens = encoder.tokenize(SENTENCES[:1])
+    assert not torch.equal(encoder(tokens), encoder(tokens))
+    encoder.eval()
+    assert torch.equal(encoder(tokens), encoder(tokens))
+    with pytest.raises(ValueError, match="forget is a share"):
+        NGrams(forget=1.0, width=8)
+
+
+def test_unknown_words_hardly_change_what_training_made_of_the_known_ones() -> None:
+    encoder = NGrams(width=64)
+    known, new = encoder.tokenize(["put the red block on the pad", "convey the red block on the pad"])
+    with torch.no_grad():
+        encoder.embedding.weight[known] *= 10  # as training does
+        one, other = encoder(known[None]), encoder(new[None])
+    assert torch.cosine_similarity(one, other).item() > 0.8

@@ -14,6 +14,7 @@ from difflib import get_close_matches
 from importlib import import_module
 from typing import Annotated, Any, Literal, get_args, get_origin
 
+from hydra.core.hydra_config import HydraConfig
 from hydra.errors import InstantiationException
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
@@ -64,6 +65,7 @@ PLAIN: dict[str, Any] = {
     "checkpoint": str | None,
     "resume": bool,
     "output": str,
+    "chosen": dict[str, str | None],
     "collect": {"episodes": Count, "seed": Seed, "workers": Count | None, "folder": str},
     "evaluate": {
         "episodes": Count,
@@ -162,6 +164,11 @@ def digest(*keys: str, _root_: DictConfig) -> str:
     values = [OmegaConf.select(_root_, key, throw_on_missing=True) for key in keys]
     plain = [OmegaConf.to_container(value, resolve=True) if OmegaConf.is_config(value) else value for value in values]
     return hashlib.sha256(json.dumps(_canonical(plain)).encode()).hexdigest()[:12]
+
+
+def chosen(group: str) -> str | None:
+    """The option that was chosen of a group, as `${chosen:task/randomize}`; None where no command line was read."""
+    return HydraConfig.get().runtime.choices.get(group) if HydraConfig.initialized() else None
 
 
 def suggestion(name: str, known: Iterable[str]) -> str:
@@ -273,3 +280,4 @@ def _hints(target: type) -> dict[str, Any]:
 
 
 OmegaConf.register_new_resolver("digest", digest, replace=True)
+OmegaConf.register_new_resolver("chosen", chosen, replace=True)

@@ -6,12 +6,14 @@ Seeds are tried in order and committed in order, until the store holds as many s
 from __future__ import annotations
 
 import logging
+import os
 import time
 from collections import Counter, deque
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from functools import partial
+from pathlib import Path
 from typing import Protocol
 
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
@@ -24,6 +26,7 @@ from vla.spec import Agent, Environment, Episode
 
 log = logging.getLogger(__name__)
 
+EFFORT = "seconds.txt"  # in the folder of a store: how long all collecting into it took [s]
 PATIENCE = 50  # seeds that may fail in a row before the expert counts as hopeless
 LOOK_AHEAD = 4  # episodes under way per worker: a long one must not keep the others waiting
 NOT_REPEATABLE = "not_repeatable"  # outcome of a success that its own actions do not bring about again
@@ -90,11 +93,30 @@ def collect(
             before = len(store.episodes)  # another process may have added some while this one waited
             _require_first_seed(store, seed)
             if before < episodes:
-                _fill_with(cluster, partial(Demonstrator, make_environment, make_expert), store, episodes, seed)
+                try:
+                    _fill_with(cluster, partial(Demonstrator, make_environment, make_expert), store, episodes, seed)
+                finally:
+                    _note_effort(store.folder, time.monotonic() - started)
     stored = len(store.episodes)
     failures = Counter(entry.outcome for entry in store.tried if not entry.success)
     tried = len(store.tried) - failures.pop(DAMAGED, 0)
     return Summary(stored, stored - before, tried, dict(failures), time.monotonic() - started)
+
+
+def effort(store: EpisodeStore, episodes: int) -> float | None:
+    """How long it took to collect so many of a store's episodes [s], whoever did; None if they came from elsewhere."""
+    file = store.folder / EFFORT
+    if not file.exists():
+        return None
+    return float(file.read_text(encoding="utf-8")) * episodes / len(store.episodes)
+
+
+def _note_effort(folder: Path, seconds: float) -> None:
+    file = folder / EFFORT
+    before = float(file.read_text(encoding="utf-8")) if file.exists() else 0.0
+    draft = folder / f".{EFFORT}"
+    draft.write_text(f"{before + seconds:.1f}\n", encoding="utf-8")
+    os.replace(draft, file)
 
 
 def _require_first_seed(store: EpisodeStore, seed: int) -> None:

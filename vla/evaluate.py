@@ -30,6 +30,7 @@ from vla.workers import cores, leave_with_parent, one_thread_each
 log = logging.getLogger(__name__)
 
 SEEN = "seen"  # the condition that a policy was trained for
+TAKEN = ("success", "dropped", "not_placed", "timeout")  # outcomes of episodes in which the named block was taken
 ERROR = "error"  # outcome of an episode that could not be played to its end
 NORMAL_QUANTILE = 1.959964  # of 0.975: an interval of 95 %
 
@@ -92,6 +93,11 @@ class Report:
     def interval(self) -> tuple[float, float]:
         """95 % confidence interval of `success`."""
         return wilson_interval(self.successes, self.episodes)
+
+    @property
+    def taken(self) -> float:
+        """Share of the episodes in which the block that was named was taken, wherever it went, 0…1."""
+        return sum(self.taxonomy.get(outcome, 0) for outcome in TAKEN) / self.episodes if self.episodes else 0.0
 
     @property
     def taxonomy(self) -> dict[str, int]:

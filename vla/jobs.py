@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import logging
+import time
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -27,6 +28,7 @@ from vla.parts import (
 )
 
 if TYPE_CHECKING:
+    from vla.evaluate import Report
     from vla.policy import Policy
 
 log = logging.getLogger(__name__)
@@ -79,10 +81,11 @@ def evaluate(config: DictConfig) -> float | None:
     Raises:
         ValueError: an episode could not be played to its end; the report, which is written, says why.
     """
-    from vla.evaluate import SEEN, evaluate, keep_recordings
+    from vla.evaluate import SEEN, keep_recordings
     from vla.page import PAGE, optional, write_page
     from vla.policy import latency
     from vla.report import plot_report, write_report
+    from vla.results import run_of
     from vla.suite import plot_suite, suite_table
     from vla.train import trained
 
@@ -90,23 +93,20 @@ def evaluate(config: DictConfig) -> float | None:
     checkpoint = Path(config.checkpoint) if config.checkpoint and not config.resume else trained(config)
     if checkpoint is None:
         return None
-    seeds = range(config.evaluate.seed, config.evaluate.seed + config.evaluate.episodes)
-    recordings = output / "recordings"
-    make = partial(make_policy, plain(config.policy), checkpoint)
-    recorder = partial(make_recorder, plain(config.recorder), recordings) if config.recorder else None
-    task, reports = plain(config.task), {}
-    for name, changes in {SEEN: {}, **plain(config.evaluate.conditions)}.items():
-        environment = partial(make_environment, {**task, "randomize": {**task["randomize"], **changes}})
-        # Recordings are for what the policy was trained for; what fails elsewhere is counted.
-        watching = recorder if name == SEEN else None
-        reports[name] = evaluate(environment, make, watching, seeds, config.evaluate.workers, name)
+    started = time.monotonic()
+    reports = _played(config, checkpoint, output / "recordings")
     report = reports.pop(SEEN)
     if config.recorder:
-        keep_recordings(report, recordings, output / "rollouts.rrd", config.evaluate.recordings)
-    policy = make()
-    size = {"parameters": sum(p.numel() for p in policy.model.parameters()), "latency_ms": latency(policy)}
+        keep_recordings(report, output / "recordings", output / "rollouts.rrd", config.evaluate.recordings)
+    policy = make_policy(plain(config.policy), checkpoint)
+    facts = {
+        **plain(config.chosen),
+        "parameters": sum(p.numel() for p in policy.model.parameters()),
+        "latency_ms": latency(policy),
+        "budget_s": run_of(checkpoint).budget(time.monotonic() - started),
+    }
     note_config(config)
-    write_report(report, output / "report.json", str(checkpoint), plain(config), size, reports)
+    write_report(report, output / "report.json", str(checkpoint), plain(config), facts, reports)
     plot_report(report, output / "report.png")
     if reports:
         plot_suite({SEEN: report, **reports}, output / "suite.png")
@@ -119,6 +119,26 @@ def evaluate(config: DictConfig) -> float | None:
     if errors:
         raise ValueError(f"{len(errors)} episodes ended in an error, see {output / 'report.json'}")
     return report.success
+
+
+def _played(config: DictConfig, checkpoint: Path, recordings: Path) -> dict[str, Report]:
+    """Condition → report on the same seeds; the first is what the policy was trained for, and alone is recorded."""
+    from vla.evaluate import SEEN, evaluate
+
+    seeds = range(config.evaluate.seed, config.evaluate.seed + config.evaluate.episodes)
+    make = partial(make_policy, plain(config.policy), checkpoint)
+    recorder = partial(make_recorder, plain(config.recorder), recordings) if config.recorder else None
+    task = plain(config.task)
+    reports: dict[str, Report] = {}
+    for name, changes in {SEEN: {}, **plain(config.evaluate.conditions)}.items():
+        changed = {**task, **changes, "randomize": {**task["randomize"], **changes.get("randomize", {})}}
+        if reports and changed == task:  # the level at which it was trained
+            reports[name] = reports[SEEN]
+        else:
+            environment = partial(make_environment, changed)
+            watching = None if reports else recorder
+            reports[name] = evaluate(environment, make, watching, seeds, config.evaluate.workers, name)
+    return reports
 
 
 def export(config: DictConfig) -> None:

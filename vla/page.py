@@ -153,6 +153,8 @@ def _facts(run: Run) -> dict[str, str]:
         facts["time of an action"] = f"{report['latency_ms']:.1f} ms"
     if training:
         facts["training"] = f"{training['steps']} steps in {_duration(training['seconds'])}"
+    if report.get("budget_s"):
+        facts["collection, training, evaluation"] = _duration(report["budget_s"])
     if (collect := run.config.get("collect")) and run.metrics:
         facts["demonstrations"] = str(collect["episodes"])
     if report:

@@ -32,18 +32,19 @@ def write_report(
     path: Path,
     checkpoint: str | None,
     config: Mapping[str, Any],
-    policy: Mapping[str, float] | None = None,
+    facts: Mapping[str, Any] | None = None,
     conditions: Mapping[str, Report] | None = None,
 ) -> None:
     """Write a report as JSON, all of it or nothing: rate and interval, outcomes, what was evaluated, every episode.
 
-    `policy` says how large and how fast what was evaluated is; `conditions` are reports on the same seeds, by name.
+    `facts` say what was evaluated: which options were chosen, how large and fast the policy is, what it took;
+    `conditions` are reports on the same seeds, by name.
     """
     content = {
         **summary(report),
         "seeds": [result.seed for result in report.results],
         "checkpoint": checkpoint,
-        **(policy or {}),
+        **(facts or {}),
         "conditions": {
             name: {**summary(other), "outcomes": [result.outcome for result in other.results]}
             for name, other in (conditions or {}).items()
@@ -66,6 +67,7 @@ def summary(report: Report) -> dict[str, Any]:
         "episodes": report.episodes,
         "successes": report.successes,
         "errors": len(report.errors),
+        "taken": report.taken,
         "taxonomy": report.taxonomy,
     }
 

@@ -52,6 +52,11 @@ class Run:
         """How many the model has, if that is known."""
         return self.training.get("parameters", self.report.get("parameters"))
 
+    def budget(self, evaluation: float) -> float | None:
+        """Seconds that collection and training took, and an evaluation after them; None if that is not known."""
+        collection, training = self.training.get("collection_s"), self.training.get("seconds")
+        return None if collection is None or training is None else round(collection + training + evaluation, 1)
+
     @property
     def reports(self) -> dict[str, Report]:
         """Condition → its report, the one that the policy was trained for first; draws and conditions' steps are left
@@ -83,6 +88,15 @@ def read_run(folder: Path) -> Run:
     )
 
 
+def run_of(checkpoint: str | Path) -> Run:
+    """The run that left a checkpoint.
+
+    Raises:
+        ValueError: a file of it is damaged.
+    """
+    return read_run(Path(checkpoint).resolve().parent.parent)
+
+
 def require_run(folder: Path) -> Run:
     """As `read_run`.
 
@@ -100,10 +114,13 @@ def write_config(folder: Path, config: Mapping[str, Any], changes: list[Node]) -
         write(folder / name, yaml.safe_dump(content, sort_keys=False, allow_unicode=True, width=120))
 
 
-def note_training(folder: Path, parameters: int, steps: int, seconds: float, ended: str) -> None:
-    """Write how large the model is, which step its training reached and in which time [s], and how it ended: "done",
-    "interrupted", or what went wrong."""
+def note_training(
+    folder: Path, parameters: int, steps: int, seconds: float, ended: str, collection: float | None = None
+) -> None:
+    """Write how large the model is, which step its training reached and in which time [s], how it ended, "done",
+    "interrupted", or what went wrong, and how long its demonstrations took to collect [s], if that is known."""
     facts = {"parameters": parameters, "steps": steps, "seconds": round(seconds, 1), "ended": ended}
+    facts |= {"collection_s": None if collection is None else round(collection, 1)}
     write(folder / TRAINING, json.dumps(facts, ensure_ascii=False) + "\n")
 
 

@@ -17,6 +17,7 @@ LAST = "last.ckpt"
 LOCK = ".training"  # held by the process that trains into a folder of checkpoints
 
 OF_POLICY = ("task", "tokenizer", "model")
+CHOSEN = {"experiment": "experiment", "model": "model", "randomize": "task/randomize"}  # name in `chosen` → group
 # What training follows from, apart from where and how fast it runs.
 OF_TRAINING = (
     *("task", "expert", "collect.episodes", "collect.seed", "data", "tokenizer", "model", "learner", "seed"),
@@ -40,7 +41,10 @@ def adopt(cfg: DictConfig, saved: Mapping[str, Any], overrides: Sequence[str]) -
                 f"{override.input_line} cannot be combined with a checkpoint, whose weights belong to the {group} "
                 "they were trained with: leave one of the two out"
             )
-    return _on_top(cfg, {group: saved[group] for group in OF_POLICY}, said)
+    named = {override.key_or_group for override in said}
+    kept = saved.get("chosen", {})
+    chosen = {name: cfg.chosen[name] if group in named else kept.get(name) for name, group in CHOSEN.items()}
+    return _on_top(cfg, {**{group: saved[group] for group in OF_POLICY}, "chosen": chosen}, said)
 
 
 def go_on(cfg: DictConfig, overrides: Sequence[str]) -> DictConfig:

@@ -11,7 +11,7 @@ import os
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
 
 from filelock import FileLock
@@ -20,6 +20,10 @@ from hydra.experimental.callback import Callback
 from hydra.types import RunMode
 from omegaconf import DictConfig
 
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+DEMONSTRATIONS = "collect.episodes"  # the override over which success is drawn
 SEED = "seed"  # the override that distinguishes the cells of one row
 OVERRIDES = ".hydra/overrides.yaml"  # what Hydra leaves in the folder of every cell
 FAILURE = "error.txt"  # in the folder of a cell that failed
@@ -161,12 +165,50 @@ def markdown(rows: list[Row]) -> str:
 
 
 def plot(rows: list[Row], path: Path) -> None:
-    """Draw success over the time of an action; the area of a point grows with the parameters, and a line joins what
-    nothing else beats in both."""
+    """Draw success over the number of demonstrations where that is what differs, else over the time of an action."""
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(8, 5), layout="constrained")
-    axes = figure.add_subplot()
+    curve = DEMONSTRATIONS in rows[0].choices
+    conditions = len(rows[0].successes) if curve else 1
+    figure = Figure(figsize=(8 if conditions == 1 else 6 * conditions, 5), layout="constrained")
+    if curve:
+        for axes, condition in zip(figure.subplots(1, conditions, squeeze=False)[0], rows[0].successes, strict=True):
+            _plot_curves(axes, rows, condition)
+    else:
+        _plot_costs(figure.add_subplot(), rows)
+    for axes in figure.axes:
+        axes.set_ylabel("success, 95 % CI")
+        axes.grid(alpha=0.3)
+        axes.spines[["top", "right"]].set_visible(False)
+    figure.savefig(path, dpi=110, format="png")
+
+
+def _plot_curves(axes: Axes, rows: list[Row], condition: str) -> None:
+    """Success under one condition over the number of demonstrations; rows with the same other choices share a line."""
+    lines: dict[str, list[Row]] = {}
+    for row in rows:
+        others = " ".join(value for key, value in row.choices.items() if key != DEMONSTRATIONS)
+        lines.setdefault(others, []).append(row)
+    for name, line in lines.items():
+        line.sort(key=lambda row: int(row.choices[DEMONSTRATIONS]))
+        rates = [row.interval(condition) for row in line]
+        reach = [[rate - low for rate, low, _ in rates], [high - rate for rate, _, high in rates]]
+        counts = [int(row.choices[DEMONSTRATIONS]) for row in line]
+        axes.errorbar(counts, [rate for rate, _, _ in rates], reach, fmt="o-", capsize=3, label=name)
+    axes.set_xscale("log")
+    axes.set_xticks(sorted({int(row.choices[DEMONSTRATIONS]) for row in rows}))
+    axes.xaxis.set_major_formatter("{x:g}")
+    axes.xaxis.set_minor_formatter("")
+    axes.set_ylim(-0.02, 1.02)
+    axes.set_xlabel("demonstrations")
+    axes.set_title(condition, fontsize=10)
+    if len(lines) > 1:
+        axes.legend(frameon=False)
+
+
+def _plot_costs(axes: Axes, rows: list[Row]) -> None:
+    """Success over the time of an action; the area of a point grows with the parameters, and a line joins what nothing
+    else beats in both."""
     axes.set_xscale("log")
     for row in rows:
         rate, low, high = row.seen
@@ -181,10 +223,6 @@ def plot(rows: list[Row], path: Path) -> None:
     close = max(row.latency for row in rows) < 10 * min(row.latency for row in rows)
     axes.xaxis.set_minor_formatter("{x:g}" if close else "")
     axes.set_xlabel("time of an action [ms]")
-    axes.set_ylabel("success, 95 % CI")
-    axes.grid(alpha=0.3)
-    axes.spines[["top", "right"]].set_visible(False)
-    figure.savefig(path, dpi=110, format="png")
 
 
 def pareto(rows: list[Row]) -> list[Row]:

@@ -13,6 +13,7 @@ import lightning
 from lightning import Trainer
 from omegaconf import DictConfig
 
+from vla.collect import effort
 from vla.models.fidelity import fidelity
 from vla.models.learner import Learner
 from vla.page import PAGE, optional, write_page
@@ -28,7 +29,7 @@ from vla.parts import (
     plain,
     unfitted_learner,
 )
-from vla.results import note_training
+from vla.results import note_training, run_of
 from vla.resume import LAST, alone
 from vla.samples import FILE, SHOWN, draw_samples
 from vla.training import Interruption, enough_memory, keep_metrics, make_trainer, quiet_lightning
@@ -63,7 +64,7 @@ def trained(config: DictConfig) -> Path | None:
             draw_samples(data.gather(data.order(0)[:SHOWN]), store.spec, output / FILE)
         if config.checkpoint:
             keep_metrics(trainer, Path(config.checkpoint))
-        with _told(config, trainer, learner):
+        with _told(config, trainer, learner, effort(store, config.collect.episodes)):
             try:
                 with enough_memory(config), interruption.listening():
                     trainer.fit(learner, datamodule=data, ckpt_path=config.checkpoint, weights_only=True)
@@ -87,12 +88,13 @@ def _closed_loop(config: DictConfig, checkpoints: Path) -> ClosedLoop | None:
 
 
 @contextmanager
-def _told(config: DictConfig, trainer: Trainer, learner: Learner) -> Iterator[None]:
-    """However the training within ends, its page and the log tell how it did."""
+def _told(config: DictConfig, trainer: Trainer, learner: Learner, collection: float | None) -> Iterator[None]:
+    """However the training within ends, its page and the log tell how it did, all that it went on from included."""
     output = output_folder(config)
     note_config(config)
     parameters = sum(parameter.numel() for parameter in learner.model.parameters())
     log.info("training %s with %.2f M parameters", type(learner.model).__name__, parameters / 1e6)
+    before = run_of(config.checkpoint).training.get("seconds", 0.0) if config.checkpoint else 0.0
     started, ended = time.monotonic(), "done"
     try:
         yield
@@ -100,9 +102,9 @@ def _told(config: DictConfig, trainer: Trainer, learner: Learner) -> Iterator[No
         ended = "interrupted" if isinstance(error, KeyboardInterrupt) else str(error) or type(error).__name__
         raise
     finally:
-        seconds = time.monotonic() - started
+        seconds = before + time.monotonic() - started
         if trainer.is_global_zero:
             with optional(output / PAGE):
-                note_training(output, parameters, trainer.global_step, seconds, ended)
+                note_training(output, parameters, trainer.global_step, seconds, ended, collection)
                 write_page(output)
     log.info("trained %d steps in %.0f s: %s", trainer.global_step, seconds, output / "checkpoints")

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor, nn
 
 PADDING = 0
+INITIAL = 0.1  # deviation of vectors before training: small, so that unknown n-grams hardly say anything
 
 
 class TextEncoder(nn.Module, ABC):
@@ -46,18 +47,25 @@ class NGrams(TextEncoder):
         vocabulary: number of learned vectors; n-grams that hash to the same one share it.
         words: longest n-gram of words.
         characters: length of the n-grams of characters, taken from every word between its boundary marks.
+        forget: share of the n-grams that a sentence goes without in training, as one with unknown words will.
         width: length of the sentence vector.
     """
 
-    def __init__(self, vocabulary: int = 4096, words: int = 2, characters: int = 3, *, width: int) -> None:
+    def __init__(
+        self, vocabulary: int = 4096, words: int = 2, characters: int = 3, forget: float = 0.0, *, width: int
+    ) -> None:
         super().__init__(width)
+        if not 0 <= forget < 1:
+            raise ValueError(f"forget is a share of the n-grams from 0 up to 1, got {forget}")
         if vocabulary < 2 or words < 1 or characters < 1:
             raise ValueError(
                 f"n-grams need vocabulary >= 2, words >= 1 and characters >= 1, "
                 f"got vocabulary={vocabulary}, words={words}, characters={characters}"
             )
-        self.vocabulary, self.words, self.characters = vocabulary, words, characters
+        self.vocabulary, self.words, self.characters, self.forget = vocabulary, words, characters, forget
         self.embedding = nn.Embedding(vocabulary, width, padding_idx=PADDING)
+        with torch.no_grad():
+            self.embedding.weight.mul_(INITIAL)
         self.norm = nn.LayerNorm(width)
 
     def tokenize(self, sentences: list[str]) -> Tensor:
@@ -67,7 +75,9 @@ class NGrams(TextEncoder):
         return torch.tensor([row + (PADDING,) * (length - len(row)) for row in rows])
 
     def forward(self, tokens: Tensor) -> Tensor:
-        """(B, width) vectors for (B, L) tokens, whatever the number of 0s at the end."""
+        """(B, width) vectors for (B, L) tokens, wherever 0s stand among them."""
+        if self.training and self.forget:
+            tokens = tokens * (torch.rand(tokens.shape, device=tokens.device) >= self.forget)
         count = (tokens != PADDING).sum(1, keepdim=True).clamp(min=1)
         vector: Tensor = self.norm(self.embedding(tokens).sum(1) / count)
         return vector

@@ -90,6 +90,7 @@ class BoundScene:
         self.latency = 0.0  # from a command to the motors [s]
         self.noise = Noise()
         self.novelty: float = 0.0  # probability that an evaluation's instruction has something new in it
+        self.passed_over = 0  # blocks that are not named, of those that would be named first
         self.paint_blocks(list(COLOURS)[:count], np.array(list(COLOURS.values()))[:count])
         for pad in range(len(PADS)):
             self.place_pad(pad, 0.4, 0.15 * pad)

@@ -64,6 +64,8 @@ class Waypoint:
     def _decide(self, truth: dict[str, Array], opening: float) -> Array:
         """(7,) unclipped action for this state."""
         manner = MANNERS[int(truth["manner"][0])]
+        if manner == "stay":
+            return self._action(truth, np.zeros(3), 0.0, 1.0)
         if manner == "push":
             return self._push(truth)
         if truth["grasped"][0]:

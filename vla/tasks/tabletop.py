@@ -53,8 +53,9 @@ class Tabletop:
         """
         if min(image_size) < 1:
             raise ValueError(f"task.image_size is a height and a width of at least 1 pixel, not {list(image_size)}")
-        if not goal.blocks <= blocks <= len(COLOURS):
-            raise ValueError(f"task.blocks is from {goal.blocks} to {len(COLOURS)}, one colour each, not {blocks}")
+        most = len(COLOURS) - goal.absent
+        if not goal.blocks <= blocks <= most:
+            raise ValueError(f"task.blocks is from {goal.blocks} to {most}, one colour each, not {blocks}")
         low = np.array([-TRANSLATION] * 3 + [-ROTATION] * 3 + [0.0])
         high = np.array([TRANSLATION] * 3 + [ROTATION] * 3 + [1.0])
         self.spec = Spec(

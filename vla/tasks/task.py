@@ -20,7 +20,7 @@ from vla.tasks.goals.mixed import Mixed
 from vla.tasks.language import Novelty
 from vla.tasks.outcome import Judge
 from vla.tasks.randomize.axis import Axis, Streams
-from vla.tasks.scene import PADS, Scene
+from vla.tasks.scene import COLOURS, PADS, Scene
 
 CONTROL_HZ = 10.0
 FINGER_STEP = FINGER_SPEED / CONTROL_HZ  # furthest a finger moves in one control period [m]
@@ -88,7 +88,7 @@ class TabletopTask(composer.Task):
         physics.forward()
         novelty = self._novelty(seed)
         self.aim = self._choose(novelty, self.streams(seed, "named"))
-        self.instruction = self.goal.language.say(self._slots(), novelty, self.streams(seed, "language"))
+        self.instruction = self.goal.language.say(self._slots(seed), novelty, self.streams(seed, "language"))
         language = {"instruction": self.instruction, "novelty": novelty or "none"}
         self.draws = {"named": self._named(), **draws, "language": language}
         data = self.bound.data
@@ -120,14 +120,18 @@ class TabletopTask(composer.Task):
         order = [int(index) for index in random_state.permutation(self.bound.present)]
         # A sort keeps the order among equals: where nothing is held out, it changes nothing.
         order.sort(key=lambda index: (self.bound.block_names[index] in held_out) != (novelty == "combinations"))
+        order = order[self.bound.passed_over :] + order[: self.bound.passed_over]
         pads = [int(index) for index in random_state.permutation(self.goal.pads)]
         return Aim(tuple(order[: self.goal.named]), tuple(pads))
 
-    def _slots(self) -> dict[str, str]:
+    def _slots(self, seed: int) -> dict[str, str]:
         """What the slots of an instruction stand for."""
         blocks = zip(("block", "other"), self.aim.blocks, strict=False)
         pads = zip(("pad", "rest"), self.aim.pads, strict=False)
         slots = {slot: self.bound.block_names[index] for slot, index in blocks}
+        if self.goal.absent:
+            missing = [name for name in COLOURS if name not in self.bound.block_names[: self.bound.present]]
+            slots["absent"] = missing[self.streams(seed, "absent").randint(len(missing))]
         return slots | {slot: list(PADS)[index] for slot, index in pads}
 
     def _named(self) -> dict[str, Any]:
@@ -205,6 +209,7 @@ class TabletopTask(composer.Task):
             touched=np.array([bool(touching) for touching in fingers]),
             pads=bound.data.mocap_pos[bound.zones[: self.goal.pads]].copy(),
             tool=bound.data.site_xpos[bound.tcp].copy(),
+            arm_speed=float(np.abs(bound.data.qvel[bound.velocities]).max()),
         )
 
     def truth(self) -> dict[str, Array]:

@@ -14,8 +14,8 @@ from vla.tasks.language import Grammar
 
 AT_REST = 0.02  # speed below which a block counts as resting [m/s]
 
-Manner = Literal["place", "hold", "push"]
-MANNERS: tuple[Manner, ...] = ("place", "hold", "push")
+Manner = Literal["place", "hold", "push", "stay"]
+MANNERS: tuple[Manner, ...] = ("place", "hold", "push", "stay")
 
 
 @dataclass(frozen=True)
@@ -31,6 +31,7 @@ class Facts:
     touched: Array  # (B,) whether any does
     pads: Array  # (Z, 3) centres [m]
     tool: Array  # (3,) the point between the fingertips [m]
+    arm_speed: float = 0.0  # of the fastest joint [rad/s]
 
     def away(self, block: int, place: Array) -> float:
         """Horizontal distance of a block's centre from a place [m]."""
@@ -60,7 +61,7 @@ class Subgoal:
 
     block: int
     destination: Array  # (3,) for its centre [m]
-    manner: Manner  # let go there, keep there, or get there without being lifted
+    manner: Manner  # let go there, keep there, get there without being lifted, or leave it alone
     done: bool
     tolerance: float = 0.02  # horizontal distance from the destination at which to let go [m]
 
@@ -72,13 +73,14 @@ class Goal(ABC):
         named: how many blocks the instruction names.
         moves: how many of them are to be moved.
         blocks: the fewest that must lie on the table.
+        absent: the fewest colours that must not lie there.
         pads: how many lie there.
-        language: what is said; the slots {block} and {other} are the named blocks' colours, {pad} and {rest} those of
-            the pads.
+        language: what is said; the slots {block} and {other} are the named blocks' colours, {absent} one that no
+            block has, {pad} and {rest} those of the pads.
         hold_steps: control steps in a row for which all subgoals must be done.
     """
 
-    named, moves, blocks, pads = 1, 1, 2, 1
+    named, moves, blocks, absent, pads = 1, 1, 2, 0, 1
 
     def __init__(self, language: Grammar, hold_steps: int) -> None:
         self.language, self.hold_steps = language, hold_steps

@@ -10,7 +10,7 @@ from vla.tasks.goals.goal import Goal
 
 
 class Mixed:
-    """One of several goals, drawn per episode; `blocks` is the fewest that must lie on the table for any of them."""
+    """One of several goals, drawn per episode; `blocks` and `absent` are the most that any of them needs."""
 
     def __init__(self, goals: Mapping[str, Goal | None]) -> None:
         """Args: name → goal, or None to leave one out.
@@ -22,6 +22,7 @@ class Mixed:
         if not self.goals:
             raise ValueError("task.goal.goals names no goal")
         self.blocks = max(goal.blocks for goal in self.goals.values())
+        self.absent = max(goal.absent for goal in self.goals.values())
 
     def draw(self, random_state: np.random.RandomState) -> Goal:
         """One of them."""

@@ -1,4 +1,4 @@
-"""The axis about what is said."""
+"""The axes about what is said."""
 
 from __future__ import annotations
 
@@ -20,3 +20,16 @@ class Phrasing:
         """Nothing to draw here: each episode draws whether, and then what."""
         scene.novelty = self.held_out
         return {"held_out": self.held_out}
+
+
+class Naming:
+    """Which block the instruction names: in the same scene, another one than it would name without this axis."""
+
+    def __init__(self, passed_over: int) -> None:
+        """Args: how many blocks are passed over, in the order in which they would be named."""
+        self.passed_over = passed_over
+
+    def __call__(self, scene: BoundScene, random_state: np.random.RandomState) -> dict[str, Any]:
+        """Nothing to draw here."""
+        scene.passed_over = self.passed_over
+        return {"passed_over": self.passed_over}
