@@ -5,11 +5,15 @@ Shapes: N images, C channels, H by W pixels, h by w positions of a feature map, 
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
+
+
+DARK = 0.1  # of a brightness up to 3: colours darker than that say little
 
 
 class FiLM(nn.Module):
@@ -58,10 +62,13 @@ class FilmConv(ImageEncoder):
         channels: output channels, one per convolution.
         kernels: kernel sizes, one per convolution [px].
         strides: strides, one per convolution.
+        chroma: whether it sees colours relative to their brightness too, which a lamp and shadows change less.
         text_width: length of the text vector.
     """
 
-    def __init__(self, channels: list[int], kernels: list[int], strides: list[int], *, text_width: int) -> None:
+    def __init__(
+        self, channels: list[int], kernels: list[int], strides: list[int], chroma: bool = True, *, text_width: int
+    ) -> None:
         if not channels or not len(channels) == len(kernels) == len(strides):
             raise ValueError(
                 f"channels, kernels and strides need one entry per convolution, got {channels}, {kernels}, {strides}"
@@ -72,7 +79,10 @@ class FilmConv(ImageEncoder):
             nn.Conv2d(i, o, kernel, stride, kernel // 2)
             for i, o, kernel, stride in zip(inputs, channels, kernels, strides, strict=True)
         ]
-        for conv in convs:
+        self.chroma: nn.Conv2d | None = None
+        if chroma:
+            self.chroma = nn.Conv2d(3, channels[0], kernels[0], strides[0], kernels[0] // 2, bias=False)
+        for conv in (*convs, *([self.chroma] if self.chroma else [])):
             # Without normalisation layers the signal must keep its size, or the attention over positions starts flat.
             nn.init.kaiming_normal_(conv.weight, nonlinearity="relu")
         self.convs = nn.ModuleList(convs)
@@ -81,10 +91,19 @@ class FilmConv(ImageEncoder):
 
     def forward(self, images: Tensor, text: Tensor) -> Tensor:
         """(N, 3, H, W) float images in 0 … 1 and (N, text_width) text to (N, channels, h, w)."""
-        x = (images - 0.5) * 4  # about unit variance
-        for conv, film in zip(self.convs, self.films, strict=True):
+        x = self.convs[0]((images - 0.5).mul_(4))  # about unit variance
+        if self.chroma is not None:
+            x = (x + self.chroma(_relative(images))) * math.sqrt(0.5)
+        x = F.relu_(self.films[0](x, text))
+        for conv, film in zip(self.convs[1:], self.films[1:], strict=True):
             x = F.relu_(film(conv(x), text))
         return x
+
+
+def _relative(images: Tensor) -> Tensor:
+    """What of the brightness of each pixel is red, green and blue, as far from grey as about unit variance wants it."""
+    brightness = images[:, 0] + images[:, 1] + images[:, 2] + DARK  # a sum over few channels is slow
+    return (images / brightness.unsqueeze(1)).sub_(1 / 3).mul_(6)
 
 
 class TokenLearner(nn.Module):
