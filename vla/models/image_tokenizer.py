@@ -12,7 +12,6 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-
 DARK = 0.1  # of a brightness up to 3: colours darker than that say little
 
 
