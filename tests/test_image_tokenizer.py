@@ -32,7 +32,7 @@ def test_film_conv_listens_to_the_text() -> None:
 def test_with_chroma_alone_a_dimmer_lamp_changes_little() -> None:
     torch.manual_seed(0)
     encoder = FilmConv([8], [5], [2], text_width=8)
-    torch.nn.init.zeros_(encoder.convs[0].weight)  # so that only relative colours are left
+    torch.nn.init.zeros_(encoder.get_parameter("convs.0.weight"))  # so that only relative colours are left
     bright, text = 0.3 + 0.7 * torch.rand(1, 3, 16, 16), torch.randn(1, 8)
     with torch.no_grad():
         features, dim, other = (encoder(images, text) for images in (bright, bright / 2, bright.roll(1, 1)))
