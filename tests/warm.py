@@ -14,7 +14,7 @@ import runpy
 import signal
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import cache
 from pathlib import Path
 from socket import create_server
@@ -26,9 +26,12 @@ from vla.tasks.backend import choose_backend
 PATIENCE = 300  # [s]
 
 
-def run(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
-    """What `python -m vla.run` with these arguments does in a folder."""
-    return _done(folder, "vla.run", arguments, [{}])[0]
+Meanwhile = Callable[[int], None]  # is given the process
+
+
+def run(folder: Path, *arguments: str, meanwhile: Meanwhile | None = None) -> subprocess.CompletedProcess[str]:
+    """What `python -m vla.run` with these arguments does in a folder, whatever is done to it `meanwhile`."""
+    return _done(folder, "vla.run", arguments, [{}], meanwhile)[0]
 
 
 def run_together(folder: Path, program: str, *arguments: str) -> None:
@@ -41,7 +44,11 @@ def run_together(folder: Path, program: str, *arguments: str) -> None:
 
 
 def _done(
-    folder: Path, program: str, arguments: Sequence[str], environments: Sequence[dict[str, str]]
+    folder: Path,
+    program: str,
+    arguments: Sequence[str],
+    environments: Sequence[dict[str, str]],
+    meanwhile: Meanwhile | None = None,
 ) -> list[subprocess.CompletedProcess[str]]:
     """Run a program once with each of the additions to the environment, at the same time."""
     with TemporaryDirectory() as scratch:
@@ -59,7 +66,12 @@ def _done(
         source = _source()
         assert source.stdin is not None and source.stdout is not None
         print(json.dumps(orders), file=source.stdin, flush=True)
-        codes = json.loads(source.stdout.readline())
+        processes = json.loads(source.stdout.readline())
+        try:
+            if meanwhile:
+                meanwhile(*processes)
+        finally:
+            codes = json.loads(source.stdout.readline())
         texts = [[Path(file).read_text(encoding="utf-8") for file in each] for each in files]
     command = ["python", "-m", program, *arguments]
     return [subprocess.CompletedProcess(command, code, *each) for code, each in zip(codes, texts, strict=True)]
@@ -102,7 +114,7 @@ def _codes(processes: list[int]) -> list[int]:
 
 
 def main() -> None:
-    """Load the libraries; then, for every line of standard input, fork and answer with the exit statuses."""
+    """Load the libraries; then, for every line of standard input, fork and tell the processes, then how they ended."""
     choose_backend()
     import lightning
     import matplotlib.figure
@@ -124,6 +136,7 @@ def main() -> None:
                 _become(order)
                 return
             processes.append(process)
+        print(json.dumps(processes), flush=True)
         print(json.dumps(_codes(processes)), flush=True)
 
 
