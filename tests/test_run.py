@@ -8,7 +8,6 @@ import re
 import shutil
 import signal
 import subprocess
-import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -19,7 +18,6 @@ import yaml
 from rerun.chunk import RrdReader
 
 from vla.policy import read_checkpoint
-from vla.tasks.backend import TRIED
 
 SMALL = (
     "validate.episodes=0",
@@ -120,13 +118,6 @@ def test_cells_run_at_the_same_time_and_one_that_fails_leaves_the_others_alone(h
     assert (home / "grid/sweep.md").exists() and "at least 1" in (home / "grid/2/error.txt").read_text()
 
 
-@pytest.mark.parametrize("launcher", ["basic", "joblib"])
-def test_a_grid_whose_cells_want_several_processes_is_refused(home: Path, launcher: str) -> None:
-    several = ("trainer=ddp", "trainer.accelerator=cpu", "trainer.devices=2", "seed=0")
-    done = vla(home, "-m", f"hydra/launcher={launcher}", *several, ok=False)
-    assert "trainer.devices=1" in done.stderr and "submitit_slurm" in done.stderr and "Traceback" not in done.stderr
-
-
 def test_the_menu_is_what_hydra_would_list(home: Path) -> None:
     menu = vla(home, "--help").stdout
     assert "task/goal: lift, mixed, pick_place, pick_place_two, push, stack\n" in menu
@@ -190,36 +181,6 @@ def test_an_episode_is_replayed_into_a_recording(home: Path) -> None:
     assert "has no seed 99" in done.stderr and "Traceback" not in done.stderr
 
 
-BAD_INPUT = {
-    "misspelt key": (("colect.episodes=3",), "collect"),
-    "misspelt option": (("model=rt2",), "rt1"),
-    "wrong type": (("trainer.max_steps=many",), "trainer.max_steps"),
-    "too few episodes": (("evaluate.episodes=0",), "at least 1"),
-    "empty batches": (("data.batch_size=0",), "data.batch_size"),
-    "unknown job": (("job=evalute",), "evaluate"),
-    "missing checkpoint": (("checkpoint=nowhere.ckpt",), "nowhere.ckpt"),
-    "no deployment": (("job=deploy", "checkpoint=run/checkpoints/last.ckpt"), "deploy="),
-    "nothing interrupted": (
-        ("checkpoint=last", "output=nowhere/now"),
-        "none of the 0 trainings in nowhere was interrupted",
-    ),
-    "no room on the table": (("job=preview", "task.blocks=4", "task.randomize.placement.x=[0.5,0.5]"), "no room"),
-    "no dataset": (("job=collect", "expert=lerobot", "expert.folder=nowhere"), "no LeRobot dataset in nowhere"),
-    "nothing to compare": (("job=report",), "report.runs=[RUN,RUN]"),
-    "no run": (("job=report", "report.runs=[run,outputs]"), "outputs is no run"),
-    "no GPU": (("trainer=gpu", *(item for item in SMALL if "accelerator" not in item)), "gpu"),
-}
-
-
-@pytest.mark.parametrize("name", BAD_INPUT)
-def test_bad_input_ends_in_one_clear_sentence(home: Path, name: str) -> None:
-    arguments, says = BAD_INPUT[name]
-    done = vla(home, *arguments, ok=False)
-    errors = [line for line in done.stderr.splitlines() if line.startswith("error: ")]
-    assert len(errors) == 1 and says in errors[0], done.stderr
-    assert "Traceback" not in done.stderr
-
-
 def test_a_damaged_checkpoint_is_named(home: Path) -> None:
     whole = (home / "run/checkpoints/last.ckpt").read_bytes()
     (home / "cut.ckpt").write_bytes(whole[: len(whole) // 2])
@@ -254,19 +215,6 @@ def test_a_damaged_store_is_named_and_left_alone(home: Path, tmp_path: Path) -> 
     done = vla(home, *SMALL, "job=train", f"collect.folder={tmp_path}/store", ok=False)
     assert "rgb_front.bin" in done.stderr and "Traceback" not in done.stderr
     assert (tmp_path / "store/rgb_front.bin").stat().st_size == 1000
-
-
-def test_without_gl_the_error_says_what_to_install(home: Path) -> None:
-    environment = {**os.environ, "MUJOCO_GL": "egl", "__EGL_VENDOR_LIBRARY_FILENAMES": "/nowhere.json"}
-    del environment[TRIED]
-    done = subprocess.run(
-        [sys.executable, "-m", "vla.run", "job=preview", "preview.episodes=1"],
-        cwd=home,
-        env=environment,
-        capture_output=True,
-        text=True,
-    )
-    assert done.returncode == 1 and "libegl1" in done.stderr and "Traceback" not in done.stderr
 
 
 def test_a_model_that_memory_cannot_hold_is_refused_in_one_sentence(home: Path) -> None:
