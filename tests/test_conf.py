@@ -41,9 +41,9 @@ def composed_with(group: str, option: str) -> DictConfig:
 
 
 def test_the_default_passes_for_every_job_but_deploy() -> None:
-    for job in JOBS:
-        if job != "deploy":
-            check(composed(f"job={job}"))
+    cfg = composed()
+    for cfg.job in sorted({*JOBS} - {"deploy"}):
+        check(cfg)
 
 
 def test_deploying_nothing_is_refused() -> None:

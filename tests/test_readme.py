@@ -96,8 +96,8 @@ def small(arguments: list[str]) -> list[str]:
     if "experiment=ablation" in said:
         few += ["variant=no_transformer,no_history", "seed=0", "hydra.sweep.dir=ablation"]
     if "model=rt1" in said:  # at full size a second per frame
-        few += ["model.history=1", "model.image_size=32", "data.batch_size=2", "data.validation_windows=1"]
-        few += ["trainer.max_steps=1", "trainer.limit_val_batches=0"]
+        few += ["model.history=1", "model.image_size=32", "model.image.name=efficientnet_b0", "model.layers=1"]
+        few += ["data.batch_size=2", "data.validation_windows=1", "trainer.max_steps=1", "trainer.limit_val_batches=0"]
     if arguments == ["job=benchmark"]:
         few += ["output=speed"]
     return few

@@ -25,7 +25,6 @@ from vla.tasks.backend import choose_backend
 
 PATIENCE = 300  # [s]
 
-
 Meanwhile = Callable[[int], None]  # is given the process
 
 
