@@ -3,6 +3,7 @@ store of episodes of the toy world."""
 
 from __future__ import annotations
 
+import gc
 import os
 from collections.abc import Iterator
 from pathlib import Path
@@ -22,6 +23,12 @@ CONF = Path(__file__).parents[1] / "conf"
 for name, threads in THREAD_SETTINGS.items():
     os.environ.setdefault(name, threads)
 choose_backend()
+
+
+def pytest_collection_finish() -> None:
+    """What has been imported by now stays: nobody need look through it again and again for what could be freed."""
+    gc.collect()
+    gc.freeze()
 
 
 def make_tabletop(*overrides: str) -> Tabletop:

@@ -99,7 +99,7 @@ def test_an_unknown_key_is_named_with_what_was_probably_meant() -> None:
         ("collect.workers", "all", "collect.workers must be int, at least 1 or null, got 'all'"),
         ("seed", "first", "seed must be int, at least 0, got 'first'"),
         ("task.meshes", "lite", "task.meshes must be one of light, full, got 'lite', did you mean light?"),
-        ("job", "evalute", "job must be one of"),
+        ("evaluate.episodes", 0, "evaluate.episodes must be int, at least 1, got 0"),
         (
             "benchmark.names",
             ["training"],
@@ -131,6 +131,10 @@ def test_a_job_needs_its_groups_and_looks_at_no_others() -> None:
         policy={"_target_": "vla.policy.Policy"},
         deploy={"_target_": "vla.nowhere.Nothing"},
     )
+
+
+def test_a_misspelt_job_is_answered_with_what_was_probably_meant() -> None:
+    assert problem(job="evalute").endswith("got 'evalute', did you mean evaluate?")
 
 
 def test_the_job_menu_is_the_table_of_jobs() -> None:

@@ -3,52 +3,31 @@
 from __future__ import annotations
 
 import json
-import os
-import subprocess
-import sys
 from pathlib import Path
-from socket import create_server
 
 import numpy as np
 import pytest
 import torch
 import toy
+import warm
 from test_run import SMALL, vla
-from together import composed, train
+from test_training import STOP, same
+from test_windows import windows
+from together import PAIRS, composed, train
 
-from vla.cluster import Local
-from vla.collect import collect
-from vla.data.episodes import EpisodeStore
 from vla.parts import make_policy
 from vla.policy import noise
 from vla.training import LAST, make_trainer
 
 TORCHRUN = {"TORCHELASTIC_RUN_ID": "1", "RANK": "0", "LOCAL_RANK": "0", "WORLD_SIZE": "2"}  # what it sets
-PAIRS = ("ddp,rt1_tiny", "fsdp,rt1_tiny", "fsdp,decoder")
 
 
 @pytest.fixture(scope="module")
-def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("episodes")
-    collect(EpisodeStore.create_or_open(folder, toy.SPEC, {}), toy.make_environment, toy.make_expert, 30, Local(1), 0)
-    return folder
-
-
-@pytest.fixture(scope="module")
-def together(store: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Where two processes have left what they trained, in a folder for each of `PAIRS`."""
-    folder = tmp_path_factory.mktemp("together")
-    with create_server(("127.0.0.1", 0)) as free:
-        port = str(free.getsockname()[1])
-    script = [sys.executable, str(Path(__file__).with_name("together.py")), str(store), str(folder), *PAIRS]
-    shared = {**os.environ, "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": port, "NODE_RANK": "0"}
-    processes = [subprocess.Popen(script, env={**shared, "LOCAL_RANK": str(rank)}, cwd=folder) for rank in (0, 1)]
-    try:
-        assert [process.wait(120) for process in processes] == [0, 0]
-    finally:
-        for process in processes:
-            process.kill()
-    return folder
+def together(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Where two processes have left what they trained and saw."""
+    left = tmp_path_factory.mktemp("together")
+    warm.run_together(left, "together", str(folder), str(left))
+    return left
 
 
 def require_equal(one: Path, other: Path) -> None:
@@ -60,28 +39,46 @@ def require_equal(one: Path, other: Path) -> None:
 
 @pytest.mark.parametrize("pair", ["ddp,rt1_tiny", "fsdp,rt1_tiny"])
 def test_two_processes_learn_what_one_learns_from_batches_twice_as_large(
-    store: Path, together: Path, pair: str, tmp_path: Path
+    folder: Path, together: Path, pair: str, tmp_path: Path
 ) -> None:
-    found = train(store, tmp_path, "trainer=cpu", "model=rt1_tiny", "data.batch_size=16")
+    found = train(folder, tmp_path, "trainer=cpu", "model=rt1_tiny", "data.batch_size=16")
     assert torch.load(together / pair / "found.pt", weights_only=True) == pytest.approx(found, rel=1e-3)
     require_equal(tmp_path / LAST, together / pair / LAST)
 
 
 @pytest.mark.parametrize("pair", PAIRS)
-def test_what_several_processes_leave_is_a_checkpoint_like_any_other(
-    store: Path, together: Path, pair: str, tmp_path: Path
-) -> None:
+def test_what_several_processes_leave_is_a_checkpoint_like_any_other(together: Path, pair: str) -> None:
     path = together / pair / LAST
     policy = make_policy({"_target_": "vla.policy.Policy", "device": "cpu"}, path)
     action = policy.act(noise(toy.SPEC, np.random.default_rng(0)))
     assert action.shape == (3,) and np.isfinite(action).all()
 
 
-def test_training_goes_on_with_another_number_of_processes(store: Path, together: Path, tmp_path: Path) -> None:
+def test_training_goes_on_with_another_number_of_processes(folder: Path, together: Path, tmp_path: Path) -> None:
     longer = ("trainer=cpu", "model=rt1_tiny", "data.batch_size=16", "trainer.max_steps=6")
-    train(store, tmp_path / "on", *longer, checkpoint=together / "fsdp,rt1_tiny" / LAST)
-    train(store, tmp_path / "whole", *longer)
+    train(folder, tmp_path / "on", *longer, checkpoint=together / "fsdp,rt1_tiny" / LAST)
+    train(folder, tmp_path / "whole", *longer)
     require_equal(tmp_path / "whole" / LAST, tmp_path / "on" / LAST)
+
+
+def test_two_processes_go_on_with_the_same_bits(together: Path) -> None:
+    whole, half, rest = (
+        torch.load(together / name / "checkpoints" / LAST, weights_only=True) for name in ("whole", "half", "rest")
+    )
+    assert half["global_step"] == STOP
+    for part in ("state_dict", "current_model_state", "optimizer_states"):
+        assert same(whole[part], rest[part]), part
+    assert not same(whole["state_dict"], half["state_dict"])
+
+
+def test_two_processes_of_a_trainer_see_every_window_once_between_them(folder: Path, together: Path) -> None:
+    module = windows(folder)
+    count = len(module.training_windows)
+    seen = np.stack([np.load(together / f"seen{rank}.npy") for rank in (0, 1)], axis=1)  # (steps, 2, B, …)
+    drawn = seen.reshape(np.prod(seen.shape[:3]), -1)[:count]
+    every = module.gather(module.training_windows)["proprio"].numpy().reshape(count, -1)
+    assert len(np.unique(every, axis=0)) == count  # no two windows look alike
+    np.testing.assert_array_equal(np.unique(drawn, axis=0), np.unique(every, axis=0))
 
 
 @pytest.mark.parametrize(

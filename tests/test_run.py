@@ -4,33 +4,32 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
-import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-import torch
 import warm
 import yaml
 from rerun.chunk import RrdReader
 
 from vla.policy import read_checkpoint
-from vla.tasks.backend import TRIED
 
 SMALL = (
     "validate.episodes=0",
     "task.image_size=[32,32]",
     "task.shadows=false",
-    "collect.episodes=24",
+    "collect.episodes=12",
     "collect.workers=1",
     "trainer.max_steps=4",
     "trainer.val_check_interval=2",
     "trainer.accelerator=cpu",
     "data.batch_size=8",
-    "data.validation_fraction=0.1",
+    "data.validation_fraction=0.2",
     "data.validation_windows=8",
     "evaluate.episodes=2",
     "evaluate.workers=1",
@@ -42,6 +41,14 @@ def vla(folder: Path, *arguments: str, ok: bool = True) -> subprocess.CompletedP
     done = warm.run(folder, *arguments)
     assert (done.returncode == 0) == ok, done.stdout + done.stderr
     return done
+
+
+def wait_for(condition: Callable[[], bool]) -> None:
+    """Until it holds, or too long."""
+    give_up = time.monotonic() + 120
+    while not condition():
+        assert time.monotonic() < give_up
+        time.sleep(0.02)
 
 
 @pytest.fixture(scope="module")
@@ -70,7 +77,7 @@ def test_the_main_job_collects_trains_evaluates_and_records(home: Path) -> None:
     training = json.loads((home / "run/training.json").read_text())
     assert report["budget_s"] > training["collection_s"] + training["seconds"] > training["collection_s"] > 1
     assert report["episodes"] == 2 and report["errors"] == 0
-    assert report["config"]["collect"]["episodes"] == 24
+    assert report["config"]["collect"]["episodes"] == 12
     names = ("report.html", "report.png", "rollouts.rrd", "samples.png", "metrics.csv", "checkpoints/last.ckpt")
     for name in (*names, "checkpoints/best.ckpt"):
         assert (home / "run" / name).stat().st_size > 0
@@ -115,13 +122,6 @@ def test_cells_run_at_the_same_time_and_one_that_fails_leaves_the_others_alone(h
     assert (home / "grid/sweep.md").exists() and "at least 1" in (home / "grid/2/error.txt").read_text()
 
 
-@pytest.mark.parametrize("launcher", ["basic", "joblib"])
-def test_a_grid_whose_cells_want_several_processes_is_refused(home: Path, launcher: str) -> None:
-    several = ("trainer=ddp", "trainer.accelerator=cpu", "trainer.devices=2", "seed=0")
-    done = vla(home, "-m", f"hydra/launcher={launcher}", *several, ok=False)
-    assert "trainer.devices=1" in done.stderr and "submitit_slurm" in done.stderr and "Traceback" not in done.stderr
-
-
 def test_the_menu_is_what_hydra_would_list(home: Path) -> None:
     menu = vla(home, "--help").stdout
     assert "task/goal: lift, mixed, pick_place, pick_place_two, push, stack\n" in menu
@@ -146,15 +146,15 @@ def test_a_collection_killed_again_and_again_goes_on_and_ends_up_the_same(home: 
     def committed() -> int:
         return index.read_bytes().count(b"\n") if index.exists() else 0
 
-    for until, pause in ((0, 1.5), (1, 0.0), (9, 0.1)):  # while it starts, at its first commit, on the way
-        process = subprocess.Popen([sys.executable, "-m", "vla.run", *arguments], cwd=home, stdout=subprocess.DEVNULL)
-        deadline = time.monotonic() + 120
-        while time.monotonic() < deadline and committed() < until:
-            time.sleep(0.02)
-        time.sleep(pause)
-        os.kill(process.pid, signal.SIGKILL)
-        process.wait()
-        assert until <= committed() < 24
+    for until, pause in ((0, 0.5), (1, 0.0), (4, 0.1)):  # while it starts, at its first commit, on the way
+
+        def kill(process: int, until: int = until, pause: float = pause) -> None:
+            wait_for(lambda: committed() >= until)
+            time.sleep(pause)
+            os.kill(process, signal.SIGKILL)
+
+        assert warm.run(home, *arguments, meanwhile=kill).returncode == -signal.SIGKILL
+        assert until <= committed() < 12
     vla(home, *arguments)
     (reference,) = (home / "outputs/episodes").iterdir()
     for file in reference.iterdir():
@@ -164,14 +164,14 @@ def test_a_collection_killed_again_and_again_goes_on_and_ends_up_the_same(home: 
 
 def test_a_store_is_chosen_from_another_and_its_damage_is_named(home: Path, tmp_path: Path) -> None:
     (whole,) = (home / "outputs/episodes").iterdir()
-    where = "inspect.where={seed: [3, 12], placement.yaw: [-2, 2], instruction: '*the*'}"
+    where = "inspect.where={seed: [3, 10], placement.yaw: [-2, 2], instruction: '*the*'}"
     done = vla(home, "job=inspect", f"inspect.folder={whole}", where, f"inspect.into={tmp_path}/few")
-    assert "10 whole ones, of 10 seeds tried: 3 to 12" in done.stdout
+    assert "8 whole ones, of 8 seeds tried: 3 to 10" in done.stdout
     assert (tmp_path / "few/card.png").stat().st_size > 10_000
     with open(tmp_path / "few/rgb_front.bin", "r+b") as file:
         file.truncate(file.seek(0, os.SEEK_END) - 1)
     done = vla(home, "job=inspect", f"inspect.folder={tmp_path}/few", ok=False)
-    assert "9 whole ones" in done.stdout and "1 damaged episodes" in done.stderr and "Traceback" not in done.stderr
+    assert "7 whole ones" in done.stdout and "1 damaged episodes" in done.stderr and "Traceback" not in done.stderr
 
 
 def test_an_episode_is_replayed_into_a_recording(home: Path) -> None:
@@ -183,36 +183,6 @@ def test_an_episode_is_replayed_into_a_recording(home: Path) -> None:
     assert any(path.startswith("/world/panda") for path in recorded)
     done = vla(home, *replay, "inspect.episode=99", ok=False)
     assert "has no seed 99" in done.stderr and "Traceback" not in done.stderr
-
-
-BAD_INPUT = {
-    "misspelt key": (("colect.episodes=3",), "collect"),
-    "misspelt option": (("model=rt2",), "rt1"),
-    "wrong type": (("trainer.max_steps=many",), "trainer.max_steps"),
-    "too few episodes": (("evaluate.episodes=0",), "at least 1"),
-    "empty batches": (("data.batch_size=0",), "data.batch_size"),
-    "unknown job": (("job=evalute",), "evaluate"),
-    "missing checkpoint": (("checkpoint=nowhere.ckpt",), "nowhere.ckpt"),
-    "no deployment": (("job=deploy", "checkpoint=run/checkpoints/last.ckpt"), "deploy="),
-    "nothing interrupted": (
-        ("checkpoint=last", "output=nowhere/now"),
-        "none of the 0 trainings in nowhere was interrupted",
-    ),
-    "no room on the table": (("job=preview", "task.blocks=4", "task.randomize.placement.x=[0.5,0.5]"), "no room"),
-    "no dataset": (("job=collect", "expert=lerobot", "expert.folder=nowhere"), "no LeRobot dataset in nowhere"),
-    "nothing to compare": (("job=report",), "report.runs=[RUN,RUN]"),
-    "no run": (("job=report", "report.runs=[run,outputs]"), "outputs is no run"),
-    "no GPU": (("trainer=gpu", *(item for item in SMALL if "accelerator" not in item)), "gpu"),
-}
-
-
-@pytest.mark.parametrize("name", BAD_INPUT)
-def test_bad_input_ends_in_one_clear_sentence(home: Path, name: str) -> None:
-    arguments, says = BAD_INPUT[name]
-    done = vla(home, *arguments, ok=False)
-    errors = [line for line in done.stderr.splitlines() if line.startswith("error: ")]
-    assert len(errors) == 1 and says in errors[0], done.stderr
-    assert "Traceback" not in done.stderr
 
 
 def test_a_damaged_checkpoint_is_named(home: Path) -> None:
@@ -251,19 +221,6 @@ def test_a_damaged_store_is_named_and_left_alone(home: Path, tmp_path: Path) -> 
     assert (tmp_path / "store/rgb_front.bin").stat().st_size == 1000
 
 
-def test_without_gl_the_error_says_what_to_install(home: Path) -> None:
-    environment = {**os.environ, "MUJOCO_GL": "egl", "__EGL_VENDOR_LIBRARY_FILENAMES": "/nowhere.json"}
-    del environment[TRIED]
-    done = subprocess.run(
-        [sys.executable, "-m", "vla.run", "job=preview", "preview.episodes=1"],
-        cwd=home,
-        env=environment,
-        capture_output=True,
-        text=True,
-    )
-    assert done.returncode == 1 and "libegl1" in done.stderr and "Traceback" not in done.stderr
-
-
 def test_a_model_that_memory_cannot_hold_is_refused_in_one_sentence(home: Path) -> None:
     done = vla(home, *SMALL, "job=train", f"model.width={10**12}", "output=huge", ok=False)
     assert done.stderr.startswith("error: training takes more memory than there is: lower data.batch_size (now 8)")
@@ -276,30 +233,30 @@ def test_training_that_fails_says_so_in_its_page(home: Path) -> None:
     assert "Training failed: the loss is not a finite number" in (home / "failed/report.html").read_text()
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
-def test_training_that_is_interrupted_saves_and_goes_on(home: Path, number: int) -> None:
-    folder = f"outputs/runs/stopped{number}"
-    arguments = [*SMALL, "trainer.limit_val_batches=0", "trainer.val_check_interval=null", "learner.schedule=constant"]
-    arguments += ["trainer.check_val_every_n_epoch=1", "recorder=none"]
-    command = [sys.executable, "-u", "-m", "vla.run", *arguments, f"output={folder}", "trainer.max_steps=100000"]
-    process = subprocess.Popen(command, cwd=home, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
-    metrics = home / folder / "metrics.csv"
-    give_up = time.monotonic() + 60
-    while not metrics.exists() or not metrics.stat().st_size:
-        assert process.poll() is None and time.monotonic() < give_up
-        time.sleep(0.05)
-    process.send_signal(number)
-    printed = process.communicate(timeout=30)[0]
-    assert process.returncode == 130, printed
-    checkpoint = f"{folder}/checkpoints/last.ckpt"
-    assert "interrupted after" in printed and checkpoint in printed
-    assert "Training was interrupted after" in (home / folder / "report.html").read_text()
-    if number == signal.SIGTERM:
-        return  # what follows is the same
-    steps = int(printed.partition("interrupted after ")[2].split()[0])
-    done = vla(home, "checkpoint=last", f"trainer.max_steps={steps + 2}")
-    assert f"trained {steps + 2} steps" in done.stdout and done.stdout.strip().splitlines()[-1].startswith("success ")
-    assert (home / folder / "report.json").exists()
-    vla(home, *arguments, "job=train", f"trainer.max_steps={steps + 2}", "output=whole")
-    ends = [torch.load(home / run / "checkpoints/last.ckpt", weights_only=True) for run in (folder, "whole")]
-    assert all(torch.equal(value, ends[1]["state_dict"][name]) for name, value in ends[0]["state_dict"].items())
+def test_training_that_is_interrupted_saves_and_goes_on(home: Path) -> None:
+    """By both signals, one after the other; that it then is, bit for bit, the same training is for `test_training`."""
+    run = home / "outputs/runs/stopped"
+    metrics, page = run / "metrics.csv", run / "report.html"
+
+    def interrupted(number: signal.Signals, *arguments: str) -> int:
+        """After how many steps a training was."""
+
+        def interrupt(process: int) -> None:
+            before = metrics.stat().st_size if metrics.exists() else 0
+            wait_for(lambda: metrics.exists() and metrics.stat().st_size > before)
+            os.kill(process, number)
+
+        done = warm.run(home, *arguments, meanwhile=interrupt)
+        assert done.returncode == 130, done.stdout + done.stderr
+        said = re.search(r"interrupted after (\d+) steps", done.stdout + done.stderr)
+        assert said and f"{run.relative_to(home)}/checkpoints/last.ckpt" in done.stdout + done.stderr
+        assert f"Training was interrupted after {said[1]} steps" in page.read_text()
+        return int(said[1])
+
+    endless = ("trainer.max_steps=100000", "trainer.limit_val_batches=0", "learner.schedule=constant", "recorder=none")
+    steps = interrupted(signal.SIGTERM, *SMALL, *endless, f"output={run.relative_to(home)}")
+    more = interrupted(signal.SIGINT, "checkpoint=last")
+    assert more > steps
+    done = vla(home, "checkpoint=last", f"trainer.max_steps={more + 2}")
+    assert f"trained {more + 2} steps" in done.stdout and done.stdout.strip().splitlines()[-1].startswith("success ")
+    assert (run / "report.json").exists()

@@ -4,9 +4,6 @@ where it ends for want of memory."""
 from __future__ import annotations
 
 import csv
-import os
-import subprocess
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -143,45 +140,6 @@ def test_other_demonstrations_are_refused(folder: Path, tmp_path: Path) -> None:
         make_trainer(config(), None).fit(
             learner, datamodule=windows(folder, episodes=8), ckpt_path=tmp_path / "checkpoints/last.ckpt"
         )
-
-
-TWO = """
-import sys
-from collections.abc import Callable
-from pathlib import Path
-
-import torch
-from fake_batch import make_rt1
-from test_training import STEPS, STOP, same, train
-
-options = {"devices": 2, "strategy": "ddp"}
-store = Path(sys.argv[1])
-torch.manual_seed(0)
-start = make_rt1(dropout=0.2).state_dict()
-ends = []
-for output, stop, checkpoint in (
-    ("whole", None, None),
-    ("half", STOP, None),
-    ("rest", None, Path("half/checkpoints/last.ckpt")),
-):
-    model = make_rt1(dropout=0.2)
-    model.load_state_dict(start)
-    ends.append(train(model, store, Path(output), stop, checkpoint, **options))
-whole, half, rest = ends
-assert half["global_step"] == STOP
-for part in ("state_dict", "current_model_state", "optimizer_states"):
-    assert same(whole[part], rest[part]), part
-assert not same(whole["state_dict"], half["state_dict"])
-"""
-
-
-def test_two_processes_go_on_with_the_same_bits(folder: Path, tmp_path: Path) -> None:
-    (tmp_path / "two.py").write_text(TWO)
-    tests = Path(__file__).parent
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(tests), str(tests.parent)])}
-    command = [sys.executable, "two.py", str(folder)]
-    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=120)
-    assert done.returncode == 0, done.stderr
 
 
 def test_it_logs_how_fast_it_is_and_what_it_waits_for(folder: Path, tmp_path: Path) -> None:

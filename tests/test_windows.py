@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import os
 import shutil
-import subprocess
-import sys
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
@@ -265,33 +262,6 @@ def test_a_resumed_training_sees_what_an_uninterrupted_one_sees(folder: Path, tm
         tail = whole.seen[step * accumulate :]
         assert all(torch.equal(one, two) for one, two in zip(resumed.seen, tail, strict=True))
         assert torch.equal(resumed.weight, whole.weight)
-
-
-TWO = """
-import sys
-from pathlib import Path
-import numpy as np
-from test_windows import fit
-model = fit(Path(sys.argv[1]), int(sys.argv[2]), devices=2)
-np.save(f"seen{model.global_rank}.npy", np.stack(model.seen))
-"""
-
-
-def test_two_processes_of_a_trainer_see_every_window_once_between_them(folder: Path, tmp_path: Path) -> None:
-    module = windows(folder)
-    count = len(module.training_windows)
-    steps = -(-count // (8 * 2))
-    (tmp_path / "two.py").write_text(TWO)
-    tests = Path(__file__).parent
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(tests), str(tests.parent)])}
-    command = [sys.executable, "two.py", str(folder), str(steps)]
-    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=120)
-    assert done.returncode == 0, done.stderr
-    seen = np.stack([np.load(tmp_path / f"seen{rank}.npy") for rank in (0, 1)], axis=1)  # (steps, 2, B, …)
-    drawn = seen.reshape(steps * 2 * 8, -1)[:count]
-    every = module.gather(module.training_windows)["proprio"].numpy().reshape(count, -1)
-    assert len(np.unique(every, axis=0)) == count  # no two windows look alike
-    np.testing.assert_array_equal(np.unique(drawn, axis=0), np.unique(every, axis=0))
 
 
 def test_training_leaves_the_store_as_it_is(folder: Path, tmp_path: Path) -> None:

@@ -1,6 +1,6 @@
-"""One of the processes that train small models together, with every real part, on episodes of the toy world.
+"""One of the processes that train together, with every real part, on episodes of the toy world.
 
-python together.py STORE FOLDER TRAINER,MODEL …
+python together.py STORE FOLDER
 """
 
 from __future__ import annotations
@@ -9,7 +9,11 @@ import sys
 from pathlib import Path
 
 import lightning
+import numpy as np
+import test_training
+import test_windows
 import torch
+from fake_batch import make_rt1
 from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig
 
@@ -17,6 +21,7 @@ from vla.data.episodes import EpisodeStore
 from vla.parts import make_data, make_learner
 from vla.training import LAST, make_trainer, quiet_lightning
 
+PAIRS = ("ddp,rt1_tiny", "fsdp,rt1_tiny", "fsdp,decoder")  # trainer, model
 CONF = Path(__file__).parents[1] / "conf"
 SMALL = (
     "collect.episodes=30",
@@ -50,12 +55,34 @@ def train(store: Path, folder: Path, *overrides: str, checkpoint: Path | None = 
     return {name: value.item() for name, value in trainer.callback_metrics.items() if name.startswith("val/")}
 
 
+def train_pairs(store: Path, folder: Path) -> None:
+    """Leave in a folder for each of `PAIRS` a checkpoint, and what validation found."""
+    for pair in PAIRS:
+        trainer, model = pair.split(",")
+        two = ("trainer.accelerator=cpu", "trainer.devices=2")
+        found = train(store, folder / pair, f"trainer={trainer}", f"model={model}", *two)
+        torch.save(found, folder / pair / "found.pt")
+
+
+def train_in_pieces(store: Path, folder: Path) -> None:
+    """Leave the checkpoints of a training in one piece, of its first half, and of this one gone on with."""
+    model = make_rt1(dropout=0.2)
+    start = {name: value.clone() for name, value in model.state_dict().items()}
+    half = folder / "half/checkpoints" / LAST
+    for name, stop, checkpoint in (("whole", None, None), ("half", test_training.STOP, None), ("rest", None, half)):
+        model.load_state_dict(start)
+        test_training.train(model, store, folder / name, stop, checkpoint, devices=2, strategy="ddp")
+
+
+def see_windows(store: Path, folder: Path) -> None:
+    """Leave what this process saw while the two saw every window once."""
+    steps = -(-len(test_windows.windows(store).training_windows) // (8 * 2))
+    model = test_windows.fit(store, steps, devices=2)
+    np.save(folder / f"seen{model.global_rank}.npy", np.stack([seen.numpy() for seen in model.seen]))
+
+
 if __name__ == "__main__":
     torch.set_num_threads(1)
     store, folder = Path(sys.argv[1]), Path(sys.argv[2])
-    for pair in sys.argv[3:]:
-        trainer, model = pair.split(",")
-        found = train(
-            store, folder / pair, f"trainer={trainer}", f"model={model}", "trainer.accelerator=cpu", "trainer.devices=2"
-        )
-        torch.save(found, folder / pair / "found.pt")
+    for leave in (train_pairs, train_in_pieces, see_windows):
+        leave(store, folder)
