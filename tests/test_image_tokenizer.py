@@ -60,7 +60,7 @@ def test_keypoints_say_where_they_look_and_what_is_there() -> None:
     features[0, :, 1, 4] = torch.tensor([100.0, 7.0])
     keypoints = Keypoints(2, 1)
     keypoints.score.weight.data = torch.tensor([[1.0, 0.0]])
-    assert keypoints(features).flatten().tolist() == pytest.approx([1.0, -0.5, 100.0, 7.0])  # x right, y down
+    assert keypoints(features).flatten().tolist() == pytest.approx([4.0, -2.0, 100.0, 7.0])  # x right, y down
 
 
 def test_a_clip_is_shifted_as_one_and_clips_differ() -> None:

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from vla.models.action_tokenizer import PerComponent
 from vla.models.image_tokenizer import ImageEncoder, Keypoints, RandomShift
-from vla.models.model import Batch, Standardize, TokenModel, pixels
+from vla.models.model import Batch, Standardize, TokenModel, perceptron, pixels
 from vla.models.text import TextEncoder
 from vla.spec import Spec
 
@@ -40,7 +40,7 @@ class BC(TokenModel):
         chunk: int = 1,
         keypoints: int = 32,
         text_width: int = 64,
-        width: int = 256,
+        width: int = 512,
         shift: tuple[float, float] = (12, 12),
         auxiliary: float = 1.0,
         *,
@@ -56,7 +56,7 @@ class BC(TokenModel):
         self.proprioception = Standardize(self.posture_width)
         seen = sum(keypoints * reader.width for reader in readers)
         features = seen + self.posture_width + text_width
-        self.trunk = nn.Sequential(nn.Linear(features, width), nn.ReLU(), nn.Linear(width, width), nn.ReLU())
+        self.trunk = perceptron(features, width)
         self.head = nn.Linear(width, chunk * len(spec.action) * tokenizer.bins)
 
     def forward(self, batch: Batch) -> dict[str, Tensor]:

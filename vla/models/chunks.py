@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from vla.models.action_tokenizer import ActionTokenizer
 from vla.models.image_tokenizer import ImageEncoder, Keypoints, RandomShift
-from vla.models.model import Batch, Model, Standardize, pixels
+from vla.models.model import Batch, Model, Standardize, perceptron, pixels
 from vla.models.text import TextEncoder
 from vla.spec import Spec
 
@@ -72,7 +72,7 @@ class ChunkModel(Model):
         self.proprioception = Standardize(self.posture_width)
         widths = [*[keypoints * reader.width for reader in readers], self.posture_width, text_width]
         self.tokens = nn.ModuleList(nn.Linear(features, width) for features in widths)
-        self.meet = nn.Sequential(nn.Linear(sum(widths), hidden), nn.ReLU(), nn.Linear(hidden, hidden), nn.ReLU())
+        self.meet = perceptron(sum(widths), hidden)
         self.first_token = nn.Linear(hidden, width)
 
     def standing(self, batch: Batch) -> Tensor:

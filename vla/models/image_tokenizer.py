@@ -12,6 +12,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+SPREAD = 4.0  # of the positions of keypoints: wide, as a hundredth of the image makes the difference
 DARK = 0.1  # of a brightness up to 3: colours darker than that say little
 
 
@@ -146,10 +147,10 @@ class Keypoints(nn.Module):
         nn.init.normal_(self.score.weight, std=1.0)  # attention that starts flat sends no gradient
 
     def forward(self, features: Tensor) -> Tensor:
-        """(N, C, h, w) features to (N, M, 2 + C): positions x, y in -1 … 1, and features."""
+        """(N, C, h, w) features to (N, M, 2 + C): positions x, y in -SPREAD … SPREAD, and features."""
         values = features.flatten(2)  # (N, C, h·w)
         weights = (self.score.weight @ values).softmax(-1)  # (N, M, h·w)
-        return torch.cat([weights.float() @ grid(features), (weights @ values.mT).float()], -1)
+        return torch.cat([SPREAD * (weights.float() @ grid(features)), (weights @ values.mT).float()], -1)
 
 
 def grid(features: Tensor) -> Tensor:

@@ -197,6 +197,13 @@ class TokenModel(Model):
         return Prediction(self.tokenizer.read(logits), logits.softmax(-1))
 
 
+def perceptron(inputs: int, width: int) -> nn.Sequential:
+    """What many features of any size meet in: three layers from `inputs` to `width`, normalised on the way."""
+    first = [nn.Linear(inputs, width), nn.LayerNorm(width), nn.GELU()]
+    second = [nn.Linear(width, width), nn.LayerNorm(width), nn.GELU()]
+    return nn.Sequential(*first, *second, nn.Linear(width, width), nn.GELU())
+
+
 def newest(present: Tensor) -> Tensor:
     """(B,) place of the last of the (B, T) frames that is present."""
     return (present * torch.arange(1, present.shape[1] + 1, device=present.device)).argmax(1)
