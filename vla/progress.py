@@ -85,7 +85,7 @@ class Progress(RichProgressBar):
     READ_EVERY = 10  # steps; each time a GPU is waited for
 
     def __init__(self) -> None:
-        super().__init__()
+        super().__init__(refresh_rate=4)  # a second: painting takes milliseconds, in a thread that the model waits for
         self._loss = float("nan")
 
     def on_train_batch_end(
