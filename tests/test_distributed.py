@@ -11,13 +11,13 @@ import torch
 import toy
 import warm
 from test_run import SMALL, vla
-from test_training import STOP, same
+from test_trainer import STOP, same
 from test_windows import windows
 from together import PAIRS, composed, train
 
 from vla.parts import make_policy
 from vla.policy import noise
-from vla.training import LAST, make_trainer
+from vla.trainer import LAST, make_trainer
 
 TORCHRUN = {"TORCHELASTIC_RUN_ID": "1", "RANK": "0", "LOCAL_RANK": "0", "WORLD_SIZE": "2"}  # what it sets
 

@@ -16,7 +16,7 @@ from toy import SPEC
 from vla.models.learner import Learner
 from vla.models.model import Model
 from vla.policy import read_checkpoint
-from vla.training import AtomicFiles
+from vla.trainer import AtomicFiles
 
 CONFIG = {"model": {"_target_": "vla.models.bc.BC", "shift": [0, 0]}, "seed": 0}
 

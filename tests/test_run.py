@@ -234,7 +234,7 @@ def test_training_that_fails_says_so_in_its_page(home: Path) -> None:
 
 
 def test_training_that_is_interrupted_saves_and_goes_on(home: Path) -> None:
-    """By both signals, one after the other; that it then is, bit for bit, the same training is for `test_training`."""
+    """By both signals, one after the other; that it then is, bit for bit, the same training is for `test_trainer`."""
     run = home / "outputs/runs/stopped"
     metrics, page = run / "metrics.csv", run / "report.html"
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import lightning
 import numpy as np
-import test_training
+import test_trainer
 import test_windows
 import torch
 from fake_batch import make_rt1
@@ -19,7 +19,7 @@ from omegaconf import DictConfig
 
 from vla.data.episodes import EpisodeStore
 from vla.parts import make_data, make_learner
-from vla.training import LAST, make_trainer, quiet_lightning
+from vla.trainer import LAST, make_trainer, quiet_lightning
 
 PAIRS = ("ddp,rt1_tiny", "fsdp,rt1_tiny", "fsdp,decoder")  # trainer, model
 CONF = Path(__file__).parents[1] / "conf"
@@ -69,9 +69,9 @@ def train_in_pieces(store: Path, folder: Path) -> None:
     model = make_rt1(dropout=0.2)
     start = {name: value.clone() for name, value in model.state_dict().items()}
     half = folder / "half/checkpoints" / LAST
-    for name, stop, checkpoint in (("whole", None, None), ("half", test_training.STOP, None), ("rest", None, half)):
+    for name, stop, checkpoint in (("whole", None, None), ("half", test_trainer.STOP, None), ("rest", None, half)):
         model.load_state_dict(start)
-        test_training.train(model, store, folder / name, stop, checkpoint, devices=2, strategy="ddp")
+        test_trainer.train(model, store, folder / name, stop, checkpoint, devices=2, strategy="ddp")
 
 
 def see_windows(store: Path, folder: Path) -> None:

@@ -124,6 +124,12 @@ def note_training(
     write(folder / TRAINING, json.dumps(facts, ensure_ascii=False) + "\n")
 
 
+def note_choice(folder: Path, checkpoint: str) -> None:
+    """Add to what `note_training` wrote which of its checkpoints is to be evaluated."""
+    facts = _read(folder / TRAINING, json.loads, {}) | {"checkpoint": checkpoint}
+    write(folder / TRAINING, json.dumps(facts, ensure_ascii=False) + "\n")
+
+
 def differences(one: Any, other: Any, key: str = "") -> list[tuple[str, Any, Any]]:
     """Dotted key and both values of everything in which two plain configurations differ, leaf by leaf.
 

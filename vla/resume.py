@@ -51,13 +51,14 @@ def go_on(cfg: DictConfig, overrides: Sequence[str]) -> DictConfig:
     """The configuration of the training that made `cfg.checkpoint`, to go on with it.
 
     "last" stands for the newest interrupted run among the neighbours of `cfg.output`, in whose folder it goes on; if
-    its training was finished, what comes after that is done. What the command line `overrides` say about anything but
+    its training was finished, what it chose is evaluated. What the command line `overrides` say about anything but
     what the training follows from applies on top.
 
     Raises:
         ValueError: there is none, or an override would make it another training.
     """
     from vla.policy import read_checkpoint
+    from vla.results import run_of
 
     last = cfg.checkpoint == "last"
     path = newest_interrupted(Path(cfg.output).parent) if last else Path(cfg.checkpoint)
@@ -83,6 +84,8 @@ def go_on(cfg: DictConfig, overrides: Sequence[str]) -> DictConfig:
         resumed.output = str(path.parent.parent)
     if last and "job" not in named:
         resumed.job = saved.config["job"]
+    if last and saved.finished and resumed.job == "evaluate":
+        resumed.checkpoint = str(path.with_name(run_of(path).training.get("checkpoint", path.name)))
     return resumed
 
 

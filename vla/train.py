@@ -29,10 +29,10 @@ from vla.parts import (
     plain,
     unfitted_learner,
 )
-from vla.results import note_training, run_of
+from vla.results import note_choice, note_training, run_of
 from vla.resume import LAST, alone
 from vla.samples import FILE, SHOWN, draw_samples
-from vla.training import Interruption, enough_memory, keep_metrics, make_trainer, quiet_lightning
+from vla.trainer import Interruption, enough_memory, keep_metrics, make_trainer, quiet_lightning
 from vla.validation import ClosedLoop
 
 log = logging.getLogger(__name__)
@@ -77,7 +77,9 @@ def trained(config: DictConfig) -> Path | None:
                 trainer.save_checkpoint(checkpoints / LAST, weights_only=False)
     if not trainer.is_global_zero:
         return None  # what follows training is done once
-    return closed_loop.chosen(checkpoints / LAST) if closed_loop else checkpoints / LAST
+    chosen = closed_loop.chosen(checkpoints / LAST) if closed_loop else checkpoints / LAST
+    note_choice(output, chosen.name)
+    return chosen
 
 
 def _closed_loop(config: DictConfig, checkpoints: Path) -> ClosedLoop | None:

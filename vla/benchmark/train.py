@@ -23,7 +23,7 @@ from vla.benchmark.memory import forget_peak, peak
 from vla.data.episodes import EpisodeStore
 from vla.models.flops import matmul_flops, peak_flops, training_flops
 from vla.parts import collected, make_data, make_learner
-from vla.training import enough_memory, make_trainer, quiet_lightning
+from vla.trainer import enough_memory, make_trainer, quiet_lightning
 
 PRECISIONS = {"fp32": "32-true", "bf16": "bf16-mixed"}  # the trainer's names
 WARM_UP = 3  # steps of a round before the clock starts: the first ones allocate and compile

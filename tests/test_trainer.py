@@ -21,7 +21,7 @@ from test_windows import windows
 from vla.models.diffusion import Diffusion
 from vla.models.learner import Learner
 from vla.models.model import Model
-from vla.training import Interruption, enough_memory, keep_metrics, make_trainer
+from vla.trainer import Interruption, enough_memory, keep_metrics, make_trainer
 
 MODELS: dict[str, Callable[[], Model]] = {
     "bc": lambda: make_bc(shift=(64, 64)),

@@ -1,0 +1,28 @@
+"""Which run is gone on with, and how."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import torch
+import toy
+from test_conf import composed
+
+from vla.parts import plain
+from vla.results import note_choice, note_training
+from vla.resume import go_on
+
+
+def test_an_evaluation_that_was_interrupted_takes_what_the_training_had_chosen(tmp_path: Path) -> None:
+    run = tmp_path / "runs/one"
+    (run / "checkpoints").mkdir(parents=True)
+    now = composed("checkpoint=last", f"output={tmp_path}/runs/now")
+    content = {"config": plain(now), "spec": toy.SPEC.to_dict(), "state_dict": {}, "finished": True}
+    torch.save(content, run / "checkpoints/last.ckpt")
+    note_training(run, 1, 1, 1.0, "done")
+    note_choice(run, "best.ckpt")
+    resumed = go_on(now, ["checkpoint=last"])
+    assert (resumed.checkpoint, resumed.output) == (str(run / "checkpoints/best.ckpt"), str(run))
+    assert not resumed.resume
+    now.job = "train"
+    assert go_on(now, ["checkpoint=last", "job=train"]).checkpoint == str(run / "checkpoints/last.ckpt")
