@@ -95,6 +95,10 @@ def small(arguments: list[str]) -> list[str]:
         few += ["collect.folder=remote"]
     if "experiment=ablation" in said:
         few += ["variant=no_transformer,no_history", "seed=0", "hydra.sweep.dir=ablation"]
+    if "experiment=recipe" in said:
+        few += ["variant=chunked"]
+    if "experiment=learning_curve" in said:
+        few += ["task/randomize=default", "collect.episodes=10,12", "hydra.sweep.dir=curve"]
     if "model=rt1" in said:  # at full size a second per frame
         few += ["model.history=1", "model.image_size=32", "model.image.name=efficientnet_b0", "model.layers=1"]
         few += ["data.batch_size=2", "data.validation_windows=1", "trainer.max_steps=1", "trainer.limit_val_batches=0"]
@@ -116,6 +120,9 @@ def require_results(home: Path, arguments: list[str], printed: str) -> None:
         lines = (home / "ablation/sweep.md").read_text().splitlines()
         assert "| variant | seen [%] | instructions [%] | distractors [%] | backgrounds [%] |" in lines[0]
         assert [line.split()[1] for line in lines[2:]] == ["no_transformer", "no_history"]
+    if "experiment=learning_curve" in arguments:
+        lines = (home / "curve/sweep.md").read_text().splitlines()
+        assert "| collect.episodes | seen [%] | wide [%] |" in lines[0] and len(lines) == 4
 
 
 @pytest.mark.parametrize("command", COMMANDS)
