@@ -10,7 +10,10 @@ import numpy as np
 from rich.table import Table
 
 from vla.evaluate import ERROR, Report
-from vla.report import GREEN, GREY
+from vla.report import BLUE, GREEN, GREY, RED
+
+# What the name of a condition may end with → colour, and how far below the middle of the row.
+LEVELS = {"": (GREEN, 0.0), "wide": (BLUE, -0.13), "hard": (RED, 0.13)}
 
 
 def mcnemar(one: Report, other: Report) -> float:
@@ -44,20 +47,34 @@ def suite_table(reports: Mapping[str, Report]) -> Table:
 
 
 def plot_suite(reports: Mapping[str, Report], path: Path) -> None:
-    """Draw the success rate with its interval under every condition, the first of them as a line for all."""
+    """Draw the success rate with its interval under every condition, the first of them as a line for all, and the
+    levels of one axis in one row."""
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(8, 1.2 + 0.28 * len(reports)), layout="constrained")
+    lines = list(dict.fromkeys(axis for axis, _ in map(_axis_and_level, reports)))
+    figure = Figure(figsize=(8, 1.4 + 0.32 * len(lines)), layout="constrained")
     axes = figure.add_subplot()
-    rows = np.arange(len(reports))[::-1]
-    rates = np.array([report.success for report in reports.values()])
-    reach = np.abs(np.array([report.interval for report in reports.values()]).T - rates)
-    axes.axvline(rates[0], color=GREY, linewidth=0.8, linestyle="--")
-    axes.errorbar(rates, rows, xerr=reach, fmt="o", color=GREEN, ecolor=GREY, capsize=3)
-    axes.set_yticks(rows, [name.replace("_", " ") for name in reports])
+    axes.axvline(next(iter(reports.values())).success, color=GREY, linewidth=0.8, linestyle="--")
+    for level, (colour, below) in LEVELS.items():
+        chosen = {
+            axis: report for name, report in reports.items() for axis, at in [_axis_and_level(name)] if at == level
+        }
+        rates = np.array([report.success for report in chosen.values()])
+        reach = np.abs(np.array([report.interval for report in chosen.values()]).reshape(-1, 2).T - rates)
+        rows = [len(lines) - 1 - lines.index(axis) - below for axis in chosen]
+        axes.errorbar(rates, rows, xerr=reach, fmt="o", color=colour, ecolor=GREY, capsize=3, label=level or None)
+    axes.set_yticks(range(len(lines)), [axis.replace("_", " ") for axis in reversed(lines)])
     axes.set_xlim(-0.02, 1.02)
-    axes.set_ylim(-0.6, len(reports) - 0.4)
+    axes.set_ylim(-0.6, len(lines) - 0.4)
+    if len(lines) < len(reports):
+        axes.legend(frameon=False, loc="lower left")
     axes.set_xlabel("success, 95 % CI")
     axes.grid(axis="x", alpha=0.3)
     axes.spines[["top", "right"]].set_visible(False)
     figure.savefig(path, dpi=110)
+
+
+def _axis_and_level(name: str) -> tuple[str, str]:
+    """The parts of a condition's name, as in light_hard; most have no level."""
+    axis, _, level = name.rpartition("_")
+    return (axis, level) if axis and level in LEVELS else (name, "")
