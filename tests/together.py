@@ -31,6 +31,8 @@ SMALL = (
     "trainer.max_steps=4",
     "trainer.val_check_interval=2",
     "learner.ema=0.9",
+    "learner.lr=1e-3",
+    "model.text.forget=0",  # processes would not forget the same
     "model.shift=[0,0]",
     "model.history=1",  # padding would count per process
 )
