@@ -10,7 +10,7 @@ import os
 import time
 from collections import Counter, deque
 from collections.abc import Callable
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -104,7 +104,10 @@ def collect(
 
 
 def effort(store: EpisodeStore, episodes: int) -> float | None:
-    """How long it took to collect so many of a store's episodes [s], whoever did; None if they came from elsewhere."""
+    """How long it took to collect so many of a store's episodes [s], whoever did; None if they came from elsewhere.
+
+    What a process did that was killed outright does not count.
+    """
     file = store.folder / EFFORT
     if not file.exists():
         return None
@@ -112,11 +115,13 @@ def effort(store: EpisodeStore, episodes: int) -> float | None:
 
 
 def _note_effort(folder: Path, seconds: float) -> None:
+    """Add to what is noted; on a full disk, of which the store complains, it stays as it is."""
     file = folder / EFFORT
-    before = float(file.read_text(encoding="utf-8")) if file.exists() else 0.0
     draft = folder / f".{EFFORT}"
-    draft.write_text(f"{before + seconds:.1f}\n", encoding="utf-8")
-    os.replace(draft, file)
+    with suppress(OSError):
+        before = float(file.read_text(encoding="utf-8")) if file.exists() else 0.0
+        draft.write_text(f"{before + seconds:.1f}\n", encoding="utf-8")
+        os.replace(draft, file)
 
 
 def _require_first_seed(store: EpisodeStore, seed: int) -> None:

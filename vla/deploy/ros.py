@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import signal
 from collections.abc import Iterator, Sequence
@@ -106,6 +107,8 @@ def spin(node: Any, stopped: Event) -> None:
 
     executor = SingleThreadedExecutor()
     executor.add_node(node)
+    # All that was imported and built stays: the collector need not look through it while an arm moves, nor at the end.
+    gc.freeze()
     try:
         while not stopped.is_set():
             executor.spin_once(timeout_sec=0.05)
