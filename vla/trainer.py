@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import csv
+import ctypes
 import logging
 import os
+import platform
 import signal
 import threading
 import warnings
@@ -32,6 +34,8 @@ from vla.resume import LAST
 log = logging.getLogger(__name__)
 
 SAVE_EVERY = 500  # steps
+TRIM_THRESHOLD, MMAP_THRESHOLD = -1, -3  # of mallopt(3)
+LARGEST = 2**25  # that MMAP_THRESHOLD may be [B]
 SIZES = ("history", "image_size", "chunk", "width")  # of a model, as far as it has them, that memory grows with
 
 
@@ -140,6 +144,7 @@ def make_trainer(config: DictConfig, checkpoints: Path | None, *watching: Callba
     Raises:
         ValueError: the machine has not what it asks for, or a logger's package is missing.
     """
+    _hold_memory()
     callbacks: list[Callback] = [Progress(), *watching]
     options: dict[str, Any] = {"logger": False, "enable_checkpointing": False}
     if config.learner.ema:
@@ -197,6 +202,15 @@ def keep_metrics(trainer: Trainer, checkpoint: Path) -> None:
     # Lightning begins with an empty file.
     writers[0].experiment.metrics = [row for row in rows if int(row["step"]) < steps]
     writers[0].save()
+
+
+def _hold_memory() -> None:
+    """Keep what a step frees for the next one: given back to the system it comes again page by page, which took 7 % of
+    a step of `bc` on a CPU and 12 % of `rt1_tiny`."""
+    if platform.libc_ver()[0] == "glibc":
+        library = ctypes.CDLL(None)
+        library.mallopt(MMAP_THRESHOLD, LARGEST)
+        library.mallopt(TRIM_THRESHOLD, -1)  # never
 
 
 def _loggers(config: DictConfig, folder: Path) -> list[Logger]:

@@ -91,9 +91,10 @@ class FilmConv(ImageEncoder):
 
     def forward(self, images: Tensor, text: Tensor) -> Tensor:
         """(N, 3, H, W) float images in 0 … 1 and (N, text_width) text to (N, channels, h, w)."""
-        x = self.convs[0]((images - 0.5).mul_(4))  # about unit variance
+        scale = 1.0 if self.chroma is None else math.sqrt(0.5)  # two independent sums are as large as one
+        x = self.convs[0]((images - 0.5).mul_(4 * scale))  # about unit variance
         if self.chroma is not None:
-            x = (x + self.chroma(_relative(images))) * math.sqrt(0.5)
+            x = x + self.chroma(_relative(images).mul_(6 * scale))
         x = F.relu_(self.films[0](x, text))
         for conv, film in zip(self.convs[1:], self.films[1:], strict=True):
             x = F.relu_(film(conv(x), text))
@@ -101,9 +102,9 @@ class FilmConv(ImageEncoder):
 
 
 def _relative(images: Tensor) -> Tensor:
-    """What of the brightness of each pixel is red, green and blue, as far from grey as about unit variance wants it."""
+    """What of the brightness of each pixel is red, green and blue, less a third: 0 is grey."""
     brightness = images[:, 0] + images[:, 1] + images[:, 2] + DARK  # a sum over few channels is slow
-    return (images / brightness.unsqueeze(1)).sub_(1 / 3).mul_(6)
+    return (images / brightness.unsqueeze(1)).sub_(1 / 3)
 
 
 class TokenLearner(nn.Module):
@@ -116,11 +117,12 @@ class TokenLearner(nn.Module):
 
     def __init__(self, channels: int, tokens: int = 8) -> None:
         super().__init__()
+        hidden = min(channels, 64)  # 64 as published; of few channels, more would only cost
         self.attention = nn.Sequential(
             nn.LayerNorm(channels, eps=1e-6),
-            nn.Linear(channels, 64),
+            nn.Linear(channels, hidden),
             nn.GELU(approximate="tanh"),
-            nn.Linear(64, tokens),
+            nn.Linear(hidden, tokens),
         )
 
     def forward(self, features: Tensor) -> Tensor:
@@ -149,8 +151,10 @@ class Keypoints(nn.Module):
     def forward(self, features: Tensor) -> Tensor:
         """(N, C, h, w) features to (N, M, 2 + C): positions x, y in -SPREAD … SPREAD, and features."""
         values = features.flatten(2)  # (N, C, h·w)
-        weights = (self.score.weight @ values).softmax(-1)  # (N, M, h·w)
-        return torch.cat([SPREAD * (weights.float() @ grid(features)), (weights @ values.mT).float()], -1)
+        # One product per image, as that of all at once is copied into the order of the softmax.
+        weights = torch.bmm(self.score.weight.expand(len(values), -1, -1), values).softmax(-1)  # (N, M, h·w)
+        places = (SPREAD * grid(features)).expand(len(values), -1, -1)
+        return torch.bmm(weights.float(), torch.cat([places, values.mT.float()], -1))
 
 
 def grid(features: Tensor) -> Tensor:
