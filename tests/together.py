@@ -18,6 +18,7 @@ from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig
 
 from vla.data.episodes import EpisodeStore
+from vla.models.learner import Learner
 from vla.parts import make_data, make_learner
 from vla.trainer import LAST, make_trainer, quiet_lightning
 
@@ -31,7 +32,8 @@ SMALL = (
     "trainer.max_steps=4",
     "trainer.val_check_interval=2",
     "learner.ema=0.9",
-    "learner.lr=1e-3",  # at which `require_equal` says what rounding is
+    "learner.warmup_steps=0",
+    "learner.schedule=constant",  # or a longer training would begin otherwise
     "model.text.forget=0",  # processes would not forget the same
     "model.shift=[0,0]",
     "model.history=1",  # padding would count per process
@@ -44,12 +46,17 @@ def composed(*overrides: str) -> DictConfig:
         return compose("config", overrides=["output=out", *SMALL, *overrides])
 
 
+def untrained(store: Path, *overrides: str) -> Learner:
+    """The same weights every time."""
+    lightning.seed_everything(0, verbose=False)
+    return make_learner(composed(*overrides), EpisodeStore(store))
+
+
 def train(store: Path, folder: Path, *overrides: str, checkpoint: Path | None = None) -> dict[str, float]:
     """Train, from a checkpoint on if there is one, leave `last.ckpt` and return what the last validation found."""
     config = composed(*overrides)
     quiet_lightning()
-    lightning.seed_everything(0, verbose=False)
-    learner = make_learner(config, EpisodeStore(store))
+    learner = untrained(store, *overrides)
     trainer = make_trainer(config, folder)
     data = make_data(config, EpisodeStore(store), learner.model)
     trainer.fit(learner, datamodule=data, ckpt_path=checkpoint, weights_only=True)
