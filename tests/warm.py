@@ -1,8 +1,8 @@
 """Programs in processes of their own that begin with the heavy libraries loaded, which else takes most of their time: a
 process that has imported them and done nothing else forks for every one.
 
-MuJoCo is not among them: importing it opens the display, which does not survive a fork. Nor do they free what they began
-with when they end, which takes longer than most of what they do.
+MuJoCo is not among them: importing it opens the display, which does not survive a fork. When they end they do not free
+what they began with, which would take longer than most of what they do.
 """
 
 from __future__ import annotations
