@@ -24,7 +24,7 @@ test: setup
 	.venv/bin/ruff check
 	.venv/bin/mypy
 	.venv/bin/pytest -n 2 --dist loadfile -m "not realtime"
-	.venv/bin/pytest -m realtime
+	.venv/bin/pytest -m realtime $$(grep -l realtime tests/test_*.py)
 
 setup: .venv/.installed
 

@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
+from functools import cache
 from pathlib import Path
 
 import pytest
 from hydra import compose, initialize_config_dir
-from hydra.errors import ConfigCompositionException
 from omegaconf import DictConfig
 
 from vla.check import JOBS, check
 
 CONF = Path(__file__).parents[1] / "conf"
+AXES = CONF / "task/randomize"  # a group for each, with levels of the same names
+LEVELS = sorted({path.stem for path in AXES.glob("*/*.yaml")})
 OPTIONS = [
     (path.parent.relative_to(CONF).as_posix(), path.stem)
     for path in sorted(CONF.rglob("*.yaml"))
-    if path.parent != CONF and path.parent.name != "hydra"
+    if path.parent != CONF and path.parent.name != "hydra" and path.parents[1] != AXES
 ]
 
 
@@ -23,23 +25,23 @@ OPTIONS = [
 TOGETHER = {("tokenizer", "fast"): ["model=decoder"]}
 
 
-def composed(*overrides: str) -> DictConfig:
+def composed(*overrides: str, whole: bool = False) -> DictConfig:
     with initialize_config_dir(str(CONF), version_base="1.3"):
-        return compose("config", overrides=["output=outputs/runs/now", *overrides])
+        return compose("config", overrides=["output=outputs/runs/now", *overrides], return_hydra_config=whole)
 
 
-def composed_with(group: str, option: str) -> DictConfig:
-    """A config in which `option` stands, together with a parent that has such a nested group."""
-    parent = group.rpartition("/")[0]
-    parents = [f"{parent}={path.stem}" for path in sorted((CONF / parent).glob("*.yaml"))] if parent else []
-    chosen = [TOGETHER.get((group, option), []), *[[choice] for choice in parents]]
-    attempts = [[*overrides, f"{group}={option}"] for overrides in chosen]
-    for attempt in (*attempts, [f"+{group}={option}"]):  # the last where no option is chosen by default
-        try:
-            return composed(*attempt)
-        except ConfigCompositionException as error:
-            problem = error
-    raise problem
+@cache
+def groups(*overrides: str) -> set[str]:
+    """Those of which an option is chosen, if only by default."""
+    return {*composed(*overrides, whole=True).hydra.runtime.choices}
+
+
+@cache
+def brought_by(group: str) -> list[str]:
+    """What to choose so that there is such a group: nothing, or an option of the group around it."""
+    around = group.rpartition("/")[0]
+    parents = [[f"{around}={path.stem}"] for path in sorted((CONF / around).glob("*.yaml"))] if around else []
+    return next(overrides for overrides in ([], *parents) if group in groups(*overrides))
 
 
 def test_the_default_passes_for_every_job_but_deploy() -> None:
@@ -60,10 +62,16 @@ def test_empty_batches_are_refused() -> None:
 
 @pytest.mark.parametrize(("group", "option"), OPTIONS, ids=[f"{group}={option}" for group, option in OPTIONS])
 def test_option(group: str, option: str) -> None:
-    cfg = composed_with(group, option)
+    cfg = composed(*TOGETHER.get((group, option), brought_by(group)), f"{group}={option}")
     top = group.partition("/")[0]
     cfg.job = next((job for job in ("evaluate", "export", "deploy") if top in JOBS[job] and cfg.get(top)), "evaluate")
     check(cfg)
+
+
+@pytest.mark.parametrize("level", LEVELS)
+def test_every_axis_of_randomisation_at_a_level(level: str) -> None:
+    axes = [f"task/randomize/{path.parent.name}" for path in sorted(AXES.glob(f"*/{level}.yaml"))]
+    check(composed(*(f"{'' if axis in groups() else '+'}{axis}={level}" for axis in axes)))
 
 
 def test_a_model_of_one_token_per_component_takes_no_other_tokens() -> None:

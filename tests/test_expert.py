@@ -25,9 +25,9 @@ def test_the_expert_solves_every_goal(goal: str, perturbed: bool) -> None:
     environment = make_tabletop(f"goal={goal}")
     expert = Waypoint(environment.spec, Perturbation() if perturbed else None)
     with environment.blind():
-        episodes = [rollout(environment, expert, seed) for seed in range(25)]
+        episodes = [rollout(environment, expert, seed) for seed in range(12)]
     environment.close()
-    assert sum(episode.success for episode in episodes) >= (22 if perturbed else 24)
+    assert sum(episode.success for episode in episodes) >= (10 if perturbed else 11)
 
 
 @pytest.mark.parametrize("goal", GOALS)
@@ -35,9 +35,9 @@ def test_wide_randomisation_is_within_the_experts_reach(goal: str) -> None:
     environment = make_tabletop(f"goal={goal}", "randomize=wide")
     expert = Waypoint(environment.spec)
     with environment.blind():
-        outcomes = [rollout(environment, expert, seed).outcome for seed in range(20)]
+        outcomes = [rollout(environment, expert, seed).outcome for seed in range(10)]
     environment.close()
-    assert outcomes.count("success") >= 18
+    assert outcomes.count("success") >= 9
 
 
 def test_the_clean_action_is_recorded_where_another_one_is_executed(tabletop: Tabletop) -> None:

@@ -113,12 +113,12 @@ def test_runs_are_compared_in_one_page(home: Path) -> None:
 
 def test_cells_run_at_the_same_time_and_one_that_fails_leaves_the_others_alone(home: Path) -> None:
     launcher = ("-m", "hydra/launcher=joblib", "hydra.launcher.n_jobs=2", "hydra.sweep.dir=grid")
-    done = vla(home, *launcher, "checkpoint=run/checkpoints/last.ckpt", "evaluate.workers=1",
-               "evaluate.episodes=0,1,-2", ok=False)  # fmt: skip
+    done = vla(home, *launcher, *SMALL, "recorder=none", "evaluate.episodes=0,1,-2", ok=False)
     errors = done.stderr[done.stderr.index("error: ") :].splitlines()
     assert errors[0].startswith("error: 2 of 3 cells failed") and "Traceback" not in done.stderr
     assert errors[1].startswith("  0 evaluate.episodes=0: evaluate.episodes must be") and "=-2: " in errors[2]
     assert json.loads((home / "grid/1/report.json").read_text())["episodes"] == 1
+    assert json.loads((home / "grid/1/training.json").read_text())["steps"] == 4
     assert (home / "grid/sweep.md").exists() and "at least 1" in (home / "grid/2/error.txt").read_text()
 
 

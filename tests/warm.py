@@ -1,7 +1,8 @@
 """Programs in processes of their own that begin with the heavy libraries loaded, which else takes most of their time: a
 process that has imported them and done nothing else forks for every one.
 
-MuJoCo is not among them: importing it opens the display, which does not survive a fork.
+MuJoCo is not among them: importing it opens the display, which does not survive a fork. When they end they do not free
+what they began with, which would take longer than most of what they do.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ from typing import Any
 from vla.tasks.backend import choose_backend
 
 PATIENCE = 300  # [s]
+status = 0  # with which this process ends
 
 Meanwhile = Callable[[int], None]  # is given the process
 
@@ -87,6 +89,7 @@ def _source() -> subprocess.Popen[str]:
 
 def _become(order: dict[str, Any]) -> None:
     """Turn this process into the one that was ordered."""
+    global status
     signal.alarm(PATIENCE)  # ends it
     os.chdir(order["folder"])
     os.environ.clear()
@@ -97,7 +100,20 @@ def _become(order: dict[str, Any]) -> None:
         os.close(opened)
     sys.argv[1:] = order["arguments"]
     sys.path.insert(0, order["folder"])
-    runpy.run_module(order["program"], run_name="__main__", alter_sys=True)
+    status = 1
+    try:
+        runpy.run_module(order["program"], run_name="__main__", alter_sys=True)
+        status = 0
+    except SystemExit as end:
+        status = end.code if isinstance(end.code, int) else int(end.code is not None)
+        raise
+
+
+def _end() -> None:
+    """The last thing that is done at exit."""
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(status)
 
 
 def _codes(processes: list[int]) -> list[int]:
@@ -114,6 +130,7 @@ def _codes(processes: list[int]) -> list[int]:
 
 def main() -> None:
     """Load the libraries; then, for every line of standard input, fork and tell the processes, then how they ended."""
+    atexit.register(_end)  # before the libraries register what they do at exit, and so after it
     choose_backend()
     import lightning
     import matplotlib.figure
@@ -124,9 +141,8 @@ def main() -> None:
     import torch.utils.tensorboard
 
     del lightning, matplotlib, pyarrow, rerun, torch
-    if sys.modules.get("triton") is None:  # which would complain
-        gc.collect()
-        gc.freeze()  # or each process looks through all this when it ends, and copies it to do so
+    gc.collect()
+    gc.freeze()  # or each process looks through all this again and again, and copies it to do so
     for line in sys.stdin:
         processes = []
         for order in json.loads(line):
