@@ -10,7 +10,7 @@ from fake_batch import make_batch
 from lightning import Callback
 from test_learner import loader, make_learner, make_trainer
 
-from vla.averaging import Averaging
+from vla.averaging import EVERY, Averaging
 from vla.policy import read_checkpoint
 
 DECAY = 0.9
@@ -31,13 +31,13 @@ class Watch(Callback):
 
 
 def test_it_is_the_exponential_average_of_the_steps_and_what_is_validated_and_saved(tmp_path: Path) -> None:
-    batch, watch = make_batch(1), Watch()
-    trainer = make_trainer(4, Averaging(DECAY), watch)
-    trainer.fit(make_learner(lr=1e-2, warmup_steps=0), loader(batch, 4), loader(batch, 1))
+    batch, watch, steps = make_batch(1), Watch(), 2 * EVERY + 1
+    trainer = make_trainer(steps, Averaging(DECAY), watch)
+    trainer.fit(make_learner(lr=1e-2, warmup_steps=0), loader(batch, steps), loader(batch, 1))
     trainer.save_checkpoint(tmp_path / "last.ckpt")
-    average = watch.trained[0]
-    for weight in watch.trained[1:]:
-        average = DECAY * average + (1 - DECAY) * weight
+    average, share = watch.trained[0], DECAY**EVERY
+    for weight in watch.trained[EVERY - 1 :: EVERY]:
+        average = share * average + (1 - share) * weight
     torch.testing.assert_close(watch.validated[-1], average)
     torch.testing.assert_close(read_checkpoint(tmp_path / "last.ckpt").state["head.weight"], average)
     saved = torch.load(tmp_path / "last.ckpt", weights_only=True)
