@@ -129,9 +129,11 @@ def _played(config: DictConfig, checkpoint: Path, recordings: Path) -> dict[str,
     make = partial(make_policy, plain(config.policy), checkpoint)
     recorder = partial(make_recorder, plain(config.recorder), recordings) if config.recorder else None
     task = plain(config.task)
+    task["randomize"] = {axis: level for axis, level in task["randomize"].items() if level is not None}
     reports: dict[str, Report] = {}
     for name, changes in {SEEN: {}, **plain(config.evaluate.conditions)}.items():
-        changed = {**task, **changes, "randomize": {**task["randomize"], **changes.get("randomize", {})}}
+        axes = {**task["randomize"], **changes.get("randomize", {})}
+        changed = {**task, **changes, "randomize": {axis: level for axis, level in axes.items() if level is not None}}
         if reports and changed == task:  # the level at which it was trained
             reports[name] = reports[SEEN]
         else:
