@@ -227,10 +227,33 @@ def test_a_checkpoint_brings_its_task_tokenizer_and_model_and_task_overrides_app
     assert "light" not in adopt(cfg, SAVED, ["~task.randomize.light"]).task.randomize
 
 
-@pytest.mark.parametrize("override", ["tokenizer=rt1", "tokenizer.bins=32", "model/image=efficientnet", "+model.x=1"])
+KEPT = ["tokenizer=rt1", "tokenizer.bins=32", "model/image=efficientnet", "+model.x=1", "experiment=few", "variant=rt1"]
+
+
+@pytest.mark.parametrize("override", KEPT)
 def test_a_checkpoint_keeps_its_tokenizer_and_model(override: str) -> None:
     with pytest.raises(ValueError, match="cannot be combined with a checkpoint"):
         adopt(config(), SAVED, [override])
+
+
+def test_a_report_says_what_the_training_of_its_checkpoint_was() -> None:
+    cfg, saved = config(job="evaluate"), {**SAVED, "collect": {"episodes": 50}, "learner": {"lr": 1e-4}}
+    assert adopt(cfg, saved, []).collect.episodes == 50
+    cfg.job = "export"
+    assert adopt(cfg, saved, []).collect.episodes != 50
+
+
+@pytest.mark.parametrize(
+    ("override", "says"),
+    [
+        ({"evaluate.seed": 0}, r"evaluate\.seed must be .*1000000"),
+        ({"validate.seed": 1_000_004, "validate.episodes": 1}, "share episodes"),
+        ({"resume": True}, "checkpoint=last"),
+    ],
+)
+def test_what_would_judge_what_it_chose_or_trained_on_is_refused(override: dict[str, Any], says: str) -> None:
+    with pytest.raises(ValueError, match=says):
+        check(config(**override))
 
 
 def test_any_error_is_one_line() -> None:

@@ -42,7 +42,7 @@ PARTS = {
     "vla.deploy": ("vla.spec", "vla.policy", "vla.tasks", "vla.data", "vla.evaluate", "vla.record", "vla.deploy"),
     "vla.stores": ("vla",),
     "vla.annotations": (),
-    "vla.check": ("vla.annotations",),
+    "vla.check": ("vla.annotations", "vla.spec"),
     "vla.peers": ("vla.workers",),
     "vla.resume": ("vla.policy", "vla.results"),
     "vla.progress": ("vla.models",),

@@ -7,6 +7,7 @@ import io
 import json
 import logging
 import re
+from dataclasses import replace
 from html import unescape
 from pathlib import Path
 from typing import Any
@@ -44,10 +45,14 @@ def a_report(*outcomes: str) -> Report:
     return Report(tuple(Result(FIRST_SEED + n, outcome, SAID, 20, {"n": n}) for n, outcome in enumerate(outcomes)))
 
 
-def a_run(folder: Path, outcomes: str = "ssss", width: int = 16, curves: str = CURVES) -> Path:
+def a_run(
+    folder: Path, outcomes: str = "ssss", width: int = 16, curves: str = CURVES, light: float | None = None
+) -> Path:
     """A folder as an evaluation leaves it, without pictures and recordings; s is a success, d a drop."""
     folder.mkdir(parents=True)
     report = a_report(*({"s": "success", "d": "dropped"}[outcome] for outcome in outcomes))
+    if light is not None:
+        report = Report(tuple(replace(result, draws={**result.draws, "light": light}) for result in report.results))
     config = {**CONFIG, "model": {"_target_": "vla.models.bc.BC", "width": width}}
     size = {"parameters": 1_500_000, "latency_ms": 2.5}
     dark = a_report(*["dropped"] * len(outcomes))
@@ -200,6 +205,12 @@ def test_runs_are_compared_on_the_seeds_they_share(tmp_path: Path) -> None:
     assert "model.width 16 8 16" in told
     assert 'href="../good/run/report.html"' in markup and "bad/run/report.html" not in markup
     assert markup.count("<svg") == 6
+
+
+def test_other_scenes_under_the_same_seeds_are_not_compared(tmp_path: Path) -> None:
+    plain, dark = a_run(tmp_path / "plain", "ssssssss"), a_run(tmp_path / "dark", "dddddddd", light=0.1)
+    told = text(write_comparison([plain, dark], tmp_path / "new"))
+    assert "plain 100.0" in told and "plain dark 8" not in told
 
 
 def test_runs_with_nothing_to_compare_are_refused(tmp_path: Path) -> None:

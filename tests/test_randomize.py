@@ -11,7 +11,7 @@ from conftest import CONF, make_tabletop
 
 from vla.spec import Array
 from vla.tasks.randomize.axis import Streams
-from vla.tasks.randomize.blocks import Colours, Distractors, Placement, Shapes
+from vla.tasks.randomize.blocks import Colours, Distractors, Masses, Placement, Shapes
 from vla.tasks.tabletop import Tabletop
 
 DEFAULT = {"distractors", "colour", "size", "mass", "friction", "placement", "arm", "light", "camera", "table"}
@@ -112,6 +112,17 @@ def test_every_shape_stands_on_the_table_and_weighs_what_its_volume_says() -> No
             for _ in range(5):
                 environment.step(np.array([0, 0, 0, 0, 0, 0, 1.0]))
             assert np.abs(bound.block_centres() - start).max() < 1e-3
+    environment.close()
+
+
+def test_a_shape_that_is_drawn_after_the_mass_keeps_the_factor() -> None:
+    environment = make_tabletop("randomize=none")
+    mass, shape = Masses((2.0, 2.0)), Shapes(["tall"])
+    environment.task.randomize = {"mass": mass, "shape": shape}
+    with environment.blind():
+        environment.reset(0)
+    bound = environment.task.bound
+    np.testing.assert_allclose(bound.model.body_mass[bound.block_bodies[:3]], 2 * 600.0 * 8 * 1.25 * 0.02**3)
     environment.close()
 
 

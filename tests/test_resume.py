@@ -24,5 +24,7 @@ def test_an_evaluation_that_was_interrupted_takes_what_the_training_had_chosen(t
     resumed = go_on(now, ["checkpoint=last"])
     assert (resumed.checkpoint, resumed.output) == (str(run / "checkpoints/best.ckpt"), str(run))
     assert not resumed.resume
+    another = go_on(now, ["checkpoint=last", "trainer=cpu", "trainer.gradient_clip_val=2"])
+    assert another.trainer.max_steps == now.trainer.max_steps
     now.job = "train"
     assert go_on(now, ["checkpoint=last", "job=train"]).checkpoint == str(run / "checkpoints/last.ckpt")

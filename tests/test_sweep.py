@@ -60,6 +60,16 @@ def test_cells_that_failed_are_left_out_and_a_sweep_without_any_writes_nothing(t
     assert row.choices == {} and row.name == "all"
 
 
+def test_a_condition_that_not_every_cell_played_is_left_open(tmp_path: Path) -> None:
+    cell(tmp_path, 0, ["evaluate=paper"], 7)
+    cell(tmp_path, 1, ["evaluate=default"], 7)
+    report = tmp_path / "1/report.json"
+    report.write_text(json.dumps({**json.loads(report.read_text()), "conditions": {}}))
+    tabulate(tmp_path)
+    assert "| default | 70.0 (39.7-89.2) | - |" in (tmp_path / "sweep.md").read_text()
+    assert (tmp_path / "sweep.html").exists()
+
+
 def test_what_is_slower_and_no_better_is_off_the_front(tmp_path: Path) -> None:
     cell(tmp_path, 0, ["model=a"], 7, latency=1.0)
     cell(tmp_path, 1, ["model=b"], 7, latency=3.0)

@@ -30,6 +30,7 @@ MODELS: dict[str, Callable[[], Model]] = {
     "diffusion, which draws": lambda: make_denoising(Diffusion),
 }
 STEPS, STOP = 11, 6
+VALIDATED = 4  # every so many steps
 
 
 def config(**trainer: Any) -> DictConfig:
@@ -37,7 +38,7 @@ def config(**trainer: Any) -> DictConfig:
         "accelerator": "cpu",
         "max_steps": STEPS,
         "max_epochs": -1,
-        "val_check_interval": 4,
+        "val_check_interval": VALIDATED,
         "check_val_every_n_epoch": None,
         "num_sanity_val_steps": 0,
         "log_every_n_steps": 2,
@@ -66,12 +67,18 @@ class StopAfter(Callback):
 
 
 def train(
-    model: Model, store: Path, output: Path, stop: int | None = None, checkpoint: Path | None = None, **trainer: Any
+    model: Model,
+    store: Path,
+    output: Path,
+    stop: int | None = None,
+    checkpoint: Path | None = None,
+    killer: lightning.Callback | None = None,
+    **trainer: Any,
 ) -> dict[str, Any]:
     """What the checkpoint holds that a training leaves behind."""
     lightning.seed_everything(0 if checkpoint is None else 1, verbose=False)  # what came before must not matter
     interruption = Interruption(output / "checkpoints")
-    watching = [interruption, *([StopAfter(interruption, stop)] if stop else [])]
+    watching = [interruption, *([StopAfter(interruption, stop)] if stop else []), *([killer] if killer else [])]
     made = make_trainer(config(**trainer), output / "checkpoints", *watching)
     if checkpoint:
         keep_metrics(made, checkpoint)
@@ -117,6 +124,41 @@ def test_going_on_after_an_interruption_gives_the_same_bits(name: str, folder: P
     for part in ("state_dict", "current_model_state", "optimizer_states", "lr_schedulers"):
         assert same(whole[part], rest[part]), part
     assert not same(half["state_dict"], rest["state_dict"])
+    assert logged(tmp_path / "half") == logged(tmp_path / "whole") != []
+
+
+class DieAt(lightning.Callback):
+    """The process ends before a step, whatever is under way."""
+
+    def __init__(self, step: int) -> None:
+        self._step = step
+
+    def on_train_batch_start(self, trainer: lightning.Trainer, *_: Any) -> None:
+        if trainer.global_step == self._step:
+            raise RuntimeError("killed")
+
+
+@pytest.mark.parametrize("killed", [False, True], ids=["interrupted", "killed"])
+def test_what_ends_at_a_step_that_is_validated_does_not_lose_the_validation(
+    killed: bool, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    start = make_bc().state_dict()
+
+    def fresh() -> Model:
+        model = make_bc()
+        model.load_state_dict(start)
+        return model
+
+    train(fresh(), folder, tmp_path / "whole")
+    if killed:
+        monkeypatch.setattr("vla.trainer.SAVE_EVERY", VALIDATED)
+        with pytest.raises(RuntimeError, match="killed"):
+            train(fresh(), folder, tmp_path / "half", killer=DieAt(VALIDATED + 1))
+    else:
+        train(fresh(), folder, tmp_path / "half", stop=VALIDATED)
+    last = tmp_path / "half/checkpoints/last.ckpt"
+    assert torch.load(last, weights_only=True)["global_step"] == VALIDATED
+    train(make_bc(), folder, tmp_path / "half", checkpoint=last)
     assert logged(tmp_path / "half") == logged(tmp_path / "whole") != []
 
 

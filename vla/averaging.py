@@ -17,7 +17,8 @@ EVERY = 4  # steps: a pass over all weights takes as long as a twentieth of the 
 class Averaging(Callback):
     """Keeps an exponential moving average of what a model learns, also where its weights are shared out.
 
-    It takes in the weights of every fourth step, with the weight of four. A checkpoint holds the average as its `state_dict`, and what training goes on with as `current_model_state`.
+    It takes in the weights of every fourth step, with the weight of four. A checkpoint holds the average as its
+    `state_dict`, and what training goes on with as `current_model_state`.
 
     Args:
         decay: share of the average that a step leaves, above 0 and below 1.

@@ -20,6 +20,7 @@ from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 
 from vla.annotations import describe, matches
+from vla.spec import FIRST_SEED
 
 # What a `_target_` may name: configs also come out of checkpoints, which may come from anybody.
 ALLOWED = ("vla.", "torch.", "lightning.", "dm_control.composer.variation.")
@@ -57,6 +58,7 @@ RUNTIME: dict[str, tuple[str, ...]] = {
 
 Count = Annotated[int, 1]
 Seed = Annotated[int, 0]
+UnseenSeed = Annotated[int, FIRST_SEED]
 
 # The nodes that name no class.
 PLAIN: dict[str, Any] = {
@@ -69,12 +71,12 @@ PLAIN: dict[str, Any] = {
     "collect": {"episodes": Count, "seed": Seed, "workers": Count | None, "folder": str},
     "evaluate": {
         "episodes": Count,
-        "seed": Seed,
+        "seed": UnseenSeed,
         "workers": Count | None,
         "recordings": Seed | None,
         "conditions": dict[str, dict[str, Any]],
     },
-    "validate": {"episodes": Seed, "seed": Seed},
+    "validate": {"episodes": Seed, "seed": UnseenSeed},
     "preview": {"episodes": Count, "seed": Seed},
     "benchmark": {
         "names": list[Literal["collect", "loader", "train", "policy", "deploy"]],
@@ -133,6 +135,9 @@ def check(cfg: DictConfig) -> None:
     for name, annotation in PLAIN.items():
         node = OmegaConf.to_container(cfg[name], resolve=True) if OmegaConf.is_config(cfg[name]) else cfg[name]
         _check_plain(name, node, annotation)
+    _require_apart(cfg)
+    if cfg.resume and cfg.checkpoint is None:
+        raise ValueError("resume=true goes on from a checkpoint: name one, or take checkpoint=last")
     trained = cfg.checkpoint is not None and not cfg.resume
     groups = EVALUATION if cfg.job == "evaluate" and trained else JOBS[cfg.job]
     for group in groups:
@@ -146,6 +151,16 @@ def check(cfg: DictConfig) -> None:
             raise ValueError(f"job={cfg.job} needs {group}=OPTION; --help lists the options")
     if "model" in groups:
         _require_together(*(_locate(f"{group}._target_", cfg[group]._target_) for group in ("tokenizer", "model")))
+
+
+def _require_apart(cfg: DictConfig) -> None:
+    names = ("validate", "evaluate")
+    one, other = (range(cfg[name].seed, cfg[name].seed + cfg[name].episodes) for name in names)
+    if range(max(one.start, other.start), min(one.stop, other.stop)):
+        raise ValueError(
+            f"validate.seed={one.start} and evaluate.seed={other.start} share episodes, but those that choose the "
+            "weights must not judge them: move one of the two"
+        )
 
 
 def _require_together(tokenizer: type, model: type) -> None:

@@ -111,7 +111,7 @@ def effort(store: EpisodeStore, episodes: int) -> float | None:
     file = store.folder / EFFORT
     if not file.exists():
         return None
-    return float(file.read_text(encoding="utf-8")) * episodes / len(store.episodes)
+    return float(file.read_text(encoding="utf-8")) * episodes / len(EpisodeStore(store.folder).episodes)
 
 
 def _note_effort(folder: Path, seconds: float) -> None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable
+from contextlib import nullcontext
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -81,23 +82,30 @@ def evaluate(config: DictConfig) -> float | None:
     Raises:
         ValueError: an episode could not be played to its end; the report, which is written, says why.
     """
-    from vla.evaluate import SEEN, keep_recordings
-    from vla.page import PAGE, optional, write_page
-    from vla.policy import latency
-    from vla.report import plot_report, write_report
-    from vla.results import run_of
-    from vla.suite import plot_suite, suite_table
+    from vla.resume import alone
     from vla.train import trained
 
     output = output_folder(config)
     checkpoint = Path(config.checkpoint) if config.checkpoint and not config.resume else trained(config)
     if checkpoint is None:
         return None
+    own = checkpoint.resolve().parent == (output / "checkpoints").resolve()
+    with alone(checkpoint.parent) if own else nullcontext():  # checkpoint=last shall not take it for interrupted
+        return _reported(config, checkpoint, output)
+
+
+def _reported(config: DictConfig, checkpoint: Path, output: Path) -> float:
+    """Play, write down how it went, and return the success rate."""
+    from vla.evaluate import SEEN, keep_recordings
+    from vla.page import PAGE, optional, write_page
+    from vla.policy import latency
+    from vla.report import plot_report, write_report
+    from vla.results import run_of
+    from vla.suite import plot_suite, suite_table
+
     started = time.monotonic()
     reports = _played(config, checkpoint, output / "recordings")
     report = reports.pop(SEEN)
-    if config.recorder:
-        keep_recordings(report, output / "recordings", output / "rollouts.rrd", config.evaluate.recordings)
     policy = make_policy(plain(config.policy), checkpoint)
     facts = {
         **plain(config.chosen),
@@ -107,6 +115,9 @@ def evaluate(config: DictConfig) -> float | None:
     }
     note_config(config)
     write_report(report, output / "report.json", str(checkpoint), plain(config), facts, reports)
+    if config.recorder:
+        with optional(output / "rollouts.rrd"):
+            keep_recordings(report, output / "recordings", output / "rollouts.rrd", config.evaluate.recordings)
     plot_report(report, output / "report.png")
     if reports:
         plot_suite({SEEN: report, **reports}, output / "suite.png")
@@ -153,10 +164,7 @@ def export(config: DictConfig) -> None:
     if config.export._target_.startswith("vla.program."):
         log.info("wrote %s", exporter.export(_required_policy(config)))
         return
-    from vla.data.episodes import EpisodeStore
-
-    store = EpisodeStore(collected(config).folder, config.collect.episodes)
-    log.info("wrote %s", exporter.export(store))
+    log.info("wrote %s", exporter.export(collected(config)))
 
 
 def deploy(config: DictConfig) -> None:

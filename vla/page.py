@@ -19,7 +19,7 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
 from vla.curves import colours, draw_run, draw_runs
-from vla.evaluate import ERROR, Report
+from vla.evaluate import ERROR, Report, Result
 from vla.report import BLUE, GREEN, GREY, RED
 from vla.results import ABSENT, Run, differences, read_run, require_run, write
 from vla.suite import mcnemar
@@ -100,7 +100,7 @@ def write_comparison(folders: Sequence[Path], target: Path) -> Path:
     )
 
 
-def write_sweep(folder: Path, choices: Sequence[str], lines: Sequence[Line], cells: Sequence[Path]) -> Path:
+def write_sweep(folder: Path, choices: Sequence[str], lines: Sequence[Line], cells: Sequence[Path], over: str) -> Path:
     """Show the table of a sweep, its picture and the curves of its cells, and return the path of the page.
 
     Args:
@@ -108,6 +108,7 @@ def write_sweep(folder: Path, choices: Sequence[str], lines: Sequence[Line], cel
         choices: what distinguishes its lines.
         lines: of the table.
         cells: their folders, whose names a line's links bear.
+        over: what success is drawn over in its picture.
     """
     runs = {cell.name: read_run(cell) for cell in cells}
     told = {cell: f"{cell}: {' '.join(line.words)}" for line in lines for cell in line.links}
@@ -121,6 +122,7 @@ def write_sweep(folder: Path, choices: Sequence[str], lines: Sequence[Line], cel
         curves=draw_runs({name: run.metrics for name, run in runs.items()}),
         cells=dict(zip(map(told.get, runs), colours(len(runs)), strict=True)),
         pictures={overview.name: overview} if overview.is_file() else {},
+        over=over,
     )
 
 
@@ -210,21 +212,25 @@ def _pairs(runs: Mapping[str, Run]) -> list[dict[str, Any]]:
     found = []
     for one, other in combinations(runs, 2):
         mine, yours = (_by_seed(runs[name]) for name in (one, other))
-        # Under the same seed another goal or another level of randomisation is another episode; the sentence tells.
-        seeds = [
-            seed for seed, result in mine.items() if seed in yours and result.instruction == yours[seed].instruction
-        ]
+        # Under the same seed another goal or another level of randomisation is another episode; what was drawn tells.
+        seeds = [seed for seed, (_, scene) in mine.items() if seed in yours and scene == yours[seed][1]]
         if seeds:
-            a, b = (Report(tuple(results[seed] for seed in seeds)) for results in (mine, yours))
-            won = [(mine[seed].outcome == "success", yours[seed].outcome == "success") for seed in seeds]
+            a, b = (Report(tuple(results[seed][0] for seed in seeds)) for results in (mine, yours))
+            won = [(x.outcome == "success", y.outcome == "success") for x, y in zip(a.results, b.results, strict=True)]
             counts = {"first": won.count((True, False)), "second": won.count((False, True)), "seeds": len(seeds)}
             found.append({"one": one, "other": other, **counts, "p": mcnemar(a, b)})
     return found
 
 
-def _by_seed(run: Run) -> dict[int, Any]:
+def _by_seed(run: Run) -> dict[int, tuple[Result, Any]]:
+    """Seed → how the policy did where it was trained, and what there was to see and to hear."""
     seen = next(iter(run.reports.values()), Report(()))
-    return {result.seed: result for result in seen.results if result.outcome != ERROR}
+    drawn = {each["seed"]: each["draws"] for each in run.report.get("per_episode", ())}
+    return {
+        result.seed: (result, (result.instruction, drawn[result.seed]))
+        for result in seen.results
+        if result.outcome != ERROR
+    }
 
 
 def _between(runs: Mapping[str, Run]) -> dict[str, list[Any]]:

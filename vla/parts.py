@@ -140,7 +140,7 @@ def _source(config: DictConfig) -> tuple[Spec, Recorded | None]:
 
 
 def collected(config: DictConfig) -> EpisodeStore:
-    """The episode store of this configuration, with at least as many episodes as asked for."""
+    """The episode store of this configuration, with as many episodes as asked for, whatever else it holds."""
     from vla.collect import collect
     from vla.data.episodes import EpisodeStore
 
@@ -153,7 +153,7 @@ def collected(config: DictConfig) -> EpisodeStore:
     if recorded is not None:
         added = recorded.fill(store, config.collect.episodes)
         log.info("%s: %d recorded episodes, %d of them new", store.folder, len(store.episodes), added)
-        return store
+        return EpisodeStore(store.folder, config.collect.episodes)
     summary = collect(
         store,
         partial(make_environment, source["task"]),
@@ -172,7 +172,7 @@ def collected(config: DictConfig) -> EpisodeStore:
         100 * summary.success_rate,
         failures,
     )
-    return store
+    return EpisodeStore(store.folder, config.collect.episodes)
 
 
 def make_learner(config: DictConfig, store: EpisodeStore) -> Learner:

@@ -23,28 +23,35 @@ OF_TRAINING = (
     *("task", "expert", "collect.episodes", "collect.seed", "data", "tokenizer", "model", "learner", "seed"),
     *("experiment", "variant"),
 )
+# What a training's length and steps are, of a trainer.
+FAR = ("max_steps", "max_epochs", "val_check_interval", "accumulate_grad_batches", "gradient_clip_val")
+# What the report on a policy says of its training.
+TOLD = ("expert", "collect", "data", "learner", "trainer", "validate", "seed")
 
 
 def adopt(cfg: DictConfig, saved: Mapping[str, Any], overrides: Sequence[str]) -> DictConfig:
-    """`cfg` with the task, tokenizer and model of a checkpoint's config `saved`.
+    """`cfg` with the task, tokenizer and model of a checkpoint's config `saved`, and for a report with the rest of its
+    training.
 
     What the command line `overrides` say about the task, as in `task/randomize=wide task.blocks=4`, applies on top.
 
     Raises:
-        ValueError: an override of the tokenizer or the model, which the weights were trained with.
+        ValueError: an override of the tokenizer or the model, which the weights were trained with, or of an experiment
+            or variant, which stand for several choices.
     """
     said = _parsed(overrides)
     for override in said:
         group = _path(override).partition(".")[0]
-        if group in ("tokenizer", "model"):
+        if group in ("tokenizer", "model", "experiment", "variant"):
             raise ValueError(
                 f"{override.input_line} cannot be combined with a checkpoint, whose weights belong to the {group} "
-                "they were trained with: leave one of the two out"
+                "they were trained with: leave one of the two out; task/randomize=wide and evaluate=suite can be"
             )
     named = {override.key_or_group for override in said}
     kept = saved.get("chosen", {})
     chosen = {name: cfg.chosen[name] if group in named else kept.get(name) for name, group in CHOSEN.items()}
-    return _on_top(cfg, {**{group: saved[group] for group in OF_POLICY}, "chosen": chosen}, said)
+    names = [*OF_POLICY, *(name for name in TOLD if cfg.job == "evaluate" and name in saved)]
+    return _on_top(cfg, {**{name: saved[name] for name in names}, "chosen": chosen}, said)
 
 
 def go_on(cfg: DictConfig, overrides: Sequence[str]) -> DictConfig:
@@ -72,6 +79,11 @@ def go_on(cfg: DictConfig, overrides: Sequence[str]) -> DictConfig:
             )
     adopted = {name: value for name, value in saved.config.items() if name in cfg and name not in ("job", "output")}
     resumed = _on_top(cfg, adopted, said)
+    named = {_path(override) for override in said}
+    if "trainer" in named:  # how fast it goes on, not how far
+        for name in FAR:
+            if name in saved.config["trainer"] and f"trainer.{name}" not in named:
+                OmegaConf.update(resumed, f"trainer.{name}", saved.config["trainer"][name], force_add=True)
     # Where weights are shared out, Lightning numbers what the optimiser remembers in another order.
     sharing = OmegaConf.is_dict(OmegaConf.select(resumed, "trainer.strategy"))
     if sharing and not isinstance(saved.config["trainer"].get("strategy"), dict):
@@ -79,7 +91,6 @@ def go_on(cfg: DictConfig, overrides: Sequence[str]) -> DictConfig:
             f"trainer=fsdp cannot go on from {path}, which was trained without it: use trainer=ddp, or start anew"
         )
     resumed.checkpoint, resumed.resume = str(path), not saved.finished
-    named = {_path(override) for override in said}
     if last and "output" not in named:
         resumed.output = str(path.parent.parent)
     if last and "job" not in named:

@@ -157,6 +157,9 @@ def markdown(rows: list[Row]) -> str:
     for row in rows:
         shares = []
         for condition in conditions:
+            if condition not in row.successes:
+                shares.append("-")
+                continue
             rate, low, high = (100 * value for value in row.interval(condition))
             shares.append(f"{rate:.1f} ({low:.1f}-{high:.1f})")
         seeds = ", ".join(f"{100 * rate:.1f}" for rate in row.rates)
@@ -186,7 +189,7 @@ def plot(rows: list[Row], path: Path) -> None:
 def _plot_curves(axes: Axes, rows: list[Row], condition: str) -> None:
     """Success under one condition over the number of demonstrations; rows with the same other choices share a line."""
     lines: dict[str, list[Row]] = {}
-    for row in rows:
+    for row in (row for row in rows if condition in row.successes):
         others = " ".join(value for key, value in row.choices.items() if key != DEMONSTRATIONS)
         lines.setdefault(others, []).append(row)
     for name, line in lines.items():
@@ -247,8 +250,9 @@ def _write_page(rows: list[Row], folder: Path) -> None:
         )
         for row in rows
     ]
+    over = "the number of demonstrations" if DEMONSTRATIONS in rows[0].choices else "the time of an action"
     with optional(folder / SWEEP):
-        write_sweep(folder, list(rows[0].choices), lines, [cell for row in rows for cell in row.cells])
+        write_sweep(folder, list(rows[0].choices), lines, [cell for row in rows for cell in row.cells], over)
 
 
 def _write_csv(rows: list[Row], path: Path) -> None:

@@ -71,10 +71,10 @@ def trained(config: DictConfig) -> Path | None:
             except SystemExit:  # at a SIGTERM Lightning leaves as if all were well
                 if not interruption.asked:
                     raise
+            if not interruption.stopped:
+                trainer.save_checkpoint(checkpoints / LAST, weights_only=False)
             if interruption.asked and trainer.is_global_zero:
                 raise KeyboardInterrupt
-            if not interruption.asked:
-                trainer.save_checkpoint(checkpoints / LAST, weights_only=False)
     if not trainer.is_global_zero:
         return None  # what follows training is done once
     chosen = closed_loop.chosen(checkpoints / LAST) if closed_loop else checkpoints / LAST
@@ -85,7 +85,9 @@ def trained(config: DictConfig) -> Path | None:
 def _closed_loop(config: DictConfig, checkpoints: Path) -> ClosedLoop | None:
     """What lets the policy act in every validation, if it is to."""
     seeds = range(config.validate.seed, config.validate.seed + config.validate.episodes)
-    makers = partial(make_environment, plain(config.task)), partial(in_training, plain(config.policy))
+    task = plain(config.task)
+    task["randomize"] = {**task["randomize"], "phrasing": None}  # what is held out chooses no weights
+    makers = partial(make_environment, task), partial(in_training, plain(config.policy))
     return ClosedLoop(*makers, seeds, checkpoints) if seeds else None
 
 

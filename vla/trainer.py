@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 import torch
 from lightning import Callback, LightningModule, Trainer
-from lightning.pytorch.callbacks import Checkpoint, ModelCheckpoint
+from lightning.pytorch.callbacks import Checkpoint
 from lightning.pytorch.loggers import CSVLogger, Logger
 from lightning.pytorch.plugins import TorchCheckpointIO
 from lightning.pytorch.strategies import ParallelStrategy
@@ -48,7 +48,7 @@ class Interruption(Checkpoint):
 
     def __init__(self, checkpoints: Path) -> None:
         self._path = checkpoints / LAST
-        self.asked = False
+        self.asked = self.stopped = self._whole = False
 
     @contextmanager
     def listening(self) -> Iterator[None]:
@@ -80,11 +80,20 @@ class Interruption(Checkpoint):
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
     ) -> None:
         """Save while everything that goes on from here is still at hand, and no gradient half gathered."""
-        if (batch_idx + 1) % trainer.accumulate_grad_batches:
+        self._whole = (batch_idx + 1) % trainer.accumulate_grad_batches == 0
+        if not _validates(trainer, batch_idx):
+            self._stop(trainer)
+
+    def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Where a step is validated, save after that: who went on from before it would leave it out."""
+        self._stop(trainer)
+
+    def _stop(self, trainer: Trainer) -> None:
+        if not self._whole:
             return
         # A signal that comes after this, and so to one process only, is heard of in the next step.
         if trainer.strategy.reduce_boolean_decision(self.asked, all=False) and not trainer.should_stop:
-            self.asked = True
+            self.asked = self.stopped = True
             trainer.save_checkpoint(self._path, weights_only=False)
             trainer.should_stop = True
             trainer.limit_val_batches = 0  # else Lightning validates once more before it stops
@@ -93,6 +102,36 @@ class Interruption(Checkpoint):
     def on_save_checkpoint(self, trainer: Trainer, pl_module: LightningModule, checkpoint: dict[str, Any]) -> None:
         """A checkpoint of a training that is over is not to be gone on from."""
         checkpoint["finished"] = trainer.state.finished
+
+
+class Saving(Checkpoint):
+    """Keeps `last.ckpt` of every so many steps, of one that is validated after its validation."""
+
+    def __init__(self, checkpoints: Path) -> None:
+        self._path, self._due, self._step = checkpoints / LAST, False, -1
+
+    def on_train_batch_end(
+        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
+    ) -> None:
+        """Save, or leave it to the validation that follows."""
+        step = trainer.global_step
+        self._due, self._step = step != self._step and step % SAVE_EVERY == 0, step
+        if not _validates(trainer, batch_idx):
+            self._save(trainer)
+
+    def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Save what was left over."""
+        self._save(trainer)
+
+    def _save(self, trainer: Trainer) -> None:
+        if self._due:
+            self._due = False
+            trainer.save_checkpoint(self._path, weights_only=False)
+
+
+def _validates(trainer: Trainer, batch_idx: int) -> bool:
+    every = trainer.val_check_batch
+    return bool(trainer.enable_validation and every and (batch_idx + 1) % every == 0)
 
 
 class AtomicFiles(TorchCheckpointIO):
@@ -150,10 +189,7 @@ def make_trainer(config: DictConfig, checkpoints: Path | None, *watching: Callba
     if config.learner.ema:
         callbacks.append(Averaging(config.learner.ema))
     if checkpoints is not None:
-        callbacks += [
-            Pace(),
-            ModelCheckpoint(checkpoints, filename="last", every_n_train_steps=SAVE_EVERY, enable_version_counter=False),
-        ]
+        callbacks += [Pace(), Saving(checkpoints)]
         options = {"logger": _loggers(config, checkpoints.parent)}
     callbacks.append(Draws(config.seed))  # after all that might draw something itself
     try:

@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from lightning import Callback, LightningModule, Trainer
 
-from vla.evaluate import ClosableEnvironment
+from vla.evaluate import ClosableEnvironment, wilson_interval
 from vla.models.learner import Learner
 from vla.models.model import Model
 from vla.rollout import rollout
@@ -74,8 +74,10 @@ class ClosedLoop(Callback):
             self._environment = None
 
     def chosen(self, last: Path) -> Path:
-        """`best.ckpt` where the weights did worse in the last validation than in an earlier one, else `last`."""
-        if self.success >= self.best or not self._path.exists():
+        """`best.ckpt` where the last validation lies below the 95 % confidence interval of the best one, else `last`:
+        among a few episodes, one more or less is chance, while longer trained is better."""
+        low, _ = wilson_interval(round(max(self.best, 0.0) * len(self._seeds)), len(self._seeds))
+        if self.success >= low or not self._path.exists():
             return last
         log.info("success in validation fell from %.0f to %.0f %%: %s", 100 * self.best, 100 * self.success, self._path)
         return self._path
@@ -86,4 +88,6 @@ class ClosedLoop(Callback):
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Go on with it."""
-        self.success, self.best = state_dict["success"], state_dict["best"]
+        self.success = state_dict["success"]
+        if self._path.exists():  # else it was left in another folder, and what comes now is the best here
+            self.best = state_dict["best"]

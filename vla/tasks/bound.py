@@ -86,6 +86,7 @@ class BoundScene:
             getattr(self.model, name)[:] = value
         count = len(self.block_geoms)
         self.extents = np.full((count, 3), BLOCK_HALF_SIZE)  # half sizes of the blocks, upright [m]
+        self.density = np.full(count, BLOCK_DENSITY)  # of each block [kg/m³]
         self.present = min(count, 3)  # blocks on the table, the first ones
         self.latency = 0.0  # from a command to the motors [s]
         self.noise = Noise()
@@ -119,7 +120,7 @@ class BoundScene:
         all that MuJoCo derives from them."""
         x, y, z = self.extents[index] = half_size
         volume = 2 * np.pi * x**2 * z if round else 8 * x * y * z
-        mass = BLOCK_DENSITY * volume
+        mass = self.density[index] * volume
         model, geom, body = self.model, self.block_geoms[index], self.block_bodies[index]
         kind = mujoco.mjtGeom.mjGEOM_CYLINDER if round else mujoco.mjtGeom.mjGEOM_BOX
         model.geom_type[geom] = int(kind)
@@ -133,6 +134,12 @@ class BoundScene:
             model.body_inertia[body] = mass * np.array([x**2 / 4 + z**2 / 3, x**2 / 4 + z**2 / 3, x**2 / 2])
         else:
             model.body_inertia[body] = mass / 3 * (np.sum(self.extents[index] ** 2) - self.extents[index] ** 2)
+
+    def scale_density(self, factors: Array) -> None:
+        """Make each block so many times as heavy, (count,), whatever its size and shape are or become."""
+        self.density *= factors
+        self.model.body_mass[self.block_bodies] *= factors
+        self.model.body_inertia[self.block_bodies] *= factors[:, None]
 
     def finish(self, pads: int) -> None:
         """Make model and state consistent after all changes; only so many pads lie on the table."""

@@ -112,8 +112,7 @@ class Masses:
     def __call__(self, scene: BoundScene, random_state: np.random.RandomState) -> dict[str, Any]:
         """Draw a factor per block."""
         factors = random_state.uniform(*self.factor, len(scene.block_geoms))
-        scene.model.body_mass[scene.block_bodies] *= factors
-        scene.model.body_inertia[scene.block_bodies] *= factors[:, None]
+        scene.scale_density(factors)
         return {"factor": rounded(factors)}
 
 
