@@ -11,12 +11,11 @@ from __future__ import annotations
 
 import hashlib
 import time
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import suppress
+from concurrent.futures import Future, ThreadPoolExecutor
 from functools import lru_cache
 from pathlib import Path
-from queue import Empty, SimpleQueue
-from threading import Thread
 from typing import Annotated
 
 import numpy as np
@@ -47,40 +46,23 @@ class Stream:
         self.waited = 0.0
 
     def __iter__(self) -> Iterator[Batch]:
-        wanted: SimpleQueue[Array | None] = SimpleQueue()
-        made: SimpleQueue[Batch | Exception] = SimpleQueue()
-
-        def make() -> None:
-            while (windows := wanted.get()) is not None:
-                try:
-                    made.put(self._gather(windows))
-                except Exception as error:  # is raised where the batch is waited for
-                    made.put(error)
-
-        Thread(target=make, name="windows", daemon=True).start()
-        under_way = 0
+        maker = ThreadPoolExecutor(1, "windows")  # which, unlike a daemon, has ended before the interpreter does
+        under_way: deque[Future[Batch]] = deque()
         try:
             for windows in self._plan():
-                wanted.put(windows)
-                under_way += 1
-                if under_way > self._ahead:
-                    yield self._next(made)
-                    under_way -= 1
-            for _ in range(under_way):
-                yield self._next(made)
+                under_way.append(maker.submit(self._gather, windows))
+                if len(under_way) > self._ahead:
+                    yield self._wait_for(under_way.popleft())
+            while under_way:
+                yield self._wait_for(under_way.popleft())
         finally:
-            with suppress(Empty):
-                while True:
-                    wanted.get_nowait()
-            wanted.put(None)
+            maker.shutdown(wait=False, cancel_futures=True)
 
-    def _next(self, made: SimpleQueue[Batch | Exception]) -> Batch:
+    def _wait_for(self, batch: Future[Batch]) -> Batch:
         started = time.perf_counter()
-        batch = made.get()
+        made = batch.result()
         self.waited += time.perf_counter() - started
-        if isinstance(batch, Exception):
-            raise batch
-        return batch
+        return made
 
 
 class CountedStream(Stream):
