@@ -14,7 +14,6 @@ from test_learner import loader, make_learner, make_trainer
 from test_policy import act, observations
 from toy import SPEC, ToyEnvironment
 
-from vla.averaging import Averaging
 from vla.models.action_tokenizer import RT1
 from vla.models.decoder import Decoder
 from vla.models.fast import Fast
@@ -179,7 +178,7 @@ def test_what_was_perceived_is_kept_while_the_window_moves_on() -> None:
 
 def test_a_trained_decoder_of_fast_tokens_plays_an_episode_from_its_checkpoint(tmp_path: Path) -> None:
     model = make_fast(chunk=4)
-    trainer = make_trainer(3, Averaging(0.9))
+    trainer = make_trainer(3)
     trainer.fit(make_learner(model), loader(make_batch(2, chunk=4), 3))
     trainer.save_checkpoint(tmp_path / "fast.ckpt")
     restored = make_decoder(chunk=4, tokenizer=Fast(bins=256, chunk=4, spec=SPEC))
