@@ -101,10 +101,6 @@ class Ear:
             return 0.0
         return float(np.abs(np.subtract(self.states[-1].position, self.states[-2].position)).max())
 
-    def sees_it_stand(self) -> bool:
-        """Whether the joints stayed where they were over the newest ten joint states."""
-        return len(self.states) >= 10 and np.ptp([state.position for state in self.states[-10:]], axis=0).max() < 1e-3
-
     def close(self) -> None:
         """Stop listening."""
         self._executor.shutdown()
@@ -159,8 +155,10 @@ def test_when_the_agent_is_killed_the_simulator_holds_the_arm(
     ear.say("put the red block on the pad")
     ear.until(lambda: ear.moved() > 1e-3)
     agent.kill()
-    ear.states.clear()
-    ear.until(ear.sees_it_stand, 10.0)
+    ear.listen(0.5)
+    heard = len(ear.states)
+    ear.until(lambda: len(ear.states) >= heard + 35)  # 0.7 s for the simulator, however busy the machine is
+    assert ear.moved() < 1e-3
 
 
 @pytest.mark.realtime
