@@ -4,187 +4,31 @@ from __future__ import annotations
 
 import itertools
 import os
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-import rclpy
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticStatus
 from lifecycle_msgs.msg import Transition
-from lifecycle_msgs.srv import ChangeState, GetState
-from rclpy.context import Context
-from rclpy.executors import SingleThreadedExecutor
+from lifecycle_msgs.srv import GetState
 from rclpy.parameter import Parameter
-from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import Image, JointState
-from std_msgs.msg import Float64MultiArray, String
+from std_msgs.msg import Float64MultiArray
 from std_srvs.srv import Trigger
-from test_session import FORWARD, HOME, ROBOT, SPEC
-from trajectory_msgs.msg import JointTrajectory
+from test_session import HOME, ROBOT
+from world import World
 
-from vla.deploy import messages
-from vla.deploy.agent import Agent
-from vla.deploy.ros import NETWORKS, Network
-from vla.deploy.ros2 import Ros2, Topics
+from vla.deploy.ros import NETWORKS
 from vla.deploy.session import State
-from vla.spec import Array, Observation
 
 pytestmark = pytest.mark.realtime
 
 FROZEN = Time(sec=5, nanosec=5)
-TOPICS = Topics({"front": "/front", "wrist": "/wrist"}, "/joint_states", "/words", "/commands", "/gripper")
-KINDS = {"joint_state": JointState, "trajectory": JointTrajectory, "forward": Float64MultiArray}
 WORKER = int(os.environ.get("PYTEST_XDIST_WORKER", "gw0").removeprefix("gw"))
 domains = itertools.count(1 + 20 * (WORKER % 5))
-
-
-class Forward:
-    """A policy that always goes on, and remembers what it was shown."""
-
-    spec = SPEC
-
-    def __init__(self) -> None:
-        self.seen: list[Observation] = []
-        self.fails, self.takes = False, 0.0
-
-    def reset(self, instruction: str, seed: int) -> None:
-        """Forget nothing: there is nothing to forget."""
-
-    def plan(self, observation: Observation) -> Array:
-        """One centimetre along x."""
-        self.seen.append(observation)
-        time.sleep(self.takes)
-        if self.fails:
-            raise RuntimeError("no idea")
-        return FORWARD
-
-
-class World:
-    """Cameras, an arm that does what it is told, and a person; the agent lives in the same thread."""
-
-    def __init__(self, domain: int, command: Any, arguments: list[str]) -> None:
-        Network("SYSTEM_DEFAULT", "loopback").apply()
-        self.contexts = [Context(), Context()]
-        for context, given in zip(self.contexts, (arguments, None), strict=True):
-            rclpy.init(args=given, context=context, domain_id=domain)
-        self.policy = Forward()
-        nothing: Any = None
-        self.settings = Ros2(
-            robot=ROBOT,
-            network=Network("SYSTEM_DEFAULT"),
-            topics=TOPICS,
-            command=command,
-            policy=nothing,
-            environment=nothing,
-            output=Path(),
-        )
-        self.agent = Agent(self.policy, self.settings, context=self.contexts[0])  # type: ignore[arg-type]
-        self.node = rclpy.create_node("world", context=self.contexts[1])
-        self.executors = [SingleThreadedExecutor(context=context) for context in self.contexts]
-        for executor, node in zip(self.executors, (self.agent, self.node), strict=True):
-            executor.add_node(node)
-        self.images = {camera: self.node.create_publisher(Image, f"/{camera}", 1) for camera in SPEC.cameras}
-        self.states = self.node.create_publisher(JointState, "/joint_states", 1)
-        self.words = self.node.create_publisher(String, "/words", 1)
-        self.commands: list[Any] = []
-        self.node.create_subscription(KINDS[command], "/commands", self.commands.append, 100)
-        self.statuses: list[DiagnosticStatus] = []
-        self.node.create_subscription(DiagnosticStatus, "/vla_agent/status", self.statuses.append, 100)
-        self.joints = HOME.copy()
-        self.cameras, self.feels = list(SPEC.cameras), True
-        self.changed: Callable[[Image], None] = lambda image: None
-        self.clock = self.node.create_publisher(Clock, "/clock", 1)
-        self.simulated: float | None = None  # time [s], where it is
-
-    def spin(self, until: Callable[[], Any], seconds: float = 10.0) -> None:
-        """Let both sides live until something holds."""
-        give_up = time.monotonic() + seconds
-        while not until():
-            assert time.monotonic() < give_up, f"state {self.agent.session and self.agent.session.state}"
-            for executor in self.executors:
-                executor.spin_once(timeout_sec=0.001)
-
-    def _spin_for(self, seconds: float) -> None:
-        end = time.monotonic() + seconds
-        self.spin(lambda: time.monotonic() >= end)
-
-    def live(self, seconds: float, until: Callable[[], Any] = lambda: False) -> None:
-        """The world goes on, images at 10 Hz and joint states at 50 Hz, for so long or until something holds."""
-        end, tick = time.monotonic() + seconds, 0
-        while time.monotonic() < end and not until():
-            if self.simulated is not None:
-                self.simulated += 0.02
-                self.clock.publish(Clock(clock=self._now()))
-            if self.feels:
-                if self.commands and isinstance(self.commands[-1], JointState):
-                    self.joints = np.array(self.commands[-1].position[:7])
-                self.states.publish(joint_state(self.joints))
-            if tick % 5 == 0:
-                for camera in self.cameras:
-                    image = messages.fill_image(Image(), np.zeros((8, 8, 3), np.uint8), camera)
-                    image.header.stamp = self._now()
-                    self.changed(image)
-                    self.images[camera].publish(image)
-            tick += 1
-            self._spin_for(0.02)
-
-    def _now(self) -> Time:
-        if self.simulated is None:
-            return self.node.get_clock().now().to_msg()
-        seconds, rest = divmod(self.simulated, 1.0)
-        return Time(sec=int(seconds), nanosec=int(rest * 1e9))
-
-    def ask(self, kind: Any, name: str, request: Any) -> Any:
-        """What a service of the agent answers."""
-        client = self.node.create_client(kind, f"/vla_agent/{name}")
-        self.spin(client.service_is_ready)
-        answer = client.call_async(request)
-        self.spin(answer.done)
-        return answer.result()
-
-    def change(self, transition: int) -> bool:
-        """Ask for a change of the lifecycle's state."""
-        request = ChangeState.Request(transition=Transition(id=transition))
-        return bool(self.ask(ChangeState, "change_state", request).success)
-
-    def start(self) -> None:
-        """Configure, activate, connect, and give the word."""
-        assert self.change(Transition.TRANSITION_CONFIGURE) and self.change(Transition.TRANSITION_ACTIVATE)
-        everybody = [*self.images.values(), self.states, self.words]
-        self.spin(lambda: all(publisher.get_subscription_count() for publisher in everybody))
-        self.live(2.0, until=lambda: self.commands)
-        self.words.publish(String(data="put the red block on the pad"))
-        self.live(2.0, until=lambda: self.policy.seen[-1].instruction)
-        self.live(0.1)
-
-    def becomes(self, state: State) -> bool:
-        """Whether the agent gets there, within some seconds of the world's life."""
-        self.live(5.0, until=lambda: self.state is state)
-        return self.state is state
-
-    @property
-    def state(self) -> State:
-        """What the agent is doing."""
-        assert self.agent.session is not None
-        return self.agent.session.state
-
-    def close(self) -> None:
-        """End both sides."""
-        for executor, node in zip(self.executors, (self.agent, self.node), strict=True):
-            executor.remove_node(node)
-            executor.shutdown()
-            node.destroy_node()
-        for context in self.contexts:
-            rclpy.try_shutdown(context=context)
-
-
-def joint_state(joints: Array) -> JointState:
-    names = [*reversed(ROBOT.joints), *ROBOT.fingers, "of_somebody_else"]
-    return JointState(name=names, position=[*joints[::-1].tolist(), 0.04, 0.04, 1.0])
 
 
 @pytest.fixture

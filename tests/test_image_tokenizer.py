@@ -60,7 +60,21 @@ def test_keypoints_say_where_they_look_and_what_is_there() -> None:
     features[0, :, 1, 4] = torch.tensor([100.0, 7.0])
     keypoints = Keypoints(2, 1)
     keypoints.score.weight.data = torch.tensor([[1.0, 0.0]])
+    keypoints.contrast.data.fill_(3.0)
     assert keypoints(features).flatten().tolist() == pytest.approx([4.0, -2.0, 100.0, 7.0])  # x right, y down
+
+
+def test_keypoints_look_as_closely_at_a_faint_image_and_none_at_everything_alike() -> None:
+    torch.manual_seed(0)
+    keypoints, features = Keypoints(16, 32), torch.randn(4, 16, 24, 24)
+    places = keypoints(features)[..., :2]
+    assert torch.allclose(keypoints(7 + 0.01 * features)[..., :2], places, atol=1e-3)
+    assert (places.std(0).mean(-1) > 0.1).all()  # of flat attention 0.0
+
+
+def test_keypoints_of_an_image_of_one_colour_are_its_middle() -> None:
+    places = Keypoints(3, 5)(torch.full((1, 3, 4, 6), 0.7))[..., :2]
+    assert torch.allclose(places, torch.zeros(1, 5, 2), atol=1e-5)
 
 
 def test_a_clip_is_shifted_as_one_and_clips_differ() -> None:

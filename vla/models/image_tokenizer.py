@@ -14,6 +14,8 @@ from torch import Tensor, nn
 
 SPREAD = 4.0  # of the positions of keypoints: wide, as a hundredth of the image makes the difference
 DARK = 0.1  # of a brightness up to 3: colours darker than that say little
+CONTRAST = 2.0  # standard deviation that the scores of a keypoint start with: of 576 positions, a few count
+FLAT = 1e-3  # standard deviation below which scores say nothing
 
 
 class FiLM(nn.Module):
@@ -58,6 +60,8 @@ class ImageEncoder(nn.Module, ABC):
 class FilmConv(ImageEncoder):
     """A few convolutions, each followed by FiLM; made to train on a CPU.
 
+    Their nonlinearity lets every channel learn again, where of so few without normalisation ReLU kills most for good.
+
     Args:
         channels: output channels, one per convolution.
         kernels: kernel sizes, one per convolution [px].
@@ -95,9 +99,9 @@ class FilmConv(ImageEncoder):
         x = self.convs[0]((images - 0.5).mul_(4 * scale))  # about unit variance
         if self.chroma is not None:
             x = x + self.chroma(_relative(images).mul_(6 * scale))
-        x = F.relu_(self.films[0](x, text))
+        x = F.silu(self.films[0](x, text))
         for conv, film in zip(self.convs[1:], self.films[1:], strict=True):
-            x = F.relu_(film(conv(x), text))
+            x = F.silu(film(conv(x), text))
         return x
 
 
@@ -137,6 +141,9 @@ class Keypoints(nn.Module):
 
     Each comes with the features found there, weighted alike: a position alone does not say how a thing is turned.
 
+    The scores under the softmax are given the same standard deviation over every image, learned for each keypoint: else
+    most attend to everything alike, which sends no gradient, from the first day to the last.
+
     Args:
         channels: C of the feature map.
         keypoints: M.
@@ -146,13 +153,18 @@ class Keypoints(nn.Module):
         super().__init__()
         self.width = 2 + channels
         self.score = nn.Linear(channels, keypoints, bias=False)
-        nn.init.normal_(self.score.weight, std=1.0)  # attention that starts flat sends no gradient
+        self.contrast = nn.Parameter(torch.full((keypoints,), math.log(CONTRAST)))
 
     def forward(self, features: Tensor) -> Tensor:
         """(N, C, h, w) features to (N, M, 2 + C): positions x, y in -SPREAD … SPREAD, and features."""
         values = features.flatten(2)  # (N, C, h·w)
-        # One product per image, as that of all at once is copied into the order of the softmax.
-        weights = torch.bmm(self.score.weight.expand(len(values), -1, -1), values).softmax(-1)  # (N, M, h·w)
+        centred = values - values.mean(-1, keepdim=True)
+        # The deviation of the scores follows from the covariance of the few channels, at a fraction of what it would
+        # cost to go over the scores. One product per image, as that of all at once is copied into the softmax's order.
+        covariance = torch.bmm(centred, centred.mT) / values.shape[-1]
+        variance = (self.score.weight @ covariance * self.score.weight).sum(-1, keepdim=True)  # (N, M, 1)
+        query = self.score.weight * self.contrast.exp()[:, None] / variance.clamp(min=FLAT**2).sqrt()
+        weights = torch.bmm(query, centred).softmax(-1)  # (N, M, h·w)
         places = (SPREAD * grid(features)).expand(len(values), -1, -1)
         return torch.bmm(weights.float(), torch.cat([places, values.mT.float()], -1))
 
