@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import gc
 import os
+import signal
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -23,6 +24,9 @@ CONF = Path(__file__).parents[1] / "conf"
 for name, threads in THREAD_SETTINGS.items():
     os.environ.setdefault(name, threads)
 choose_backend()
+
+# What a shell runs in the background ignores interrupts, and so would the programs that tests start and interrupt.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def pytest_collection_finish() -> None:
