@@ -60,7 +60,7 @@ class ImageEncoder(nn.Module, ABC):
 class FilmConv(ImageEncoder):
     """A few convolutions, each followed by FiLM; made to train on a CPU.
 
-    Their nonlinearity lets every channel learn again, where of so few without normalisation ReLU kills most for good.
+    With SiLU, since ReLU left most of so few channels dead, which nothing here normalises.
 
     Args:
         channels: output channels, one per convolution.
@@ -142,7 +142,7 @@ class Keypoints(nn.Module):
     Each comes with the features found there, weighted alike: a position alone does not say how a thing is turned.
 
     The scores under the softmax are given the same standard deviation over every image, learned for each keypoint: else
-    most attend to everything alike, which sends no gradient, from the first day to the last.
+    most end up attending to everything alike, which sends no gradient.
 
     Args:
         channels: C of the feature map.
