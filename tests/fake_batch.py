@@ -66,6 +66,7 @@ def make_bc(
     image: Callable[..., Any] = TINY_IMAGE,
     text: Callable[..., Any] = TINY_TEXT,
     shift: tuple[float, float] = (0, 0),
+    spec: Spec = SPEC,
 ) -> BC:
     """A small BC."""
     return BC(
@@ -77,8 +78,8 @@ def make_bc(
         width=64,
         shift=shift,
         auxiliary=auxiliary,
-        spec=SPEC,
-        tokenizer=Uniform(bins=64, spec=SPEC),
+        spec=spec,
+        tokenizer=Uniform(bins=64, spec=spec),
     )
 
 

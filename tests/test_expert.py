@@ -57,6 +57,25 @@ def test_a_grasp_that_is_made_to_miss_is_made_good(tabletop: Tabletop) -> None:
     assert (episode.executed[beside, 6] == 0).all()
 
 
+def test_a_slow_episode_executes_a_share_of_its_motions_and_labels_the_whole(tabletop: Tabletop) -> None:
+    quiet = Perturbation(start=0.0, noise=0.0, rate=0.0, unturned=0.0, missed=0.0)
+    slow = Perturbation(start=0.0, noise=0.0, rate=0.0, unturned=0.0, missed=0.0, pace=(0.4, 0.5))
+    with tabletop.blind():
+        at_once, slowly = (rollout(tabletop, Waypoint(tabletop.spec, each), 3) for each in (quiet, slow))
+    assert slowly.success and len(slowly.actions) > 1.3 * len(at_once.actions)
+    np.testing.assert_array_equal(slowly.actions[0], at_once.actions[0])
+    moved = np.abs(slowly.actions[:, :6]) > 1e-4
+    shares = slowly.executed[:, :6][moved] / slowly.actions[:, :6][moved]
+    assert shares.min() >= 0.4 and shares.max() <= 0.5 and np.ptp(shares) < 1e-3
+    np.testing.assert_array_equal(slowly.executed[:, 6], slowly.actions[:, 6])
+
+
+@pytest.mark.parametrize("pace", [(0.5,), (0.0, 1.0), (1.0, 0.5)])
+def test_a_pace_that_is_none_is_named(pace: tuple[float, ...]) -> None:
+    with pytest.raises(ValueError, match=r"expert\.perturb\.pace=.* must be two shares above 0"):
+        Perturbation(pace=pace)
+
+
 def test_labels_depend_on_the_state_alone(tabletop: Tabletop) -> None:
     """A fresh expert, shown a state from the middle of an episode, says what the one that lived through it said."""
     with tabletop.blind():

@@ -27,6 +27,7 @@ SPEC = Spec(
     frame="base",
     control_hz=10.0,
     truth=(("target", 2), ("point", 2)),
+    chain=tuple((0.0, 0.0, 0.1, 1.0, float(number % 2), 0.0, 0.0) for number in range(8)),
 )
 
 EPISODES = 30  # of `make_store`

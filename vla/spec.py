@@ -7,7 +7,7 @@ file and never each other.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import MISSING, asdict, dataclass, fields, replace
 from typing import Any, Literal, Protocol
 
 import numpy as np
@@ -31,6 +31,9 @@ class Spec:
     frame: str  # frame in which Cartesian actions are expressed
     control_hz: float  # [Hz]
     truth: tuple[tuple[str, int], ...] = ()  # simulator state kept as an auxiliary training target: name, size
+    # (J + 1, 7) where the frame of each joint, which turns about its z axis, and last that of the tool lies in the
+    # frame before: offset [m], quaternion wxyz; nothing where it is not known
+    chain: tuple[tuple[float, ...], ...] = ()
 
     @property
     def truth_size(self) -> int:
@@ -48,21 +51,25 @@ class Spec:
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> Spec:
-        """The inverse of `to_dict`.
+        """The inverse of `to_dict`; fields that have a default may be missing.
 
         Raises:
             ValueError: a field is missing or unknown.
         """
         names = {field.name for field in fields(cls)}
-        if set(values) != names:
+        optional = {field.name for field in fields(cls) if field.default is not MISSING}
+        if not names - optional <= set(values) <= names:
             raise ValueError(f"a spec has the fields {sorted(names)}, this one has {sorted(values)}")
         return cls(**{name: _tuples(value) for name, value in values.items()})
 
     def require(self, other: Spec, what: str, against: str) -> None:
-        """Raise a ValueError naming the first field in which the spec of `what` (self) differs from `against`."""
+        """Raise a ValueError naming the first field in which the spec of `what` (self) differs from `against`.
+
+        A chain that one of them does not know is no difference.
+        """
         for field in fields(self):
             mine, theirs = getattr(self, field.name), getattr(other, field.name)
-            if mine != theirs:
+            if mine != theirs and not (field.name == "chain" and () in (mine, theirs)):
                 raise ValueError(f"{what} has {field.name} = {mine}, but {against} has {theirs}")
 
 

@@ -13,6 +13,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from vla.models.action_tokenizer import ActionTokenizer, PerComponent
+from vla.models.kinematics import ForwardKinematics
 from vla.models.sharding import summed
 from vla.models.text import TextEncoder
 from vla.spec import Spec
@@ -114,19 +115,21 @@ class Model(nn.Module, ABC):
         self.history, self.chunk, self.auxiliary = history, chunk, auxiliary
         self.execute = chunk
         self.spec, self.tokenizer, self.text = spec, tokenizer, text
-        self.posture_width = len(spec.joints) + 1
+        self.kinematics = ForwardKinematics(spec.chain) if spec.chain else None
+        self.posture_width = len(spec.joints) + 1 + (ForwardKinematics.WIDTH if spec.chain else 0)
         self.truth_head: nn.Linear | None = None
         if auxiliary > 0 and spec.truth_size > 0:
             self.truth_head = nn.Linear(truth_width, spec.truth_size)
             self.truth_scale = Standardize(spec.truth_size)
 
     def posture(self, batch: Batch) -> Tensor:
-        """(B, T, posture_width) joint positions and gripper opening.
+        """(B, T, posture_width) joint positions, gripper opening and, where the chain is known, pose of the tool.
 
         Without velocities: a learner that sees them learns that an arm at rest stays at rest.
         """
-        joints = len(self.spec.joints)
-        return torch.cat([batch["proprio"][..., :joints], batch["proprio"][..., 2 * joints :]], -1)
+        count = len(self.spec.joints)
+        joints, rest = batch["proprio"][..., :count], batch["proprio"][..., 2 * count :]
+        return torch.cat([joints, rest] if self.kinematics is None else [joints, rest, self.kinematics(joints)], -1)
 
     def encode(self, batch: Batch) -> Tensor | None:
         """What of each frame can be kept while a window moves on, (B, T, N, E); None for a model that keeps nothing.

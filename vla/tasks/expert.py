@@ -172,6 +172,7 @@ class Perturbation:
         closed: float = 0.3,
         unturned: float = 0.3,
         missed: float = 0.1,
+        pace: Sequence[float] = (1.0, 1.0),
         low: Sequence[float] = (0.34, -0.26, 0.015),
         high: Sequence[float] = (0.66, 0.26, 0.34),
     ) -> None:
@@ -184,16 +185,24 @@ class Perturbation:
         closed: probability that an excursion commands a closed gripper.
         unturned: probability that an episode carries no turn out, so that blocks are also held by their edges.
         missed: probability that a grasp is made to miss: the gripper closes a few centimetres beside the block.
+        pace: least and largest share of its motions that an episode executes: a slow one shows more of the last
+            centimetres, where a learner that is not quite there comes to rest.
         low: lower corner of the box of points to go to, in the base frame [m].
         high: upper corner.
+
+        Raises:
+            ValueError: the pace is not two shares above 0.
         """
+        if len(pace) != 2 or not 0 < pace[0] <= pace[1]:
+            raise ValueError(f"expert.perturb.pace={list(pace)} must be two shares above 0, the smaller one first")
         self._start, self._start_steps, self._rate, self._steps = start, tuple(start_steps), rate, tuple(steps)
         self._noise, self._closed, self._unturned, self._missed = noise, closed, unturned, missed
-        self._low, self._high = np.array(low), np.array(high)
+        (self._slowest, self._fastest), self._low, self._high = pace, np.array(low), np.array(high)
 
     def reset(self, seed: int) -> None:
-        """Draw whether and where this episode starts off."""
+        """Draw how fast, whether and where this episode starts off."""
         self._random = np.random.default_rng([seed, 0x5EED])
+        self._pace = np.random.default_rng([seed, 0xACE]).uniform(self._slowest, self._fastest)
         self._left, self._open = 0, True
         self._turns = self._random.uniform() >= self._unturned
         if self._random.uniform() < self._start:
@@ -220,6 +229,6 @@ class Perturbation:
             action[:3] = self._point - commanded[:3, 3]
             action[5], action[6] = self._turn, self._gripper
             return action
-        action[:6] *= 1 + self._noise * self._random.standard_normal(6)
+        action[:6] *= self._pace * (1 + self._noise * self._random.standard_normal(6))
         action[5] *= self._turns
         return action

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Literal
@@ -84,6 +85,12 @@ DARK = (0.22, 0.23, 0.25, 1.0)
 # Robot geometry collides with the world but not with itself.
 ROBOT_CONTACT = {"contype": 2, "conaffinity": 1}
 NO_CONTACT = {"contype": 0, "conaffinity": 0}
+
+# Where each joint's frame, and last the tool's, lies in the one before: offset [m] and quaternion wxyz.
+CHAIN = (
+    *((*map(float, link["pos"]), *map(float, link["quat"])) for link in LINKS),
+    (0.0, 0.0, FLANGE_TO_HAND + HAND_TO_TCP, math.cos(HAND_YAW / 2), 0.0, 0.0, math.sin(HAND_YAW / 2)),
+)
 
 
 def mesh_folder() -> Path:

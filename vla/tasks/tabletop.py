@@ -10,7 +10,7 @@ import dm_env
 import numpy as np
 
 from vla.spec import Array, Observation, Shape, Spec
-from vla.tasks.franka import FINGER_TRAVEL
+from vla.tasks.franka import CHAIN, FINGER_TRAVEL
 from vla.tasks.goals.goal import Goal
 from vla.tasks.goals.mixed import Mixed
 from vla.tasks.randomize.axis import Axis
@@ -69,6 +69,7 @@ class Tabletop:
             frame="panda_link0",
             control_hz=CONTROL_HZ,
             truth=(("tcp", 3), ("block", 3), ("destination", 3), ("faces", 2)),
+            chain=CHAIN,
         )
         task = TabletopTask(
             goal, randomize, Scene(blocks=blocks, meshes=meshes, shadows=shadows), low, high, time_limit
