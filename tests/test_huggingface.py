@@ -121,6 +121,8 @@ def test_a_text_tower_is_read_where_it_was_trained_to_be(name: str, tmp_path: Pa
     assert not any("vision" in key for key in encoder.get_extra_state()["weights"])
     again = HuggingFace(width=8)
     again.load_state_dict(encoder.state_dict())
+    weights, loaded = (each.get_extra_state()["weights"] for each in (encoder, again))
+    assert weights.keys() == loaded.keys() and all(torch.equal(weights[key], loaded[key]) for key in weights)
     assert torch.allclose(again.tokenize(SENTENCES), encoder.tokenize(SENTENCES), atol=1e-6)
 
 

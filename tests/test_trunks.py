@@ -61,8 +61,10 @@ def test_at_the_start_a_feature_map_is_that_of_the_network(name: str, size: int 
             patches = expected[:, plain.num_prefix_tokens :]
             h = round(patches.shape[1] ** 0.5)
             expected = patches.mT.unflatten(-1, (h, h))
-        # Not bit for bit: on some processors the attention of a ViT depends on where its memory happens to lie.
-        assert torch.allclose(ours(images, torch.randn(2, 4)), ours.projection(expected), atol=1e-5)
+        features = ours(images, torch.randn(2, 4))
+        # On some processors the last bits of a ViT's attention depend on where its memory happens to lie.
+        bound = 1e-6 if "vit" in name else 0
+        torch.testing.assert_close(features, ours.projection(expected), atol=bound, rtol=bound)
         smaller = ours(torch.rand(2, 3, 24, 20), torch.randn(2, 4))  # resized first
         assert smaller.shape == (2, 8, *expected.shape[-2:])
 
