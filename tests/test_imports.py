@@ -27,6 +27,7 @@ PARTS = {
     "vla.rollout": ("vla.spec",),
     "vla.record": ("vla.spec",),
     "vla.workers": (),
+    "vla.ending": (),
     "vla.cluster": ("vla.workers",),
     "vla.collect": ("vla.spec", "vla.rollout", "vla.data", "vla.cluster"),
     "vla.evaluate": ("vla.spec", "vla.rollout", "vla.record", "vla.workers"),

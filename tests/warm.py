@@ -1,8 +1,7 @@
 """Programs in processes of their own that begin with the heavy libraries loaded, which else takes most of their time: a
 process that has imported them and done nothing else forks for every one.
 
-MuJoCo is not among them: importing it opens the display, which does not survive a fork. When they end they do not free
-what they began with, which would take longer than most of what they do.
+MuJoCo is not among them: importing it opens the display, which does not survive a fork.
 """
 
 from __future__ import annotations
@@ -22,10 +21,10 @@ from socket import create_server
 from tempfile import TemporaryDirectory
 from typing import Any
 
+from vla.ending import swift_end
 from vla.tasks.backend import choose_backend
 
 PATIENCE = 300  # [s]
-status = 0  # with which this process ends
 
 Meanwhile = Callable[[int], None]  # is given the process
 
@@ -89,7 +88,6 @@ def _source() -> subprocess.Popen[str]:
 
 def _become(order: dict[str, Any]) -> None:
     """Turn this process into the one that was ordered."""
-    global status
     signal.alarm(PATIENCE)  # ends it
     os.chdir(order["folder"])
     os.environ.clear()
@@ -100,20 +98,7 @@ def _become(order: dict[str, Any]) -> None:
         os.close(opened)
     sys.argv[1:] = order["arguments"]
     sys.path.insert(0, order["folder"])
-    status = 1
-    try:
-        runpy.run_module(order["program"], run_name="__main__", alter_sys=True)
-        status = 0
-    except SystemExit as end:
-        status = end.code if isinstance(end.code, int) else int(end.code is not None)
-        raise
-
-
-def _end() -> None:
-    """The last thing that is done at exit."""
-    sys.stdout.flush()
-    sys.stderr.flush()
-    os._exit(status)
+    runpy.run_module(order["program"], run_name="__main__", alter_sys=True)
 
 
 def _codes(processes: list[int]) -> list[int]:
@@ -130,7 +115,6 @@ def _codes(processes: list[int]) -> list[int]:
 
 def main() -> None:
     """Load the libraries; then, for every line of standard input, fork and tell the processes, then how they ended."""
-    atexit.register(_end)  # before the libraries register what they do at exit, and so after it
     choose_backend()
     import lightning
     import matplotlib.figure
@@ -156,4 +140,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    with swift_end():
+        main()

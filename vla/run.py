@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gc
 import os
 import re
 import sys
@@ -21,6 +20,7 @@ from yaml import YAMLError
 
 from vla.check import JOBS, check, suggestion
 from vla.deploy import ros
+from vla.ending import swift_end
 from vla.resume import adopt, go_on
 from vla.sweep import failures, note_failure
 
@@ -183,10 +183,8 @@ def main() -> None:
         sys.exit(130)
     except Exception as error:
         _end(error)
-    finally:
-        # Python ends by looking through all that was imported for what could be freed, which takes up to two seconds.
-        gc.freeze()
 
 
 if __name__ == "__main__":
-    main()
+    with swift_end():
+        main()
