@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -24,6 +25,8 @@ from toy import SPEC, ToyEnvironment, ToyExpert
 from vla.check import build
 from vla.data.episodes import EpisodeStore
 from vla.data.export import Files, unfinished
+from vla.data.lerobot import LeRobot
+from vla.data.packed import Packed
 from vla.rollout import rollout
 from vla.spec import Episode, Spec
 
@@ -104,6 +107,20 @@ def test_what_is_there_is_left_alone(tmp_path: Path) -> None:
     Files(folder).export(store)
     assert (folder / "episode_00001/step_0003/front/rgb_image.png").exists()
     assert (folder / "episode_00000/manifest.json").stat().st_mtime_ns == untouched
+
+
+@pytest.mark.parametrize("kind", [Files, LeRobot, Packed])
+def test_what_a_killed_export_left_beside_the_whole_one_is_removed(
+    kind: Callable[..., Files | LeRobot | Packed], tmp_path: Path
+) -> None:
+    store, _ = stored(tmp_path / "store")
+    folder = kind(tmp_path / "export", workers=1).export(store)
+    left = folder.with_name(".export.unfinished")
+    left.mkdir()
+    (left / "lock").touch()
+    before = content(folder)
+    kind(folder, workers=1).export(store)
+    assert not left.exists() and content(folder) == before
 
 
 def test_a_folder_with_other_episodes_is_refused(tmp_path: Path) -> None:

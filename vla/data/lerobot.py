@@ -65,11 +65,13 @@ class LeRobot:
         source = self._source(store)
         if not source["episodes"]:
             raise ValueError(f"{store.folder} holds no episodes yet: collect some first")
-        if _is_of(self._folder, source):
-            return self._folder
-        if self._folder.exists() and (not self._folder.is_dir() or any(self._folder.iterdir())):
-            raise ValueError(f"{self._folder} holds something else than these episodes: choose another export.folder")
         with unfinished(self._folder) as place:
+            if _is_of(self._folder, source):
+                return self._folder
+            if self._folder.exists() and (not self._folder.is_dir() or any(self._folder.iterdir())):
+                raise ValueError(
+                    f"{self._folder} holds something else than these episodes: choose another export.folder"
+                )
             draft = place / "dataset"
             if not _is_of(draft, source):
                 shutil.rmtree(draft, ignore_errors=True)

@@ -65,11 +65,13 @@ class Packed:
             raise ValueError(f"{store.folder} holds JPEG, which gets no better: pack the store that it was made of")
         tried = _tried(store)
         header = self._header(store, len(tried))
-        if _is_of(self._folder, header, tried):
-            return self._folder
-        if self._folder.exists() and (not self._folder.is_dir() or any(self._folder.iterdir())):
-            raise ValueError(f"{self._folder} holds something else than these episodes: choose another export.folder")
         with unfinished(self._folder) as place:
+            if _is_of(self._folder, header, tried):
+                return self._folder
+            if self._folder.exists() and (not self._folder.is_dir() or any(self._folder.iterdir())):
+                raise ValueError(
+                    f"{self._folder} holds something else than these episodes: choose another export.folder"
+                )
             draft = place / "store"
             shutil.rmtree(draft, ignore_errors=True)  # left by an export that was cut short
             draft.mkdir()
