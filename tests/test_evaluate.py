@@ -12,6 +12,7 @@ import toy_recordable as toy
 from rerun.chunk import RrdReader
 
 from vla.evaluate import FIRST_SEED, Report, Result, evaluate, keep_recordings, wilson_interval
+from vla.report import summary
 from vla.spec import Environment
 
 SEEDS = range(FIRST_SEED, FIRST_SEED + 10)
@@ -34,6 +35,24 @@ def test_wilson_interval_equals_values_worked_out_by_hand() -> None:
 def test_the_last_line_is_the_success_rate() -> None:
     report = results(*["success"] * 83, *["dropped"] * 17)
     assert str(report).splitlines() == ["dropped 17", "success 83/100 (83.0 %, 95 % CI 74.5-89.1)"]
+
+
+def test_several_goals_are_told_apart() -> None:
+    def asked(goal: str, *outcomes: str) -> list[Result]:
+        return [Result(FIRST_SEED, outcome, draws={"named": {"goal": goal}}) for outcome in outcomes]
+
+    push, lift = asked("Push", "success", "dropped", "error"), asked("Lift", "success", "success")
+    nothing = Result(FIRST_SEED, "error", error="ValueError: no scene")
+    report = Report((*push, *lift, nothing))
+    assert report.goals == {"Lift": Report(tuple(lift)), "Push": Report(tuple(push))}
+    assert str(report).splitlines()[-3:] == [
+        "Lift 2/2 (100.0 %, 95 % CI 34.2-100.0)",
+        "Push 1/2 (50.0 %, 95 % CI 9.5-90.5)",
+        "success 3/4 (75.0 %, 95 % CI 30.1-95.4)",
+    ]
+    assert summary(report)["goals"] == {"Lift": summary(report.goals["Lift"]), "Push": summary(report.goals["Push"])}
+    alone = Report(tuple(push))
+    assert "Push" not in str(alone) and summary(alone)["goals"] == {}
 
 
 def test_errors_are_neither_successes_nor_failures() -> None:

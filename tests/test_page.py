@@ -148,6 +148,18 @@ def test_words_of_others_are_escaped(tmp_path: Path) -> None:
     assert "<script" not in page.read_text() and "<nan>" not in page.read_text()
 
 
+def test_goals_have_their_own_rates_where_there_are_several(tmp_path: Path) -> None:
+    goals = ["Push", "Lift", "Lift"]
+    results = [Result(FIRST_SEED + n, "success", SAID, 20, {"named": {"goal": goal}}) for n, goal in enumerate(goals)]
+    for name, played in {"one": results[1:], "two": results}.items():
+        (tmp_path / name).mkdir()
+        write_report(Report(tuple(played)), tmp_path / name / "report.json", None, CONFIG)
+    assert "goal success [%] of Lift 100.0 (34.2-100.0) 2/2 Push 100.0 (20.7-100.0) 1/1" in text(
+        write_page(tmp_path / "two")
+    )
+    assert "Lift" not in text(write_page(tmp_path / "one"))
+
+
 def test_what_is_missing_is_left_out(tmp_path: Path) -> None:
     told = text(write_page(tmp_path))
     assert told.startswith(tmp_path.name)

@@ -104,15 +104,29 @@ class Report:
         """Outcome → episodes, the most frequent first."""
         return dict(Counter(result.outcome for result in self.results).most_common())
 
+    @property
+    def goals(self) -> dict[str, Report]:
+        """Goal → report on the episodes that asked for it, by name; an error before the first scene asked for none."""
+        asked: dict[str, list[Result]] = {}
+        for result in self.results:
+            if goal := result.draws.get("named", {}).get("goal"):
+                asked.setdefault(goal, []).append(result)
+        return {goal: Report(tuple(asked[goal])) for goal in sorted(asked)}
+
     def __str__(self) -> str:
-        """Failures, errors and, on the last line, the success rate with its interval."""
+        """Failures, errors, goals if there are several and, on the last line, the success rate with its interval."""
         lines = [f"{outcome} {count}" for outcome, count in self.taxonomy.items() if outcome not in ("success", ERROR)]
         if self.errors:
             first = self.errors[0]
             lines.append(f"errors {len(self.errors)}, the first at seed {first.seed}: {first.error}")
+        if len(self.goals) > 1:
+            lines += [f"{goal} {report._rate()}" for goal, report in self.goals.items()]
+        return "\n".join([*lines, f"success {self._rate()}"])
+
+    def _rate(self) -> str:
         low, high = self.interval
         share = f"{100 * self.success:.1f} %, 95 % CI {100 * low:.1f}-{100 * high:.1f}"
-        return "\n".join([*lines, f"success {self.successes}/{self.episodes} ({share})"])
+        return f"{self.successes}/{self.episodes} ({share})"
 
 
 def wilson_interval(successes: int, trials: int) -> tuple[float, float]:

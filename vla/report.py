@@ -58,8 +58,9 @@ def write_report(
 
 
 def summary(report: Report) -> dict[str, Any]:
-    """Rate, interval and outcomes of a report, fit for JSON."""
+    """Rate, interval and outcomes of a report, and of every goal if there are several, fit for JSON."""
     low, high = report.interval
+    goals = report.goals if len(report.goals) > 1 else {}
     return {
         "success": report.success,
         "ci_low": low,
@@ -69,6 +70,7 @@ def summary(report: Report) -> dict[str, Any]:
         "errors": len(report.errors),
         "taken": report.taken,
         "taxonomy": report.taxonomy,
+        "goals": {goal: summary(part) for goal, part in goals.items()},
     }
 
 
