@@ -141,6 +141,7 @@ def _plot_groups(axes: Axes, values: Sequence[Any], played: Sequence[Result]) ->
     groups = _groups(values)
     if _numbers(values):
         places = [float(np.mean([values[index] for index in group])) for group in groups]
+        axes.locator_params(axis="x", nbins=4)  # more would run into each other where numbers are long
     else:
         places = list(range(len(groups)))
         names = [str(values[group[0]]) for group in groups]
