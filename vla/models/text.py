@@ -52,7 +52,7 @@ class NGrams(TextEncoder):
     """
 
     def __init__(
-        self, vocabulary: int = 4096, words: int = 2, characters: int = 3, forget: float = 0.0, *, width: int
+        self, vocabulary: int = 4096, words: int = 3, characters: int = 3, forget: float = 0.0, *, width: int
     ) -> None:
         super().__init__(width)
         if not 0 <= forget < 1:
