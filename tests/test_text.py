@@ -7,6 +7,9 @@ import sys
 
 import pytest
 import torch
+from conftest import CONF
+from hydra.utils import instantiate
+from omegaconf import OmegaConf
 
 from vla.models.text import NGrams
 
@@ -33,6 +36,22 @@ def test_case_and_punctuation_do_not_matter_but_order_does() -> None:
     plain, loud, swapped = encoder.tokenize(["red on blue", "Red on BLUE!", "blue on red"])
     assert torch.equal(plain, loud)
     assert set(plain.tolist()) != set(swapped.tolist())
+
+
+SAID = {"block": "red", "other": "blue", "pad": "black", "rest": "white"}
+
+
+@pytest.mark.parametrize("goal", ["stack", "pick_place_two"])
+@pytest.mark.parametrize("pair", [("block", "other"), ("pad", "rest")])
+def test_which_block_belongs_where_can_be_told_from_every_phrasing(goal: str, pair: tuple[str, str]) -> None:
+    encoder = instantiate(OmegaConf.load(CONF / "model/text/ngrams.yaml"))(width=8)
+    language = OmegaConf.load(CONF / "task/goal" / f"{goal}.yaml").language
+    verbs = {slot: words[0] for slot, words in language.words.items()}
+    swapped = {**SAID, pair[0]: SAID[pair[1]], pair[1]: SAID[pair[0]]}
+    for phrasing in (*language.phrasings, *language.held_out_phrasings):
+        sentences = [phrasing.format(**verbs, **said) for said in (SAID, swapped)]
+        one, other = encoder.tokenize(sentences).tolist()
+        assert sentences[0] == sentences[1] or sorted(one) != sorted(other), sentences
 
 
 def test_related_words_share_tokens() -> None:

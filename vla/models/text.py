@@ -40,8 +40,8 @@ class TextEncoder(nn.Module, ABC):
 class NGrams(TextEncoder):
     """The mean of learned vectors, one for each hashed word and n-gram of the sentence; needs no download.
 
-    Words the training never saw still share n-grams of characters with known ones, and an n-gram of words tells
-    "red on blue" from "blue on red".
+    Words the training never saw still share n-grams of characters with known ones, and three words at a time tell "put
+    the red block on the blue block" from "put the blue block on the red block", which have the same pairs of words.
 
     Args:
         vocabulary: number of learned vectors; n-grams that hash to the same one share it.
