@@ -1,6 +1,6 @@
 """Make the README's pictures anew, with the README's commands: python docs/pictures.py RUN_FOLDER
 
-RUN_FOLDER is what a main job left, `outputs/runs/<time>`. The viewer is photographed without a display, for which it
+RUN_FOLDER is what an evaluation left, `outputs/runs/<time>`. The viewer is photographed without a display, for which it
 needs Vulkan: on Debian the packages libvulkan1 and mesa-vulkan-drivers. Pages are photographed by chromium.
 """
 
@@ -19,7 +19,7 @@ from rerun.experimental import ViewerClient
 from vla.record import VIEWER
 
 DOCS = Path(__file__).parent
-HEIGHT = 1670  # of the page, as far as it is shown [px]
+HEIGHT = 1800  # of the page, as far as it is shown [px]
 STEP = 12  # at which the rollout is shown: about to grasp
 
 
