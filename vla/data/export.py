@@ -137,6 +137,16 @@ def write_json(path: Path, value: Any) -> None:
     path.write_text(json.dumps(value, ensure_ascii=False, indent=1) + "\n", encoding="utf-8")
 
 
+def require_empty(folder: Path) -> None:
+    """Refuse to export to a folder that holds something.
+
+    Raises:
+        ValueError: it does, or it is a file.
+    """
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise ValueError(f"{folder} holds something else than these episodes: choose another export.folder")
+
+
 @contextmanager
 def unfinished(folder: Path) -> Iterator[Path]:
     """A hidden folder beside `folder` for what is not whole yet; it is removed at the end, and stays where that fails.

@@ -20,7 +20,7 @@ import pyarrow.parquet as pq
 
 from vla.data import lerobot_layout as layout
 from vla.data.episodes import EpisodeStore
-from vla.data.export import each, origin, unfinished, write_json
+from vla.data.export import each, origin, require_empty, unfinished, write_json
 from vla.data.moments import image_moments, moments
 from vla.data.video import encode
 from vla.spec import Array
@@ -68,10 +68,7 @@ class LeRobot:
         with unfinished(self._folder) as place:
             if _is_of(self._folder, source):
                 return self._folder
-            if self._folder.exists() and (not self._folder.is_dir() or any(self._folder.iterdir())):
-                raise ValueError(
-                    f"{self._folder} holds something else than these episodes: choose another export.folder"
-                )
+            require_empty(self._folder)
             draft = place / "dataset"
             if not _is_of(draft, source):
                 shutil.rmtree(draft, ignore_errors=True)

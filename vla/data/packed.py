@@ -14,7 +14,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 
 from vla.data.episodes import EpisodeStore, checksum
-from vla.data.export import each, unfinished
+from vla.data.export import each, require_empty, unfinished
 from vla.data.index import Entry, index_line
 from vla.data.pack import JPEG, OFFSET, ZLIB, pack
 from vla.spec import Array
@@ -68,10 +68,7 @@ class Packed:
         with unfinished(self._folder) as place:
             if _is_of(self._folder, header, tried):
                 return self._folder
-            if self._folder.exists() and (not self._folder.is_dir() or any(self._folder.iterdir())):
-                raise ValueError(
-                    f"{self._folder} holds something else than these episodes: choose another export.folder"
-                )
+            require_empty(self._folder)
             draft = place / "store"
             shutil.rmtree(draft, ignore_errors=True)  # left by an export that was cut short
             draft.mkdir()
