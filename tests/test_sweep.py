@@ -9,7 +9,8 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
-from vla.sweep import pareto, tabulate
+from vla.sweep import tabulate
+from vla.sweep_plot import pareto, validated
 
 
 def cell(sweep: Path, number: int, overrides: list[str], successes: int, latency: float = 2.0, dark: int = 1) -> None:
@@ -89,3 +90,17 @@ def test_over_the_number_of_demonstrations_success_is_a_curve_under_each_conditi
     cell(tmp_path / "one", 1, ["collect.episodes=70"], 5)
     tabulate(tmp_path / "one")
     assert wide == Image.open(tmp_path / "one/sweep.png").width  # two conditions, side by side
+
+
+def test_success_over_training_is_that_of_all_seeds_in_validation(tmp_path: Path) -> None:
+    for number, (count, seed) in enumerate([(50, 0), (50, 1), (100, 0), (100, 1)]):
+        cell(tmp_path, number, [f"collect.episodes={count}", f"seed={seed}"], 5)
+    few, many = tabulate(tmp_path)
+    without = Image.open(tmp_path / "sweep.png").height
+    assert validated(few) == {}
+    for seed, share in enumerate((0.25, 0.75)):
+        (tmp_path / f"{seed}/config.yaml").write_text("validate: {episodes: 20}")
+        (tmp_path / f"{seed}/metrics.csv").write_text(f"step,val/success\n699,{share - 0.25}\n1399,{share}\n")
+    assert validated(few) == {700: (10, 40), 1400: (20, 40)} and validated(many) == {}
+    tabulate(tmp_path)
+    assert Image.open(tmp_path / "sweep.png").height == 2 * without  # a row of its own

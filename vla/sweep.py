@@ -11,7 +11,7 @@ import os
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 from urllib.parse import quote
 
 from filelock import FileLock
@@ -19,9 +19,6 @@ from hydra.core.utils import JobReturn
 from hydra.experimental.callback import Callback
 from hydra.types import RunMode
 from omegaconf import DictConfig
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
 
 DEMONSTRATIONS = "collect.episodes"  # the override over which success is drawn
 SEED = "seed"  # the override that distinguishes the cells of one row
@@ -100,6 +97,8 @@ def tabulate(folder: Path) -> list[Row]:
     """Write the table of a sweep's folder, and return its rows; nothing is written where no cell has a report yet."""
     rows = read_rows(folder)
     if rows:
+        from vla.sweep_plot import plot
+
         _whole(folder / "sweep.csv", lambda path: _write_csv(rows, path))
         _whole(folder / "sweep.md", lambda path: path.write_text(markdown(rows), encoding="utf-8"))
         _whole(folder / "sweep.png", lambda path: plot(rows, path))
@@ -165,76 +164,6 @@ def markdown(rows: list[Row]) -> str:
         seeds = ", ".join(f"{100 * rate:.1f}" for rate in row.rates)
         lines.append([*row.choices.values(), *shares, seeds, f"{row.parameters / 1e6:.2f}", f"{row.latency:.1f}"])
     return "".join(f"| {' | '.join(line)} |\n" for line in lines)
-
-
-def plot(rows: list[Row], path: Path) -> None:
-    """Draw success over the number of demonstrations where that is what differs, else over the time of an action."""
-    from matplotlib.figure import Figure
-
-    curve = DEMONSTRATIONS in rows[0].choices
-    conditions = len(rows[0].successes) if curve else 1
-    figure = Figure(figsize=(8 if conditions == 1 else 6 * conditions, 5), layout="constrained")
-    if curve:
-        for axes, condition in zip(figure.subplots(1, conditions, squeeze=False)[0], rows[0].successes, strict=True):
-            _plot_curves(axes, rows, condition)
-    else:
-        _plot_costs(figure.add_subplot(), rows)
-    for axes in figure.axes:
-        axes.set_ylabel("success, 95 % CI")
-        axes.grid(alpha=0.3)
-        axes.spines[["top", "right"]].set_visible(False)
-    figure.savefig(path, dpi=110, format="png")
-
-
-def _plot_curves(axes: Axes, rows: list[Row], condition: str) -> None:
-    """Success under one condition over the number of demonstrations; rows with the same other choices share a line."""
-    lines: dict[str, list[Row]] = {}
-    for row in (row for row in rows if condition in row.successes):
-        others = " ".join(value for key, value in row.choices.items() if key != DEMONSTRATIONS)
-        lines.setdefault(others, []).append(row)
-    for name, line in lines.items():
-        line.sort(key=lambda row: int(row.choices[DEMONSTRATIONS]))
-        rates = [row.interval(condition) for row in line]
-        reach = [[rate - low for rate, low, _ in rates], [high - rate for rate, _, high in rates]]
-        counts = [int(row.choices[DEMONSTRATIONS]) for row in line]
-        axes.errorbar(counts, [rate for rate, _, _ in rates], reach, fmt="o-", capsize=3, label=name)
-    axes.set_xscale("log")
-    axes.set_xticks(sorted({int(row.choices[DEMONSTRATIONS]) for row in rows}))
-    axes.xaxis.set_major_formatter("{x:g}")
-    axes.xaxis.set_minor_formatter("")
-    axes.set_ylim(-0.02, 1.02)
-    axes.set_xlabel("demonstrations")
-    axes.set_title(condition, fontsize=10)
-    if len(lines) > 1:
-        axes.legend(frameon=False)
-
-
-def _plot_costs(axes: Axes, rows: list[Row]) -> None:
-    """Success over the time of an action; the area of a point grows with the parameters, and a line joins what nothing
-    else beats in both."""
-    axes.set_xscale("log")
-    for row in rows:
-        rate, low, high = row.seen
-        axes.errorbar(row.latency, rate, [[rate - low], [high - rate]], color="#8a8f98", capsize=3, zorder=1)
-        axes.scatter(row.latency, rate, s=40 + 60 * (row.parameters / 1e6) ** 0.5, color="#2e9e5b", alpha=0.8)
-        label = f"{row.name}, {row.parameters / 1e6:.2f} M"
-        axes.annotate(label, (row.latency, rate), (9, 5), textcoords="offset points", fontsize=9)
-    best = pareto(rows)
-    axes.plot([row.latency for row in best], [row.seen[0] for row in best], color="#2e9e5b", linewidth=0.8)
-    axes.margins(x=0.3)
-    axes.xaxis.set_major_formatter("{x:g}")
-    close = max(row.latency for row in rows) < 10 * min(row.latency for row in rows)
-    axes.xaxis.set_minor_formatter("{x:g}" if close else "")
-    axes.set_xlabel("time of an action [ms]")
-
-
-def pareto(rows: list[Row]) -> list[Row]:
-    """The rows that no faster one matches in success, fastest first."""
-    best: list[Row] = []
-    for row in sorted(rows, key=lambda row: (row.latency, -row.seen[0])):
-        if not best or row.seen[0] > best[-1].seen[0]:
-            best.append(row)
-    return best
 
 
 def _write_page(rows: list[Row], folder: Path) -> None:
