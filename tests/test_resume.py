@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import pytest
 import torch
 import toy
 from test_conf import composed
 
 from vla.parts import plain
 from vla.results import note_choice, note_training
-from vla.resume import go_on
+from vla.resume import go_on, taken_up
 
 
 def test_an_evaluation_that_was_interrupted_takes_what_the_training_had_chosen(tmp_path: Path) -> None:
@@ -28,3 +29,20 @@ def test_an_evaluation_that_was_interrupted_takes_what_the_training_had_chosen(t
     assert another.trainer.max_steps == now.trainer.max_steps
     now.job = "train"
     assert go_on(now, ["checkpoint=last", "job=train"]).checkpoint == str(run / "checkpoints/last.ckpt")
+
+
+@pytest.mark.parametrize("finished", [False, True])
+def test_a_training_is_taken_up_where_its_folder_has_it(tmp_path: Path, finished: bool) -> None:
+    asked = composed(f"output={tmp_path}")
+    assert taken_up(asked) is asked  # there is none yet
+    (tmp_path / "checkpoints").mkdir()
+    content = {"config": plain(asked), "spec": toy.SPEC.to_dict(), "state_dict": {}, "finished": finished}
+    torch.save(content, tmp_path / "checkpoints/last.ckpt")
+    asked.evaluate.workers = 1  # not what a training follows from
+    found = taken_up(asked)
+    assert found is not None
+    assert (found.checkpoint, found.resume) == (str(tmp_path / "checkpoints/last.ckpt"), not finished)
+    asked.job = "train"
+    assert (taken_up(asked) is None) == finished
+    with pytest.raises(ValueError, match=r"differs in model\.width: choose another output=DIR"):
+        taken_up(composed(f"output={tmp_path}", "model.width=17"))

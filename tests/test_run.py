@@ -106,6 +106,20 @@ def test_a_checkpoint_brings_its_task_and_model_and_takes_harder_scenes(home: Pa
     assert refused.stderr.count("\n") == 1 and "model=rt1_tiny" in refused.stderr
 
 
+def test_the_same_command_in_the_same_folder_does_nothing_twice(home: Path) -> None:
+    arguments = (*SMALL, "validate.episodes=1", "hydra.run.dir=run")
+    made = {home / "run" / name: (home / "run" / name).stat().st_mtime_ns for name in ("report.json", "metrics.csv")}
+    done = vla(home, *arguments, "output=run")
+    assert "nothing is trained anew" in done.stdout and "nothing is evaluated anew" in done.stdout
+    refused = vla(home, *arguments, "output=run", "learner.lr=1e-4", "trainer.max_steps=5", ok=False)
+    assert "run holds a training that differs in learner.lr, trainer.max_steps: choose" in refused.stderr
+    assert made == {path: path.stat().st_mtime_ns for path in made}
+    shutil.copytree(home / "run", home / "copy")
+    done = vla(home, *arguments, "output=copy", "evaluate.episodes=1")  # its evaluation is another
+    assert "nothing is trained anew" in done.stdout and "training BC" not in done.stdout
+    assert json.loads((home / "copy/report.json").read_text())["episodes"] == 1
+
+
 def test_runs_are_compared_in_one_page(home: Path) -> None:
     vla(home, "job=report", "report.runs=[run]", "output=compared")
     assert 'href="../run/report.html"' in (home / "compared/comparison.html").read_text()

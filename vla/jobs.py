@@ -82,7 +82,7 @@ def evaluate(config: DictConfig) -> float | None:
     Raises:
         ValueError: an episode could not be played to its end; the report, which is written, says why.
     """
-    from vla.resume import alone
+    from vla.resume import alone, reported
     from vla.train import trained
 
     output = output_folder(config)
@@ -90,6 +90,8 @@ def evaluate(config: DictConfig) -> float | None:
     if checkpoint is None:
         return None
     own = checkpoint.resolve().parent == (output / "checkpoints").resolve()
+    if own and (success := reported(config, checkpoint)) is not None:
+        return success
     with alone(checkpoint.parent) if own else nullcontext():  # checkpoint=last shall not take it for interrupted
         return _reported(config, checkpoint, output)
 

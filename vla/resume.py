@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import copy
+import logging
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from filelock import FileLock, Timeout
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
 from omegaconf import DictConfig, OmegaConf, open_dict
+
+log = logging.getLogger(__name__)
 
 LAST = "last.ckpt"
 LOCK = ".training"  # held by the process that trains into a folder of checkpoints
@@ -25,6 +28,12 @@ OF_TRAINING = (
 )
 # What a training's length and steps are, of a trainer.
 FAR = ("max_steps", "max_epochs", "val_check_interval", "accumulate_grad_batches", "gradient_clip_val")
+# What makes two trainings in one folder the same one.
+IDENTITY = (
+    *("task", "expert", "collect.episodes", "collect.seed", "data"),
+    *("tokenizer", "model", "learner", "validate", "seed"),
+    *(f"trainer.{name}" for name in (*FAR, "precision")),
+)
 # What the report on a policy says of its training.
 TOLD = ("expert", "collect", "data", "learner", "trainer", "validate", "seed")
 
@@ -98,6 +107,59 @@ def go_on(cfg: DictConfig, overrides: Sequence[str]) -> DictConfig:
     if last and saved.finished and resumed.job == "evaluate":
         resumed.checkpoint = str(path.with_name(run_of(path).training.get("checkpoint", path.name)))
     return resumed
+
+
+def taken_up(cfg: DictConfig) -> DictConfig | None:
+    """`cfg` with the checkpoint that its folder holds of the very training that it asks for, if there is one: to go on
+    from, or to evaluate what was chosen where that training came to its end; None if nothing is left to do.
+
+    Raises:
+        ValueError: the folder holds another training.
+    """
+    from vla.policy import read_checkpoint
+    from vla.results import differences, run_of
+
+    path = Path(cfg.output) / "checkpoints" / LAST
+    if cfg.checkpoint is not None or not path.exists():
+        return cfg
+    saved = read_checkpoint(path)
+    apart = [key for key, _, _ in differences(_identity(saved.config), _identity(_plain(cfg)))]
+    if apart:
+        raise ValueError(
+            f"{cfg.output} holds a training that differs in {', '.join(apart[:3])}{', …' if apart[3:] else ''}: choose "
+            f"another output=DIR, or hydra.sweep.dir=DIR of a sweep, or go on with it by checkpoint={path} resume=true"
+        )
+    found = copy.deepcopy(cfg)
+    found.resume = not saved.finished
+    found.checkpoint = str(path if found.resume else path.with_name(run_of(path).training.get("checkpoint", LAST)))
+    log.info("%s %s", "nothing is trained anew: there is" if saved.finished else "going on from", found.checkpoint)
+    return None if saved.finished and cfg.job == "train" else found
+
+
+def reported(cfg: DictConfig, checkpoint: Path) -> float | None:
+    """The success rate in the report that `cfg.output` holds, if that is of the same checkpoint, asked the same."""
+    from vla.results import REPORT, differences, read_run
+
+    report = read_run(Path(cfg.output)).report
+    if not report or report["errors"] or report["checkpoint"] != str(checkpoint):
+        return None
+    if {key for key, _, _ in differences(report["config"], _plain(cfg))} - {"checkpoint", "resume"}:
+        return None
+    log.info("nothing is evaluated anew: %s is of this very experiment", Path(cfg.output) / REPORT)
+    return float(report["success"])
+
+
+def _plain(cfg: DictConfig) -> dict[str, Any]:
+    return cast("dict[str, Any]", OmegaConf.to_container(cfg, resolve=True))
+
+
+def _identity(config: Mapping[str, Any]) -> dict[str, Any]:
+    """Key → value of what makes a training this one; None where the configuration does not have the key."""
+    values: dict[str, Any] = {}
+    for key in IDENTITY:
+        group, _, name = key.partition(".")
+        values[key] = config[group].get(name) if name else config[group]
+    return values
 
 
 def newest_interrupted(runs: Path) -> Path:

@@ -21,7 +21,7 @@ from yaml import YAMLError
 from vla.check import JOBS, check, suggestion
 from vla.deploy import ros
 from vla.ending import swift_end
-from vla.resume import adopt, go_on
+from vla.resume import adopt, go_on, taken_up
 from vla.sweep import failures, note_failure
 
 PACKAGE = Path(__file__).resolve().parent
@@ -121,7 +121,8 @@ def _do(cfg: DictConfig) -> float | None:
 
         choose_backend()  # before the check imports MuJoCo, which reads MUJOCO_GL at once
     check(cfg)
-    return jobs.run(cfg)
+    left = taken_up(cfg) if cfg.job in ("train", "evaluate") else cfg
+    return jobs.run(left) if left is not None else None
 
 
 def _fail(error: Exception) -> NoReturn:

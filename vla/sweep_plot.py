@@ -114,7 +114,7 @@ def _plot_costs(axes: Axes, rows: list[Row]) -> None:
         axes.annotate(label, (row.latency, rate), (9, 5), textcoords="offset points", fontsize=9)
     best = pareto(rows)
     axes.plot([row.latency for row in best], [row.seen[0] for row in best], color="#2e9e5b", linewidth=0.8)
-    axes.margins(x=0.3)
+    axes.set_xlim(0.6 * min(row.latency for row in rows), 2.5 * max(row.latency for row in rows))
     axes.xaxis.set_major_formatter("{x:g}")
     close = max(row.latency for row in rows) < 10 * min(row.latency for row in rows)
     axes.xaxis.set_minor_formatter("{x:g}" if close else "")
