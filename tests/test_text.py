@@ -10,6 +10,7 @@ import torch
 from conftest import CONF
 from hydra.utils import instantiate
 from omegaconf import OmegaConf
+from test_conf import composed
 
 from vla.models.text import NGrams
 
@@ -52,6 +53,20 @@ def test_which_block_belongs_where_can_be_told_from_every_phrasing(goal: str, pa
         sentences = [phrasing.format(**verbs, **said) for said in (SAID, swapped)]
         one, other = encoder.tokenize(sentences).tolist()
         assert sentences[0] == sentences[1] or sorted(one) != sorted(other), sentences
+
+
+def test_n_grams_of_many_goals_say_which_block_belongs_on_which_pad() -> None:
+    """In their mean, too, which cannot tell what has the same n-grams in both orders together."""
+    cfg = composed("experiment=multitask")
+    encoder = instantiate(cfg.model.text)(width=8)
+
+    def n_grams(phrasing: str, said: dict[str, str]) -> list[int]:
+        turned = dict(block=said["other"], other=said["block"], pad=said["rest"], rest=said["pad"])
+        rows = encoder.tokenize([phrasing.format(put="put", **words) for words in (said, turned)])
+        return sorted(rows.flatten().tolist())
+
+    for phrasing in cfg.task.goal.goals.pick_place_two.language.phrasings:
+        assert n_grams(phrasing, SAID) != n_grams(phrasing, {**SAID, "pad": SAID["rest"], "rest": SAID["pad"]})
 
 
 def test_related_words_share_tokens() -> None:
