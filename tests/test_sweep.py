@@ -57,6 +57,8 @@ def test_cells_that_failed_are_left_out_and_a_sweep_without_any_writes_nothing(t
     assert tabulate(tmp_path) == []
     assert not list(tmp_path.glob("sweep.*"))
     cell(tmp_path, 1, ["model=bc", "seed=0"], 9)
+    cell(tmp_path, 2, ["model=rt1", "seed=0"], 9)
+    (tmp_path / "2/error.txt").write_text("holds a training that differs in model")  # the report is of another sweep
     (row,) = tabulate(tmp_path)
     assert row.choices == {} and row.name == "all"
 

@@ -56,7 +56,7 @@ def test_which_block_belongs_where_can_be_told_from_every_phrasing(goal: str, pa
 
 
 def test_n_grams_of_many_goals_say_which_block_belongs_on_which_pad() -> None:
-    """In their mean, too, which cannot tell what has the same n-grams in both orders together."""
+    """In a weighted sum of them, too, which cannot tell what has the same n-grams in both orders together."""
     cfg = composed("experiment=multitask")
     encoder = instantiate(cfg.model.text)(width=8)
 

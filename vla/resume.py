@@ -7,12 +7,15 @@ import logging
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any, cast
 
 from filelock import FileLock, Timeout
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
 from omegaconf import DictConfig, OmegaConf, open_dict
+
+if TYPE_CHECKING:
+    from vla.policy import Checkpoint
 
 log = logging.getLogger(__name__)
 
@@ -93,12 +96,7 @@ def go_on(cfg: DictConfig, overrides: Sequence[str]) -> DictConfig:
         for name in FAR:
             if name in saved.config["trainer"] and f"trainer.{name}" not in named:
                 OmegaConf.update(resumed, f"trainer.{name}", saved.config["trainer"][name], force_add=True)
-    # Where weights are shared out, Lightning numbers what the optimiser remembers in another order.
-    sharing = OmegaConf.is_dict(OmegaConf.select(resumed, "trainer.strategy"))
-    if sharing and not isinstance(saved.config["trainer"].get("strategy"), dict):
-        raise ValueError(
-            f"trainer=fsdp cannot go on from {path}, which was trained without it: use trainer=ddp, or start anew"
-        )
+    _require_same_sharing(resumed, saved)
     resumed.checkpoint, resumed.resume = str(path), not saved.finished
     if last and "output" not in named:
         resumed.output = str(path.parent.parent)
@@ -129,6 +127,8 @@ def taken_up(cfg: DictConfig) -> DictConfig | None:
             f"{cfg.output} holds a training that differs in {', '.join(apart[:3])}{', …' if apart[3:] else ''}: choose "
             f"another output=DIR, or hydra.sweep.dir=DIR of a sweep, or go on with it by checkpoint={path} resume=true"
         )
+    if not saved.finished:
+        _require_same_sharing(cfg, saved)
     found = copy.deepcopy(cfg)
     found.resume = not saved.finished
     found.checkpoint = str(path if found.resume else path.with_name(run_of(path).training.get("checkpoint", LAST)))
@@ -141,12 +141,23 @@ def reported(cfg: DictConfig, checkpoint: Path) -> float | None:
     from vla.results import REPORT, differences, read_run
 
     report = read_run(Path(cfg.output)).report
-    if not report or report["errors"] or report["checkpoint"] != str(checkpoint):
+    if not report or report["checkpoint"] != str(checkpoint):
+        return None
+    if any(part["errors"] for part in (report, *report["conditions"].values())):
         return None
     if {key for key, _, _ in differences(report["config"], _plain(cfg))} - {"checkpoint", "resume"}:
         return None
     log.info("nothing is evaluated anew: %s is of this very experiment", Path(cfg.output) / REPORT)
     return float(report["success"])
+
+
+def _require_same_sharing(cfg: DictConfig, saved: Checkpoint) -> None:
+    """Where weights are shared out, Lightning numbers what the optimiser remembers in another order."""
+    sharing = OmegaConf.is_dict(OmegaConf.select(cfg, "trainer.strategy"))
+    if sharing and not isinstance(saved.config["trainer"].get("strategy"), dict):
+        raise ValueError(
+            f"trainer=fsdp cannot go on from {saved.path}, which was trained without it: use trainer=ddp, or start anew"
+        )
 
 
 def _plain(cfg: DictConfig) -> dict[str, Any]:

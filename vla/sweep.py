@@ -107,12 +107,13 @@ def tabulate(folder: Path) -> list[Row]:
 
 
 def read_rows(folder: Path) -> list[Row]:
-    """The cells that have a report, put together, in the order of the sweep."""
+    """The cells that have a report, and did not fail since, put together, in the order of the sweep."""
     from vla.evaluate import SEEN
 
     cells = [
         (_overrides(cell), cell, json.loads((cell / "report.json").read_text(encoding="utf-8")))
         for cell in _cells(folder, "report.json")
+        if not (cell / FAILURE).exists()  # its report may be of other overrides
     ]
     telling = [key for key in _telling([overrides for overrides, _, _ in cells]) if key != SEED]
     rows: dict[tuple[str, ...], Row] = {}
