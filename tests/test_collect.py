@@ -18,6 +18,7 @@ import toy
 from vla.cluster import Local
 from vla.collect import EFFORT, NOT_REPEATABLE, PATIENCE, MakeEnvironment, MakeExpert, Summary, collect, effort
 from vla.data.episodes import EpisodeStore
+from vla.spec import FIRST_SEED
 
 EPISODES = 30
 TRIED = 37  # seeds 3, 8, 13, … fail
@@ -166,6 +167,13 @@ def test_a_worker_that_dies_is_reported_and_costs_nothing(tmp_path: Path, whole:
     assert [entry.seed for entry in EpisodeStore(tmp_path).tried] == list(range(lines(tmp_path)))
     gather(tmp_path)
     assert content(tmp_path) == content(whole)
+
+
+def test_demonstrations_never_come_from_the_seeds_of_evaluations(tmp_path: Path) -> None:
+    store = EpisodeStore.create_or_open(tmp_path, toy.SPEC, {})
+    with pytest.raises(ValueError, match="seeds from 1000000 on are kept for evaluation"):  # as one of the four fails
+        collect(store, toy.make_environment, toy.make_expert, 4, Local(1), FIRST_SEED - 4)
+    assert store.episodes and all(entry.seed < FIRST_SEED for entry in store.tried)
 
 
 def test_an_expert_without_hope_is_given_up(tmp_path: Path) -> None:

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import json
+import os
+import time
 from pathlib import Path
 
 import pytest
@@ -11,7 +14,7 @@ from test_conf import composed
 
 from vla.parts import plain
 from vla.results import note_choice, note_training
-from vla.resume import go_on, taken_up
+from vla.resume import go_on, reported, taken_up
 
 
 def test_an_evaluation_that_was_interrupted_takes_what_the_training_had_chosen(tmp_path: Path) -> None:
@@ -31,18 +34,37 @@ def test_an_evaluation_that_was_interrupted_takes_what_the_training_had_chosen(t
     assert go_on(now, ["checkpoint=last", "job=train"]).checkpoint == str(run / "checkpoints/last.ckpt")
 
 
-@pytest.mark.parametrize("finished", [False, True])
-def test_a_training_is_taken_up_where_its_folder_has_it(tmp_path: Path, finished: bool) -> None:
+@pytest.mark.parametrize(("finished", "chosen"), [(False, ""), (True, ""), (True, "best.ckpt")])
+def test_a_training_is_taken_up_where_its_folder_has_it(tmp_path: Path, finished: bool, chosen: str) -> None:
     asked = composed(f"output={tmp_path}")
     assert taken_up(asked) is asked  # there is none yet
     (tmp_path / "checkpoints").mkdir()
     content = {"config": plain(asked), "spec": toy.SPEC.to_dict(), "state_dict": {}, "finished": finished}
     torch.save(content, tmp_path / "checkpoints/last.ckpt")
+    if chosen:  # which a process that was killed may not have come to
+        note_choice(tmp_path, chosen)
     asked.evaluate.workers = 1  # not what a training follows from
     found = taken_up(asked)
     assert found is not None
-    assert (found.checkpoint, found.resume) == (str(tmp_path / "checkpoints/last.ckpt"), not finished)
+    assert (found.checkpoint, found.resume) == (str(tmp_path / "checkpoints" / (chosen or "last.ckpt")), not chosen)
     asked.job = "train"
-    assert (taken_up(asked) is None) == finished
+    assert (taken_up(asked) is None) == bool(chosen)
+    elsewhere = composed(f"output={tmp_path}", "checkpoint=other/last.ckpt", "resume=true", "model.width=17")
+    with pytest.raises(ValueError, match="differs in model"):
+        taken_up(elsewhere)
     with pytest.raises(ValueError, match=r"differs in model\.width: choose another output=DIR"):
         taken_up(composed(f"output={tmp_path}", "model.width=17"))
+
+
+def test_a_report_of_weights_that_were_trained_for_longer_since_is_not_this_one(tmp_path: Path) -> None:
+    asked = composed(f"output={tmp_path}")
+    checkpoint = tmp_path / "last.ckpt"
+    checkpoint.touch()
+    report = {"checkpoint": str(checkpoint), "success": 0.5, "errors": 0, "conditions": {}, "config": plain(asked)}
+    (tmp_path / "report.json").write_text(json.dumps(report))
+    assert reported(asked, checkpoint) == 0.5
+    asked.evaluate.episodes += 1
+    assert reported(asked, checkpoint) is None
+    asked.evaluate.episodes -= 1
+    os.utime(checkpoint, (time.time() + 10, time.time() + 10))
+    assert reported(asked, checkpoint) is None

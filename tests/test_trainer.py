@@ -4,6 +4,8 @@ where it ends for want of memory."""
 from __future__ import annotations
 
 import csv
+import os
+import signal
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -22,6 +24,7 @@ from vla.models.diffusion import Diffusion
 from vla.models.learner import Learner
 from vla.models.model import Model
 from vla.trainer import Interruption, enough_memory, keep_metrics, make_trainer
+from vla.validation import ClosedLoop
 
 MODELS: dict[str, Callable[[], Model]] = {
     "bc": lambda: make_bc(shift=(64, 64)),
@@ -214,3 +217,32 @@ def test_memory_of_a_gpu_or_of_the_loader_is_named_alike(error: Exception) -> No
 def test_other_errors_stay_what_they_are() -> None:
     with pytest.raises(RuntimeError, match="shapes"), enough_memory(OmegaConf.create({})):
         raise RuntimeError("shapes differ")
+
+
+def test_the_second_signal_of_a_process_stops_at_once_and_leaves_the_checkpoint_before(tmp_path: Path) -> None:
+    interruption = Interruption(tmp_path)
+    with interruption.listening():
+        interruption.asked = True  # as another process was, which heard of it before this one
+        os.kill(os.getpid(), signal.SIGTERM)
+        assert not interruption.stopped
+        with pytest.raises(KeyboardInterrupt):
+            os.kill(os.getpid(), signal.SIGTERM)
+    assert interruption.stopped
+
+
+class Stumbling(toy.ToyExpert):
+    """Cannot play one seed."""
+
+    def reset(self, instruction: str, seed: int) -> None:
+        if seed == 1:
+            raise RuntimeError("the simulation diverged")
+        super().reset(instruction, seed)
+
+
+def test_an_episode_that_cannot_be_played_in_validation_costs_no_training(
+    folder: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    closed_loop = ClosedLoop(toy.make_environment, lambda model: Stumbling(), range(4), tmp_path / "run/checkpoints")
+    train(make_bc(), folder, tmp_path / "run", killer=closed_loop)
+    assert closed_loop.success == pytest.approx(0.5)  # seed 3 fails in this world
+    assert "seed 1 ended in an error, in validation: the simulation diverged" in caplog.text

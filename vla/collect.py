@@ -22,7 +22,7 @@ from vla.cluster import Cluster, MakeWorker, Team, Wait, WorkersLost
 from vla.data.episodes import EpisodeStore
 from vla.data.index import DAMAGED
 from vla.rollout import replay, rollout
-from vla.spec import Agent, Environment, Episode
+from vla.spec import FIRST_SEED, Agent, Environment, Episode
 
 log = logging.getLogger(__name__)
 
@@ -93,10 +93,11 @@ def collect(
             before = len(store.episodes)  # another process may have added some while this one waited
             _require_first_seed(store, seed)
             if before < episodes:
+                began = time.monotonic()  # and not when the wait for another process did
                 try:
                     _fill_with(cluster, partial(Demonstrator, make_environment, make_expert), store, episodes, seed)
                 finally:
-                    _note_effort(store.folder, time.monotonic() - started)
+                    _note_effort(store.folder, time.monotonic() - began)
     stored = len(store.episodes)
     failures = Counter(entry.outcome for entry in store.tried if not entry.success)
     tried = len(store.tried) - failures.pop(DAMAGED, 0)
@@ -156,6 +157,8 @@ def _fill(store: EpisodeStore, team: Team, episodes: int, seed: int) -> None:
         while stored < episodes:
             # Never more under way than are missing: an expert that does not fail makes none in vain.
             while len(pending) < min(LOOK_AHEAD * team.size, episodes - stored):
+                if next_seed >= FIRST_SEED:
+                    raise ValueError(f"seeds from {FIRST_SEED} on are kept for evaluation: lower collect.seed")
                 pending.append(team.submit(next_seed))
                 next_seed += 1
             episode: Episode = pending.popleft()()

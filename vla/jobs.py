@@ -116,7 +116,6 @@ def _reported(config: DictConfig, checkpoint: Path, output: Path) -> float:
         "budget_s": run_of(checkpoint).budget(time.monotonic() - started),
     }
     note_config(config)
-    write_report(report, output / "report.json", str(checkpoint), plain(config), facts, reports)
     if config.recorder:
         with optional(output / "rollouts.rrd"):
             keep_recordings(report, output / "recordings", output / "rollouts.rrd", config.evaluate.recordings)
@@ -124,6 +123,8 @@ def _reported(config: DictConfig, checkpoint: Path, output: Path) -> float:
     if reports:
         plot_suite({SEEN: report, **reports}, output / "suite.png")
         show(suite_table({SEEN: report, **reports}))
+    # Only now: whoever finds it does nothing of this again.
+    write_report(report, output / "report.json", str(checkpoint), plain(config), facts, reports)
     with optional(output / PAGE):
         write_page(output)
     log.info("wrote %s, report.json, report.png%s", output / PAGE, " and rollouts.rrd" if config.recorder else "")

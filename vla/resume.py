@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import logging
+import os
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -20,6 +21,8 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 LAST = "last.ckpt"
+CHOICE = "checkpoint"  # in training.json, the file of the weights that are to be evaluated
+FOUND = "VLA_LAST"  # what checkpoint=last was found to be
 LOCK = ".training"  # held by the process that trains into a folder of checkpoints
 
 OF_POLICY = ("task", "tokenizer", "model")
@@ -33,9 +36,9 @@ OF_TRAINING = (
 FAR = ("max_steps", "max_epochs", "val_check_interval", "accumulate_grad_batches", "gradient_clip_val")
 # What makes two trainings in one folder the same one.
 IDENTITY = (
-    *("task", "expert", "collect.episodes", "collect.seed", "data"),
+    *("task", "expert", "collect.episodes", "collect.seed", "collect.folder", "data"),
     *("tokenizer", "model", "learner", "validate", "seed"),
-    *(f"trainer.{name}" for name in (*FAR, "precision")),
+    *(f"trainer.{name}" for name in (*FAR, "precision", "devices", "num_nodes")),
 )
 # What the report on a policy says of its training.
 TOLD = ("expert", "collect", "data", "learner", "trainer", "validate", "seed")
@@ -80,7 +83,7 @@ def go_on(cfg: DictConfig, overrides: Sequence[str]) -> DictConfig:
     from vla.results import run_of
 
     last = cfg.checkpoint == "last"
-    path = newest_interrupted(Path(cfg.output).parent) if last else Path(cfg.checkpoint)
+    path = _newest_interrupted(Path(cfg.output).parent) if last else Path(cfg.checkpoint)
     saved = read_checkpoint(path)
     said = _parsed(overrides)
     for override in said:
@@ -103,7 +106,8 @@ def go_on(cfg: DictConfig, overrides: Sequence[str]) -> DictConfig:
     if last and "job" not in named:
         resumed.job = saved.config["job"]
     if last and saved.finished and resumed.job == "evaluate":
-        resumed.checkpoint = str(path.with_name(run_of(path).training.get("checkpoint", path.name)))
+        chosen = run_of(path).training.get(CHOICE)
+        resumed.checkpoint, resumed.resume = str(path.with_name(chosen or path.name)), chosen is None
     return resumed
 
 
@@ -118,7 +122,9 @@ def taken_up(cfg: DictConfig) -> DictConfig | None:
     from vla.results import differences, run_of
 
     path = Path(cfg.output) / "checkpoints" / LAST
-    if cfg.checkpoint is not None or not path.exists():
+    given = Path(cfg.checkpoint).resolve() if cfg.checkpoint else None
+    elsewhere = given is not None and (cfg.resume or cfg.job == "train") and given.parent != path.resolve().parent
+    if not path.exists() or (given is not None and not elsewhere):
         return cfg
     saved = read_checkpoint(path)
     apart = [key for key, _, _ in differences(_identity(saved.config), _identity(_plain(cfg)))]
@@ -127,13 +133,13 @@ def taken_up(cfg: DictConfig) -> DictConfig | None:
             f"{cfg.output} holds a training that differs in {', '.join(apart[:3])}{', …' if apart[3:] else ''}: choose "
             f"another output=DIR, or hydra.sweep.dir=DIR of a sweep, or go on with it by checkpoint={path} resume=true"
         )
-    if not saved.finished:
+    chosen = run_of(path).training.get(CHOICE) if saved.finished else None  # killed in between, it has yet to be chosen
+    if chosen is None:
         _require_same_sharing(cfg, saved)
     found = copy.deepcopy(cfg)
-    found.resume = not saved.finished
-    found.checkpoint = str(path if found.resume else path.with_name(run_of(path).training.get("checkpoint", LAST)))
-    log.info("%s %s", "nothing is trained anew: there is" if saved.finished else "going on from", found.checkpoint)
-    return None if saved.finished and cfg.job == "train" else found
+    found.checkpoint, found.resume = str(path.with_name(chosen or LAST)), chosen is None
+    log.info("%s %s", "nothing is trained anew: there is" if chosen else "going on from", found.checkpoint)
+    return None if chosen and (cfg.job == "train" or not _first_process()) else found
 
 
 def reported(cfg: DictConfig, checkpoint: Path) -> float | None:
@@ -142,6 +148,8 @@ def reported(cfg: DictConfig, checkpoint: Path) -> float | None:
 
     report = read_run(Path(cfg.output)).report
     if not report or report["checkpoint"] != str(checkpoint):
+        return None
+    if (Path(cfg.output) / REPORT).stat().st_mtime < checkpoint.stat().st_mtime:  # which was trained for longer since
         return None
     if any(part["errors"] for part in (report, *report["conditions"].values())):
         return None
@@ -173,6 +181,13 @@ def _identity(config: Mapping[str, Any]) -> dict[str, Any]:
     return values
 
 
+def _newest_interrupted(runs: Path) -> Path:
+    """As `newest_interrupted`; processes that a trainer starts are told by the first, which holds that run by then."""
+    if os.environ.get("LOCAL_RANK", "0") == "0" or FOUND not in os.environ:
+        os.environ[FOUND] = str(newest_interrupted(runs))
+    return Path(os.environ[FOUND])
+
+
 def newest_interrupted(runs: Path) -> Path:
     """The checkpoint of the newest run in a folder whose training, or the evaluation after it, did not come to its end.
 
@@ -201,9 +216,7 @@ def alone(checkpoints: Path) -> Iterator[None]:
     Raises:
         ValueError: another one does.
     """
-    from lightning.pytorch.utilities import rank_zero_only
-
-    if rank_zero_only.rank != 0:  # type: ignore[attr-defined]
+    if not _first_process():
         yield
         return
     checkpoints.mkdir(parents=True, exist_ok=True)
@@ -218,6 +231,12 @@ def alone(checkpoints: Path) -> Iterator[None]:
         yield
     finally:
         lock.release()
+
+
+def _first_process() -> bool:
+    from lightning.pytorch.utilities import rank_zero_only
+
+    return bool(rank_zero_only.rank == 0)  # type: ignore[attr-defined]
 
 
 def _held(checkpoints: Path) -> bool:

@@ -108,7 +108,6 @@ def _devices(trainer: DictConfig) -> int:
 def _do(cfg: DictConfig) -> float | None:
     from vla import jobs
 
-    _require_sweepable(cfg)
     said = HydraConfig.get().overrides.task
     if cfg.checkpoint is not None and (cfg.checkpoint == "last" or cfg.resume or cfg.job == "train"):
         cfg = go_on(cfg, said)
@@ -116,6 +115,7 @@ def _do(cfg: DictConfig) -> float | None:
         from vla.policy import read_checkpoint
 
         cfg = adopt(cfg, read_checkpoint(cfg.checkpoint).config, said)
+    _require_sweepable(cfg)  # with the trainer that a checkpoint brings
     if "task" in JOBS.get(cfg.job, ()):
         from vla.tasks.backend import choose_backend
 

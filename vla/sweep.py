@@ -15,7 +15,7 @@ from typing import Any
 from urllib.parse import quote
 
 from filelock import FileLock
-from hydra.core.utils import JobReturn
+from hydra.core.utils import JobReturn, JobStatus
 from hydra.experimental.callback import Callback
 from hydra.types import RunMode
 from omegaconf import DictConfig
@@ -71,6 +71,8 @@ class Tabulate(Callback):
     def on_job_end(self, config: DictConfig, job_return: JobReturn, **kwargs: Any) -> None:
         """Write the table of all cells that have a report by now."""
         if config.hydra.mode == RunMode.MULTIRUN:
+            if job_return.status == JobStatus.COMPLETED:  # another sweep in this folder may have failed at it meanwhile
+                (Path(config.hydra.runtime.output_dir) / FAILURE).unlink(missing_ok=True)
             folder = Path(config.hydra.sweep.dir)
             with FileLock(folder / ".lock"):  # the last cell to get it sees all others
                 tabulate(folder)

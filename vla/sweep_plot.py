@@ -48,6 +48,8 @@ def validated(row: Row) -> Points:
     points: Points = {}
     for run in map(read_run, row.cells):
         played = run.config.get("validate", {}).get("episodes", 0)
+        if not played:
+            continue
         for step, share in zip(*run.metrics.get("val/success", ((), ())), strict=True):
             won, others = points.get(int(step) + 1, (0, 0))
             points[int(step) + 1] = won + round(share * played), others + played

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import partial
@@ -29,7 +28,8 @@ from vla.parts import (
     plain,
     unfitted_learner,
 )
-from vla.results import note_choice, note_training, run_of
+from vla.policy import read_checkpoint
+from vla.results import note_choice, note_training
 from vla.resume import LAST, alone
 from vla.samples import FILE, SHOWN, draw_samples
 from vla.trainer import Interruption, enough_memory, keep_metrics, make_trainer, quiet_lightning
@@ -44,7 +44,7 @@ def trained(config: DictConfig) -> Path | None:
     quiet_lightning()
     output = output_folder(config)
     checkpoints = output / "checkpoints"
-    interruption = Interruption(checkpoints)
+    interruption = Interruption(checkpoints, read_checkpoint(config.checkpoint).seconds if config.checkpoint else 0.0)
     closed_loop = _closed_loop(config, checkpoints)
     with alone(checkpoints):
         # Before anything is collected: the devices asked for may be missing, and so may be pretrained weights.
@@ -60,11 +60,13 @@ def trained(config: DictConfig) -> Path | None:
         tokens = fidelity(learner.model.tokenizer, store.statistics.chunks(learner.model.chunk), store.spec.units)
         log.info("%s: %s", type(learner.model.tokenizer).__name__, tokens)
         data.setup()
+        if not len(data.held_out_windows):
+            trainer.limit_val_batches = 0  # else what waits for a validation would wait in vain
         with optional(output / FILE):
             draw_samples(data.gather(data.order(0)[:SHOWN]), store.spec, output / FILE)
         if config.checkpoint:
             keep_metrics(trainer, Path(config.checkpoint))
-        with _told(config, trainer, learner, effort(store, config.collect.episodes)):
+        with _told(config, trainer, interruption, learner, effort(store, config.collect.episodes)):
             try:
                 with enough_memory(config), interruption.listening():
                     trainer.fit(learner, datamodule=data, ckpt_path=config.checkpoint, weights_only=True)
@@ -92,21 +94,22 @@ def _closed_loop(config: DictConfig, checkpoints: Path) -> ClosedLoop | None:
 
 
 @contextmanager
-def _told(config: DictConfig, trainer: Trainer, learner: Learner, collection: float | None) -> Iterator[None]:
+def _told(
+    config: DictConfig, trainer: Trainer, interruption: Interruption, learner: Learner, collection: float | None
+) -> Iterator[None]:
     """However the training within ends, its page and the log tell how it did, all that it went on from included."""
     output = output_folder(config)
     note_config(config)
     parameters = sum(parameter.numel() for parameter in learner.model.parameters())
     log.info("training %s with %.2f M parameters", type(learner.model).__name__, parameters / 1e6)
-    before = run_of(config.checkpoint).training.get("seconds", 0.0) if config.checkpoint else 0.0
-    started, ended = time.monotonic(), "done"
+    ended = "done"
     try:
         yield
     except BaseException as error:
         ended = "interrupted" if isinstance(error, KeyboardInterrupt) else str(error) or type(error).__name__
         raise
     finally:
-        seconds = before + time.monotonic() - started
+        seconds = interruption.seconds
         if trainer.is_global_zero:
             with optional(output / PAGE):
                 note_training(output, parameters, trainer.global_step, seconds, ended, collection)

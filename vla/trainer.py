@@ -9,6 +9,7 @@ import os
 import platform
 import signal
 import threading
+import time
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -43,16 +44,27 @@ class Interruption(Checkpoint):
     """At the first SIGINT or SIGTERM training saves and stops after the current step, at the second one at once.
 
     Processes that train together stop together, whichever of them was asked to. As one of Lightning's checkpoints it
-    comes after all other callbacks. Every checkpoint says whether training was `finished`.
+    comes after all other callbacks. Every checkpoint says whether training was `finished`, and how many `seconds` it
+    took.
+
+    Args:
+        checkpoints: where it saves.
+        before: how long the training had taken that is gone on with [s].
     """
 
-    def __init__(self, checkpoints: Path) -> None:
-        self._path = checkpoints / LAST
-        self.asked = self.stopped = self._whole = False
+    def __init__(self, checkpoints: Path, before: float = 0.0) -> None:
+        self._path, self._before, self._began = checkpoints / LAST, before, time.monotonic()
+        self.asked = self.stopped = self._heard = self._whole = False
+
+    @property
+    def seconds(self) -> float:
+        """How long the training has taken by now, what it went on from included [s]."""
+        return self._before + time.monotonic() - self._began
 
     @contextmanager
     def listening(self) -> Iterator[None]:
-        """Within, the signals are heard; only the main thread can hear them."""
+        """Within, the signals are heard, and the time counts; only the main thread can hear them."""
+        self._began = time.monotonic()
         if threading.current_thread() is not threading.main_thread():
             yield
             return
@@ -72,9 +84,10 @@ class Interruption(Checkpoint):
             self._listen()
 
     def _hear(self, number: int, frame: FrameType | None) -> None:
-        if self.asked:
+        if self._heard:  # another process may have asked before
+            self.stopped = True  # in the middle of something: the checkpoint before is the last whole one
             raise KeyboardInterrupt
-        self.asked = True
+        self._heard = self.asked = True
 
     def on_train_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
@@ -101,7 +114,7 @@ class Interruption(Checkpoint):
 
     def on_save_checkpoint(self, trainer: Trainer, pl_module: LightningModule, checkpoint: dict[str, Any]) -> None:
         """A checkpoint of a training that is over is not to be gone on from."""
-        checkpoint["finished"] = trainer.state.finished
+        checkpoint["finished"], checkpoint["seconds"] = trainer.state.finished, self.seconds
 
 
 class Saving(Checkpoint):

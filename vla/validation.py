@@ -56,7 +56,7 @@ class ClosedLoop(Callback):
         policy = self._make_policy(pl_module.model)
         mine = self._seeds[trainer.global_rank :: trainer.world_size]
         with torch.compiler.set_stance("force_eager"):  # one window is not the shape that was compiled
-            won = sum(rollout(self._environment, policy, seed).success for seed in mine)
+            won = sum(_succeeds(self._environment, policy, seed) for seed in mine)
         share = torch.tensor(won / len(self._seeds), device=pl_module.device)
         pl_module.log("val/success", share, sync_dist=True, reduce_fx="sum")
 
@@ -84,10 +84,20 @@ class ClosedLoop(Callback):
 
     def state_dict(self) -> dict[str, Any]:
         """What an interrupted training goes on with."""
-        return {"success": self.success, "best": self.best}
+        return {"success": self.success, "best": self.best, "seeds": list(self._seeds)}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Go on with it."""
         self.success = state_dict["success"]
-        if self._path.exists():  # else it was left in another folder, and what comes now is the best here
+        # Where it was left in another folder, or judged by other episodes, what comes now is the best here.
+        if self._path.exists() and state_dict.get("seeds") == list(self._seeds):
             self.best = state_dict["best"]
+
+
+def _succeeds(environment: ClosableEnvironment, policy: Agent, seed: int) -> bool:
+    """Whether an episode does; one that cannot be played does not, and costs no training."""
+    try:
+        return rollout(environment, policy, seed).success
+    except Exception as problem:
+        log.warning("the episode of seed %d ended in an error, in validation: %s", seed, problem)
+        return False
