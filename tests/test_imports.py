@@ -49,7 +49,7 @@ PARTS = {
     "vla.resume": ("vla.policy", "vla.results"),
     "vla.progress": ("vla.models",),
     "vla.averaging": ("vla.models",),
-    "vla.validation": ("vla.spec", "vla.models", "vla.rollout", "vla.evaluate"),
+    "vla.validation": ("vla.spec", "vla.models", "vla.evaluate"),
     "vla.trainer": ("vla.averaging", "vla.check", "vla.progress", "vla.resume"),
     "vla.train": ("vla",),
     "vla.benchmark": ("vla",),

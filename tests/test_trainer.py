@@ -123,7 +123,10 @@ def test_going_on_after_an_interruption_gives_the_same_bits(name: str, folder: P
     whole = train(fresh(), folder, tmp_path / "whole")
     half = train(fresh(), folder, tmp_path / "half", stop=STOP)
     assert half["global_step"] == STOP and not half["finished"] and whole["finished"]
-    rest = train(MODELS[name](), folder, tmp_path / "half", checkpoint=tmp_path / "half/checkpoints/last.ckpt")
+    last = tmp_path / "half/checkpoints/last.ckpt"
+    torch.save({**half, "seconds": 1000.0}, last)
+    rest = train(MODELS[name](), folder, tmp_path / "half", checkpoint=last)
+    assert 1000 < rest["seconds"] < 1100
     for part in ("state_dict", "current_model_state", "optimizer_states", "lr_schedulers"):
         assert same(whole[part], rest[part]), part
     assert not same(half["state_dict"], rest["state_dict"])
@@ -245,4 +248,4 @@ def test_an_episode_that_cannot_be_played_in_validation_costs_no_training(
     closed_loop = ClosedLoop(toy.make_environment, lambda model: Stumbling(), range(4), tmp_path / "run/checkpoints")
     train(make_bc(), folder, tmp_path / "run", killer=closed_loop)
     assert closed_loop.success == pytest.approx(0.5)  # seed 3 fails in this world
-    assert "seed 1 ended in an error, in validation: the simulation diverged" in caplog.text
+    assert "seed 1 could not be played in validation: RuntimeError: the simulation diverged" in caplog.text

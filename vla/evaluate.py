@@ -198,6 +198,19 @@ def keep_recordings(report: Report, folder: Path, target: Path, limit: int | Non
     return len(files[:limit])
 
 
+def play(environment: Environment, agent: Agent, seed: int, recorder: Recorder | None = None) -> Result:
+    """Play one episode; never raises, so that one bad seed does not cost the others, or a training."""
+    try:
+        episode = rollout(environment, agent, seed, recorder)
+    except Exception as problem:
+        where = traceback.extract_tb(problem.__traceback__)[-1]
+        what = f"{type(problem).__name__}: {problem} ({Path(where.filename).name}:{where.lineno})"
+        return Result(seed, ERROR, error=what)
+    # Draws may come as arrays; plain values compare, and fit into JSON.
+    draws = json.loads(json.dumps(episode.draws, default=lambda value: value.tolist()))
+    return Result(seed, episode.outcome, episode.instruction, len(episode.observations), draws)
+
+
 @dataclass(frozen=True)
 class _Factories:
     environment: MakeEnvironment
@@ -214,16 +227,8 @@ class _Player:
         self._recorder = None if make.recorder is None else make.recorder()
 
     def play(self, seed: int) -> Result:
-        """Play one episode; never raises, so that one bad seed does not cost the others."""
-        try:
-            episode = rollout(self._environment, self._agent, seed, self._recorder)
-        except Exception as problem:
-            where = traceback.extract_tb(problem.__traceback__)[-1]
-            what = f"{type(problem).__name__}: {problem} ({Path(where.filename).name}:{where.lineno})"
-            return Result(seed, ERROR, error=what)
-        # Draws may come as arrays; plain values compare, and fit into JSON.
-        draws = json.loads(json.dumps(episode.draws, default=lambda value: value.tolist()))
-        return Result(seed, episode.outcome, episode.instruction, len(episode.observations), draws)
+        """Play one episode."""
+        return play(self._environment, self._agent, seed, self._recorder)
 
     def close(self) -> None:
         """Free the environment."""

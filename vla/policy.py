@@ -31,7 +31,6 @@ class Checkpoint:
     spec: Spec
     state: dict[str, Tensor]  # of the model
     finished: bool  # whether the training came to its end
-    seconds: float = 0.0  # that it took until then
 
     def restore(self, model: torch.nn.Module) -> None:
         """Load the weights.
@@ -67,8 +66,8 @@ def read_checkpoint(path: str | Path) -> Checkpoint:
         raise ValueError(f"{path} is no checkpoint of this project: it carries no configuration and spec")
     prefix = "model."
     state = {key[len(prefix) :]: value for key, value in content["state_dict"].items() if key.startswith(prefix)}
-    history = content.get("finished", False), content.get("seconds", 0.0)
-    return Checkpoint(path, content["config"], Spec.from_dict(content["spec"]), state, *history)
+    finished = content.get("finished", False)
+    return Checkpoint(path, content["config"], Spec.from_dict(content["spec"]), state, finished)
 
 
 class Policy:

@@ -52,6 +52,11 @@ class Run:
         """How many the model has, if that is known."""
         return self.training.get("parameters", self.report.get("parameters"))
 
+    @property
+    def chosen(self) -> str | None:
+        """File of the weights that are to be evaluated; None where that has yet to be found out."""
+        return self.training.get("checkpoint")
+
     def budget(self, evaluation: float) -> float | None:
         """Seconds that collection and training took, and an evaluation after them; None if that is not known."""
         collection, training = self.training.get("collection_s"), self.training.get("seconds")

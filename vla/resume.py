@@ -21,7 +21,6 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 LAST = "last.ckpt"
-CHOICE = "checkpoint"  # in training.json, the file of the weights that are to be evaluated
 FOUND = "VLA_LAST"  # what checkpoint=last was found to be
 LOCK = ".training"  # held by the process that trains into a folder of checkpoints
 
@@ -106,7 +105,7 @@ def go_on(cfg: DictConfig, overrides: Sequence[str]) -> DictConfig:
     if last and "job" not in named:
         resumed.job = saved.config["job"]
     if last and saved.finished and resumed.job == "evaluate":
-        chosen = run_of(path).training.get(CHOICE)
+        chosen = run_of(path).chosen
         resumed.checkpoint, resumed.resume = str(path.with_name(chosen or path.name)), chosen is None
     return resumed
 
@@ -133,7 +132,7 @@ def taken_up(cfg: DictConfig) -> DictConfig | None:
             f"{cfg.output} holds a training that differs in {', '.join(apart[:3])}{', …' if apart[3:] else ''}: choose "
             f"another output=DIR, or hydra.sweep.dir=DIR of a sweep, or go on with it by checkpoint={path} resume=true"
         )
-    chosen = run_of(path).training.get(CHOICE) if saved.finished else None  # killed in between, it has yet to be chosen
+    chosen = run_of(path).chosen if saved.finished else None  # killed in between, it has yet to be chosen
     if chosen is None:
         _require_same_sharing(cfg, saved)
     found = copy.deepcopy(cfg)

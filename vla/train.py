@@ -28,7 +28,6 @@ from vla.parts import (
     plain,
     unfitted_learner,
 )
-from vla.policy import read_checkpoint
 from vla.results import note_choice, note_training
 from vla.resume import LAST, alone
 from vla.samples import FILE, SHOWN, draw_samples
@@ -44,7 +43,7 @@ def trained(config: DictConfig) -> Path | None:
     quiet_lightning()
     output = output_folder(config)
     checkpoints = output / "checkpoints"
-    interruption = Interruption(checkpoints, read_checkpoint(config.checkpoint).seconds if config.checkpoint else 0.0)
+    interruption = Interruption(checkpoints)
     closed_loop = _closed_loop(config, checkpoints)
     with alone(checkpoints):
         # Before anything is collected: the devices asked for may be missing, and so may be pretrained weights.

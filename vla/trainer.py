@@ -46,14 +46,10 @@ class Interruption(Checkpoint):
     Processes that train together stop together, whichever of them was asked to. As one of Lightning's checkpoints it
     comes after all other callbacks. Every checkpoint says whether training was `finished`, and how many `seconds` it
     took.
-
-    Args:
-        checkpoints: where it saves.
-        before: how long the training had taken that is gone on with [s].
     """
 
-    def __init__(self, checkpoints: Path, before: float = 0.0) -> None:
-        self._path, self._before, self._began = checkpoints / LAST, before, time.monotonic()
+    def __init__(self, checkpoints: Path) -> None:
+        self._path, self._before, self._began = checkpoints / LAST, 0.0, time.monotonic()
         self.asked = self.stopped = self._heard = self._whole = False
 
     @property
@@ -115,6 +111,10 @@ class Interruption(Checkpoint):
     def on_save_checkpoint(self, trainer: Trainer, pl_module: LightningModule, checkpoint: dict[str, Any]) -> None:
         """A checkpoint of a training that is over is not to be gone on from."""
         checkpoint["finished"], checkpoint["seconds"] = trainer.state.finished, self.seconds
+
+    def on_load_checkpoint(self, trainer: Trainer, pl_module: LightningModule, checkpoint: dict[str, Any]) -> None:
+        """Count from what the training had taken."""
+        self._before = checkpoint.get("seconds", 0.0)
 
 
 class Saving(Checkpoint):

@@ -10,10 +10,9 @@ from typing import Any
 import torch
 from lightning import Callback, LightningModule, Trainer
 
-from vla.evaluate import ClosableEnvironment, wilson_interval
+from vla.evaluate import ClosableEnvironment, play, wilson_interval
 from vla.models.learner import Learner
 from vla.models.model import Model
-from vla.rollout import rollout
 from vla.spec import Agent
 
 log = logging.getLogger(__name__)
@@ -56,7 +55,11 @@ class ClosedLoop(Callback):
         policy = self._make_policy(pl_module.model)
         mine = self._seeds[trainer.global_rank :: trainer.world_size]
         with torch.compiler.set_stance("force_eager"):  # one window is not the shape that was compiled
-            won = sum(_succeeds(self._environment, policy, seed) for seed in mine)
+            results = [play(self._environment, policy, seed) for seed in mine]
+        for result in results:
+            if result.error:
+                log.warning("seed %d could not be played in validation: %s", result.seed, result.error)
+        won = sum(result.outcome == "success" for result in results)
         share = torch.tensor(won / len(self._seeds), device=pl_module.device)
         pl_module.log("val/success", share, sync_dist=True, reduce_fx="sum")
 
@@ -92,12 +95,3 @@ class ClosedLoop(Callback):
         # Where it was left in another folder, or judged by other episodes, what comes now is the best here.
         if self._path.exists() and state_dict.get("seeds") == list(self._seeds):
             self.best = state_dict["best"]
-
-
-def _succeeds(environment: ClosableEnvironment, policy: Agent, seed: int) -> bool:
-    """Whether an episode does; one that cannot be played does not, and costs no training."""
-    try:
-        return rollout(environment, policy, seed).success
-    except Exception as problem:
-        log.warning("the episode of seed %d ended in an error, in validation: %s", seed, problem)
-        return False
