@@ -78,7 +78,21 @@ def test_what_is_slower_and_no_better_is_off_the_front(tmp_path: Path) -> None:
     cell(tmp_path, 1, ["model=b"], 7, latency=3.0)
     cell(tmp_path, 2, ["model=c"], 10, latency=10.0)
     cell(tmp_path, 3, ["model=d"], 0, latency=20.0)
-    assert [row.name for row in pareto(tabulate(tmp_path))] == ["a", "c"]
+    rows = tabulate(tmp_path)
+    assert [row.name for row in pareto(rows, "seen")] == ["a", "c"] and [row.name for row in pareto(rows, "dark")] == [
+        "a"
+    ]
+
+
+def test_success_is_drawn_over_the_time_of_an_action_only_where_that_differs(tmp_path: Path) -> None:
+    for number, latency in enumerate((1.0, 1.9)):
+        cell(tmp_path, number, [f"model={number}"], 7, latency)
+    tabulate(tmp_path)
+    without = Image.open(tmp_path / "sweep.png").height
+    (tmp_path / "1/report.json").unlink()
+    cell(tmp_path, 2, ["model=2"], 7, latency=2.1)
+    tabulate(tmp_path)
+    assert Image.open(tmp_path / "sweep.png").height > 2 * without
 
 
 def test_over_the_number_of_demonstrations_success_is_a_curve_under_each_condition(tmp_path: Path) -> None:

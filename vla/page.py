@@ -100,7 +100,7 @@ def write_comparison(folders: Sequence[Path], target: Path) -> Path:
     )
 
 
-def write_sweep(folder: Path, choices: Sequence[str], lines: Sequence[Line], cells: Sequence[Path], over: str) -> Path:
+def write_sweep(folder: Path, choices: Sequence[str], lines: Sequence[Line], cells: Sequence[Path]) -> Path:
     """Show the table of a sweep, its picture and the curves of its cells, and return the path of the page.
 
     Args:
@@ -108,7 +108,6 @@ def write_sweep(folder: Path, choices: Sequence[str], lines: Sequence[Line], cel
         choices: what distinguishes its lines.
         lines: of the table.
         cells: their folders, whose names a line's links bear.
-        over: what success is drawn over in its picture.
     """
     runs = {cell.name: read_run(cell) for cell in cells}
     told = {cell: f"{cell}: {' '.join(line.words)}" for line in lines for cell in line.links}
@@ -122,7 +121,6 @@ def write_sweep(folder: Path, choices: Sequence[str], lines: Sequence[Line], cel
         curves=draw_runs({name: run.metrics for name, run in runs.items()}),
         cells=dict(zip(map(told.get, runs), colours(len(runs)), strict=True)),
         pictures={overview.name: overview} if overview.is_file() else {},
-        over=over,
     )
 
 

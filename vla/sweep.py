@@ -48,11 +48,6 @@ class Row:
         """Median over the cells [ms]."""
         return sorted(self.latencies)[len(self.latencies) // 2]
 
-    @property
-    def seen(self) -> tuple[float, float, float]:
-        """`interval` under the condition that the policies were trained for, which every cell has."""
-        return self.interval(next(iter(self.successes)))
-
     def interval(self, condition: str) -> tuple[float, float, float]:
         """Success rate of all cells together and its 95 % confidence interval, which takes episodes for independent."""
         from vla.evaluate import wilson_interval
@@ -182,9 +177,8 @@ def _write_page(rows: list[Row], folder: Path) -> None:
         )
         for row in rows
     ]
-    over = "the number of demonstrations" if DEMONSTRATIONS in rows[0].choices else "the time of an action"
     with optional(folder / SWEEP):
-        write_sweep(folder, list(rows[0].choices), lines, [cell for row in rows for cell in row.cells], over)
+        write_sweep(folder, list(rows[0].choices), lines, [cell for row in rows for cell in row.cells])
 
 
 def _write_csv(rows: list[Row], path: Path) -> None:

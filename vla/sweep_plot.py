@@ -11,36 +11,58 @@ from vla.sweep import DEMONSTRATIONS, Row
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+SUCCESS = "success, 95 % CI"
 
 Points = dict[int, tuple[int, int]]  # training step → episodes that succeeded in its validation, and all played then
 
 
 def plot(rows: list[Row], path: Path) -> None:
-    """Draw success over the number of demonstrations, and over training, where that number is what differs, else over
-    the time of an action."""
+    """Draw success under every condition: over the number of demonstrations, and over training, where that number is
+    what differs; else of each row, and over the time of an action where some take twice as long as others."""
     from matplotlib.figure import Figure
 
+    figure = Figure(layout="constrained", dpi=110)
     if DEMONSTRATIONS in rows[0].choices:
-        conditions, lines = list(rows[0].successes), _lines(rows)
-        seen = {name: {row.choices[DEMONSTRATIONS]: validated(row) for row in line} for name, line in lines.items()}
-        trained = {name: curves for name, curves in seen.items() if any(curves.values())}
-        columns = max(len(conditions), len(trained))
-        figure = Figure(figsize=(max(8, 5.5 * columns), 10 if trained else 5), layout="constrained")
-        panels = figure.subplots(2 if trained else 1, columns, squeeze=False)
-        for axes, condition in zip(panels[0], conditions, strict=False):
-            _plot_curves(axes, lines, condition)
-        for axes, (name, curves) in zip(panels[-1], trained.items(), strict=False):
-            _plot_training(axes, name, curves)
-        for axes in panels.flat:
-            axes.set_visible(axes.has_data())
+        _draw_numbers(figure, rows)
     else:
-        figure = Figure(figsize=(8, 5), layout="constrained")
-        _plot_costs(figure.add_subplot(), rows)
+        _draw_choices(figure, rows)
     for axes in figure.axes:
-        axes.set_ylabel("success, 95 % CI")
         axes.grid(alpha=0.3)
         axes.spines[["top", "right"]].set_visible(False)
-    figure.savefig(path, dpi=110, format="png")
+    figure.savefig(path, format="png")
+
+
+def _draw_numbers(figure: Figure, rows: list[Row]) -> None:
+    conditions, lines = list(rows[0].successes), _lines(rows)
+    seen = {name: {row.choices[DEMONSTRATIONS]: validated(row) for row in line} for name, line in lines.items()}
+    trained = {name: curves for name, curves in seen.items() if any(curves.values())}
+    columns = max(len(conditions), len(trained))
+    figure.set_size_inches(max(8, 5.5 * columns), 10 if trained else 5)
+    panels = figure.subplots(2 if trained else 1, columns, squeeze=False)
+    for axes, condition in zip(panels[0], conditions, strict=False):
+        _plot_curves(axes, lines, condition)
+    for axes, (name, curves) in zip(panels[-1], trained.items(), strict=False):
+        _plot_training(axes, name, curves)
+    for axes in panels.flat:
+        axes.set_visible(axes.has_data())
+        axes.set_ylabel(SUCCESS)
+
+
+def _draw_choices(figure: Figure, rows: list[Row]) -> None:
+    conditions = list(dict.fromkeys(condition for row in rows for condition in row.successes))
+    latencies = [row.latency for row in rows]
+    heights = [1.2 + 0.3 * len(rows), *([4.2] if max(latencies) > 2 * min(latencies) else [])]
+    figure.set_size_inches(max(8, 2 + 3.3 * len(conditions)), sum(heights))
+    panels = figure.subplots(len(heights), len(conditions), squeeze=False, height_ratios=heights)
+    for axes, condition in zip(panels[0], conditions, strict=True):
+        _plot_rows(axes, rows, condition)
+        axes.tick_params(labelleft=condition == conditions[0])
+    for axes, condition in zip(panels[1:].flat, conditions, strict=False):
+        _plot_costs(axes, rows, condition)
+    for axes in panels[1:, 0]:
+        axes.set_ylabel(SUCCESS)
 
 
 def validated(row: Row) -> Points:
@@ -104,29 +126,49 @@ def _plot_training(axes: Axes, name: str, curves: dict[str, Points]) -> None:
     axes.legend(frameon=False, title="demonstrations")
 
 
-def _plot_costs(axes: Axes, rows: list[Row]) -> None:
-    """Success over the time of an action; the area of a point grows with the parameters, and a line joins what nothing
-    else beats in both."""
+def _plot_rows(axes: Axes, rows: list[Row], condition: str) -> None:
+    """Success of every row under one condition, in the order of the sweep; a line goes on from the first."""
+    for height, row in enumerate(rows):
+        if condition in row.successes:
+            rate, low, high = row.interval(condition)
+            axes.errorbar(rate, height, xerr=[[rate - low], [high - rate]], fmt="o", color=f"C{height}", capsize=3)
+    if condition in rows[0].successes:
+        axes.axvline(rows[0].interval(condition)[0], color="C0", linewidth=0.8, linestyle=":")
+    axes.set_yticks(range(len(rows)), [f"{row.name}, {row.parameters / 1e6:.2f} M" for row in rows])
+    axes.set_ylim(len(rows) - 0.5, -0.5)
+    axes.set_xlim(-0.02, 1.02)
+    axes.set_xlabel(SUCCESS)
+    axes.set_title(condition, fontsize=10)
+
+
+def _plot_costs(axes: Axes, rows: list[Row], condition: str) -> None:
+    """Success over the time of an action, in the colours of the rows; the area of a point grows with the parameters,
+    and a line joins what nothing else beats in both."""
+    from matplotlib.ticker import LogLocator
+
+    for number, row in enumerate(rows):
+        if condition in row.successes:
+            rate, low, high = row.interval(condition)
+            axes.errorbar(row.latency, rate, [[rate - low], [high - rate]], color="#c4c8ce", capsize=3, zorder=1)
+            axes.scatter(row.latency, rate, s=40 + 60 * (row.parameters / 1e6) ** 0.5, color=f"C{number}", alpha=0.9)
+    best = pareto(rows, condition)
+    rates = [row.interval(condition)[0] for row in best]
+    axes.plot([row.latency for row in best], rates, color="#8a8f98", linewidth=0.8, zorder=0)
     axes.set_xscale("log")
-    for row in rows:
-        rate, low, high = row.seen
-        axes.errorbar(row.latency, rate, [[rate - low], [high - rate]], color="#8a8f98", capsize=3, zorder=1)
-        axes.scatter(row.latency, rate, s=40 + 60 * (row.parameters / 1e6) ** 0.5, color="#2e9e5b", alpha=0.8)
-        label = f"{row.name}, {row.parameters / 1e6:.2f} M"
-        axes.annotate(label, (row.latency, rate), (9, 5), textcoords="offset points", fontsize=9)
-    best = pareto(rows)
-    axes.plot([row.latency for row in best], [row.seen[0] for row in best], color="#2e9e5b", linewidth=0.8)
-    axes.set_xlim(0.6 * min(row.latency for row in rows), 2.5 * max(row.latency for row in rows))
+    axes.set_xlim(0.7 * min(row.latency for row in rows), 1.4 * max(row.latency for row in rows))
+    axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
     axes.xaxis.set_major_formatter("{x:g}")
-    close = max(row.latency for row in rows) < 10 * min(row.latency for row in rows)
-    axes.xaxis.set_minor_formatter("{x:g}" if close else "")
+    axes.xaxis.set_minor_formatter("")
     axes.set_xlabel("time of an action [ms]")
 
 
-def pareto(rows: list[Row]) -> list[Row]:
-    """The rows that no faster one matches in success, fastest first."""
+def pareto(rows: list[Row], condition: str) -> list[Row]:
+    """The rows that no faster one matches in success under a condition, fastest first."""
     best: list[Row] = []
-    for row in sorted(rows, key=lambda row: (row.latency, -row.seen[0])):
-        if not best or row.seen[0] > best[-1].seen[0]:
+    highest = -1.0
+    played = [(row.latency, -row.interval(condition)[0], row) for row in rows if condition in row.successes]
+    for _, failure, row in sorted(played, key=lambda one: one[:2]):
+        if -failure > highest:
             best.append(row)
+            highest = -failure
     return best
