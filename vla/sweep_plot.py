@@ -10,8 +10,12 @@ from vla.results import read_run
 from vla.sweep import DEMONSTRATIONS, Row
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from matplotlib.artist import Artist
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+    from matplotlib.legend import Legend
 
 SUCCESS = "success, 95 % CI"
 
@@ -44,10 +48,25 @@ def _draw_numbers(figure: Figure, rows: list[Row]) -> None:
     for axes, condition in zip(panels[0], conditions, strict=False):
         _plot_curves(axes, lines, condition)
     for axes, (name, curves) in zip(panels[-1], trained.items(), strict=False):
-        _plot_training(axes, name, curves)
+        _plot_training(axes, name, curves, sorted({_demonstrations(row) for row in rows}))
+    if trained:
+        _key(panels[-1][: len(trained)]).set_in_layout(columns == len(trained))  # else there is room
     for axes in panels.flat:
         axes.set_visible(axes.has_data())
         axes.set_ylabel(SUCCESS)
+
+
+def _key(panels: Sequence[Axes]) -> Legend:
+    """One for all panels of training, beside the last."""
+    lines: dict[str, Artist] = {}
+    for axes in panels:
+        for line, label in zip(*axes.get_legend_handles_labels(), strict=True):
+            lines.setdefault(label, line)
+    labels = sorted(lines, key=int)
+    handles, place = [lines[label] for label in labels], (1.02, 0.5)
+    return panels[-1].legend(
+        handles, labels, title="demonstrations", loc="center left", bbox_to_anchor=place, frameon=False
+    )
 
 
 def _draw_choices(figure: Figure, rows: list[Row]) -> None:
@@ -109,13 +128,13 @@ def _plot_curves(axes: Axes, lines: dict[str, list[Row]], condition: str) -> Non
         axes.legend(frameon=False)
 
 
-def _plot_training(axes: Axes, name: str, curves: dict[str, Points]) -> None:
+def _plot_training(axes: Axes, name: str, curves: dict[str, Points], counts: list[int]) -> None:
     """Success in validation over the steps of training, a line for each number of demonstrations."""
     from matplotlib import colormaps
 
-    for number, (demonstrations, points) in enumerate(curves.items()):
+    for demonstrations, points in curves.items():
         intervals = [wilson_interval(*point) for point in points.values()]
-        colour = colormaps["viridis_r"]((number + 1) / len(curves))
+        colour = colormaps["viridis_r"]((counts.index(int(demonstrations)) + 1) / len(counts))
         rates = [won / played for won, played in points.values()]
         axes.plot(list(points), rates, "o-", color=colour, markersize=4, label=demonstrations)
         low, high = [low for low, _ in intervals], [high for _, high in intervals]
@@ -123,7 +142,6 @@ def _plot_training(axes: Axes, name: str, curves: dict[str, Points]) -> None:
     axes.set_ylim(-0.02, 1.02)
     axes.set_xlabel("steps of training")
     axes.set_title(", ".join(filter(None, (name, "in validation"))), fontsize=10)
-    axes.legend(frameon=False, title="demonstrations")
 
 
 def _plot_rows(axes: Axes, rows: list[Row], condition: str) -> None:
