@@ -30,7 +30,12 @@ from vla.sweep import tabulate
 
 SAID = "lift the <script>alert('red')</script> block"
 SEEN = [FIRST_SEED, FIRST_SEED + 1, FIRST_SEED + 3]  # the toy world fails at the last
-CONFIG = {"model": {"_target_": "vla.models.bc.BC", "width": 16}, "trainer": {"max_steps": 400}, "output": "there"}
+CONFIG = {
+    "task": {"blocks": 3},
+    "model": {"_target_": "vla.models.bc.BC", "width": 16},
+    "trainer": {"max_steps": 400},
+    "output": "there",
+}
 CURVES = """\
 epoch,step,lr,train/loss,train/truth_loss,val/error_dx_mm,val/error_dy_mm,val/error_gripper,val/loss
 0,9,0.001,4.5,1.0,,,,
@@ -46,17 +51,26 @@ def a_report(*outcomes: str) -> Report:
 
 
 def a_run(
-    folder: Path, outcomes: str = "ssss", width: int = 16, curves: str = CURVES, light: float | None = None
+    folder: Path,
+    outcomes: str = "ssss",
+    width: int = 16,
+    curves: str = CURVES,
+    light: float | None = None,
+    dark: str = "",
 ) -> Path:
-    """A folder as an evaluation leaves it, without pictures and recordings; s is a success, d a drop."""
+    """A folder as an evaluation leaves it, without pictures and recordings; s is a success, d a drop, and in the dark
+    all are drops unless told."""
     folder.mkdir(parents=True)
-    report = a_report(*({"s": "success", "d": "dropped"}[outcome] for outcome in outcomes))
+    report, in_the_dark = (
+        a_report(*({"s": "success", "d": "dropped"}[outcome] for outcome in all_of_them))
+        for all_of_them in (outcomes, dark or "d" * len(outcomes))
+    )
     if light is not None:
         report = Report(tuple(replace(result, draws={**result.draws, "light": light}) for result in report.results))
-    config = {**CONFIG, "model": {"_target_": "vla.models.bc.BC", "width": width}}
+    told = {"evaluate": {"conditions": {"dark": {"light": light}}}}
+    config = {**CONFIG, **told, "model": {"_target_": "vla.models.bc.BC", "width": width}}
     size = {"parameters": 1_500_000, "latency_ms": 2.5}
-    dark = a_report(*["dropped"] * len(outcomes))
-    write_report(report, folder / "report.json", f"{folder}/checkpoints/last.ckpt", config, size, {"dark": dark})
+    write_report(report, folder / "report.json", f"{folder}/checkpoints/last.ckpt", config, size, {"dark": in_the_dark})
     (folder / "metrics.csv").write_text(curves)
     write_config(folder, config, [{"key": "model.width", "here": width, "default": 32}])
     return folder
@@ -205,15 +219,17 @@ def test_configurations_differ_leaf_by_leaf() -> None:
 
 
 def test_runs_are_compared_on_the_seeds_they_share(tmp_path: Path) -> None:
-    good, bad = a_run(tmp_path / "good/run", "ssssssss"), a_run(tmp_path / "bad/run", "ddddddsd", width=8)
+    good = a_run(tmp_path / "good/run", "ssssssss", dark="ssssssdd")
+    bad = a_run(tmp_path / "bad/run", "ddddddsd", width=8)
     short = a_run(tmp_path / "short/run", "ds")
     write_page(good)
     page = write_comparison([good, bad, short], tmp_path / "new")
     told, markup = text(page), page.read_text()
     assert page == tmp_path / "new/comparison.html" and told.startswith("3 runs")
     assert "good/run 100.0 (67.6-100.0)" in told
-    assert "good/run bad/run 8 7 0 0.016" in told  # seven lost, none won: 2 / 2^7
-    assert "good/run short/run 2 1 0 1" in told
+    assert "good/run bad/run seen 8 7 0 0.016" in told  # seven lost, none won: 2 / 2^7
+    assert "good/run bad/run dark 8 6 0 0.031" in told
+    assert "good/run short/run seen 2 1 0 1" in told
     assert "model.width 16 8 16" in told
     assert 'href="../good/run/report.html"' in markup and "bad/run/report.html" not in markup
     assert markup.count("<svg") == 6
@@ -222,7 +238,7 @@ def test_runs_are_compared_on_the_seeds_they_share(tmp_path: Path) -> None:
 def test_other_scenes_under_the_same_seeds_are_not_compared(tmp_path: Path) -> None:
     plain, dark = a_run(tmp_path / "plain", "ssssssss"), a_run(tmp_path / "dark", "dddddddd", light=0.1)
     told = text(write_comparison([plain, dark], tmp_path / "new"))
-    assert "plain 100.0" in told and "plain dark 8" not in told
+    assert "plain 100.0" in told and "On the same seeds" not in told
 
 
 def test_runs_with_nothing_to_compare_are_refused(tmp_path: Path) -> None:

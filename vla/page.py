@@ -19,7 +19,7 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
 from vla.curves import colours, draw_run, draw_runs
-from vla.evaluate import ERROR, Report, Result
+from vla.evaluate import ERROR, SEEN, Report, Result
 from vla.report import BLUE, GREEN, GREY, RED
 from vla.results import ABSENT, Run, differences, read_run, require_run, write
 from vla.suite import mcnemar
@@ -206,29 +206,32 @@ def _links(run: Path, page: Path) -> dict[str, str]:
 
 
 def _pairs(runs: Mapping[str, Run]) -> list[dict[str, Any]]:
-    """Every two runs that played the same seeds: who won where the other lost, and how surely they differ."""
+    """Every two runs that played the same episodes: who won where the other lost, and how surely they differ."""
     found = []
     for one, other in combinations(runs, 2):
-        mine, yours = (_by_seed(runs[name]) for name in (one, other))
-        # Under the same seed another goal or another level of randomisation is another episode; what was drawn tells.
-        seeds = [seed for seed, (_, scene) in mine.items() if seed in yours and scene == yours[seed][1]]
-        if seeds:
-            a, b = (Report(tuple(results[seed][0] for seed in seeds)) for results in (mine, yours))
-            won = [(x.outcome == "success", y.outcome == "success") for x, y in zip(a.results, b.results, strict=True)]
-            counts = {"first": won.count((True, False)), "second": won.count((False, True)), "seeds": len(seeds)}
-            found.append({"one": one, "other": other, **counts, "p": mcnemar(a, b)})
+        for condition in runs[one].reports:
+            mine, yours = (_by_seed(runs[name], condition) for name in (one, other))
+            # Under the same seed another goal or another level of randomisation is another episode.
+            seeds = [seed for seed, (_, scene) in mine.items() if seed in yours and scene == yours[seed][1]]
+            if seeds:
+                a, b = (Report(tuple(results[seed][0] for seed in seeds)) for results in (mine, yours))
+                won = [
+                    (x.outcome == "success", y.outcome == "success") for x, y in zip(a.results, b.results, strict=True)
+                ]
+                counts = {"first": won.count((True, False)), "second": won.count((False, True)), "seeds": len(seeds)}
+                found.append({"one": one, "other": other, "condition": condition, **counts, "p": mcnemar(a, b)})
     return found
 
 
-def _by_seed(run: Run) -> dict[int, tuple[Result, Any]]:
-    """Seed → how the policy did where it was trained, and what there was to see and to hear."""
-    seen = next(iter(run.reports.values()), Report(()))
-    drawn = {each["seed"]: each["draws"] for each in run.report.get("per_episode", ())}
-    return {
-        result.seed: (result, (result.instruction, drawn[result.seed]))
-        for result in seen.results
-        if result.outcome != ERROR
-    }
+def _by_seed(run: Run, condition: str) -> dict[int, tuple[Result, Any]]:
+    """Seed → how the policy did under a condition, and what tells whether there was the same to see and to hear."""
+    results = [result for result in run.reports.get(condition, Report(())).results if result.outcome != ERROR]
+    if condition == SEEN:
+        drawn = {each["seed"]: each["draws"] for each in run.report.get("per_episode", ())}
+        return {result.seed: (result, (result.instruction, drawn[result.seed])) for result in results}
+    told = run.report["config"]
+    scene = told["task"], told["evaluate"]["conditions"][condition]
+    return {result.seed: (result, scene) for result in results}
 
 
 def _between(runs: Mapping[str, Run]) -> dict[str, list[Any]]:
