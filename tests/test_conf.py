@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 from hydra import compose, initialize_config_dir
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 
 from vla.check import JOBS, check
 
@@ -72,6 +72,21 @@ def test_option(group: str, option: str) -> None:
 def test_every_axis_of_randomisation_at_a_level(level: str) -> None:
     axes = [f"task/randomize/{path.parent.name}" for path in sorted(AXES.glob(f"*/{level}.yaml"))]
     check(composed(*(f"{'' if axis in groups() else '+'}{axis}={level}" for axis in axes)))
+
+
+@pytest.mark.parametrize("level", ["none", "default", "wide"])
+def test_intensity_and_colour_of_the_light_are_changed_one_at_a_time(level: str) -> None:
+    cfg = composed("evaluate=suite", f"task/randomize={level}")
+    check(cfg)
+    conditions = OmegaConf.to_container(cfg.evaluate.conditions, resolve=True)
+    assert isinstance(conditions, dict)
+    hard, intensity, colour = (
+        conditions[f"light{name}_hard"]["randomize"]["light"] for name in ("", "_intensity", "_colour")
+    )
+    unchanged = {"_target_": hard["_target_"], "brightness": [0.55, 0.55], "tint": 0.0, "tilt": 0.0}  # as in the scene
+    own = {**unchanged, **(cfg.task.randomize.get("light") or {})}
+    assert intensity == {**own, "brightness": hard["brightness"]}
+    assert colour == {**own, "tint": hard["tint"]}
 
 
 def test_a_model_of_one_token_per_component_takes_no_other_tokens() -> None:
