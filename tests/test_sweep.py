@@ -79,9 +79,8 @@ def test_what_is_slower_and_no_better_is_off_the_front(tmp_path: Path) -> None:
     cell(tmp_path, 2, ["model=c"], 10, latency=10.0)
     cell(tmp_path, 3, ["model=d"], 0, latency=20.0)
     rows = tabulate(tmp_path)
-    assert [row.name for row in pareto(rows, "seen")] == ["a", "c"] and [row.name for row in pareto(rows, "dark")] == [
-        "a"
-    ]
+    assert [row.name for row in pareto(rows, "seen")] == ["a", "c"]
+    assert [row.name for row in pareto(rows, "dark")] == ["a"]
 
 
 def test_success_is_drawn_over_the_time_of_an_action_only_where_that_differs(tmp_path: Path) -> None:

@@ -7,6 +7,7 @@ import json
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -62,7 +63,7 @@ class Run:
         collection, training = self.training.get("collection_s"), self.training.get("seconds")
         return None if collection is None or training is None else round(collection + training + evaluation, 1)
 
-    @property
+    @cached_property
     def reports(self) -> dict[str, Report]:
         """Condition → its report, the one that the policy was trained for first; draws and conditions' steps are left
         out."""

@@ -182,11 +182,13 @@ def _plot_costs(axes: Axes, rows: list[Row], condition: str) -> None:
 
 def pareto(rows: list[Row], condition: str) -> list[Row]:
     """The rows that no faster one matches in success under a condition, fastest first."""
+
+    def rate(row: Row) -> float:
+        return row.interval(condition)[0]
+
     best: list[Row] = []
-    highest = -1.0
-    played = [(row.latency, -row.interval(condition)[0], row) for row in rows if condition in row.successes]
-    for _, failure, row in sorted(played, key=lambda one: one[:2]):
-        if -failure > highest:
+    played = [row for row in rows if condition in row.successes]
+    for row in sorted(played, key=lambda row: (row.latency, -rate(row))):
+        if not best or rate(row) > rate(best[-1]):
             best.append(row)
-            highest = -failure
     return best
