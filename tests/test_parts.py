@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -104,3 +105,14 @@ def test_what_cannot_be_built_is_named_before_anything_is_collected(
     with pytest.raises(ValueError, match=message):
         jobs.run(composed(*SMALL, *overrides))
     assert not (tmp_path / "store").exists()
+
+
+def test_training_starts_from_a_policy_whose_demonstrations_held_another_truth(
+    tmp_path: Path, tabletop: Tabletop
+) -> None:
+    _, checkpoint = trained(tmp_path, tabletop)
+    without = replace(tabletop.spec, truth=(), chain=())  # as recordings of a real robot are
+    model = unfitted_learner(composed(*SMALL, f"pretrained={checkpoint}"), without).model
+    own, saved = model.state_dict(), read_checkpoint(checkpoint).state
+    assert {name for name in saved if name not in own} == {name for name in saved if name.startswith("truth_")} != set()
+    assert all(torch.equal(saved[name], value) for name, value in own.items())

@@ -13,6 +13,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+import torch
 import warm
 import yaml
 from rerun.chunk import RrdReader
@@ -218,6 +219,24 @@ def test_training_goes_on_as_what_it_was(home: Path) -> None:
     for other in ("model.width=32", "task/goal=lift", "learner.lr=1"):
         refused = vla(home, *arguments, other, ok=False)
         assert f"{other} cannot be combined with going on" in refused.stderr and "Traceback" not in refused.stderr
+
+
+def test_a_policy_is_trained_further_for_another_goal(home: Path, tmp_path: Path) -> None:
+    shutil.copy(home / "run/checkpoints/last.ckpt", tmp_path / "policy.ckpt")
+    arguments = (*SMALL, f"pretrained={tmp_path}/policy.ckpt", "task/goal=push", "job=train")
+    done = vla(home, *arguments, "learner.lr=1e-12", "trainer.max_steps=1", "output=tuned")
+    assert f"starting from {tmp_path}/policy.ckpt" in done.stdout
+    before, after = (read_checkpoint(path) for path in (tmp_path / "policy.ckpt", home / "tuned/checkpoints/last.ckpt"))
+    assert after.config["task"]["goal"] != before.config["task"]["goal"]
+    for name, weight in before.state.items():
+        gathered = name.startswith(("proprioception.", "truth_scale."))  # statistics, of all that was ever seen
+        assert gathered or torch.allclose(after.state[name], weight, atol=1e-9), name
+    for other in ("model=rt1_tiny", "tokenizer.bins=64", "variant=no_shift", "checkpoint=tuned/checkpoints/last.ckpt"):
+        refused = vla(home, *arguments, other, ok=False)
+        assert refused.stderr.startswith("error: ") and len(refused.stderr.splitlines()) == 1, refused.stderr
+    (tmp_path / "policy.ckpt").unlink()  # which going on does not need
+    done = vla(home, "job=train", "checkpoint=tuned/checkpoints/last.ckpt", "trainer.max_steps=2", "output=further")
+    assert "trained 2 steps" in done.stdout
 
 
 def test_a_checkpoint_of_other_cameras_is_refused(home: Path) -> None:

@@ -65,6 +65,7 @@ PLAIN: dict[str, Any] = {
     "job": Literal["preview", "collect", "train", "evaluate", "export", "deploy", "benchmark", "inspect", "report"],
     "seed": Seed,
     "checkpoint": str | None,
+    "pretrained": str | None,
     "resume": bool,
     "output": str,
     "chosen": dict[str, str | None],

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from dataclasses import replace
 from functools import cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -183,8 +184,22 @@ def make_learner(config: DictConfig, store: EpisodeStore) -> Learner:
 
 
 def unfitted_learner(config: DictConfig, spec: Spec) -> Learner:
-    """The learner of a configuration's model, which needs no demonstrations; its tokenizer has yet to be fitted."""
-    model = build(config.model, spec=spec, tokenizer=build(config.tokenizer, spec=spec))
+    """The learner of a configuration's model, which needs no demonstrations; its tokenizer has yet to be fitted, unless
+    all comes out of a checkpoint, of this training or of the one that it starts from.
+
+    Raises:
+        ValueError: that checkpoint is none, or of a policy for another kind of step.
+    """
+    from vla.policy import read_checkpoint
+
+    origin, node = config.checkpoint or config.pretrained, plain(config.model)
+    saved = read_checkpoint(origin) if origin else None
+    if saved:
+        saved.spec.perceived.require(spec.perceived, f"the checkpoint {origin}", "what it is to be trained on")
+        spec, node = replace(spec, chain=saved.spec.chain), _without_pretraining(node)
+    model = build(node, spec=spec, tokenizer=build(config.tokenizer, spec=spec))
+    if saved:
+        saved.start(model)
     learner: Learner = build(config.learner, model=model, spec=spec, config=plain(config))
     return learner
 

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from pickle import UnpicklingError
 from typing import Any, Literal
@@ -43,6 +43,18 @@ class Checkpoint:
         except RuntimeError as error:
             first = str(error).strip().splitlines()[-1].strip()
             raise ValueError(f"{self.path} does not fit the model of its own configuration: {first}") from error
+
+    def start(self, model: Model) -> None:
+        """Load the weights, to train them further; the head that predicts the truth starts anew where that differs.
+
+        Raises:
+            ValueError: they are those of another model.
+        """
+        state = self.state
+        if self.spec.truth != model.spec.truth:
+            anew = {name: value for name, value in model.state_dict().items() if name.startswith(Model.OF_TRUTH)}
+            state = {name: value for name, value in state.items() if not name.startswith(Model.OF_TRUTH)} | anew
+        replace(self, state=state).restore(model)
 
 
 def read_checkpoint(path: str | Path) -> Checkpoint:

@@ -29,18 +29,18 @@ CHOSEN = {"experiment": "experiment", "model": "model", "randomize": "task/rando
 # What training follows from, apart from where and how fast it runs.
 OF_TRAINING = (
     *("task", "expert", "collect.episodes", "collect.seed", "data", "tokenizer", "model", "learner", "seed"),
-    *("experiment", "variant"),
+    *("experiment", "variant", "pretrained"),
 )
 # What a training's length and steps are, of a trainer.
 FAR = ("max_steps", "max_epochs", "val_check_interval", "accumulate_grad_batches", "gradient_clip_val")
 # What makes two trainings in one folder the same one.
 IDENTITY = (
     *("task", "expert", "collect.episodes", "collect.seed", "collect.folder", "data"),
-    *("tokenizer", "model", "learner", "validate", "seed"),
+    *("tokenizer", "model", "learner", "validate", "seed", "pretrained"),
     *(f"trainer.{name}" for name in (*FAR, "precision", "devices", "num_nodes")),
 )
 # What the report on a policy says of its training.
-TOLD = ("expert", "collect", "data", "learner", "trainer", "validate", "seed")
+TOLD = ("expert", "collect", "data", "learner", "trainer", "validate", "seed", "pretrained")
 
 
 def adopt(cfg: DictConfig, saved: Mapping[str, Any], overrides: Sequence[str]) -> DictConfig:
@@ -54,18 +54,43 @@ def adopt(cfg: DictConfig, saved: Mapping[str, Any], overrides: Sequence[str]) -
             or variant, which stand for several choices.
     """
     said = _parsed(overrides)
-    for override in said:
-        group = _path(override).partition(".")[0]
-        if group in ("tokenizer", "model", "experiment", "variant"):
-            raise ValueError(
-                f"{override.input_line} cannot be combined with a checkpoint, whose weights belong to the {group} "
-                "they were trained with: leave one of the two out; task/randomize=wide and evaluate=suite can be"
-            )
+    _require_own_parts(said, ("experiment", "variant"))
     named = {override.key_or_group for override in said}
     kept = saved.get("chosen", {})
     chosen = {name: cfg.chosen[name] if group in named else kept.get(name) for name, group in CHOSEN.items()}
     names = [*OF_POLICY, *(name for name in TOLD if cfg.job == "evaluate" and name in saved)]
     return _on_top(cfg, {**{name: saved[name] for name in names}, "chosen": chosen}, said)
+
+
+def start_from(cfg: DictConfig, overrides: Sequence[str]) -> DictConfig:
+    """`cfg` with the tokenizer and the model of the policy `cfg.pretrained`, from whose weights it is to be trained.
+
+    Raises:
+        ValueError: there is no such policy, `cfg` trains nothing anew, or an override of the tokenizer or the model, or
+            of a variant, which may stand for them.
+    """
+    from vla.policy import read_checkpoint
+
+    if cfg.checkpoint is not None or cfg.job not in ("train", "evaluate"):
+        raise ValueError(
+            f"pretrained={cfg.pretrained} is what a new training starts from: it goes with job=train or evaluate, and "
+            "without checkpoint=, which goes on with a training or evaluates it"
+        )
+    said = _parsed(overrides)
+    _require_own_parts(said, ("variant",))
+    saved = read_checkpoint(cfg.pretrained).config
+    chosen = {**_plain(cfg.chosen), "model": saved.get("chosen", {}).get("model")}
+    return _on_top(cfg, {"tokenizer": saved["tokenizer"], "model": saved["model"], "chosen": chosen}, said)
+
+
+def _require_own_parts(said: Sequence[Override], others: Sequence[str]) -> None:
+    for override in said:
+        group = _path(override).partition(".")[0]
+        if group in ("tokenizer", "model", *others):
+            raise ValueError(
+                f"{override.input_line} cannot be combined with a checkpoint, whose weights belong to the {group} "
+                "they were trained with: leave one of the two out; task/randomize=wide and evaluate=suite can be"
+            )
 
 
 def go_on(cfg: DictConfig, overrides: Sequence[str]) -> DictConfig:
@@ -89,7 +114,8 @@ def go_on(cfg: DictConfig, overrides: Sequence[str]) -> DictConfig:
         if f"{_path(override)}.".startswith(tuple(f"{name}." for name in OF_TRAINING)):
             raise ValueError(
                 f"{override.input_line} cannot be combined with going on from {path}: with other data, another "
-                "model or learner it is another training, so leave it out, or start one without checkpoint="
+                f"model or learner it is another training, so leave it out, or start one, with pretrained={path} in "
+                "place of checkpoint= if it is to start from these weights"
             )
     adopted = {name: value for name, value in saved.config.items() if name in cfg and name not in ("job", "output")}
     resumed = _on_top(cfg, adopted, said)
@@ -176,7 +202,7 @@ def _identity(config: Mapping[str, Any]) -> dict[str, Any]:
     values: dict[str, Any] = {}
     for key in IDENTITY:
         group, _, name = key.partition(".")
-        values[key] = config[group].get(name) if name else config[group]
+        values[key] = config[group].get(name) if name else config.get(group)
     return values
 
 

@@ -21,7 +21,7 @@ from yaml import YAMLError
 from vla.check import JOBS, check, suggestion
 from vla.deploy import ros
 from vla.ending import swift_end
-from vla.resume import adopt, go_on, taken_up
+from vla.resume import adopt, go_on, start_from, taken_up
 from vla.sweep import failures, note_failure
 
 PACKAGE = Path(__file__).resolve().parent
@@ -109,6 +109,8 @@ def _do(cfg: DictConfig) -> float | None:
     from vla import jobs
 
     said = HydraConfig.get().overrides.task
+    if cfg.pretrained is not None:
+        cfg = start_from(cfg, said)
     if cfg.checkpoint is not None and (cfg.checkpoint == "last" or cfg.resume or cfg.job == "train"):
         cfg = go_on(cfg, said)
     elif cfg.checkpoint is not None and cfg.job in ADOPTING:

@@ -54,7 +54,8 @@ def trained(config: DictConfig) -> Path | None:
         with enough_memory(config):
             learner = unfitted_learner(config, demonstrated(config))
         store = collected(config)
-        fit(learner.model.tokenizer, config, store)
+        if not (config.checkpoint or config.pretrained):
+            fit(learner.model.tokenizer, config, store)
         data = make_data(config, store, learner.model)
         tokens = fidelity(learner.model.tokenizer, store.statistics.chunks(learner.model.chunk), store.spec.units)
         log.info("%s: %s", type(learner.model.tokenizer).__name__, tokens)
@@ -100,7 +101,8 @@ def _told(
     output = output_folder(config)
     note_config(config)
     parameters = sum(parameter.numel() for parameter in learner.model.parameters())
-    log.info("training %s with %.2f M parameters", type(learner.model).__name__, parameters / 1e6)
+    start = f", starting from {config.pretrained}" if config.pretrained and not config.checkpoint else ""
+    log.info("training %s with %.2f M parameters%s", type(learner.model).__name__, parameters / 1e6, start)
     ended = "done"
     try:
         yield

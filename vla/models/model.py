@@ -101,6 +101,8 @@ class Model(nn.Module, ABC):
         tokenizer: how actions and tokens belong together, and between which bounds actions lie.
     """
 
+    OF_TRUTH = ("truth_head.", "truth_scale.")  # what names of weights begin with that are needed in training only
+
     def __init__(
         self,
         history: int,
