@@ -146,7 +146,13 @@ def test_what_a_tokenizer_loses_is_told_in_the_units_of_people() -> None:
     # Bins of 1 m and 1 rad: an action of 0.25 m rounds down to 0 m and so loses 250 mm, always to the same side.
     tokenizer = RT1(bins=3, spec=SPEC)
     told = fidelity(tokenizer, np.tile([0.25, 0.0, 1.0], (4, 1, 1)), SPEC.units)
-    assert told.startswith("250.000 mm (bias 250.000)") and "1 to 1 of 3 bins used; 3 tokens per action" in told
+    assert (
+        told.startswith("250.000 mm (bias 250.000, at most 250.000)")
+        and "1 to 1 of 3 bins used; 3 tokens per action" in told
+    )
+    turning = replace(SPEC, units=("m", "rad", "1"))
+    told = fidelity(RT1(bins=3, spec=turning), np.tile([0.0, 0.25, 1.0], (4, 1, 1)), turning.units)
+    assert "14.324 ° (bias 14.324, at most 14.324)" in told
     fine = fidelity(Uniform(spec=SPEC, statistics=BOUNDS), BOUNDS.chunks(1), SPEC.units)
     assert float(fine.split()[0]) < 0.2
 
@@ -228,8 +234,10 @@ def test_all_tokenizers_say_what_they_lose(name: str) -> None:
 @every
 def test_a_component_without_a_range_is_refused_by_name(name: str) -> None:
     spec = replace(SPEC, low=(-0.05, 0.05, 0.0))
-    with pytest.raises(ValueError, match="the spec allows y no range"):
+    with pytest.raises(ValueError, match="the spec must give y a range"):
         KINDS[name](spec=spec, statistics=BOUNDS)
+    with pytest.raises(ValueError, match="the spec must give y a range"):
+        KINDS[name](spec=replace(SPEC, high=(0.05, float("inf"), 1.0)), statistics=BOUNDS)
 
 
 def test_tokens_are_drawn_from_the_targets() -> None:

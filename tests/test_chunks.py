@@ -9,10 +9,12 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from fake_batch import make_act, make_batch, make_denoising, overfit, with_text
+from fake_batch import TINY_IMAGE, TINY_TEXT, make_act, make_batch, make_denoising, overfit, with_text
 from test_policy import observations
 from toy import SPEC, ToyEnvironment
 
+from vla.models.act import ACT
+from vla.models.action_tokenizer import Uniform
 from vla.models.chunks import ChunkModel
 from vla.models.diffusion import Diffusion
 from vla.models.flow import Flow
@@ -139,6 +141,13 @@ def test_looks_again_after_the_actions_that_are_executed(make: Callable[..., Chu
     policy.reset(seen[0].instruction, 0)
     plan = policy.plan(seen[0])
     assert plan.shape == (4, 3) and np.array_equal(plan[:2], acted[:2])
+
+
+@pytest.mark.parametrize("kind", [ACT, Diffusion, Flow])
+@pytest.mark.parametrize(("width", "heads"), [(32, 5), (33, 3)])
+def test_a_width_that_heads_cannot_share_is_refused(kind: type[Any], width: int, heads: int) -> None:
+    with pytest.raises(ValueError, match=rf"model\.width={width} must be even, and a multiple of model\.heads={heads}"):
+        kind(TINY_IMAGE, TINY_TEXT, width=width, heads=heads, spec=SPEC, tokenizer=Uniform(spec=SPEC))
 
 
 def test_more_cannot_be_executed_than_is_predicted() -> None:

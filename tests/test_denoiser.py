@@ -77,6 +77,21 @@ def test_who_knows_the_noise_finds_the_actions(steps: int) -> None:
     assert torch.allclose(model.sample(torch.randn(2, 4, 3), torch.zeros(2, 1, 32)), action, atol=1e-4)
 
 
+@pytest.mark.parametrize("steps", [1, 2, 5, 10])
+def test_noise_that_tells_nothing_does_not_become_an_action(steps: int) -> None:
+    model = make_denoising(Diffusion)
+    model.steps, spread = steps, 0.2
+
+    def expected(noisy: Tensor, time: Tensor) -> Tensor:
+        """The mean of the noise in what was made of normal actions around 0."""
+        share = kept((time * LEVELS).round())[:, None, None]
+        return (1 - share).sqrt() * noisy / (share * spread**2 + 1 - share)
+
+    model.denoiser = Told(expected)  # type: ignore[assignment]
+    actions = model.sample(torch.randn(500, 4, 3, generator=torch.Generator().manual_seed(0)), torch.zeros(500, 1, 32))
+    assert actions.std() < 1.1 * spread
+
+
 def test_a_constant_velocity_leads_exactly_there() -> None:
     model = make_denoising(Flow)
     noise, velocity = torch.randn(2, 4, 3), torch.randn(2, 4, 3)

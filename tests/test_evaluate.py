@@ -6,12 +6,11 @@ import os
 from functools import partial
 from pathlib import Path
 
-import numpy as np
 import pytest
 import toy_recordable as toy
 from rerun.chunk import RrdReader
 
-from vla.evaluate import FIRST_SEED, Report, Result, evaluate, keep_recordings, wilson_interval
+from vla.evaluate import FIRST_SEED, Report, Result, evaluate, keep_recordings
 from vla.report import summary
 from vla.spec import Environment
 
@@ -20,16 +19,6 @@ SEEDS = range(FIRST_SEED, FIRST_SEED + 10)
 
 def results(*outcomes: str) -> Report:
     return Report(tuple(Result(FIRST_SEED + index, outcome) for index, outcome in enumerate(outcomes)))
-
-
-def test_wilson_interval_equals_values_worked_out_by_hand() -> None:
-    # 8 of 10: centre (0.8 + 3.8415/20) / 1.38415 = 0.71674,
-    # half width 1.95996 √(0.8·0.2/10 + 3.8415/400) / 1.38415 = 0.22659
-    np.testing.assert_allclose(wilson_interval(8, 10), (0.49016, 0.94332), atol=1e-5)
-    # None of 10: from 0 to z² / (n + z²) = 3.8415 / 13.8415
-    np.testing.assert_allclose(wilson_interval(0, 10), (0, 0.27753), atol=1e-5)
-    np.testing.assert_allclose(wilson_interval(10, 10), (1 - 0.27753, 1), atol=1e-5)
-    assert wilson_interval(0, 0) == (0, 1)
 
 
 def test_the_last_line_is_the_success_rate() -> None:

@@ -43,7 +43,7 @@ def trained(tmp_path: Path, tabletop: Tabletop, *overrides: str) -> tuple[Policy
         enable_progress_bar=False,
         enable_model_summary=False,
     )
-    batches: Any = [make_batch(learner.model.history, spec=tabletop.spec)] * 2
+    batches: Any = [make_batch(learner.model.history, learner.model.chunk, spec=tabletop.spec)] * 2
     trainer.fit(learner, DataLoader(batches, batch_size=None))
     trainer.save_checkpoint(tmp_path / "last.ckpt")
     read_checkpoint(tmp_path / "last.ckpt").restore(learner.model)  # the averages
@@ -105,6 +105,16 @@ def test_what_cannot_be_built_is_named_before_anything_is_collected(
     with pytest.raises(ValueError, match=message):
         jobs.run(composed(*SMALL, *overrides))
     assert not (tmp_path / "store").exists()
+
+
+@pytest.mark.parametrize("model", ["rt1_tiny", "decoder", "act", "diffusion", "flow"])
+def test_every_model_comes_back_out_of_its_file(model: str, tmp_path: Path, tabletop: Tabletop) -> None:
+    policy, checkpoint = trained(tmp_path, tabletop, f"model={model}")
+    observation = tabletop.reset(0)
+    again = make_policy(CPU, checkpoint, tabletop)
+    assert type(again.model) is type(policy.model)
+    for _ in range(2):
+        assert np.array_equal(again.act(observation), policy.act(observation))
 
 
 def test_training_starts_from_a_policy_whose_demonstrations_held_another_truth(

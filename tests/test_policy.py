@@ -88,12 +88,25 @@ def test_compiled_it_acts_the_same() -> None:
     assert act(Policy(compile=True, model=model, spec=SPEC), seen) == pytest.approx(eager, abs=1e-5)
 
 
-def test_in_half_precision_it_sees_about_the_same() -> None:
-    torch.manual_seed(0)
-    model = make_bc()
-    exact, half = Policy(model=model, spec=SPEC), Policy(precision="bf16", model=model, spec=SPEC)
+def test_another_sentence_is_not_compiled_anew() -> None:
+    torch.compiler.reset()
+    policy = Policy(compile=True, model=make_bc(), spec=SPEC)
     (seen,) = observations(1)
-    exact.act(seen), half.act(seen)
+    compiled = torch._dynamo.utils.counters["stats"]
+    counts = []
+    for sentence in ("lift it", "put the small green block on the blue pad, and leave the others where they are"):
+        policy.act(replace(seen, instruction=sentence))
+        counts.append(compiled["unique_graphs"])
+    assert counts[0] == counts[1] > 0
+
+
+@pytest.mark.parametrize("make", [make_bc, make_rt1], ids=["bc", "rt1 with kept tokens"])
+def test_in_half_precision_it_sees_about_the_same(make: Callable[[], Model]) -> None:
+    torch.manual_seed(0)
+    model = make()
+    exact, half = Policy(model=model, spec=SPEC), Policy(precision="bf16", model=model, spec=SPEC)
+    for seen in observations(4):
+        exact.act(seen), half.act(seen)
     assert half.info["probabilities"] == pytest.approx(exact.info["probabilities"], abs=0.01)
     assert not np.array_equal(half.info["probabilities"], exact.info["probabilities"])
 

@@ -4,23 +4,34 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from copy import deepcopy
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from fake_batch import make_bc, make_decoder, make_rt1
+from fake_batch import make_bc, make_decoder, make_denoising, make_rt1
+from torch import Tensor
+from torch.export import ExportedProgram
 from toy import SPEC, ToyEnvironment
 
+from vla.models.diffusion import Diffusion
 from vla.models.model import Model
 from vla.policy import Policy
-from vla.program import Program
+from vla.program import Act, Encode, Program, capture
+
+
+def make_diffusion() -> Model:
+    """One that writes short programs."""
+    model = make_denoising(Diffusion)
+    model.steps = 2
+    return model
 
 
 @pytest.mark.parametrize(
     "make",
-    [lambda: make_bc(chunk=2), lambda: make_rt1(proprioception=True), make_decoder],
-    ids=["bc", "rt1 with kept tokens", "decoder"],
+    [lambda: make_bc(chunk=2), lambda: make_rt1(proprioception=True), make_decoder, make_diffusion],
+    ids=["bc", "rt1 with kept tokens", "decoder", "diffusion"],
 )
 def test_the_programs_act_like_the_policy_for_any_sentence(make: Callable[[], Model], tmp_path: Path) -> None:
     from onnxruntime import InferenceSession
@@ -37,8 +48,8 @@ def test_the_programs_act_like_the_policy_for_any_sentence(make: Callable[[], Mo
     policy.reset(instruction, 0)
     observation = observation.__class__(**{**vars(observation), "instruction": instruction})
     expected = policy.plan(observation)
-    window = policy.window()
-    inputs = {**window.pop("rgb"), **window}
+    window, drawn = policy.window(), policy.model.draw(torch.Generator().manual_seed(0))
+    inputs = {**window.pop("rgb"), **window, **({} if drawn is None else {"noise": drawn})}
     loaded = torch.export.load(folder / "act.pt2").module()
     session = InferenceSession(folder / "act.onnx")
     given = {node.name: inputs[node.name].numpy() for node in session.get_inputs()}
@@ -54,6 +65,26 @@ def test_models_that_keep_tokens_encode_one_frame_at_a_time(tmp_path: Path) -> N
     told = json.loads((folder / "program.json").read_text())
     assert told["encode"]["inputs"]["front"] == {"dtype": "uint8", "shape": [1, 1, *SPEC.image_size, 3]}
     assert told["act"]["inputs"]["tokens"]["shape"] == [1, 3, 6, 32]
+
+
+@pytest.mark.parametrize("wrong", [0.01, float("nan")])
+@pytest.mark.parametrize("program", ["Encode", "Act"])
+def test_a_program_that_differs_is_not_written(
+    program: str, wrong: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def captured(whole: Encode | Act, inputs: dict[str, Tensor]) -> ExportedProgram:
+        if type(whole).__name__ != program:
+            return capture(whole, inputs)
+        changed = type(whole)(deepcopy(whole.model))
+        bias = changed.model.image_tokens.bias if program == "Encode" else changed.model.head.bias  # type: ignore[union-attr]
+        with torch.no_grad():
+            bias[0] += 1000 * wrong  # type: ignore[index,operator]
+        return capture(changed, inputs)
+
+    monkeypatch.setattr("vla.program.capture", captured)
+    with pytest.raises(ValueError, match=r"\.pt2 differs from the model"):
+        Program(tmp_path / "program", onnx=False).export(Policy(model=make_rt1(), spec=SPEC))
+    assert not list(tmp_path.iterdir())
 
 
 def test_nothing_is_written_over(tmp_path: Path) -> None:

@@ -12,7 +12,8 @@ from PIL import Image
 from rich.console import Console
 from toy_recordable import make_environment
 
-from vla.evaluate import FIRST_SEED, Report, Result, wilson_interval
+from vla.evaluate import FIRST_SEED, Report, Result
+from vla.intervals import wilson_interval
 from vla.report import contact_sheet, draws_table, plot_report, write_report
 
 

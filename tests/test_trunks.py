@@ -45,7 +45,10 @@ def test_at_the_start_the_efficientnet_is_the_plain_one_bit_for_bit() -> None:
     assert len(ours.films) == len(ours.blocks) == 16
 
 
-@pytest.mark.parametrize(("name", "size"), [("test_vit", 32), ("test_resnet", None), ("test_vit4", None)])
+NETWORKS = [("test_vit", 32), ("test_resnet", None), ("test_vit4", None), ("vit_base_patch16_siglip_224", 32)]
+
+
+@pytest.mark.parametrize(("name", "size"), NETWORKS)
 def test_at_the_start_a_feature_map_is_that_of_the_network(name: str, size: int | None, tmp_path: Path) -> None:
     torch.manual_seed(0)
     plain: Any = timm.create_model(name, num_classes=0, img_size=size if "vit" in name else None).eval()

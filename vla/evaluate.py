@@ -15,7 +15,6 @@ from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import closing, suppress
 from dataclasses import dataclass, field
-from math import sqrt
 from multiprocessing import get_context
 from multiprocessing.util import Finalize
 from pathlib import Path
@@ -23,6 +22,7 @@ from typing import Any, Protocol
 
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+from vla.intervals import wilson_interval
 from vla.rollout import rollout
 from vla.spec import FIRST_SEED, Agent, Environment, Recorder
 from vla.workers import cores, leave_with_parent, one_thread_each
@@ -32,7 +32,6 @@ log = logging.getLogger(__name__)
 SEEN = "seen"  # the condition that a policy was trained for
 TAKEN = ("success", "dropped", "not_placed", "timeout")  # outcomes of episodes in which the named block was taken
 ERROR = "error"  # outcome of an episode that could not be played to its end
-NORMAL_QUANTILE = 1.959964  # of 0.975: an interval of 95 %
 
 
 class ClosableEnvironment(Environment, Protocol):
@@ -127,22 +126,6 @@ class Report:
         low, high = self.interval
         share = f"{100 * self.success:.1f} %, 95 % CI {100 * low:.1f}-{100 * high:.1f}"
         return f"{self.successes}/{self.episodes} ({share})"
-
-
-def wilson_interval(successes: int, trials: int) -> tuple[float, float]:
-    """95 % confidence interval of a proportion; (0, 1) without trials.
-
-    Wilson's score interval: E. B. Wilson, "Probable inference, the law of succession, and statistical inference",
-    Journal of the American Statistical Association 22 (1927).
-    """
-    if trials == 0:
-        return 0.0, 1.0
-    share, spread = successes / trials, NORMAL_QUANTILE**2 / trials
-    centre = (share + spread / 2) / (1 + spread)
-    half_width = sqrt(spread * (share * (1 - share) + spread / 4)) / (1 + spread)
-    # At the ends the interval begins or ends exactly there, but for rounding.
-    low = centre - half_width if successes else 0.0
-    return low, centre + half_width if successes < trials else 1.0
 
 
 def evaluate(

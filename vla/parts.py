@@ -118,7 +118,7 @@ def in_training(policy: Node, model: Model) -> Policy:
 
 def _without_pretraining(model: Node) -> Node:
     """The node of a model whose weights all come out of a checkpoint, with none to be found or fetched before."""
-    nowhere = {("image", "pretrained"): False, ("text", "name"): ""}
+    nowhere = {("image", "pretrained"): "", ("text", "name"): ""}
     changed = {
         part: {**model[part], key: value} for (part, key), value in nowhere.items() if key in (model.get(part) or {})
     }

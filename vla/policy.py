@@ -21,6 +21,9 @@ from vla.spec import Array, Observation, Spec
 
 Batch = dict[str, Any]
 
+OF_TRUTH = ("truth_head", "truth_scale")  # parts of a model that are needed in training only
+LONG = " ".join(["sentence"] * 24)  # what is compiled for a text of this length is so for all shorter ones
+
 
 @dataclass(frozen=True)
 class Checkpoint:
@@ -52,8 +55,10 @@ class Checkpoint:
         """
         state = self.state
         if self.spec.truth != model.spec.truth:
-            anew = {name: value for name, value in model.state_dict().items() if name.startswith(Model.OF_TRUTH)}
-            state = {name: value for name, value in state.items() if not name.startswith(Model.OF_TRUTH)} | anew
+            state = {name: value for name, value in state.items() if name.partition(".")[0] not in OF_TRUTH}
+            for part, module in model.named_children():
+                if part in OF_TRUTH:
+                    state |= {f"{part}.{name}": value for name, value in module.state_dict().items()}
         replace(self, state=state).restore(model)
 
 
@@ -114,6 +119,7 @@ class Policy:
         self.info: dict[str, Any] = {}
         self._half = precision == "bf16"
         self._encode, self._decide = self.model.encode, self.model.predict
+        self._beside = [LONG] if compile else []  # sentences to whose length others are filled up
         if compile:
             how: dict[str, Any] = {"options": {"freezing": True}}
             if self.device.type == "cuda":
@@ -131,7 +137,7 @@ class Policy:
         self._frames.clear()
         self._chunk.clear()
         self._instruction = instruction
-        self._text = self.model.text.tokenize([instruction]).to(self.device)
+        self._text = self.model.text.tokenize([instruction, *self._beside])[:1].to(self.device)
 
     def act(self, observation: Observation) -> Array:
         """The (D,) float32 action to execute, within the spec's bounds; `info` may have its token probabilities (D, K).
@@ -164,9 +170,10 @@ class Policy:
     @torch.inference_mode()
     def _predict(self) -> tuple[Array, Array | None]:
         """Actions (k, D), clipped, and token probabilities (k, D, K), where the model has them."""
-        drawn = torch.randn(1, self.model.chunk, len(self.spec.action), generator=self._random)
+        drawn = self.model.draw(self._random)
+        noise = {} if drawn is None else {"noise": drawn.to(self.device)}
         with self._computing():
-            actions, probabilities = self._decide({**self.window(), "noise": drawn.to(self.device)})
+            actions, probabilities = self._decide({**self.window(), **noise})
         told = None if probabilities is None else probabilities[0].float().cpu().numpy()
         return np.clip(actions[0].float().cpu().numpy(), self._low, self._high), told
 

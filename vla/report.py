@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from rich.table import Table
 
-from vla.evaluate import ERROR, Report, Result, wilson_interval
+from vla.evaluate import ERROR, Report, Result
+from vla.intervals import wilson_interval
 from vla.spec import Array, Observation, flat, leaves
 
 if TYPE_CHECKING:

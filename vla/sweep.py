@@ -6,7 +6,6 @@ A cell is a folder of the sweep; cells that differ in nothing but the seed of tr
 from __future__ import annotations
 
 import csv
-import json
 import os
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -35,8 +34,7 @@ class Row:
     cells: list[Path] = field(default_factory=list)
     latencies: list[float] = field(default_factory=list)  # [ms], of each cell
     rates: list[float] = field(default_factory=list)  # success, of each cell
-    successes: dict[str, int] = field(default_factory=dict)  # condition → of all cells
-    episodes: dict[str, int] = field(default_factory=dict)
+    played: dict[str, list[dict[int, bool]]] = field(default_factory=dict)  # condition → of each cell, seed → success
 
     @property
     def name(self) -> str:
@@ -48,12 +46,22 @@ class Row:
         """Median over the cells [ms]."""
         return sorted(self.latencies)[len(self.latencies) // 2]
 
-    def interval(self, condition: str) -> tuple[float, float, float]:
-        """Success rate of all cells together and its 95 % confidence interval, which takes episodes for independent."""
-        from vla.evaluate import wilson_interval
+    @property
+    def successes(self) -> dict[str, int]:
+        """Condition → how many episodes succeeded, of all cells."""
+        return {condition: sum(sum(cell.values()) for cell in cells) for condition, cells in self.played.items()}
 
-        won, played = self.successes[condition], self.episodes[condition]
-        return (won / max(played, 1), *wilson_interval(won, played))
+    @property
+    def episodes(self) -> dict[str, int]:
+        """Condition → how many episodes were played, of all cells."""
+        return {condition: sum(map(len, cells)) for condition, cells in self.played.items()}
+
+    def interval(self, condition: str) -> tuple[float, float, float]:
+        """Success rate of all cells together and its 95 % confidence interval, for other trainings on other scenes."""
+        from vla.intervals import pooled_interval
+
+        rate = self.successes[condition] / max(self.episodes[condition], 1)
+        return (rate, *pooled_interval(self.played[condition]))
 
 
 class Tabulate(Callback):
@@ -105,24 +113,25 @@ def tabulate(folder: Path) -> list[Row]:
 
 def read_rows(folder: Path) -> list[Row]:
     """The cells that have a report, and did not fail since, put together, in the order of the sweep."""
-    from vla.evaluate import SEEN
+    from vla.evaluate import ERROR
+    from vla.results import read_run
 
     cells = [
-        (_overrides(cell), cell, json.loads((cell / "report.json").read_text(encoding="utf-8")))
+        (_overrides(cell), read_run(cell))
         for cell in _cells(folder, "report.json")
         if not (cell / FAILURE).exists()  # its report may be of other overrides
     ]
-    telling = [key for key in _telling([overrides for overrides, _, _ in cells]) if key != SEED]
+    telling = [key for key in _telling([overrides for overrides, _ in cells]) if key != SEED]
     rows: dict[tuple[str, ...], Row] = {}
-    for overrides, cell, report in cells:
+    for overrides, run in cells:
         choices = {key: overrides.get(key, "default") for key in telling}
-        row = rows.setdefault(tuple(choices.values()), Row(choices, report["parameters"]))
-        row.cells.append(cell)
-        row.latencies.append(report["latency_ms"])
-        row.rates.append(report["success"])
-        for condition, part in {SEEN: report, **report["conditions"]}.items():
-            row.successes[condition] = row.successes.get(condition, 0) + part["successes"]
-            row.episodes[condition] = row.episodes.get(condition, 0) + part["episodes"]
+        row = rows.setdefault(tuple(choices.values()), Row(choices, run.report["parameters"]))
+        row.cells.append(run.folder)
+        row.latencies.append(run.report["latency_ms"])
+        row.rates.append(run.report["success"])
+        for condition, report in run.reports.items():
+            ended = {result.seed: result.outcome == "success" for result in report.results if result.outcome != ERROR}
+            row.played.setdefault(condition, []).append(ended)
     return list(rows.values())
 
 
@@ -148,13 +157,13 @@ def _telling(cells: list[dict[str, str]]) -> list[str]:
 
 def markdown(rows: list[Row]) -> str:
     """The table for people: success under every condition with its interval, then what each row costs."""
-    conditions = list(dict.fromkeys(condition for row in rows for condition in row.successes))
+    conditions = list(dict.fromkeys(condition for row in rows for condition in row.played))
     head = [*rows[0].choices, *(f"{name} [%]" for name in conditions), "each seed [%]", "parameters [M]", "action [ms]"]
     lines = [head, ["---"] * len(head)]
     for row in rows:
         shares = []
         for condition in conditions:
-            if condition not in row.successes:
+            if condition not in row.played:
                 shares.append("-")
                 continue
             rate, low, high = (100 * value for value in row.interval(condition))
@@ -171,7 +180,7 @@ def _write_page(rows: list[Row], folder: Path) -> None:
     lines = [
         Line(
             list(row.choices.values()),
-            {condition: row.interval(condition) for condition in row.successes},
+            {condition: row.interval(condition) for condition in row.played},
             [", ".join(f"{100 * rate:.1f}" for rate in row.rates), f"{row.parameters / 1e6:.2f}", f"{row.latency:.1f}"],
             {cell.name: f"{quote(cell.name)}/report.html" for cell in row.cells},
         )
@@ -187,7 +196,7 @@ def _write_csv(rows: list[Row], path: Path) -> None:
         columns = ["condition", "success", "ci_low", "ci_high", "successes", "episodes", "cells"]
         writer.writerow([*rows[0].choices, *columns, "parameters", "latency_ms"])
         for row in rows:
-            for condition in row.successes:
+            for condition in row.played:
                 counts = [row.successes[condition], row.episodes[condition], len(row.rates)]
                 costs = [row.parameters, round(row.latency, 3)]
                 writer.writerow([*row.choices.values(), condition, *row.interval(condition), *counts, *costs])

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from vla.evaluate import wilson_interval
+from vla.intervals import wilson_interval
 from vla.results import read_run
 from vla.sweep import DEMONSTRATIONS, Row
 
@@ -39,7 +39,7 @@ def plot(rows: list[Row], path: Path) -> None:
 
 
 def _draw_numbers(figure: Figure, rows: list[Row]) -> None:
-    conditions, lines = list(rows[0].successes), _lines(rows)
+    conditions, lines = list(rows[0].played), _lines(rows)
     seen = {name: {row.choices[DEMONSTRATIONS]: validated(row) for row in line} for name, line in lines.items()}
     trained = {name: curves for name, curves in seen.items() if any(curves.values())}
     columns = max(len(conditions), len(trained))
@@ -70,7 +70,7 @@ def _key(panels: Sequence[Axes]) -> Legend:
 
 
 def _draw_choices(figure: Figure, rows: list[Row]) -> None:
-    conditions = list(dict.fromkeys(condition for row in rows for condition in row.successes))
+    conditions = list(dict.fromkeys(condition for row in rows for condition in row.played))
     latencies = [row.latency for row in rows]
     heights = [1.2 + 0.3 * len(rows), *([4.2] if max(latencies) > 2 * min(latencies) else [])]
     figure.set_size_inches(max(8, 2 + 3.3 * len(conditions)), sum(heights))
@@ -112,7 +112,7 @@ def _demonstrations(row: Row) -> int:
 def _plot_curves(axes: Axes, lines: dict[str, list[Row]], condition: str) -> None:
     """Success under one condition over the number of demonstrations."""
     for name, line in lines.items():
-        played = [row for row in line if condition in row.successes]
+        played = [row for row in line if condition in row.played]
         rates = [row.interval(condition) for row in played]
         reach = [[rate - low for rate, low, _ in rates], [high - rate for rate, _, high in rates]]
         counts = [_demonstrations(row) for row in played]
@@ -147,10 +147,10 @@ def _plot_training(axes: Axes, name: str, curves: dict[str, Points], counts: lis
 def _plot_rows(axes: Axes, rows: list[Row], condition: str) -> None:
     """Success of every row under one condition, in the order of the sweep; a line goes on from the first."""
     for height, row in enumerate(rows):
-        if condition in row.successes:
+        if condition in row.played:
             rate, low, high = row.interval(condition)
             axes.errorbar(rate, height, xerr=[[rate - low], [high - rate]], fmt="o", color=f"C{height}", capsize=3)
-    if condition in rows[0].successes:
+    if condition in rows[0].played:
         axes.axvline(rows[0].interval(condition)[0], color="C0", linewidth=0.8, linestyle=":")
     axes.set_yticks(range(len(rows)), [f"{row.name}, {row.parameters / 1e6:.2f} M" for row in rows])
     axes.set_ylim(len(rows) - 0.5, -0.5)
@@ -165,7 +165,7 @@ def _plot_costs(axes: Axes, rows: list[Row], condition: str) -> None:
     from matplotlib.ticker import LogLocator
 
     for number, row in enumerate(rows):
-        if condition in row.successes:
+        if condition in row.played:
             rate, low, high = row.interval(condition)
             axes.errorbar(row.latency, rate, [[rate - low], [high - rate]], color="#c4c8ce", capsize=3, zorder=1)
             axes.scatter(row.latency, rate, s=40 + 60 * (row.parameters / 1e6) ** 0.5, color=f"C{number}", alpha=0.9)
@@ -187,7 +187,7 @@ def pareto(rows: list[Row], condition: str) -> list[Row]:
         return row.interval(condition)[0]
 
     best: list[Row] = []
-    played = [row for row in rows if condition in row.successes]
+    played = [row for row in rows if condition in row.played]
     for row in sorted(played, key=lambda row: (row.latency, -rate(row))):
         if not best or rate(row) > rate(best[-1]):
             best.append(row)

@@ -13,6 +13,7 @@ from lightning import Trainer
 from omegaconf import DictConfig
 
 from vla.collect import effort
+from vla.models.chunks import ChunkModel
 from vla.models.fidelity import fidelity
 from vla.models.learner import Learner
 from vla.page import PAGE, optional, write_page
@@ -57,8 +58,9 @@ def trained(config: DictConfig) -> Path | None:
         if not (config.checkpoint or config.pretrained):
             fit(learner.model.tokenizer, config, store)
         data = make_data(config, store, learner.model)
-        tokens = fidelity(learner.model.tokenizer, store.statistics.chunks(learner.model.chunk), store.spec.units)
-        log.info("%s: %s", type(learner.model.tokenizer).__name__, tokens)
+        if not isinstance(learner.model, ChunkModel):  # nothing of whose actions becomes a token
+            lost = fidelity(learner.model.tokenizer, store.statistics.chunks(learner.model.chunk), store.spec.units)
+            log.info("%s: %s", type(learner.model.tokenizer).__name__, lost)
         data.setup()
         if not len(data.held_out_windows):
             trainer.limit_val_batches = 0  # else what waits for a validation would wait in vain

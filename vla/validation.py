@@ -10,7 +10,8 @@ from typing import Any
 import torch
 from lightning import Callback, LightningModule, Trainer
 
-from vla.evaluate import ClosableEnvironment, play, wilson_interval
+from vla.evaluate import ClosableEnvironment, play
+from vla.intervals import wilson_interval
 from vla.models.learner import Learner
 from vla.models.model import Model
 from vla.spec import Agent

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
 
 import numpy as np
 from omegaconf import DictConfig
@@ -13,8 +12,8 @@ from vla.check import build
 
 
 def measures(config: DictConfig) -> dict[str, Measure]:
-    """The time from an observation to an action, as `config.policy` computes it, against its network alone; and of
-    the same network if it encoded every frame of its history anew, in 32 bits and uncompiled, against that time."""
+    """The time from an observation to an action, as `config.policy` computes it, against its network alone, in 32 bits
+    and uncompiled; and of that network if it encoded every frame of its history anew, against that time."""
     import torch
 
     from vla.parts import collected, make_environment, make_learner, plain
@@ -33,8 +32,9 @@ def measures(config: DictConfig) -> dict[str, Measure]:
     steps = config.benchmark.steps
     acting = _median(lambda: agent.plan(observation), steps)
     with torch.inference_mode():
-        network = _median(partial(model.predict, agent.window()), steps)
-        naive = _median(partial(model.predict, whole), steps)
+        kept = agent.window()
+        network = _median(lambda: (model.encode(frame), model.predict(kept).actions.cpu()), steps)
+        naive = _median(lambda: model.predict(whole).actions.cpu(), steps)
     return {
         "policy": measure(acting, "ms", steps, network),
         "policy: every frame anew": measure(naive, "ms", steps, acting),

@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from vla.models.action_tokenizer import ActionTokenizer
 from vla.models.chunks import ChunkModel, mean_where
 from vla.models.image_tokenizer import ImageEncoder
-from vla.models.model import Batch, Prediction
+from vla.models.model import Batch, Prediction, require_heads
 from vla.models.text import TextEncoder
 from vla.spec import Spec
 
@@ -69,6 +69,9 @@ class ACT(ChunkModel):
         kl_weight: weight of the divergence of the latent from its prior; 0 leaves latent and CVAE encoder out.
         spec: what a step looks like.
         tokenizer: between which bounds actions lie.
+
+    Raises:
+        ValueError: `width` is odd or no multiple of `heads`, or `execute` is more than `chunk`.
     """
 
     def __init__(
@@ -90,7 +93,20 @@ class ACT(ChunkModel):
         spec: Spec,
         tokenizer: ActionTokenizer,
     ) -> None:
-        super().__init__(image, text, chunk, execute, keypoints, text_width, width, shift, auxiliary, spec, tokenizer)
+        require_heads(width, heads)
+        super().__init__(
+            image=image,
+            text=text,
+            chunk=chunk,
+            execute=execute,
+            keypoints=keypoints,
+            text_width=text_width,
+            width=width,
+            shift=shift,
+            auxiliary=auxiliary,
+            spec=spec,
+            tokenizer=tokenizer,
+        )
         self.kl_weight, self.latent = kl_weight, latent
         if kl_weight > 0:
             self.style = Style(self.posture_width, len(spec.action), chunk, width, layers, heads, latent)

@@ -6,6 +6,7 @@ dimensions.
 
 from __future__ import annotations
 
+import logging
 import math
 from abc import ABC, abstractmethod
 from typing import Protocol
@@ -16,6 +17,8 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from vla.spec import Spec
+
+log = logging.getLogger(__name__)
 
 # Fixed bounds of RT-1: 1 m, a right angle, and a gripper command of one (arXiv 2212.06817).
 RT1_BOUNDS = {"m": 1.0, "rad": math.pi / 2, "1": 1.0}
@@ -60,9 +63,9 @@ class ActionTokenizer(nn.Module, ABC):
         if bins < 2:
             raise ValueError(f"a tokenizer needs at least 2 bins, got bins={bins}")
         ranges = zip(spec.action, spec.low, spec.high, strict=True)
-        empty = [name for name, least, most in ranges if not least < most]
+        empty = [name for name, least, most in ranges if not (least < most and math.isfinite(most - least))]
         if empty:
-            raise ValueError(f"the spec allows {', '.join(empty)} no range: its low must be smaller than its high")
+            raise ValueError(f"the spec must give {', '.join(empty)} a range: a low and a higher high, both finite")
         self.bins, self.components = bins, len(spec.action)
         self.register_buffer("low", torch.as_tensor(low, dtype=torch.float32))
         self.register_buffer("high", torch.as_tensor(high, dtype=torch.float32))
@@ -176,9 +179,10 @@ class EvenBins(PerComponent):
 class Uniform(EvenBins):
     """Bins over the range of the data, nearest bin, and targets that also credit the neighbours of the right bin.
 
-    The action is read as the expectation over the most likely stretch of bins, so it is finer than a bin and two
-    separate ways to act are never averaged. A stretch and not a bin, because a sharp peak of little weight, such as
-    standing still, would otherwise beat a broad one of more weight, and a robot that stands still goes on doing so.
+    The action is read as the expectation over the most likely stretch of bins, so it is finer than a bin, and ways to
+    act that lie further apart than the stretch is long are not averaged. A stretch and not a bin, because a sharp peak
+    of little weight, such as standing still, would otherwise beat a broad one of more weight, and a robot that stands
+    still goes on doing so.
 
     Args:
         bins: K.
@@ -270,7 +274,11 @@ def data_bounds(spec: Spec, statistics: Statistics | None, margin: float = 0.0) 
             f"the statistics describe actions of {low.size} components, the spec has {len(spec.action)}: "
             f"{', '.join(spec.action)}"
         )
-    span = np.maximum(high - low, LEAST_SPAN * (allowed_high - allowed_low))
+    least = LEAST_SPAN * (allowed_high - allowed_low)
+    still = [name for name, narrow in zip(spec.action, high - low < least, strict=True) if narrow]
+    if still:
+        log.info("%s hardly differs in the demonstrations, and gets %g of its range", ", ".join(still), LEAST_SPAN)
+    span = np.maximum(high - low, least)
     half = (0.5 + margin) * span
     return (low + high) / 2 - half, (low + high) / 2 + half
 

@@ -47,7 +47,15 @@ class BC(TokenModel):
         spec: Spec,
         tokenizer: PerComponent,
     ) -> None:
-        super().__init__(1, chunk, text(width=text_width), auxiliary, width, spec, tokenizer)
+        super().__init__(
+            history=1,
+            chunk=chunk,
+            text=text(width=text_width),
+            auxiliary=auxiliary,
+            truth_width=width,
+            spec=spec,
+            tokenizer=tokenizer,
+        )
         self.shift = RandomShift(*shift)
         encoders = [image(text_width=text_width) for _ in spec.cameras]
         self.images = nn.ModuleList(encoders)

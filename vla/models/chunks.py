@@ -60,7 +60,15 @@ class ChunkModel(Model):
         tokenizer: ActionTokenizer,
     ) -> None:
         hidden = HIDDEN * width
-        super().__init__(1, chunk, text(width=text_width), auxiliary, hidden, spec, tokenizer)
+        super().__init__(
+            history=1,
+            chunk=chunk,
+            text=text(width=text_width),
+            auxiliary=auxiliary,
+            truth_width=hidden,
+            spec=spec,
+            tokenizer=tokenizer,
+        )
         if execute > chunk:
             raise ValueError(f"model.execute={execute} is more than the model.chunk={chunk} actions that are predicted")
         self.execute = execute

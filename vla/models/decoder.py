@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from vla.models.action_tokenizer import ActionTokenizer, PerComponent
 from vla.models.frames import FrameModel
 from vla.models.image_tokenizer import ImageEncoder
-from vla.models.model import Batch, Prediction, newest
+from vla.models.model import Batch, Prediction, newest, require_heads
 from vla.models.text import TextEncoder
 from vla.spec import Spec
 
@@ -61,6 +61,14 @@ def _attend(
     seen = F.scaled_dot_product_attention(query, key, value, mask)
     mixed: Tensor = attention.out_proj(seen.transpose(1, 2).flatten(2))
     return mixed
+
+
+def newest_last(frames: Tensor, present: Tensor) -> tuple[Tensor, Tensor]:
+    """(B, T, N, E) frames and (B, T) bool, turned until the newest one that is present is the last: of 1, 2, -, - it
+    makes -, -, 1, 2."""
+    length = present.shape[1]
+    places = (torch.arange(length, device=present.device) + newest(present)[:, None] + 1) % length  # (B, T)
+    return frames.gather(1, places[:, :, None, None].expand_as(frames)), present.gather(1, places)
 
 
 class Decoder(FrameModel):
@@ -116,23 +124,22 @@ class Decoder(FrameModel):
         spec: Spec,
         tokenizer: ActionTokenizer,
     ) -> None:
-        if width % heads:
-            raise ValueError(f"model.width={width} must be a multiple of model.heads={heads}")
+        require_heads(width, heads)
         super().__init__(
-            image,
-            text,
-            history,
-            image_size,
-            learned_tokens,
-            keypoints,
-            proprioception,
-            chunk,
-            auxiliary,
-            text_width,
-            width,
-            shift,
-            spec,
-            tokenizer,
+            image=image,
+            text=text,
+            history=history,
+            image_size=image_size,
+            learned_tokens=learned_tokens,
+            keypoints=keypoints,
+            proprioception=proprioception,
+            chunk=chunk,
+            auxiliary=auxiliary,
+            text_width=text_width,
+            width=width,
+            shift=shift,
+            spec=spec,
+            tokenizer=tokenizer,
         )
         self.length = tokenizer.length(chunk)  # L
         self.sentence_token = nn.Linear(text_width, width)
@@ -196,16 +203,12 @@ class Decoder(FrameModel):
         counts from the newest.
         """
         frames = batch["tokens"] if "tokens" in batch else self.encode(batch)
-        present = batch["present"]
-        # What is absent after the newest frame goes before the oldest.
-        length = present.shape[1]
-        places = (torch.arange(length, device=present.device) + newest(present)[:, None] + 1) % length  # (B, T)
-        frames = frames.gather(1, places[:, :, None, None].expand_as(frames))
+        frames, present = newest_last(frames, batch["present"])
         seen = frames.flatten(1, 2)  # (B, T·N, E)
         seen = seen + self.memory_positions.weight[-seen.shape[1] :]
         sentence = self.sentence_token(self.text(batch["text"])).unsqueeze(1)
         met = self.meet(torch.cat([frames[:, -1], sentence], 1).flatten(1)).unsqueeze(1)
-        absent = ~present.gather(1, places).repeat_interleave(self.tokens, 1)
+        absent = ~present.repeat_interleave(self.tokens, 1)
         return self.memory_norm(torch.cat([seen, sentence, met], 1)), F.pad(absent, (0, 2))
 
     def decode(self, tokens: Tensor, memory: Tensor, absent: Tensor) -> Tensor:

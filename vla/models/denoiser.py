@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from vla.models.action_tokenizer import ActionTokenizer
 from vla.models.chunks import ChunkModel, mean_where
 from vla.models.image_tokenizer import ImageEncoder
-from vla.models.model import Batch, Prediction
+from vla.models.model import Batch, Prediction, require_heads
 from vla.models.text import TextEncoder
 from vla.spec import Spec
 
@@ -80,6 +80,9 @@ class DenoisingModel(ChunkModel):
         shift, auxiliary: as in `ChunkModel`.
         spec: what a step looks like.
         tokenizer: between which bounds actions lie.
+
+    Raises:
+        ValueError: `width` is odd or no multiple of `heads`, or `execute` is more than `chunk`.
     """
 
     noise: Tensor
@@ -104,7 +107,20 @@ class DenoisingModel(ChunkModel):
         spec: Spec,
         tokenizer: ActionTokenizer,
     ) -> None:
-        super().__init__(image, text, chunk, execute, keypoints, text_width, width, shift, auxiliary, spec, tokenizer)
+        require_heads(width, heads)
+        super().__init__(
+            image=image,
+            text=text,
+            chunk=chunk,
+            execute=execute,
+            keypoints=keypoints,
+            text_width=text_width,
+            width=width,
+            shift=shift,
+            auxiliary=auxiliary,
+            spec=spec,
+            tokenizer=tokenizer,
+        )
         self.copies, self.steps, self.temperature = copies, steps, temperature
         self.denoiser = Denoiser(len(spec.action), chunk, width, layers, heads)
         noise = torch.randn(chunk, len(spec.action), generator=torch.Generator().manual_seed(0))
@@ -120,6 +136,10 @@ class DenoisingModel(ChunkModel):
     @abstractmethod
     def sample(self, noise: Tensor, context: Tensor) -> Tensor:
         """The (B, k, D) scaled actions that (B, k, D) noise becomes in view of the (B, M, E) context."""
+
+    def draw(self, random: torch.Generator) -> Tensor:
+        """(1, k, D) standard normal."""
+        return torch.randn(1, *self.noise.shape, generator=random)
 
     def forward(self, batch: Batch) -> dict[str, Tensor]:
         """context: (B, M, E); with an auxiliary head, truth: (B, 1, S), standardised."""

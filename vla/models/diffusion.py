@@ -16,6 +16,7 @@ from torch import Tensor
 from vla.models.denoiser import DenoisingModel
 
 LEVELS = 100  # of noise
+START = 90  # level to act from: noise but for 2 % of its variance; further up nothing is told of the action
 OFFSET = 0.008  # of the schedule, so that there is some noise from the start
 LEAST = 2.5e-7  # share kept at the last level, as where no step may take away more than 0.999 of the variance
 
@@ -30,10 +31,8 @@ class Diffusion(DenoisingModel):
         return share.sqrt() * action + (1 - share).sqrt() * noise, level / LEVELS, noise
 
     def sample(self, noise: Tensor, context: Tensor) -> Tensor:
-        """DDIM with eta = 0 over evenly spread levels, the last of which is 0."""
-        levels = torch.tensor(
-            [step * LEVELS // self.steps for step in reversed(range(self.steps))], device=noise.device
-        )
+        """DDIM with eta = 0 over evenly spread levels, from START to, where there is more than one, 0."""
+        levels = torch.linspace(START, 0, self.steps, device=noise.device).round()
         shares = [*kept(levels), torch.ones((), device=noise.device)]
         x = noise
         for level, share, following in zip(levels, shares[:-1], shares[1:], strict=True):

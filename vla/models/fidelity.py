@@ -16,9 +16,8 @@ READABLE = {"m": ("mm", 1000.0), "rad": ("°", 180 / math.pi), "1": ("of the gri
 
 
 def fidelity(tokenizer: ActionTokenizer, chunks: np.ndarray, units: Sequence[str]) -> str:
-    """What is lost between (N, k, D) chunks and their tokens, in one line: errors and bias in the units of people.
-
-    The largest component of each unit counts.
+    """What is lost between (N, k, D) chunks and their tokens, in one line: mean and largest error, and bias, in the
+    units of people. Of each unit the component counts that loses most.
     """
     actions = torch.from_numpy(np.array(chunks, np.float32))
     tokens = tokenizer.tokenize(actions)  # (N, L)
@@ -27,8 +26,9 @@ def fidelity(tokenizer: ActionTokenizer, chunks: np.ndarray, units: Sequence[str
     for unit, (name, scale) in READABLE.items():
         of_unit = [index for index, other in enumerate(units) if other == unit]
         if of_unit:
-            part = error[:, of_unit]
-            told.append(f"{scale * part.abs().mean(0).max():.3f} {name} (bias {scale * part.mean(0).abs().max():.3f})")
+            part = scale * error[:, of_unit]
+            bias, most = part.mean(0).abs().max(), part.abs().max()
+            told.append(f"{part.abs().mean(0).max():.3f} {name} (bias {bias:.3f}, at most {most:.3f})")
     written = tokenizer.learned(tokens, torch.ones(actions.shape[:2], dtype=torch.bool)).sum()
     per_action = f"{written / (len(chunks) * chunks.shape[1]):.3g} tokens per action"
     return f"{', '.join(told)} lost; {tokenizer.used(tokens)}; {per_action}"

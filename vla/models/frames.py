@@ -55,17 +55,27 @@ class FrameModel(Model):
         spec: Spec,
         tokenizer: ActionTokenizer,
     ) -> None:
-        super().__init__(history, chunk, text(width=text_width), auxiliary, width, spec, tokenizer)
+        super().__init__(
+            history=history,
+            chunk=chunk,
+            text=text(width=text_width),
+            auxiliary=auxiliary,
+            truth_width=width,
+            spec=spec,
+            tokenizer=tokenizer,
+        )
         self.image_size = image_size
         self.tokens = len(spec.cameras) * (learned_tokens + (keypoints > 0)) + proprioception  # N
         self.shift = RandomShift(*shift)
         self.image = image(text_width=text_width)
         self.token_learners = nn.ModuleList(TokenLearner(self.image.channels, learned_tokens) for _ in spec.cameras)
         self.image_tokens = nn.Linear(self.image.channels, width)
+        self.keypoints: nn.ModuleList | None = None
         if keypoints:
             readers = [Keypoints(self.image.channels, keypoints) for _ in spec.cameras]
             self.keypoints = nn.ModuleList(readers)
             self.keypoint_tokens = nn.ModuleList(nn.Linear(keypoints * reader.width, width) for reader in readers)
+        self.proprioception: Standardize | None = None
         if proprioception:
             self.proprioception = Standardize(self.posture_width)
             self.proprioception_token = nn.Linear(self.posture_width, width)
@@ -81,10 +91,10 @@ class FrameModel(Model):
             features = self.image(images, repeated)  # (B·T, C, h, w)
             learned = self.image_tokens(self.token_learners[index](features))
             tokens.append(learned.unflatten(0, (-1, frames)))  # (B, T, learned_tokens, E)
-            if hasattr(self, "keypoints"):
+            if self.keypoints is not None:
                 positions = self.keypoint_tokens[index](self.keypoints[index](features).flatten(1))
                 tokens.append(positions.view(-1, frames, 1, positions.shape[-1]))
-        if hasattr(self, "proprioception"):
+        if self.proprioception is not None:
             standard = self.proprioception(self.posture(batch), batch["present"])
             tokens.append(self.proprioception_token(standard).unsqueeze(2))
         return torch.cat(tokens, 2)

@@ -101,8 +101,6 @@ class Model(nn.Module, ABC):
         tokenizer: how actions and tokens belong together, and between which bounds actions lie.
     """
 
-    OF_TRUTH = ("truth_head.", "truth_scale.")  # what names of weights begin with that are needed in training only
-
     def __init__(
         self,
         history: int,
@@ -138,6 +136,10 @@ class Model(nn.Module, ABC):
 
         `forward` then takes it as "tokens" in place of images.
         """
+        return None
+
+    def draw(self, random: torch.Generator) -> Tensor | None:
+        """The "noise" to act with once, (1, k, D); None of a model that draws nothing."""
         return None
 
     @abstractmethod
@@ -207,6 +209,12 @@ def perceptron(inputs: int, width: int) -> nn.Sequential:
     first = [nn.Linear(inputs, width), nn.LayerNorm(width), nn.GELU()]
     second = [nn.Linear(width, width), nn.LayerNorm(width), nn.GELU()]
     return nn.Sequential(*first, *second, nn.Linear(width, width), nn.GELU())
+
+
+def require_heads(width: int, heads: int) -> None:
+    """Raise a ValueError unless attention can share `width` out among so many heads, in pairs of sine and cosine."""
+    if width % heads or width % 2:
+        raise ValueError(f"model.width={width} must be even, and a multiple of model.heads={heads}")
 
 
 def newest(present: Tensor) -> Tensor:

@@ -51,7 +51,8 @@ class FilmEfficientNet(ImageEncoder):
     Args:
         name: an EfficientNet of timm.
         pretrained: true fetches timm's weights or fails, false starts at random, "auto" fetches them and falls back to
-            random with a warning; anything else is the path of a weights file (.safetensors or .pth).
+            random with a warning; anything else is the path of a weights file (.safetensors or .pth), and an empty
+            text leaves the weights to the checkpoint that is loaded.
         channels: C of the feature map.
         text_width: length of the text vector.
     """
@@ -180,6 +181,8 @@ def load_trunk(name: str, pretrained: bool | str, kind: str = "", size: int | No
 
 def _weights_file(name: str, repository: str | None, pretrained: bool | str) -> Path | None:
     """The file with the weights to start from, downloaded if it must be; None to start at random."""
+    if pretrained == "":
+        return None
     if not pretrained:
         log.info("%s is built without pretrained weights", name)
         return None
