@@ -1,0 +1,58 @@
+"""Models on a GPU, by torch's fake tensors, which know where they would lie, and refuse to meet across devices."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import pytest
+import torch
+from fake_batch import make_act, make_batch, make_bc, make_decoder, make_denoising, make_rt1, with_text
+from torch import Tensor, nn
+from torch._subclasses.fake_tensor import FakeTensorMode
+from torch.utils import _pytree
+
+from vla.models.diffusion import Diffusion
+from vla.models.flow import Flow
+from vla.models.model import Model
+
+MODELS: dict[str, Callable[[], Model]] = {
+    "bc": make_bc,
+    "rt1": partial(make_rt1, proprioception=True),
+    "decoder": make_decoder,
+    "act": make_act,
+    "diffusion": partial(make_denoising, Diffusion),
+    "flow": partial(make_denoising, Flow),
+}
+
+
+class Call(nn.Module):
+    """One method of a model as a module's own."""
+
+    def __init__(self, model: Model, method: str) -> None:
+        super().__init__()
+        self.model, self.method = model, method
+
+    def forward(self, batch: dict[str, Any]) -> Any:
+        """What the method makes of a batch."""
+        return getattr(self.model, self.method)(batch)
+
+
+@pytest.mark.parametrize("method", ["loss", "encode", "predict"])
+@pytest.mark.parametrize("name", MODELS)
+def test_nothing_of_a_model_stays_behind_on_the_cpu(name: str, method: str) -> None:
+    model = MODELS[name]()
+    call = Call(model.train(method == "loss"), method)
+    model.shift = nn.Identity()  # which counts on the CPU by how much to shift
+    batch = with_text(model, make_batch(model.history, model.chunk))
+    with FakeTensorMode() as mode:
+
+        def on_gpu(value: Tensor) -> Tensor:
+            return mode.from_tensor(value).to("cuda")
+
+        state = {key: on_gpu(value) for key, value in [*call.named_parameters(), *call.named_buffers()]}
+        found = torch.func.functional_call(call, state, (_pytree.tree_map_only(Tensor, on_gpu, batch),))
+    results = [value for value in _pytree.tree_leaves(found) if isinstance(value, Tensor)]
+    assert all(result.device.type == "cuda" for result in results)
+    assert results or method == "encode"  # what keeps nothing of a frame
