@@ -134,6 +134,14 @@ def test_a_slow_policy_skips_ticks_and_a_stuck_one_holds_the_arm(world: World) -
     assert world.becomes(State.HOLDING)
 
 
+def test_of_a_chunk_as_much_is_executed_as_in_evaluation(world: World) -> None:
+    world.policy.chunk, world.policy.execute = 8, 3
+    world.live(0.5)
+    before = len(world.policy.seen)
+    world.live(1.5)
+    assert 4 <= len(world.policy.seen) - before <= 6
+
+
 def test_a_policy_that_fails_is_a_fault_that_only_deactivation_ends(world: World) -> None:
     world.policy.fails = True
     assert world.becomes(State.FAULT)

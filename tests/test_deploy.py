@@ -26,6 +26,7 @@ from std_msgs.msg import String
 from test_run import SMALL, vla
 
 from vla.deploy import messages
+from vla.deploy.bag import HEARD
 from vla.deploy.governor import Robot
 from vla.deploy.ros import Network, split_arguments
 from vla.record import VIEWER
@@ -94,6 +95,13 @@ class Ear:
         """Speak, once agent and simulator listen."""
         self.until(lambda: self._words.get_subscription_count() >= 2)
         self._words.publish(String(data=words))
+
+    def published_by(self, node: str) -> set[str]:
+        """The topics of another node, as far as they are known here by now."""
+        if node not in self.node.get_node_names():
+            return set()
+        topics = self.node.get_publisher_names_and_types_by_node(node, "/")
+        return {name for name, _ in topics} - {"/rosout", "/parameter_events"}
 
     def moved(self) -> float:
         """How far the joints went between the newest two joint states [rad]."""
@@ -199,6 +207,8 @@ def test_the_whole_loop_reports_and_its_bag_moves_an_agent_again(
     start("vla.run", "job=deploy", "deploy=ros2", CHECKPOINT, "deploy.safety.tracking=9")
     ear.until(lambda: ear.node.count_subscribers("/isaac/franka/joint_states") > 1)  # the agent listens, too
     player = start("vla.deploy.bag", "play", "loop/bag", "--speed", "2")
+    ear.until(lambda: ear.published_by("vla_bag") >= {*HEARD})
+    assert ear.published_by("vla_bag") == {*HEARD}  # and no commands
     assert player.wait(60) == 0, player.communicate()[0]
     ear.listen(0.2)
     assert np.ptp([command.position[:7] for command in ear.commands], axis=0).max() > 0.01

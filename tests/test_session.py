@@ -45,6 +45,7 @@ class World:
         self.session = Session(SPEC, ROBOT, safety or Safety(), 50.0)
         self.now, self.joints = 100.0, HOME.copy()
         self.cameras, self.feels, self.follows = ["front", "wrist"], True, True
+        self.apart = 0.0  # by how much the wrist's images are older [s]
         self.answer: Callable[[Observation], np.ndarray | None] = lambda observation: FORWARD
 
     def ticks(self, seconds: float) -> Iterator[Command]:
@@ -55,7 +56,7 @@ class World:
                 self.session.feel(self.joints, np.zeros(7), 0.08, self.now)
             if tick % 5 == 0:
                 for camera in self.cameras:
-                    self.session.see(camera, IMAGE, self.now)
+                    self.session.see(camera, IMAGE, self.now - (self.apart if camera == "wrist" else 0.0))
             observation = self.session.look(self.now)
             if observation is not None:
                 actions = self.answer(observation)
@@ -145,10 +146,11 @@ def test_a_late_answer_still_ends_where_and_when_it_should(world: World) -> None
     [
         (lambda world: setattr(world, "cameras", ["front"]), "camera wrist is older"),
         (lambda world: setattr(world, "cameras", []), "camera front is older"),
+        (lambda world: setattr(world, "apart", 0.08), "images of front, wrist lie more than 0.05 s apart"),
         (lambda world: setattr(world, "feels", False), "joint state is older"),
         (lambda world: setattr(world, "answer", lambda observation: None), "policy takes longer"),
     ],
-    ids=["one camera", "no camera", "no joint states", "no answer"],
+    ids=["one camera", "no camera", "cameras out of step", "no joint states", "no answer"],
 )
 def test_what_is_late_brakes_the_arm_and_holds_it(world: World, break_it: Callable[[World], None], reason: str) -> None:
     world.run(0.3)
@@ -164,9 +166,9 @@ def test_a_held_session_runs_again_after_fresh_frames(world: World) -> None:
     world.run(0.6)
     assert world.session.state is State.HOLDING
     world.cameras = ["front", "wrist"]
-    world.run(0.1)
+    world.run(0.2)  # two of each camera
     assert world.session.state is State.HOLDING
-    world.run(0.3)
+    world.run(0.2)
     assert world.session.state is State.RUNNING
 
 

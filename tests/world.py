@@ -36,21 +36,22 @@ class Forward:
     """A policy that always goes on, and remembers what it was shown."""
 
     spec = SPEC
+    execute = 1
 
     def __init__(self) -> None:
         self.seen: list[Observation] = []
-        self.fails, self.takes = False, 0.0
+        self.fails, self.takes, self.chunk = False, 0.0, 1
 
     def reset(self, instruction: str, seed: int) -> None:
         """Forget nothing: there is nothing to forget."""
 
     def plan(self, observation: Observation) -> Array:
-        """One centimetre along x."""
+        """One centimetre along x, again and again."""
         self.seen.append(observation)
         time.sleep(self.takes)
         if self.fails:
             raise RuntimeError("no idea")
-        return FORWARD
+        return np.repeat(FORWARD, self.chunk, 0)
 
 
 class World:

@@ -116,6 +116,7 @@ class Policy:
         usable = "cuda" if torch.cuda.is_available() else "cpu"
         self.device = torch.device(usable if device == "auto" else device)
         self.model, self.spec = model.eval().to(self.device), spec
+        self.execute = model.execute  # so many actions of a chunk, before it looks again
         self.info: dict[str, Any] = {}
         self._half = precision == "bf16"
         self._encode, self._decide = self.model.encode, self.model.predict
@@ -149,12 +150,13 @@ class Policy:
         if not self._chunk:
             actions, probabilities = self._predict()
             told = [{}] * len(actions) if probabilities is None else [{"probabilities": each} for each in probabilities]
-            self._chunk.extend(list(zip(actions, told, strict=True))[: self.model.execute])
+            self._chunk.extend(list(zip(actions, told, strict=True))[: self.execute])
         action, self.info = self._chunk.popleft()
         return action
 
     def plan(self, observation: Observation) -> Array:
-        """The (k, D) float32 actions of a whole chunk, within the spec's bounds, for those who time them themselves.
+        """The (k, D) float32 actions of a whole chunk, within the spec's bounds, of which the first `execute` are to be
+        executed, for those who time them themselves.
 
         Raises:
             ValueError: the observation is not what the policy was trained on.

@@ -258,7 +258,7 @@ class Agent(Managed):
     def _think(self, observation: Observation, afresh: bool) -> Array:
         if afresh:
             self.policy.reset(observation.instruction, 0)
-        return self.policy.plan(observation)
+        return self.policy.plan(observation)[: self.policy.execute]
 
     def _send(self) -> None:
         assert self.session is not None

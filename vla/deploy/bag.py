@@ -3,20 +3,23 @@
     python -m vla.deploy.bag record FOLDER      until interrupted; `rerun FOLDER/*.mcap` shows it
     python -m vla.deploy.bag play FOLDER        images, joint states and words as they came, for an agent to act on
 
-Only messages go into a bag, never code, so a bag of somebody else's is as safe to play as to look at.
+What else is in a bag, commands to an arm above all, is not played unless it is named.
 """
 
 from __future__ import annotations
 
 import argparse
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from pathlib import Path
 from threading import Event
 from typing import Any
 
 from vla.deploy.overhear import Eavesdropper, message_class
 from vla.deploy.ros import NETWORKS, Network, ros, spin
+
+# What an agent hears, of conf/deploy/topics/isaac.yaml.
+HEARD = ("/isaac/camera/image_raw", "/isaac/wrist_camera/image_raw", "/isaac/franka/joint_states", "/user/command")
 
 
 class Recorder(Eavesdropper):
@@ -58,11 +61,11 @@ class Recorder(Eavesdropper):
         self._writer.close()
 
 
-def play(node: Any, folder: Path, skip: set[str], stopped: Event, speed: float = 1.0) -> int:
-    """Publish the messages of a bag at the times they came, except on some topics; the number of messages.
+def play(node: Any, folder: Path, topics: Collection[str], stopped: Event, speed: float = 1.0) -> int:
+    """Publish the messages of a bag on some topics at the times they came; the number of messages.
 
     Raises:
-        ValueError: there is no bag in the folder.
+        ValueError: there is no bag in the folder, or none of the topics in the bag.
     """
     from rosbags.rosbag2 import Reader, ReaderError
 
@@ -73,7 +76,10 @@ def play(node: Any, folder: Path, skip: set[str], stopped: Event, speed: float =
     except ReaderError as error:
         raise ValueError(f"{folder} is no bag: {error}") from error
     try:
-        classes = {c.topic: message_class(c.msgtype) for c in reader.connections if c.topic not in skip}
+        classes = {c.topic: message_class(c.msgtype) for c in reader.connections if c.topic in topics}
+        if not classes:
+            there = ", ".join(sorted({c.topic for c in reader.connections})) or "nothing"
+            raise ValueError(f"{folder} has none of {', '.join(topics)}, it has {there}: name what to play by --topics")
         publishers = {t: node.create_publisher(kind, t, 10) for t, kind in classes.items() if kind is not None}
         give_up = time.monotonic() + 2.0  # somebody may need a moment to find these publishers
         while time.monotonic() < give_up and not all(p.get_subscription_count() for p in publishers.values()):
@@ -107,9 +113,7 @@ def main() -> None:
     parser.add_argument("folder", type=Path)
     parser.add_argument("--network", choices=NETWORKS, default="loopback")
     parser.add_argument("--speed", type=float, default=1.0, help="of playing, against how it was recorded")
-    parser.add_argument(
-        "--skip", nargs="*", help="topics not to play", default=["/isaac/franka/joint_commands", "/vla_agent/status"]
-    )
+    parser.add_argument("--topics", nargs="+", help="what to play", default=HEARD)
     options = parser.parse_args()
     try:
         with ros(Network.named(options.network)) as stopped:
@@ -117,7 +121,7 @@ def main() -> None:
 
             node = rclpy.create_node("vla_bag")
             if options.do == "play":
-                print(f"{play(node, options.folder, {*options.skip, '/diagnostics'}, stopped, options.speed)} messages")
+                print(f"{play(node, options.folder, options.topics, stopped, options.speed)} messages")
             else:
                 recorder = Recorder(node, options.folder)
                 spin(node, stopped)

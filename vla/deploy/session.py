@@ -42,7 +42,7 @@ class Safety:
     instruction: float | None = 60.0  # longest time to work on one instruction [s]
     tracking: float = 0.2  # largest distance of a joint from its command [rad] …
     tracking_for: float = 0.5  # … for so long [s]
-    fresh_frames: int = 3  # frames in a row after which a held session runs again
+    fresh_frames: int = 3  # frames of all cameras in a row after which a held session runs again
     rejected: int = 3  # unusable plans in a row that make a fault
 
 
@@ -82,7 +82,7 @@ class Session:
         self.instruction, self._told_at = "", 0.0
         self.overruns, self.rejections = 0, 0
         self._frames: dict[str, tuple[float, Array]] = {}
-        self._fresh, self._seen_until = 0, -np.inf
+        self._fresh, self._seen_until, self._together_at = 0, -np.inf, -np.inf
         self._measured: deque[tuple[float, Array, Array, float]] = deque()
         self._commanded: deque[tuple[float, Array]] = deque()
         self._schedule: list[tuple[float, Array, float]] = []  # when due, goal, opening
@@ -102,8 +102,9 @@ class Session:
     def see(self, camera: str, image: Array, at: float) -> None:
         """An image (H, W, 3) uint8 that was taken at `at`."""
         self._frames[camera] = (at, image)
-        if self._observed_at() is not None:
-            self._fresh += 1
+        observed = self._observed_at()
+        if observed is not None and observed > self._together_at:
+            self._fresh, self._together_at = self._fresh + 1, observed
 
     def feel(self, joints: Array, velocities: Array, opening: float, at: float) -> None:
         """Measured joints (J,) [rad], their velocities [rad/s] and the gripper's opening [m], at `at`."""
@@ -271,6 +272,8 @@ class Session:
                 return f"no image of the camera {camera} yet"
             if now - self._frames[camera][0] > self.safety.image_age:
                 return f"the newest image of the camera {camera} is older than {self.safety.image_age} s"
+        if now - self._together_at > self.safety.image_age:
+            return f"the images of {', '.join(self.spec.cameras)} lie more than {TOGETHER} s apart"
         if now - self._measured[-1][0] > self.safety.joints_age:
             return f"the newest joint state is older than {self.safety.joints_age} s"
         if self._pending is not None and now - self._pending[0] > self.safety.inference:
