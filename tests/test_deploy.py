@@ -162,6 +162,12 @@ def test_when_the_agent_is_killed_the_simulator_holds_the_arm(
     ear.until(lambda: ear.commands)
     ear.say("put the red block on the pad")
     ear.until(lambda: ear.moved() > 1e-3)
+    assert start("vla.deploy.say", "").wait(30) == 0
+    ear.until(lambda: ear.moved() < 1e-4)
+    assert start("vla.deploy.say", "--resume", "put the blue block on the pad").wait(30) == 0
+    ear.until(lambda: ear.moved() > 1e-3)
+    refused = start("vla.deploy.say", "--resume", "put the blue block on the pad")
+    assert "error: there is nothing to resume" in refused.communicate(timeout=30)[0] and refused.returncode == 1
     agent.kill()
     ear.listen(0.5)
     heard = len(ear.states)

@@ -5,11 +5,13 @@ from __future__ import annotations
 import argparse
 import sys
 import time
+from typing import Any
 
 from vla.deploy.ros import NETWORKS, Network, ros
 
 PATIENCE = 10.0  # for somebody to listen [s]
 SETTLED = 0.7  # without anybody new [s]
+RESUME = "/vla_agent/resume"
 
 
 def main() -> None:
@@ -17,6 +19,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m vla.deploy.say", description=__doc__)
     parser.add_argument("instruction")
     parser.add_argument("--topic", default="/user/command")
+    parser.add_argument("--resume", action="store_true", help="let an agent that was stopped go on")
     parser.add_argument("--network", choices=NETWORKS, default="loopback")
     options = parser.parse_args()
     with ros(Network.named(options.network)):
@@ -37,7 +40,22 @@ def main() -> None:
             )
         publisher.publish(String(data=options.instruction))
         publisher.wait_for_all_acked()
+        if options.resume:
+            _resume(node)
         node.destroy_node()
+
+
+def _resume(node: Any) -> None:
+    import rclpy
+    from std_srvs.srv import Trigger
+
+    client = node.create_client(Trigger, RESUME)
+    if not client.wait_for_service(PATIENCE):
+        sys.exit(f"error: nobody serves {RESUME}")
+    asked = client.call_async(Trigger.Request())
+    rclpy.spin_until_future_complete(node, asked, timeout_sec=PATIENCE)
+    if not asked.done() or not asked.result().success:
+        sys.exit(f"error: {asked.result().message if asked.done() else 'the agent does not answer'}")
 
 
 if __name__ == "__main__":
