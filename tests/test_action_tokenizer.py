@@ -15,7 +15,7 @@ from toy import SPEC
 
 from vla.models.action_tokenizer import RT1, ActionTokenizer, PerComponent, Uniform
 from vla.models.fast import Fast
-from vla.models.fidelity import fidelity
+from vla.models.fidelity import beyond, fidelity
 from vla.models.quantile import Quantile
 
 
@@ -229,6 +229,14 @@ def test_all_tokenizers_say_what_they_lose(name: str) -> None:
     told = fidelity(tokenizer, CHUNKS, SPEC.units)
     assert " mm (bias " in told and " used; " in told and told.endswith(" tokens per action")
     assert (float(told.split()[-4]) == 3) is isinstance(tokenizer, PerComponent)
+
+
+def test_what_lies_beyond_the_bounds_is_counted() -> None:
+    tokenizer = Uniform(spec=SPEC, statistics=BOUNDS)
+    chunks = BOUNDS.chunks(1).copy()
+    assert beyond(tokenizer, chunks) == 0
+    chunks[0, 0, 0] = 9.0
+    assert beyond(tokenizer, chunks) == pytest.approx(1 / chunks.size)
 
 
 @every

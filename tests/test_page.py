@@ -20,6 +20,7 @@ from toy_recordable import ThinkingAgent, make_environment
 from vla.curves import draw_run, draw_runs
 from vla.evaluate import FIRST_SEED, Report, Result, keep_recordings
 from vla.film import MOMENTS, read_strips
+from vla.intervals import pooled_interval
 from vla.page import optional, write_comparison, write_page
 from vla.record import RerunRecorder
 from vla.report import plot_report, write_report
@@ -274,6 +275,8 @@ def test_the_page_of_a_sweep_leads_to_every_cell(tmp_path: Path) -> None:
     tabulate(tmp_path)
     markup, told = (tmp_path / "sweep.html").read_text(), text(tmp_path / "sweep.html")
     assert re.findall(r'href="([^"]*)"', markup.partition("<svg")[0]) == [f"{n}/report.html" for n in range(3)]
-    assert "bc 87.5 (52.9-97.8)" in told and "0: bc 1: bc 2: rt1" in told
+    trainings = [dict(enumerate(won)) for won in ((True, True, True, True), (True, True, True, False))]
+    low, high = (100 * bound for bound in pooled_interval(trainings))
+    assert f"bc 87.5 ({low:.1f}-{high:.1f})" in told and "0: bc 1: bc 2: rt1" in told
     assert markup.count("<svg") == 6 and len(pictures(tmp_path / "sweep.html")) == 1
     assert json.loads((tmp_path / "0/report.json").read_text())["success"] == 1.0

@@ -93,11 +93,11 @@ def test_another_sentence_is_not_compiled_anew() -> None:
     policy = Policy(compile=True, model=make_bc(), spec=SPEC)
     (seen,) = observations(1)
     compiled = torch._dynamo.utils.counters["stats"]
-    counts = []
+    counts = [compiled["unique_graphs"]]
     for sentence in ("lift it", "put the small green block on the blue pad, and leave the others where they are"):
         policy.act(replace(seen, instruction=sentence))
         counts.append(compiled["unique_graphs"])
-    assert counts[0] == counts[1] > 0
+    assert counts[0] < counts[1] == counts[2]
 
 
 @pytest.mark.parametrize("make", [make_bc, make_rt1], ids=["bc", "rt1 with kept tokens"])

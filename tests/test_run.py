@@ -231,12 +231,16 @@ def test_a_policy_is_trained_further_for_another_goal(home: Path, tmp_path: Path
     for name, weight in before.state.items():
         gathered = name.startswith(("proprioception.", "truth_scale."))  # statistics, of all that was ever seen
         assert gathered or torch.allclose(after.state[name], weight, atol=1e-9), name
-    for other in ("model=rt1_tiny", "tokenizer.bins=64", "variant=no_shift", "checkpoint=tuned/checkpoints/last.ckpt"):
+    for other in ("model=rt1_tiny", "tokenizer.bins=64", "variant=no_shift"):
         refused = vla(home, *arguments, other, ok=False)
-        assert refused.stderr.startswith("error: ") and len(refused.stderr.splitlines()) == 1, refused.stderr
+        assert f"error: {other} cannot be combined with a checkpoint" in refused.stderr
+    refused = vla(home, *arguments, "checkpoint=tuned/checkpoints/last.ckpt", ok=False)
+    assert "is what a new training starts from" in refused.stderr and refused.stderr.count("\n") == 1
     (tmp_path / "policy.ckpt").unlink()  # which going on does not need
     done = vla(home, "job=train", "checkpoint=tuned/checkpoints/last.ckpt", "trainer.max_steps=2", "output=further")
     assert "trained 2 steps" in done.stdout
+    done = vla(home, *arguments, "learner.lr=1e-12", "trainer.max_steps=1", "output=tuned")
+    assert "nothing is trained anew" in done.stdout
 
 
 def test_a_checkpoint_of_other_cameras_is_refused(home: Path) -> None:

@@ -161,6 +161,22 @@ def test_what_is_late_brakes_the_arm_and_holds_it(world: World, break_it: Callab
     assert resting[0] * 0.02 < 0.7 and resting == list(range(resting[0], len(commands)))
 
 
+def test_a_frame_counts_once_every_camera_has_a_newer_one(world: World) -> None:
+    world.session.hold("a hand in the way")
+
+    def see(*cameras: str) -> State:
+        world.now += 0.01
+        world.session.feel(world.joints, np.zeros(7), 0.08, world.now)
+        for camera in cameras:
+            world.session.see(camera, IMAGE, world.now)
+        world.session.command(world.now)
+        return world.session.state
+
+    for cameras in (("front", "wrist"), ("wrist",), ("front",), ("wrist",)):  # two of each, and a wrist's
+        assert see(*cameras) is State.HOLDING
+    assert see("front") is State.RUNNING
+
+
 def test_a_held_session_runs_again_after_fresh_frames(world: World) -> None:
     world.cameras = []
     world.run(0.6)

@@ -205,7 +205,9 @@ def unfitted_learner(config: DictConfig, spec: Spec) -> Learner:
 
 
 def fit(tokenizer: ActionTokenizer, config: DictConfig, store: EpisodeStore) -> None:
-    """Give the tokenizer of a configuration what it takes from a store's actions."""
+    """Give a configuration's tokenizer what it takes from a store's actions, unless a checkpoint has brought it."""
+    if config.checkpoint or config.pretrained:
+        return
     fitted = build(config.tokenizer, spec=store.spec, statistics=store.statistics)
     tokenizer.load_state_dict(fitted.state_dict())
 

@@ -70,7 +70,7 @@ def read_checkpoint(path: str | Path) -> Checkpoint:
     """
     path = Path(path)
     if not path.is_file():
-        raise ValueError(f"there is no checkpoint {path}: give checkpoint=FILE, as in outputs/runs/…/checkpoints")
+        raise ValueError(f"there is no checkpoint {path}: those of a run lie in outputs/runs/…/checkpoints")
     try:
         # Old pickles, which torch would read too, fail in any way they like.
         with ZipFile(path) as archive:

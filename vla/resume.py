@@ -54,7 +54,7 @@ def adopt(cfg: DictConfig, saved: Mapping[str, Any], overrides: Sequence[str]) -
             or variant, which stand for several choices.
     """
     said = _parsed(overrides)
-    _require_own_parts(said, ("experiment", "variant"))
+    _require_own_parts(said)
     named = {override.key_or_group for override in said}
     kept = saved.get("chosen", {})
     chosen = {name: cfg.chosen[name] if group in named else kept.get(name) for name, group in CHOSEN.items()}
@@ -63,11 +63,12 @@ def adopt(cfg: DictConfig, saved: Mapping[str, Any], overrides: Sequence[str]) -
 
 
 def start_from(cfg: DictConfig, overrides: Sequence[str]) -> DictConfig:
-    """`cfg` with the tokenizer and the model of the policy `cfg.pretrained`, from whose weights it is to be trained.
+    """`cfg` with tokenizer and model of the policy `cfg.pretrained`, from whose weights it is to be trained, and with
+    its batches, which depend on how large the model is.
 
     Raises:
         ValueError: there is no such policy, `cfg` trains nothing anew, or an override of the tokenizer or the model, or
-            of a variant, which may stand for them.
+            of an experiment or variant, which may stand for them.
     """
     from vla.policy import read_checkpoint
 
@@ -77,16 +78,17 @@ def start_from(cfg: DictConfig, overrides: Sequence[str]) -> DictConfig:
             "without checkpoint=, which goes on with a training or evaluates it"
         )
     said = _parsed(overrides)
-    _require_own_parts(said, ("variant",))
-    saved = read_checkpoint(cfg.pretrained).config
+    _require_own_parts(said)
+    own = Path(cfg.output) / "checkpoints" / LAST  # of the same training, where it is to be gone on with
+    saved = read_checkpoint(own if own.exists() and not Path(cfg.pretrained).exists() else cfg.pretrained).config
     chosen = {**_plain(cfg.chosen), "model": saved.get("chosen", {}).get("model")}
-    return _on_top(cfg, {"tokenizer": saved["tokenizer"], "model": saved["model"], "chosen": chosen}, said)
+    return _on_top(cfg, {**{name: saved[name] for name in ("tokenizer", "model", "data")}, "chosen": chosen}, said)
 
 
-def _require_own_parts(said: Sequence[Override], others: Sequence[str]) -> None:
+def _require_own_parts(said: Sequence[Override]) -> None:
     for override in said:
         group = _path(override).partition(".")[0]
-        if group in ("tokenizer", "model", *others):
+        if group in ("tokenizer", "model", "experiment", "variant"):
             raise ValueError(
                 f"{override.input_line} cannot be combined with a checkpoint, whose weights belong to the {group} "
                 "they were trained with: leave one of the two out; task/randomize=wide and evaluate=suite can be"
@@ -178,7 +180,8 @@ def reported(cfg: DictConfig, checkpoint: Path) -> float | None:
         return None
     if any(part["errors"] for part in (report, *report["conditions"].values())):
         return None
-    if {key for key, _, _ in differences(report["config"], _plain(cfg))} - {"checkpoint", "resume"}:
+    asked = {"pretrained": None, **report["config"]}  # which older reports do not have
+    if {key for key, _, _ in differences(asked, _plain(cfg))} - {"checkpoint", "resume"}:
         return None
     log.info("nothing is evaluated anew: %s is of this very experiment", Path(cfg.output) / REPORT)
     return float(report["success"])

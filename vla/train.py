@@ -13,9 +13,11 @@ from lightning import Trainer
 from omegaconf import DictConfig
 
 from vla.collect import effort
+from vla.data.episodes import EpisodeStore
 from vla.models.chunks import ChunkModel
-from vla.models.fidelity import fidelity
+from vla.models.fidelity import beyond, fidelity
 from vla.models.learner import Learner
+from vla.models.model import Model
 from vla.page import PAGE, optional, write_page
 from vla.parts import (
     collected,
@@ -55,12 +57,9 @@ def trained(config: DictConfig) -> Path | None:
         with enough_memory(config):
             learner = unfitted_learner(config, demonstrated(config))
         store = collected(config)
-        if not (config.checkpoint or config.pretrained):
-            fit(learner.model.tokenizer, config, store)
+        fit(learner.model.tokenizer, config, store)
         data = make_data(config, store, learner.model)
-        if not isinstance(learner.model, ChunkModel):  # nothing of whose actions becomes a token
-            lost = fidelity(learner.model.tokenizer, store.statistics.chunks(learner.model.chunk), store.spec.units)
-            log.info("%s: %s", type(learner.model.tokenizer).__name__, lost)
+        _tell_losses(learner.model, store)
         data.setup()
         if not len(data.held_out_windows):
             trainer.limit_val_batches = 0  # else what waits for a validation would wait in vain
@@ -84,6 +83,16 @@ def trained(config: DictConfig) -> Path | None:
     chosen = closed_loop.chosen(checkpoints / LAST) if closed_loop else checkpoints / LAST
     note_choice(output, chosen.name)
     return chosen
+
+
+def _tell_losses(model: Model, store: EpisodeStore) -> None:
+    """Log what becomes of the demonstrated actions between a model's bounds, and as its tokens where it has some."""
+    chunks = store.statistics.chunks(model.chunk)
+    if not isinstance(model, ChunkModel):
+        lost = fidelity(model.tokenizer, chunks, store.spec.units)
+        log.info("%s: %s", type(model.tokenizer).__name__, lost)
+    if cut := beyond(model.tokenizer, chunks):
+        log.warning("%.2g %% of what was demonstrated is beyond the bounds of the tokenizer, and cut there", 100 * cut)
 
 
 def _closed_loop(config: DictConfig, checkpoints: Path) -> ClosedLoop | None:

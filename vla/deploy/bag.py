@@ -65,7 +65,7 @@ def play(node: Any, folder: Path, topics: Collection[str], stopped: Event, speed
     """Publish the messages of a bag on some topics at the times they came; the number of messages.
 
     Raises:
-        ValueError: there is no bag in the folder, or none of the topics in the bag.
+        ValueError: there is no bag in the folder, or a topic is not in the bag.
     """
     from rosbags.rosbag2 import Reader, ReaderError
 
@@ -77,9 +77,9 @@ def play(node: Any, folder: Path, topics: Collection[str], stopped: Event, speed
         raise ValueError(f"{folder} is no bag: {error}") from error
     try:
         classes = {c.topic: message_class(c.msgtype) for c in reader.connections if c.topic in topics}
-        if not classes:
+        if missing := ", ".join(topic for topic in topics if topic not in classes):
             there = ", ".join(sorted({c.topic for c in reader.connections})) or "nothing"
-            raise ValueError(f"{folder} has none of {', '.join(topics)}, it has {there}: name what to play by --topics")
+            raise ValueError(f"{folder} has no {missing}, it has {there}: name what to play by --topics")
         publishers = {t: node.create_publisher(kind, t, 10) for t, kind in classes.items() if kind is not None}
         give_up = time.monotonic() + 2.0  # somebody may need a moment to find these publishers
         while time.monotonic() < give_up and not all(p.get_subscription_count() for p in publishers.values()):

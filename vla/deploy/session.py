@@ -82,7 +82,11 @@ class Session:
         self.instruction, self._told_at = "", 0.0
         self.overruns, self.rejections = 0, 0
         self._frames: dict[str, tuple[float, Array]] = {}
-        self._fresh, self._seen_until, self._together_at = 0, -np.inf, -np.inf
+        self._fresh, self._counted = (
+            0,
+            dict[str, float](),
+        )  # frames of all cameras, and when those of the last were taken
+        self._seen_until, self._together_at = -np.inf, -np.inf
         self._measured: deque[tuple[float, Array, Array, float]] = deque()
         self._commanded: deque[tuple[float, Array]] = deque()
         self._schedule: list[tuple[float, Array, float]] = []  # when due, goal, opening
@@ -102,9 +106,12 @@ class Session:
     def see(self, camera: str, image: Array, at: float) -> None:
         """An image (H, W, 3) uint8 that was taken at `at`."""
         self._frames[camera] = (at, image)
-        observed = self._observed_at()
-        if observed is not None and observed > self._together_at:
-            self._fresh, self._together_at = self._fresh + 1, observed
+        if self._observed_at() is None:
+            return
+        times = {name: taken for name, (taken, _) in self._frames.items()}
+        self._together_at = max(times.values())
+        if all(taken > self._counted.get(name, -np.inf) for name, taken in times.items()):
+            self._fresh, self._counted = self._fresh + 1, times
 
     def feel(self, joints: Array, velocities: Array, opening: float, at: float) -> None:
         """Measured joints (J,) [rad], their velocities [rad/s] and the gripper's opening [m], at `at`."""
@@ -251,6 +258,7 @@ class Session:
         if self.safety.instruction is not None and now - self._told_at > self.safety.instruction:
             return self.stop(f"{self.safety.instruction:g} s on one instruction are over")
         if late:
+            self._fresh = 0
             return self._enter(State.HOLDING if self.state is State.RUNNING else self.state, late)
         if self.state is State.WAITING or (self.state is State.HOLDING and self._fresh >= self.safety.fresh_frames):
             self._enter(State.RUNNING, "")

@@ -71,7 +71,7 @@ class ACT(ChunkModel):
         tokenizer: between which bounds actions lie.
 
     Raises:
-        ValueError: `width` is odd or no multiple of `heads`, or `execute` is more than `chunk`.
+        ValueError: `width` is no multiple of `heads`, or `execute` is more than `chunk`.
     """
 
     def __init__(

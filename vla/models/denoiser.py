@@ -108,6 +108,8 @@ class DenoisingModel(ChunkModel):
         tokenizer: ActionTokenizer,
     ) -> None:
         require_heads(width, heads)
+        if width % 2:
+            raise ValueError(f"model.width={width} must be even, for pairs of a sine and a cosine")
         super().__init__(
             image=image,
             text=text,

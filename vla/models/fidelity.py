@@ -15,9 +15,15 @@ from vla.models.action_tokenizer import ActionTokenizer
 READABLE = {"m": ("mm", 1000.0), "rad": ("°", 180 / math.pi), "1": ("of the gripper", 1.0)}  # unit → name and factor
 
 
+def beyond(tokenizer: ActionTokenizer, chunks: np.ndarray) -> float:
+    """Share of the (N, k, D) numbers that lie beyond the bounds of the tokenizer."""
+    actions = torch.from_numpy(np.array(chunks, np.float32))
+    return float(((actions < tokenizer.low) | (actions > tokenizer.high)).float().mean())
+
+
 def fidelity(tokenizer: ActionTokenizer, chunks: np.ndarray, units: Sequence[str]) -> str:
-    """What is lost between (N, k, D) chunks and their tokens, in one line: mean and largest error, and bias, in the
-    units of people. Of each unit the component counts that loses most.
+    """What is lost between (N, k, D) chunks and their tokens, in one line: mean error, bias and largest error, in the
+    units of people. Of each unit, and for each of the three, the worst component counts.
     """
     actions = torch.from_numpy(np.array(chunks, np.float32))
     tokens = tokenizer.tokenize(actions)  # (N, L)

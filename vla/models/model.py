@@ -212,9 +212,9 @@ def perceptron(inputs: int, width: int) -> nn.Sequential:
 
 
 def require_heads(width: int, heads: int) -> None:
-    """Raise a ValueError unless attention can share `width` out among so many heads, in pairs of sine and cosine."""
-    if width % heads or width % 2:
-        raise ValueError(f"model.width={width} must be even, and a multiple of model.heads={heads}")
+    """Raise a ValueError unless attention can share `width` out among so many heads."""
+    if width % heads:
+        raise ValueError(f"model.width={width} must be a multiple of model.heads={heads}")
 
 
 def newest(present: Tensor) -> Tensor:
