@@ -12,13 +12,13 @@ from enum import StrEnum
 
 import numpy as np
 
+from vla.deploy.frames import Frames
 from vla.deploy.governor import Governor, Robot
 from vla.spec import Array, Observation, Spec
 from vla.tasks.control import WORKSPACE, CartesianController
 
 ACTION = ("dx", "dy", "dz", "rx", "ry", "rz", "gripper")
 EARLY = 0.25  # share of a control period that a frame may come early and still be the one to act on
-TOGETHER = 0.05  # furthest that the frames of all cameras may lie apart [s]
 MEMORY = 1.0  # how long joint states and commands are remembered [s]
 
 
@@ -81,12 +81,8 @@ class Session:
         self.state, self.reason = State.WAITING, "no joint state yet"
         self.instruction, self._told_at = "", 0.0
         self.overruns, self.rejections = 0, 0
-        self._frames: dict[str, tuple[float, Array]] = {}
-        self._fresh, self._counted = (
-            0,
-            dict[str, float](),
-        )  # frames of all cameras, and when those of the last were taken
-        self._seen_until, self._together_at = -np.inf, -np.inf
+        self._frames = Frames(self.spec.cameras)
+        self._seen_until = -np.inf
         self._measured: deque[tuple[float, Array, Array, float]] = deque()
         self._commanded: deque[tuple[float, Array]] = deque()
         self._schedule: list[tuple[float, Array, float]] = []  # when due, goal, opening
@@ -105,13 +101,7 @@ class Session:
 
     def see(self, camera: str, image: Array, at: float) -> None:
         """An image (H, W, 3) uint8 that was taken at `at`."""
-        self._frames[camera] = (at, image)
-        if self._observed_at() is None:
-            return
-        times = {name: taken for name, (taken, _) in self._frames.items()}
-        self._together_at = max(times.values())
-        if all(taken > self._counted.get(name, -np.inf) for name, taken in times.items()):
-            self._fresh, self._counted = self._fresh + 1, times
+        self._frames.see(camera, image, at)
 
     def feel(self, joints: Array, velocities: Array, opening: float, at: float) -> None:
         """Measured joints (J,) [rad], their velocities [rad/s] and the gripper's opening [m], at `at`."""
@@ -153,7 +143,7 @@ class Session:
 
     def look(self, now: float) -> Observation | None:
         """What to ask the policy about, if it is time to; then `plan` or `reject` must follow."""
-        observed = self._observed_at()
+        observed = self._frames.taken_at
         if self.state is not State.RUNNING or self._pending is not None or observed is None:
             return None
         if observed <= self._seen_until or observed < self._next_look - EARLY / self.spec.control_hz:
@@ -167,7 +157,7 @@ class Session:
         self.resumed, self._seen_until, self.observed = np.isinf(self._seen_until), observed, observed
         self._pending = (now, observed, anchor)
         return Observation(
-            rgb={camera: self._frames[camera][1] for camera in self.spec.cameras},
+            rgb=self._frames.images,
             depth={},
             joints=joints.astype(np.float32),
             velocities=velocities.astype(np.float32),
@@ -258,9 +248,10 @@ class Session:
         if self.safety.instruction is not None and now - self._told_at > self.safety.instruction:
             return self.stop(f"{self.safety.instruction:g} s on one instruction are over")
         if late:
-            self._fresh = 0
+            self._frames.fresh = 0
             return self._enter(State.HOLDING if self.state is State.RUNNING else self.state, late)
-        if self.state is State.WAITING or (self.state is State.HOLDING and self._fresh >= self.safety.fresh_frames):
+        recovered = self.state is State.HOLDING and self._frames.fresh >= self.safety.fresh_frames
+        if self.state is State.WAITING or recovered:
             self._enter(State.RUNNING, "")
         return None
 
@@ -275,13 +266,8 @@ class Session:
 
     def _late(self, now: float) -> str:
         """What is too old to act on, in words."""
-        for camera in self.spec.cameras:
-            if camera not in self._frames:
-                return f"no image of the camera {camera} yet"
-            if now - self._frames[camera][0] > self.safety.image_age:
-                return f"the newest image of the camera {camera} is older than {self.safety.image_age} s"
-        if now - self._together_at > self.safety.image_age:
-            return f"the images of {', '.join(self.spec.cameras)} lie more than {TOGETHER} s apart"
+        if late := self._frames.late(now, self.safety.image_age):
+            return late
         if now - self._measured[-1][0] > self.safety.joints_age:
             return f"the newest joint state is older than {self.safety.joints_age} s"
         if self._pending is not None and now - self._pending[0] > self.safety.inference:
@@ -305,16 +291,9 @@ class Session:
 
     def _enter(self, state: State, reason: str) -> None:
         if state is not self.state and state is not State.RUNNING:
-            self._fresh, self._schedule = 0, []
+            self._frames.fresh, self._schedule = 0, []
             self._next_look = self._seen_until = -np.inf
         self.state, self.reason = state, reason
-
-    def _observed_at(self) -> float | None:
-        """When the newest frames of all cameras were taken, or None while they do not belong together."""
-        if any(camera not in self._frames for camera in self.spec.cameras):
-            return None
-        times = [self._frames[camera][0] for camera in self.spec.cameras]
-        return min(times) if max(times) - min(times) <= TOGETHER else None
 
     def _remember(self, now: float) -> None:
         self._commanded.append((now + self.tick, self.governor.position.copy()))
