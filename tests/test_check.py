@@ -31,6 +31,7 @@ def config(**changes: Any) -> DictConfig:
             "job": "collect",
             "seed": 0,
             "checkpoint": None,
+            "pretrained": None,
             "resume": False,
             "output": "outputs/runs/now",
             "chosen": {"experiment": None, "model": "bc", "randomize": "default"},
