@@ -235,6 +235,7 @@ def test_what_lies_beyond_the_bounds_is_counted() -> None:
     tokenizer = Uniform(spec=SPEC, statistics=BOUNDS)
     chunks = BOUNDS.chunks(1).copy()
     assert beyond(tokenizer, chunks) == 0
+    assert all(beyond(fitted, CHUNKS) == 0 for fitted in EVERY.values())
     chunks[0, 0, 0] = 9.0
     assert beyond(tokenizer, chunks) == pytest.approx(1 / chunks.size)
 

@@ -91,8 +91,8 @@ def _tell_losses(model: Model, store: EpisodeStore) -> None:
     if not isinstance(model, ChunkModel):
         lost = fidelity(model.tokenizer, chunks, store.spec.units)
         log.info("%s: %s", type(model.tokenizer).__name__, lost)
-    if cut := beyond(model.tokenizer, chunks):
-        log.warning("%.2g %% of what was demonstrated is beyond the bounds of the tokenizer, and cut there", 100 * cut)
+    if outside := beyond(model.tokenizer, chunks):
+        log.warning("%.2g %% of what was demonstrated is beyond the bounds of the tokenizer", 100 * outside)
 
 
 def _closed_loop(config: DictConfig, checkpoints: Path) -> ClosedLoop | None:

@@ -16,9 +16,9 @@ READABLE = {"m": ("mm", 1000.0), "rad": ("°", 180 / math.pi), "1": ("of the gri
 
 
 def beyond(tokenizer: ActionTokenizer, chunks: np.ndarray) -> float:
-    """Share of the (N, k, D) numbers that lie beyond the bounds of the tokenizer."""
-    actions = torch.from_numpy(np.array(chunks, np.float32))
-    return float(((actions < tokenizer.low) | (actions > tokenizer.high)).float().mean())
+    """Share of the (N, k, D) numbers that lie beyond the bounds of the tokenizer, by more than rounding."""
+    actions, slack = torch.from_numpy(np.array(chunks, np.float32)), 1e-4 * (tokenizer.high - tokenizer.low)
+    return float(((actions < tokenizer.low - slack) | (actions > tokenizer.high + slack)).float().mean())
 
 
 def fidelity(tokenizer: ActionTokenizer, chunks: np.ndarray, units: Sequence[str]) -> str:
