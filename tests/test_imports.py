@@ -44,6 +44,8 @@ PARTS = {
     "vla.card": ("vla.spec", "vla.data", "vla.report"),
     "vla.deploy": ("vla.spec", "vla.policy", "vla.tasks", "vla.data", "vla.evaluate", "vla.record", "vla.deploy"),
     "vla.stores": ("vla",),
+    "vla.types": (),
+    "vla.documents": (),
     "vla.annotations": (),
     "vla.check": ("vla.annotations", "vla.spec"),
     "vla.peers": ("vla.workers",),

@@ -1,0 +1,84 @@
+"""JSON and YAML files that anybody may have written: bounded in size and depth, and validated against a type."""
+
+from __future__ import annotations
+
+import json
+from functools import cache
+from pathlib import Path
+from typing import Any, TypeVar, cast
+
+import yaml
+from pydantic import ConfigDict, PydanticUserError, TypeAdapter, ValidationError
+
+T = TypeVar("T")
+
+LARGEST = 64 << 20  # [bytes] of a file
+DEEPEST = 64  # levels of nested lists and mappings in YAML; pydantic's JSON parser ends at 200 by itself
+
+# Set as `__pydantic_config__` of the dataclasses and typed dictionaries that describe a file.
+STRICT = ConfigDict(strict=True, extra="forbid", allow_inf_nan=False)
+
+
+def read_json(path: Path, kind: type[T], largest: int = LARGEST) -> T:
+    """The JSON file at `path` as a `kind`: a dataclass, a typed dictionary or any annotation.
+
+    Raises:
+        ValueError: the file is larger than `largest` [bytes], nested too deep, not JSON, or not of that kind.
+        OSError: it cannot be read.
+    """
+    return parse_json(_read(path, largest), kind, str(path))
+
+
+def read_yaml(path: Path, kind: type[T], largest: int = 1 << 20) -> T:
+    """The YAML file at `path` as a `kind`, see `read_json`. Aliases, which can grow without bound, are refused."""
+    return parse_yaml(_read(path, largest), kind, str(path))
+
+
+def parse_json(text: str | bytes, kind: type[T], name: str) -> T:
+    """JSON text, called `name` in errors, as a `kind`, see `read_json`."""
+    try:
+        validated: T = _adapter(cast(Any, kind)).validate_json(text, strict=True)
+    except ValidationError as error:
+        raise ValueError(f"{name} is damaged or of another kind: {problems(error)}") from error
+    return validated
+
+
+def parse_yaml(text: str | bytes, kind: type[T], name: str) -> T:
+    """YAML text, called `name` in errors, as a `kind`, see `read_yaml`."""
+    depth = 0
+    try:
+        for event in yaml.parse(text, Loader=yaml.CSafeLoader):
+            depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
+            if depth > DEEPEST or isinstance(event, yaml.AliasEvent):
+                raise ValueError(f"{name} is nested deeper than {DEEPEST} levels, or has aliases")
+        plain = json.dumps(yaml.load(text, Loader=yaml.CSafeLoader))
+    except (yaml.YAMLError, UnicodeDecodeError, TypeError, RecursionError) as error:
+        raise ValueError(f"{name} is no plain YAML: {' '.join(str(error).split())[:200]}") from error
+    return parse_json(plain, kind, name)
+
+
+def problems(error: ValidationError, most: int = 3) -> str:
+    """What is wrong with a value, as `spec.cameras[0]: Input should be a valid string`; at most so many findings."""
+    found = [f"{_dotted(each['loc'])}{each['msg']}" for each in error.errors(include_url=False, include_input=False)]
+    more = f"; and {len(found) - most} more" if len(found) > most else ""
+    return "; ".join(found[:most]) + more
+
+
+def _dotted(location: tuple[int | str, ...]) -> str:
+    path = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in location)
+    return f"{path.lstrip('.')[:100]}: " if path else ""
+
+
+def _read(path: Path, largest: int) -> bytes:
+    size = path.stat().st_size
+    if size > largest:
+        raise ValueError(f"{path} has {size} bytes, more than the {largest} that such a file can have")
+    return path.read_bytes()
+
+
+@cache
+def _adapter(kind: Any) -> TypeAdapter[Any]:
+    try:
+        return TypeAdapter(kind, config=ConfigDict(allow_inf_nan=False))
+    except PydanticUserError:  # a dataclass or typed dictionary, which has a configuration of its own
+        return TypeAdapter(kind)
