@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from vla.documents import DEEPEST, STRICT, parse_json, parse_yaml, read_json, read_yaml
+from vla.documents import DEEPEST, STRICT, parse_json, parse_yaml, read_json, read_yaml, require_resolved
 from vla.types import Range
 
 
@@ -65,3 +65,15 @@ def test_a_file_that_is_too_large_is_not_read(tmp_path: Path) -> None:
     (tmp_path / "a.json").write_text("[0, 0, 0, 0]")
     with pytest.raises(ValueError, match=r"a\.json has 12 bytes, more than the 4"):
         read_json(tmp_path / "a.json", list, largest=4)
+
+
+def test_a_configuration_out_of_a_file_is_resolved() -> None:
+    within: list[Any] = [1, None, {"a": ("$", "{}")}]
+    within.append(within)
+    require_resolved({"model": within}, "store.json")
+    for value in ("a ${b}", {"${b}": 1}, {"a": [(1, {"b": "${c}"})]}):
+        with pytest.raises(ValueError, match=r"^store\.json holds the interpolation '.*\$\{.*': only resolved values"):
+            require_resolved(value, "store.json")
+    with pytest.raises(ValueError) as caught:
+        require_resolved("${" + "x" * 10_000, "store.json")
+    assert len(str(caught.value)) < 300

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from functools import cache
 from pathlib import Path
 from typing import Any, TypeVar, cast
@@ -55,6 +56,23 @@ def parse_yaml(text: str | bytes, kind: type[T], name: str) -> T:
     except (yaml.YAMLError, UnicodeDecodeError, TypeError, RecursionError) as error:
         raise ValueError(f"{name} is no plain YAML: {' '.join(str(error).split())[:200]}") from error
     return parse_json(plain, kind, name)
+
+
+def require_resolved(value: Any, name: str) -> None:
+    """Refuse a configuration out of a file, called `name`, whose strings would be looked up elsewhere when it is used.
+
+    Raises:
+        ValueError: a string in `value`, keys included, contains `${`.
+    """
+    pending: list[Any] = [value]
+    seen: set[int] = set()  # a pickle can refer to the same list many times, or to itself
+    while pending:
+        item = pending.pop()
+        if isinstance(item, str) and "${" in item:
+            raise ValueError(f"{name} holds the interpolation {item[:200]!r}: only resolved values are read from files")
+        if isinstance(item, (Mapping, list, tuple)) and id(item) not in seen:
+            seen.add(id(item))
+            pending += [*item, *item.values()] if isinstance(item, Mapping) else item
 
 
 def problems(error: ValidationError, most: int = 3) -> str:

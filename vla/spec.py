@@ -15,6 +15,7 @@ import numpy as np
 Array = np.ndarray
 
 FIRST_SEED = 1_000_000  # of evaluation; collection, which starts at small ones, never gets this far
+LONGEST_INSTRUCTION = 1000  # characters
 
 
 @dataclass(frozen=True)
