@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import hashlib
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
+import toy
 from omegaconf import DictConfig, OmegaConf
+from test_conf import composed
 
 from vla.check import JOBS, PLAIN, build, check, digest, suggestion
 from vla.resume import adopt
@@ -88,15 +89,25 @@ def test_an_unknown_key_is_named_with_what_was_probably_meant() -> None:
 @pytest.mark.parametrize(
     ("key", "value", "expected"),
     [
-        ("task.blocks", "three", "task.blocks must be int, got 'three'"),
-        ("task.blocks", True, "task.blocks must be int, got True"),
-        ("task.blocks", 2.5, "task.blocks must be int, got 2.5"),
+        ("task.blocks", "three", "task.blocks must be int, at least 1, got 'three'"),
+        ("task.blocks", True, "task.blocks must be int, at least 1, got True"),
+        ("task.blocks", 2.5, "task.blocks must be int, at least 1, got 2.5"),
         ("task.shadows", 1, "task.shadows must be bool, got 1"),
-        ("task.image_size", [96], "task.image_size must be tuple[int, int], got [96]"),
-        ("task.image_size", [96, "x"], "task.image_size must be tuple[int, int], got [96, 'x']"),
+        ("task.image_size", [96], "task.image_size must be tuple[int, int], each at least 8, at most 1024, got [96]"),
+        ("task.image_size", [96, "x"], "task.image_size must be tuple[int, int], each at least 8"),
+        ("task.image_size", [1, 1], "task.image_size must be tuple[int, int], each at least 8"),
+        ("task.cameras", ["front", "front"], "task.cameras must be tuple[str, …], each not empty, not empty, without"),
+        ("task.time_limit", float("nan"), "task.time_limit must be float, more than 0, got nan"),
+        ("task.randomize.mass.factor", [2.0, 1.0], "task.randomize.mass.factor must be tuple[float, float], each more"),
+        ("expert.perturb.steps", [5, 2], "expert.perturb.steps must be tuple[int, int], each at least 1, in ascending"),
+        ("collect.folder", "", "collect.folder must be str, not empty, got ''"),
         ("task.goal", "lift", "task.goal must be Goal or Mixed, got 'lift'"),
-        ("task.randomize.mass.factor", [0.5, "a"], "task.randomize.mass.factor must be tuple[float, float], got"),
-        ("expert.perturb.start", None, "expert.perturb.start must be float, got None"),
+        (
+            "task.randomize.mass.factor",
+            [0.5, "a"],
+            "task.randomize.mass.factor must be tuple[float, float], each more than 0, in",
+        ),
+        ("expert.perturb.start", None, "expert.perturb.start must be float, at least 0, at most 1, got None"),
         ("collect.workers", "all", "collect.workers must be int, at least 1 or null, got 'all'"),
         ("seed", "first", "seed must be int, at least 0, got 'first'"),
         ("task.meshes", "lite", "task.meshes must be one of light, full, got 'lite', did you mean light?"),
@@ -125,13 +136,10 @@ def test_a_missing_name_is_named_unless_the_program_gives_it() -> None:
 def test_a_job_needs_its_groups_and_looks_at_no_others() -> None:
     assert "job=collect needs expert" in problem(expert=None)
     check(config(deploy={"_target_": "vla.nowhere.Nothing"}))
-    assert "deploy._target_ is vla.nowhere.Nothing, which cannot be imported" in problem(
-        job="deploy",
-        tokenizer={"_target_": "vla.models.action_tokenizer.Uniform"},
-        model={"_target_": "torch.nn.Identity"},
-        policy={"_target_": "vla.policy.Policy"},
-        deploy={"_target_": "vla.nowhere.Nothing"},
-    )
+    cfg = composed("job=deploy", "deploy=loop")
+    cfg.deploy._target_ = "vla.nowhere.Nothing"
+    with pytest.raises(ValueError, match=r"deploy\._target_ is vla\.nowhere\.Nothing, which cannot be imported"):
+        check(cfg)
 
 
 def test_a_misspelt_job_is_answered_with_what_was_probably_meant() -> None:
@@ -146,29 +154,55 @@ def test_the_job_menu_is_the_table_of_jobs() -> None:
     "target",
     ["os.system", "subprocess.Popen", "vla.evaluate.os.system", "vla.evaluate.Path", "torch.hub.load", "vla.check:os"],
 )
-def test_a_target_outside_the_allowed_packages_is_refused(target: str) -> None:
+def test_a_target_that_is_no_class_of_the_package_is_refused(target: str) -> None:
     node = {"_target_": "vla.tasks.expert.Waypoint", "perturb": {"_target_": target}}
-    with pytest.raises(ValueError, match=r"perturb\._target_ (must|is)"):
-        build(node, spec=None)
+    with pytest.raises(ValueError, match=r"expert\.perturb\._target_ (must|is)"):
+        build(node, "expert", spec=None)
     with pytest.raises(ValueError, match=r"expert\.perturb\._target_ (must|is)"):
         check(config(expert=node))
 
 
+def test_a_class_stands_only_where_its_kind_is_asked_for() -> None:
+    node = {"_target_": "vla.tasks.expert.Waypoint", "perturb": MASSES}
+    with pytest.raises(ValueError, match=r"expert\.perturb must be Perturbation or null, got \{'_target_': .*Masses"):
+        build(node, "expert", spec=None)
+    with pytest.raises(ValueError, match=r"expert\._target_ must name a class of kind Agent or Recorded, got .*Masses"):
+        build(MASSES, "expert")
+    assert problem(task=MASSES).startswith("task._target_ must name a class of kind Environment")
+    assert problem(**{"task.randomize.mass": GRAMMAR}).startswith("task.randomize must be Mapping[str, Axis or")
+
+
 def test_build_gives_plain_containers_runtime_arguments_and_nested_factories() -> None:
-    built = build(OmegaConf.create({"_target_": "torch.nn.Linear", "bias": False}), in_features=2, out_features=3)
-    assert built.weight.shape == (3, 2)
-    assert built.bias is None
-    masses = build(OmegaConf.create({"_target_": "vla.tasks.randomize.blocks.Masses", "factor": [0.5, 2.0]}))
-    assert type(masses.factor) is list
-    node = {"_target_": "vla.tasks.expert.Waypoint", "perturb": {**PERTURBATION, "_partial_": True}}
-    spec = SimpleNamespace(low=(0.0,), high=(1.0,))
-    assert type(build(node, spec=spec)._perturb()).__name__ == "Perturbation"
+    cluster = build(OmegaConf.create({"_target_": "vla.cluster.Local"}), "cluster", workers=3)
+    assert cluster.workers == 3
+    image = {"_target_": "vla.models.image_tokenizer.FilmConv", "_partial_": True, "channels": [8]}
+    image |= {"kernels": [3], "strides": [2]}
+    text = {"_target_": "vla.models.text.NGrams", "_partial_": True}
+    node = OmegaConf.create({"_target_": "vla.models.bc.BC", "image": image, "text": text})
+    tokenizer = build({"_target_": "vla.models.action_tokenizer.Uniform"}, "tokenizer", spec=toy.SPEC)
+    model = build(node, "model", spec=toy.SPEC, tokenizer=tokenizer)
+    assert model.tokenizer is tokenizer and model.text.width == 64
 
 
 def test_build_passes_on_what_a_nested_constructor_complains_about() -> None:
     axis = {"_target_": "vla.tasks.randomize.blocks.Colours", "names": ["pink"]}
     with pytest.raises(ValueError, match="unknown colours"):
-        build({"_target_": "vla.tasks.tabletop.Tabletop", "goal": None, "randomize": {"colour": axis}})
+        build(config(**{"task.randomize": {"colour": axis}}).task, "task")
+
+
+def test_what_is_checked_is_what_is_built() -> None:
+    """A reference that is left would be looked up again, in another place than where it was checked."""
+    hidden = {"_target_": "vla.tasks.expert.Waypoint", "perturb": "${oc.create:{_target_:builtins.print}}"}
+    with pytest.raises(ValueError, match=r"expert holds the reference"):
+        build(hidden, "expert", spec=None)
+
+
+def test_conditions_of_an_evaluation_are_checked_with_the_task_that_they_change() -> None:
+    wrong = {"heavy": {"goal": MASSES}}
+    with pytest.raises(ValueError, match=r"task \(evaluate\.conditions\.heavy\)\.goal must be Goal or Mixed"):
+        cfg = composed()
+        cfg.evaluate.conditions = wrong
+        check(cfg)
 
 
 def digested(cfg: DictConfig) -> str:

@@ -67,13 +67,23 @@ def test_a_file_that_is_too_large_is_not_read(tmp_path: Path) -> None:
         read_json(tmp_path / "a.json", list, largest=4)
 
 
-def test_a_configuration_out_of_a_file_is_resolved() -> None:
-    within: list[Any] = [1, None, {"a": ("$", "{}")}]
-    within.append(within)
-    require_resolved({"model": within}, "store.json")
-    for value in ("a ${b}", {"${b}": 1}, {"a": [(1, {"b": "${c}"})]}):
-        with pytest.raises(ValueError, match=r"^store\.json holds the interpolation '.*\$\{.*': only resolved values"):
+def test_a_configuration_out_of_a_file_is_plain_and_resolved() -> None:
+    require_resolved({"model": [1, None, {"a": ("$", "{}")}]}, "store.json")
+    for value in ("a ${b}", {"${b}": 1}, {"a": [(1, {"b": "${c}"})]}, "${" + "x" * 10_000):
+        with pytest.raises(ValueError, match=r"^store\.json holds the reference '.*\$\{.*': only resolved") as caught:
             require_resolved(value, "store.json")
-    with pytest.raises(ValueError) as caught:
-        require_resolved("${" + "x" * 10_000, "store.json")
-    assert len(str(caught.value)) < 300
+        assert len(str(caught.value)) < 300
+    for unusual in ({"a": object()}, [b"x"], {1j: 2}):
+        with pytest.raises(ValueError, match="which is no plain data"):
+            require_resolved(unusual, "store.json")
+
+
+def test_a_configuration_that_refers_to_itself_or_grows_without_bound_is_refused() -> None:
+    endless: list[Any] = []
+    endless.append(endless)
+    doubling: list[Any] = []
+    for _ in range(DEEPEST - 1):
+        doubling = [doubling, doubling]
+    for value in (endless, doubling):
+        with pytest.raises(ValueError, match="holds more than"):
+            require_resolved(value, "store.json")

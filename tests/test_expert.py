@@ -70,12 +70,6 @@ def test_a_slow_episode_executes_a_share_of_its_motions_and_labels_the_whole(tab
     np.testing.assert_array_equal(slowly.executed[:, 6], slowly.actions[:, 6])
 
 
-@pytest.mark.parametrize("pace", [(0.5,), (0.0, 1.0), (1.0, 0.5)])
-def test_a_pace_that_is_none_is_named(pace: tuple[float, ...]) -> None:
-    with pytest.raises(ValueError, match=r"expert\.perturb\.pace=.* must be two shares above 0"):
-        Perturbation(pace=pace)
-
-
 def test_labels_depend_on_the_state_alone(tabletop: Tabletop) -> None:
     """A fresh expert, shown a state from the middle of an episode, says what the one that lived through it said."""
     with tabletop.blind():

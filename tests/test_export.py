@@ -54,7 +54,7 @@ def composed(name: str, folder: Path, *overrides: str) -> Any:
 
 def exporter(name: str, folder: Path, *overrides: str) -> Any:
     """What `export=name` and `overrides` describe."""
-    return build(composed(name, folder, *overrides))
+    return build(composed(name, folder, *overrides), "export")
 
 
 def content(folder: Path) -> dict[str, bytes]:
@@ -163,7 +163,7 @@ if __name__ == "__main__":  # worker processes import this file
     from pathlib import Path
     from vla.check import build
     from vla.data.episodes import EpisodeStore
-    build({config}).export(EpisodeStore(Path({store!r}), {episodes}))
+    build({config}, "export").export(EpisodeStore(Path({store!r}), {episodes}))
 """
 
 

@@ -1,55 +1,96 @@
-"""Plain values against the type annotations of those who want them.
+"""Plain values, and nodes that name classes, against type annotations.
 
-`Annotated[int, 1]` is a number that is at least 1.
+pydantic compares the values; a node, a mapping with a `_target_`, fits where its class is a subclass of what the
+annotation asks for. Which classes a node may name at all is decided here as well.
 """
 
 from __future__ import annotations
 
+import inspect
+import json
 import os
 import types
 from collections.abc import Collection, Iterable, Mapping, MutableMapping, Sequence
+from functools import cache
+from importlib import import_module
+from math import isfinite
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
 
-LISTS = (list, Sequence, Collection, Iterable, object)
-MAPPINGS = (dict, Mapping, MutableMapping, object)
-SCALARS: dict[type, tuple[Any, ...]] = {
-    bool: (bool, object),
-    int: (int, float, object),
-    float: (float, object),
-    str: (str, Path, os.PathLike, object),
-}
+from annotated_types import Ge, Gt, Le, Lt, MinLen, Predicate
+from pydantic import BeforeValidator, ConfigDict, TypeAdapter, ValidationError
+
+# Configurations also come out of checkpoints and stores, which may come from anybody: a `_target_` names a class of
+# this package, or one of those that `conf/` uses.
+OWN = "vla."
+LIBRARY = (
+    "lightning.Trainer",
+    "lightning.pytorch.loggers.CSVLogger",
+    "lightning.pytorch.loggers.MLFlowLogger",
+    "lightning.pytorch.loggers.TensorBoardLogger",
+    "lightning.pytorch.loggers.WandbLogger",
+    "lightning.pytorch.strategies.ModelParallelStrategy",
+)
+
+SCALARS = (bool, int, float, str, types.NoneType)
+SEQUENCES = (list, Sequence, Collection, Iterable)
+MAPPINGS = (dict, Mapping, MutableMapping)
+PATHS = (Path, os.PathLike)
+IN_EVERY_PROTOCOL = {"__init__", "__subclasshook__", "_no_init_or_replace_init"}
+BOUNDS = {Ge: "at least {0.ge}", Gt: "more than {0.gt}", Le: "at most {0.le}", Lt: "less than {0.lt}"}
+ENDLESS = 2**31 - 1  # an upper bound that goes without saying
+
+
+def locate(key: str, target: Any) -> type:
+    """The class that the `_target_` at `key` names.
+
+    Raises:
+        ValueError: it is not one of those that may be built, or it does not exist.
+    """
+    if not isinstance(target, str) or not (target.startswith(OWN) or target in LIBRARY):
+        raise ValueError(f"{key} must name a class of {OWN.rstrip('.')} or one of {', '.join(LIBRARY)}, got {target!r}")
+    module, _, name = target.rpartition(".")
+    try:
+        found = getattr(import_module(module), name)
+    except (ImportError, AttributeError) as error:
+        raise ValueError(f"{key} is {target}, which cannot be imported: {error}") from error
+    # A module of this package may itself have imported something else, such as `os`.
+    if not isinstance(found, type) or not (target in LIBRARY or found.__module__.startswith(OWN)):
+        raise ValueError(f"{key} must name a class that is defined in {OWN.rstrip('.')}, got {target!r}")
+    return found
+
+
+def is_node(value: Any) -> bool:
+    """Whether a plain value describes an object."""
+    return isinstance(value, dict) and "_target_" in value
+
+
+def fits(found: type, expected: Any) -> bool:
+    """Whether objects of the class `found` may stand where `expected` is asked for: a class, a union or a protocol."""
+    if get_origin(expected) in (Union, types.UnionType):
+        return any(fits(found, each) for each in get_args(expected))
+    expected = get_origin(expected) or expected
+    if not isinstance(expected, type):
+        return False
+    if getattr(expected, "_is_protocol", False):
+        methods = {name for name, member in vars(expected).items() if inspect.isfunction(member)} - {"__init__"}
+        return all(any(name in vars(base) for base in found.__mro__) for name in methods - IN_EVERY_PROTOCOL)
+    return issubclass(found, expected)
 
 
 def matches(value: Any, annotation: Any) -> bool:
-    """Whether a plain value may stand where `annotation` is asked for; nodes with a `_target_` are what they make."""
-    kind, arguments = get_origin(annotation) or annotation, get_args(annotation)
-    if kind is Any or isinstance(kind, TypeVar):
-        return True
-    if kind in (Union, types.UnionType):
-        return any(matches(value, argument) for argument in arguments)
-    if kind is Annotated:
-        return matches(value, arguments[0]) and value >= arguments[1]
-    if kind is Literal:
-        return any(type(value) is type(choice) and value == choice for choice in arguments)
-    if value is None:
-        return kind in (None, types.NoneType, object)
-    if isinstance(value, dict):
-        if "_target_" in value:
-            return kind not in (bool, int, float, str, Path)
-        of = arguments[1] if arguments else Any
-        return kind in MAPPINGS and all(matches(item, of) for item in value.values())
-    if isinstance(value, list):
-        return _matches_list(value, kind, arguments)
-    return kind in SCALARS.get(type(value), ())
+    """Whether a plain value, of which nodes are what they make, may stand where `annotation` is asked for.
 
-
-def _matches_list(value: list[Any], kind: Any, arguments: tuple[Any, ...]) -> bool:
-    if kind is tuple and arguments and arguments[-1] is not Ellipsis:
-        pairs = zip(value, arguments, strict=False)
-        return len(value) == len(arguments) and all(matches(item, argument) for item, argument in pairs)
-    arrays = getattr(kind, "__name__", "") == "ndarray"
-    return arrays or (kind in (*LISTS, tuple) and all(matches(item, arguments[0]) for item in value if arguments))
+    Raises:
+        ValueError: a node names a class that may not be built.
+    """
+    for target in _targets(value):
+        locate("_target_", target)
+    try:
+        _adapter(annotation).validate_json(json.dumps(value), strict=True)
+    except ValidationError:
+        return False
+    return True
 
 
 def describe(annotation: Any) -> str:
@@ -60,10 +101,86 @@ def describe(annotation: Any) -> str:
     if kind in (Union, types.UnionType):
         return " or ".join(describe(argument) for argument in arguments)
     if kind is Annotated:
-        return f"{describe(arguments[0])}, at least {arguments[1]}"
+        return ", ".join([describe(arguments[0]), *_bounds(arguments[1:])])
     if annotation in (None, types.NoneType):
         return "null"
-    if arguments:
+    if kind is tuple and get_origin(arguments[0]) is Annotated:
+        inner, *bounds = get_args(arguments[0])
+        each = f", each {', '.join(_bounds(bounds))}"
+        return describe(tuple[tuple(inner if part is not Ellipsis else part for part in arguments)]) + each  # type: ignore[misc]
+    if arguments and getattr(kind, "__name__", "") != "Callable":
         inner = ", ".join("…" if argument is Ellipsis else describe(argument) for argument in arguments)
         return f"{getattr(kind, '__name__', kind)}[{inner}]"
-    return str(getattr(annotation, "__name__", annotation))
+    return str(getattr(arguments[1] if arguments else annotation, "__name__", annotation))
+
+
+def takes_path(annotation: Any) -> bool:
+    """Whether a value of this annotation names a file or a folder."""
+    return annotation in PATHS or get_origin(annotation) in PATHS or any(map(takes_path, get_args(annotation)))
+
+
+def _bounds(constraints: Iterable[Any]) -> list[str]:
+    words = []
+    for constraint in constraints:
+        if isinstance(constraint, Predicate):
+            words.append(str(constraint.func.__doc__))
+        elif isinstance(constraint, MinLen):
+            words.append("not empty" if constraint.min_length == 1 else f"at least {constraint.min_length} long")
+        elif not isinstance(constraint, Le) or constraint.le < ENDLESS:  # type: ignore[operator]
+            words.append(BOUNDS[type(constraint)].format(constraint))
+    return words
+
+
+def _targets(value: Any) -> list[Any]:
+    own = [value["_target_"]] if is_node(value) else []
+    parts = value.values() if isinstance(value, dict) else value if isinstance(value, list) else ()
+    return own + [target for part in parts for target in _targets(part)]
+
+
+@cache
+def _adapter(annotation: Any) -> TypeAdapter[Any]:
+    return TypeAdapter(_of_json(annotation), config=ConfigDict(allow_inf_nan=False))
+
+
+def _of_json(annotation: Any) -> Any:
+    """`annotation` as pydantic can compare JSON with it: classes become nodes, whatever is a sequence a list."""
+    kind, arguments = get_origin(annotation), get_args(annotation)
+    if annotation in SCALARS or annotation is None or kind is Literal:
+        return annotation
+    if kind is Annotated:
+        return Annotated[(_of_json(arguments[0]), *arguments[1:])]
+    if kind in (Union, types.UnionType):
+        return Union[tuple(map(_of_json, arguments))]  # noqa: UP007
+    if (kind or annotation) in PATHS:
+        return str
+    if kind is tuple:
+        return tuple[tuple(each if each is Ellipsis else _of_json(each) for each in arguments)]  # type: ignore[misc]
+    if (kind or annotation) in SEQUENCES:
+        return list[_of_json(arguments[0]) if arguments else Any]  # type: ignore[misc]
+    if (kind or annotation) in MAPPINGS:
+        return dict[str, _of_json(arguments[1]) if arguments else Any]  # type: ignore[misc]
+    if annotation is object:  # whoever asks for it looks into it
+        return Any
+    if annotation in (Any, inspect.Parameter.empty) or isinstance(annotation, TypeVar):
+        return Annotated[Any, BeforeValidator(_plain)]
+    if getattr(kind, "__name__", "") == "Callable":
+        return Annotated[Any, BeforeValidator(lambda value: _node(value, arguments[1], partial=True))]
+    return Annotated[Any, BeforeValidator(lambda value: _node(value, annotation, partial=False))]
+
+
+def _plain(value: Any) -> Any:
+    if is_node(value):
+        raise ValueError("no object belongs here")
+    if isinstance(value, float) and not isfinite(value):
+        raise ValueError("numbers are finite")
+    for part in value.values() if isinstance(value, dict) else value if isinstance(value, list) else ():
+        _plain(part)
+    return value
+
+
+def _node(value: Any, expected: Any, partial: bool) -> Any:
+    if not is_node(value) or bool(value.get("_partial_")) is not partial:
+        raise ValueError("not a node")
+    if not fits(locate("_target_", value["_target_"]), expected):
+        raise ValueError("a node of another class")
+    return value

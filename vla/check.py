@@ -11,19 +11,20 @@ import json
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from difflib import get_close_matches
+from functools import cache
 from importlib import import_module
-from typing import Annotated, Any, Literal, get_args, get_origin
+from typing import Annotated, Any, Literal, cast, get_args, get_origin
 
+from annotated_types import Ge, MinLen
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import InstantiationException
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 
-from vla.annotations import describe, matches
+from vla.annotations import describe, fits, is_node, locate, matches, takes_path
+from vla.documents import require_resolved
 from vla.spec import FIRST_SEED
-
-# What a `_target_` may name: configs also come out of checkpoints, which may come from anybody.
-ALLOWED = ("vla.", "torch.", "lightning.", "dm_control.composer.variation.")
+from vla.types import Count, Natural, NonNegative, Seed, Share, Text
 
 # The groups that each job builds something from; only these are checked, so only their modules are imported.
 TRAINING = ("task", "expert", "cluster", "data", "tokenizer", "model", "learner", "trainer", "logger")
@@ -56,31 +57,62 @@ RUNTIME: dict[str, tuple[str, ...]] = {
     "deploy": ("policy", "environment", "output"),
 }
 
-Count = Annotated[int, 1]
-Seed = Annotated[int, 0]
-UnseenSeed = Annotated[int, FIRST_SEED]
+# Group → what its node makes, or the nodes in it.
+MAKES = {
+    "task": ("vla.spec.Environment",),
+    "expert": ("vla.spec.Agent", "vla.data.recorded.Recorded"),
+    "cluster": ("vla.cluster.Cluster",),
+    "data": ("vla.data.windows.Windows",),
+    "tokenizer": ("vla.models.action_tokenizer.ActionTokenizer",),
+    "model": ("vla.models.model.Model",),
+    "learner": ("vla.models.learner.Learner",),
+    "trainer": ("lightning.Trainer",),
+    "logger": ("lightning.pytorch.loggers.Logger",),
+    "policy": ("vla.policy.Policy",),
+    "recorder": ("vla.spec.Recorder",),
+    "export": ("vla.spec.Exporter",),
+    "deploy": ("vla.spec.Deployment",),
+}
+
+# Narrower than Lightning's own annotations: arguments with which its trainer fails late, or silently trains nothing.
+NARROWER: dict[str, dict[str, Any]] = {
+    "lightning.Trainer": {
+        "max_steps": Literal[-1] | Count,
+        "max_epochs": Literal[-1] | Count | None,
+        "devices": Literal["auto", -1] | Count | Annotated[list[Natural], MinLen(1)] | Text,
+        "num_nodes": Count,
+        "accumulate_grad_batches": Count,
+        "gradient_clip_val": NonNegative | None,
+        "val_check_interval": Count | Share | None,
+        "limit_val_batches": Natural | Share | None,
+        "limit_train_batches": Natural | Share | None,
+        "log_every_n_steps": Count,
+    }
+}
+
+UnseenSeed = Annotated[Seed, Ge(FIRST_SEED)]
 
 # The nodes that name no class.
 PLAIN: dict[str, Any] = {
     "job": Literal["preview", "collect", "train", "evaluate", "export", "deploy", "benchmark", "inspect", "report"],
     "seed": Seed,
-    "checkpoint": str | None,
-    "pretrained": str | None,
+    "checkpoint": Text | None,
+    "pretrained": Text | None,
     "resume": bool,
-    "output": str,
+    "output": Text,
     "chosen": dict[str, str | None],
-    "collect": {"episodes": Count, "seed": Seed, "workers": Count | None, "folder": str},
+    "collect": {"episodes": Count, "seed": Seed, "workers": Count | None, "folder": Text},
     "evaluate": {
         "episodes": Count,
         "seed": UnseenSeed,
         "workers": Count | None,
-        "recordings": Seed | None,
-        "conditions": dict[str, dict[str, Any]],
+        "recordings": Natural | None,
+        "conditions": dict[str, dict[str, object]],
     },
-    "validate": {"episodes": Seed, "seed": UnseenSeed},
+    "validate": {"episodes": Natural, "seed": UnseenSeed},
     "preview": {"episodes": Count, "seed": Seed},
     "benchmark": {
-        "names": list[Literal["collect", "loader", "train", "policy", "deploy"]],
+        "names": Annotated[list[Literal["collect", "loader", "train", "policy", "deploy"]], MinLen(1)],
         "episodes": Count,
         "batches": Count,
         "steps": Count,
@@ -91,33 +123,39 @@ PLAIN: dict[str, Any] = {
         "lerobot": str | None,
     },
     "inspect": {
-        "folder": str,
-        "stores": list[str] | None,
+        "folder": Text,
+        "stores": Annotated[list[Text], MinLen(1)] | None,
         "where": dict[str, Any] | None,
         "repair": bool,
-        "into": str | None,
-        "episode": Seed | None,
+        "into": Text | None,
+        "episode": Natural | None,
     },
-    "report": {"runs": list[str]},
+    "report": {"runs": list[Text]},
 }
 GROUPS = tuple(dict.fromkeys(group for groups in JOBS.values() for group in groups))
 
-HYDRA_KEYS = ("_target_", "_partial_", "_convert_", "_recursive_")
+HYDRA_KEYS = ("_target_", "_partial_")
 
 
-def build(node: DictConfig | Mapping[str, Any], **runtime: Any) -> Any:
-    """The object that `node`, composed or plain, describes, given the arguments that only the program knows.
+def build(node: DictConfig | Mapping[str, Any], group: str, **runtime: Any) -> Any:
+    """The object that `node`, composed or plain, of a group such as "model" describes.
 
-    Nested nodes are built first, and those with `_partial_: true` arrive as factories.
+    Nested nodes are built first, and those with `_partial_: true` arrive as factories. What is checked is the very
+    mapping that is built: references are resolved before, and any that is left is refused.
+
+    Args:
+        node: it names a class in `_target_`, and its arguments.
+        group: what the node is one of; it decides of which kind the class has to be.
+        runtime: the arguments that only the program knows.
 
     Raises:
-        ValueError: a `_target_` that is not allowed, or what the constructor of a nested node raises.
+        ValueError: a class that may not be built or is of another kind, wrong arguments, or what a constructor raises.
     """
-    plain = OmegaConf.to_container(node) if isinstance(node, DictConfig) else node
-    for key, target in _targets(plain):
-        _locate(key, target)
+    plain = OmegaConf.to_container(node, resolve=True) if isinstance(node, DictConfig) else node
+    require_resolved(plain, group)
+    check_node(group, plain, makes(group), tuple(runtime))
     try:
-        factory = instantiate(node, _convert_="all", _partial_=True)
+        factory = instantiate(plain, _convert_="all", _partial_=True)
     except InstantiationException as error:
         if isinstance(error.__cause__, ValueError):
             raise ValueError(str(error.__cause__)) from error
@@ -147,11 +185,29 @@ def check(cfg: DictConfig) -> None:
             assert isinstance(node, dict)
             nodes = {f"{group}.{name!s}": each for name, each in node.items()} if group in SEVERAL else {group: node}
             for key, each in nodes.items():
-                check_node(key, each, RUNTIME.get(group, ()))
+                check_node(key, each, makes(group), RUNTIME.get(group, ()))
         elif group not in OPTIONAL:
             raise ValueError(f"job={cfg.job} needs {group}=OPTION; --help lists the options")
     if "model" in groups:
-        _require_together(*(_locate(f"{group}._target_", cfg[group]._target_) for group in ("tokenizer", "model")))
+        _require_together(*(locate(f"{group}._target_", cfg[group]._target_) for group in ("tokenizer", "model")))
+    if cfg.job == "evaluate":
+        task, conditions = (OmegaConf.to_container(node, resolve=True) for node in (cfg.task, cfg.evaluate.conditions))
+        for name, changes in cast("dict[str, Any]", conditions).items():
+            changed = with_changes(cast("dict[str, Any]", task), changes)
+            check_node(f"task (evaluate.conditions.{name})", changed, makes("task"))
+
+
+def with_changes(task: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
+    """A task node with the changes of a condition: other arguments, axes at another level, or null: switched off."""
+    axes = {**task["randomize"], **changes.get("randomize", {})}
+    return {**task, **changes, "randomize": {axis: level for axis, level in axes.items() if level is not None}}
+
+
+@cache
+def makes(group: str) -> Any:
+    """The class, protocol or union of the objects that a group describes."""
+    classes = [getattr(import_module(module), name) for module, _, name in (p.rpartition(".") for p in MAKES[group])]
+    return classes[0] if len(classes) == 1 else classes[0] | classes[1]
 
 
 def _require_apart(cfg: DictConfig) -> None:
@@ -165,7 +221,7 @@ def _require_apart(cfg: DictConfig) -> None:
 
 
 def _require_together(tokenizer: type, model: type) -> None:
-    if not issubclass(tokenizer, _hints(model).get("tokenizer", object)):
+    if not fits(tokenizer, _hints(model).get("tokenizer", object)):
         raise ValueError(
             f"{model.__name__} predicts one token per component, which {tokenizer.__name__} does not have: choose "
             "another tokenizer, such as uniform, or model=decoder, which goes with all"
@@ -201,55 +257,54 @@ def _canonical(value: Any) -> Any:
     return int(value) if isinstance(value, float) and value.is_integer() else value
 
 
-def _targets(node: Any, key: str = "") -> Iterator[tuple[str, Any]]:
-    if isinstance(node, dict):
-        if "_target_" in node:
-            yield f"{key}_target_", node["_target_"]
-        for name, value in node.items():
-            yield from _targets(value, f"{key}{name}.")
-    elif isinstance(node, list):
-        for index, value in enumerate(node):
-            yield from _targets(value, f"{key}{index}.")
-
-
-def _locate(key: str, target: Any) -> type:
-    if not isinstance(target, str) or not target.startswith(ALLOWED):
-        raise ValueError(f"{key} must begin with {' or '.join(ALLOWED)}, got {target!r}")
-    try:
-        module, _, name = target.rpartition(".")
-        found = getattr(import_module(module), name)
-    except (ImportError, AttributeError) as error:
-        raise ValueError(f"{key} is {target}, which cannot be imported: {error}") from error
-    # An allowed module may itself have imported something that is not, such as `os`.
-    if not isinstance(found, type) or not found.__module__.startswith(ALLOWED):
-        raise ValueError(f"{key} must name a class defined under {' or '.join(ALLOWED)}, got {target!r}")
-    return found
-
-
-def check_node(key: str, node: Any, runtime: Sequence[str] = ()) -> None:
+def check_node(key: str, node: Any, expected: Any, runtime: Sequence[str] = ()) -> None:
     """Bind a plain node, called `key`, to the signature of the class it names; `runtime` arguments come later.
 
     Raises:
-        ValueError: an unknown, missing or ill-typed key, with its dotted name and what is allowed in its place.
+        ValueError: a class that is no `expected`, or an unknown, missing or ill-typed key, with its dotted name and
+            what is allowed in its place.
     """
-    if not isinstance(node, dict) or "_target_" not in node:
-        raise ValueError(f"{key} must be a node with a _target_, got {node!r}")
-    target = _locate(f"{key}._target_", node["_target_"])
+    if not is_node(node):
+        raise ValueError(f"{key} must be a node with a _target_, got {_short(node)}")
+    target = locate(f"{key}._target_", node["_target_"])
+    if not fits(target, expected):
+        raise ValueError(f"{key}._target_ must name a class of kind {describe(expected)}, got {node['_target_']}")
     parameters = inspect.signature(target).parameters
-    kinds = {parameter.kind for parameter in parameters.values()}
-    known = [name for name in parameters if name not in runtime]
-    hints = _hints(target)
+    several = [name for name, each in parameters.items() if each.kind is inspect.Parameter.VAR_KEYWORD]
+    known = [name for name in parameters if name not in (*runtime, *several)]
+    hints = {**_hints(target), **NARROWER.get(node["_target_"], {})}
     for name, value in node.items():
         if name in HYDRA_KEYS:
             continue
-        if inspect.Parameter.VAR_KEYWORD not in kinds:
+        if not several or str(name).startswith("_"):
             _require_known(key, name, known, target.__name__)
         _check_value(f"{key}.{name}", value, hints.get(name, Any))
     for name in () if node.get("_partial_") else known:
-        parameter = parameters[name]
-        variadic = parameter.kind in (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
-        if name not in node and parameter.default is inspect.Parameter.empty and not variadic:
+        if name not in node and parameters[name].default is inspect.Parameter.empty:
             raise ValueError(f"{key}.{name} is missing: {target.__name__} needs it")
+
+
+def require_no_paths(config: Mapping[str, Any], names: Iterable[str], source: object) -> None:
+    """Refuse nodes out of a file in which a class is given a file or folder to read or write.
+
+    Args:
+        config: plain, with the nodes `names`, as far as there are any.
+        source: where it comes from, for the error.
+
+    Raises:
+        ValueError: with the dotted name of the first such argument, or a class that may not be built.
+    """
+    for key in (key for name in names for key in _paths_in(config.get(name), name)):
+        raise ValueError(f"{source} names a path in {key}: paths are taken from your own runs and commands only")
+
+
+def _paths_in(node: Any, key: str) -> Iterator[str]:
+    """Dotted names of the arguments in a node, called `key`, that name a file or folder."""
+    if is_node(node):
+        hints = _hints(locate(f"{key}._target_", node["_target_"]))
+        yield from (f"{key}.{name}" for name, value in node.items() if value and takes_path(hints.get(name, Any)))
+    for name, part in node.items() if isinstance(node, dict) else enumerate(node) if isinstance(node, list) else ():
+        yield from _paths_in(part, f"{key}.{name}")
 
 
 def _check_plain(key: str, value: Any, annotation: Any) -> None:
@@ -267,16 +322,26 @@ def _check_plain(key: str, value: Any, annotation: Any) -> None:
 
 
 def _check_value(key: str, value: Any, annotation: Any) -> None:
+    _check_nodes(key, value)  # first: what is wrong in a node says more than that its place wants another
     if not matches(value, annotation):
         choices = [str(choice) for choice in get_args(annotation)] if get_origin(annotation) is Literal else []
         hint = suggestion(str(value), choices)
-        raise ValueError(f"{key} must be {describe(annotation)}, got {value!r}{hint}")
-    if isinstance(value, dict) and "_target_" in value:
-        return check_node(key, value)
+        raise ValueError(f"{key} must be {describe(annotation)}, got {_short(value)}{hint}")
+
+
+def _check_nodes(key: str, value: Any) -> None:
+    """Check the nodes in a value against their own signatures, wherever they stand."""
+    if is_node(value):
+        return check_node(key, value, object)
     children = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
     for name, child in children:
-        _check_value(f"{key}.{name}" if isinstance(value, dict) else f"{key}[{name}]", child, Any)
+        _check_nodes(f"{key}.{name}" if isinstance(value, dict) else f"{key}[{name}]", child)
     return None
+
+
+def _short(value: Any) -> str:
+    text = repr(value)
+    return text if len(text) <= 200 else f"{text[:200]}…"
 
 
 def _require_known(key: str, name: str, known: Collection[str], owner: str) -> None:

@@ -24,6 +24,7 @@ from socket import gethostname
 from typing import TYPE_CHECKING, Any, Protocol
 from uuid import uuid4
 
+from vla.types import Count, Positive
 from vla.workers import cores, leave_with_parent, one_thread, one_thread_each
 
 if TYPE_CHECKING:
@@ -79,10 +80,8 @@ class WorkersLost(ValueError):
 class Local:
     """Spawned processes of this machine; a single worker is this process itself."""
 
-    def __init__(self, workers: int | None = None) -> None:
-        """`workers` is how many, None: one per core; a ValueError where that is less than one."""
-        if workers is not None and workers < 1:
-            raise ValueError(f"collect.workers is the number of processes, at least 1, not {workers}")
+    def __init__(self, workers: Count | None = None) -> None:
+        """`workers` is how many, None: one per core."""
         self.workers = workers or cores()
 
     @contextmanager
@@ -152,7 +151,7 @@ class Dask:
     They want one thread each. A Dask cluster runs whatever its clients send, so it belongs on trusted networks only.
     """
 
-    def __init__(self, address: str, patience: float = 60.0) -> None:
+    def __init__(self, address: str, patience: Positive = 60.0) -> None:
         """Args:
         address: of the scheduler, as tcp://HOST:PORT.
         patience: how long to wait for a result while there are no workers [s].

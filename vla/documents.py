@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
 from functools import cache
 from pathlib import Path
 from typing import Any, TypeVar, cast
@@ -14,6 +13,7 @@ from pydantic import ConfigDict, PydanticUserError, TypeAdapter, ValidationError
 T = TypeVar("T")
 
 LARGEST = 64 << 20  # [bytes] of a file
+MOST = 100_000  # values in a configuration
 DEEPEST = 64  # levels of nested lists and mappings in YAML; pydantic's JSON parser ends at 200 by itself
 
 # Set as `__pydantic_config__` of the dataclasses and typed dictionaries that describe a file.
@@ -59,20 +59,26 @@ def parse_yaml(text: str | bytes, kind: type[T], name: str) -> T:
 
 
 def require_resolved(value: Any, name: str) -> None:
-    """Refuse a configuration out of a file, called `name`, whose strings would be looked up elsewhere when it is used.
+    """Refuse a configuration out of a file, called `name`, that is not plain data in which everything is resolved.
 
     Raises:
-        ValueError: a string in `value`, keys included, contains `${`.
+        ValueError: it has a value that is no mapping, list, text, number or null, a text with `${`, which would be
+            looked up elsewhere when it is used, more than `MOST` values, or more levels than `DEEPEST`.
     """
-    pending: list[Any] = [value]
-    seen: set[int] = set()  # a pickle can refer to the same list many times, or to itself
+    pending, count = [(value, 0)], 0
     while pending:
-        item = pending.pop()
-        if isinstance(item, str) and "${" in item:
-            raise ValueError(f"{name} holds the interpolation {item[:200]!r}: only resolved values are read from files")
-        if isinstance(item, (Mapping, list, tuple)) and id(item) not in seen:
-            seen.add(id(item))
-            pending += [*item, *item.values()] if isinstance(item, Mapping) else item
+        item, depth = pending.pop()
+        count += 1
+        if count > MOST or depth > DEEPEST:  # a pickle can refer to the same list many times, or to itself
+            raise ValueError(f"{name} holds more than {MOST} values, or more than {DEEPEST} levels of them")
+        if isinstance(item, str):
+            if "${" in item:
+                raise ValueError(f"{name} holds the reference {item[:200]!r}: only resolved values are read from files")
+        elif isinstance(item, (dict, list, tuple)):
+            parts = [*item, *item.values()] if isinstance(item, dict) else item
+            pending += [(part, depth + 1) for part in parts]
+        elif item is not None and not isinstance(item, (bool, int, float)):
+            raise ValueError(f"{name} holds a {type(item).__name__}, which is no plain data")
 
 
 def problems(error: ValidationError, most: int = 3) -> str:

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 from omegaconf import DictConfig
 from rich import print as show
 
-from vla.check import build
+from vla.check import build, with_changes
 from vla.parts import (
     collected,
     make_environment,
@@ -142,12 +142,10 @@ def _played(config: DictConfig, checkpoint: Path, recordings: Path) -> dict[str,
     seeds = range(config.evaluate.seed, config.evaluate.seed + config.evaluate.episodes)
     make = partial(make_policy, plain(config.policy), checkpoint)
     recorder = partial(make_recorder, plain(config.recorder), recordings) if config.recorder else None
-    task = plain(config.task)
-    task["randomize"] = {axis: level for axis, level in task["randomize"].items() if level is not None}
+    task = with_changes(plain(config.task), {})
     reports: dict[str, Report] = {}
     for name, changes in {SEEN: {}, **plain(config.evaluate.conditions)}.items():
-        axes = {**task["randomize"], **changes.get("randomize", {})}
-        changed = {**task, **changes, "randomize": {axis: level for axis, level in axes.items() if level is not None}}
+        changed = with_changes(task, changes)
         if reports and changed == task:  # the level at which it was trained
             reports[name] = reports[SEEN]
         else:
@@ -163,7 +161,7 @@ def export(config: DictConfig) -> None:
     Raises:
         ValueError: programs are asked for, and there is no checkpoint.
     """
-    exporter = build(config.export)
+    exporter = build(config.export, "export")
     if config.export._target_.startswith("vla.program."):
         log.info("wrote %s", exporter.export(_required_policy(config)))
         return
@@ -190,6 +188,7 @@ def deployed(config: DictConfig) -> Any:
     """The deployment that `config.deploy` describes, ready to run."""
     return build(
         config.deploy,
+        "deploy",
         policy=partial(_required_policy, config),
         environment=partial(make_environment, plain(config.task)),
         output=output_folder(config),

@@ -66,7 +66,7 @@ def make_environment(task: Node) -> Tabletop:
     from vla.tasks.backend import choose_backend
 
     choose_backend()
-    environment: Tabletop = build(task)
+    environment: Tabletop = build(task, "task")
     return environment
 
 
@@ -78,7 +78,7 @@ def make_expert(expert: Node, environment: Environment) -> Agent:
     """
     from vla.data.recorded import Recorded
 
-    agent: Agent = build(expert, spec=environment.spec)
+    agent: Agent = build(expert, "expert", spec=environment.spec)
     if isinstance(agent, Recorded):
         raise ValueError("recorded demonstrations cannot act: this job needs another expert, such as expert=waypoint")
     return agent
@@ -86,7 +86,7 @@ def make_expert(expert: Node, environment: Environment) -> Agent:
 
 def make_recorder(recorder: Node, folder: Path) -> Recorder:
     """A recorder that writes into a folder."""
-    made: Recorder = build(recorder, folder=folder)
+    made: Recorder = build(recorder, "recorder", folder=folder)
     return made
 
 
@@ -101,28 +101,27 @@ def make_policy(policy: Node, checkpoint: Path, environment: Environment | None 
     saved = read_checkpoint(checkpoint)
     if environment is not None:
         saved.spec.perceived.require(environment.spec.perceived, f"the checkpoint {checkpoint}", "the task")
-    tokenizer = build(saved.config["tokenizer"], spec=saved.spec)
-    model = build(_without_pretraining(saved.config["model"]), spec=saved.spec, tokenizer=tokenizer)
+    tokenizer = build(saved.config["tokenizer"], "tokenizer", spec=saved.spec)
+    model = build(_without_pretraining(saved.config["model"]), "model", spec=saved.spec, tokenizer=tokenizer)
     saved.restore(model)
-    made: Policy = build(policy, model=model, spec=saved.spec)
+    made: Policy = build(policy, "policy", model=model, spec=saved.spec)
     return made
 
 
 def in_training(policy: Node, model: Model) -> Policy:
     """The policy of a model that is being trained, on its device, not compiled once more."""
-    made: Policy = build(
-        {**policy, "device": next(model.parameters()).device.type, "compile": False}, model=model, spec=model.spec
-    )
+    here = {**policy, "device": next(model.parameters()).device.type, "compile": False}
+    made: Policy = build(here, "policy", model=model, spec=model.spec)
     return made
 
 
 def _without_pretraining(model: Node) -> Node:
     """The node of a model whose weights all come out of a checkpoint, with none to be found or fetched before."""
-    nowhere = {("image", "pretrained"): "", ("text", "name"): ""}
-    changed = {
-        part: {**model[part], key: value} for (part, key), value in nowhere.items() if key in (model.get(part) or {})
+    nowhere = {"image": "pretrained", "text": "name"}
+    parts = {
+        part: model[part] for part, key in nowhere.items() if isinstance(model.get(part), dict) and key in model[part]
     }
-    return {**model, **changed}
+    return {**model, **{part: {**node, nowhere[part]: ""} for part, node in parts.items()}}
 
 
 def demonstrated(config: DictConfig) -> Spec:
@@ -136,7 +135,7 @@ def _source(config: DictConfig) -> tuple[Spec, Recorded | None]:
 
     environment = make_environment(plain(config.task))
     environment.close()
-    expert = build(config.expert, spec=environment.spec)
+    expert = build(config.expert, "expert", spec=environment.spec)
     return (expert.spec, expert) if isinstance(expert, Recorded) else (environment.spec, None)
 
 
@@ -147,7 +146,7 @@ def collected(config: DictConfig) -> EpisodeStore:
 
     if config.collect.seed + config.collect.episodes > FIRST_SEED:
         raise ValueError(f"collect.seed={config.collect.seed}: seeds from {FIRST_SEED} on are kept for evaluation")
-    cluster = build(config.cluster)
+    cluster = build(config.cluster, "cluster")
     spec, recorded = _source(config)
     source = {"task": plain(config.task), "expert": plain(config.expert)}
     store = EpisodeStore.create_or_open(Path(config.collect.folder), spec, source)
@@ -197,10 +196,10 @@ def unfitted_learner(config: DictConfig, spec: Spec) -> Learner:
     if saved:
         saved.spec.perceived.require(spec.perceived, f"the checkpoint {origin}", "what it is to be trained on")
         spec, node = replace(spec, chain=saved.spec.chain), _without_pretraining(node)
-    model = build(node, spec=spec, tokenizer=build(config.tokenizer, spec=spec))
+    model = build(node, "model", spec=spec, tokenizer=build(config.tokenizer, "tokenizer", spec=spec))
     if saved:
         saved.start(model)
-    learner: Learner = build(config.learner, model=model, spec=spec, config=plain(config))
+    learner: Learner = build(config.learner, "learner", model=model, spec=spec, config=plain(config))
     return learner
 
 
@@ -208,7 +207,7 @@ def fit(tokenizer: ActionTokenizer, config: DictConfig, store: EpisodeStore) -> 
     """Give a configuration's tokenizer what it takes from a store's actions, unless a checkpoint has brought it."""
     if config.checkpoint or config.pretrained:
         return
-    fitted = build(config.tokenizer, spec=store.spec, statistics=store.statistics)
+    fitted = build(config.tokenizer, "tokenizer", spec=store.spec, statistics=store.statistics)
     tokenizer.load_state_dict(fitted.state_dict())
 
 
@@ -216,6 +215,7 @@ def make_data(config: DictConfig, store: EpisodeStore, model: Any) -> Windows:
     """The windows that a model wants of a store: the first `collect.episodes`, whatever else it holds."""
     windows: Windows = build(
         config.data,
+        "data",
         folder=store.folder,
         spec=store.spec,
         history=model.history,

@@ -10,17 +10,21 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from pickle import UnpicklingError
 from typing import Any, Literal
-from zipfile import BadZipFile, ZipFile
+from zipfile import ZIP_STORED, BadZipFile, ZipFile
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from vla.documents import require_resolved
 from vla.models.model import Model
 from vla.spec import Array, Observation, Spec
 
 Batch = dict[str, Any]
 
+NODES = ("task", "tokenizer", "model")  # what a checkpoint's configuration says of a policy
+# What else it may say, also as mappings.
+OTHERS = ("chosen", "expert", "collect", "data", "learner", "trainer", "validate")
 OF_TRUTH = ("truth_head", "truth_scale")  # parts of a model that are needed in training only
 LONG = " ".join(["sentence"] * 24)  # what is compiled for a text of this length is so for all shorter ones
 
@@ -43,8 +47,8 @@ class Checkpoint:
         """
         try:
             model.load_state_dict(self.state)
-        except RuntimeError as error:
-            first = str(error).strip().splitlines()[-1].strip()
+        except (RuntimeError, TypeError, AttributeError) as error:  # the latter for values that are no tensors
+            first = str(error).strip().splitlines()[-1].strip()[:200]
             raise ValueError(f"{self.path} does not fit the model of its own configuration: {first}") from error
 
     def start(self, model: Model) -> None:
@@ -63,28 +67,49 @@ class Checkpoint:
 
 
 def read_checkpoint(path: str | Path) -> Checkpoint:
-    """Read a checkpoint without running code that may be in it.
+    """Read a checkpoint as data: no code in it runs, and its configuration holds resolved plain values.
 
     Raises:
         ValueError: there is no file, it is damaged, or it is not a checkpoint of this project.
+        OSError: it may not be read.
     """
     path = Path(path)
     if not path.is_file():
         raise ValueError(f"there is no checkpoint {path}: those of a run lie in outputs/runs/…/checkpoints")
+    content = _load(path)
+    config, spec, state = (content.get(name) for name in ("config", "spec", "state_dict"))
+    if config is None or spec is None:
+        raise ValueError(f"{path} is no checkpoint of this project: it carries no configuration and spec")
+    require_resolved(config, f"the configuration in {path}")
+    _require_nodes(config, path)
+    if not isinstance(state, dict) or not all(isinstance(key, str) for key in state):
+        raise ValueError(f"{path} holds no weights: copy it again from where it is whole")
+    prefix = "model."
+    state = {key[len(prefix) :]: value for key, value in state.items() if key.startswith(prefix)}
+    return Checkpoint(path, config, Spec.from_dict(spec), state, content.get("finished") is True)
+
+
+def _load(path: Path) -> dict[str, Any]:
     try:
         # Old pickles, which torch would read too, fail in any way they like.
-        with ZipFile(path) as archive:
+        with path.open("rb") as file, ZipFile(file) as archive:
+            entries = archive.infolist()
+            # torch compresses nothing, so what unpacks to more than the file would fill the memory on purpose.
+            packed = any(entry.compress_type != ZIP_STORED for entry in entries)
+            if packed or sum(entry.file_size for entry in entries) > path.stat().st_size:
+                raise BadZipFile("its parts are compressed or overlap")
             if archive.testzip() is not None:  # torch does not look at the checksums
                 raise BadZipFile("checksums do not fit")
         content = torch.load(path, map_location="cpu", weights_only=True)
-    except (RuntimeError, UnpicklingError, OSError, BadZipFile) as error:
+    except (RuntimeError, UnpicklingError, EOFError, LookupError, TypeError, AttributeError, BadZipFile) as error:
         raise ValueError(f"{path} cannot be read as a checkpoint, it is damaged or something else") from error
-    if not isinstance(content, dict) or not {"config", "spec", "state_dict"} <= set(content):
-        raise ValueError(f"{path} is no checkpoint of this project: it carries no configuration and spec")
-    prefix = "model."
-    state = {key[len(prefix) :]: value for key, value in content["state_dict"].items() if key.startswith(prefix)}
-    finished = content.get("finished", False)
-    return Checkpoint(path, content["config"], Spec.from_dict(content["spec"]), state, finished)
+    return content if isinstance(content, dict) else {}
+
+
+def _require_nodes(config: Any, path: Path) -> None:
+    nodes = all(isinstance(config.get(name), dict) for name in NODES) if isinstance(config, dict) else False
+    if not nodes or not all(isinstance(config.get(name, {}), dict) for name in OTHERS):
+        raise ValueError(f"{path} is no checkpoint of this project: its configuration lacks {', '.join(NODES)}")
 
 
 class Policy:

@@ -20,6 +20,7 @@ from torch.export import Dim, ExportedProgram
 
 from vla.models.model import Batch, Model
 from vla.policy import Policy, noise
+from vla.types import Text
 
 log = logging.getLogger(__name__)
 
@@ -76,7 +77,7 @@ class Program:
         onnx: whether to write ONNX too, which needs the extra `onnx`.
     """
 
-    def __init__(self, folder: str | Path, onnx: bool = True) -> None:
+    def __init__(self, folder: Text | Path, onnx: bool = True) -> None:
         self._folder, self._onnx = Path(folder).resolve(), onnx
 
     def export(self, policy: Policy) -> Path:

@@ -16,6 +16,7 @@ import rerun_cli
 from PIL import Image
 
 from vla.spec import Array, Environment, Episode, Observation, Shape, Spec
+from vla.types import Point
 
 # N steps, S series of a plot, D action components, K bins, V vertices, F faces
 
@@ -37,8 +38,8 @@ class RerunRecorder:
     def __init__(
         self,
         folder: str | os.PathLike[str],
-        eye: Sequence[float] = (1.2, -0.7, 0.75),
-        look_at: Sequence[float] = (0.38, 0.0, 0.2),
+        eye: Point = (1.2, -0.7, 0.75),
+        look_at: Point = (0.38, 0.0, 0.2),
     ) -> None:
         """Record into a folder, which is made.
 
@@ -225,7 +226,7 @@ def _normals(vertices: Array, faces: Array) -> Array:
     return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
 
 
-def _blueprint(spec: Spec, tokens: bool, eye: Sequence[float], look_at: Sequence[float]) -> rrb.Blueprint:
+def _blueprint(spec: Spec, tokens: bool, eye: Point, look_at: Point) -> rrb.Blueprint:
     """Scene large on the left; texts and cameras on the right; curves and tokens below."""
     controls = rrb.EyeControls3D(position=eye, look_target=look_at, eye_up=(0, 0, 1))
     scene = rrb.Spatial3DView(origin="/world", name="scene", eye_controls=controls, line_grid=False)

@@ -15,6 +15,8 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
 from omegaconf import DictConfig, OmegaConf, open_dict
 
+from vla.check import require_no_paths
+
 if TYPE_CHECKING:
     from vla.policy import Checkpoint
 
@@ -39,6 +41,9 @@ IDENTITY = (
     *("tokenizer", "model", "learner", "validate", "seed", "pretrained"),
     *(f"trainer.{name}" for name in (*FAR, "precision", "devices", "num_nodes")),
 )
+# What somebody else's checkpoint decides of a training that goes on from it; where files lie, what is logged where and
+# on which devices it runs, the command line decides.
+OF_OTHERS = ("task", "expert", "data", "tokenizer", "model", "learner", "validate", "seed", "chosen")
 # What the report on a policy says of its training.
 TOLD = ("expert", "collect", "data", "learner", "trainer", "validate", "seed", "pretrained")
 
@@ -59,6 +64,7 @@ def adopt(cfg: DictConfig, saved: Mapping[str, Any], overrides: Sequence[str]) -
     kept = saved.get("chosen", {})
     chosen = {name: cfg.chosen[name] if group in named else kept.get(name) for name, group in CHOSEN.items()}
     names = [*OF_POLICY, *(name for name in TOLD if cfg.job == "evaluate" and name in saved)]
+    require_no_paths(saved, OF_POLICY, cfg.checkpoint)
     return _on_top(cfg, {**{name: saved[name] for name in names}, "chosen": chosen}, said)
 
 
@@ -82,7 +88,9 @@ def start_from(cfg: DictConfig, overrides: Sequence[str]) -> DictConfig:
     own = Path(cfg.output) / "checkpoints" / LAST  # of the same training, where it is to be gone on with
     saved = read_checkpoint(own if own.exists() and not Path(cfg.pretrained).exists() else cfg.pretrained).config
     chosen = {**_plain(cfg.chosen), "model": saved.get("chosen", {}).get("model")}
-    return _on_top(cfg, {**{name: saved[name] for name in ("tokenizer", "model", "data")}, "chosen": chosen}, said)
+    parts = ("tokenizer", "model", "data")
+    require_no_paths(saved, parts, cfg.pretrained)
+    return _on_top(cfg, {**{name: saved[name] for name in parts if name in saved}, "chosen": chosen}, said)
 
 
 def _require_own_parts(said: Sequence[Override]) -> None:
@@ -119,19 +127,25 @@ def go_on(cfg: DictConfig, overrides: Sequence[str]) -> DictConfig:
                 f"model or learner it is another training, so leave it out, or start one, with pretrained={path} in "
                 "place of checkpoint= if it is to start from these weights"
             )
-    adopted = {name: value for name, value in saved.config.items() if name in cfg and name not in ("job", "output")}
-    resumed = _on_top(cfg, adopted, said)
+    own = _is_own(path, cfg)
+    names = [name for name in cfg if name not in ("job", "output")] if own else OF_OTHERS
+    resumed = _on_top(cfg, {name: saved.config[name] for name in names if name in saved.config}, said)
     named = {_path(override) for override in said}
-    if "trainer" in named:  # how fast it goes on, not how far
+    if not own:
+        require_no_paths(_plain(resumed), OF_OTHERS, path)
+        for name in ("episodes", "seed"):
+            if name in saved.config.get("collect", {}):
+                OmegaConf.update(resumed, f"collect.{name}", saved.config["collect"][name])
+    if not own or "trainer" in named:  # how fast it goes on, not how far
         for name in FAR:
-            if name in saved.config["trainer"] and f"trainer.{name}" not in named:
+            if name in saved.config.get("trainer", {}) and f"trainer.{name}" not in named:
                 OmegaConf.update(resumed, f"trainer.{name}", saved.config["trainer"][name], force_add=True)
     _require_same_sharing(resumed, saved)
     resumed.checkpoint, resumed.resume = str(path), not saved.finished
     if last and "output" not in named:
         resumed.output = str(path.parent.parent)
     if last and "job" not in named:
-        resumed.job = saved.config["job"]
+        resumed.job = saved.config.get("job", cfg.job)
     if last and saved.finished and resumed.job == "evaluate":
         chosen = run_of(path).chosen
         resumed.checkpoint, resumed.resume = str(path.with_name(chosen or path.name)), chosen is None
@@ -187,10 +201,15 @@ def reported(cfg: DictConfig, checkpoint: Path) -> float | None:
     return float(report["success"])
 
 
+def _is_own(checkpoint: Path, cfg: DictConfig) -> bool:
+    """Whether a checkpoint lies in a run beside the one that `cfg.output` names, where the user's own runs lie."""
+    return checkpoint.resolve().parent.parent.parent == Path(cfg.output).resolve().parent
+
+
 def _require_same_sharing(cfg: DictConfig, saved: Checkpoint) -> None:
     """Where weights are shared out, Lightning numbers what the optimiser remembers in another order."""
     sharing = OmegaConf.is_dict(OmegaConf.select(cfg, "trainer.strategy"))
-    if sharing and not isinstance(saved.config["trainer"].get("strategy"), dict):
+    if sharing and not isinstance(saved.config.get("trainer", {}).get("strategy"), dict):
         raise ValueError(
             f"trainer=fsdp cannot go on from {saved.path}, which was trained without it: use trainer=ddp, or start anew"
         )
@@ -229,7 +248,7 @@ def newest_interrupted(runs: Path) -> Path:
         if _held(path.parent):
             continue
         saved = read_checkpoint(path)
-        unreported = saved.config["job"] == "evaluate" and not (path.parent.parent / "report.json").exists()
+        unreported = saved.config.get("job") == "evaluate" and not (path.parent.parent / "report.json").exists()
         if not saved.finished or unreported:
             return path
     raise ValueError(

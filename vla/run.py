@@ -108,6 +108,10 @@ def _devices(trainer: DictConfig) -> int:
 def _do(cfg: DictConfig) -> float | None:
     from vla import jobs
 
+    if "task" in JOBS.get(cfg.job, ()):
+        from vla.tasks.backend import choose_backend
+
+        choose_backend()  # before a check imports MuJoCo, which reads MUJOCO_GL at once
     said = HydraConfig.get().overrides.task
     if cfg.pretrained is not None:
         cfg = start_from(cfg, said)
@@ -118,10 +122,6 @@ def _do(cfg: DictConfig) -> float | None:
 
         cfg = adopt(cfg, read_checkpoint(cfg.checkpoint).config, said)
     _require_sweepable(cfg)  # with the trainer that a checkpoint brings
-    if "task" in JOBS.get(cfg.job, ()):
-        from vla.tasks.backend import choose_backend
-
-        choose_backend()  # before the check imports MuJoCo, which reads MUJOCO_GL at once
     check(cfg)
     left = taken_up(cfg) if cfg.job in ("train", "evaluate") else cfg
     return jobs.run(left) if left is not None else None

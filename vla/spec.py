@@ -200,6 +200,14 @@ class Recorder(Protocol):
         ...
 
 
+class Exporter(Protocol):
+    """Something that writes an episode store, or a policy, in another format."""
+
+    def export(self, source: Any) -> Any:
+        """Write all of it; returns the path of what was written."""
+        ...
+
+
 class Deployment(Protocol):
     """A way to put a policy to work; built as `Deployment(**yaml, policy=…, environment=…, output=…)`.
 

@@ -10,7 +10,7 @@ from typing import Any
 from rich import print as show
 
 from vla.card import store_table, write_card
-from vla.check import check_node
+from vla.check import require_no_paths
 from vla.data.episodes import EpisodeStore
 from vla.data.inspection import examine, find, listed, put_together, require_whole
 
@@ -72,7 +72,7 @@ def replay_into(output: Path, folder: Path, seed: int) -> None:
             f"{folder} does not say in which task seed {seed} was made, so there is no scene to replay it in"
         )
     choose_backend()  # before the check imports MuJoCo, which reads MUJOCO_GL at once
-    check_node(f"{folder / 'store.json'}: task", config["task"])
+    require_no_paths(config, ("task",), folder)
     environment = make_environment(config["task"])
     store.spec.require(environment.spec, f"the episode store {folder}", "its task as it is built now")
     with environment.blind():

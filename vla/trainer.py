@@ -206,7 +206,7 @@ def make_trainer(config: DictConfig, checkpoints: Path | None, *watching: Callba
         options = {"logger": _loggers(config, checkpoints.parent)}
     callbacks.append(Draws(config.seed))  # after all that might draw something itself
     try:
-        trainer: Trainer = build(config.trainer, callbacks=callbacks, **options)
+        trainer: Trainer = build(config.trainer, "trainer", callbacks=callbacks, **options)
         if isinstance(trainer.strategy, ParallelStrategy) and trainer.strategy.cluster_environment:
             # As many processes as a cluster started, of which Lightning would not speak before the training.
             trainer.strategy.cluster_environment.validate_settings(trainer.num_devices, trainer.num_nodes)
@@ -266,7 +266,7 @@ def _loggers(config: DictConfig, folder: Path) -> list[Logger]:
     loggers = []
     for name, node in (config.logger or {}).items():
         try:
-            loggers.append(build(node, save_dir=str(folder)))
+            loggers.append(build(node, "logger", save_dir=str(folder)))
         except ModuleNotFoundError as error:
             raise ValueError(
                 f"logger.{name} needs a package that is not installed: pip install 'vla[{name}]'"

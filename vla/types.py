@@ -9,7 +9,7 @@ import itertools
 from collections.abc import Sequence
 from typing import Annotated, Any
 
-from annotated_types import Ge, Gt, Le, MinLen, Predicate
+from annotated_types import Ge, Gt, Le, Lt, MinLen, Predicate
 
 
 def ascending(values: Sequence[float]) -> bool:
@@ -22,16 +22,28 @@ def unique(values: Sequence[Any]) -> bool:
     return len({repr(value) for value in values}) == len(values)
 
 
-Natural = Annotated[int, Ge(0)]
-Count = Annotated[int, Ge(1)]
+Natural = Annotated[int, Ge(0), Le(2**31 - 1)]
+Count = Annotated[int, Ge(1), Le(2**31 - 1)]
 Seed = Annotated[int, Ge(0), Le(2**32 - 1)]  # what NumPy and Lightning take
 NonNegative = Annotated[float, Ge(0)]
 Positive = Annotated[float, Gt(0)]
 Share = Annotated[float, Ge(0), Le(1)]  # a probability, a fraction
+Rate = Annotated[float, Ge(0), Lt(1)]  # of dropout, of a moving average
 Range = Annotated[tuple[float, float], Predicate(ascending)]  # low, high
 NonNegativeRange = Annotated[tuple[NonNegative, NonNegative], Predicate(ascending)]
 PositiveRange = Annotated[tuple[Positive, Positive], Predicate(ascending)]
 CountRange = Annotated[tuple[Count, Count], Predicate(ascending)]
-ImageSize = tuple[Annotated[int, Ge(8), Le(2048)], Annotated[int, Ge(8), Le(2048)]]  # height, width [px]
+Pixels = Annotated[int, Ge(8), Le(1024)]
+ImageSize = tuple[Pixels, Pixels]  # height, width
+Point = tuple[float, float, float]  # [m]
+# Sizes of networks, within what a machine can hold: nodes of models also come out of checkpoints.
+Width = Annotated[int, Ge(1), Le(16384)]
+Layers = Annotated[int, Ge(1), Le(256)]
+Steps = Annotated[int, Ge(1), Le(1024)]  # of history, of a chunk of actions
+Bins = Annotated[int, Ge(2), Le(65536)]
+Widths = Annotated[list[Width], MinLen(1)]
+Kernels = Annotated[list[Annotated[int, Ge(1), Le(31)]], MinLen(1)]
+Shift = tuple[NonNegative, NonNegative]  # of images in augmentation, down and across [px]
+
 Text = Annotated[str, MinLen(1)]
 Names = Annotated[tuple[Text, ...], MinLen(1), Predicate(unique)]

@@ -22,7 +22,7 @@ def measures(config: DictConfig) -> dict[str, Measure]:
     observation = environment.reset(0)
     environment.close()
     model = make_learner(config, collected(config)).model
-    agent = build(config.policy, model=model, spec=environment.spec)
+    agent = build(config.policy, "policy", model=model, spec=environment.spec)
     for _ in range(model.history + 1):  # the first ones compile and allocate
         agent.act(observation)
     frame = agent.frame(observation)

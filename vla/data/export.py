@@ -14,7 +14,7 @@ from contextlib import contextmanager, suppress
 from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from filelock import FileLock, Timeout
@@ -24,6 +24,7 @@ from rich.progress import track
 from vla.data.episodes import EpisodeStore
 from vla.data.index import Entry
 from vla.spec import Array, Spec
+from vla.types import Count, Text
 from vla.workers import cores, leave_with_parent
 
 MILLIMETRE = np.float32(0.001)  # [m]
@@ -40,7 +41,7 @@ class Folders(ABC):
         workers: processes; null: one per core. The files do not depend on it.
     """
 
-    def __init__(self, folder: str | Path, workers: Annotated[int, 1] | None = None) -> None:
+    def __init__(self, folder: Text | Path, workers: Count | None = None) -> None:
         self._folder = Path(folder).resolve()
         self._workers = workers
 

@@ -17,6 +17,7 @@ from typing import Annotated, Any
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
+from annotated_types import Ge, Le
 
 from vla.data import lerobot_layout as layout
 from vla.data.episodes import EpisodeStore
@@ -24,6 +25,7 @@ from vla.data.export import each, origin, require_empty, unfinished, write_json
 from vla.data.moments import image_moments, moments
 from vla.data.video import encode
 from vla.spec import Array
+from vla.types import Count, Text
 
 # Readers keep a video open and look frames up by 32-bit seconds: neither one file per episode nor a single one will do.
 EPISODES_PER_VIDEO = 50
@@ -46,10 +48,10 @@ class LeRobot:
 
     def __init__(
         self,
-        folder: str | Path,
-        crf: Annotated[int, 0] = 30,
+        folder: Text | Path,
+        crf: Annotated[int, Ge(0), Le(63)] = 30,
         depth: bool = False,
-        workers: Annotated[int, 1] | None = None,
+        workers: Count | None = None,
     ) -> None:
         if crf > 63:
             raise ValueError(f"export.crf is from 0 to 63, not {crf}")

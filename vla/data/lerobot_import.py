@@ -38,7 +38,7 @@ class LeRobot(Recorded):
         ValueError: there is no such dataset, it cannot be read, or it differs from the task; the first difference.
     """
 
-    def __init__(self, folder: str | None = None, *, spec: Spec) -> None:
+    def __init__(self, folder: Path | str | None = None, *, spec: Spec) -> None:
         if folder is None:
             raise ValueError("expert=lerobot needs the folder of a dataset: expert.folder=DIR")
         self._folder, self.spec = Path(folder), spec.perceived

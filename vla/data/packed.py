@@ -12,12 +12,14 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
+from annotated_types import Ge, Le
 
 from vla.data.episodes import EpisodeStore, checksum
 from vla.data.export import each, require_empty, unfinished
 from vla.data.index import Entry, index_line
 from vla.data.pack import JPEG, OFFSET, ZLIB, pack
 from vla.spec import Array
+from vla.types import Count, Text
 
 
 @dataclass(frozen=True)
@@ -43,10 +45,10 @@ class Packed:
 
     def __init__(
         self,
-        folder: str | Path,
+        folder: Text | Path,
         codec: Literal["lossless", "jpeg"] = "lossless",
-        quality: Annotated[int, 1] = 90,
-        workers: Annotated[int, 1] | None = None,
+        quality: Annotated[int, Ge(1), Le(100)] = 90,
+        workers: Count | None = None,
     ) -> None:
         if quality > 95:
             raise ValueError(f"export.quality is from 1 to 95, not {quality}")

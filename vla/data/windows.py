@@ -16,7 +16,6 @@ from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import lru_cache
 from pathlib import Path
-from typing import Annotated
 
 import numpy as np
 from lightning import LightningDataModule
@@ -24,13 +23,14 @@ from lightning import LightningDataModule
 from vla.data.episodes import EpisodeStore
 from vla.data.gather import Batch, Gather
 from vla.spec import Array, Spec
+from vla.types import Count, Natural, Rate, Seed
 
 # Multiplying by the golden ratio spreads consecutive seeds evenly over the circle of 32-bit numbers (Knuth, The Art of
 # Computer Programming 3, section 6.4): every stretch of seeds gets its share of held-out episodes.
 GOLDEN = 2654435769
 
 
-def held_out(seed: int, fraction: float) -> bool:
+def held_out(seed: Seed, fraction: float) -> bool:
     """Whether the episode of `seed` is kept for validation, whatever other episodes there are."""
     return seed * GOLDEN % 2**32 < fraction * 2**32
 
@@ -102,13 +102,13 @@ class Windows(LightningDataModule):
         spec: Spec,
         history: int,
         chunk: int,
-        seed: int,
-        batch_size: Annotated[int, 1],
-        validation_fraction: float,
-        validation_windows: Annotated[int, 1],
+        seed: Seed,
+        batch_size: Count,
+        validation_fraction: Rate,
+        validation_windows: Count,
         depth: bool,
-        ahead: Annotated[int, 0],
-        episodes: int | None = None,
+        ahead: Natural,
+        episodes: Count | None = None,
     ) -> None:
         super().__init__()
         if not 0 <= validation_fraction < 1:
@@ -200,5 +200,5 @@ class Windows(LightningDataModule):
 
 
 @lru_cache(maxsize=2)
-def _shuffled(count: int, seed: int, number: int) -> Array:
+def _shuffled(count: int, seed: Seed, number: int) -> Array:
     return np.random.default_rng([seed, number]).permutation(count)

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import asdict
 from functools import cache
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
 
@@ -19,6 +19,7 @@ from vla.data.index import Entry
 from vla.deploy.governor import Robot
 from vla.deploy.ros2 import Topics
 from vla.spec import Array, Spec
+from vla.types import Count, Text
 
 SECOND = 1_000_000_000  # [ns]
 
@@ -48,13 +49,13 @@ class Mcap(Folders):
 
     def __init__(
         self,
-        folder: str | Path,
+        folder: Text | Path,
         topics: Topics,
         robot: Robot,
         depths: dict[str, str],
         action: str,
         executed: str,
-        workers: Annotated[int, 1] | None = None,
+        workers: Count | None = None,
     ) -> None:
         super().__init__(folder, workers)
         self._topics, self._robot, self._depths = topics, robot, depths

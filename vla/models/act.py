@@ -9,7 +9,6 @@ Shapes: B batch, k action chunk, D action components, M context tokens, E width 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Annotated
 
 import torch
 from torch import Tensor, nn
@@ -20,6 +19,7 @@ from vla.models.image_tokenizer import ImageEncoder
 from vla.models.model import Batch, Prediction, require_heads
 from vla.models.text import TextEncoder
 from vla.spec import Spec
+from vla.types import Layers, NonNegative, Shift, Steps, Width
 
 
 class Style(nn.Module):
@@ -35,7 +35,14 @@ class Style(nn.Module):
     """
 
     def __init__(
-        self, posture_width: int, components: int, chunk: int, width: int, layers: int, heads: int, latent: int
+        self,
+        posture_width: int,
+        components: int,
+        chunk: Steps,
+        width: int,
+        layers: Layers,
+        heads: Layers,
+        latent: Width,
     ) -> None:
         super().__init__()
         self.start = nn.Embedding(1, width)
@@ -78,17 +85,17 @@ class ACT(ChunkModel):
         self,
         image: Callable[..., ImageEncoder],
         text: Callable[..., TextEncoder],
-        chunk: int = 8,
-        execute: Annotated[int, 1] = 2,
-        keypoints: int = 32,
-        text_width: int = 64,
-        width: int = 128,
-        layers: int = 2,
-        heads: int = 4,
-        latent: int = 32,
-        kl_weight: float = 10.0,
-        shift: tuple[float, float] = (12, 12),
-        auxiliary: float = 1.0,
+        chunk: Steps = 8,
+        execute: Steps = 2,
+        keypoints: Width = 32,
+        text_width: Width = 64,
+        width: Width = 128,
+        layers: Layers = 2,
+        heads: Layers = 4,
+        latent: Width = 32,
+        kl_weight: NonNegative = 10.0,
+        shift: Shift = (12, 12),
+        auxiliary: NonNegative = 1.0,
         *,
         spec: Spec,
         tokenizer: ActionTokenizer,

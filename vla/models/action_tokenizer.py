@@ -17,6 +17,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from vla.spec import Spec
+from vla.types import Bins, Count, NonNegative
 
 log = logging.getLogger(__name__)
 
@@ -58,7 +59,7 @@ class ActionTokenizer(nn.Module, ABC):
     high: Tensor  # (D,)
     end = -1  # the token that ends a sequence and fills it up; none where all are of one length
 
-    def __init__(self, spec: Spec, low: np.ndarray, high: np.ndarray, bins: int) -> None:
+    def __init__(self, spec: Spec, low: np.ndarray, high: np.ndarray, bins: Bins) -> None:
         super().__init__()
         if bins < 2:
             raise ValueError(f"a tokenizer needs at least 2 bins, got bins={bins}")
@@ -195,10 +196,10 @@ class Uniform(EvenBins):
 
     def __init__(
         self,
-        bins: int = 256,
-        margin: float = 0.05,
-        smoothing: float = 3.0,
-        reach: int = 50,
+        bins: Bins = 256,
+        margin: NonNegative = 0.05,
+        smoothing: NonNegative = 3.0,
+        reach: Count = 50,
         *,
         spec: Spec,
         statistics: Statistics | None = None,
@@ -247,7 +248,7 @@ class RT1(EvenBins):
         statistics: accepted like in every tokenizer, and not needed.
     """
 
-    def __init__(self, bins: int = 256, *, spec: Spec, statistics: Statistics | None = None) -> None:
+    def __init__(self, bins: Bins = 256, *, spec: Spec, statistics: Statistics | None = None) -> None:
         unknown = sorted(set(spec.units) - set(RT1_BOUNDS))
         if unknown:
             raise ValueError(f"tokenizer=rt1 knows the units {sorted(RT1_BOUNDS)}, the spec has {unknown}")

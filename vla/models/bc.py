@@ -15,6 +15,7 @@ from vla.models.image_tokenizer import ImageEncoder, Keypoints, RandomShift
 from vla.models.model import Batch, Standardize, TokenModel, perceptron, pixels
 from vla.models.text import TextEncoder
 from vla.spec import Spec
+from vla.types import NonNegative, Shift, Steps, Width
 
 
 class BC(TokenModel):
@@ -37,12 +38,12 @@ class BC(TokenModel):
         self,
         image: Callable[..., ImageEncoder],
         text: Callable[..., TextEncoder],
-        chunk: int = 1,
-        keypoints: int = 32,
-        text_width: int = 64,
-        width: int = 512,
-        shift: tuple[float, float] = (12, 12),
-        auxiliary: float = 1.0,
+        chunk: Steps = 1,
+        keypoints: Width = 32,
+        text_width: Width = 64,
+        width: Width = 512,
+        shift: Shift = (12, 12),
+        auxiliary: NonNegative = 1.0,
         *,
         spec: Spec,
         tokenizer: PerComponent,

@@ -6,7 +6,6 @@ Shapes: B batch, k action chunk, D action components, M context tokens, E width 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Annotated
 
 import torch
 from torch import Tensor, nn
@@ -16,6 +15,7 @@ from vla.models.image_tokenizer import ImageEncoder, Keypoints, RandomShift
 from vla.models.model import Batch, Model, Standardize, perceptron, pixels
 from vla.models.text import TextEncoder
 from vla.spec import Spec
+from vla.types import NonNegative, Shift, Steps, Width
 
 HIDDEN = 2  # width of the layers in which all features meet, in widths of a token
 
@@ -49,13 +49,13 @@ class ChunkModel(Model):
         self,
         image: Callable[..., ImageEncoder],
         text: Callable[..., TextEncoder],
-        chunk: int,
-        execute: Annotated[int, 1],
-        keypoints: int,
+        chunk: Steps,
+        execute: Steps,
+        keypoints: Width,
         text_width: int,
         width: int,
-        shift: tuple[float, float],
-        auxiliary: float,
+        shift: Shift,
+        auxiliary: NonNegative,
         spec: Spec,
         tokenizer: ActionTokenizer,
     ) -> None:

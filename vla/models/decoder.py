@@ -18,6 +18,7 @@ from vla.models.image_tokenizer import ImageEncoder
 from vla.models.model import Batch, Prediction, newest, require_heads
 from vla.models.text import TextEncoder
 from vla.spec import Spec
+from vla.types import Layers, Natural, NonNegative, Pixels, Rate, Shift, Steps, Width
 
 
 class CachedLayer:
@@ -106,20 +107,20 @@ class Decoder(FrameModel):
         self,
         image: Callable[..., ImageEncoder],
         text: Callable[..., TextEncoder],
-        history: int = 2,
-        image_size: int | None = None,
-        learned_tokens: int = 4,
-        keypoints: int = 32,
+        history: Steps = 2,
+        image_size: Pixels | None = None,
+        learned_tokens: Natural = 4,
+        keypoints: Natural = 32,
         proprioception: bool = True,
-        chunk: int = 1,
-        auxiliary: float = 1.0,
-        text_width: int = 64,
-        width: int = 128,
-        layers: int = 2,
-        heads: int = 4,
-        feedforward: int = 256,
-        dropout: float = 0.0,
-        shift: tuple[float, float] = (12, 12),
+        chunk: Steps = 1,
+        auxiliary: NonNegative = 1.0,
+        text_width: Width = 64,
+        width: Width = 128,
+        layers: Layers = 2,
+        heads: Layers = 4,
+        feedforward: Width = 256,
+        dropout: Rate = 0.0,
+        shift: Shift = (12, 12),
         *,
         spec: Spec,
         tokenizer: ActionTokenizer,

@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 from abc import abstractmethod
 from collections.abc import Callable
-from typing import Annotated
 
 import torch
 from torch import Tensor, nn
@@ -20,6 +19,7 @@ from vla.models.image_tokenizer import ImageEncoder
 from vla.models.model import Batch, Prediction, require_heads
 from vla.models.text import TextEncoder
 from vla.spec import Spec
+from vla.types import Layers, NonNegative, Shift, Steps, Width
 
 FASTEST, SLOWEST = 100.0, 1.0  # frequencies of the embedding of time, which runs from 0 to 1 [rad]
 
@@ -38,7 +38,7 @@ class Denoiser(nn.Module):
 
     mask: Tensor
 
-    def __init__(self, components: int, chunk: int, width: int, layers: int, heads: int) -> None:
+    def __init__(self, components: int, chunk: Steps, width: int, layers: Layers, heads: Layers) -> None:
         super().__init__()
         self.width = width
         self.action = nn.Linear(components, width)
@@ -91,18 +91,18 @@ class DenoisingModel(ChunkModel):
         self,
         image: Callable[..., ImageEncoder],
         text: Callable[..., TextEncoder],
-        chunk: int = 8,
-        execute: Annotated[int, 1] = 2,
-        keypoints: int = 32,
-        text_width: int = 64,
-        width: int = 128,
-        layers: int = 3,
-        heads: int = 4,
-        copies: Annotated[int, 1] = 2,
-        steps: Annotated[int, 1] = 10,
-        temperature: float = 0.5,
-        shift: tuple[float, float] = (12, 12),
-        auxiliary: float = 1.0,
+        chunk: Steps = 8,
+        execute: Steps = 2,
+        keypoints: Width = 32,
+        text_width: Width = 64,
+        width: Width = 128,
+        layers: Layers = 3,
+        heads: Layers = 4,
+        copies: Steps = 2,
+        steps: Steps = 10,
+        temperature: NonNegative = 0.5,
+        shift: Shift = (12, 12),
+        auxiliary: NonNegative = 1.0,
         *,
         spec: Spec,
         tokenizer: ActionTokenizer,

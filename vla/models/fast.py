@@ -5,7 +5,7 @@ Shapes: k actions of a chunk, D action components, L tokens of a sequence, K tok
 
 from __future__ import annotations
 
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -16,6 +16,7 @@ from torch import Tensor
 
 from vla.models.action_tokenizer import LEAST_SPAN, ActionTokenizer, Statistics, data_bounds
 from vla.spec import Spec
+from vla.types import Bins, Positive, Steps
 
 FIRST = 0x100  # code point of the smallest coefficient; up to 0xD800 every code point is a character
 END = "<end>"
@@ -46,9 +47,9 @@ class Fast(ActionTokenizer):
 
     def __init__(
         self,
-        bins: int = 1024,
-        scale: float = 10.0,
-        chunk: Annotated[int, 1] = 8,
+        bins: Bins = 1024,
+        scale: Positive = 10.0,
+        chunk: Steps = 8,
         *,
         spec: Spec,
         statistics: Statistics | None = None,

@@ -15,6 +15,7 @@ from vla.models.image_tokenizer import ImageEncoder, Keypoints, RandomShift, Tok
 from vla.models.model import Batch, Model, Standardize, pixels
 from vla.models.text import TextEncoder
 from vla.spec import Spec
+from vla.types import Natural, NonNegative, Pixels, Shift, Steps
 
 
 class FrameModel(Model):
@@ -42,16 +43,16 @@ class FrameModel(Model):
         self,
         image: Callable[..., ImageEncoder],
         text: Callable[..., TextEncoder],
-        history: int,
-        image_size: int | None,
-        learned_tokens: int,
-        keypoints: int,
+        history: Steps,
+        image_size: Pixels | None,
+        learned_tokens: Natural,
+        keypoints: Natural,
         proprioception: bool,
-        chunk: int,
-        auxiliary: float,
+        chunk: Steps,
+        auxiliary: NonNegative,
         text_width: int,
         width: int,
-        shift: tuple[float, float],
+        shift: Shift,
         spec: Spec,
         tokenizer: ActionTokenizer,
     ) -> None:

@@ -12,6 +12,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from vla.types import Kernels, Width, Widths
+
 SPREAD = 4.0  # of the positions of keypoints: wide, as a hundredth of the image makes the difference
 DARK = 0.1  # of a brightness up to 3: colours darker than that say little
 CONTRAST = 2.0  # standard deviation that the scores of a keypoint start with: of 576 positions, a few count
@@ -71,7 +73,7 @@ class FilmConv(ImageEncoder):
     """
 
     def __init__(
-        self, channels: list[int], kernels: list[int], strides: list[int], chroma: bool = True, *, text_width: int
+        self, channels: Widths, kernels: Kernels, strides: Kernels, chroma: bool = True, *, text_width: int
     ) -> None:
         if not channels or not len(channels) == len(kernels) == len(strides):
             raise ValueError(
@@ -149,7 +151,7 @@ class Keypoints(nn.Module):
         keypoints: M.
     """
 
-    def __init__(self, channels: int, keypoints: int) -> None:
+    def __init__(self, channels: int, keypoints: Width) -> None:
         super().__init__()
         self.width = 2 + channels
         self.score = nn.Linear(channels, keypoints, bias=False)

@@ -16,6 +16,7 @@ from vla.models.image_tokenizer import RandomShift
 from vla.models.model import Model
 from vla.models.sharding import gathered, shard, share
 from vla.spec import Spec
+from vla.types import Natural, NonNegative, Positive, Rate
 
 Batch = dict[str, Any]
 
@@ -42,12 +43,12 @@ class Learner(LightningModule):
 
     def __init__(
         self,
-        lr: float = 1e-3,
-        weight_decay: float = 0.01,
-        warmup_steps: int = 100,
+        lr: Positive = 1e-3,
+        weight_decay: NonNegative = 0.01,
+        warmup_steps: Natural = 100,
         schedule: Literal["cosine", "constant"] = "cosine",
         compile: bool = False,
-        ema: float = 0.998,
+        ema: Rate = 0.998,
         *,
         model: Model,
         spec: Spec,

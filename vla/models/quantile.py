@@ -11,6 +11,7 @@ from torch import Tensor
 
 from vla.models.action_tokenizer import PerComponent, Statistics, data_bounds
 from vla.spec import Spec
+from vla.types import Bins
 
 
 class Quantile(PerComponent):
@@ -29,7 +30,7 @@ class Quantile(PerComponent):
     edges: Tensor  # (D, K - 1) between neighbouring bins, rising; those of unused bins lie beyond the bounds
     centres: Tensor  # (D, K) the actions that the tokens stand for
 
-    def __init__(self, bins: int = 256, *, spec: Spec, statistics: Statistics | None = None) -> None:
+    def __init__(self, bins: Bins = 256, *, spec: Spec, statistics: Statistics | None = None) -> None:
         low, high = data_bounds(spec, statistics)
         super().__init__(spec, low, high, bins)
         sample = np.linspace(low, high, 2 * bins + 1) if statistics is None else statistics.chunks(1)[:, 0]

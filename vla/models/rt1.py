@@ -18,6 +18,7 @@ from vla.models.image_tokenizer import ImageEncoder
 from vla.models.model import Batch, TokenModel
 from vla.models.text import TextEncoder
 from vla.spec import Spec
+from vla.types import Layers, Natural, NonNegative, Pixels, Rate, Shift, Steps, Width
 
 
 class Layer(nn.Module):
@@ -30,7 +31,7 @@ class Layer(nn.Module):
         dropout: of the attention weights and of the feed-forward output.
     """
 
-    def __init__(self, width: int, heads: int, key_width: int, dropout: float) -> None:
+    def __init__(self, width: int, heads: Layers, key_width: Width, dropout: Rate) -> None:
         super().__init__()
         self.heads, self.dropout = heads, dropout
         self.attention_norm = nn.LayerNorm(width, eps=1e-6)
@@ -81,20 +82,20 @@ class RT1(FrameModel, TokenModel):
         self,
         image: Callable[..., ImageEncoder],
         text: Callable[..., TextEncoder],
-        history: int = 6,
-        image_size: int | None = 288,
-        learned_tokens: int = 8,
-        keypoints: int = 0,
+        history: Steps = 6,
+        image_size: Pixels | None = 288,
+        learned_tokens: Natural = 8,
+        keypoints: Natural = 0,
         proprioception: bool = False,
-        chunk: int = 1,
-        auxiliary: float = 0.0,
-        text_width: int = 512,
-        width: int = 512,
-        layers: int = 8,
-        heads: int = 8,
-        key_width: int = 128,
-        dropout: float = 0.1,
-        shift: tuple[float, float] = (20, 50),
+        chunk: Steps = 1,
+        auxiliary: NonNegative = 0.0,
+        text_width: Width = 512,
+        width: Width = 512,
+        layers: Layers = 8,
+        heads: Layers = 8,
+        key_width: Width = 128,
+        dropout: Rate = 0.1,
+        shift: Shift = (20, 50),
         *,
         spec: Spec,
         tokenizer: PerComponent,

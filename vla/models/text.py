@@ -9,9 +9,13 @@ import re
 import zlib
 from abc import ABC, abstractmethod
 from functools import lru_cache
+from typing import Annotated
 
 import torch
+from annotated_types import Ge, Le
 from torch import Tensor, nn
+
+from vla.types import Count, Rate
 
 PADDING = 0
 INITIAL = 0.1  # deviation of vectors before training: small, so that unknown n-grams hardly say anything
@@ -52,7 +56,13 @@ class NGrams(TextEncoder):
     """
 
     def __init__(
-        self, vocabulary: int = 4096, words: int = 3, characters: int = 3, forget: float = 0.0, *, width: int
+        self,
+        vocabulary: Annotated[int, Ge(2), Le(2**24)] = 4096,
+        words: Count = 3,
+        characters: Count = 3,
+        forget: Rate = 0.0,
+        *,
+        width: int,
     ) -> None:
         super().__init__(width)
         if not 0 <= forget < 1:

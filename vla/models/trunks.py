@@ -17,6 +17,7 @@ from torch import Tensor, nn
 
 from vla.models.hub import fetch
 from vla.models.image_tokenizer import FiLM, ImageEncoder
+from vla.types import Pixels, Width
 
 log = logging.getLogger(__name__)
 
@@ -61,7 +62,7 @@ class FilmEfficientNet(ImageEncoder):
         self,
         name: str = "efficientnet_b3",
         pretrained: bool | str = "auto",
-        channels: int = 512,
+        channels: Width = 512,
         *,
         text_width: int,
     ) -> None:
@@ -109,8 +110,8 @@ class FilmTrunk(ImageEncoder):
         name: str,
         pretrained: bool | str = "auto",
         frozen: bool = True,
-        size: int | None = None,
-        channels: int = 128,
+        size: Pixels | None = None,
+        channels: Width = 128,
         *,
         text_width: int,
     ) -> None:

@@ -7,13 +7,15 @@ state came about, and a policy can learn to recover from anything the expert was
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+from annotated_types import Ge, Le
 
 from vla.spec import Array, Observation, Spec
 from vla.tasks.control import DOWN, MAX_OPENING, rotation_z, vector_from_rotation
 from vla.tasks.goals.goal import MANNERS, Manner
+from vla.types import CountRange, Point, PositiveRange, Share
 
 HOVER = 0.08  # height above the block from which it is approached [m]
 CARRY = 0.07  # height above the table at which it is carried [m]
@@ -164,17 +166,17 @@ class Perturbation:
 
     def __init__(
         self,
-        start: float = 0.7,
-        start_steps: Sequence[int] = (2, 9),
-        rate: float = 0.06,
-        steps: Sequence[int] = (2, 5),
-        noise: float = 0.2,
-        closed: float = 0.3,
-        unturned: float = 0.3,
-        missed: float = 0.1,
-        pace: Sequence[float] = (1.0, 1.0),
-        low: Sequence[float] = (0.34, -0.26, 0.015),
-        high: Sequence[float] = (0.66, 0.26, 0.34),
+        start: Share = 0.7,
+        start_steps: CountRange = (2, 9),
+        rate: Share = 0.06,
+        steps: CountRange = (2, 5),
+        noise: Annotated[float, Ge(0), Le(2)] = 0.2,
+        closed: Share = 0.3,
+        unturned: Share = 0.3,
+        missed: Share = 0.1,
+        pace: PositiveRange = (1.0, 1.0),
+        low: Point = (0.34, -0.26, 0.015),
+        high: Point = (0.66, 0.26, 0.34),
     ) -> None:
         """Args:
         start: probability that an episode begins with an excursion.
@@ -189,12 +191,7 @@ class Perturbation:
             centimetres, where a learner that is not quite there comes to rest.
         low: lower corner of the box of points to go to, in the base frame [m].
         high: upper corner.
-
-        Raises:
-            ValueError: the pace is not two shares above 0.
         """
-        if len(pace) != 2 or not 0 < pace[0] <= pace[1]:
-            raise ValueError(f"expert.perturb.pace={list(pace)} must be two shares above 0, the smaller one first")
         self._start, self._start_steps, self._rate, self._steps = start, tuple(start_steps), rate, tuple(steps)
         self._noise, self._closed, self._unturned, self._missed = noise, closed, unturned, missed
         (self._slowest, self._fastest), self._low, self._high = pace, np.array(low), np.array(high)

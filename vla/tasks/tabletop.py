@@ -17,6 +17,7 @@ from vla.tasks.randomize.axis import Axis
 from vla.tasks.render import Renderer
 from vla.tasks.scene import COLOURS, Scene
 from vla.tasks.task import CONTROL_HZ, BriskEnvironment, TabletopTask
+from vla.types import Count, ImageSize, Names, Positive
 
 TRANSLATION = 0.04  # largest translation per step [m]
 ROTATION = 0.25  # largest rotation per step [rad]
@@ -29,10 +30,10 @@ class Tabletop:
         self,
         goal: Goal | Mixed,
         randomize: Mapping[str, Axis | None],
-        blocks: int = 4,
-        image_size: tuple[int, int] = (96, 96),
-        cameras: tuple[str, ...] = ("front", "wrist"),
-        time_limit: float = 10.0,
+        blocks: Count = 4,
+        image_size: ImageSize = (96, 96),
+        cameras: Names = ("front", "wrist"),
+        time_limit: Positive = 10.0,
         meshes: Literal["light", "full"] = "light",
         shadows: bool = True,
     ) -> None:

@@ -6,12 +6,13 @@ import numpy as np
 
 from vla.tasks.goals.goal import Aim, Facts, Goal, Subgoal
 from vla.tasks.language import Grammar
+from vla.types import Count, Positive
 
 
 class Lift(Goal):
     """Lift the named block and keep it up."""
 
-    def __init__(self, language: Grammar, height: float = 0.10, hold_steps: int = 3) -> None:
+    def __init__(self, language: Grammar, height: Positive = 0.10, hold_steps: Count = 3) -> None:
         """Args: what is said; how high the block must be above where it stood [m]; steps it must stay there."""
         super().__init__(language, hold_steps)
         self.height = height

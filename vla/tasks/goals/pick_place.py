@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from vla.tasks.goals.goal import Aim, Facts, Goal, Subgoal, placed
 from vla.tasks.language import Grammar
+from vla.types import Count, Positive
 
 
 class PickPlace(Goal):
     """Put the named block on the pad and let go of it."""
 
-    def __init__(self, language: Grammar, radius: float = 0.04, hold_steps: int = 3) -> None:
+    def __init__(self, language: Grammar, radius: Positive = 0.04, hold_steps: Count = 3) -> None:
         """Args: what is said; how far from the pad's centre the block's may rest [m]; steps it must rest."""
         super().__init__(language, hold_steps)
         self.radius = radius

@@ -6,6 +6,7 @@ import numpy as np
 
 from vla.tasks.goals.goal import Aim, Facts, Goal, Subgoal, placed
 from vla.tasks.language import Grammar
+from vla.types import Count, Positive
 
 CLEAR = 0.06  # distance of the tool from a block that is left alone [m]
 
@@ -15,7 +16,7 @@ class PickPlaceTwo(Goal):
 
     named, moves, pads = 2, 2, 2
 
-    def __init__(self, language: Grammar, radius: float = 0.04, hold_steps: int = 3) -> None:
+    def __init__(self, language: Grammar, radius: Positive = 0.04, hold_steps: Count = 3) -> None:
         """Args: what is said; how far from a pad's centre a block's may rest [m]; steps both must rest."""
         super().__init__(language, hold_steps)
         self.radius = radius

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from vla.tasks.goals.goal import AT_REST, Aim, Facts, Goal, Subgoal
 from vla.tasks.language import Grammar
+from vla.types import Count, Positive
 
 
 class Push(Goal):
@@ -11,7 +12,9 @@ class Push(Goal):
 
     pads = 2
 
-    def __init__(self, language: Grammar, radius: float = 0.04, highest: float = 0.02, hold_steps: int = 3) -> None:
+    def __init__(
+        self, language: Grammar, radius: Positive = 0.04, highest: Positive = 0.02, hold_steps: Count = 3
+    ) -> None:
         """Args: what is said; how far from the pad's centre the block's may rest [m]; how far it may ever have left the
         table [m]; steps it must rest."""
         super().__init__(language, hold_steps)

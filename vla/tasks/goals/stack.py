@@ -6,6 +6,7 @@ import numpy as np
 
 from vla.tasks.goals.goal import AT_REST, Aim, Facts, Goal, Subgoal
 from vla.tasks.language import Grammar
+from vla.types import Count
 
 UP = np.array([0.0, 0.0, 1.0])
 SAG = 0.006  # how far a stacked block may be from the height that its size says [m]
@@ -16,7 +17,7 @@ class Stack(Goal):
 
     named, blocks = 2, 3  # with two, "the other one" would need no words
 
-    def __init__(self, language: Grammar, hold_steps: int = 3) -> None:
+    def __init__(self, language: Grammar, hold_steps: Count = 3) -> None:
         """Args: what is said; steps that the upper block must rest."""
         super().__init__(language, hold_steps)
 

@@ -6,6 +6,7 @@ import numpy as np
 
 from vla.tasks.goals.goal import Aim, Facts, Goal, Subgoal
 from vla.tasks.language import Grammar
+from vla.types import Count, Positive
 
 AT_REST = 0.05  # speed of the fastest joint below which the arm counts as resting [rad/s]
 
@@ -15,7 +16,7 @@ class Stay(Goal):
 
     absent = 1
 
-    def __init__(self, language: Grammar, unmoved: float = 0.01, hold_steps: int = 15) -> None:
+    def __init__(self, language: Grammar, unmoved: Positive = 0.01, hold_steps: Count = 15) -> None:
         """Args: what is said; how far a block may have moved at most [m]; steps in a row in which the arm must rest."""
         super().__init__(language, hold_steps)
         self.unmoved = unmoved

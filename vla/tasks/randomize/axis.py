@@ -8,15 +8,23 @@ are called in the order of the configuration; `null` in place of an axis switche
 
 from __future__ import annotations
 
-from typing import Any, Protocol
+from typing import Annotated, Any, Protocol
 from zlib import crc32
 
 import numpy as np
+from annotated_types import Ge, Le, Predicate
 
 from vla.spec import Array
 from vla.tasks.bound import BoundScene
+from vla.types import Share, ascending
 
-Range = tuple[float, float]  # low, high
+Length = Annotated[float, Ge(0), Le(1)]  # [m]
+Coordinate = Annotated[float, Ge(-2), Le(2)]  # in the base frame, around an arm that reaches less than a metre [m]
+Angle = Annotated[float, Ge(-3.2), Le(3.2)]  # [rad]
+Lengths = Annotated[tuple[Length, Length], Predicate(ascending)]  # low, high [m]
+Places = Annotated[tuple[Coordinate, Coordinate], Predicate(ascending)]  # low, high [m]
+Angles = Annotated[tuple[Angle, Angle], Predicate(ascending)]  # low, high [rad]
+Shares = Annotated[tuple[Share, Share], Predicate(ascending)]  # low, high
 
 
 class Axis(Protocol):

@@ -4,29 +4,28 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from math import dist
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+from annotated_types import Ge, Le, MinLen, Predicate
 
 from vla.tasks.bound import BoundScene
-from vla.tasks.randomize.axis import Range, rounded
+from vla.tasks.randomize.axis import Angles, Places, rounded
 from vla.tasks.scene import COLOURS, PAD_RADIUS, PADS
+from vla.types import CountRange, NonNegative, PositiveRange, Share, ascending, unique
 
 SHAPES = {"cube": 1.0, "cylinder": 1.0, "tall": 1.25, "flat": 0.75}  # name → height over width
+HalfSize = Annotated[float, Ge(0.005), Le(0.04)]  # [m], what the gripper can hold
+HalfSizes = Annotated[tuple[HalfSize, HalfSize], Predicate(ascending)]
+ColourNames = Annotated[Sequence[str], MinLen(1), Predicate(unique)]
 ROOM = 0.034  # of a block on the table: half the diagonal of the largest one that there usually is [m]
 
 
 class Distractors:
     """How many other blocks lie beside the first one that is named."""
 
-    def __init__(self, count: tuple[int, int]) -> None:
-        """Args: fewest and most.
-
-        Raises:
-            ValueError: none: then the block would need no name.
-        """
-        if count[0] < 1:
-            raise ValueError("task.randomize.distractors.count is at least 1, or language would decide nothing")
+    def __init__(self, count: CountRange) -> None:
+        """Args: fewest and most; at least one, or the block would need no name."""
         self.count = count
 
     def __call__(self, scene: BoundScene, random_state: np.random.RandomState) -> dict[str, Any]:
@@ -42,7 +41,7 @@ class Distractors:
 class Colours:
     """Which colour each block has: different names from a list, and a tint of each."""
 
-    def __init__(self, names: Sequence[str], jitter: float = 0.0) -> None:
+    def __init__(self, names: ColourNames, jitter: Share = 0.0) -> None:
         """Args: names to draw from without repetition; largest change of each channel, 0…1.
 
         Raises:
@@ -68,7 +67,7 @@ class Colours:
 class Sizes:
     """Size of each block."""
 
-    def __init__(self, half_size: Range) -> None:
+    def __init__(self, half_size: HalfSizes) -> None:
         """Args: range of half the edge [m]."""
         self.half_size = half_size
 
@@ -83,7 +82,7 @@ class Sizes:
 class Shapes:
     """Shape of each block; it applies after the size."""
 
-    def __init__(self, names: Sequence[str]) -> None:
+    def __init__(self, names: Annotated[Sequence[str], MinLen(1)]) -> None:
         """Args: names to draw from, evenly.
 
         Raises:
@@ -105,7 +104,7 @@ class Shapes:
 class Masses:
     """Mass of each block, apart from its size."""
 
-    def __init__(self, factor: Range) -> None:
+    def __init__(self, factor: PositiveRange) -> None:
         """Args: range of the factor on the mass that follows from size and density."""
         self.factor = factor
 
@@ -119,7 +118,7 @@ class Masses:
 class Friction:
     """Sliding friction of blocks and table."""
 
-    def __init__(self, sliding: Range) -> None:
+    def __init__(self, sliding: PositiveRange) -> None:
         """Args: range of the sliding coefficient."""
         self.sliding = sliding
 
@@ -134,7 +133,7 @@ class Friction:
 class Placement:
     """Where pads and blocks lie: evenly in a rectangle, apart from each other."""
 
-    def __init__(self, x: Range, y: Range, yaw: Range = (0.0, 0.0), clearance: float = 0.03) -> None:
+    def __init__(self, x: Places, y: Places, yaw: Angles = (0.0, 0.0), clearance: NonNegative = 0.03) -> None:
         """Args: ranges of centres [m] and block yaw [rad]; least gap between outlines [m]."""
         self.x, self.y, self.yaw, self.clearance = x, y, yaw, clearance
 

@@ -7,12 +7,13 @@ from typing import Any
 import numpy as np
 
 from vla.tasks.bound import BoundScene
+from vla.types import Natural, Share
 
 
 class Phrasing:
     """How often an evaluation says something that training never hears."""
 
-    def __init__(self, held_out: float) -> None:
+    def __init__(self, held_out: Share) -> None:
         """Args: share of the episodes of an evaluation, 0…1."""
         self.held_out = held_out
 
@@ -25,7 +26,7 @@ class Phrasing:
 class Naming:
     """Which block the instruction names: in the same scene, another one than it would name without this axis."""
 
-    def __init__(self, passed_over: int) -> None:
+    def __init__(self, passed_over: Natural) -> None:
         """Args: how many blocks are passed over, in the order in which they would be named."""
         self.passed_over = passed_over
 

@@ -8,7 +8,8 @@ import numpy as np
 
 from vla.tasks.bound import BoundScene, Noise
 from vla.tasks.control import DOWN, HOME, MAX_OPENING, rotation_z, solve
-from vla.tasks.randomize.axis import Range, rounded
+from vla.tasks.randomize.axis import Angles, Lengths, Places, rounded
+from vla.types import NonNegativeRange, PositiveRange, Share
 
 
 class Arm:
@@ -16,11 +17,11 @@ class Arm:
 
     def __init__(
         self,
-        x: Range,
-        y: Range,
-        z: Range,
-        yaw: Range = (0.0, 0.0),
-        opening: Range = (MAX_OPENING, MAX_OPENING),
+        x: Places,
+        y: Places,
+        z: Places,
+        yaw: Angles = (0.0, 0.0),
+        opening: Lengths = (MAX_OPENING, MAX_OPENING),
     ) -> None:
         """Args: ranges of the tool point in the base frame [m], its yaw [rad] and the gripper's opening [m]."""
         self.x, self.y, self.z, self.yaw, self.opening = x, y, z, yaw, opening
@@ -38,7 +39,7 @@ class Arm:
 class Robot:
     """Colours of the robot's shell."""
 
-    def __init__(self, shade: Range, tint: float = 0.0) -> None:
+    def __init__(self, shade: NonNegativeRange, tint: Share = 0.0) -> None:
         """Args: range of the factor on its brightness; largest change of each channel."""
         self.shade, self.tint = shade, tint
 
@@ -53,7 +54,7 @@ class Robot:
 class Gains:
     """Strength of each joint's servo."""
 
-    def __init__(self, factor: Range) -> None:
+    def __init__(self, factor: PositiveRange) -> None:
         """Args: range of the factor on stiffness and damping."""
         self.factor = factor
 
@@ -68,7 +69,7 @@ class Gains:
 class Latency:
     """Time from a command to the motors."""
 
-    def __init__(self, seconds: Range) -> None:
+    def __init__(self, seconds: NonNegativeRange) -> None:
         """Args: its range [s]."""
         self.seconds = seconds
 
@@ -81,7 +82,9 @@ class Latency:
 class Sensors:
     """Noise of cameras and joint encoders."""
 
-    def __init__(self, image: Range, joints: Range = (0.0, 0.0), gripper: Range = (0.0, 0.0)) -> None:
+    def __init__(
+        self, image: NonNegativeRange, joints: NonNegativeRange = (0.0, 0.0), gripper: NonNegativeRange = (0.0, 0.0)
+    ) -> None:
         """Args: ranges of the standard deviations, of colour channels 0…255, joints [rad] and opening [m]."""
         self.image, self.joints, self.gripper = image, joints, gripper
 

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
+from annotated_types import Ge, Le
 
 from vla.spec import Array
 from vla.tasks.bound import BoundScene
-from vla.tasks.randomize.axis import Range, rounded
+from vla.tasks.randomize.axis import Angle, Length, Shares, rounded
 from vla.tasks.scene import LAMP_DISTANCE, SHADOWED, TEXTURE
+from vla.types import NonNegativeRange, Share
 
 PATTERNS = ("checks", "stripes", "patches")
 
@@ -17,7 +19,7 @@ PATTERNS = ("checks", "stripes", "patches")
 class Light:
     """Brightness, colour, direction and place of the lamp."""
 
-    def __init__(self, brightness: Range, tint: float = 0.0, tilt: float = 0.0) -> None:
+    def __init__(self, brightness: NonNegativeRange, tint: Share = 0.0, tilt: Angle = 0.0) -> None:
         """Args: range of brightness 0…1; largest change of each channel; largest change of the direction [rad]."""
         self.brightness, self.tint, self.tilt = brightness, tint, tilt
 
@@ -34,7 +36,13 @@ class Light:
 class Cameras:
     """Where each camera is, where it looks, and how wide."""
 
-    def __init__(self, position: float = 0.0, rotation: float = 0.0, fovy: float = 0.0, wrist: float = 0.25) -> None:
+    def __init__(
+        self,
+        position: Length = 0.0,
+        rotation: Angle = 0.0,
+        fovy: Annotated[float, Ge(0), Le(30)] = 0.0,
+        wrist: Share = 0.25,
+    ) -> None:
         """Args: largest change along each axis [m], about each axis [rad], of the field of view [degrees]; the
         share of all three that the wrist camera, which is screwed on, gets."""
         self.position, self.rotation, self.fovy, self.wrist = position, rotation, fovy, wrist
@@ -60,7 +68,7 @@ class Cameras:
 class Table:
     """Colour of the table."""
 
-    def __init__(self, brightness: Range, tint: float = 0.0) -> None:
+    def __init__(self, brightness: Shares, tint: Share = 0.0) -> None:
         """Args: range of brightness, 0…1; largest change of each channel."""
         self.brightness, self.tint = brightness, tint
 
@@ -74,7 +82,7 @@ class Table:
 class Texture:
     """A picture on table or floor, made by chance: checks, stripes or patches in two shades."""
 
-    def __init__(self, surface: Literal["table", "floor"], contrast: Range) -> None:
+    def __init__(self, surface: Literal["table", "floor"], contrast: Shares) -> None:
         """Args: what it lies on; range of how much darker and differently coloured its second shade is, 0…1."""
         self.surface, self.contrast = surface, contrast
 
@@ -103,7 +111,7 @@ def _pattern(kind: str, random_state: np.random.RandomState) -> Array:
 class Background:
     """Colour of everything that is not on the table."""
 
-    def __init__(self, brightness: Range, tint: float = 0.0) -> None:
+    def __init__(self, brightness: Shares, tint: Share = 0.0) -> None:
         """Args: range of brightness, 0…1; largest change of each channel."""
         self.brightness, self.tint = brightness, tint
 
