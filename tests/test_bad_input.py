@@ -8,8 +8,10 @@ import sys
 from pathlib import Path
 
 import pytest
+from test_conf import composed
 from test_run import SMALL, vla
 
+from vla.check import build, check
 from vla.tasks.backend import TRIED
 
 BAD_INPUT = {
@@ -35,6 +37,51 @@ def test_bad_input_ends_in_one_clear_sentence(tmp_path: Path, name: str) -> None
     errors = [line for line in done.stderr.splitlines() if line.startswith("error: ")]
     assert len(errors) == 1 and says in errors[0], done.stderr
     assert "Traceback" not in done.stderr
+
+
+# Job → values that no experiment can have, each of which is refused by the name of its key before any work.
+NONSENSE = {
+    "collect": (
+        *("task.time_limit=nan", "task.time_limit=inf", "task.goal.radius=nan", "task.image_size=[1,1]"),
+        *("task.image_size=[4096,4096]", "task.cameras=[front,front]", "task.randomize.mass.factor=[nan,nan]"),
+        *("task.randomize.mass.factor=[0,0]", "task.randomize.mass.factor=[2,1]", "task.randomize.camera.fovy=500"),
+        *("task.randomize.size.half_size=[0,0]", "task.randomize.size.half_size=[10,10]"),
+        *("task.randomize.arm.x=[5,5]", "task.goal.language.phrasings=[]", "expert.perturb.rate=nan"),
+        *("expert.perturb.rate=-1", "expert.perturb.noise=1e9", "expert.perturb.steps=[5,2]", "collect.folder="),
+        *("collect.workers=0", "collect.seed=-1", "cluster.workers=0", "collect.episodes=99999999999"),
+    ),
+    "train": (
+        *("seed=99999999999999999999", "data.seed=-1", "data.validation_fraction=1.5", "model.chunk=0"),
+        *("model.chunk=-1", "model.width=-1", "model.width=0", "model.width=10000000", "model.keypoints=0"),
+        *("model.text_width=0", "model.shift=[-1,-1]", "model.auxiliary=nan", "model.auxiliary=-1"),
+        *("model.image.strides=[0,1,1]", "model.image.kernels=[0,0,0]", "model.image.kernels=[99,99,99]"),
+        *("model.image.channels=[]", "tokenizer.smoothing=-1", "tokenizer.margin=-5", "tokenizer.bins=1000000"),
+        *("learner.lr=0", "learner.ema=1", "learner.ema=nan", "learner.warmup_steps=-1", "trainer.max_steps=0"),
+        *("trainer.val_check_interval=0", "trainer.accumulate_grad_batches=0", "trainer.devices=-7"),
+        *("trainer.gradient_clip_val=-1", "trainer.limit_val_batches=-1", "trainer.precision=17"),
+    ),
+    "evaluate": ("evaluate.episodes=0", "evaluate.workers=0", "evaluate.seed=3", "policy.precision=16"),
+    "benchmark": ("benchmark.names=[]", "benchmark.rounds=0"),
+    "inspect": ("inspect.stores=[]", "inspect.folder="),
+    "report": ("report.runs=['']",),
+}
+
+
+@pytest.mark.parametrize(("job", "override"), [(job, override) for job in NONSENSE for override in NONSENSE[job]])
+def test_nonsense_is_refused_by_the_name_of_its_key(job: str, override: str) -> None:
+    with pytest.raises(ValueError) as caught:
+        check(composed(f"job={job}", override))
+    assert str(caught.value).startswith(f"{override.partition('=')[0]} must be ")
+
+
+@pytest.mark.parametrize(
+    "phrasing", ["{nope} it", "take the {", "take {block.__class__}", "take {0}", "{block:>99999}"]
+)
+def test_a_phrasing_that_is_no_phrasing_is_refused(phrasing: str) -> None:
+    cfg = composed()
+    cfg.task.goal.language.phrasings = [phrasing]
+    with pytest.raises(ValueError, match=r"^task\.goal\.language"):
+        build(cfg.task, "task")
 
 
 @pytest.mark.parametrize("launcher", ["basic", "joblib"])

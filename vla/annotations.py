@@ -17,7 +17,7 @@ from math import isfinite
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
 
-from annotated_types import Ge, Gt, Le, Lt, MinLen, Predicate
+from annotated_types import Ge, Gt, Le, Lt, MaxLen, MinLen, Predicate
 from pydantic import BeforeValidator, ConfigDict, TypeAdapter, ValidationError
 
 # Configurations also come out of checkpoints and stores, which may come from anybody: a `_target_` names a class of
@@ -126,7 +126,9 @@ def _bounds(constraints: Iterable[Any]) -> list[str]:
             words.append(str(constraint.func.__doc__))
         elif isinstance(constraint, MinLen):
             words.append("not empty" if constraint.min_length == 1 else f"at least {constraint.min_length} long")
-        elif not isinstance(constraint, Le) or constraint.le < ENDLESS:  # type: ignore[operator]
+        elif isinstance(constraint, MaxLen):
+            words.append(f"at most {constraint.max_length} long")
+        elif not isinstance(constraint, Le) or constraint.le != ENDLESS:
             words.append(BOUNDS[type(constraint)].format(constraint))
     return words
 

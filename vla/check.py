@@ -15,7 +15,7 @@ from functools import cache
 from importlib import import_module
 from typing import Annotated, Any, Literal, cast, get_args, get_origin
 
-from annotated_types import Ge, MinLen
+from annotated_types import Ge, Gt, Le, MinLen
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import InstantiationException
 from hydra.utils import instantiate
@@ -83,7 +83,7 @@ NARROWER: dict[str, dict[str, Any]] = {
         "num_nodes": Count,
         "accumulate_grad_batches": Count,
         "gradient_clip_val": NonNegative | None,
-        "val_check_interval": Count | Share | None,
+        "val_check_interval": Count | Annotated[float, Gt(0), Le(1)] | None,
         "limit_val_batches": Natural | Share | None,
         "limit_train_batches": Natural | Share | None,
         "log_every_n_steps": Count,

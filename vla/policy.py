@@ -18,7 +18,7 @@ from torch import Tensor
 
 from vla.documents import require_resolved
 from vla.models.model import Model
-from vla.spec import Array, Observation, Spec
+from vla.spec import LONGEST_INSTRUCTION, Array, Observation, Spec
 
 Batch = dict[str, Any]
 
@@ -158,7 +158,13 @@ class Policy:
         self.reset("", 0)
 
     def reset(self, instruction: str, seed: int) -> None:
-        """Forget the past; what the model draws from now on follows from `seed`."""
+        """Forget the past; what the model draws from now on follows from `seed`.
+
+        Raises:
+            ValueError: the instruction has more than `LONGEST_INSTRUCTION` characters.
+        """
+        if len(instruction) > LONGEST_INSTRUCTION:
+            raise ValueError(f"an instruction has at most {LONGEST_INSTRUCTION} characters, not {len(instruction)}")
         self._random = torch.Generator().manual_seed(seed)
         self._frames.clear()
         self._chunk.clear()

@@ -5,7 +5,6 @@ Shapes: B sentences, L tokens of one of them, E length of the encoder's own vect
 
 from __future__ import annotations
 
-import json
 import logging
 from functools import lru_cache
 from pathlib import Path
@@ -14,13 +13,14 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from vla.documents import parse_json
 from vla.models.hub import fetch
 from vla.models.text import TextEncoder
 
 log = logging.getLogger(__name__)
 
 FILES = ("config.json", "tokenizer.json", "tokenizer_config.json", "model*.safetensors", "model.safetensors.index.json")
-KEPT = 65536  # sentences whose vectors are remembered
+KEPT = 8192  # sentences whose vectors are remembered: 40 MB where all are as long as instructions may be
 
 # Text halves of models of images and text, which were trained to be read in one place: the class, and where.
 TOWERS = {
@@ -84,14 +84,21 @@ class SentenceEncoder:
 
     @classmethod
     def from_state(cls, state: dict[str, Any]) -> SentenceEncoder:
-        """The encoder that `state` described."""
+        """The encoder that `state` described.
+
+        Raises:
+            ValueError: it describes none.
+        """
         from tokenizers import Tokenizer
         from transformers import AutoConfig
 
-        config = AutoConfig.for_model(**json.loads(state["config"]))
-        network = _network_class(config)(config)
-        network.load_state_dict(state["weights"])
-        return cls(network, Tokenizer.from_str(state["tokenizer"]))
+        try:
+            config = AutoConfig.for_model(**parse_json(state["config"], dict[str, Any], "its configuration"))
+            network = _network_class(config)(config)
+            network.load_state_dict(state["weights"])
+            return cls(network, Tokenizer.from_str(state["tokenizer"]))
+        except Exception as error:  # tokenizers raises nothing narrower for text that is no tokenizer
+            raise ValueError(f"the encoder in the checkpoint cannot be read: {str(error)[:200]}") from error
 
     def state(self) -> dict[str, Any]:
         """All that it takes to build the encoder again: two texts in JSON, and tensors."""

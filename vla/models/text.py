@@ -18,6 +18,7 @@ from torch import Tensor, nn
 from vla.types import Count, Rate
 
 PADDING = 0
+KEPT = 8192  # sentences whose numbers are remembered: 70 MB where all are as long as instructions may be
 INITIAL = 0.1  # deviation of vectors before training: small, so that unknown n-grams hardly say anything
 
 
@@ -81,8 +82,7 @@ class NGrams(TextEncoder):
     def tokenize(self, sentences: list[str]) -> Tensor:
         """(B, L) int64 hashes of the n-grams of B sentences, whatever their case, filled up with 0."""
         rows = [_hashes(sentence, self.vocabulary, self.words, self.characters) for sentence in sentences]
-        length = max(len(row) for row in rows)
-        return torch.tensor([row + (PADDING,) * (length - len(row)) for row in rows])
+        return nn.utils.rnn.pad_sequence(rows, batch_first=True, padding_value=PADDING)
 
     def forward(self, tokens: Tensor) -> Tensor:
         """(B, width) vectors for (B, L) tokens, wherever 0s stand among them."""
@@ -93,12 +93,12 @@ class NGrams(TextEncoder):
         return vector
 
 
-@lru_cache(maxsize=65536)
-def _hashes(sentence: str, vocabulary: int, words: int, characters: int) -> tuple[int, ...]:
+@lru_cache(maxsize=KEPT)
+def _hashes(sentence: str, vocabulary: int, words: int, characters: int) -> Tensor:
     found = re.findall(r"\w+", sentence.lower())
     grams = [" ".join(found[i : i + n]) for n in range(1, words + 1) for i in range(len(found) - n + 1)]
     for word in found:
         marked = f"<{word}>"
         grams += [f"#{marked[i : i + characters]}" for i in range(len(marked) - characters + 1)]
     # crc32 and not hash(): the same in every process, so that a checkpoint means the same tomorrow.
-    return tuple(1 + zlib.crc32(gram.encode()) % (vocabulary - 1) for gram in grams) or (PADDING,)
+    return torch.tensor([1 + zlib.crc32(gram.encode()) % (vocabulary - 1) for gram in grams] or [PADDING])

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping, Sequence
-from typing import Literal
+from string import Formatter
+from typing import Annotated, Literal
 
 import numpy as np
+from annotated_types import MaxLen, MinLen
+
+Phrasings = Annotated[Sequence[Annotated[str, MaxLen(300)]], MinLen(1)]
+Words = Annotated[Sequence[Annotated[str, MinLen(1), MaxLen(60)]], MinLen(1)]
 
 Novelty = Literal["words", "phrasings", "combinations"]
 
@@ -19,17 +23,18 @@ class Grammar:
 
     def __init__(
         self,
-        phrasings: Sequence[str],
-        words: Mapping[str, Sequence[str]],
-        held_out_phrasings: Sequence[str],
-        held_out_words: Mapping[str, Sequence[str]],
+        phrasings: Phrasings,
+        words: Mapping[str, Words],
+        held_out_phrasings: Phrasings,
+        held_out_words: Mapping[str, Words],
         held_out_colours: Sequence[str] = (),
     ) -> None:
         """Args: what is said in training, slot → words for it; the same for what is new; colours of blocks that are
         not named in training.
 
         Raises:
-            ValueError: a held-out part is empty, or heard in training after all.
+            ValueError: a held-out part is empty, or heard in training after all, or braces in a phrasing are not those
+                of a slot.
         """
         self.phrasings, self.words = tuple(phrasings), {slot: tuple(said) for slot, said in words.items()}
         self.held_out_phrasings = tuple(held_out_phrasings)
@@ -40,6 +45,7 @@ class Grammar:
         if leaked or not held_out_phrasings or not held_out_words:
             what = f"also in the part that training hears: {sorted(leaked)}" if leaked else "empty"
             raise ValueError(f"the held-out part of task.goal.language is {what}")
+        self.slots = {slot for phrasing in (*phrasings, *held_out_phrasings) for slot in _slots(phrasing)} - {*words}
 
     @property
     def novelties(self) -> tuple[Novelty, ...]:
@@ -60,4 +66,12 @@ class Grammar:
 
 
 def _slots(phrasing: str) -> set[str]:
-    return set(re.findall(r"{(\w+)}", phrasing))
+    try:
+        fields = list(Formatter().parse(phrasing))
+    except ValueError as error:
+        raise ValueError(f"task.goal.language: {phrasing!r} has braces that do not match: {error}") from error
+    slots = {name for _, name, _, _ in fields if name is not None}
+    # A field of str.format may also reach into attributes and pad without bound.
+    if not all(name.isidentifier() for name in slots) or any(form or turned for _, _, form, turned in fields):
+        raise ValueError(f"task.goal.language: in {phrasing!r} braces hold more than the name of a slot")
+    return slots

@@ -83,6 +83,9 @@ class Goal(ABC):
     named, moves, blocks, absent, pads = 1, 1, 2, 0, 1
 
     def __init__(self, language: Grammar, hold_steps: int) -> None:
+        known = ["block", "other"][: self.named] + ["pad", "rest"][: self.pads] + ["absent"] * bool(self.absent)
+        if unknown := sorted(language.slots - set(known)):
+            raise ValueError(f"task.goal.language has the slots {unknown}, but {type(self).__name__} fills {known}")
         self.language, self.hold_steps = language, hold_steps
 
     def draw(self, random_state: np.random.RandomState) -> Goal:
