@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
+from zipfile import ZIP_DEFLATED, ZipFile
 
 import pytest
 import torch
@@ -201,3 +202,20 @@ def test_a_path_in_somebody_elses_checkpoint_is_refused(tmp_path: Path) -> None:
     torch.save({"config": config, "spec": toy.SPEC.to_dict(), "state_dict": {}}, path)
     with pytest.raises(ValueError, match=r"last\.ckpt names a path in expert\.folder"):
         go_on(composed(f"output={tmp_path}/elsewhere/mine", f"checkpoint={path}", "resume=true"), [])
+
+
+def test_a_model_that_its_checkpoint_cannot_hold_is_refused_before_it_is_made(tmp_path: Path) -> None:
+    path = checkpoint(tmp_path / "last.ckpt", "model.width", 16384)
+    config = torch.load(path, weights_only=True)["config"]
+    config["model"]["text_width"] = 16384
+    torch.save({"config": config, "spec": toy.SPEC.to_dict(), "state_dict": {}}, path)
+    with pytest.raises(ValueError, match=r"describes a model of \d+ MiB, which it does not hold"):
+        make_policy(plain(composed().policy), path)
+
+
+def test_compressed_checkpoints_are_refused_before_they_are_unpacked(tmp_path: Path) -> None:
+    with ZipFile(tmp_path / "bomb.ckpt", "w", ZIP_DEFLATED) as archive, archive.open("archive/data.pkl", "w") as file:
+        for _ in range(256):
+            file.write(bytes(2**20))
+    with pytest.raises(ValueError, match=r"bomb\.ckpt cannot be read as a checkpoint"):
+        read_checkpoint(tmp_path / "bomb.ckpt")

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from vla.models.action_tokenizer import ActionTokenizer
     from vla.models.learner import Learner
     from vla.models.model import Model
-    from vla.policy import Policy
+    from vla.policy import Checkpoint, Policy
     from vla.spec import Agent, Environment, Recorder, Spec
     from vla.tasks.tabletop import Tabletop
 
@@ -102,10 +102,21 @@ def make_policy(policy: Node, checkpoint: Path, environment: Environment | None 
     if environment is not None:
         saved.spec.perceived.require(environment.spec.perceived, f"the checkpoint {checkpoint}", "the task")
     tokenizer = build(saved.config["tokenizer"], "tokenizer", spec=saved.spec)
-    model = build(_without_pretraining(saved.config["model"]), "model", spec=saved.spec, tokenizer=tokenizer)
+    model = _model(_without_pretraining(saved.config["model"]), saved.spec, tokenizer, saved)
     saved.restore(model)
     made: Policy = build(policy, "policy", model=model, spec=saved.spec)
     return made
+
+
+def _model(node: Node, spec: Spec, tokenizer: ActionTokenizer, saved: Checkpoint | None) -> Model:
+    """The model that a node describes; one whose weights come out of a checkpoint is no larger than that."""
+    import torch
+
+    if saved:
+        with torch.device("meta"):
+            saved.require_plausible(build(node, "model", spec=spec, tokenizer=tokenizer))
+    model: Model = build(node, "model", spec=spec, tokenizer=tokenizer)
+    return model
 
 
 def in_training(policy: Node, model: Model) -> Policy:
@@ -196,7 +207,7 @@ def unfitted_learner(config: DictConfig, spec: Spec) -> Learner:
     if saved:
         saved.spec.perceived.require(spec.perceived, f"the checkpoint {origin}", "what it is to be trained on")
         spec, node = replace(spec, chain=saved.spec.chain), _without_pretraining(node)
-    model = build(node, "model", spec=spec, tokenizer=build(config.tokenizer, "tokenizer", spec=spec))
+    model = _model(node, spec, build(config.tokenizer, "tokenizer", spec=spec), saved)
     if saved:
         saved.start(model)
     learner: Learner = build(config.learner, "learner", model=model, spec=spec, config=plain(config))

@@ -51,6 +51,21 @@ class Checkpoint:
             first = str(error).strip().splitlines()[-1].strip()[:200]
             raise ValueError(f"{self.path} does not fit the model of its own configuration: {first}") from error
 
+    def require_plausible(self, outline: torch.nn.Module) -> None:
+        """Refuse weights that the file cannot hold, before memory is given to them.
+
+        Args:
+            outline: the model of the configuration, on the device "meta".
+
+        Raises:
+            ValueError: it is far larger than the file.
+        """
+        size = sum(tensor.numel() * tensor.element_size() for tensor in (*outline.parameters(), *outline.buffers()))
+        if size > 2 * self.path.stat().st_size + 2**22:
+            raise ValueError(
+                f"{self.path} describes a model of {size >> 20} MiB, which it does not hold: it is damaged"
+            )
+
     def start(self, model: Model) -> None:
         """Load the weights, to train them further; the head that predicts the truth starts anew where that differs.
 

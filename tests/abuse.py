@@ -1,0 +1,329 @@
+"""Attacks in bulk, for the table in docs/safety.md: `python tests/abuse.py FOLDER [commands|checkpoints|kills …]`.
+
+Every trial is a real command in a process of its own, in a folder that is made. A trial holds when the command ends in
+time, and either succeeds or says in one line what is wrong, and when nothing that a file asked for was done.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import random
+import re
+import resource
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from test_trust import hostile
+
+SMALL = ("task.image_size=[32,32]", "task.shadows=false", "collect.episodes=12", "collect.workers=2")
+TRAIN = (*SMALL, "job=train", "validate.episodes=0", "data.batch_size=4", "trainer.max_steps=4", "trainer=cpu")
+EVALUATE = ("evaluate.episodes=1", "evaluate.workers=1", "recorder=none")
+LIMIT = 100.0  # [s] that a command may take
+
+WRONG = (
+    *(
+        "job=colect",
+        "model=rt2",
+        "model.widht=3",
+        "trainer.max_steps=many",
+        "checkpoint=nowhere.ckpt",
+        "task/goal=lfit",
+    ),
+    *(
+        "checkpoint=last",
+        "job=report",
+        "job=deploy deploy=ros2",
+        "job=inspect inspect.folder=nowhere",
+        "seed=",
+        "=",
+        "a=b",
+    ),
+    *("job=collect task.time_limit=nan", "job=collect task.time_limit=inf", "job=collect task.goal.radius=nan"),
+    *("job=collect expert.perturb.rate=nan", "job=collect task.randomize.mass.factor=[nan,nan]"),
+    *("job=collect task.randomize.mass.factor=[0,0]", "job=collect task.randomize.mass.factor=[-1,-1]"),
+    *("job=collect task.randomize.size.half_size=[0,0]", "job=collect task.goal.language.phrasings=[]"),
+    *("job=collect task.goal.language.phrasings=['{nope}']", "job=collect task.goal.language.phrasings=['{']"),
+    *("job=collect task.goal.language.phrasings=['{0.__class__}']", "job=collect expert.perturb.steps=[5,2]"),
+    *("seed=99999999999999999999", "data.seed=-1", "model.chunk=0", "model.chunk=-1", "model.width=-1"),
+    *("model.image.strides=[0,1,1]", "model.image.kernels=[0,0,0]", "model.image.kernels=[3]"),
+    *("trainer.val_check_interval=0", "trainer.accumulate_grad_batches=0", "trainer.devices=-7", "trainer.devices=99"),
+    *("job=collect task.image_size=[1,1]", "job=collect task.cameras=[front,front]", "job=collect task.cameras=[top]"),
+    *("job=collect task.randomize.mass.factor=[2,1]", "job=collect task.randomize.camera.fovy=500"),
+    *("job=collect task.randomize.arm.x=[5,5]", "job=collect expert.perturb.rate=-1", "job=collect collect.folder="),
+    *("job=collect expert.perturb.noise=1e9", "model.width=0", "model.keypoints=0", "model.text_width=0"),
+    *("model.shift=[-1,-1]", "model.auxiliary=nan", "model.auxiliary=-1", "model.image.kernels=[99,99,99]"),
+    *("tokenizer.smoothing=-1", "tokenizer.margin=-5", "learner.warmup_steps=-1", "trainer.gradient_clip_val=-1"),
+    *(
+        "trainer.max_steps=0",
+        "job=deploy deploy=loop deploy.episodes=0 checkpoint=CKPT",
+        "job=benchmark benchmark.names=[]",
+    ),
+    *("job=inspect inspect.stores=[] inspect.into=x", "data.batch_size=10000000", "tokenizer.bins=1000000"),
+    *("job=collect task.image_size=[4096,4096]", "job=collect task.randomize.size.half_size=[10,10]"),
+    *("checkpoint=CKPT resume=true", "checkpoint=CKPT job=train", "checkpoint=CKPT model.width=3", "checkpoint=STORE"),
+    *(
+        "checkpoint=CKPT policy.device=cuda",
+        "checkpoint=CKPT task.control_hz=3",
+        "evaluate.seed=0",
+        "validate.seed=1000000",
+    ),
+    *(
+        "job=deploy deploy=ros2 checkpoint=CKPT --ros-args --nonsense",
+        "job=export export.folder=",
+        "pretrained=nowhere.ckpt",
+    ),
+    *(
+        "job=deploy deploy=ros2 checkpoint=CKPT deploy.topics.commands=bad!topic",
+        "job=export export=program export.folder=x",
+    ),
+    *(
+        "job=deploy deploy=ros2 checkpoint=CKPT deploy.network.domain=9999",
+        "expert=lerobot",
+        "expert=lerobot expert.folder=.",
+    ),
+    *(
+        "job=report report.runs=[DAMAGED/list]",
+        "job=report report.runs=[DAMAGED/config]",
+        "job=report report.runs=[DAMAGED/training]",
+    ),
+    *(
+        "job=report report.runs=[DAMAGED/metrics]",
+        "job=report report.runs=[DAMAGED/loop]",
+        "job=report report.runs=[DAMAGED/empty]",
+    ),
+    *(
+        "job=report report.runs=[DAMAGED/bomb]",
+        "logger=wandb",
+        "logger=mlflow",
+        "tokenizer=fast",
+        "cluster=dask cluster.address=x",
+    ),
+    *(
+        "cluster=dask cluster.address=tcp://127.0.0.1:1 job=collect",
+        "trainer=gpu",
+        "trainer=fsdp",
+        "trainer.precision=8",
+    ),
+)
+# `store.json` and lines of an index that no collection writes: where, and what stands there.
+HEADERS: tuple[tuple[str, Any], ...] = (
+    *((f"spec.{name}", 5) for name in ("cameras", "action", "units", "low", "image_size")),
+    *(("spec", 3), ("spec.image_size", [-1, -1]), ("spec.image_size", ["a", "b"]), ("spec.action", [])),
+    *(("spec.control_hz", 0), ("spec.control_hz", "x"), ("packed", None), ("packed", "x"), ("config", None)),
+    *(("config", [1]), ("config", {"parts": None}), ("format", 0), ("format", None)),
+    *(("config", {"task": {"_target_": "os.system"}}), ("config", {"task": "${oc.env:PATH}"})),
+)
+
+
+def run(folder: Path, *arguments: str, limit: float = LIMIT, **options: Any) -> tuple[str, str]:
+    """What became of `python -m vla.run …` ("sentence", "done", "traceback", "silent", "late"), and what it printed."""
+    command = [sys.executable, "-m", "vla.run", *arguments]
+    process = subprocess.Popen(
+        command,
+        cwd=folder,
+        text=True,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        start_new_session=True,
+        **options,
+    )
+    try:
+        printed, _ = process.communicate(timeout=limit)
+    except subprocess.TimeoutExpired:
+        os.killpg(process.pid, signal.SIGKILL)
+        return "late", process.communicate()[0]
+    sentences = [line for line in printed.splitlines() if line.startswith("error: ")]
+    if "Traceback (most recent call last)" in printed:
+        return "traceback", printed
+    if process.returncode == 0:
+        return "done", printed
+    return ("sentence" if len(sentences) == 1 else "silent"), printed
+
+
+def prepared(root: Path) -> None:
+    """A store, a trained checkpoint, and damaged runs in `root`."""
+    if not (root / "run/checkpoints/last.ckpt").exists():
+        root.mkdir(parents=True, exist_ok=True)
+        ended, printed = run(root, *TRAIN, "collect.folder=store", "output=run", limit=400)
+        assert ended == "done", printed
+    files = {"list": ("report.json", "[1]"), "config": ("config.yaml", "- 1"), "training": ("training.json", "[]")}
+    files |= {"metrics": ("metrics.csv", "a,b\n1,2\n"), "empty": ("report.json", "{}")}
+    files |= {"bomb": ("config.yaml", "a: &a [x, x]\n" + "".join(f"b{n}: &b{n} [*a, *a]\n" for n in range(9)))}
+    for name, (file, text) in files.items():
+        (root / "damaged" / name).mkdir(parents=True, exist_ok=True)
+        (root / "damaged" / name / "metrics.csv").write_text("step,loss\n1,2\n")
+        (root / "damaged" / name / file).write_text(text)
+    (root / "damaged/loop").mkdir(exist_ok=True)
+    (root / "damaged/loop/report.json").unlink(missing_ok=True)
+    (root / "damaged/loop/report.json").symlink_to("report.json")
+
+
+def commands(root: Path) -> Iterator[tuple[str, bool, str]]:
+    """Command lines that ask for what cannot be: each ends in one sentence."""
+    stands = {"CKPT": "run/checkpoints/last.ckpt", "STORE": "store/store.json", "DAMAGED": "damaged"}
+    for wrong in WRONG:
+        line = wrong
+        for name, path in stands.items():
+            line = line.replace(name, path)
+        groups = () if "job=" in line or "checkpoint=" in line else (*TRAIN, "collect.folder=store")
+        ended, printed = run(
+            root, *groups, *line.split(" "), *(["output=wrong"] if "checkpoint=last" not in line else [])
+        )
+        yield wrong, ended == "sentence", f"{ended}: {last(printed)}"
+
+
+def headers(root: Path) -> Iterator[tuple[str, bool, str]]:
+    """Stores that describe themselves in nonsense."""
+    for key, value in HEADERS:
+        copy = root / "header"
+        shutil.rmtree(copy, ignore_errors=True)
+        shutil.copytree(root / "store", copy)
+        header = json.loads((copy / "store.json").read_text())
+        *parents, name = key.split(".")
+        holder = header
+        for parent in parents:
+            holder = holder[parent]
+        holder[name] = value
+        (copy / "store.json").write_text(json.dumps(header))
+        for job in (("inspect.episode=0",), ()):
+            ended, printed = run(root, "job=inspect", "inspect.folder=header", "output=wrong", *job)
+            harmless = key == "config" and not job  # what only a replay reads
+            yield f"{key}={value!r} {job}", ended == "sentence" or (harmless and ended == "done"), last(printed)
+
+
+def checkpoints(root: Path) -> Iterator[tuple[str, bool, str]]:
+    """Checkpoints that name something to run, through every job that reads one."""
+    mark = root / "mark"
+    ways: dict[str, tuple[str, ...]] = {
+        "evaluate": ("checkpoint=evil.ckpt", *EVALUATE),
+        "resume": ("checkpoint=evil.ckpt", "resume=true", "job=train"),
+        "pretrained": ("pretrained=evil.ckpt", *TRAIN, "collect.folder=store"),
+        "program": ("checkpoint=evil.ckpt", "job=export", "export=program", "export.folder=program"),
+        "deploy": ("checkpoint=evil.ckpt", "job=deploy", "deploy=ros2"),
+    }
+    content = torch.load(root / "run/checkpoints/last.ckpt", weights_only=True)
+    for attack, (key, value) in hostile(mark).items():
+        evil = json.loads(json.dumps(content["config"]))
+        *parents, name = key.split(".")
+        holder = evil
+        for parent in parents:
+            holder = holder[parent]
+        holder[name] = value
+        torch.save({**content, "config": evil}, root / "evil.ckpt")
+        for way, arguments in ways.items():
+            ended, printed = run(
+                root, *arguments, "output=wrong", env={**os.environ, "PATH": os.environ["PATH"]}, limit=60
+            )
+            acted = mark.exists()
+            shutil.rmtree(root / "wrong", ignore_errors=True)
+            yield f"{attack}, {way}", not acted and ended in ("sentence", "done", "late"), f"{ended}: {last(printed)}"
+
+
+def kills(root: Path, times: int = 20) -> Iterator[tuple[str, bool, str]]:
+    """Collections killed at a random moment, some of them by two interrupts, go on to the same bytes."""
+    chance = random.Random(0)
+    arguments = ("job=collect", *SMALL, "collect.folder=killed", "output=wrong")
+    expected = digest(root / "store")
+    trial = 0
+    while trial < times:
+        process = subprocess.Popen(
+            [sys.executable, "-m", "vla.run", *arguments],
+            cwd=root,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+            start_new_session=True,
+        )
+        time.sleep(chance.uniform(2, 9))
+        twice = trial % 4 == 0
+        for number in (signal.SIGINT, signal.SIGINT) if twice else (signal.SIGKILL,):
+            os.killpg(process.pid, number) if not twice else process.send_signal(number)
+            time.sleep(0.3)
+        try:
+            process.wait(15)
+            ended = True
+        except subprocess.TimeoutExpired:
+            os.killpg(process.pid, signal.SIGKILL)
+            ended = False
+        trial += 1
+        if trial % 5 == 0 or not ended:
+            done, _ = run(root, *arguments)
+            same = digest(root / "killed") == expected
+            shutil.rmtree(root / "killed", ignore_errors=True)
+            yield f"{trial} {'Ctrl-C twice' if twice else 'SIGKILL'}", ended and done == "done" and same, done
+
+
+def disks(root: Path) -> Iterator[tuple[str, bool, str]]:
+    """Every job where no file may grow beyond 20 kB, which is what a full disk looks like."""
+    for line in (
+        *("job=preview preview.episodes=1", "job=collect collect.episodes=12", "job=export export.folder=full"),
+        *(
+            "job=export export=lerobot export.folder=full",
+            "job=export export=program checkpoint=CKPT export.folder=full",
+        ),
+        *("job=export export=packed export.folder=full", "job=inspect inspect.into=full inspect.stores=[store]"),
+        *("job=train trainer.max_steps=4", "checkpoint=CKPT evaluate.episodes=1 evaluate.workers=1"),
+    ):
+        arguments = line.replace("CKPT", "run/checkpoints/last.ckpt").split(" ")
+        small = () if "checkpoint" in line or "preview" in line or "inspect" in line else (*TRAIN[:-1],)
+        folder = "collect.folder=full" if "job=collect" in line else "collect.folder=store"
+        ended, printed = run(root, *small, folder, *arguments, "output=wrong", preexec_fn=no_room)
+        drafts = [
+            path
+            for path in (*root.rglob(".*.*"), *root.rglob("*.partial"))
+            if path.is_file() and "hydra" not in str(path)
+        ]
+        for path in drafts:
+            path.unlink()
+        shutil.rmtree(root / "full", ignore_errors=True)
+        shutil.rmtree(root / "wrong", ignore_errors=True)
+        yield line, ended == "sentence" and not drafts, f"{ended} {[str(path) for path in drafts]}: {last(printed)}"
+
+
+def no_room() -> None:
+    """Let writes beyond 20 kB fail, without the signal that would end the process."""
+    signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))
+
+
+def digest(store: Path) -> dict[str, str]:
+    """File → hash of a store, apart from how long it took to collect."""
+    files = [path for path in sorted(store.rglob("*")) if path.is_file() and path.suffix in (".bin", ".json", ".jsonl")]
+    return {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
+
+
+def last(printed: str) -> str:
+    """The sentence that a command ended with, or its last line."""
+    lines = [line for line in printed.splitlines() if line.strip()]
+    said = [line for line in lines if line.startswith("error: ")]
+    return re.sub(r"\s+", " ", (said or lines or [""])[-1])[:200]
+
+
+SECTIONS = {"commands": commands, "headers": headers, "checkpoints": checkpoints, "disks": disks, "kills": kills}
+
+
+def main(folder: str, *names: str) -> None:
+    """Run sections and print what does not hold, and a line of the table for each."""
+    root = Path(folder).resolve()
+    prepared(root)
+    for name in names or tuple(SECTIONS):
+        counts: Counter[bool] = Counter()
+        for trial, held, how in SECTIONS[name](root):
+            counts[held] += 1
+            if not held or "-v" in os.environ.get("ABUSE", ""):
+                print(f"{'ok ' if held else 'BAD'} {name}: {trial}\n      {how}", flush=True)
+        print(f"| {name} | {counts.total()} | {counts[True]} |", flush=True)
+
+
+if __name__ == "__main__":
+    arguments: Sequence[str] = sys.argv[1:]
+    main(*arguments)
