@@ -13,7 +13,8 @@ import numpy as np
 import pytest
 from toy import SPEC, ToyEnvironment, ToyExpert
 
-from vla.data.episodes import EpisodeStore, fields_of
+from vla.data.episodes import EpisodeStore
+from vla.data.header import fields_of
 from vla.rollout import rollout
 from vla.spec import Episode
 
@@ -214,11 +215,11 @@ def test_what_cannot_be_read_is_named(tmp_path: Path) -> None:
         (folder / name).write_bytes(change((whole / name).read_bytes()))
         return folder
 
-    with pytest.raises(ValueError, match="has format 9, this version reads 1"):
-        EpisodeStore(damaged("store.json", lambda data: data.replace(b'"format": 1', b'"format": 9')))
+    with pytest.raises(ValueError, match="has format 9, this version reads 2: collect again"):
+        EpisodeStore(damaged("store.json", lambda data: data.replace(b'"format": 2', b'"format": 9')))
     with pytest.raises(ValueError, match=r"depth_wrist\.bin is shorter than its index says"):
         EpisodeStore(damaged("depth_wrist.bin", lambda data: data[:-1]))
-    with pytest.raises(ValueError, match=r"line 2 of .*index\.jsonl cannot be read"):
+    with pytest.raises(ValueError, match=r"line 2 of .*index\.jsonl is damaged: it does not fit its checksum: keep"):
         EpisodeStore(damaged("index.jsonl", lambda data: data.replace(b'{"seed": 1,', b"#", 1)))
     with pytest.raises(ValueError, match=r"line 2 of .*index\.jsonl does not follow"):
         EpisodeStore(damaged("index.jsonl", lambda data: data.split(b"\n")[0] + b"\n" + data))
@@ -229,9 +230,9 @@ def test_what_cannot_be_read_is_named(tmp_path: Path) -> None:
         store.rows("rgb")
 
 
-@pytest.mark.parametrize("content", [b"{", b"{}", b"[]", b"\xff\xfe"])
+@pytest.mark.parametrize("content", [b"{", b'{"format": 2}', b"[]", b"\xff\xfe"])
 def test_a_garbled_description_is_named_with_the_way_out(tmp_path: Path, content: bytes) -> None:
     store = EpisodeStore.create_or_open(tmp_path, SPEC, {})
     (store.folder / "store.json").write_bytes(content)
-    with pytest.raises(ValueError, match=r"store\.json cannot be read .*collect again"):
+    with pytest.raises(ValueError, match=r"store\.json is damaged or of another kind: .*collect again"):
         EpisodeStore(store.folder)

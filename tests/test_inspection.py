@@ -16,8 +16,8 @@ from toy import SPEC, ToyEnvironment, ToyExpert, make_environment, make_expert
 
 from vla.cluster import Local
 from vla.collect import collect
-from vla.data import inspection
 from vla.data.episodes import EpisodeStore
+from vla.data.index import listed
 from vla.data.inspection import episode_of, examine, find, put_together, require_whole
 from vla.rollout import rollout
 from vla.spec import Episode
@@ -109,12 +109,22 @@ DAMAGE: dict[str, tuple[Callable[[Path], object], list[int], str]] = {
     "a changed place": (
         lambda folder: change(folder / "index.jsonl", lambda data: data.replace(b'"start": 12,', b'"start": 72,')),
         [1],
-        "rows changed",
+        "no readable line",
     ),
-    "a changed sum": (
-        lambda folder: change(folder / "index.jsonl", lambda data: data.replace(b'"sum": [', b'"sum": [9.0, ', 1)),
+    "a changed word": (
+        lambda folder: change(folder / "index.jsonl", lambda data: data.replace(b"red", b"rad", 1)),
         [0],
-        "actions unlike",
+        "no readable line",
+    ),
+    "a garbled last line": (
+        lambda folder: change(folder / "index.jsonl", lambda data: flip(data, len(data) - 2)),
+        [4],
+        "no readable line",
+    ),
+    "a changed end": (
+        lambda folder: change(folder / "index.jsonl", lambda data: flip(data, len(data) - 1)),
+        [4],
+        "no readable line",
     ),
     "a garbled first line": (
         lambda folder: change(folder / "index.jsonl", lambda data: b"#" + data),
@@ -276,7 +286,7 @@ def test_a_seed_that_is_not_there_is_named(tmp_path: Path) -> None:
 
 
 def test_seeds_are_listed_in_words() -> None:
-    assert inspection.listed([3]) == "3"
-    assert inspection.listed([4, 2, 3, 3]) == "2 to 4"
-    assert inspection.listed([1, 5]) == "1, 5"
-    assert inspection.listed([*range(0, 40, 2)]) == "0, 2, 4, 6, 8, 10, 12, 14 and 12 others"
+    assert listed([3]) == "3"
+    assert listed([4, 2, 3, 3]) == "2 to 4"
+    assert listed([1, 5]) == "1, 5"
+    assert listed([*range(0, 40, 2)]) == "0, 2, 4, 6, 8, 10, 12, 14 and 12 others"

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import io
 import json
 import shutil
 from collections.abc import Callable
 from dataclasses import replace
+from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +15,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from PIL import Image
 from test_episodes import content
 from test_export import stored
 from toy import SPEC, ToyEnvironment
@@ -20,6 +23,7 @@ from toy import SPEC, ToyEnvironment
 from vla.data.episodes import EpisodeStore
 from vla.data.lerobot import LeRobot as Export
 from vla.data.lerobot_import import LeRobot
+from vla.data.video import encode
 from vla.parts import make_expert
 from vla.spec import Spec
 
@@ -75,13 +79,26 @@ def test_an_import_goes_on_where_it_was(home: Path, tmp_path: Path) -> None:
         imported(other, tmp_path / "store")
 
 
+def copied(home: Path, folder: Path) -> Path:
+    """A copy of the dataset as others would write it, without checksums."""
+    dataset = Path(shutil.copytree(home / "dataset", folder))
+    (dataset / "meta/checksums.json").unlink()
+    return dataset
+
+
 def changed_info(home: Path, tmp_path: Path, change: Callable[[Any], None]) -> Path:
     """A copy of the dataset whose description was changed."""
-    dataset = Path(shutil.copytree(home / "dataset", tmp_path / "dataset"))
+    dataset = copied(home, tmp_path / "dataset")
     info = json.loads((dataset / "meta/info.json").read_text())
     change(info)
     (dataset / "meta/info.json").write_text(json.dumps(info))
     return dataset
+
+
+def changed_table(path: Path, name: str, values: Callable[[pa.Table], pa.Array]) -> None:
+    """Replace a column of a table."""
+    table = pq.read_table(path)
+    pq.write_table(table.set_column(table.column_names.index(name), name, values(table)), path)
 
 
 def test_what_other_people_leave_out_is_made_up_and_said(home: Path, tmp_path: Path) -> None:
@@ -108,18 +125,99 @@ def test_what_other_people_leave_out_is_made_up_and_said(home: Path, tmp_path: P
 @pytest.mark.parametrize(
     ("spec", "says"),
     [
-        (replace(SPEC, control_hz=20.0), r"a rate of 10, but the task has 20\.0"),
-        (replace(SPEC, cameras=("side",)), r"no video observation\.images\.side, .* it has observation\.images\.front"),
-        (replace(SPEC, image_size=(16, 32)), r"observation\.images\.front of \[16, 16\], but the task has \[16, 32\]"),
-        (replace(SPEC, joints=SPEC.joints[:6]), r"observation\.state of shape \[8\], but the task has \[7\]"),
-        (replace(SPEC, action=("x", "z", "gripper")), r"action of \['x', 'y', .*but the task has \['x', 'z'"),
-        (replace(SPEC, high=(0.01, 0.01, 1.0)), r"actions x from .* to 0\.01 m: are they in other units, or absolute"),
+        (replace(SPEC, control_hz=20.0), r"a rate of 10 Hz, the task has 20 Hz"),
+        (
+            replace(SPEC, cameras=("side", "top")),
+            r"no images observation\.images\.side and observation\.images\.top, it has observation\.images\.front, ob",
+        ),
+        (
+            replace(SPEC, image_size=(16, 32)),
+            r"images\.front of 16 x 16 pixels, the task has 16 x 32 pixels; .*wrist of",
+        ),
+        (
+            replace(SPEC, joints=SPEC.joints[:6]),
+            r"state of shape \[8\] \(joint1, .*\), the task has \[7\] \(joint1, .*\)",
+        ),
+        (replace(SPEC, action=("x", "z", "gripper")), r"action of x, y, gripper, the task has x, z, gripper"),
+        (
+            replace(SPEC, high=(0.01, 0.01, 0.5)),
+            r"x in action from .* 0\.01 m \(other units, or absolute\?\); y .*; gripper .* has 0 to 0\.5 \(other units",
+        ),
     ],
     ids=["rate", "camera", "size", "joints", "names", "units"],
 )
-def test_the_first_difference_from_the_task_is_named(home: Path, spec: Spec, says: str) -> None:
-    with pytest.raises(ValueError, match=says):
+def test_differences_from_the_task_are_named(home: Path, spec: Spec, says: str) -> None:
+    with pytest.raises(ValueError, match=rf"dataset is not of the task's kind of step: .*{says}"):
         LeRobot(str(home / "dataset"), spec=spec)
+
+
+def test_all_differences_are_named_at_once(home: Path, tmp_path: Path) -> None:
+    other = replace(
+        SPEC, control_hz=20.0, image_size=(8, 8), joints=SPEC.joints[:6], action=("a", "b", "c"), high=(0.01, 0.05, 1.0)
+    )
+    with pytest.raises(ValueError) as caught:
+        LeRobot(str(home / "dataset"), spec=other)
+    assert [difference.split(" ")[0] for difference in str(caught.value).split(": ", 1)[1].split("; ")] == [
+        "a", "observation.images.front", "observation.images.wrist", "observation.state", "action", "a"
+    ]  # fmt: skip
+
+    def foreign(info: Any) -> None:
+        del info["features"]["observation.images.front"], info["features"]["observation.images.wrist"]
+        info["features"]["action"] = {"dtype": "float32", "shape": [6], "names": None}
+
+    with pytest.raises(ValueError, match=r"it has none at all; action of shape \[6\], the task has \[3\] \(x, y, grip"):
+        LeRobot(str(changed_info(home, tmp_path, foreign)), spec=SPEC)
+
+
+def as_pictures(home: Path, folder: Path, size: tuple[int, int] = (16, 16)) -> Path:
+    """The dataset of `home` with its images as PNG within the table, as LeRobot writes it with `use_videos=False`."""
+    dataset, store = copied(home, folder), EpisodeStore(home / "store")
+    shutil.rmtree(dataset / "videos")
+    info = json.loads((dataset / "meta/info.json").read_text())
+    path = dataset / "data/chunk-000/file-000.parquet"
+    table = pq.read_table(path)
+    for camera in SPEC.cameras:
+        key = f"observation.images.{camera}"
+        info["features"][key] = {"dtype": "image", "shape": [3, 16, 16], "names": ["channels", "height", "width"]}
+        pictures = []
+        for step, image in enumerate(np.asarray(store.rows(f"rgb_{camera}"))):
+            file = io.BytesIO()
+            Image.fromarray(image).resize(size).save(file, "PNG")
+            pictures.append({"bytes": file.getvalue(), "path": f"../../frame-{step:06d}.png"})
+        kind = pa.struct({"bytes": pa.binary(), "path": pa.string()})
+        table = table.append_column(key, pa.array(pictures, kind))
+    pq.write_table(table, path)
+    (dataset / "meta/info.json").write_text(json.dumps(info))
+    path = dataset / "meta/episodes/chunk-000/file-000.parquet"
+    table = pq.read_table(path)
+    pq.write_table(table.drop_columns([name for name in table.column_names if name.startswith("videos/")]), path)
+    return dataset
+
+
+def test_pictures_in_the_table_come_back_bit_for_bit(home: Path, tmp_path: Path) -> None:
+    before, after = EpisodeStore(home / "store"), imported(as_pictures(home, tmp_path / "data"), tmp_path / "store")
+    for there, here in zip(before.episodes, after.episodes, strict=True):
+        expected, rows = before.read(there), after.read(here)
+        for camera in SPEC.cameras:
+            np.testing.assert_array_equal(rows[f"rgb_{camera}"], expected[f"rgb_{camera}"])
+
+
+def test_pictures_of_another_kind_are_refused_by_name(home: Path, tmp_path: Path) -> None:
+    path, key = "data/chunk-000/file-000.parquet", "observation.images.front"
+    with pytest.raises(ValueError, match=rf"{path}: {key} of episode 0: the image is 300 x 400 pixels of RGB"):
+        LeRobot(str(as_pictures(home, tmp_path / "large", (400, 300))), spec=SPEC).episode(0)
+    kinds: dict[str, Callable[[pa.Table], pa.Array]] = {
+        "lacks images": lambda table: pa.array(
+            [{"bytes": None, "path": "a.png"}] * len(table), pa.struct({"bytes": pa.binary(), "path": pa.string()})
+        ),
+        "cannot be decoded": lambda table: pa.array([{"bytes": b"\x89PNG", "path": ""}] * len(table)),
+        "something else than images": lambda table: pa.array(["a.png"] * len(table)),
+    }
+    for number, (says, values) in enumerate(kinds.items()):
+        dataset = as_pictures(home, tmp_path / f"data{number}")
+        changed_table(dataset / path, key, values)
+        with pytest.raises(ValueError, match=rf"{path}.*{says}"):
+            LeRobot(str(dataset), spec=SPEC).episode(0)
 
 
 def test_a_recording_does_not_act(home: Path) -> None:
@@ -134,9 +232,9 @@ def test_what_cannot_be_read_is_named(home: Path, tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"no LeRobot dataset in .*nowhere"):
         LeRobot(str(tmp_path / "nowhere"), spec=SPEC)
     old = changed_info(home, tmp_path / "old", lambda info: info.update(codebase_version="v2.1"))
-    with pytest.raises(ValueError, match=r"version v2\.1: convert it to v3\.0"):
+    with pytest.raises(ValueError, match=r"info\.json has version v2\.1: convert the dataset to v3\.0"):
         LeRobot(str(old), spec=SPEC)
-    with pytest.raises(ValueError, match=r"info\.json cannot be read"):
+    with pytest.raises(ValueError, match=r"info\.json is damaged or of another kind: features: Field required"):
         LeRobot(str(changed_info(home, tmp_path / "bare", lambda info: info.pop("features"))), spec=SPEC)
     for name, says in {
         "data/chunk-000/file-000.parquet": "cannot be read",
@@ -144,16 +242,126 @@ def test_what_cannot_be_read_is_named(home: Path, tmp_path: Path) -> None:
         "meta/tasks.parquet": "cannot be read",
         "videos/observation.images.wrist/chunk-000/file-000.mp4": "cannot be read as a video",
     }.items():
-        dataset = Path(shutil.copytree(home / "dataset", tmp_path / name.replace("/", "_")))
+        dataset = copied(home, tmp_path / name.replace("/", "_"))
         (dataset / name).write_bytes((dataset / name).read_bytes()[:100])
         with pytest.raises(ValueError, match=says):
             LeRobot(str(dataset), spec=SPEC).episode(0)
 
 
 def test_an_episode_that_the_data_does_not_hold_is_refused(home: Path, tmp_path: Path) -> None:
-    dataset = Path(shutil.copytree(home / "dataset", tmp_path / "dataset"))
+    dataset = copied(home, tmp_path / "dataset")
     path = dataset / "data/chunk-000/file-000.parquet"
     rows = pq.read_table(path)
     pq.write_table(rows.slice(0, len(rows) - 1), path)
     with pytest.raises(ValueError, match="says of episode 2 what its data does not hold"):
+        LeRobot(str(dataset), spec=SPEC)
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        ({"fps": 0}, r"fps: Input should be greater than 0"),
+        ({"fps": float("nan")}, r"fps: Input should be a finite number"),
+        ({"features": []}, r"features: Input should be an object"),
+        ({"features": {"action": {"dtype": "float32", "shape": "x"}}}, r"features\.action\.shape: Input should be"),
+        ({"features": {"action": {"dtype": "float32", "shape": [-1]}}}, r"greater than or equal to 1"),
+        (
+            {"features": {"action": {"dtype": "float32", "shape": [3], "names": [5]}}},
+            r"no observation\.state, it has act",
+        ),
+        ({"features": {"a" * 10_000: {"dtype": "video", "shape": [3]}}}, r"it has a{200}…; no observation\.state"),
+        ({"codebase_version": ["v3.0"] * 1000}, r"version \['v3\.0', .{1,12}: convert"),
+    ],
+)
+def test_nonsense_in_the_description_is_refused_by_name(
+    home: Path, tmp_path: Path, change: dict[str, Any], says: str
+) -> None:
+    with pytest.raises(ValueError, match=says) as caught:
+        LeRobot(str(changed_info(home, tmp_path, lambda info: info.update(change))), spec=SPEC)
+    assert str(tmp_path) in str(caught.value) and len(str(caught.value)) < 2000
+
+
+def test_a_description_nested_without_end_is_refused(home: Path, tmp_path: Path) -> None:
+    dataset = copied(home, tmp_path / "dataset")
+    (dataset / "meta/info.json").write_text('{"codebase_version": "v3.0", "features": ' + "[" * 100_000)
+    with pytest.raises(ValueError, match=r"info\.json is damaged or of another kind"):
+        LeRobot(str(dataset), spec=SPEC)
+
+
+VIDEO, EPISODES, ROWS = (
+    "videos/observation.images.front/",
+    "meta/episodes/chunk-000/file-000.parquet",
+    "data/chunk-000/file-000.parquet",
+)
+
+
+@pytest.mark.parametrize(
+    ("file", "column", "value", "says"),
+    [
+        (EPISODES, f"{VIDEO}chunk_index", None, "integers from 0 on"),
+        (EPISODES, f"{VIDEO}chunk_index", "../../x", "integers from 0 on"),
+        (EPISODES, f"{VIDEO}file_index", -1, "integers from 0 on"),
+        (EPISODES, "data/file_index", 1.5, "integers from 0 on"),
+        (EPISODES, "dataset_to_index", 2**62, "integers from 0 on"),
+        (EPISODES, f"{VIDEO}from_timestamp", float("nan"), "seconds"),
+        (EPISODES, f"{VIDEO}from_timestamp", float("inf"), "seconds"),
+        (EPISODES, f"{VIDEO}from_timestamp", -1e18, "seconds"),
+        (EPISODES, f"{VIDEO}from_timestamp", "0", "seconds"),
+        (ROWS, "action", "push", "lists of numbers"),
+        (ROWS, "action", ["a", "b", "c"], "lists of numbers"),
+        (ROWS, "action", [0.0, float("nan"), 0.0], "3 finite numbers"),
+        (ROWS, "action", [0.0, 0.0], "3 finite numbers"),
+        (ROWS, "episode_index", None, "integers from 0 on"),
+        ("meta/tasks.parquet", "task", None, "text"),
+        ("meta/tasks.parquet", "task", "a" * 1001, "tasks of more than 1000 characters: 0"),
+        ("meta/tasks.parquet", "task_index", "0", "columns task_index, task|something else than integers"),
+    ],
+)
+def test_nonsense_in_a_table_is_refused_by_name(
+    home: Path, tmp_path: Path, file: str, column: str, value: Any, says: str
+) -> None:
+    dataset = copied(home, tmp_path / "dataset")
+    changed_table(dataset / file, column, lambda table: pa.array([value] * len(table)))
+    with pytest.raises(ValueError, match=rf"{file.split('/chunk')[0]}.*{says}"):
+        LeRobot(str(dataset), spec=SPEC)
+
+
+def test_a_table_that_unpacks_without_end_is_not_read(
+    home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("vla.data.lerobot_tables.MOST_ROWS", 5)
+    with pytest.raises(ValueError, match=r"file-000\.parquet has \d+ rows, more than the 5"):
+        LeRobot(str(copied(home, tmp_path / "dataset")), spec=SPEC)
+
+
+def test_a_video_of_another_size_is_not_decoded(home: Path, tmp_path: Path) -> None:
+    dataset = copied(home, tmp_path / "dataset")
+    path = dataset / "videos/observation.images.wrist/chunk-000/file-000.mp4"
+    encode(path, [np.zeros((20, 64, 64, 3), np.uint8)], (64, 64), Fraction(10), 50)
+    with pytest.raises(ValueError, match=r"file-000\.mp4 has images of 64 x 64 pixels, not 16 x 16"):
+        LeRobot(str(dataset), spec=SPEC).episode(0)
+
+
+def test_no_flipped_bit_is_imported(home: Path, tmp_path: Path) -> None:
+    dataset = Path(shutil.copytree(home / "dataset", tmp_path / "dataset"))
+    random = np.random.default_rng(0)
+    for path in sorted(path for path in dataset.rglob("*") if path.is_file()):
+        whole = path.read_bytes()
+        for place in random.integers(len(whole), size=6).tolist():
+            path.write_bytes(whole[:place] + bytes([whole[place] ^ 1 << place % 8]) + whole[place + 1 :])
+            with pytest.raises(ValueError, match=r"dataset.*copy the dataset again from where it is whole"):
+                LeRobot(str(dataset), spec=SPEC)
+        path.write_bytes(whole)
+    assert len(LeRobot(str(dataset), spec=SPEC)) == 3
+
+
+def test_a_page_of_a_table_that_was_changed_is_not_imported(home: Path, tmp_path: Path) -> None:
+    dataset = copied(home, tmp_path / "dataset")
+    path = dataset / ROWS
+    data = bytearray(path.read_bytes())
+    with pq.ParquetFile(path) as file:
+        column = file.metadata.row_group(0).column(0)
+    data[column.data_page_offset + column.total_compressed_size - 3] ^= 1
+    path.write_bytes(data)
+    with pytest.raises(ValueError, match=r"file-000\.parquet cannot be read \(.*CRC"):
         LeRobot(str(dataset), spec=SPEC)

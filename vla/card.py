@@ -14,8 +14,8 @@ import numpy as np
 from rich.markup import escape
 from rich.table import Table
 
-from vla.data.index import Entry
-from vla.data.inspection import Findings, episode_of, listed, parts_of
+from vla.data.index import Entry, listed
+from vla.data.inspection import Findings, episode_of, parts_of
 from vla.report import BLUE, GREEN, RED, contact_sheet, spans
 from vla.spec import flat
 

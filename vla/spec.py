@@ -6,11 +6,17 @@ file and never each other.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import MISSING, asdict, dataclass, fields, replace
-from typing import Any, Literal, Protocol
+import json
+import re
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass, fields, replace
+from typing import Annotated, Any, Literal, Protocol
 
 import numpy as np
+from annotated_types import Ge, Le, MaxLen, MinLen, Predicate
+
+from vla.documents import STRICT, parse_json
+from vla.types import Count, Positive, unique
 
 Array = np.ndarray
 
@@ -18,23 +24,40 @@ FIRST_SEED = 1_000_000  # of evaluation; collection, which starts at small ones,
 LONGEST_INSTRUCTION = 1000  # characters
 
 
+def names_a_file(name: str) -> bool:
+    """fit to be a part of a file's name"""
+    return re.fullmatch(r"\w[\w.-]*", name) is not None
+
+
+# What a spec out of a file may hold.
+Name = Annotated[str, MinLen(1), MaxLen(100)]
+Names = Annotated[tuple[Name, ...], MinLen(1), MaxLen(100), Predicate(unique)]
+Camera = Annotated[Name, Predicate(names_a_file)]
+Cameras = Annotated[tuple[Camera, ...], MinLen(1), MaxLen(100), Predicate(unique)]
+Pixels = Annotated[int, Ge(1), Le(4096)]
+Numbers = Annotated[tuple[float, ...], MaxLen(100)]
+
+
 @dataclass(frozen=True)
 class Spec:
     """What one step looks like; stored with episodes and checkpoints and compared wherever the two meet."""
 
-    cameras: tuple[str, ...]
-    image_size: tuple[int, int]  # height, width [px]
-    joints: tuple[str, ...]  # names, base to tip
-    action: tuple[str, ...]  # (D,) component names
-    units: tuple[str, ...]  # (D,) "m" | "rad" | "1"
-    low: tuple[float, ...]  # (D,) smallest action
-    high: tuple[float, ...]  # (D,) largest action
-    frame: str  # frame in which Cartesian actions are expressed
-    control_hz: float  # [Hz]
-    truth: tuple[tuple[str, int], ...] = ()  # simulator state kept as an auxiliary training target: name, size
+    __pydantic_config__ = STRICT
+
+    cameras: Cameras
+    image_size: tuple[Pixels, Pixels]  # height, width [px]
+    joints: Names  # base to tip
+    action: Names  # (D,) components
+    units: Annotated[tuple[Name, ...], MaxLen(100)]  # (D,) "m" | "rad" | "1"
+    low: Numbers  # (D,) smallest action
+    high: Numbers  # (D,) largest action
+    frame: Annotated[str, MaxLen(100)]  # frame in which Cartesian actions are expressed
+    control_hz: Positive  # [Hz]
+    # simulator state kept as an auxiliary training target: name, size
+    truth: Annotated[tuple[tuple[Name, Count], ...], MaxLen(100)] = ()
     # (J + 1, 7) where the frame of each joint, which turns about its z axis, and last that of the tool lies in the
     # frame before: offset [m], quaternion wxyz; nothing where it is not known
-    chain: tuple[tuple[float, ...], ...] = ()
+    chain: Annotated[tuple[Numbers, ...], MaxLen(101)] = ()
 
     @property
     def truth_size(self) -> int:
@@ -51,17 +74,20 @@ class Spec:
         return {name: _plain(value) for name, value in asdict(self).items()}
 
     @classmethod
-    def from_dict(cls, values: Mapping[str, Any]) -> Spec:
-        """The inverse of `to_dict`; fields that have a default may be missing.
+    def from_dict(cls, values: Any, name: str = "the spec") -> Spec:
+        """The inverse of `to_dict`, of values that anybody may have written; fields that have a default may be missing.
 
         Raises:
-            ValueError: a field is missing or unknown.
+            ValueError: `values`, called `name` in errors, are no spec.
         """
-        names = {field.name for field in fields(cls)}
-        optional = {field.name for field in fields(cls) if field.default is not MISSING}
-        if not names - optional <= set(values) <= names:
-            raise ValueError(f"a spec has the fields {sorted(names)}, this one has {sorted(values)}")
-        return cls(**{name: _tuples(value) for name, value in values.items()})
+        try:
+            text = json.dumps(values)
+        except (TypeError, ValueError, RecursionError) as error:
+            raise ValueError(f"{name} is damaged or of another kind: {str(error)[:200]}") from error
+        spec = parse_json(text, cls, name)
+        if problem := next(_contradictions(spec), None):
+            raise ValueError(f"{name} is damaged or of another kind: {problem}")
+        return spec
 
     def require(self, other: Spec, what: str, against: str) -> None:
         """Raise a ValueError naming the first field in which the spec of `what` (self) differs from `against`.
@@ -71,15 +97,25 @@ class Spec:
         for field in fields(self):
             mine, theirs = getattr(self, field.name), getattr(other, field.name)
             if mine != theirs and not (field.name == "chain" and () in (mine, theirs)):
-                raise ValueError(f"{what} has {field.name} = {mine}, but {against} has {theirs}")
+                raise ValueError(f"{what} has {field.name} = {str(mine)[:200]}, but {against} has {str(theirs)[:200]}")
 
 
 def _plain(value: Any) -> Any:
     return [_plain(item) for item in value] if isinstance(value, (tuple, list)) else value
 
 
-def _tuples(value: Any) -> Any:
-    return tuple(_tuples(item) for item in value) if isinstance(value, (tuple, list)) else value
+def _contradictions(spec: Spec) -> Iterator[str]:
+    """How fields that fit their types do not fit each other."""
+    for name in ("units", "low", "high"):
+        if len(getattr(spec, name)) != len(spec.action):
+            yield f"{name} has {len(getattr(spec, name))} components, action {len(spec.action)}"
+    for name, low, high in zip(spec.action, spec.low, spec.high, strict=False):
+        if not low < high:
+            yield f"low of {name} is {low}, not less than high, {high}"
+    if spec.chain and [len(frame) for frame in spec.chain] != [7] * (len(spec.joints) + 1):
+        yield f"chain is not 7 numbers for each of {len(spec.joints)} joints and the tool"
+    if not unique([name for name, _ in spec.truth]) or spec.truth_size > 4096:
+        yield "truth has a name twice, or more than 4096 numbers"
 
 
 @dataclass(frozen=True)

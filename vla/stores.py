@@ -12,7 +12,8 @@ from rich import print as show
 from vla.card import store_table, write_card
 from vla.check import require_no_paths
 from vla.data.episodes import EpisodeStore
-from vla.data.inspection import examine, find, listed, put_together, require_whole
+from vla.data.index import listed
+from vla.data.inspection import examine, find, put_together, require_whole
 
 log = logging.getLogger(__name__)
 
@@ -38,6 +39,8 @@ def _chosen(
     folder: str, stores: list[str] | None, where: dict[str, Any] | None, repair: bool, into: str | None
 ) -> Path:
     """Path of the store to look into, which is there or is made."""
+    if stores == []:
+        raise ValueError("inspect.stores=[] names no store: leave it out, or give at least one folder")
     if into is None and (stores or where):
         raise ValueError("inspect.stores and inspect.where make a new store: say where, with inspect.into=DIR")
     if into is None and not repair:

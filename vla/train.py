@@ -63,8 +63,9 @@ def trained(config: DictConfig) -> Path | None:
         data.setup()
         if not len(data.held_out_windows):
             trainer.limit_val_batches = 0  # else what waits for a validation would wait in vain
+        first = data.gather(data.order(0)[:SHOWN])
         with optional(output / FILE):
-            draw_samples(data.gather(data.order(0)[:SHOWN]), store.spec, output / FILE)
+            draw_samples(first, store.spec, output / FILE)
         if config.checkpoint:
             keep_metrics(trainer, Path(config.checkpoint))
         with _told(config, trainer, interruption, learner, effort(store, config.collect.episodes)):

@@ -16,7 +16,7 @@ import json
 import logging
 import os
 import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -24,48 +24,35 @@ from typing import Any, BinaryIO
 import numpy as np
 from filelock import FileLock, Timeout
 
-from vla.data.index import REMEDY, SALVAGE, Entry, dumps, index_line, moments, read_index
-from vla.data.pack import CODECS, JPEG, PackedRows, whole_rows
+from vla.data.header import fields_of, header_of, read_header, write_header
+from vla.data.index import SALVAGE, Entry, dumps, index_line, listed, parse_line, read_index
+from vla.data.pack import JPEG, PackedRows, whole_rows
 from vla.data.statistics import Statistics, statistics_of
 from vla.spec import Array, Episode, Spec
 
 Rows = Array | PackedRows
 
-FORMAT = 1
+BLOCK = 256  # rows whose checksum is computed at once
 
 log = logging.getLogger(__name__)
-
-
-def fields_of(spec: Spec) -> dict[str, tuple[tuple[int, ...], np.dtype]]:
-    """Field name → shape and dtype of the row that one step leaves there."""
-    joints, action, numbers = len(spec.joints), len(spec.action), np.dtype("<f4")
-    sizes = {"joints": joints, "velocities": joints, "gripper": 1, "action": action, "executed": action}
-    if spec.truth:
-        sizes["truth"] = spec.truth_size
-    fields: dict[str, tuple[tuple[int, ...], np.dtype]] = {}
-    for camera in spec.cameras:
-        fields[f"rgb_{camera}"] = ((*spec.image_size, 3), np.dtype(np.uint8))
-        fields[f"depth_{camera}"] = (spec.image_size, np.dtype("<u2"))
-    return fields | {name: ((size,), numbers) for name, size in sizes.items()}
 
 
 class EpisodeStore:
     """Episodes on disk, opened for reading; `create_or_open` and `writing` make it grow.
 
-    Attributes: `spec`; `config`, what made the episodes; `fields`, as `fields_of`; `packed`, field of packed images →
-    codec; `tried`, one entry per seed. With `episodes` only the first so many are seen. Raises a ValueError where there
-    is no store, its format is unknown, it is damaged, or it holds fewer than `episodes`. With `damaged` a store whose
-    files are cut short or whose index has unreadable lines is opened as well, to read what is left; the seeds of such
-    lines are `LOST`.
+    Attributes: `header`, all that `store.json` says; `spec`; `config`, what made the episodes; `fields`, as
+    `fields_of`; `packed`, field of packed images → codec; `tried`, one entry per seed. With `episodes` only the first
+    so many are seen. With `damaged` a store whose files are cut short or whose index has unreadable lines is opened as
+    well, to read what is left; the seeds of such lines are `LOST`. Raises a ValueError where there is no store, its
+    format is unknown, it is damaged, or it holds fewer than `episodes`.
     """
 
     def __init__(self, folder: str | Path, episodes: int | None = None, damaged: bool = False) -> None:
         self.folder = Path(folder)
-        header = _read_header(self.folder)
-        self.spec = Spec.from_dict(header["spec"])
-        self.config: dict[str, Any] = header["config"]
+        self.header, self.spec = read_header(self.folder)
+        self.config: dict[str, Any] = self.header.config
         self.fields = fields_of(self.spec)
-        self.packed: dict[str, str] = header.get("packed", {})
+        self.packed: Mapping[str, str] = self.header.packed
         self._limit, self._damaged = episodes, damaged
         self._files: dict[str, BinaryIO] = {}
         self._refresh()
@@ -83,7 +70,7 @@ class EpisodeStore:
         if not (folder / "store.json").exists():
             folder.mkdir(parents=True, exist_ok=True)
             with FileLock(folder / "lock"):
-                _write_header(folder, spec, plain)
+                write_header(folder, header_of(spec, plain))
         store = cls(folder)
         spec.require(store.spec, "this task", f"the episode store {folder}")
         different = sorted(key for key in {*plain, *store.config} if plain.get(key) != store.config.get(key))
@@ -108,10 +95,12 @@ class EpisodeStore:
 
     @property
     def statistics(self) -> Statistics:
-        """Moments of the actions in `episodes`, and a sample of them; a ValueError if there are none."""
+        """Moments of the actions in `episodes`, and a sample of them; a ValueError if there are none, or damaged."""
         if not self.episodes:
             raise ValueError(f"{self.folder} holds no episodes yet: collect some first")
-        return statistics_of(self.episodes, np.asarray(self.rows("action")))
+        actions = self.rows("action")
+        self.verify(self.episodes, {"action": actions})
+        return statistics_of(self.episodes, np.asarray(actions))
 
     def rows(self, field: str) -> Rows:
         """All committed rows of `field`, (N, …): nothing is read until it is indexed.
@@ -124,7 +113,7 @@ class EpisodeStore:
         if self._rows == 0:
             return np.empty((0, *shape), dtype)
         if field in self.packed:
-            return PackedRows(self.folder, field, self.packed[field], (self._rows, *shape), dtype, self._changed)
+            return PackedRows(self.folder, field, self.packed[field], (self._rows, *shape), dtype, self._changed_at)
         return np.asarray(np.memmap(self._path(field), dtype, mode="r", shape=(self._rows, *shape)))
 
     def read(self, entry: Entry) -> dict[str, Array]:
@@ -132,19 +121,47 @@ class EpisodeStore:
         span = slice(entry.start, entry.start + entry.steps)
         sources = {field: self.rows(field) for field in self.fields}
         rows = {field: np.array(source[span]) for field, source in sources.items()}
-        # Decoders may differ in how they round, so what is checked of a JPEG is the file.
-        checked = {field: stored(sources[field], span) if self.lossy(field) else rows[field] for field in rows}
-        if any(len(values) < entry.steps for values in rows.values()) or checksum(checked) != entry.crc:
-            raise self._changed(entry.start)
+        for field, values in rows.items():
+            # Decoders may differ in how they round, so what is checked of a JPEG is the file.
+            checked = stored(sources[field], span) if self.lossy(field) else values
+            if len(values) < entry.steps or zlib.crc32(checked.data) != entry.crc.get(field):
+                raise self._changed([entry.seed])
         return rows
+
+    def verify(self, entries: Iterable[Entry], rows: Mapping[str, Rows]) -> None:
+        """Compare the rows of episodes, field → what `rows` gives, with their checksums.
+
+        Raises:
+            ValueError: some are not those that were written; names the seeds.
+        """
+        changed = [
+            entry.seed
+            for entry in entries
+            if not all(self._intact(entry, field, source) for field, source in rows.items())
+        ]
+        if changed:
+            raise self._changed(changed)
+
+    def _intact(self, entry: Entry, field: str, rows: Rows) -> bool:
+        crc, end = 0, entry.start + entry.steps
+        try:
+            for first in range(entry.start, end, BLOCK):
+                span = slice(first, min(first + BLOCK, end))
+                crc = zlib.crc32((stored(rows, span) if self.lossy(field) else rows[span]).data, crc)
+        except ValueError:  # an image that cannot be decoded
+            return False
+        return crc == entry.crc.get(field)
 
     def lossy(self, field: str) -> bool:
         """Whether the rows of `field` are only like those that were recorded."""
         return self.packed.get(field) == JPEG
 
-    def _changed(self, row: int) -> ValueError:
-        seed = next((entry.seed for entry in self.episodes if row < entry.start + entry.steps), None)
-        return ValueError(f"the rows of seed {seed} in {self.folder} were changed on disk: {SALVAGE}")
+    def _changed(self, seeds: Sequence[int]) -> ValueError:
+        which = f"seed {seeds[0]}" if len(seeds) == 1 else f"the seeds {listed(seeds)}"
+        return ValueError(f"the rows of {which} in {self.folder} were changed on disk: {SALVAGE}")
+
+    def _changed_at(self, row: int) -> ValueError:
+        return self._changed([entry.seed for entry in self.episodes if row < entry.start + entry.steps][:1])
 
     @contextmanager
     def writing(self) -> Iterator[None]:
@@ -181,24 +198,24 @@ class EpisodeStore:
         """
         assert episode.success, "failures go to `fail`"
         rows = self._rows_of(episode)
-        action = rows["action"]
-        fixed = (episode.seed, episode.outcome, episode.instruction, self._rows, len(action), dict(episode.draws))
-        self._commit(Entry(*fixed, checksum(rows), moments(action)), rows)
+        what = (episode.seed, episode.outcome, episode.instruction, self._rows, len(episode.actions))
+        self._commit(Entry(*what, dict(episode.draws), checksums(rows)), rows)
 
     def fail(self, seed: int, outcome: str, draws: Mapping[str, Any]) -> None:
         """Note that `seed` was tried and why it failed; no rows are stored. Raises as `append` does."""
-        self._commit(Entry(seed, outcome, "", self._rows, 0, dict(draws), 0, {}), {})
+        self._commit(Entry(seed, outcome, "", self._rows, 0, dict(draws), {}), {})
 
     def _commit(self, entry: Entry, rows: Mapping[str, Array]) -> None:
         assert self._files, "append and fail work inside `with store.writing()`"
         if self.next_seed not in (None, entry.seed):
             raise ValueError(f"{self.folder} expects seed {self.next_seed} next, seed {entry.seed} came")
         line = index_line(entry)
+        entry = parse_line(line[:-1], f"{self.folder}: the entry of seed {entry.seed}")  # as a reader will see it
         try:
             for name, values in rows.items():
                 _write(self._files[name], values.data.cast("B"))
             _write(self._files["index"], memoryview(line))
-            self.tried.append(Entry(**json.loads(line)))  # as a reader will see it
+            self.tried.append(entry)
             self._rows += entry.steps
             self._index_size += len(line)
         except OSError as error:
@@ -266,50 +283,11 @@ def stored(rows: Rows, span: slice) -> Array:
     return rows[span] if isinstance(rows, np.ndarray) else rows.stored(span)
 
 
-def checksum(rows: Mapping[str, Array]) -> int:
-    """What an entry keeps of all rows of its episode."""
-    crc = 0
-    for values in rows.values():
-        crc = zlib.crc32(values.data.cast("B"), crc)
-    return crc
+def checksums(rows: Mapping[str, Array]) -> dict[str, int]:
+    """What an entry keeps of the rows of its episode: field → CRC-32."""
+    return {field: zlib.crc32(values.data) for field, values in rows.items()}
 
 
 def _write(file: BinaryIO, data: memoryview) -> None:
     while data:  # an unbuffered write may take only a part
         data = data[file.write(data) :]
-
-
-def _write_header(folder: Path, spec: Spec, config: dict[str, Any]) -> None:
-    path = folder / "store.json"
-    if path.exists():  # another process was faster
-        return
-    orphans = sorted(file.name for file in folder.iterdir() if file.suffix in (".bin", ".jsonl"))
-    if orphans:
-        raise ValueError(f"{folder} holds {orphans[0]} without {path.name}, which says what it means: {REMEDY}")
-    fields = {name: {"shape": shape, "dtype": dtype.name} for name, (shape, dtype) in fields_of(spec).items()}
-    header = {"format": FORMAT, "spec": spec.to_dict(), "config": config, "fields": fields}
-    draft = folder / "store.json.draft"
-    try:
-        draft.write_text(dumps(header), encoding="utf-8")
-    except OSError as error:
-        raise ValueError(
-            f"{folder} cannot take a store ({error.strerror}): make room there, or set collect.folder"
-        ) from error
-    os.replace(draft, path)
-
-
-def _read_header(folder: Path) -> dict[str, Any]:
-    path = folder / "store.json"
-    if not path.exists():
-        raise ValueError(f"there is no episode store in {folder} (no {path.name}): collect one first, with job=collect")
-    try:
-        header: dict[str, Any] = json.loads(path.read_bytes())
-        if not {"format", "spec"} <= set(header):
-            raise ValueError("it names no format and spec")
-    except (ValueError, TypeError) as error:
-        raise ValueError(f"{path} cannot be read ({error}): {REMEDY}") from error
-    if header["format"] != FORMAT:
-        raise ValueError(f"{path} has format {header['format']}, this version reads {FORMAT}: collect again")
-    if unknown := sorted(set(header.get("packed", {}).values()) - set(CODECS)):
-        raise ValueError(f"{path} has images packed by {unknown}, this version reads {CODECS}: pack them again")
-    return header

@@ -23,6 +23,7 @@ from rich.progress import track
 
 from vla.data.episodes import EpisodeStore
 from vla.data.index import Entry
+from vla.documents import read_json
 from vla.spec import Array, Spec
 from vla.types import Count, Text
 from vla.workers import cores, leave_with_parent
@@ -63,7 +64,7 @@ class Folders(ABC):
         if not folder.exists():
             return False
         manifest = self._manifest(store, number)
-        if json.loads((folder / "manifest.json").read_text(encoding="utf-8")) != manifest:
+        if read_json(folder / "manifest.json", dict[str, Any]) != manifest:
             raise ValueError(
                 f"{folder} was exported from other episodes, or as other files: choose another export.folder"
             )

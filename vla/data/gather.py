@@ -64,6 +64,9 @@ class Gather:
         chunk: actions k that label a frame.
         depth: whether batches carry depth.
         pin: whether batches lie in page-locked memory, which a GPU copies from without waiting.
+
+    Raises:
+        ValueError: numbers in the store are not those that were written.
     """
 
     def __init__(self, store: EpisodeStore, history: int, chunk: int, depth: bool = False, pin: bool = False) -> None:
@@ -73,12 +76,15 @@ class Gather:
         self._images = {kind: {name: store.rows(f"{kind}_{name}") for name in store.spec.cameras} for kind in kinds}
         # One array, because looking rows up costs more than copying so few numbers.
         names = ("joints", "velocities", "gripper", *(("truth",) if store.spec.truth else ()))
-        self._numbers = np.concatenate([store.rows(name)[:] for name in names], axis=1)
+        numbers = {name: store.rows(name) for name in (*names, "action", "executed")}
+        store.verify(store.episodes, numbers)
+        self._numbers = np.concatenate([numbers[name][:] for name in names], axis=1)
         self._truth_size = store.spec.truth_size
-        self._action = store.rows("action")
-        off = disturbed(self._action[:], store.rows("executed")[:], store.spec)
+        self._action = numbers["action"]
+        off = disturbed(self._action[:], numbers["executed"][:], store.spec)
         self._disturbances = np.append(0, off.cumsum())  # before each row
-        entries = store.episodes
+        self._store, self._entries = store, (entries := store.episodes)
+        self._verified = np.zeros(len(entries), bool)  # whose images are
         self._instructions = [entry.instruction for entry in entries]
         self._first = np.array([entry.start for entry in entries])
         self._last = np.array([entry.start + entry.steps - 1 for entry in entries])
@@ -89,8 +95,13 @@ class Gather:
         A frame before the start of the episode is all zeros, not present, and has no valid label. A label is not valid
         either if a step between its frame and itself was disturbed, or if it lies beyond the end, where it repeats the
         last action. So the valid labels of a frame come first.
+
+        Raises:
+            ValueError: images of these episodes are not those that were written; they are checked once.
         """
         episode = self._first.searchsorted(windows, side="right") - 1  # (B,)
+        if not self._verified[episode].all():
+            self._verify(np.unique(episode[~self._verified[episode]]))
         first, last = self._first[episode, None], self._last[episode, None]
         frames = windows[:, None] + self._ages  # (B, T)
         labels = frames[:, :, None] + self._aheads  # (B, T, k)
@@ -115,6 +126,12 @@ class Gather:
         batch["valid"] = self._own(valid)
         batch["instruction"] = [self._instructions[number] for number in episode.tolist()]
         return batch
+
+    def _verify(self, episodes: Array) -> None:
+        entries = [self._entries[number] for number in episodes.tolist()]
+        images = {f"{kind}_{camera}": rows for kind, of in self._images.items() for camera, rows in of.items()}
+        self._store.verify(entries, images)
+        self._verified[episodes] = True
 
     def _take(self, rows: Rows, index: Array, absent: Array | None = None) -> torch.Tensor:
         values = self._empty((*index.shape, *rows.shape[1:]), TYPES[rows.dtype])

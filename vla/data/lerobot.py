@@ -5,7 +5,6 @@ Shapes: N steps, D components, H by W pixels.
 
 from __future__ import annotations
 
-import json
 import os
 import shutil
 from collections import deque
@@ -24,11 +23,14 @@ from vla.data.episodes import EpisodeStore
 from vla.data.export import each, origin, require_empty, unfinished, write_json
 from vla.data.moments import image_moments, moments
 from vla.data.video import encode
+from vla.documents import read_json
 from vla.spec import Array
 from vla.types import Count, Text
 
 # Readers keep a video open and look frames up by 32-bit seconds: neither one file per episode nor a single one will do.
 EPISODES_PER_VIDEO = 50
+
+LARGEST = 1 << 30  # [bytes] of `meta/vla.json`, which has the draws of every episode
 
 Columns = dict[str, Array]
 
@@ -98,11 +100,13 @@ class LeRobot:
         for camera, found in counts.items():
             statistics[layout.image_key(camera)] = image_moments(np.sum(found, 0), len(whole["index"]))
         layout.write_rows(_made(draft / layout.place(layout.DATA)), self._rows(store, columns))
-        pq.write_table(pa.Table.from_pylist(episodes), _made(draft / layout.place(layout.EPISODES)))
+        table = pa.Table.from_pylist(episodes)
+        pq.write_table(table, _made(draft / layout.place(layout.EPISODES)), write_page_checksum=True)
         layout.write_tasks(draft / layout.TASKS, tasks)
         write_json(draft / "meta/stats.json", statistics)
         info = layout.info(store.spec, self._depth, len(episodes), len(whole["index"]), len(tasks))
         write_json(draft / "meta/info.json", info)
+        write_json(draft / layout.CHECKSUMS, layout.checksums(draft))
 
     def _rows(self, store: EpisodeStore, columns: Sequence[Columns]) -> Iterator[Columns]:
         """The columns of every episode, with depth if it is wanted."""
@@ -134,7 +138,7 @@ class LeRobot:
 def _is_of(folder: Path, source: Mapping[str, Any]) -> bool:
     path = folder / "meta/vla.json"
     try:
-        return bool(json.loads(path.read_text(encoding="utf-8")) == source)
+        return read_json(path, dict[str, Any], LARGEST) == source
     except (OSError, ValueError):  # not there, or cut short
         return False
 

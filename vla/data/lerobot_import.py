@@ -5,58 +5,68 @@ Shapes: N steps, J joints, D action components, H by W pixels.
 
 from __future__ import annotations
 
-import json
-from collections.abc import Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.parquet as pq
 
 from vla.data import lerobot_layout as layout
+from vla.data import lerobot_tables as tables
+from vla.data.index import listed
+from vla.data.lerobot_fit import beyond, differences
+from vla.data.lerobot_tables import REMEDY, counts, numbers
+from vla.data.pack import decoded
 from vla.data.recorded import Recorded
 from vla.data.video import decode
-from vla.spec import Array, Episode, Observation, Spec
-
-TOLERANCE = 1e-3  # by which actions may leave the task's bounds, as a share of their range: rounding
-REMEDY = "copy the dataset again from where it is whole"
+from vla.documents import read_json
+from vla.spec import LONGEST_INSTRUCTION, Array, Episode, Observation, Spec
 
 
 class LeRobot(Recorded):
     """A LeRobot dataset, version 3.0, of the task's kind of step: cameras, image size, joints, actions and rate.
 
-    An episode counts as a success. Where there is no `depth.CAMERA`, depth is 0: no return; where there are no
-    `velocities`, they are the differences of the joint positions; where there are no `executed` actions, they are those
-    to imitate. What was made up stands in the draws of the episode.
+    Images are videos, or PNG within the tables. An episode counts as a success. Where there is no `depth.CAMERA`, depth
+    is 0: no return; where there are no `velocities`, they are the differences of the joint positions; where there are
+    no `executed` actions, they are those to imitate. What was made up stands in the draws of the episode.
 
     Args:
         folder: the dataset.
         spec: of the task.
 
     Raises:
-        ValueError: there is no such dataset, it cannot be read, or it differs from the task; the first difference.
+        ValueError: there is no such dataset, it is damaged, or it differs from the task; names all differences.
     """
 
     def __init__(self, folder: Path | str | None = None, *, spec: Spec) -> None:
         if folder is None:
             raise ValueError("expert=lerobot needs the folder of a dataset: expert.folder=DIR")
         self._folder, self.spec = Path(folder), spec.perceived
+        self._require_unchanged()
         info = self._read_info()
-        there, known = info["features"], layout.features(spec, depth=True)
-        self._has_depth = all(there.get(key) == known[key] for key in map(layout.depth_key, spec.cameras))
-        extra = [key for key in (layout.EXECUTED, layout.VELOCITIES) if there.get(key) == known[key]]
+        self._require_fit(info)
+        known = layout.features(spec, depth=True)
+
+        def has(key: str) -> bool:
+            there = info.features.get(key)
+            return there is not None and there == layout.Feature(
+                known[key]["dtype"], tuple(known[key]["shape"]), known[key]["names"]
+            )
+
+        self._has_depth = all(has(layout.depth_key(camera)) for camera in spec.cameras)
+        extra = [key for key in (layout.EXECUTED, layout.VELOCITIES) if has(key)]
         self._lacks = [] if self._has_depth else ["depth"]
         self._lacks += [key for key in (layout.EXECUTED, layout.VELOCITIES) if key not in extra]
-        columns = ["episode_index", "dataset_from_index", "dataset_to_index", "data/chunk_index", "data/file_index"]
-        for video in (f"videos/{layout.image_key(camera)}" for camera in spec.cameras):
-            columns += [f"{video}/{name}" for name in ("chunk_index", "file_index", "from_timestamp")]
-        self._episodes = self._table("meta/episodes", columns).sort_by("episode_index").to_pylist()
-        rows = self._table("data", [layout.STATE, layout.ACTION, *extra, "episode_index", "task_index"])
-        self._numbers = {name: self._column(rows, name) for name in (layout.STATE, layout.ACTION, *extra)}
+        kinds = {camera: info.features[layout.image_key(camera)].dtype for camera in spec.cameras}
+        self._videos = [camera for camera, kind in kinds.items() if kind == "video"]
+        self._episodes = self._read_episodes()
+        rows = self._rows([layout.STATE, layout.ACTION, *extra])
+        self._numbers = {name: self._matrix(rows, name) for name in (layout.STATE, layout.ACTION, *extra)}
         self._owner, self._task = (rows[name].to_numpy() for name in ("episode_index", "task_index"))
         self._tasks = self._read_tasks()
-        self._require_whole()
+        for number in range(len(self)):
+            self._place(number)
 
     def __len__(self) -> int:
         """How many episodes there are."""
@@ -66,7 +76,7 @@ class LeRobot(Recorded):
         """One of them, with its images.
 
         Raises:
-            ValueError: a video is damaged.
+            ValueError: images are damaged.
         """
         spec, (rows, instruction) = self.spec, self._place(number)
         steps, joints = rows.stop - rows.start, len(spec.joints)
@@ -94,26 +104,41 @@ class LeRobot(Recorded):
     def _images(self, number: int, camera: str, steps: int) -> Array:
         """(N, H, W, 3) uint8."""
         key, row = layout.image_key(camera), self._episodes[number]
+        if camera not in self._videos:
+            return self._pictures(number, key, steps)
         chunk, file, start = (row[f"videos/{key}/{name}"] for name in ("chunk_index", "file_index", "from_timestamp"))
         # Where the layout has it; a path that stands in somebody's file could lead anywhere.
         path = self._folder / layout.VIDEOS.format(video_key=key, chunk_index=chunk, file_index=file)
-        images = decode(path, start, steps, layout.rate(self.spec))
-        if images.shape[1:3] != self.spec.image_size:
-            raise ValueError(f"{path} has images of {images.shape[1:3]} pixels, not {self.spec.image_size}: {REMEDY}")
-        return images
+        return decode(path, start, steps, layout.rate(self.spec), self.spec.image_size)
+
+    def _pictures(self, number: int, key: str, steps: int) -> Array:
+        """(N, H, W, 3) uint8 of images in the table; the path that each has as well is not followed."""
+        path, column = self._column(number, key, tables.pictures)
+        contents = [one and one["bytes"] for one in column.to_pylist()]
+        if len(contents) != steps or not all(contents):
+            raise ValueError(f"{path} lacks images {key} of episode {number}: {REMEDY}")
+        try:
+            return np.stack([decoded(content, "PNG", (*self.spec.image_size, 3)) for content in contents])
+        except ValueError as error:
+            raise ValueError(f"{path}: {key} of episode {number}: {error}: {REMEDY}") from error
 
     def _depth(self, number: int, camera: str, steps: int) -> Array:
         """(N, H, W) uint16 [mm]."""
         shape = (steps, *self.spec.image_size)
         if not self._has_depth:
             return np.zeros(shape, np.uint16)
-        key, row = layout.depth_key(camera), self._episodes[number]
-        path = layout.DATA.format(chunk_index=row["data/chunk_index"], file_index=row["data/file_index"])
-        rows = self._parquet([self._folder / path], [key], [("episode_index", "=", number)])
-        values = np.asarray(rows[key].combine_chunks().flatten().flatten(), np.uint16)
-        if len(values) != np.prod(shape):
-            raise ValueError(f"{self._folder} has {key} of another size in episode {number}: {REMEDY}")
+        path, column = self._column(number, layout.depth_key(camera), tables.pixels)
+        values = np.asarray(column.combine_chunks().flatten().flatten())
+        if values.dtype != np.uint16 or len(values) != np.prod(shape):
+            raise ValueError(f"{path} has {layout.depth_key(camera)} of another size in episode {number}: {REMEDY}")
         return values.reshape(shape)
+
+    def _column(self, number: int, key: str, kind: tables.Kind) -> tuple[Path, pa.ChunkedArray]:
+        """What an episode has of a column that is too large to keep, and the file that it stands in."""
+        row = self._episodes[number]
+        path = layout.DATA.format(chunk_index=row["data/chunk_index"], file_index=row["data/file_index"])
+        only = [("episode_index", "=", number)]
+        return self._folder / path, tables.read([self._folder / path], {key: kind}, only)[key]
 
     def _place(self, number: int) -> tuple[slice, str]:
         """Rows and instruction of an episode."""
@@ -127,91 +152,78 @@ class LeRobot(Recorded):
             raise ValueError(f"{self._folder} has several tasks in episode {number}: here an episode has one")
         return rows, self._tasks[tasks.pop()]
 
-    def _read_info(self) -> dict[str, Any]:
+    def _read_info(self) -> layout.Info:
         path = self._folder / "meta/info.json"
+        if not path.exists():
+            raise ValueError(f"there is no LeRobot dataset in {self._folder} (no meta/info.json)")
         try:
-            info: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
-            if info["codebase_version"] == layout.VERSION:
-                self._require_fit(info)
-        except FileNotFoundError as error:
-            raise ValueError(f"there is no LeRobot dataset in {self._folder} (no meta/info.json)") from error
-        except (json.JSONDecodeError, UnicodeDecodeError, LookupError, TypeError, AttributeError) as error:
-            raise ValueError(f"{path} cannot be read ({error!r}): {REMEDY}") from error
-        if info["codebase_version"] != layout.VERSION:
-            version = info["codebase_version"]
-            raise ValueError(f"{self._folder} has version {version}: convert it to {layout.VERSION} with lerobot")
-        return info
+            version = read_json(path, dict[str, Any]).get("codebase_version")
+            if version == layout.VERSION:
+                return read_json(path, layout.Info)
+        except ValueError as error:
+            raise ValueError(f"{error}: {REMEDY}") from error
+        raise ValueError(
+            f"{path} has version {str(version)[:20]}: convert the dataset to {layout.VERSION} with lerobot"
+        )
 
-    def _require_fit(self, info: dict[str, Any]) -> None:
-        spec, ours, theirs = self.spec, layout.features(self.spec, depth=True), info["features"]
-        self._require("a rate of", info["fps"], spec.control_hz)
-        for camera in spec.cameras:
-            key = layout.image_key(camera)
-            if theirs.get(key, {}).get("dtype") != "video":
-                videos = [name for name, feature in theirs.items() if feature["dtype"] == "video"]
-                raise ValueError(f"{self._folder} has no video {key}, which the task has: it has {', '.join(videos)}")
-            self._require(f"{key} of", _size(theirs[key]["shape"]), list(spec.image_size))
-        for key in (layout.STATE, layout.ACTION):
-            if key not in theirs:
-                raise ValueError(f"{self._folder} has no {key}: it has {', '.join(theirs)}")
-            self._require(f"{key} of shape", theirs[key]["shape"], ours[key]["shape"])
-            names = _names(theirs[key]["names"])
-            self._require(f"{key} of", names or ours[key]["names"], ours[key]["names"])
+    def _require_unchanged(self) -> None:
+        """Compare the files with their checksums, if the dataset has them."""
+        path = self._folder / layout.CHECKSUMS
+        if not path.exists():
+            return
+        try:
+            noted, found = read_json(path, layout.Checksums), layout.checksums(self._folder)
+        except ValueError as error:
+            raise ValueError(f"{error}: {REMEDY}") from error
+        if changed := [name for name in noted if noted[name] != found.get(name)]:
+            raise ValueError(
+                f"{self._folder} has changed since it was exported, in {', '.join(changed)[:200]}: {REMEDY}, or delete "
+                f"{layout.CHECKSUMS} if that was on purpose"
+            )
 
-    def _require(self, what: str, theirs: Any, ours: Any) -> None:
-        if theirs != ours:
-            raise ValueError(f"{self._folder} has {what} {theirs}, but the task has {ours}")
+    def _require_fit(self, info: layout.Info) -> None:
+        found, action = list(differences(info, self.spec)), info.features.get(layout.ACTION)
+        if action is not None and action.shape == (len(self.spec.action),):
+            found += beyond(self._matrix(self._rows([layout.ACTION]), layout.ACTION), self.spec)
+        if found:
+            raise ValueError(f"{self._folder} is not of the task's kind of step: {'; '.join(found)}")
 
-    def _require_whole(self) -> None:
-        for number in range(len(self)):
-            self._place(number)
-        actions = self._numbers[layout.ACTION]
-        slack = TOLERANCE * (np.array(self.spec.high) - self.spec.low)
-        for index, (name, unit) in enumerate(zip(self.spec.action, self.spec.units, strict=True)):
-            low, high = self.spec.low[index], self.spec.high[index]
-            least, most = float(actions[:, index].min()), float(actions[:, index].max())
-            if least < low - slack[index] or most > high + slack[index]:
-                raise ValueError(
-                    f"{self._folder} has actions {name} from {least:.3g} to {most:.3g}, the task's are from {low} to "
-                    f"{high} {unit}: are they in other units, or absolute?"
-                )
+    def _rows(self, names: list[str]) -> pa.Table:
+        return self._table("data", dict.fromkeys(names, numbers) | {"episode_index": counts, "task_index": counts})
 
-    def _column(self, rows: pa.Table, name: str) -> Array:
+    def _matrix(self, rows: pa.Table, name: str) -> Array:
         """(N, …) float32 of a column of lists."""
-        values = np.asarray(rows[name].combine_chunks().flatten(), np.float32)
         size = layout.features(self.spec, depth=True)[name]["shape"][0]
-        if len(values) != len(rows) * size or not np.isfinite(values).all():
-            raise ValueError(f"{self._folder} has rows of {name} that are not {size} finite numbers: {REMEDY}")
-        return values.reshape(len(rows), size)
+        values = tables.matrix(rows[name], size)
+        if values is None or not len(values):
+            raise ValueError(f"{self._folder}/data has rows of {name} that are not {size} finite numbers: {REMEDY}")
+        return values
+
+    def _read_episodes(self) -> list[dict[str, Any]]:
+        """What `meta/episodes` says of each episode, in their order."""
+        names = ("episode_index", "dataset_from_index", "dataset_to_index", "data/chunk_index", "data/file_index")
+        columns = dict.fromkeys(names, counts)
+        for video in (f"videos/{layout.image_key(camera)}" for camera in self._videos):
+            columns |= {f"{video}/chunk_index": counts, f"{video}/file_index": counts}
+            columns |= {f"{video}/from_timestamp": tables.times}
+        found: list[dict[str, Any]] = self._table("meta/episodes", columns).sort_by("episode_index").to_pylist()
+        return found
 
     def _read_tasks(self) -> dict[int, str]:
         """Index → instruction. What pandas calls the column of instructions depends on who wrote it."""
-        table = self._parquet([self._folder / layout.TASKS])
-        text = (pa.string(), pa.large_string())
-        names = [field.name for field in table.schema if field.type in text]
-        if len(names) != 1 or "task_index" not in table.column_names:
-            raise ValueError(f"{self._folder}/meta/tasks.parquet has no column of tasks: {REMEDY}")
-        return dict(zip(table["task_index"].to_pylist(), table[names[0]].to_pylist(), strict=True))
+        path = self._folder / layout.TASKS
+        columns = tables.columns_of(path)
+        names = [name for name in columns if name != "task_index"]
+        if len(names) != 1:
+            raise ValueError(f"{path} has the columns {', '.join(columns)[:200]}, not one of tasks and task_index")
+        table = tables.read([path], {"task_index": counts, names[0]: tables.texts})
+        found = dict(zip(table["task_index"].to_pylist(), table[names[0]].to_pylist(), strict=True))
+        if longer := [index for index, text in found.items() if len(text) > LONGEST_INSTRUCTION]:
+            raise ValueError(f"{path} has tasks of more than {LONGEST_INSTRUCTION} characters: {listed(longer)}")
+        return found
 
-    def _table(self, name: str, columns: Sequence[str]) -> pa.Table:
-        return self._parquet(sorted((self._folder / name).glob("chunk-*/file-*.parquet")), columns)
-
-    def _parquet(self, paths: Sequence[Path], columns: Sequence[str] | None = None, only: Any = None) -> pa.Table:
-        try:
-            tables = [pq.read_table(path, columns=columns and list(columns), filters=only) for path in paths]
-            table = pa.concat_tables(tables)
-        except (pa.ArrowException, OSError) as error:
-            raise ValueError(f"{self._folder} cannot be read ({error}): {REMEDY}") from error
-        if missing := [name for name in columns or () if name not in table.column_names]:
-            raise ValueError(f"{self._folder} lacks the columns {', '.join(missing)}: {REMEDY}")
-        return table
-
-
-def _size(shape: Sequence[int]) -> list[int]:
-    """Height and width, whether colours come first or last."""
-    return list(shape[1:]) if shape[0] == 3 and shape[-1] != 3 else list(shape[:2])
-
-
-def _names(names: Any) -> list[str] | None:
-    """The names of components: a list, a list within a dictionary, or none."""
-    return next(iter(names.values()), None) if isinstance(names, dict) else names
+    def _table(self, name: str, columns: Mapping[str, tables.Kind]) -> pa.Table:
+        paths = sorted((self._folder / name).glob("chunk-*/file-*.parquet"))
+        if not paths:
+            raise ValueError(f"{self._folder / name} holds no tables: {REMEDY}")
+        return tables.read(paths, columns)

@@ -6,6 +6,7 @@
     meta/episodes/chunk-000/file-000.parquet  where every episode begins and ends, and its own statistics
     data/chunk-000/file-000.parquet           one row per step
     videos/observation.images.CAMERA/chunk-000/file-000.mp4     several episodes, one after the other
+    meta/checksums.json                       file → CRC-32; only `vla` writes it
 
 Shapes: N steps, D components, H by W pixels.
 """
@@ -13,17 +14,22 @@ Shapes: N steps, D components, H by W pixels.
 from __future__ import annotations
 
 import json
+import zlib
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
+from annotated_types import Ge, MaxLen
+from pydantic import ConfigDict
 
 from vla.data.video import PIXELS
 from vla.spec import Array, Spec
+from vla.types import Count, Positive
 
 VERSION = "v3.0"
 FILE = "chunk-{chunk_index:03d}/file-{file_index:03d}"
@@ -31,6 +37,7 @@ DATA = f"data/{FILE}.parquet"
 VIDEOS = f"videos/{{video_key}}/{FILE}.mp4"
 EPISODES = f"meta/episodes/{FILE}.parquet"
 TASKS = "meta/tasks.parquet"
+CHECKSUMS = "meta/checksums.json"
 FILES_PER_CHUNK = 1000
 
 # Policies of LeRobot take what is called "observation…" for an input, what is called "action…" for an output, and all
@@ -38,6 +45,48 @@ FILES_PER_CHUNK = 1000
 STATE, ACTION, EXECUTED, VELOCITIES = "observation.state", "action", "executed", "velocities"
 COUNTERS = {"timestamp": "float32", "frame_index": "int64", "episode_index": "int64"}
 COUNTERS |= {"index": "int64", "task_index": "int64"}
+
+
+# Others may say more of their datasets.
+LENIENT = ConfigDict(strict=True, extra="ignore", allow_inf_nan=False)
+
+
+@dataclass
+class Feature:
+    """What `info.json` says of a column or a video."""
+
+    __pydantic_config__ = LENIENT
+
+    dtype: str
+    shape: Annotated[tuple[Count, ...], MaxLen(8)]
+    names: Any = None
+
+
+@dataclass
+class Info:
+    """What is read of `info.json`."""
+
+    __pydantic_config__ = LENIENT
+
+    fps: Positive
+    features: dict[str, Feature]
+
+
+Checksums = dict[str, Annotated[int, Ge(0)]]  # path in the dataset → CRC-32
+
+
+def checksums(folder: Path) -> Checksums:
+    """The checksums of all files of a dataset but the one that they stand in."""
+    files = sorted(path for path in folder.rglob("*") if path.is_file() and path != folder / CHECKSUMS)
+    return {path.relative_to(folder).as_posix(): _crc(path) for path in files}
+
+
+def _crc(path: Path) -> int:
+    crc = 0
+    with path.open("rb") as file:
+        while block := file.read(1 << 20):
+            crc = zlib.crc32(block, crc)
+    return crc
 
 
 def image_key(camera: str) -> str:
@@ -126,7 +175,7 @@ def write_tasks(path: Path, tasks: Sequence[str]) -> None:
         "creator": {"library": "pyarrow", "version": pa.__version__},
         "pandas_version": "2.2.0",
     }
-    pq.write_table(table.replace_schema_metadata({"pandas": json.dumps(pandas)}), path)
+    pq.write_table(table.replace_schema_metadata({"pandas": json.dumps(pandas)}), path, write_page_checksum=True)
 
 
 def write_rows(path: Path, episodes: Iterable[dict[str, Array]]) -> None:
@@ -141,7 +190,8 @@ def write_rows(path: Path, episodes: Iterable[dict[str, Array]]) -> None:
             if writer is None:
                 kinds = {name: _kind(values) for name, values in columns.items()}
                 metadata = {"huggingface": json.dumps({"info": {"features": kinds}})}
-                writer = pq.ParquetWriter(path, table.schema.with_metadata(metadata), compression="zstd")
+                schema = table.schema.with_metadata(metadata)
+                writer = pq.ParquetWriter(path, schema, compression="zstd", write_page_checksum=True)
             writer.write_table(table.replace_schema_metadata(metadata))
     finally:
         if writer is not None:

@@ -7,9 +7,10 @@ of 64 bits, little-endian. An image is its bytes as zlib packs them, or a JPEG.
 from __future__ import annotations
 
 import io
+import struct
 import zlib
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, wait
 from functools import cache
 from pathlib import Path
 
@@ -20,7 +21,6 @@ from vla.spec import Array
 from vla.workers import cores
 
 JPEG, ZLIB = "jpeg", "zlib"
-CODECS = (JPEG, ZLIB)
 OFFSET = np.dtype("<u8")
 LEVEL = 6  # of zlib: 9 takes four times as long to save 2 %
 
@@ -77,11 +77,13 @@ class PackedRows:
             for place in places:
                 try:
                     images[place] = self._decode(self._bytes[starts[place] : ends[place]])
-                except (zlib.error, OSError, ValueError) as error:
+                except (zlib.error, ValueError) as error:
                     raise self._changed(int(rows[place])) from error
 
-        for _ in _threads().map(decode, [range(first, len(rows), cores()) for first in range(cores())]):
-            pass
+        under_way = [_threads().submit(decode, range(first, len(rows), cores())) for first in range(cores())]
+        wait(under_way)  # even if one fails: nobody writes into `out` or reads the file any more
+        for share in under_way:
+            share.result()
         return out
 
     def stored(self, rows: slice) -> Array:
@@ -91,21 +93,38 @@ class PackedRows:
 
     def _decode(self, packed: Array) -> Array:
         shape = self.shape[1:]
-        if self._codec == ZLIB:
-            size = int(np.prod(shape)) * self.dtype.itemsize
-            return np.frombuffer(zlib.decompress(packed.data, bufsize=size), self.dtype).reshape(shape)
-        image = np.asarray(Image.open(io.BytesIO(packed.data), formats=["JPEG"]))
-        if image.shape != shape:
-            raise ValueError(f"the image is {image.shape}, not {shape}")
-        return image
+        if self._codec != ZLIB:
+            return decoded(packed.data, "JPEG", shape)
+        size, stream = int(np.prod(shape)) * self.dtype.itemsize, zlib.decompressobj()
+        rows = stream.decompress(packed.data, size + 1)  # never more, whatever the bytes may unpack to
+        if len(rows) != size or not stream.eof or stream.unused_data:
+            raise ValueError("the image has another size")
+        return np.frombuffer(rows, self.dtype).reshape(shape)
+
+
+def decoded(packed: bytes | memoryview, format: str, shape: tuple[int, ...]) -> Array:
+    """An RGB image (H, W, 3) uint8 of Pillow's `format`; it is only decoded if it has that `shape`.
+
+    Raises:
+        ValueError: it has not, or is damaged.
+    """
+    try:
+        with Image.open(io.BytesIO(packed), formats=[format]) as image:
+            if image.mode != "RGB" or (image.height, image.width, 3) != shape:
+                raise ValueError(f"the image is {image.height} x {image.width} pixels of {image.mode}")
+            return np.asarray(image)
+    except (OSError, SyntaxError, EOFError, struct.error, zlib.error, Image.DecompressionBombError) as error:
+        raise ValueError(f"the image cannot be decoded ({str(error)[:200]})") from error
 
 
 def whole_rows(folder: Path, field: str, rows: int) -> int:
     """How many of `rows` rows of a packed field are there: fewer where a file was cut short."""
     images, offsets = folder / f"{field}.pack", folder / f"{field}.offsets"
-    if not images.exists() or not offsets.exists():
+    if not images.exists() or not images.stat().st_size or not offsets.exists():
         return 0
-    return int(np.count_nonzero(np.fromfile(offsets, OFFSET, rows + 1)[1:] <= images.stat().st_size))
+    there = min(rows + 1, offsets.stat().st_size // OFFSET.itemsize)  # NumPy reserves memory for what it is asked for
+    within = np.flatnonzero(np.fromfile(offsets, OFFSET, there)[1:] <= images.stat().st_size)
+    return int(within[-1]) + 1 if len(within) else 0  # what a changed offset garbles is told when it is decoded
 
 
 @cache

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import shutil
 from collections.abc import Mapping, Sequence
@@ -14,10 +13,11 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from annotated_types import Ge, Le
 
-from vla.data.episodes import EpisodeStore, checksum
+from vla.data.episodes import EpisodeStore, checksums
 from vla.data.export import each, require_empty, unfinished
+from vla.data.header import NAME, Codec, Header
 from vla.data.index import Entry, index_line
-from vla.data.pack import JPEG, OFFSET, ZLIB, pack
+from vla.data.pack import JPEG, OFFSET, pack
 from vla.spec import Array
 from vla.types import Count, Text
 
@@ -28,7 +28,7 @@ class Pieces:
 
     images: dict[str, list[bytes]]  # field → an image per step
     rest: dict[str, Array]  # field → rows
-    crc: int
+    crc: dict[str, int]
 
 
 class Packed:
@@ -53,7 +53,8 @@ class Packed:
         if quality > 95:
             raise ValueError(f"export.quality is from 1 to 95, not {quality}")
         self._folder, self._workers = Path(folder).resolve(), workers
-        self._colour, self._quality = {"lossless": ZLIB, "jpeg": JPEG}[codec], quality
+        self._colour: Codec = "zlib" if codec == "lossless" else "jpeg"
+        self._quality = quality
 
     def export(self, store: EpisodeStore) -> Path:
         """Write the store, all of it or nothing; returns the folder.
@@ -74,21 +75,21 @@ class Packed:
             draft = place / "store"
             shutil.rmtree(draft, ignore_errors=True)  # left by an export that was cut short
             draft.mkdir()
-            (draft / "store.json").write_text(json.dumps(header, ensure_ascii=False), encoding="utf-8")
+            (draft / NAME).write_text(header.text(), encoding="utf-8")
             self._write(draft, store, tried)
             os.rename(draft, self._folder)
         return self._folder
 
-    def _codecs(self, store: EpisodeStore) -> dict[str, str]:
+    def _codecs(self, store: EpisodeStore) -> dict[str, Codec]:
         """Field of images → how they are packed."""
-        codecs = {f"rgb_{camera}": self._colour for camera in store.spec.cameras}
-        return codecs | {f"depth_{camera}": ZLIB for camera in store.spec.cameras}
+        codecs: dict[str, Codec] = {f"rgb_{camera}": self._colour for camera in store.spec.cameras}
+        codecs |= {f"depth_{camera}": "zlib" for camera in store.spec.cameras}
+        return codecs
 
-    def _header(self, store: EpisodeStore, tried: int) -> dict[str, Any]:
+    def _header(self, store: EpisodeStore, tried: int) -> Header:
         """What `store.json` of the new store says."""
-        header: dict[str, Any] = json.loads((store.folder / "store.json").read_bytes())
-        header |= {"config": _first(store.config, tried), "packed": self._codecs(store)}
-        return header | ({"quality": self._quality} if self._colour == JPEG else {})
+        quality = self._quality if self._colour == JPEG else None
+        return replace(store.header, config=_first(store.config, tried), packed=self._codecs(store), quality=quality)
 
     def _write(self, folder: Path, store: EpisodeStore, tried: Sequence[Entry]) -> None:
         lengths: dict[str, list[int]] = {name: [0] for name in self._codecs(store)}
@@ -118,7 +119,7 @@ class Packed:
         images = {name: [pack(image, codec, self._quality) for image in rows[name]] for name, codec in codecs.items()}
         rest = {name: values for name, values in rows.items() if name not in images}
         lossy = {name: np.frombuffer(b"".join(images[name]), np.uint8) for name in images if codecs[name] == JPEG}
-        return Pieces(images, rest, checksum(rows | lossy))
+        return Pieces(images, rest, checksums(rows | lossy))
 
 
 def _tried(store: EpisodeStore) -> list[Entry]:
@@ -140,11 +141,10 @@ def _first(config: Mapping[str, Any], tried: int) -> dict[str, Any]:
     return {**config, "parts": parts}
 
 
-def _is_of(folder: Path, header: Mapping[str, Any], tried: Sequence[Entry]) -> bool:
+def _is_of(folder: Path, header: Header, tried: Sequence[Entry]) -> bool:
     try:
-        same = json.loads((folder / "store.json").read_text(encoding="utf-8")) == header
-        return same and [replace(entry, crc=0) for entry in EpisodeStore(folder).tried] == [
-            replace(entry, crc=0) for entry in tried
-        ]
+        there = EpisodeStore(folder)
+        same = [replace(entry, crc={}) for entry in there.tried] == [replace(entry, crc={}) for entry in tried]
+        return same and there.header == header
     except (OSError, ValueError):  # not there, or damaged
         return False

@@ -41,17 +41,21 @@ class Statistics:
 
 
 def statistics_of(entries: Sequence[Entry], actions: Array) -> Statistics:
-    """The statistics of stored episodes, folded from their `entries` alone, and the rows of their actions."""
-    moments = [entry.action for entry in entries]
-    steps = sum(entry.steps for entry in entries)
-    mean = np.sum([action["sum"] for action in moments], axis=0) / steps
-    variance = np.sum([action["square"] for action in moments], axis=0) / steps - mean**2
+    """The statistics of the (N, D) actions of stored episodes, which are as `entries` say."""
+    ends = np.array([entry.start + entry.steps for entry in entries])
+    shown = actions[: ends[-1]]
+    total, squares = np.zeros((2, shown.shape[1]))
+    for entry in entries:  # one after the other: in double precision, all at once might not fit into memory
+        wide = shown[entry.start : entry.start + entry.steps].astype(np.float64)
+        total += wide.sum(0)
+        squares += (wide**2).sum(0)
+    mean = total / len(shown)
     return Statistics(
-        low=np.min([action["low"] for action in moments], axis=0),
-        high=np.max([action["high"] for action in moments], axis=0),
+        low=shown.min(0).astype(np.float64),
+        high=shown.max(0).astype(np.float64),
         mean=mean,
-        std=np.sqrt(np.maximum(variance, 0)),
-        steps=steps,
+        std=np.sqrt(np.maximum(squares / len(shown) - mean**2, 0)),
+        steps=len(shown),
         actions=actions,
-        ends=np.array([entry.start + entry.steps for entry in entries]),
+        ends=ends,
     )

@@ -42,27 +42,33 @@ def encode(path: Path, clips: Iterable[Array], size: tuple[int, int], fps: Fract
         file.mux(stream.encode(None))
 
 
-def decode(path: Path, start: float, count: int, fps: Fraction) -> Array:
-    """The `count` frames of a video from `start` [s] on, (count, H, W, 3) uint8.
+def decode(path: Path, start: float, count: int, fps: Fraction, size: tuple[int, int]) -> Array:
+    """The `count` frames of a video from `start` [s] on, (count, H, W, 3) uint8 with images of `size` (H, W).
 
     Raises:
-        ValueError: the video cannot be read, or does not hold them.
+        ValueError: the video cannot be read, has images of another size, or does not hold them.
     """
     images: dict[int, Array] = {}
     try:
         with av.open(path) as file:
             stream = file.streams.video[0]
-            assert stream.time_base is not None
-            file.seek(round(start / stream.time_base), stream=stream)  # the key frame before it
+            _require_size(path, stream, size)  # before anything is decoded
+            file.seek(round(start / (stream.time_base or 1)), stream=stream)  # the key frame before it
             for frame in file.decode(stream):
-                assert frame.time is not None
-                number = round((frame.time - start) * float(fps))
+                _require_size(path, frame, size)
+                number = -1 if frame.time is None else round((frame.time - start) * float(fps))
                 if number >= count:
                     break
-                images[number] = frame.to_ndarray(format="rgb24")
+                if number >= 0:
+                    images[number] = frame.to_ndarray(format="rgb24")
     except (av.error.FFmpegError, OSError, IndexError) as error:
         raise ValueError(f"{path} cannot be read as a video: {error}") from error
     missing = [number for number in range(count) if number not in images]
     if missing:
         raise ValueError(f"{path} lacks the frame at {start + missing[0] / float(fps):.3f} s")
     return np.stack([images[number] for number in range(count)])
+
+
+def _require_size(path: Path, images: av.VideoStream | av.VideoFrame, size: tuple[int, int]) -> None:
+    if (images.height, images.width) != size:
+        raise ValueError(f"{path} has images of {images.height} x {images.width} pixels, not {size[0]} x {size[1]}")

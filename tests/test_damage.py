@@ -1,0 +1,108 @@
+"""No change on disk, in whatever file of a store, is trained on."""
+
+from __future__ import annotations
+
+import string
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from test_episodes import CONFIG, EPISODES, add
+from toy import SPEC
+
+from vla.data.episodes import EpisodeStore
+from vla.data.packed import Packed
+from vla.data.windows import Windows
+
+SKIPPED = ("lock",)
+
+
+def train(folder: Path) -> None:
+    """What a training does with a store before and while it learns from every step."""
+    store = EpisodeStore.create_or_open(folder, SPEC, CONFIG)
+    assert store.statistics.steps
+    windows = Windows(
+        folder,
+        SPEC,
+        history=1,
+        chunk=1,
+        seed=0,
+        batch_size=8,
+        validation_fraction=0,
+        validation_windows=8,
+        depth=True,
+        ahead=0,
+    )
+    windows.setup()
+    for first in range(0, len(windows.training_windows), 8):
+        windows.gather(windows.training_windows[first : first + 8])
+
+
+def changes(folder: Path, names: list[str], change: Callable[[bytes, int], int], count: int) -> int:
+    """How many of so many changes of one byte, in files chosen at random, end a training by name."""
+    random, named = np.random.default_rng(0), 0
+    for _ in range(count):
+        path = folder / str(random.choice(names))
+        whole = path.read_bytes()
+        place = int(random.integers(len(whole)))
+        while (value := change(whole, place)) == whole[place]:
+            place = (place + 1) % len(whole)
+        put(path, place, value)
+        with pytest.raises(ValueError, match=folder.name):
+            train(folder)
+        named += 1
+        put(path, place, whole[place])
+    train(folder)
+    return named
+
+
+def put(path: Path, place: int, value: int) -> None:
+    """Change one byte where it is: the file may be mapped into memory."""
+    with path.open("r+b") as file:
+        file.seek(place)
+        file.write(bytes([value]))
+
+
+def flip(data: bytes, place: int) -> int:
+    return data[place] ^ 1 << place % 8
+
+
+def respell(data: bytes, place: int) -> int:
+    """Another digit for a digit, another letter for a letter."""
+    for alphabet in (string.digits, string.ascii_lowercase, string.ascii_uppercase):
+        if (found := alphabet.find(chr(data[place]))) >= 0:
+            return ord(alphabet[(found + 1 + place % (len(alphabet) - 1)) % len(alphabet)])
+    return data[place]
+
+
+def test_no_flipped_bit_is_trained_on(tmp_path: Path) -> None:
+    add(tmp_path / "store", EPISODES)
+    files = sorted(path.name for path in (tmp_path / "store").iterdir() if path.name not in SKIPPED)
+    assert changes(tmp_path / "store", files, flip, 90) == 90
+
+
+@pytest.mark.parametrize("codec", ["lossless", "jpeg"])
+def test_no_flipped_bit_of_a_packed_store_is_trained_on(tmp_path: Path, codec: str) -> None:
+    Packed(tmp_path / "packed", codec=codec, workers=1).export(add(tmp_path / "store", EPISODES))  # type: ignore[arg-type]
+    files = sorted(path.name for path in (tmp_path / "packed").iterdir() if path.suffix in (".pack", ".offsets"))
+    assert changes(tmp_path / "packed", files, flip, 30) == 30
+
+
+def test_no_letter_or_digit_of_an_index_is_trained_on(tmp_path: Path) -> None:
+    add(tmp_path / "store", EPISODES)
+    assert changes(tmp_path / "store", ["index.jsonl"], respell, 60) == 60
+
+
+def test_all_damaged_episodes_are_named_with_the_way_out(tmp_path: Path) -> None:
+    store = add(tmp_path / "store", EPISODES)
+    path = store.folder / "rgb_wrist.bin"
+    image = len(path.read_bytes()) // len(store.rows("action"))
+    data = bytearray(path.read_bytes())
+    for entry in store.episodes[1:3]:
+        data[entry.start * image] ^= 1
+    path.write_bytes(data)
+    with pytest.raises(ValueError, match=r"rows of the seeds 1, 2 in .*store .* job=inspect inspect\.repair=true"):
+        windows = Windows(store.folder, SPEC, 1, 1, 0, 48, 0, 8, False, 0)
+        windows.setup()
+        windows.gather(windows.training_windows)
