@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 import torch
 from omegaconf import OmegaConf
 
+from vla.benchmark import benchmark
 from vla.benchmark.measure import measure
 from vla.benchmark.memory import forget_peak, peak
 from vla.benchmark.train import measures
@@ -23,6 +26,11 @@ def test_a_peak_of_memory_is_remembered_until_it_is_forgotten() -> None:
     assert peak(device) - held > 0.9 * size
     held = forget_peak(device)
     assert peak(device) - held < 0.5 * size
+
+
+def test_a_benchmark_of_nothing_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=r"benchmark\.names is empty: the stages are collect, loader"):
+        benchmark(OmegaConf.create({"benchmark": {"names": []}}), tmp_path)
 
 
 @pytest.mark.parametrize(

@@ -117,7 +117,11 @@ def test_an_unknown_key_is_named_with_what_was_probably_meant() -> None:
             ["training"],
             "benchmark.names must be list[one of collect, loader, train",
         ),
-        ("benchmark.precisions", ["fp16"], "benchmark.precisions must be list[one of fp32, bf16], got ['fp16']"),
+        (
+            "benchmark.precisions",
+            ["fp16"],
+            "benchmark.precisions must be list[one of fp32, bf16] or null, got ['fp16']",
+        ),
     ],
 )
 def test_a_wrong_value_is_named_with_what_is_allowed(key: str, value: Any, expected: str) -> None:

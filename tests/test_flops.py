@@ -96,4 +96,22 @@ def test_peaks_are_those_of_the_data_sheets(
 
 def test_a_processor_has_no_peak_but_a_rate() -> None:
     assert peak_flops(CPU, "32-true") is None
-    assert matmul_flops(CPU, "32-true", 0.1) > 1e9
+    assert 0 < matmul_flops(CPU, "32-true", 0.01) < float("inf")
+
+
+def test_mixed_precision_has_the_better_rate_of_both_and_products_that_take_too_long_are_left_out(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """On a device that takes a minute for a large product in 16 bits, and on every clock: the products are counted."""
+    now, sizes = 0.0, []
+
+    def multiply(self: torch.Tensor, other: torch.Tensor) -> None:
+        nonlocal now
+        sizes.append(len(self))
+        now += 2 * len(self) ** 3 / {torch.float32: 1e11, torch.bfloat16: 1e9}[self.dtype]
+
+    monkeypatch.setattr(torch.Tensor, "__matmul__", multiply)
+    monkeypatch.setattr("vla.models.flops.time.perf_counter", lambda: now)
+    assert matmul_flops(CPU, "bf16-mixed", 0.2) == pytest.approx(1e11)
+    assert max(sizes) == 1024 and now < 1
+    assert matmul_flops(CPU, "bf16-true", 0.2) == pytest.approx(1e9)

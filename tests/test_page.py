@@ -114,7 +114,7 @@ def test_the_page_tells_everything_that_lies_in_the_folder(whole: Path) -> None:
     for words in (
         "66.7 % success: 4 of 6, 95 % CI 30.0-90.3",
         "parameters 1.50 M",
-        "time of an action 2.5 ms",
+        "time per action 2.5 ms",
         "40 steps in 6 min 40 s",
         "checkpoint checkpoints/last.ckpt",
         "dark 0.0 (0.0-39.0) 0/6 0.12",  # four lost, none won: 2 / 2^4
@@ -169,7 +169,7 @@ def test_goals_have_their_own_rates_where_there_are_several(tmp_path: Path) -> N
     for name, played in {"one": results[1:], "two": results}.items():
         (tmp_path / name).mkdir()
         write_report(Report(tuple(played)), tmp_path / name / "report.json", None, CONFIG)
-    assert "goal success [%] of Lift 100.0 (34.2-100.0) 2/2 Push 100.0 (20.7-100.0) 1/1" in text(
+    assert "goal success [%] episodes Lift 100.0 (34.2-100.0) 2/2 Push 100.0 (20.7-100.0) 1/1" in text(
         write_page(tmp_path / "two")
     )
     assert "Lift" not in text(write_page(tmp_path / "one"))
@@ -184,6 +184,18 @@ def test_what_is_missing_is_left_out(tmp_path: Path) -> None:
     note_training(tmp_path, 1, 39, 3.0, "interrupted")
     told = text(write_page(tmp_path))
     assert "Training was interrupted after 39 steps" in told and "Rollouts" not in told
+
+
+def test_axes_of_success_end_at_one_and_small_numbers_keep_their_digits(tmp_path: Path) -> None:
+    curves = "step,val/success,val/error_gripper\n9,0.5,0.01001\n19,1.0,0.01003\n"
+    panels = draw_run(read_run(a_run(tmp_path / "run", curves=curves)).metrics)
+    ticks = {title: re.findall(r">([\d.]+)</text>", panel) for title, panel in panels.items()}
+    assert "1.0" in ticks["success"] and max(float(tick) for tick in ticks["success"] if "." in tick) == 1
+    assert {"0.01001", "0.01003"} <= {tick.rstrip("0") for tick in ticks["error gripper"]}
+    labels = re.findall(r'text-anchor: end[^>]* x="([\d.-]+)"[^>]*>([\d.]+)<', "".join(panels.values()))
+    assert len(labels) > 8
+    for right, label in labels:  # each begins within the picture: at 9 px a digit is more than 5 wide
+        assert float(right) > 5 * len(label), label
 
 
 def test_every_family_of_metrics_is_one_panel(tmp_path: Path) -> None:
@@ -228,9 +240,8 @@ def test_runs_are_compared_on_the_seeds_they_share(tmp_path: Path) -> None:
     told, markup = text(page), page.read_text()
     assert page == tmp_path / "new/comparison.html" and told.startswith("3 runs")
     assert "good/run 100.0 (67.6-100.0)" in told
-    assert "good/run bad/run seen 8 7 0 0.016" in told  # seven lost, none won: 2 / 2^7
-    assert "good/run bad/run dark 8 6 0 0.031" in told
-    assert "good/run short/run seen 2 1 0 1" in told
+    assert "good/run and bad/run seen 8 7 0 0.016 dark 8 6 0 0.031" in told  # seven lost, none won: 2 / 2^7
+    assert "good/run and short/run seen 2 1 0 1" in told
     assert "model.width 16 8 16" in told
     assert 'href="../good/run/report.html"' in markup and "bad/run/report.html" not in markup
     assert markup.count("<svg") == 6
@@ -239,7 +250,7 @@ def test_runs_are_compared_on_the_seeds_they_share(tmp_path: Path) -> None:
 def test_other_scenes_under_the_same_seeds_are_not_compared(tmp_path: Path) -> None:
     plain, dark = a_run(tmp_path / "plain", "ssssssss"), a_run(tmp_path / "dark", "dddddddd", light=0.1)
     told = text(write_comparison([plain, dark], tmp_path / "new"))
-    assert "plain 100.0" in told and "On the same seeds" not in told
+    assert "plain 100.0" in told and "on the same seeds" not in told
 
 
 def test_runs_with_nothing_to_compare_are_refused(tmp_path: Path) -> None:
@@ -252,10 +263,13 @@ def test_runs_with_nothing_to_compare_are_refused(tmp_path: Path) -> None:
     ):
         with pytest.raises(ValueError, match=says):
             write_comparison(folders, tmp_path / "new")
-    for file, says in (("rollouts.rrd", "cannot be read"), ("report.json", "is damaged")):
-        (run / file).write_text("{")
-        with pytest.raises(ValueError, match=f"{file} {says}"):
-            write_comparison([run], tmp_path / "new")
+    loop = tmp_path / "loop"
+    loop.symlink_to(loop)
+    with pytest.raises(ValueError, match="loop is no run"):
+        write_comparison([loop], tmp_path / "new")
+    (run / "rollouts.rrd").write_text("{")
+    with pytest.raises(ValueError, match=r"rollouts\.rrd cannot be read"):
+        write_comparison([run], tmp_path / "new")
     assert not (tmp_path / "new").exists()
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import re
 import shlex
@@ -18,6 +19,9 @@ import torch
 from test_cluster import address_in, dask
 from test_run import SMALL, vla
 from tiny_encoder import write_encoder
+
+from vla.processor import has_bfloat16
+from vla.workers import cores
 
 DOCS = Path(__file__).parents[1] / "docs"
 README = (Path(__file__).parents[1] / "README.md").read_text(encoding="utf-8")
@@ -63,18 +67,22 @@ def address(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
 
 
 def require_floors(measures: dict[str, dict[str, Any]]) -> None:
-    """Every stage was measured, against a floor of its own."""
-    assert {name.partition(":")[0] for name in measures} == {"collect", "loader", "train", "policy"}
-    shares = [measures[f"collect: {stage}"]["ratio"] for stage in ("physics", "rendering", "replay", "storing")]
-    assert 0 < sum(shares) < 1
-    for measure in measures.values():
-        assert set(measure) == {"value", "unit", "n", "floor", "ratio"} and measure["floor"] > 0
-    for precision in ("fp32", "bf16"):
+    """Every stage was measured, against a floor of its own; how fast it was is for no test to judge."""
+    stages = ("physics", "rendering", "expert, controller, judge", "images into arrays", "replay", "storing")
+    precisions = ("fp32", "bf16") if has_bfloat16() else ("fp32",)
+    watched = ("", ": data-wait", ": MFU", ": memory", ": loss")
+    assert set(measures) == {
+        *("collect", *(f"collect: {stage}" for stage in stages), f"collect: {cores()} processes"),
+        *("loader", "loader: 1 frame", "loader: 6 frames"),
+        *(f"train: {precision}{what}" for precision in precisions for what in watched),
+        *("train: loader alone", "policy", "policy: every frame anew"),
+    }
+    for name, measure in measures.items():
+        assert set(measure) == {"value", "unit", "n", "floor", "ratio"} and measure["n"] > 0, name
+        assert all(math.isfinite(measure[key]) for key in ("value", "floor", "ratio")) and measure["floor"] > 0, name
+    for precision in precisions:
         assert measures[f"train: {precision}"]["n"] == 2 * 8
-        assert 0 < measures[f"train: {precision}: data-wait"]["ratio"] < 1
-        assert 0 < measures[f"train: {precision}: MFU"]["ratio"] < 1
-        assert measures[f"train: {precision}: memory"]["ratio"] > 1
-        assert measures[f"train: {precision}: loss"]["ratio"] == pytest.approx(1, abs=0.01)
+        assert measures[f"train: {precision}: MFU"]["ratio"] <= 1
 
 
 def small(arguments: list[str]) -> list[str]:

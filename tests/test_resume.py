@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import time
 from pathlib import Path
@@ -12,7 +11,9 @@ import torch
 import toy
 from test_conf import composed
 
+from vla.evaluate import Report, Result
 from vla.parts import plain
+from vla.report import write_report
 from vla.results import note_choice, note_training
 from vla.resume import go_on, reported, taken_up
 
@@ -42,6 +43,7 @@ def test_a_training_is_taken_up_where_its_folder_has_it(tmp_path: Path, finished
     content = {"config": plain(asked), "spec": toy.SPEC.to_dict(), "state_dict": {}, "finished": finished}
     torch.save(content, tmp_path / "checkpoints/last.ckpt")
     if chosen:  # which a process that was killed may not have come to
+        note_training(tmp_path, 1, 1, 1.0, "done")
         note_choice(tmp_path, chosen)
     asked.evaluate.workers = 1  # not what a training follows from
     found = taken_up(asked)
@@ -60,8 +62,8 @@ def test_a_report_of_weights_that_were_trained_for_longer_since_is_not_this_one(
     asked = composed(f"output={tmp_path}")
     checkpoint = tmp_path / "last.ckpt"
     checkpoint.touch()
-    report = {"checkpoint": str(checkpoint), "success": 0.5, "errors": 0, "conditions": {}, "config": plain(asked)}
-    (tmp_path / "report.json").write_text(json.dumps(report))
+    report = Report((Result(1_000_000, "success"), Result(1_000_001, "dropped")))
+    write_report(report, tmp_path / "report.json", str(checkpoint), plain(asked))
     assert reported(asked, checkpoint) == 0.5
     asked.evaluate.episodes += 1
     assert reported(asked, checkpoint) is None

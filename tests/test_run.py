@@ -76,7 +76,7 @@ def test_the_main_job_collects_trains_evaluates_and_records(home: Path) -> None:
     } <= set(report)
     assert (report["experiment"], report["model"], report["randomize"]) == ("quickstart", "bc", "default")
     training = json.loads((home / "run/training.json").read_text())
-    assert report["budget_s"] > training["collection_s"] + training["seconds"] > training["collection_s"] > 1
+    assert report["budget_s"] > training["collection_s"] + training["seconds"] > training["collection_s"] > 0
     assert report["episodes"] == 2 and report["errors"] == 0
     assert report["config"]["collect"]["episodes"] == 12
     names = ("report.html", "report.png", "rollouts.rrd", "samples.png", "metrics.csv", "checkpoints/last.ckpt")
@@ -87,7 +87,7 @@ def test_the_main_job_collects_trains_evaluates_and_records(home: Path) -> None:
     success = header.split(",").index("val/success")
     assert [row.split(",")[success] for row in rows if row.split(",")[success]] == ["0.0", "0.0"]  # hardly trained
     page = (home / "run/report.html").read_text()
-    for words in ("4 steps", "collect.episodes", ">800<", "What training began with", 'href="rollouts.rrd"'):
+    for words in ("4 steps", "collect.episodes", ">800<", "First training batch", 'href="rollouts.rrd"'):
         assert words in page, words
     assert yaml.safe_load((home / "run/config.yaml").read_text()) == report["config"]
     printed = (home / "printed.txt").read_text()

@@ -9,7 +9,9 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
+from vla.evaluate import Report, Result
 from vla.intervals import pooled_interval
+from vla.report import write_report
 from vla.sweep import tabulate
 from vla.sweep_plot import pareto, validated
 
@@ -20,15 +22,10 @@ def cell(sweep: Path, number: int, overrides: list[str], successes: int, latency
     (folder / ".hydra").mkdir(parents=True)
     (folder / ".hydra/overrides.yaml").write_text("".join(f"- {one}\n" for one in overrides))
     seen = ["success"] * successes + ["timeout"] * (10 - successes)
-    report = {
-        "success": successes / 10,
-        "parameters": 2_000_000,
-        "latency_ms": latency,
-        "seeds": list(range(10)),
-        "per_episode": [{"seed": seed, "outcome": seen[seed], "instruction": ""} for seed in range(10)],
-        "conditions": {"dark": {"outcomes": ["success"] * dark + ["dropped"] * (5 - dark) + ["error"] * 5}},
-    }
-    (folder / "report.json").write_text(json.dumps(report))
+    in_the_dark = ["success"] * dark + ["dropped"] * (5 - dark) + ["error"] * 5
+    plain, other = (Report(tuple(map(Result, range(10), outcomes))) for outcomes in (seen, in_the_dark))
+    size = {"parameters": 2_000_000, "latency_ms": latency}
+    write_report(plain, folder / "report.json", None, {}, size, {"dark": other})
 
 
 def test_seeds_are_put_together_and_the_rest_is_told_apart(tmp_path: Path) -> None:

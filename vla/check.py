@@ -117,7 +117,7 @@ PLAIN: dict[str, Any] = {
         "batches": Count,
         "steps": Count,
         "rounds": Count,
-        "precisions": list[Literal["fp32", "bf16"]],
+        "precisions": list[Literal["fp32", "bf16"]] | None,
         "compile": list[bool],
         "robosuite": str | None,
         "lerobot": str | None,

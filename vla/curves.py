@@ -14,7 +14,6 @@ from vla.results import Curve
 
 COLOURS = (GREEN, BLUE, RED, "#d9942b", "#8a5bb8", "#2f9fa3", "#b5628f", GREY)  # of runs, or of components
 SIZE = (3.4, 2.3)  # of a picture [inch]
-AXES = (0.16, 0.12, 0.82, 0.81)  # left, bottom, width and height of a picture's axes, as shares of it
 INK = "#010203"  # stands for the colour of the page's text, which only the page knows
 DECADE = 10.0  # a loss that changes by more is drawn over a logarithmic axis
 
@@ -84,16 +83,20 @@ def _draw(title: str, lines: Lines) -> str:
     settings |= {f"{part}.color": INK for part in ("text", "xtick", "ytick")}
     settings |= {"axes.edgecolor": INK, "axes.labelcolor": INK, "grid.color": INK, "axes.linewidth": 0.6}
     with matplotlib.rc_context(settings):
-        figure = Figure(figsize=SIZE)
-        axes = figure.add_axes(AXES)
+        figure = Figure(figsize=SIZE, layout="constrained")
+        axes = figure.add_subplot()
         for label, training, colour, (steps, values) in lines:
             few = "o" if len(steps) < 30 and not training else ""
             look = {"linewidth": 1.0, "alpha": 0.8} if training else {"linewidth": 1.7, "marker": few, "markersize": 3}
-            axes.plot(steps, values, color=colour, label=label, **look)
+            axes.plot(steps, values, color=colour, label=label, clip_on=title != "success", **look)
         if title.endswith("loss") and _spans_decades(lines):
             axes.set_yscale("log", subs=[2, 5])
             axes.yaxis.set_major_formatter("{x:g}")
             axes.yaxis.set_minor_formatter("{x:g}")
+        else:
+            axes.ticklabel_format(useOffset=False)
+        if title == "success":
+            axes.set_ylim(0, 1)
         if any(label for label, _, _, _ in lines):
             axes.legend(frameon=False, fontsize=8, ncols=3)
         axes.grid(alpha=0.12)

@@ -27,12 +27,12 @@ def read_json(path: Path, kind: type[T], largest: int = LARGEST) -> T:
         ValueError: the file is larger than `largest` [bytes], nested too deep, not JSON, or not of that kind.
         OSError: it cannot be read.
     """
-    return parse_json(_read(path, largest), kind, str(path))
+    return parse_json(read_bounded(path, largest), kind, str(path))
 
 
 def read_yaml(path: Path, kind: type[T], largest: int = 1 << 20) -> T:
     """The YAML file at `path` as a `kind`, see `read_json`. Aliases, which can grow without bound, are refused."""
-    return parse_yaml(_read(path, largest), kind, str(path))
+    return parse_yaml(read_bounded(path, largest), kind, str(path))
 
 
 def parse_json(text: str | bytes, kind: type[T], name: str) -> T:
@@ -93,7 +93,8 @@ def _dotted(location: tuple[int | str, ...]) -> str:
     return f"{path.lstrip('.')[:100]}: " if path else ""
 
 
-def _read(path: Path, largest: int) -> bytes:
+def read_bounded(path: Path, largest: int = LARGEST) -> bytes:
+    """The content of a file, see `read_json`."""
     size = path.stat().st_size
     if size > largest:
         raise ValueError(f"{path} has {size} bytes, more than the {largest} that such a file can have")

@@ -38,8 +38,8 @@ def read_strips(file: Path, failures: int, successes: int) -> list[Strip]:
     try:
         reader = RrdReader(file)
         return [_strip(reader, entry) for entry in _chosen(reader.recordings(), failures, successes)]
-    except RuntimeError as error:  # of the library
-        raise ValueError(f"{file} cannot be read: {error}") from error
+    except (RuntimeError, KeyError, ValueError) as error:  # the library's, and those of recordings of something else
+        raise ValueError(f"{file} cannot be read, remove it to do without pictures: {error}") from error
 
 
 def _chosen(entries: Sequence[StoreEntry], failures: int, successes: int) -> list[StoreEntry]:

@@ -27,6 +27,7 @@ from vla.parts import (
     output_folder,
     plain,
 )
+from vla.processor import warn_of_bfloat16
 
 if TYPE_CHECKING:
     from vla.evaluate import Report
@@ -37,6 +38,7 @@ log = logging.getLogger(__name__)
 
 def run(config: DictConfig) -> float | None:
     """Do what `config.job` says; evaluation returns the success rate, which sweeps maximise."""
+    warn_of_bfloat16(config)
     return JOBS[config.job](config)
 
 

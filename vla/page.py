@@ -21,7 +21,7 @@ from markupsafe import Markup
 from vla.curves import colours, draw_run, draw_runs
 from vla.evaluate import ERROR, SEEN, Report, Result
 from vla.report import BLUE, GREEN, GREY, RED
-from vla.results import ABSENT, Run, differences, read_run, require_run, write
+from vla.results import ABSENT, Run, at, differences, read_run, require_run, write
 from vla.suite import mcnemar
 
 log = logging.getLogger(__name__)
@@ -66,6 +66,7 @@ def write_page(folder: Path) -> Path:
         title=_title(run),
         run=run,
         facts=_facts(run),
+        all_steps=at(run.config, "trainer.max_steps", None),
         conditions=_conditions(run),
         curves=draw_run(run.metrics),
         strips=_strips(run, FAILURES, SUCCESSES),
@@ -81,7 +82,8 @@ def write_comparison(folders: Sequence[Path], target: Path) -> Path:
     """
     if not folders:
         raise ValueError("name the runs to compare, as in report.runs=[RUN,RUN]")
-    runs = dict(zip(_names(folders), map(require_run, folders), strict=True))
+    read = [require_run(folder) for folder in folders]
+    runs = dict(zip(_names(folders), read, strict=True))
     lines = [
         Line([name], _intervals(run), _costs(run), _links(run.folder, target), colour)
         for (name, run), colour in zip(runs.items(), colours(len(runs)), strict=True)
@@ -149,20 +151,20 @@ def _facts(run: Run) -> dict[str, str]:
     facts = {}
     if run.parameters is not None:
         facts["parameters"] = f"{run.parameters / 1e6:.2f} M"
-    if "latency_ms" in report:
-        facts["time of an action"] = f"{report['latency_ms']:.1f} ms"
+    if report and report.latency_ms:
+        facts["time per action"] = f"{report.latency_ms:.1f} ms"
     if training:
-        facts["training"] = f"{training['steps']} steps in {_duration(training['seconds'])}"
-    if report.get("budget_s"):
-        facts["collection, training, evaluation"] = _duration(report["budget_s"])
-    if (collect := run.config.get("collect")) and run.metrics:
-        facts["demonstrations"] = str(collect["episodes"])
-    if report:
-        facts["evaluated on"] = f"seeds {min(report['seeds'])} to {max(report['seeds'])}"
-    if report.get("checkpoint"):
-        checkpoint = Path(report["checkpoint"]).resolve()
-        inside = checkpoint.is_relative_to(run.folder.resolve())
-        facts["checkpoint"] = str(checkpoint.relative_to(run.folder.resolve()) if inside else report["checkpoint"])
+        facts["training"] = f"{training.steps} steps in {_duration(training.seconds)}"
+    if report and report.budget_s:
+        facts["collection, training, evaluation"] = _duration(report.budget_s)
+    if run.metrics and (demonstrations := at(run.config, "collect.episodes")) != ABSENT:
+        facts["demonstrations"] = str(demonstrations)
+    if report and report.seeds:
+        facts["evaluated on"] = f"seeds {min(report.seeds)} to {max(report.seeds)}"
+    if report and report.checkpoint:
+        folder, checkpoint = (Path(os.path.realpath(path)) for path in (run.folder, report.checkpoint))
+        inside = checkpoint.is_relative_to(folder)
+        facts["checkpoint"] = str(checkpoint.relative_to(folder) if inside else report.checkpoint)
     return facts
 
 
@@ -190,9 +192,9 @@ def _costs(run: Run) -> list[str]:
     return [
         run.model or ABSENT,
         ABSENT if run.parameters is None else f"{run.parameters / 1e6:.2f}",
-        f"{run.report['latency_ms']:.1f}" if "latency_ms" in run.report else ABSENT,
-        str(run.training.get("steps", logged)),
-        _duration(run.training["seconds"]) if run.training else ABSENT,
+        f"{run.report.latency_ms:.1f}" if run.report and run.report.latency_ms else ABSENT,
+        str(run.training.steps if run.training else logged),
+        _duration(run.training.seconds) if run.training else ABSENT,
     ]
 
 
@@ -227,10 +229,9 @@ def _by_seed(run: Run, condition: str) -> dict[int, tuple[Result, Any]]:
     """Seed → how the policy did under a condition, and what tells whether there was the same to see and to hear."""
     results = [result for result in run.reports.get(condition, Report(())).results if result.outcome != ERROR]
     if condition == SEEN:
-        drawn = {each["seed"]: each["draws"] for each in run.report.get("per_episode", ())}
-        return {result.seed: (result, (result.instruction, drawn[result.seed])) for result in results}
-    told = run.report["config"]
-    scene = told["task"], told["evaluate"]["conditions"][condition]
+        return {result.seed: (result, (result.instruction, result.draws)) for result in results}
+    told = run.report.config if run.report else {}
+    scene = at(told, "task"), at(at(told, "evaluate.conditions"), condition)
     return {result.seed: (result, scene) for result in results}
 
 
@@ -238,13 +239,7 @@ def _between(runs: Mapping[str, Run]) -> dict[str, list[Any]]:
     """Dotted key → its value in each run, of everything in which their configurations differ."""
     first, *others = (run.config for run in runs.values())
     keys = dict.fromkeys(key for other in others for key, _, _ in differences(first, other))
-    return {key: [_at(run.config, key) for run in runs.values()] for key in keys}
-
-
-def _at(config: Any, key: str) -> Any:
-    for name in key.split("."):
-        config = config.get(name, ABSENT) if isinstance(config, Mapping) else ABSENT
-    return config
+    return {key: [at(run.config, key) for run in runs.values()] for key in keys}
 
 
 def _strips(run: Run, failures: int, successes: int) -> list[Any]:

@@ -19,6 +19,7 @@ class Pace(Callback):
     """Logs, since the last time, `pace/samples_per_s` of all processes, `pace/waiting`, the share of the time in which
     this process waited for its batch, `pace/mfu`, the share of the device's peak that the model's own arithmetic
     takes (model FLOPs utilisation, arXiv 2204.02311), and on GPUs `pace/memory_gb`, the most that was in use.
+    Without a data sheet the peak is the best rate measured so far, of matrix products or of the training itself.
 
     Validation does not count. The stream of batches counts the seconds that it was waited for as `waited`.
     """
@@ -63,7 +64,9 @@ class Pace(Callback):
             "pace/waiting": (_waited(trainer) - self._waited) / seconds,
         }
         if self._flops:  # not where weights are shared out, of which no copy can be made to count on
-            pace["pace/mfu"] = self._flops * self._batches / seconds / self._peak
+            rate = self._flops * self._batches / seconds
+            self._peak = max(self._peak, rate)
+            pace["pace/mfu"] = rate / self._peak
         if pl_module.device.type == "cuda":
             pace["pace/memory_gb"] = torch.cuda.max_memory_allocated(pl_module.device) / 1e9
         pl_module.log_dict(pace)

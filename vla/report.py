@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,6 +13,7 @@ import numpy as np
 from rich.table import Table
 
 from vla.evaluate import ERROR, Report, Result
+from vla.factors import association, factors, groups, numeric
 from vla.intervals import wilson_interval
 from vla.spec import Array, Observation, flat, leaves
 
@@ -21,8 +22,6 @@ if TYPE_CHECKING:
     from PIL import Image
 
 GREEN, RED, BLUE, GREY = "#2e9e5b", "#d2483f", "#3b76c4", "#8a8f98"
-BINS = 5  # groups of equally many episodes into which a drawn number is cut
-GROUPS = 8  # most words between which a factor's panel can tell
 PANELS = 8  # drawn factors on the page
 TILE = 144  # smallest height of an image on a contact sheet [px]
 CAPTION = 18  # height of a line of text on it [px]
@@ -81,16 +80,17 @@ def plot_report(report: Report, path: Path) -> None:
     The drawn factors over which success varies most, compared with chance, come first.
     """
     from matplotlib.figure import Figure
+    from matplotlib.layout_engine import ConstrainedLayoutEngine
 
     played = [result for result in report.results if result.outcome != ERROR]
-    factors = sorted(_factors(played).items(), key=lambda factor: -_association(factor[1], played))[:PANELS]
-    rows = 1 + -(-len(factors) // 4)
-    figure = Figure(figsize=(13, 3.1 * rows), layout="constrained")
+    shown = sorted(factors(played).items(), key=lambda factor: -association(factor[1], played))[:PANELS]
+    rows = 1 + -(-len(shown) // 4)
+    figure = Figure(figsize=(13, 3.1 * rows), layout=ConstrainedLayoutEngine(h_pad=0.12))
     figure.suptitle(str(report).splitlines()[-1], fontsize=15, fontweight="bold")
     grid = figure.add_gridspec(rows, 4)
     _plot_outcomes(figure.add_subplot(grid[0, :2]), report)
     _plot_lengths(figure.add_subplot(grid[0, 2:]), played)
-    for index, (name, values) in enumerate(factors):
+    for index, (name, values) in enumerate(shown):
         axes = figure.add_subplot(grid[1 + index // 4, index % 4])
         axes.set_title(name, fontsize=10)
         plot = _plot_points if isinstance(values[0], tuple) else _plot_groups
@@ -104,7 +104,7 @@ def _plot_outcomes(axes: Axes, report: Report) -> None:
     """One bar per outcome, the success bar with its interval."""
     names, counts = list(report.taxonomy)[::-1], list(report.taxonomy.values())[::-1]
     colours = [GREEN if name == "success" else GREY if name == ERROR else RED for name in names]
-    axes.barh(names, counts, color=colours, height=0.7)
+    axes.barh([name.replace("_", " ") for name in names], counts, color=colours, height=0.7)
     low, high = (bound * report.episodes for bound in report.interval)
     for row, (name, count) in enumerate(zip(names, counts, strict=True)):
         axes.annotate(
@@ -113,8 +113,9 @@ def _plot_outcomes(axes: Axes, report: Report) -> None:
         if name == "success":
             axes.plot([low, high], [row, row], color="black", linewidth=1.5, marker="|", markersize=10)
     axes.set_xlim(0, 1.1 * len(report.results))
+    axes.locator_params(axis="x", integer=True)
     axes.set_xlabel("episodes")
-    axes.set_title("outcomes", fontsize=10)
+    axes.set_title("outcomes", fontsize=10, loc="left")
 
 
 def _plot_lengths(axes: Axes, played: Sequence[Result]) -> None:
@@ -122,10 +123,11 @@ def _plot_lengths(axes: Axes, played: Sequence[Result]) -> None:
     steps = [[result.steps for result in played if (result.outcome == "success") == good] for good in (True, False)]
     edges = np.histogram_bin_edges(steps[0] + steps[1] or [0], bins=30)
     axes.hist(steps, bins=list(edges), stacked=True, color=[GREEN, RED], label=["success", "failure"])
-    axes.legend(frameon=False)
+    axes.legend(frameon=False, ncols=2, loc="lower right", bbox_to_anchor=(1, 1), borderaxespad=0)
     axes.set_xlabel("steps")
+    axes.locator_params(axis="y", integer=True)
     axes.set_ylabel("episodes")
-    axes.set_title("length of episodes", fontsize=10)
+    axes.set_title("length of episodes", fontsize=10, loc="left")
 
 
 def _plot_points(axes: Axes, values: Sequence[tuple[float, float]], played: Sequence[Result]) -> None:
@@ -139,73 +141,24 @@ def _plot_points(axes: Axes, values: Sequence[tuple[float, float]], played: Sequ
 
 def _plot_groups(axes: Axes, values: Sequence[Any], played: Sequence[Result]) -> None:
     """Success rate with its interval in each group of values; a group of numbers stands at its mean."""
-    groups = _groups(values)
-    if _numbers(values):
-        places = [float(np.mean([values[index] for index in group])) for group in groups]
+    split = groups(values)
+    if numeric(values):
+        places = [float(np.mean([values[index] for index in group])) for group in split]
         axes.locator_params(axis="x", nbins=4)  # more would run into each other where numbers are long
     else:
-        places = list(range(len(groups)))
-        names = [str(values[group[0]]) for group in groups]
+        places = list(range(len(split)))
+        names = [str(values[group[0]]) for group in split]
         tilt = 20 if max(map(len, names)) > 9 else 0
         axes.set_xticks(places, names, fontsize=8, rotation=tilt, ha="right" if tilt else "center")
-        axes.set_xlim(-0.5, len(groups) - 0.5)
-    won = [sum(played[index].outcome == "success" for index in group) for group in groups]
-    rates = np.array([good / len(group) for good, group in zip(won, groups, strict=True)])
-    bounds = np.array([wilson_interval(good, len(group)) for good, group in zip(won, groups, strict=True)])
+        axes.set_xlim(-0.5, len(split) - 0.5)
+    won = [sum(played[index].outcome == "success" for index in group) for group in split]
+    rates = np.array([good / len(group) for good, group in zip(won, split, strict=True)])
+    bounds = np.array([wilson_interval(good, len(group)) for good, group in zip(won, split, strict=True)])
     reach = np.abs(bounds.T - rates)
-    axes.errorbar(places, rates, reach, fmt="o-", color=GREEN, ecolor=GREY, linewidth=0.7, capsize=3)
-    axes.set_ylim(0, 1.05)
+    axes.errorbar(places, rates, reach, fmt="o-", color=GREEN, ecolor=GREY, linewidth=0.7, capsize=3, clip_on=False)
+    axes.set_ylim(0, 1)
     axes.set_ylabel("success")
     axes.grid(axis="y", alpha=0.3)
-
-
-def _factors(played: Sequence[Result]) -> dict[str, list[Any]]:
-    """Dotted name → value per episode, of every draw that all episodes have and that falls into a few groups.
-
-    A pair of numbers is one factor, a point; longer lists are one factor per item.
-    """
-    rows = [
-        {name: value for axis, draw in flat(result.draws).items() for name, value in _items(axis, draw)}
-        for result in played
-    ]
-    names = [name for name in (rows[0] if rows else {}) if all(name in row for row in rows)]
-    columns = {name: [row[name] for row in rows] for name in names}
-    return {name: values for name, values in columns.items() if 1 < len(_groups(values)) <= GROUPS}
-
-
-def _items(name: str, value: Any) -> Iterator[tuple[str, Any]]:
-    if not isinstance(value, list):
-        yield name, value
-    elif len(value) == 2 and all(isinstance(item, float) for item in value):
-        yield name, tuple(value)
-    else:
-        for index, item in enumerate(value):
-            yield from _items(f"{name}[{index}]", item)
-
-
-def _numbers(values: Sequence[Any]) -> bool:
-    return all(isinstance(value, (int, float)) and not isinstance(value, bool) for value in values)
-
-
-def _groups(values: Sequence[Any]) -> list[list[int]]:
-    """Indices of the episodes, by value if these are few or words, else in groups of equally many; points by the
-    quarter of the plane that they are in."""
-    if isinstance(values[0], tuple):
-        values = [str(quarter) for quarter in np.array(values) > np.median(values, axis=0)]
-    different = sorted(set(values))
-    if len(different) <= BINS or not _numbers(values):
-        return [[index for index, other in enumerate(values) if other == value] for value in different]
-    return [group.tolist() for group in np.array_split(np.argsort(values, kind="stable"), BINS)]
-
-
-def _association(values: Sequence[Any], played: Sequence[Result]) -> float:
-    """How much success differs between the groups: Pearson's χ² per degree of freedom, about 1 by chance."""
-    good = np.array([result.outcome == "success" for result in played], dtype=float)
-    rate, groups = good.mean(), _groups(values)
-    if rate in (0.0, 1.0):
-        return 0.0
-    squares = sum(len(group) * (good[group].mean() - rate) ** 2 for group in groups)
-    return float(squares / (rate * (1 - rate)) / (len(groups) - 1))
 
 
 def contact_sheet(seeds: Sequence[int], observations: Sequence[Observation], columns: int = 2) -> Image.Image:

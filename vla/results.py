@@ -3,21 +3,24 @@
 from __future__ import annotations
 
 import csv
+import io
 import json
 import os
-from collections.abc import Mapping
-from dataclasses import dataclass
-from functools import cached_property
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, replace
+from functools import cached_property, partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import yaml
 
+from vla.documents import read_bounded, read_json, read_yaml
 from vla.evaluate import SEEN, Report, Result
+from vla.run_files import Change, Node, ReportFile, Training
 from vla.spec import Array
 
-Node = dict[str, Any]
+T = TypeVar("T")
 Curve = tuple[Array, Array]  # steps (N,) and values (N,)
 
 CONFIG, CHANGES, TRAINING = "config.yaml", "changes.yaml", "training.json"
@@ -29,52 +32,53 @@ ABSENT = "-"  # stands for a key that one of two configurations does not have
 
 @dataclass(frozen=True)
 class Run:
-    """What lies in a run's folder; what does not is empty."""
+    """What lies in a run's folder; what does not is empty or None."""
 
     folder: Path
     config: Node  # resolved
-    changes: list[Node] | None  # `key`, and its values `here` and by `default`
-    training: Node  # as written by `note_training`
+    changes: list[Change] | None
+    training: Training | None
     metrics: dict[str, Curve]
-    report: Node  # report.json
+    report: ReportFile | None
 
     @property
     def model(self) -> str:
         """Name of the model's class, or nothing."""
-        return str(self.config.get("model", {}).get("_target_", "")).rpartition(".")[2]
+        return str(at(self.config, "model._target_", "")).rpartition(".")[2]
 
     @property
     def goal(self) -> str:
         """Name of the goal's class, or nothing."""
-        return str(self.config.get("task", {}).get("goal", {}).get("_target_", "")).rpartition(".")[2]
+        return str(at(self.config, "task.goal._target_", "")).rpartition(".")[2]
 
     @property
     def parameters(self) -> int | None:
         """How many the model has, if that is known."""
-        return self.training.get("parameters", self.report.get("parameters"))
+        known = self.training or self.report
+        return known.parameters if known else None
 
     @property
     def chosen(self) -> str | None:
         """File of the weights that are to be evaluated; None where that has yet to be found out."""
-        return self.training.get("checkpoint")
+        return self.training.checkpoint if self.training else None
 
     def budget(self, evaluation: float) -> float | None:
         """Seconds that collection and training took, and an evaluation after them; None if that is not known."""
-        collection, training = self.training.get("collection_s"), self.training.get("seconds")
-        return None if collection is None or training is None else round(collection + training + evaluation, 1)
+        if self.training is None or self.training.collection_s is None:
+            return None
+        return round(self.training.collection_s + self.training.seconds + evaluation, 1)
 
     @cached_property
     def reports(self) -> dict[str, Report]:
-        """Condition → its report, the one that the policy was trained for first; draws and conditions' steps are left
-        out."""
+        """Condition → its report, the one that the policy was trained for first; of the others only seeds and
+        outcomes are known."""
         if not self.report:
             return {}
-        played = [Result(each["seed"], each["outcome"], each["instruction"]) for each in self.report["per_episode"]]
         others = {
-            name: Report(tuple(map(Result, self.report["seeds"], part["outcomes"])))
-            for name, part in self.report.get("conditions", {}).items()
+            name: Report(tuple(map(Result, self.report.seeds, part.outcomes)))
+            for name, part in self.report.conditions.items()
         }
-        return {SEEN: Report(tuple(played)), **others}
+        return {SEEN: Report(tuple(self.report.per_episode)), **others}
 
 
 def read_run(folder: Path) -> Run:
@@ -83,15 +87,12 @@ def read_run(folder: Path) -> Run:
     Raises:
         ValueError: a file is damaged.
     """
-    report = _read(folder / REPORT, json.loads, {})
-    return Run(
-        folder,
-        _read(folder / CONFIG, yaml.safe_load, report.get("config", {})),
-        _read(folder / CHANGES, yaml.safe_load, None),
-        _read(folder / TRAINING, json.loads, {}),
-        _read(folder / METRICS, _curves, {}),
-        report,
-    )
+    report = _read(folder / REPORT, partial(read_json, kind=ReportFile), None)
+    config = _read(folder / CONFIG, partial(read_yaml, kind=Node), report.config if report else {})
+    changes = _read(folder / CHANGES, partial(read_yaml, kind=list[Change]), None)
+    training = _read(folder / TRAINING, partial(read_json, kind=Training), None)
+    metrics: dict[str, Curve] = _read(folder / METRICS, _curves, {})
+    return Run(folder, config, changes, training, metrics, report)
 
 
 def run_of(checkpoint: str | Path) -> Run:
@@ -125,15 +126,22 @@ def note_training(
 ) -> None:
     """Write how large the model is, which step its training reached and in which time [s], how it ended, "done",
     "interrupted", or what went wrong, and how long its demonstrations took to collect [s], if that is known."""
-    facts = {"parameters": parameters, "steps": steps, "seconds": round(seconds, 1), "ended": ended}
-    facts |= {"collection_s": None if collection is None else round(collection, 1)}
-    write(folder / TRAINING, json.dumps(facts, ensure_ascii=False) + "\n")
+    collected = None if collection is None else round(collection, 1)
+    _write_training(folder, Training(parameters, steps, round(seconds, 1), ended, collected))
 
 
 def note_choice(folder: Path, checkpoint: str) -> None:
     """Add to what `note_training` wrote which of its checkpoints is to be evaluated."""
-    facts = _read(folder / TRAINING, json.loads, {}) | {"checkpoint": checkpoint}
-    write(folder / TRAINING, json.dumps(facts, ensure_ascii=False) + "\n")
+    _write_training(folder, replace(read_json(folder / TRAINING, Training), checkpoint=checkpoint))
+
+
+def at(config: Any, key: str, absent: Any = ABSENT) -> Any:
+    """The value of a plain configuration at a dotted key, or `absent`."""
+    for name in key.split("."):
+        if not isinstance(config, Mapping) or name not in config:
+            return absent
+        config = config[name]
+    return config
 
 
 def differences(one: Any, other: Any, key: str = "") -> list[tuple[str, Any, Any]]:
@@ -159,20 +167,33 @@ def write(path: Path, text: str) -> None:
     os.replace(draft, path)
 
 
-def _read(path: Path, parse: Any, otherwise: Any) -> Any:
+def _write_training(folder: Path, training: Training) -> None:
+    write(folder / TRAINING, json.dumps(asdict(training), ensure_ascii=False) + "\n")
+
+
+def _read(path: Path, read: Callable[[Path], T], otherwise: T) -> T:
     if not path.is_file():
         return otherwise
     try:
-        return parse(path.read_text(encoding="utf-8"))
-    except (ValueError, yaml.YAMLError) as error:
-        raise ValueError(f"{path} is damaged: {' '.join(str(error).split())}") from error
+        return read(path)
+    except ValueError as error:
+        raise ValueError(f"{error}; remove the file to do without it, or repeat the run") from error
 
 
-def _curves(text: str) -> dict[str, Curve]:
+def _curves(path: Path) -> dict[str, Curve]:
     """The columns of metrics.csv; where a step was logged again, after an interruption, the later value counts."""
     points: dict[str, dict[int, float]] = {}
-    for row in csv.DictReader(text.splitlines()):
-        for name, value in row.items():
-            if value and name not in ("step", "epoch"):
-                points.setdefault(name, {})[int(row["step"])] = float(value)
+    rows = csv.reader(io.StringIO(read_bounded(path).decode("utf-8", "replace"), newline=""))
+    try:
+        names = next(rows, ["step"])
+        if "step" not in names:
+            raise ValueError("there is no column step")
+        for row in rows:
+            if len(row) < len(names):  # a process was killed while it wrote this row
+                continue
+            for name, value in zip(names, row, strict=True):
+                if value and name not in ("step", "epoch"):
+                    points.setdefault(name, {})[int(row[names.index("step")])] = float(value)
+    except (ValueError, csv.Error) as error:
+        raise ValueError(f"{path} is damaged in line {rows.line_num}: {error}") from error
     return {name: (np.array(sorted(at)), np.array([at[step] for step in sorted(at)])) for name, at in points.items()}

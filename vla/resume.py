@@ -188,17 +188,16 @@ def reported(cfg: DictConfig, checkpoint: Path) -> float | None:
     from vla.results import REPORT, differences, read_run
 
     report = read_run(Path(cfg.output)).report
-    if not report or report["checkpoint"] != str(checkpoint):
+    if report is None or report.checkpoint != str(checkpoint):
         return None
     if (Path(cfg.output) / REPORT).stat().st_mtime < checkpoint.stat().st_mtime:  # which was trained for longer since
         return None
-    if any(part["errors"] for part in (report, *report["conditions"].values())):
+    if any(part.errors for part in (report, *report.conditions.values())):
         return None
-    asked = {"pretrained": None, **report["config"]}  # which older reports do not have
-    if {key for key, _, _ in differences(asked, _plain(cfg))} - {"checkpoint", "resume"}:
+    if {key for key, _, _ in differences(report.config, _plain(cfg))} - {"checkpoint", "resume"}:
         return None
     log.info("nothing is evaluated anew: %s is of this very experiment", Path(cfg.output) / REPORT)
-    return float(report["success"])
+    return report.success
 
 
 def _is_own(checkpoint: Path, cfg: DictConfig) -> bool:

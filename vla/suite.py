@@ -62,12 +62,13 @@ def plot_suite(reports: Mapping[str, Report], path: Path) -> None:
         rates = np.array([report.success for report in chosen.values()])
         reach = np.abs(np.array([report.interval for report in chosen.values()]).reshape(-1, 2).T - rates)
         rows = [len(lines) - 1 - lines.index(axis) - below for axis in chosen]
-        axes.errorbar(rates, rows, xerr=reach, fmt="o", color=colour, ecolor=GREY, capsize=3, label=level or None)
+        name = level or None
+        axes.errorbar(rates, rows, None, reach, "o", color=colour, ecolor=GREY, capsize=3, label=name, clip_on=False)
     axes.set_yticks(range(len(lines)), [axis.replace("_", " ") for axis in reversed(lines)])
-    axes.set_xlim(-0.02, 1.02)
+    axes.set_xlim(0, 1)
     axes.set_ylim(-0.6, len(lines) - 0.4)
     if len(lines) < len(reports):
-        axes.legend(frameon=False, loc="lower left")
+        axes.legend(frameon=False, ncols=2, loc="lower right", bbox_to_anchor=(1, 1), borderaxespad=0)
     axes.set_xlabel("success, 95 % CI")
     axes.grid(axis="x", alpha=0.3)
     axes.spines[["top", "right"]].set_visible(False)

@@ -114,21 +114,24 @@ def tabulate(folder: Path) -> list[Row]:
 def read_rows(folder: Path) -> list[Row]:
     """The cells that have a report, and did not fail since, put together, in the order of the sweep."""
     from vla.evaluate import ERROR
-    from vla.results import read_run
+    from vla.results import REPORT, read_run
 
     cells = [
         (_overrides(cell), read_run(cell))
-        for cell in _cells(folder, "report.json")
+        for cell in _cells(folder, REPORT)
         if not (cell / FAILURE).exists()  # its report may be of other overrides
     ]
     telling = [key for key in _telling([overrides for overrides, _ in cells]) if key != SEED]
     rows: dict[tuple[str, ...], Row] = {}
     for overrides, run in cells:
         choices = {key: overrides.get(key, "default") for key in telling}
-        row = rows.setdefault(tuple(choices.values()), Row(choices, run.report["parameters"]))
+        file = run.report
+        if file is None or file.parameters is None or file.latency_ms is None:
+            raise ValueError(f"{run.folder / REPORT} is of no evaluation: it lacks parameters or latency_ms")
+        row = rows.setdefault(tuple(choices.values()), Row(choices, file.parameters))
         row.cells.append(run.folder)
-        row.latencies.append(run.report["latency_ms"])
-        row.rates.append(run.report["success"])
+        row.latencies.append(file.latency_ms)
+        row.rates.append(file.success)
         for condition, report in run.reports.items():
             ended = {result.seed: result.outcome == "success" for result in report.results if result.outcome != ERROR}
             row.played.setdefault(condition, []).append(ended)
@@ -143,9 +146,10 @@ def _cells(folder: Path, having: str) -> list[Path]:
 
 def _overrides(cell: Path) -> dict[str, str]:
     from hydra.core.override_parser.overrides_parser import OverridesParser
-    from yaml import safe_load
 
-    said = OverridesParser.create().parse_overrides(safe_load((cell / OVERRIDES).read_text(encoding="utf-8")))
+    from vla.documents import read_yaml
+
+    said = OverridesParser.create().parse_overrides(read_yaml(cell / OVERRIDES, list[str]))
     return {one.key_or_group: one.get_value_element_as_str() for one in said}
 
 

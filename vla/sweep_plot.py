@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from vla.intervals import wilson_interval
-from vla.results import read_run
+from vla.results import at, read_run
 from vla.sweep import DEMONSTRATIONS, Row
 
 if TYPE_CHECKING:
@@ -18,16 +18,19 @@ if TYPE_CHECKING:
     from matplotlib.legend import Legend
 
 SUCCESS = "success, 95 % CI"
+COLUMNS = 4  # panels beside each other
 
 Points = dict[int, tuple[int, int]]  # training step → episodes that succeeded in its validation, and all played then
 
 
 def plot(rows: list[Row], path: Path) -> None:
     """Draw success under every condition: over the number of demonstrations, and over training, where that number is
-    what differs; else of each row, and over the time of an action where some take twice as long as others."""
+    what differs; else of each row, and, under the first conditions, over the time per action where some rows take
+    twice as long as others."""
     from matplotlib.figure import Figure
+    from matplotlib.layout_engine import ConstrainedLayoutEngine
 
-    figure = Figure(layout="constrained", dpi=110)
+    figure = Figure(layout=ConstrainedLayoutEngine(h_pad=0.1), dpi=110)
     if DEMONSTRATIONS in rows[0].choices:
         _draw_numbers(figure, rows)
     else:
@@ -72,24 +75,30 @@ def _key(panels: Sequence[Axes]) -> Legend:
 def _draw_choices(figure: Figure, rows: list[Row]) -> None:
     conditions = list(dict.fromkeys(condition for row in rows for condition in row.played))
     latencies = [row.latency for row in rows]
-    heights = [1.2 + 0.3 * len(rows), *([4.2] if max(latencies) > 2 * min(latencies) else [])]
-    figure.set_size_inches(max(8, 2 + 3.3 * len(conditions)), sum(heights))
-    panels = figure.subplots(len(heights), len(conditions), squeeze=False, height_ratios=heights)
-    for axes, condition in zip(panels[0], conditions, strict=True):
-        _plot_rows(axes, rows, condition)
-        axes.tick_params(labelleft=condition == conditions[0])
-    for axes, condition in zip(panels[1:].flat, conditions, strict=False):
-        _plot_costs(axes, rows, condition)
-    for axes in panels[1:, 0]:
-        axes.set_ylabel(SUCCESS)
+    lines = [conditions[first : first + COLUMNS] for first in range(0, len(conditions), COLUMNS)]
+    heights = [1.2 + 0.3 * len(rows)] * len(lines)
+    if costs := max(latencies) > 2 * min(latencies):
+        heights.append(4.2)
+    figure.set_size_inches(max(8, 2 + 3.3 * len(lines[0])), sum(heights))
+    panels = figure.subplots(len(heights), len(lines[0]), squeeze=False, height_ratios=heights)
+    for row, line in zip(panels, lines, strict=False):
+        for axes, condition in zip(row, line, strict=False):
+            _plot_rows(axes, rows, condition)
+            axes.tick_params(labelleft=axes is row[0])
+        for axes in row[len(line) :]:
+            axes.set_visible(False)
+    if costs:
+        panels[-1][0].set_ylabel(SUCCESS)
+        for axes, condition in zip(panels[-1], lines[0], strict=True):
+            _plot_costs(axes, rows, condition)
 
 
 def validated(row: Row) -> Points:
     """Of all cells together; nothing where nothing was played."""
     points: Points = {}
     for run in map(read_run, row.cells):
-        played = run.config.get("validate", {}).get("episodes", 0)
-        if not played:
+        played = at(run.config, "validate.episodes", 0)
+        if not isinstance(played, int) or played < 1:
             continue
         for step, share in zip(*run.metrics.get("val/success", ((), ())), strict=True):
             won, others = points.get(int(step) + 1, (0, 0))
@@ -116,14 +125,14 @@ def _plot_curves(axes: Axes, lines: dict[str, list[Row]], condition: str) -> Non
         rates = [row.interval(condition) for row in played]
         reach = [[rate - low for rate, low, _ in rates], [high - rate for rate, _, high in rates]]
         counts = [_demonstrations(row) for row in played]
-        axes.errorbar(counts, [rate for rate, _, _ in rates], reach, fmt="o-", capsize=3, label=name)
+        axes.errorbar(counts, [rate for rate, _, _ in rates], reach, fmt="o-", capsize=3, label=name, clip_on=False)
     axes.set_xscale("log")
     axes.set_xticks(sorted({_demonstrations(row) for line in lines.values() for row in line}))
     axes.xaxis.set_major_formatter("{x:g}")
     axes.xaxis.set_minor_formatter("")
-    axes.set_ylim(-0.02, 1.02)
+    axes.set_ylim(0, 1)
     axes.set_xlabel("demonstrations")
-    axes.set_title(condition, fontsize=10)
+    axes.set_title(condition.replace("_", " "), fontsize=10)
     if len(lines) > 1:
         axes.legend(frameon=False)
 
@@ -136,10 +145,10 @@ def _plot_training(axes: Axes, name: str, curves: dict[str, Points], counts: lis
         intervals = [wilson_interval(*point) for point in points.values()]
         colour = colormaps["viridis_r"]((counts.index(int(demonstrations)) + 1) / len(counts))
         rates = [won / played for won, played in points.values()]
-        axes.plot(list(points), rates, "o-", color=colour, markersize=4, label=demonstrations)
+        axes.plot(list(points), rates, "o-", color=colour, markersize=4, label=demonstrations, clip_on=False)
         low, high = [low for low, _ in intervals], [high for _, high in intervals]
         axes.fill_between(list(points), low, high, color=colour, alpha=0.1, linewidth=0)
-    axes.set_ylim(-0.02, 1.02)
+    axes.set_ylim(0, 1)
     axes.set_xlabel("steps of training")
     axes.set_title(", ".join(filter(None, (name, "in validation"))), fontsize=10)
 
@@ -149,26 +158,29 @@ def _plot_rows(axes: Axes, rows: list[Row], condition: str) -> None:
     for height, row in enumerate(rows):
         if condition in row.played:
             rate, low, high = row.interval(condition)
-            axes.errorbar(rate, height, xerr=[[rate - low], [high - rate]], fmt="o", color=f"C{height}", capsize=3)
+            reach, colour = [[rate - low], [high - rate]], f"C{height}"
+            axes.errorbar(rate, height, xerr=reach, fmt="o", color=colour, capsize=3, clip_on=False)
     if condition in rows[0].played:
         axes.axvline(rows[0].interval(condition)[0], color="C0", linewidth=0.8, linestyle=":")
     axes.set_yticks(range(len(rows)), [f"{row.name}, {row.parameters / 1e6:.2f} M" for row in rows])
     axes.set_ylim(len(rows) - 0.5, -0.5)
-    axes.set_xlim(-0.02, 1.02)
+    axes.set_xlim(0, 1)
+    axes.set_xticks([0, 0.25, 0.5, 0.75, 1], ["0", "", "0.5", "", "1"])
     axes.set_xlabel(SUCCESS)
-    axes.set_title(condition, fontsize=10)
+    axes.set_title(condition.replace("_", " "), fontsize=10)
 
 
 def _plot_costs(axes: Axes, rows: list[Row], condition: str) -> None:
-    """Success over the time of an action, in the colours of the rows; the area of a point grows with the parameters,
+    """Success over the time per action, in the colours of the rows; the area of a point grows with the parameters,
     and a line joins what nothing else beats in both."""
     from matplotlib.ticker import LogLocator
 
     for number, row in enumerate(rows):
         if condition in row.played:
             rate, low, high = row.interval(condition)
-            axes.errorbar(row.latency, rate, [[rate - low], [high - rate]], color="#c4c8ce", capsize=3, zorder=1)
-            axes.scatter(row.latency, rate, s=40 + 60 * (row.parameters / 1e6) ** 0.5, color=f"C{number}", alpha=0.9)
+            reach, area = [[rate - low], [high - rate]], 40 + 60 * (row.parameters / 1e6) ** 0.5
+            axes.errorbar(row.latency, rate, reach, color="#c4c8ce", capsize=3, zorder=1, clip_on=False)
+            axes.scatter(row.latency, rate, s=area, color=f"C{number}", alpha=0.9, clip_on=False)
     best = pareto(rows, condition)
     rates = [row.interval(condition)[0] for row in best]
     axes.plot([row.latency for row in best], rates, color="#8a8f98", linewidth=0.8, zorder=0)
@@ -177,7 +189,9 @@ def _plot_costs(axes: Axes, rows: list[Row], condition: str) -> None:
     axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
     axes.xaxis.set_major_formatter("{x:g}")
     axes.xaxis.set_minor_formatter("")
-    axes.set_xlabel("time of an action [ms]")
+    axes.set_ylim(0, 1)
+    axes.set_xlabel("time per action [ms]")
+    axes.set_title(condition.replace("_", " "), fontsize=10)
 
 
 def pareto(rows: list[Row], condition: str) -> list[Row]:

@@ -22,8 +22,10 @@ def benchmark(config: DictConfig, output: Path) -> dict[str, Measure]:
     """Measure what `config.benchmark.names` lists, print a table, write `benchmark.json`; name → measure.
 
     Raises:
-        ValueError: a name that is no stage.
+        ValueError: no name, or one that is no stage.
     """
+    if not config.benchmark.names:
+        raise ValueError(f"benchmark.names is empty: the stages are {', '.join(STAGES)}")
     unknown = sorted(set(config.benchmark.names) - set(STAGES))
     if unknown:
         raise ValueError(f"benchmark.names has {unknown}, the stages are {sorted(STAGES)}")

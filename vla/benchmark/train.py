@@ -7,6 +7,7 @@ import logging
 import os
 import shutil
 import time
+from collections.abc import Sequence
 from itertools import product
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -23,7 +24,10 @@ from vla.benchmark.memory import forget_peak, peak
 from vla.data.episodes import EpisodeStore
 from vla.models.flops import matmul_flops, peak_flops, training_flops
 from vla.parts import collected, make_data, make_learner
+from vla.processor import computes_on_processor, has_bfloat16
 from vla.trainer import enough_memory, make_trainer, quiet_lightning
+
+log = logging.getLogger(__name__)
 
 PRECISIONS = {"fp32": "32-true", "bf16": "bf16-mixed"}  # the trainer's names
 WARM_UP = 3  # steps of a round before the clock starts: the first ones allocate and compile
@@ -32,12 +36,15 @@ PEAK_SECONDS = 0.5  # per round, for the peak of a device that none is known of
 
 
 def measures(config: DictConfig) -> dict[str, Measure]:
-    """Training in every precision, compiled and not, five measures of each; and the loader alone.
+    """Training in every precision that is fast here, or that is asked for, compiled and not, five measures of each;
+    and the loader alone.
 
     - samples per second through the real trainer and loader, against forward, backward and optimiser step alone on one
       batch that is there, of the same precision, compiled alike;
     - how long a step waits for its batch, against how long it takes;
-    - the arithmetic of the model, against the peak of the device: the ratio is the model FLOPs utilisation;
+    - the arithmetic of the model, against the peak of the device: the ratio is the model FLOPs utilisation. Where no
+      data sheet gives the peak, it is the best rate that this run measured in the same precision, of matrix products
+      of several sizes (in mixed precision also of 32 bits) or of the model;
     - the memory at its fullest, on a CPU what training adds to the process, against gradients and the optimiser's two
       moments;
     - the mean loss of the later half of the steps, against that of the first kind: start and batches are the same.
@@ -47,15 +54,16 @@ def measures(config: DictConfig) -> dict[str, Measure]:
     Raises:
         ValueError: nothing is asked for, there is no compiler, or not enough memory.
     """
-    if not config.benchmark.precisions or not config.benchmark.compile:
+    on_processor = computes_on_processor(config.trainer.accelerator)
+    precisions = _precisions(config.benchmark.precisions, on_processor)
+    if not precisions or not config.benchmark.compile:
         raise ValueError("training is timed in each of benchmark.precisions and benchmark.compile: both need an entry")
-    on_gpu = torch.cuda.is_available() and config.trainer.accelerator != "cpu"
-    if any(config.benchmark.compile) and not on_gpu and not shutil.which(os.environ.get("CXX", "g++")):
+    if any(config.benchmark.compile) and on_processor and not shutil.which(os.environ.get("CXX", "g++")):
         raise ValueError("to compile for a CPU takes a C++ compiler: install g++, or set benchmark.compile=[false]")
     quiet_lightning()
     logging.getLogger("lightning.pytorch.profilers").setLevel(logging.WARNING)
     store = collected(config)
-    kinds = product(config.benchmark.precisions, sorted(set(config.benchmark.compile)))
+    kinds = product(precisions, sorted(set(config.benchmark.compile)))
     trials = [Trial(config, store, precision, compiled) for precision, compiled in kinds]
     loading = []
     for _ in range(config.benchmark.rounds):
@@ -65,11 +73,20 @@ def measures(config: DictConfig) -> dict[str, Measure]:
         loading.append(trials[0].load())
     found: dict[str, Measure] = {}
     for trial in trials:
-        peak = max(other.peak for other in trials if other.precision == trial.precision)
+        peak = max(max(other.peak, other.rate) for other in trials if other.precision == trial.precision)
         found |= trial.measures(peak, trials[0].loss)
     fastest = max(trial.samples / trial.best.seconds for trial in trials)
     found["train: loader alone"] = measure(trials[0].samples / min(loading), "samples/s", trials[0].samples, fastest)
     return found
+
+
+def _precisions(asked: Sequence[str] | None, on_processor: bool) -> Sequence[str]:
+    if asked is not None:
+        return asked
+    if on_processor and not has_bfloat16():
+        log.info("bf16 is left out: this processor has no instructions for it; benchmark.precisions=[bf16] times it")
+        return ["fp32"]
+    return list(PRECISIONS)
 
 
 class Round(NamedTuple):
@@ -113,6 +130,11 @@ class Trial(lightning.Callback):
         self._rounds: list[Round] = []
 
     @property
+    def rate(self) -> float:
+        """The best rate of the model [FLOP/s], within the training or without it."""
+        return self._flops * self.steps / min(min(each.seconds, each.alone) for each in self._rounds)
+
+    @property
     def best(self) -> Round:
         """The fastest round."""
         return min(self._rounds, key=lambda each: each.seconds)
@@ -127,6 +149,8 @@ class Trial(lightning.Callback):
         with TemporaryDirectory() as folder:
             trainer = make_trainer(self._config, Path(folder), self)
             trainer.fit(self._learner, datamodule=data)
+            if trainer.received_sigterm:  # in the last hook, after which Lightning would go on as if nothing were
+                raise KeyboardInterrupt
         profiler: SimpleProfiler = trainer.profiler  # type: ignore[attr-defined]
         waiting = sum(profiler.recorded_durations[WAITING][WARM_UP : WARM_UP + self.steps])
         self._rounds.append(Round(self._marks[1] - self._marks[0], waiting, self._alone, self._memory))
@@ -175,7 +199,7 @@ class Trial(lightning.Callback):
         precision = PRECISIONS[self.precision]
         known = peak_flops(device, precision)
         self.peak = max(self.peak, known or matmul_flops(device, precision, PEAK_SECONDS))
-        self._whose = "the data sheet" if known else "a matmul here"
+        self._whose = "the data sheet" if known else "measured rates"
         del self._batch
 
     def measures(self, peak: float, loss: float) -> dict[str, Measure]:

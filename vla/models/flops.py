@@ -1,6 +1,7 @@
 """How much arithmetic a training step takes, and how much a device can do.
 
-The model FLOPs utilisation of a training is `training_flops` times batches per second, over the peak of its device.
+The model FLOPs utilisation of a training is `training_flops` times batches per second, over the peak of its device:
+`peak_flops` of its data sheet, else the best rate that was measured, by `matmul_flops` or in the training itself.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from torch.utils.flop_counter import FlopCounterMode, conv_flop_count
 from vla.models.model import Batch, Model
 
 WINDOWS = 2  # to count on: batch normalisation wants more than one value
+SIZES = (128, 256, 512, 1024, 2048, 4096, 8192)  # of matrices whose products are timed
 
 # Rates of dense matrix multiplication [FLOP/s], bfloat16 or float16, TensorFloat-32, float32 without tensor cores, from
 # NVIDIA's data sheets of H100, H200, A100 and L40S, which print twice these rates for tensor cores where they assume
@@ -80,7 +82,7 @@ def peak_flops(device: torch.device, precision: str) -> float | None:
     """What a device can do at most [FLOP/s] in a precision of Lightning's trainer, such as "bf16-mixed".
 
     In 32 bits it depends on `torch.get_float32_matmul_precision()`. None for what no data sheet is known of: a CPU,
-    another GPU, a slice of one, another precision; `matmul_flops` measures that.
+    another GPU, a slice of one, another precision; `matmul_flops` measures a rate to compare with.
     """
     words = set(re.split("[ -]", torch.cuda.get_device_name(device))) if device.type == "cuda" else set()
     if "MIG" in words:
@@ -95,18 +97,32 @@ def peak_flops(device: torch.device, precision: str) -> float | None:
 
 
 def matmul_flops(device: torch.device, precision: str, seconds: float = 1.0) -> float:
-    """What a device does at best [FLOP/s] in one large matrix product after the other, for some seconds.
+    """The best rate [FLOP/s] of square matrix products of several sizes on a device, measured for about some seconds.
 
-    On a device of no known peak this is the one to compare with: nothing that is made of matrix products is faster.
+    It stands in for the peak where no data sheet gives one. Mixed precisions compute in 32 bits as well, so their rate
+    is the better one of both. Sizes whose single product would take longer than all others together are left out.
     """
-    size = 8192 if device.type == "cuda" else 2048
-    types = {"bf16": torch.bfloat16, "16": torch.float16, "64": torch.float64}
-    matrix = torch.randn(size, size, device=device, dtype=types.get(precision.partition("-")[0], torch.float32))
-    shortest, end = float("inf"), time.perf_counter() + seconds
-    while time.perf_counter() < end:
-        started = time.perf_counter()
-        matrix @ matrix
-        if device.type == "cuda":
-            torch.cuda.synchronize(device)
-        shortest = min(shortest, time.perf_counter() - started)
-    return 2 * size**3 / shortest
+    short = {"bf16": torch.bfloat16, "16": torch.float16, "64": torch.float64}
+    kinds = {short.get(precision.partition("-")[0], torch.float32)}
+    kinds |= {torch.float32} if precision.endswith("mixed") else set()
+    return max(_best_rate(device, kind, seconds / len(kinds)) for kind in kinds)
+
+
+def _best_rate(device: torch.device, kind: torch.dtype, seconds: float) -> float:
+    best = 0.0
+    for size in SIZES:
+        flops = 2 * size**3
+        if best and flops / best > seconds:
+            break
+        matrix = torch.randn(size, size, device=device).to(kind)
+        end = time.perf_counter() + seconds / len(SIZES)
+        while True:
+            started = time.perf_counter()
+            matrix @ matrix
+            if device.type == "cuda":
+                torch.cuda.synchronize(device)
+            ended = time.perf_counter()
+            best = max(best, flops / (ended - started))
+            if ended > end:
+                break
+    return best

@@ -1,0 +1,98 @@
+"""What a run left is read as its types, whoever wrote it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from itertools import count
+from pathlib import Path
+from typing import Any
+
+import pytest
+from test_page import CONFIG, a_run
+
+from vla.page import write_comparison
+from vla.results import note_choice, note_training, read_run, run_of
+from vla.run_files import Change, Training
+
+BOMB = "a: &a [x, x]\nb: &b [*a, *a]\nc: [*b, *b]\n"
+
+
+def changed(**values: Any) -> Callable[[str], str]:
+    """What makes another text of a JSON object: some of its values changed."""
+    return lambda text: json.dumps({**json.loads(text), **values})
+
+
+def test_what_was_written_is_read(tmp_path: Path) -> None:
+    folder = a_run(tmp_path / "run", "sd")
+    note_training(folder, 12, 40, 3.04, "done", 2.0)
+    note_choice(folder, "best.ckpt")
+    run = run_of(folder / "checkpoints/best.ckpt")
+    assert run.training == Training(12, 40, 3.0, "done", 2.0, "best.ckpt")
+    assert (run.chosen, run.model, run.goal, run.budget(1.0)) == ("best.ckpt", "BC", "", 6.0)
+    assert run.changes == [Change("model.width", 16, 32)] and run.config["task"] == CONFIG["task"]
+    assert run.report is not None and run.report.successes == 1
+    assert [result.outcome for result in run.reports["seen"].results] == ["success", "dropped"]
+    assert [result.outcome for result in run.reports["dark"].results] == ["dropped", "dropped"]
+
+
+@pytest.mark.parametrize(
+    ("file", "content", "says"),
+    [
+        ("report.json", "[1]", r"report\.json is damaged or of another kind"),
+        ("report.json", "{}", r"report\.json is damaged or of another kind: .*Field required"),
+        ("report.json", "{", r"report\.json is damaged or of another kind: .*JSON"),
+        ("report.json", "[" * 10**6, r"report\.json is damaged .*recursion limit"),
+        ("report.json", changed(success=2), r"success: Input should be less than or equal to 1"),
+        ("report.json", changed(success=float("nan")), r"success: Input should be a finite number"),
+        ("report.json", changed(seeds=[1]), r"per_episode is about other episodes than seeds"),
+        ("report.json", changed(per_episode=[{"seed": "x", "outcome": 1}]), r"per_episode\[0\]\.seed: "),
+        ("report.json", changed(conditions={"dark": 3}), r"conditions\.dark: "),
+        ("config.yaml", "- 1", r"config\.yaml is damaged or of another kind: Input should be an object"),
+        ("config.yaml", BOMB, r"config\.yaml is nested deeper than \d+ levels, or has aliases"),
+        ("config.yaml", "a: [" * 10**5, r"config\.yaml is nested deeper"),
+        ("config.yaml", "# " + "x" * (2 << 20), r"config\.yaml has \d+ bytes, more than"),
+        ("config.yaml", "a: !!python/object/apply:os.getcwd []", r"config\.yaml is no plain YAML"),
+        ("changes.yaml", "key: 1", r"changes\.yaml is damaged or of another kind"),
+        ("changes.yaml", "- {key: 1, here: 2}", r"\[0\]\.key: .*; \[0\]\.default: Field required"),
+        ("training.json", "[]", r"training\.json is damaged or of another kind"),
+        ("training.json", "{}", r"parameters: Field required"),
+        ("training.json", changed(checkpoint="../../other.ckpt"), r"checkpoint: String should match pattern"),
+        ("metrics.csv", "epoch,train/loss\n0,1\n", r"metrics\.csv is damaged in line 1: there is no column step"),
+        ("metrics.csv", "step,train/loss\n9,1\nten,2\n", r"metrics\.csv is damaged in line 3: .*'ten'"),
+        ("metrics.csv", "step,train/loss\n9,low\n", r"line 2: could not convert"),
+        ("metrics.csv", "step,train/loss\n9,1,2\n", r"line 2: .*longer"),
+        ("metrics.csv", "step,train/loss\n9," + "1" * 10**6, r"line 2: field larger"),
+    ],
+    ids=count(),
+)
+def test_a_file_of_another_kind_is_refused_by_name_with_a_way_out(
+    file: str, content: str | Callable[[str], str], says: str, tmp_path: Path
+) -> None:
+    folder = a_run(tmp_path / "run")
+    note_training(folder, 12, 40, 3.0, "done")
+    path = folder / file
+    path.write_text(content if isinstance(content, str) else content(path.read_text()))
+    with pytest.raises(ValueError, match=says) as refused:
+        write_comparison([folder], tmp_path / "new")
+    told = str(refused.value)
+    assert str(path) in told and told.endswith("; remove the file to do without it, or repeat the run")
+    assert "\n" not in told and len(told) < 1000 and not (tmp_path / "new").exists()
+
+
+@pytest.mark.parametrize("config", [{}, {"task": 3, "model": [1], "collect": None, "trainer": "x", "validate": 1}])
+def test_a_configuration_with_other_things_in_it_is_shown_as_it_is(config: dict[str, Any], tmp_path: Path) -> None:
+    folder, other = a_run(tmp_path / "run"), a_run(tmp_path / "other")
+    (folder / "config.yaml").write_text(json.dumps(config))
+    report = folder / "report.json"
+    report.write_text(json.dumps({**json.loads(report.read_text()), "config": config}))
+    page = write_comparison([folder, other], tmp_path).read_text()
+    assert "model" in page
+
+
+def test_a_row_that_a_killed_process_left_half_is_skipped(tmp_path: Path) -> None:
+    (tmp_path / "metrics.csv").write_text("epoch,step,train/loss\n0,9,2.5\n0,1")
+    steps, values = read_run(tmp_path).metrics["train/loss"]
+    assert (steps.tolist(), values.tolist()) == ([9], [2.5])
+    (tmp_path / "metrics.csv").write_text("")
+    assert read_run(tmp_path).metrics == {}
