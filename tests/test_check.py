@@ -109,7 +109,7 @@ def test_an_unknown_key_is_named_with_what_was_probably_meant() -> None:
         ),
         ("expert.perturb.start", None, "expert.perturb.start must be float, at least 0, at most 1, got None"),
         ("collect.workers", "all", "collect.workers must be int, at least 1 or null, got 'all'"),
-        ("seed", "first", "seed must be int, at least 0, got 'first'"),
+        ("seed", "first", "seed must be int, at least 0, at most 4294967295, got 'first'"),
         ("task.meshes", "lite", "task.meshes must be one of light, full, got 'lite', did you mean light?"),
         ("evaluate.episodes", 0, "evaluate.episodes must be int, at least 1, got 0"),
         (
