@@ -16,11 +16,12 @@ from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import GetState
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import Image, JointState
-from std_msgs.msg import Float64MultiArray
+from std_msgs.msg import Float64MultiArray, String
 from std_srvs.srv import Trigger
-from test_session import HOME, ROBOT
-from world import World
+from test_session import HOME, ROBOT, SPEC
+from world import KINDS, World, positions
 
+from vla.deploy import messages
 from vla.deploy.ros import NETWORKS
 from vla.deploy.session import State
 
@@ -162,6 +163,52 @@ def test_stop_and_resume(world: World) -> None:
     assert world.becomes(State.RUNNING)
 
 
+def test_an_instruction_that_a_stop_keeps_from_being_followed_is_answered(
+    world: World, capfd: pytest.CaptureFixture[str]
+) -> None:
+    assert world.ask(Trigger, "stop", Trigger.Request()).success
+    world.words.publish(String(data="put the blue block on the pad"))
+    said = "heard, but stopped: 'put the blue block on the pad'; stopped by request; to go on: python -m vla.deploy.say"
+    world.live(5.0, until=lambda: world.statuses[-1].message.startswith(said))
+    assert world.state is State.STOPPED and capfd.readouterr().err.count(said) == 1
+    assert world.ask(Trigger, "resume", Trigger.Request()).success
+    assert world.becomes(State.RUNNING)
+    world.live(5.0, until=lambda: world.policy.seen[-1].instruction == "put the blue block on the pad")
+    assert world.policy.seen[-1].instruction == "put the blue block on the pad"
+
+
+def test_an_instruction_too_long_is_dropped_and_the_former_one_followed(
+    world: World, capfd: pytest.CaptureFixture[str]
+) -> None:
+    world.words.publish(String(data="push " * 10**5))
+    world.live(1.0)
+    assert world.becomes(State.RUNNING) and world.policy.seen[-1].instruction == "put the red block on the pad"
+    printed = capfd.readouterr().err
+    assert "an instruction of 500000 characters, at most 1000 fit" in printed and len(printed) < 2000
+    world.words.publish(String(data=("push " * 200).strip()))
+    world.live(5.0, until=lambda: world.policy.seen[-1].instruction.startswith("push"))
+    told = {pair.key: pair.value for pair in world.statuses[-1].values}
+    assert len(world.policy.seen[-1].instruction) == 999 and len(told["instruction"]) <= 80
+
+
+def test_images_of_another_size_are_fitted_and_that_is_said_once(
+    world: World, capfd: pytest.CaptureFixture[str]
+) -> None:
+    pixels = np.zeros((30, 40, 3), np.uint8)
+    pixels[:, 5:35] = 200  # the centre
+
+    def enlarge(image: Image) -> None:
+        messages.fill_image(image, pixels, "camera")
+
+    world.changed = enlarge
+    world.live(0.8)
+    assert world.becomes(State.RUNNING)
+    assert {image.shape for image in world.policy.seen[-1].rgb.values()} == {(8, 8, 3)}
+    assert all((image == 200).all() for image in world.policy.seen[-1].rgb.values())
+    said = "images of 40 by 30 pixels are cropped at the centre to 30 by 30 and resized to 8 by 8"
+    assert capfd.readouterr().err.count(said) == 2  # cameras
+
+
 def test_somebody_else_who_commands_the_arm_is_a_fault(world: World) -> None:
     other = world.node.create_publisher(JointState, "/commands", 1)
     assert world.becomes(State.FAULT)
@@ -198,6 +245,24 @@ def test_deactivation_brakes_first(world: World) -> None:
     assert np.abs(steps[count // 2 : count]).max() > 0 and not steps[-1].any()
     change = np.abs(np.diff(steps, axis=0)).max(0)
     assert (change <= ROBOT.hardest * 0.02**2 + 1e-9).all()
+
+
+@pytest.mark.parametrize("command", KINDS)
+def test_limits_hold_from_one_message_to_the_next(make_world: Callable[..., World], command: str) -> None:
+    """A controller replaces what is left of a trajectory by the next one, while the goals jump about."""
+    world = make_world(command, "--ros-args", "-p", "speed_share:=0.25", "-p", "acceleration_share:=0.05")
+    generator = np.random.default_rng(0)
+    world.policy.action = lambda: generator.uniform(SPEC.low, SPEC.high, (1, 7)).astype(np.float32)
+    world.start()
+    world.live(1.5)
+    reached: list[np.ndarray] = []
+    fastest, hardest = 0.25 * np.array(ROBOT.speed), 0.05 * np.array(ROBOT.acceleration)
+    for ahead in map(positions, world.commands):
+        speeds = np.diff([*reached[-2:], *ahead], axis=0) / 0.02
+        assert (np.abs(speeds) <= fastest + 1e-9).all()
+        assert (np.abs(np.diff(speeds, axis=0)) / 0.02 <= hardest + 1e-6).all()
+        reached.append(ahead[0])
+    assert len(reached) > 50 and np.ptp(reached, axis=0).max() > 0.05
 
 
 def test_trajectories_end_at_rest(make_world: Callable[..., World]) -> None:

@@ -28,8 +28,10 @@ from test_run import SMALL, vla
 from vla.deploy import messages
 from vla.deploy.bag import HEARD
 from vla.deploy.governor import Robot
+from vla.deploy.images import fitted
 from vla.deploy.ros import Network, split_arguments
 from vla.record import VIEWER
+from vla.tasks import backend
 
 WORKER = int(os.environ.get("PYTEST_XDIST_WORKER", "gw0").removeprefix("gw"))
 DOMAIN = 15 + 20 * (WORKER % 5)
@@ -166,6 +168,9 @@ def test_when_the_agent_is_killed_the_simulator_holds_the_arm(
     ear.until(lambda: ear.moved() > 1e-3)
     refused = start("vla.deploy.say", "--resume", "put the blue block on the pad")
     assert "error: there is nothing to resume" in refused.communicate(timeout=30)[0] and refused.returncode == 1
+    reset = start("vla.deploy.say", "--reset", "put the blue block on the pad")
+    assert reset.communicate(timeout=30)[0].startswith('episode 1000001: "') and reset.returncode == 0
+    ear.until(lambda: ear.moved() > 1e-3)
     agent.kill()
     ear.listen(0.5)
     heard = len(ear.states)
@@ -242,7 +247,7 @@ def test_what_the_node_thinks_is_what_the_evaluated_policy_does(home: Path) -> N
         state.velocity = [*observation.velocities.tolist(), 0.0, 0.0]
         joints, velocities, gripper = messages.joints_from(state, robot)
         size = environment.spec.image_size
-        rgb = {camera: messages.image_from(message, size) for camera, message in images.items()}
+        rgb = {camera: fitted(messages.image_from(message), size, "centre") for camera, message in images.items()}
         seen = Observation(rgb, {}, joints.astype(np.float32), velocities, gripper, observation.instruction)
         np.testing.assert_array_equal(deployed.plan(seen)[0], action)
         observation = environment.step(action)
@@ -264,12 +269,24 @@ def test_what_is_for_ros_is_kept_from_hydra() -> None:
         ([CHECKPOINT, "deploy=ros2", "deploy.command=velocity"], "joint_state, trajectory, forward"),
         ([CHECKPOINT, "deploy=ros2", "deploy.network.profile=nowhere.xml"], "nowhere.xml"),
         ([CHECKPOINT, "deploy=ros2", "deploy.robot.speed_share=2"], "speed_share"),
+        ([CHECKPOINT, "deploy=ros2", "deploy.network.domain=9999"], "9999"),
+        ([CHECKPOINT, "deploy=ros2", "deploy.topics.commands='bad topic!'"], "topics.commands is 'bad topic!'"),
+        ([CHECKPOINT, "deploy=ros2", "--ros-args", "--nonsense"], "--nonsense"),
+        ([CHECKPOINT, "deploy=ros2", "--ros-args", "-p", "command_hz:=0.0"], "command_hz out of range"),
+        ([CHECKPOINT, "deploy=loop", "deploy.episodes=0"], "deploy.episodes"),
         ([CHECKPOINT, "deploy=ros2", "~deploy.topics.images.wrist"], "wrist"),
     ],
 )
 def test_what_cannot_be_deployed_ends_in_one_sentence(home: Path, arguments: list[str], words: str) -> None:
     done = vla(home, "job=deploy", *arguments, ok=False)
-    assert words in done.stderr and "Traceback" not in done.stderr
+    # What is found by the node itself stands in its log as well.
+    assert re.fullmatch(r"(\[ERROR\] .*\n)?error: .*\n", done.stderr) and words in done.stderr
+
+
+def test_an_instruction_that_nobody_would_hear_is_not_said(start: Callable[..., subprocess.Popen[str]]) -> None:
+    said = start("vla.deploy.say", "push " * 201)
+    assert said.communicate(timeout=30)[0].startswith("error: the instruction has 1005 characters")
+    assert said.returncode == 1
 
 
 def test_a_damaged_checkpoint_is_named_before_anything_starts(home: Path) -> None:
@@ -284,10 +301,21 @@ def test_a_damaged_checkpoint_is_named_before_anything_starts(home: Path) -> Non
 def test_without_ros_the_way_out_is_named(home: Path) -> None:
     (home / "without").mkdir()
     (home / "without/rclpy.py").write_text("raise ImportError('not here')")
-    environment = {**os.environ, "PYTHONPATH": str(home / "without")}
+    paths = [str(home / "without"), *filter(None, [os.environ.get("PYTHONPATH")])]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(paths)}
     command = [sys.executable, "-m", "vla.run", "job=deploy", "deploy=ros2", CHECKPOINT]
     done = subprocess.run(command, cwd=home, env=environment, capture_output=True, text=True)
     assert done.returncode == 1 and "vla[ros]" in done.stderr and "Traceback" not in done.stderr
+
+
+def test_a_policy_is_deployed_where_nothing_renders(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(backend, "PROBE", "raise SystemExit(1)")
+    for name in ("MUJOCO_GL", "DISPLAY", backend.TRIED):
+        monkeypatch.delenv(name, raising=False)
+    with pytest.raises(RuntimeError, match="nothing here can render with MUJOCO_GL=egl or osmesa"):
+        backend.choose_backend()
+    backend.choose_backend(required=False)
+    assert os.environ["MUJOCO_GL"] == "disabled"
 
 
 def test_a_ros_installation_finds_the_node() -> None:

@@ -73,6 +73,16 @@ def test_braking_ends_at_rest_within_what_the_acceleration_allows(governor: Gove
     assert governor.resting
 
 
+def test_a_speed_limit_that_is_lowered_on_the_way_is_reached_by_braking(governor: Governor) -> None:
+    for _ in range(50):
+        governor.step(np.array([0.9, 1.9]))
+    fast = governor.velocity
+    governor.robot = replace(ROBOT, speed_share=0.1)
+    steps = [fast, *(governor.velocity for _ in range(30) if governor.step(np.array([0.9, 1.9])) is not None)]
+    assert (np.abs(np.diff(steps, axis=0)) <= ROBOT.hardest * PERIOD + 1e-9).all()
+    assert (np.abs(fast) > governor.robot.fastest).any() and (np.abs(steps[-1]) <= governor.robot.fastest + 1e-9).all()
+
+
 def test_the_first_command_is_the_measured_pose() -> None:
     governor = Governor(ROBOT, PERIOD)
     governor.start(np.array([0.3, -0.4]))

@@ -44,7 +44,10 @@ PARTS = {
     "vla.samples": ("vla.spec", "vla.report"),
     "vla.page": ("vla.evaluate", "vla.report", "vla.suite", "vla.results", "vla.curves", "vla.film"),
     "vla.card": ("vla.spec", "vla.data", "vla.report"),
-    "vla.deploy": ("vla.spec", "vla.policy", "vla.tasks", "vla.data", "vla.evaluate", "vla.record", "vla.deploy"),
+    "vla.deploy": (
+        *("vla.spec", "vla.policy", "vla.tasks", "vla.data", "vla.evaluate", "vla.record", "vla.deploy"),
+        *("vla.documents", "vla.types"),
+    ),
     "vla.stores": ("vla",),
     "vla.types": (),
     "vla.documents": (),

@@ -41,14 +41,14 @@ def joints(**changed: Any) -> Any:
 
 
 def test_an_image_goes_there_and_back() -> None:
-    np.testing.assert_array_equal(messages.image_from(image(), (2, 3)), PIXELS)
+    np.testing.assert_array_equal(messages.image_from(image()), PIXELS)
 
 
 def test_padded_rows_and_other_encodings_are_understood() -> None:
     padded = np.full((2, 16), 255, np.uint8)
     padded[:, :12] = np.concatenate([PIXELS[..., ::-1], np.zeros((2, 3, 1), np.uint8)], -1).reshape(2, 12)
     message = image(encoding="bgra8", step=16, data=padded.tobytes())
-    np.testing.assert_array_equal(messages.image_from(message, (2, 3)), PIXELS)
+    np.testing.assert_array_equal(messages.image_from(message), PIXELS)
 
 
 @pytest.mark.parametrize(
@@ -58,12 +58,14 @@ def test_padded_rows_and_other_encodings_are_understood() -> None:
         ({"data": b"abc"}, "3 bytes, 2 rows of 9 are 18"),
         ({"step": 8}, "step is 8 bytes, 3 pixels of rgb8 need 9"),
         ({"step": 10}, "2 rows of 10"),
-        ({"height": 1}, "1 by 3 pixels, the policy was trained on 2 by 3"),
+        ({"encoding": "x" * 10**6}, "encoding is 'x{79}…', understood"),
+        ({"height": 0, "data": b""}, "3 by 0 pixels"),
+        ({"height": 2**31, "width": 2**31, "step": 2**33}, "18 bytes"),
     ],
 )
 def test_an_image_that_is_none_is_refused(changed: dict, reason: str) -> None:
     with pytest.raises(ValueError, match=reason):
-        messages.image_from(image(**changed), (2, 3))
+        messages.image_from(image(**changed))
 
 
 def test_joints_are_found_by_name() -> None:

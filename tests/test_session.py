@@ -207,7 +207,8 @@ def test_a_stop_lasts_until_resumed(world: World) -> None:
     world.session.stop("by hand")
     commands = world.run(1.0)
     assert world.session.state is State.STOPPED and not commands[-1].velocity.any()
-    world.session.listen("put the blue block on the pad", world.now)
+    assert world.session.reason.startswith("by hand; to go on: python -m vla.deploy.say --resume")
+    assert not world.session.listen("put the blue block on the pad", world.now)
     world.run(0.2)
     assert world.session.state is State.STOPPED
     assert world.session.resume(world.now)
@@ -226,7 +227,25 @@ def test_one_instruction_is_not_worked_on_for_ever() -> None:
     world.session.listen("go", world.now)
     world.answer = lambda observation: np.zeros((1, 7))
     world.run(1.5)
-    assert world.session.state is State.STOPPED and "1 s on one instruction" in world.session.reason
+    assert world.session.state is State.STOPPED
+    assert world.session.reason == "1 s on one instruction are over; to go on: say what to do next"
+
+
+def test_the_next_instruction_ends_a_stop_because_the_time_was_up_and_no_other() -> None:
+    world = World(Safety(instruction=1.0))
+    world.run(0.1)
+    world.session.listen("go", world.now)
+    world.run(1.5)
+    assert world.session.state is State.STOPPED
+    assert world.session.listen("go", world.now)
+    world.run(0.5)
+    assert world.session.state is State.RUNNING
+    world.run(1.0)
+    assert world.session.state is State.STOPPED
+    world.session.stop("by hand")  # on top of the other one
+    assert not world.session.listen("go on", world.now)
+    world.run(0.5)
+    assert world.session.state is State.STOPPED and "by hand" in world.session.reason
 
 
 def test_an_arm_that_does_not_follow_is_a_fault(world: World) -> None:
@@ -249,6 +268,23 @@ def test_what_lies_ahead_ends_at_rest(world: World) -> None:
     assert not ahead[-1].velocity.any() and ahead[0].velocity.any()
     moved = np.diff([command.position for command in ahead], axis=0) / 0.02
     assert (np.abs(moved) <= ROBOT.fastest + 1e-9).all()
+
+
+def test_what_lies_ahead_follows_from_the_command_whatever_changes() -> None:
+    """A controller that is sent a new trajectory every tick, and one that is sent no more, keep to the limits."""
+    world = World()
+    generator = np.random.default_rng(0)
+    world.answer = lambda observation: generator.uniform(SPEC.low, SPEC.high, (1, 7))
+    world.run(0.1)
+    world.session.listen("go", world.now)
+    sent: list[np.ndarray] = []
+    for command in world.ticks(2.0):
+        ahead = [each.position for each in world.session.horizon(world.now)]
+        sent.append(command.position)
+        speeds = np.diff([*sent[-3:], *ahead], axis=0) / 0.02
+        assert (np.abs(speeds) <= ROBOT.fastest + 1e-9).all()
+        assert (np.abs(np.diff(speeds, axis=0)) / 0.02 <= ROBOT.hardest + 1e-6).all()
+    assert np.ptp(sent, axis=0).max() > 0.1
 
 
 def test_a_new_instruction_is_looked_at_with_the_next_frame(world: World) -> None:

@@ -41,17 +41,18 @@ class Forward:
     def __init__(self) -> None:
         self.seen: list[Observation] = []
         self.fails, self.takes, self.chunk = False, 0.0, 1
+        self.action: Callable[[], Array] = lambda: FORWARD
 
     def reset(self, instruction: str, seed: int) -> None:
         """Forget nothing: there is nothing to forget."""
 
     def plan(self, observation: Observation) -> Array:
-        """One centimetre along x, again and again."""
+        """One centimetre along x, again and again, or what a test wants."""
         self.seen.append(observation)
         time.sleep(self.takes)
         if self.fails:
             raise RuntimeError("no idea")
-        return np.repeat(FORWARD, self.chunk, 0)
+        return np.repeat(self.action(), self.chunk, 0)
 
 
 class World:
@@ -111,8 +112,8 @@ class World:
                 self.simulated += 0.02
                 self.clock.publish(Clock(clock=self._now()))
             if self.feels:
-                if self.commands and isinstance(self.commands[-1], JointState):
-                    self.joints = np.array(self.commands[-1].position[:7])
+                if self.commands:
+                    self.joints = positions(self.commands[-1])[0]
                 self.states.publish(joint_state(self.joints))
             if tick % 5 == 0:
                 for camera in self.cameras:
@@ -171,6 +172,13 @@ class World:
             node.destroy_node()
         for context in self.contexts:
             rclpy.try_shutdown(context=context)
+
+
+def positions(command: Any) -> Array:
+    """(N, 7) where a command sends the arm, tick by tick [rad]."""
+    if isinstance(command, JointTrajectory):
+        return np.array([point.positions for point in command.points])
+    return np.array([command.position[:7] if isinstance(command, JointState) else command.data])
 
 
 def joint_state(joints: Array) -> JointState:

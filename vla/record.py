@@ -108,10 +108,7 @@ class _Writer:
 
     def shapes(self, shapes: Iterable[Shape]) -> None:
         """The geometry of every body, in its own frame."""
-        self._static("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP)
-        for shape in shapes:
-            place = rr.Transform3D(translation=shape.position, quaternion=_xyzw(shape.quaternion))
-            self._static(_path("world", shape.body, shape.name), place, _solid(shape))
+        draw_shapes(self._stream, shapes)
 
     def poses(self, poses: Sequence[Mapping[str, Array]]) -> None:
         """Body poses, only at the steps where they changed: for many bodies that is never."""
@@ -125,14 +122,14 @@ class _Writer:
         """Colour as JPEG, depth as lossless 16-bit PNG [mm]."""
         steps = np.arange(len(observations))
         for camera in observations[0].rgb:
-            blobs = [_encoded(seen.rgb[camera], "JPEG", quality=90) for seen in observations]
+            blobs = [encoded(seen.rgb[camera], "JPEG", quality=90) for seen in observations]
             columns = rr.EncodedImage.columns(blob=blobs, media_type=["image/jpeg"] * len(blobs))
             self._columns(_path("camera", camera, "rgb"), steps, columns)
         for camera in observations[0].depth:
             path, some = _path("camera", camera, "depth"), np.stack([seen.depth[camera] for seen in observations[::8]])
             shades = np.percentile(some[some > 0], (1, 90)) if some.any() else (0.0, 1.0)
             self._static(path, rr.EncodedDepthImage.from_fields(meter=1000.0, depth_range=shades, colormap="turbo"))
-            blobs = [_encoded(seen.depth[camera], "PNG", compress_level=1) for seen in observations]
+            blobs = [encoded(seen.depth[camera], "PNG", compress_level=1) for seen in observations]
             columns = rr.EncodedDepthImage.columns(blob=blobs, media_type=["image/png"] * len(blobs))
             self._columns(path, steps, columns)
 
@@ -163,7 +160,7 @@ class _Writer:
         levels[:, ::row] = 0  # a line between rows
         shades = np.linspace(0, 255, len(HEAT))
         palette = np.stack([np.interp(np.arange(256), shades, channel) for channel in HEAT.T], axis=1).astype(np.uint8)
-        blobs = [_encoded(picture, "PNG", palette=palette, compress_level=1) for picture in levels]
+        blobs = [encoded(picture, "PNG", palette=palette, compress_level=1) for picture in levels]
         self._columns("tokens", steps, rr.EncodedImage.columns(blob=blobs, media_type=["image/png"] * len(blobs)))
         beside = [(-32.0, (index + 0.5) * row) for index in range(components)]
         self._static("tokens/names", rr.Points2D(beside, labels=self._spec.action, radii=0.0, show_labels=True))
@@ -183,6 +180,21 @@ class _Writer:
         self._stream.send_columns(path, [rr.TimeColumn("step", sequence=steps), seconds], columns)
 
 
+def draw_shapes(stream: rr.RecordingStream, shapes: Iterable[Shape]) -> None:
+    """The geometry of every body, in its own frame."""
+    stream.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+    for shape in shapes:
+        place = rr.Transform3D(translation=shape.position, quaternion=_xyzw(shape.quaternion))
+        stream.log(_path("world", shape.body, shape.name), place, _solid(shape), static=True)
+
+
+def draw_poses(stream: rr.RecordingStream, poses: Mapping[str, Array]) -> None:
+    """Where the bodies of `draw_shapes` are now."""
+    for body, pose in poses.items():
+        place = rr.Transform3D(translation=pose[:3], quaternion=_xyzw(pose[3:]))
+        stream.log(_path("world", body), place)
+
+
 def _path(*parts: str) -> str:
     """Entity path; a slash within a name would hang one body below another."""
     return "/".join(part.replace("/", ".") for part in parts)
@@ -192,7 +204,8 @@ def _xyzw(wxyz: Array) -> Any:
     return np.asarray(wxyz)[..., [1, 2, 3, 0]]
 
 
-def _encoded(pixels: Array, kind: str, palette: Array | None = None, **options: int) -> bytes:
+def encoded(pixels: Array, kind: str, palette: Array | None = None, **options: int) -> bytes:
+    """An image file of `kind`, "PNG" or "JPEG", with Pillow's `options` for it."""
     image, buffer = Image.fromarray(pixels), io.BytesIO()
     if palette is not None:
         image.putpalette(palette.tobytes())

@@ -108,10 +108,11 @@ def _devices(trainer: DictConfig) -> int:
 def _do(cfg: DictConfig) -> float | None:
     from vla import jobs
 
-    if "task" in JOBS.get(cfg.job, ()):
+    if cfg.checkpoint is not None or "task" in JOBS.get(cfg.job, ()):
         from vla.tasks.backend import choose_backend
 
-        choose_backend()  # before a check imports MuJoCo, which reads MUJOCO_GL at once
+        # Before a check imports MuJoCo, which reads MUJOCO_GL at once; a policy on a robot does not render.
+        choose_backend(required=cfg.job != "deploy")
     said = HydraConfig.get().overrides.task
     if cfg.pretrained is not None:
         cfg = start_from(cfg, said)

@@ -8,7 +8,7 @@ from collections import deque
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import asdict, replace
 from functools import partial
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 from builtin_interfaces.msg import Duration
@@ -16,6 +16,7 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor, SetParametersResult
 from rclpy.clock import Clock, ClockType
 from rclpy.context import Context
+from rclpy.exceptions import ParameterException
 from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import Image, JointState
@@ -23,13 +24,13 @@ from std_msgs.msg import Float64MultiArray, String
 from std_srvs.srv import Trigger
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
-from vla.deploy import messages
+from vla.deploy import images, messages
 from vla.deploy.governor import Robot
 from vla.deploy.managed import Managed
 from vla.deploy.ros2 import Ros2
 from vla.deploy.session import Session, State
 from vla.policy import Policy
-from vla.spec import Array, Observation
+from vla.spec import LONGEST_INSTRUCTION, Array, Observation
 
 LEVELS = {
     State.WAITING: DiagnosticStatus.OK,
@@ -38,6 +39,7 @@ LEVELS = {
     State.STOPPED: DiagnosticStatus.WARN,
     State.FAULT: DiagnosticStatus.ERROR,
 }
+LONGEST_LINE = 300  # of what the agent says of itself [characters]
 COMMANDS = {"joint_state": JointState, "trajectory": JointTrajectory, "forward": Float64MultiArray}
 
 
@@ -52,11 +54,16 @@ class Agent(Managed):
         self._timers: list[Any] = []
         self._figures: dict[str, deque[float]] = {}
         self._stamps: dict[str, tuple[int, int]] = {}
+        self._sizes: dict[str, tuple[int, ...]] = {}  # camera → shape of its last image
         self._asked: tuple[Future[Array], float] | None = None
         self._last_tick: float | None = None
         self._told: tuple[State | None, str] = (None, "")
+        self._unheeded = ""  # an instruction that a stop or a fault keeps from being followed, in words
         self._dropped = 0
-        self._declare()
+        try:
+            self._declare()
+        except ParameterException as error:  # of what stands behind --ros-args
+            raise ValueError(str(error)) from error
 
     # Parameters.
 
@@ -68,6 +75,7 @@ class Agent(Managed):
             self.declare_parameter(name, value, ParameterDescriptor(floating_point_range=limits))
         self.declare_parameter("command", self.settings.command)
         self.declare_parameter("image_reliability", self.settings.image_reliability)
+        self.declare_parameter("image_crop", self.settings.image_crop)
         rate = FloatingPointRange(from_value=1.0, to_value=1000.0)
         self.declare_parameter("command_hz", self.settings.command_hz, ParameterDescriptor(floating_point_range=[rate]))
         self.add_on_set_parameters_callback(self._may_set)
@@ -97,6 +105,9 @@ class Agent(Managed):
         self._kind = self.get_parameter("command").value
         if self._kind not in COMMANDS:
             raise ValueError(f"command is '{self._kind}', there are {', '.join(COMMANDS)}")
+        self._crop = self.get_parameter("image_crop").value
+        if self._crop not in get_args(images.Crop):
+            raise ValueError(f"image_crop is '{self._crop}', there are {', '.join(get_args(images.Crop))}")
         session = Session(spec, robot, self.settings.safety, self.get_parameter("command_hz").value)
         self._warm_up()
         reliable = self.get_parameter("image_reliability").value == "reliable"
@@ -115,7 +126,7 @@ class Agent(Managed):
         self.serve(Trigger, "~/stop", self._on_stop)
         self.serve(Trigger, "~/resume", self._on_resume)
         self._pool = ThreadPoolExecutor(1, thread_name_prefix="policy")
-        self._figures, self._stamps, self._dropped = {}, {}, 0
+        self._figures, self._stamps, self._sizes, self._dropped = {}, {}, {}, 0
         self.session = session
 
     def _warm_up(self) -> None:
@@ -153,7 +164,7 @@ class Agent(Managed):
         """Brake, publish the pose that is held, and end the timers."""
         if not self._timers or self.session is None:
             return
-        self.session.stop("deactivated")
+        self.session.stop("deactivated", "activate the agent")
         while True:
             self._send()
             if self.session.governor.resting:
@@ -185,9 +196,13 @@ class Agent(Managed):
             return self._drop(f"an image of the camera {camera} came twice; does its clock stand still?")
         self._stamps[camera] = stamp
         try:
-            image = messages.image_from(message, self.policy.spec.image_size)
+            image = messages.image_from(message)
         except ValueError as error:
             return self._drop(f"camera {camera}: {error}")
+        if self._sizes.get(camera) != image.shape:
+            self._sizes[camera] = image.shape
+            if change := images.change(image, self.policy.spec.image_size, self._crop):
+                self.get_logger().info(f"camera {camera}: {change}")
         age = self._age(stamp)
         self._note("image age", age)
         self.session.see(camera, image, now - age)
@@ -204,9 +219,24 @@ class Agent(Managed):
         self.session.feel(joints, velocities, opening, now)
 
     def _on_instruction(self, message: String) -> None:
-        if self._timers and self.session is not None:
-            self.session.listen(message.data, time.monotonic())
-            self.get_logger().info(f"instruction: '{message.data}'")
+        if not self._timers or self.session is None:
+            return
+        words, session = message.data, self.session
+        quoted = repr(messages.cut(words))
+        if len(words) > LONGEST_INSTRUCTION:
+            return self._drop(f"an instruction of {len(words)} characters, at most {LONGEST_INSTRUCTION} fit: {quoted}")
+        known = words.strip() == session.instruction
+        if session.listen(words, time.monotonic()):
+            if not known:
+                self.get_logger().info(f"instruction: {quoted}")
+        elif words.strip():
+            self._unheed(f"heard, but {session.state}: {quoted}; {session.reason}")
+
+    def _unheed(self, words: str) -> None:
+        if words != self._unheeded:
+            self._unheeded = words
+            self.get_logger().warning(messages.cut(words, LONGEST_LINE))
+            self._report()
 
     def _on_stop(self, request: Any, response: Any) -> Any:
         response.success = bool(self._timers)
@@ -221,7 +251,7 @@ class Agent(Managed):
 
     def _drop(self, why: str) -> None:
         self._dropped += 1
-        self.get_logger().warning(why, throttle_duration_sec=1.0)
+        self.get_logger().warning(messages.cut(why, LONGEST_LINE), throttle_duration_sec=1.0)
 
     def _age(self, stamp: tuple[int, int]) -> float:
         """Age [s] of a message by its stamp; 0 where the stamp cannot be of this clock."""
@@ -258,7 +288,9 @@ class Agent(Managed):
     def _think(self, observation: Observation, afresh: bool) -> Array:
         if afresh:
             self.policy.reset(observation.instruction, 0)
-        return self.policy.plan(observation)[: self.policy.execute]
+        size = self.policy.spec.image_size
+        rgb = {camera: images.fitted(image, size, self._crop) for camera, image in observation.rgb.items()}
+        return self.policy.plan(replace(observation, rgb=rgb))[: self.policy.execute]
 
     def _send(self) -> None:
         assert self.session is not None
@@ -271,7 +303,7 @@ class Agent(Managed):
             message = messages.fill_joint_state(JointState(), robot, command)
             message.header.stamp = self.get_clock().now().to_msg()
         elif self._kind == "trajectory":
-            ahead = self.session.horizon(now)
+            ahead = [command, *self.session.horizon(now)]  # the next trajectory replaces all after the first
             message = messages.fill_trajectory(
                 JointTrajectory(), JointTrajectoryPoint, Duration, robot, ahead, self.session.tick
             )
@@ -293,8 +325,8 @@ class Agent(Managed):
         if self._timers:
             self._look_for_others()
         if (session.state, session.reason) != self._told:
-            self._told = (session.state, session.reason)
-            words = f"{session.state}: {session.reason}" if session.reason else str(session.state)
+            self._told, self._unheeded = (session.state, session.reason), ""
+            words = f"{session.state}: {messages.cut(session.reason, LONGEST_LINE)}".removesuffix(": ")
             # One line each: rclpy does not let one and the same line log with changing severity.
             if LEVELS[session.state] == DiagnosticStatus.OK:
                 self.get_logger().info(words)
@@ -302,7 +334,7 @@ class Agent(Managed):
                 self.get_logger().warning(words)
         values = {
             "state": session.state.value,
-            "instruction": session.instruction,
+            "instruction": messages.cut(session.instruction),
             "messages dropped": str(self._dropped),
             "ticks skipped": str(session.overruns),
         }
@@ -310,7 +342,7 @@ class Agent(Managed):
             middle, high = np.percentile(list(figures), [50, 99]) * 1000
             values[f"{name} p50 [ms]"], values[f"{name} p99 [ms]"] = f"{middle:.1f}", f"{high:.1f}"
         pairs = [KeyValue(key=key, value=value) for key, value in values.items()]
-        text = session.reason or session.state.value
+        text = messages.cut(self._unheeded or session.reason or session.state.value, LONGEST_LINE)
         status = DiagnosticStatus(level=LEVELS[session.state], name=self.get_name(), message=text, values=pairs)
         self._status.publish(status)
         array = DiagnosticArray(status=[status])

@@ -6,10 +6,15 @@ Shapes: J joints. Positions [rad], speeds [rad/s], accelerations [rad/s²].
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
+from annotated_types import Gt, Le, MinLen
 
 from vla.spec import Array
+from vla.types import NonNegative, Positive, Text
+
+PositiveShare = Annotated[float, Gt(0), Le(1)]
 
 REST = 1e-9  # slower is rounding [rad/s]
 
@@ -32,17 +37,17 @@ class Robot:
         ValueError: lists of different lengths, or a share that is none.
     """
 
-    joints: list[str]
+    joints: Annotated[list[Text], MinLen(1)]
     low: list[float]
     high: list[float]
-    speed: list[float]
-    acceleration: list[float]
-    fingers: list[str]
-    finger_travel: float = 0.04
-    margin: float = 0.05
-    overshoot: float = 0.01
-    speed_share: float = 0.25
-    acceleration_share: float = 0.25
+    speed: list[Positive]
+    acceleration: list[Positive]
+    fingers: list[Text]
+    finger_travel: Positive = 0.04
+    margin: NonNegative = 0.05
+    overshoot: NonNegative = 0.01
+    speed_share: PositiveShare = 0.25
+    acceleration_share: PositiveShare = 0.25
 
     def __post_init__(self) -> None:
         lengths = {len(values) for values in (self.joints, self.low, self.high, self.speed, self.acceleration)}
@@ -120,8 +125,9 @@ class Governor:
 
     def _move(self, velocity: Array) -> Array:
         change = self.robot.hardest * self._period
-        velocity = np.clip(velocity, self.velocity - change, self.velocity + change)
         velocity = np.clip(velocity, -self.robot.fastest, self.robot.fastest)
+        # Second, because the speed limit may have been lowered on the way: that is no reason to jerk.
+        velocity = np.clip(velocity, self.velocity - change, self.velocity + change)
         # Never so fast towards a position limit that braking would end behind it.
         up = self._stoppable(self.robot.highest - self.position)
         down = self._stoppable(self.position - self.robot.lowest)

@@ -6,7 +6,6 @@ import json
 import logging
 import os
 import signal
-import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -19,9 +18,11 @@ from typing import TYPE_CHECKING, Any
 
 from vla.deploy.bag import Recorder
 from vla.deploy.overhear import Eavesdropper
-from vla.deploy.ros import ros
+from vla.deploy.ros import plain_errors, ros
 from vla.deploy.ros2 import Ros2, Simulated
 from vla.evaluate import Report, Result
+from vla.tasks.backend import choose_backend
+from vla.types import Count
 
 if TYPE_CHECKING:
     from vla.policy import Policy
@@ -48,7 +49,7 @@ class Loop:
 
     agent: Callable[..., Ros2]
     simulator: Callable[..., Simulated]
-    episodes: int = 20
+    episodes: Count = 20
     record: bool = True
     policy: Callable[[], Policy]
     environment: Callable[[], Tabletop]
@@ -100,10 +101,9 @@ class Loop:
 
 def _run(node: Ros2 | Simulated) -> None:
     """What the process of a node does; what the user can mend ends in one sentence."""
-    try:
+    choose_backend(required=False)  # also keeps out of this process what does not go with MuJoCo's renderer
+    with plain_errors():
         node.run()
-    except (ValueError, ImportError) as error:
-        sys.exit(f"error: {error}")
 
 
 class Person:

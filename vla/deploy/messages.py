@@ -16,22 +16,32 @@ from vla.deploy.governor import Robot
 from vla.deploy.session import Command
 from vla.spec import Array
 
-# Encoding → bytes per pixel, and which of them are red, green and blue.
-ENCODINGS = {"rgb8": (3, (0, 1, 2)), "bgr8": (3, (2, 1, 0)), "rgba8": (4, (0, 1, 2)), "bgra8": (4, (2, 1, 0))}
+# Encoding → bytes per pixel, and where in them red, green and blue are.
+ENCODINGS = {
+    "rgb8": (3, slice(0, 3)),
+    "bgr8": (3, slice(2, None, -1)),
+    "rgba8": (4, slice(0, 3)),
+    "bgra8": (4, slice(2, None, -1)),
+}
 
 
-def image_from(message: Any, size: tuple[int, int]) -> Array:
+def cut(text: str, longest: int = 80) -> str:
+    """Text of any length as logs show it, with at most `longest` characters."""
+    return text if len(text) <= longest else f"{text[: longest - 1]}…"
+
+
+def image_from(message: Any) -> Array:
     """The (H, W, 3) uint8 RGB image of a sensor_msgs/Image.
 
     Raises:
-        ValueError: not of `size` (H, W), an encoding that is no colour image, or fewer bytes than it promises.
+        ValueError: an encoding that is no colour image, no pixels, or fewer bytes than it promises.
     """
     if message.encoding not in ENCODINGS:
-        raise ValueError(f"image encoding is '{message.encoding}', understood are {', '.join(ENCODINGS)}")
+        raise ValueError(f"image encoding is {cut(message.encoding)!r}, understood are {', '.join(ENCODINGS)}")
     depth, order = ENCODINGS[message.encoding]
     height, width, step = message.height, message.width, message.step
-    if (height, width) != size:
-        raise ValueError(f"image is {height} by {width} pixels, the policy was trained on {size[0]} by {size[1]}")
+    if not height or not width:
+        raise ValueError(f"image is {width} by {height} pixels")
     if step < width * depth:
         raise ValueError(f"image step is {step} bytes, {width} pixels of {message.encoding} need {width * depth}")
     if len(message.data) != step * height:

@@ -14,8 +14,9 @@ MESSAGE_PACKAGES = ("sensor_msgs", "std_msgs", "trajectory_msgs", "diagnostic_ms
 
 def message_class(name: str) -> Any:
     """The class of a message type such as sensor_msgs/msg/Image; None for those that robots and agents do not use."""
-    package, _, kind = name.split("/")
-    return getattr(import_module(f"{package}.msg"), kind) if package in MESSAGE_PACKAGES else None
+    package, _, kind = name.partition("/msg/")
+    found = getattr(import_module(f"{package}.msg"), kind, None) if package in MESSAGE_PACKAGES else None
+    return found if isinstance(found, type) else None
 
 
 class Eavesdropper(ABC):

@@ -4,14 +4,20 @@ from __future__ import annotations
 
 import gc
 import os
+import shlex
 import signal
+import sys
+import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from threading import Event
 from types import FrameType
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
+from annotated_types import Ge, Le
+
+LAST_DOMAIN = 232  # beyond it there are no ports
 LOOPBACK = Path(__file__).with_name("loopback.xml")
 
 # What stood behind --ros-args on the command line; it belongs to ROS, and Hydra must not see it.
@@ -38,7 +44,7 @@ class Network:
         self,
         discovery: Range,
         profile: str | None = None,
-        domain: int | None = None,
+        domain: Annotated[int, Ge(0), Le(LAST_DOMAIN)] | None = None,
     ) -> None:
         """Args:
         discovery: ROS_AUTOMATIC_DISCOVERY_RANGE.
@@ -57,7 +63,7 @@ class Network:
         """Set the environment, which ROS reads when it starts.
 
         Raises:
-            ValueError: there is no such profile.
+            ValueError: there is no such profile or domain.
         """
         os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = self.discovery
         if self.profile is not None:
@@ -66,6 +72,9 @@ class Network:
             os.environ["FASTRTPS_DEFAULT_PROFILES_FILE"] = self.profile
         if self.domain is not None:
             os.environ["ROS_DOMAIN_ID"] = str(self.domain)
+        domain = os.environ.get("ROS_DOMAIN_ID") or "0"
+        if not (domain.isdecimal() and int(domain) <= LAST_DOMAIN):
+            raise ValueError(f"deploy.network.domain, or ROS_DOMAIN_ID, is {domain!r}: 0 to {LAST_DOMAIN} exist")
 
 
 @contextmanager
@@ -74,8 +83,11 @@ def ros(network: Network, log_folder: Path | None = None) -> Iterator[Event]:
 
     Raises:
         ImportError: rclpy cannot be imported.
+        ValueError: ROS does not start with this network and these arguments.
     """
     network.apply()
+    # dm_control has DeprecationWarnings shown; those of other people's packages are nothing that a user could mend.
+    warnings.filterwarnings("ignore", category=DeprecationWarning, module="lark")
     if log_folder is not None:
         os.environ.setdefault("ROS_LOG_DIR", str(log_folder))
     try:
@@ -92,13 +104,26 @@ def ros(network: Network, log_folder: Path | None = None) -> Iterator[Event]:
         stopped.set()
 
     before = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM)}
-    rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
     try:
+        try:
+            rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
+        except RuntimeError as error:
+            given = shlex.join(arguments) or "its environment"
+            raise ValueError(f"ROS does not accept {given}: {str(error).splitlines()[0]}") from error
         yield stopped
     finally:
         rclpy.try_shutdown()
         for number, handler in before.items():
             signal.signal(number, handler)
+
+
+@contextmanager
+def plain_errors() -> Iterator[None]:
+    """Ends the process with one sentence for what the user can mend."""
+    try:
+        yield
+    except (ValueError, ImportError) as error:
+        sys.exit(f"error: {error}")
 
 
 def spin(node: Any, stopped: Event) -> None:

@@ -6,23 +6,33 @@ task's environment, and a folder to write to.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from vla.deploy.governor import Robot
+from vla.deploy.images import Crop
 from vla.deploy.ros import Network, ros, spin
 from vla.deploy.session import Safety
+from vla.types import NonNegative, Positive, Seed
 
 if TYPE_CHECKING:
     from vla.policy import Policy
     from vla.tasks.tabletop import Tabletop
 
 
+NAME = re.compile(r"(~/|/)?[A-Za-z_]\w*(/[A-Za-z_]\w*)*", re.ASCII)  # of a topic
+
+
 @dataclass(frozen=True)
 class Topics:
-    """What the topics are called; remappings apply on top."""
+    """What the topics are called; remappings apply on top.
+
+    Raises:
+        ValueError: ROS has no such names.
+    """
 
     images: dict[str, str]  # camera → topic of sensor_msgs/Image
     joint_states: str  # sensor_msgs/JointState
@@ -30,17 +40,23 @@ class Topics:
     commands: str
     gripper: str | None = None  # Float64MultiArray of finger positions, for the commands that have no room for them
 
+    def __post_init__(self) -> None:
+        named = {**asdict(self), **{f"images.{camera}": topic for camera, topic in self.images.items()}}
+        for key, topic in named.items():
+            if isinstance(topic, str) and not NAME.fullmatch(topic):
+                raise ValueError(f"topics.{key} is {topic!r}: a topic is letters, digits and _ between slashes")
+
 
 @dataclass(frozen=True)
 class Timing:
     """How the simulated world keeps time."""
 
-    joints_hz: float = 50.0  # of joint states, and of looking for commands
-    camera_hz: float = 10.0
-    camera_latency: float = 0.0  # from exposure to publication [s]
-    command_timeout: float = 0.5  # without a command for so long, the arm stays where it is [s]
+    joints_hz: Positive = 50.0  # of joint states, and of looking for commands
+    camera_hz: Positive = 10.0
+    camera_latency: NonNegative = 0.0  # from exposure to publication [s]
+    command_timeout: Positive = 0.5  # without a command for so long, the arm stays where it is [s]
     clock: bool = False  # publish /clock, and stamp with it
-    speed: float = 1.0  # of simulated against real time
+    speed: Positive = 1.0  # of simulated against real time
 
 
 @dataclass(kw_only=True)
@@ -55,6 +71,7 @@ class Ros2:
         command: JointState with positions, JointTrajectory that ends at rest, or Float64MultiArray of positions.
         command_hz: commands per second.
         image_reliability: how images are subscribed; large ones over a bad network may want "reliable".
+        image_crop: what is used of images whose aspect ratio is not that of training: the centre, or all, squeezed.
         autostart: configure and activate at once; otherwise somebody's lifecycle manager does.
         policy, environment, output: given by the job.
     """
@@ -64,8 +81,9 @@ class Ros2:
     topics: Topics
     safety: Safety = field(default_factory=Safety)
     command: Literal["joint_state", "trajectory", "forward"] = "joint_state"
-    command_hz: float = 50.0
+    command_hz: Positive = 50.0
     image_reliability: Literal["best_effort", "reliable"] = "best_effort"
+    image_crop: Crop = "centre"
     autostart: bool = True
     policy: Callable[[], Policy]
     environment: Callable[[], Tabletop]
@@ -110,7 +128,7 @@ class Simulated:
     network: Network
     topics: Topics
     timing: Timing = field(default_factory=Timing)
-    seed: int = 1_000_000
+    seed: Seed = 1_000_000
     policy: Callable[[], Policy]
     environment: Callable[[], Tabletop]
     output: Path

@@ -16,7 +16,11 @@ from vla.deploy.frames import Frames
 from vla.deploy.governor import Governor, Robot
 from vla.spec import Array, Observation, Spec
 from vla.tasks.control import WORKSPACE, CartesianController
+from vla.types import Count, Positive
 
+# The ways out.
+RESUME = 'python -m vla.deploy.say --resume "INSTRUCTION", or call ~/resume'
+RESTART = "deactivate and activate the agent, or start it again"
 ACTION = ("dx", "dy", "dz", "rx", "ry", "rz", "gripper")
 EARLY = 0.25  # share of a control period that a frame may come early and still be the one to act on
 MEMORY = 1.0  # how long joint states and commands are remembered [s]
@@ -28,7 +32,7 @@ class State(StrEnum):
     WAITING = "waiting"  # for an arm, an image or an instruction; holds the pose it found
     RUNNING = "running"
     HOLDING = "holding"  # something is late or wrong; runs again when frames are fresh
-    STOPPED = "stopped"  # somebody said so; until resumed
+    STOPPED = "stopped"  # somebody said so, until resumed; or the time is up, until the next instruction
     FAULT = "fault"  # something must be looked at; until deactivated
 
 
@@ -36,14 +40,14 @@ class State(StrEnum):
 class Safety:
     """When to hold and when to give up; None switches a limit off."""
 
-    image_age: float = 0.3  # oldest image to act on [s]
-    joints_age: float = 0.2  # oldest joint state [s]
-    inference: float = 0.3  # longest wait for the policy [s]
-    instruction: float | None = 60.0  # longest time to work on one instruction [s]
-    tracking: float = 0.2  # largest distance of a joint from its command [rad] …
-    tracking_for: float = 0.5  # … for so long [s]
-    fresh_frames: int = 3  # frames of all cameras in a row after which a held session runs again
-    rejected: int = 3  # unusable plans in a row that make a fault
+    image_age: Positive = 0.3  # oldest image to act on [s]
+    joints_age: Positive = 0.2  # oldest joint state [s]
+    inference: Positive = 0.3  # longest wait for the policy [s]
+    instruction: Positive | None = 60.0  # longest time to work on one instruction [s]
+    tracking: Positive = 0.2  # largest distance of a joint from its command [rad] …
+    tracking_for: Positive = 0.5  # … for so long [s]
+    fresh_frames: Count = 3  # frames of all cameras in a row after which a held session runs again
+    rejected: Count = 3  # unusable plans in a row that make a fault
 
 
 @dataclass(frozen=True)
@@ -79,7 +83,7 @@ class Session:
         """Forget everything; the next joint state is where the arm is taken over."""
         self.governor = Governor(self.governor.robot, self.tick)
         self.state, self.reason = State.WAITING, "no joint state yet"
-        self.instruction, self._told_at = "", 0.0
+        self.instruction, self._told_at, self._time_is_up = "", 0.0, False
         self.overruns, self.rejections = 0, 0
         self._frames = Frames(self.spec.cameras)
         self._seen_until = -np.inf
@@ -109,18 +113,25 @@ class Session:
         while self._measured[0][0] < at - MEMORY:
             self._measured.popleft()
 
-    def listen(self, instruction: str, now: float) -> None:
-        """A new task in words; empty words stop the arm."""
+    def listen(self, instruction: str, now: float) -> bool:
+        """A new task in words, which ends a stop because the time was up; empty words stop the arm.
+
+        Returns whether the instruction is followed: not after any other stop, nor after a fault.
+        """
         if not instruction.strip():
-            return self.stop("the instruction is empty")
+            self.stop("the instruction is empty")
+            return False
         self.instruction, self._told_at = instruction.strip(), now
         self._schedule, self._next_look = [], -np.inf
-        return None
+        if self.state is State.STOPPED and self._time_is_up:
+            self.resume(now)
+        return self.state not in (State.STOPPED, State.FAULT)
 
-    def stop(self, reason: str) -> None:
-        """Stand still until resumed."""
+    def stop(self, reason: str, way_out: str = RESUME) -> None:
+        """Stand still until resumed; `way_out` tells a person how."""
         if self.state is not State.FAULT:
-            self._enter(State.STOPPED, reason)
+            self._time_is_up = False
+            self._enter(State.STOPPED, f"{reason}; to go on: {way_out}")
 
     def resume(self, now: float) -> bool:
         """Go on after a stop; false where there is nothing to go on with."""
@@ -132,7 +143,7 @@ class Session:
 
     def fail(self, reason: str) -> None:
         """Stand still until deactivated."""
-        self._enter(State.FAULT, reason)
+        self._enter(State.FAULT, f"{reason}; to go on: {RESTART}")
 
     def hold(self, reason: str) -> None:
         """Stand still until frames are fresh again."""
@@ -246,7 +257,9 @@ class Session:
         if not self.instruction:
             return self._enter(State.WAITING, "no instruction yet")
         if self.safety.instruction is not None and now - self._told_at > self.safety.instruction:
-            return self.stop(f"{self.safety.instruction:g} s on one instruction are over")
+            self.stop(f"{self.safety.instruction:g} s on one instruction are over", "say what to do next")
+            self._time_is_up = True
+            return None
         if late:
             self._frames.fresh = 0
             return self._enter(State.HOLDING if self.state is State.RUNNING else self.state, late)

@@ -20,15 +20,15 @@ from std_srvs.srv import Trigger
 from vla.deploy import messages
 from vla.deploy.governor import Robot
 from vla.deploy.ros2 import Timing, Topics
-from vla.spec import Array
+from vla.spec import LONGEST_INSTRUCTION, Array
 from vla.tasks.control import MAX_OPENING
 from vla.tasks.tabletop import Tabletop
 
 
 class Simulator(Node):
-    """Plays episodes one after the other: `~/reset` starts the next, `~/episode` says how it stands.
+    """Plays episodes one after the other: `~/reset` starts the next, `~/episode` and the log say how it stands.
 
-    An episode's time runs from its instruction on, as in evaluation.
+    An episode's time runs from the first instruction that is heard, as in evaluation.
     """
 
     def __init__(self, environment: Tabletop, robot: Robot, topics: Topics, timing: Timing, seed: int) -> None:
@@ -60,22 +60,29 @@ class Simulator(Node):
         self._target, self._heard_at = self._here(), None
         self._running, self._ticks = False, 0
         self._until_frame = 0.0
+        self.get_logger().info(self.words)
         self._tell()
+
+    @property
+    def words(self) -> str:
+        """The episode in words: its seed and what to say."""
+        return f'episode {self.seed}: "{self.environment.task.instruction}"'
 
     def _on_reset(self, request: Any, response: Any) -> Any:
         self.reset()
-        response.success = True
+        response.success, response.message = True, self.words
         return response
 
     def _on_instruction(self, message: String) -> None:
-        if message.data.strip() and not self._running and not self.environment.done:
+        heard = len(message.data) <= LONGEST_INSTRUCTION and message.data.strip()
+        if heard and not self._running and not self.environment.done:
             self._running, self._ticks = True, 0
 
     def _on_command(self, message: JointState) -> None:
         try:
             joints, opening = messages.command_from(message, self.robot)
         except ValueError as error:
-            return self.get_logger().warning(str(error), throttle_duration_sec=1.0)
+            return self.get_logger().warning(messages.cut(str(error), 300), throttle_duration_sec=1.0)
         self._target = (joints, self._target[1] if opening is None else opening)
         self._heard_at = time.monotonic()
 
@@ -93,6 +100,8 @@ class Simulator(Node):
             self.environment.judge()
             if self.environment.done:
                 self._running = False
+                after = "in" if self.environment.outcome == "success" else "after"
+                self.get_logger().info(f"{self.environment.outcome} {after} {self._ticks * self._tick_seconds:.1f} s")
                 self._tell()
         self._publish()
 

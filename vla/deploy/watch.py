@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
-from vla.deploy.ros import NETWORKS, Network, ros, spin
+from vla.deploy.ros import NETWORKS, Network, plain_errors, ros, spin
 
 
 def main() -> None:
@@ -14,7 +14,7 @@ def main() -> None:
     parser.add_argument("--agent", default="/vla_agent")
     parser.add_argument("--network", choices=NETWORKS, default="loopback")
     options = parser.parse_args()
-    with ros(Network.named(options.network)) as stopped:
+    with plain_errors(), ros(Network.named(options.network)) as stopped:
         import rclpy
         from diagnostic_msgs.msg import DiagnosticStatus
 
@@ -23,7 +23,8 @@ def main() -> None:
             figures = "  ".join(
                 f"{key} {value}" for key, value in values.items() if key not in ("state", "instruction")
             )
-            print(f"{values['state']:8} {status.message:40} '{values['instruction']}'  {figures}", flush=True)
+            state, instruction = values.get("state", "?"), values.get("instruction", "")
+            print(f"{state:8} {status.message:40} '{instruction}'  {figures}", flush=True)
 
         node = rclpy.create_node("vla_watch")
         node.create_subscription(DiagnosticStatus, f"{options.agent}/status", show, 10)

@@ -12,8 +12,10 @@ TRIED = "VLA_GL_WORKS"  # the backend that was seen to work, for the processes t
 PROBE = "import mujoco; mujoco.GLContext(8, 8).make_current()"
 
 
-def choose_backend() -> None:
+def choose_backend(required: bool = True) -> None:
     """Set MUJOCO_GL, unless it is set: EGL on a machine without a display, OSMesa where EGL does not work.
+
+    Where neither works, and none is `required`, rendering is disabled.
 
     Must run before MuJoCo is first imported, because it reads the variable then.
 
@@ -35,6 +37,9 @@ def choose_backend() -> None:
         if subprocess.run([sys.executable, "-c", PROBE], env=environment, capture_output=True).returncode == 0:
             os.environ["MUJOCO_GL"] = os.environ[TRIED] = backend
             return
+    if not required:
+        os.environ["MUJOCO_GL"] = "disabled"
+        return
     raise RuntimeError(
         f"nothing here can render with MUJOCO_GL={' or '.join(candidates)}: install the packages libegl1 and "
         "libgl1-mesa-dri, or libosmesa6, or set MUJOCO_GL to egl, osmesa or glfw"
