@@ -26,6 +26,7 @@ BAD_INPUT = {
     "no room on the table": (("job=preview", "task.blocks=4", "task.randomize.placement.x=[0.5,0.5]"), "no room"),
     "no dataset": (("job=collect", "expert=lerobot", "expert.folder=nowhere"), "no LeRobot dataset in nowhere"),
     "nothing to compare": (("job=report",), "report.runs=[RUN,RUN]"),
+    "more processes than cores": (("job=train", *SMALL, "trainer.devices=999"), "than this machine has cores"),
     "no GPU": (("trainer=gpu", *(item for item in SMALL if "accelerator" not in item)), "gpu"),
 }
 

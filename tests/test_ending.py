@@ -39,3 +39,9 @@ def test_all_but_the_freeing_is_done(last: str, status: int, said: str) -> None:
     done = subprocess.run([sys.executable, "-c", PROGRAM.format(last=last)], capture_output=True, text=True, timeout=30)
     assert (done.returncode, done.stdout) == (status, "thread\nhandler\n")
     assert done.stderr.endswith(said) and bool(done.stderr) == bool(said)
+
+
+def test_a_closed_output_is_no_error() -> None:
+    command = ["sh", "-c", 'exec "$@" >&-', "sh", sys.executable, "-c", PROGRAM.format(last="pass")]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=30)
+    assert (done.returncode, done.stderr) == (0, "")

@@ -76,7 +76,10 @@ def test_an_episode_that_raises_is_an_error_and_the_others_go_on() -> None:
 def test_an_episode_that_kills_its_process_is_an_error_and_the_others_are_played() -> None:
     report = evaluate(toy.make_deadly_environment, toy.make_agent, None, SEEDS, workers=2)
     assert [error.seed for error in report.errors] == [toy.DEADLY_SEED]
-    assert "died, twice" in report.errors[0].error
+    assert report.errors[0].error == (
+        "the worker process for this episode crashed twice: it ended with exit status 1. Run with "
+        "evaluate.workers=1 for the traceback."
+    )
     assert len(report.results) == len(SEEDS)
 
 

@@ -16,8 +16,8 @@ MODULES = {
     for path in sorted((ROOT / "vla").rglob("*.py"))
 }
 
-# What describes and reads plain values; it imports nothing of the package.
-EVERYWHERE = ("vla.types", "vla.documents")
+# What describes and reads plain values, and writes files; it imports nothing of the package.
+EVERYWHERE = ("vla.types", "vla.documents", "vla.files")
 # A part of the package → the parts that its modules may import; the entry and the jobs may import everything.
 PARTS = {
     "vla.spec": (),
@@ -28,10 +28,11 @@ PARTS = {
     "vla.program": ("vla.spec", "vla.models", "vla.policy"),
     "vla.rollout": ("vla.spec",),
     "vla.record": ("vla.spec",),
+    "vla.files": (),
     "vla.workers": (),
     "vla.ending": (),
     "vla.cluster": ("vla.workers",),
-    "vla.collect": ("vla.spec", "vla.rollout", "vla.data", "vla.cluster"),
+    "vla.collect": ("vla.spec", "vla.rollout", "vla.data", "vla.cluster", "vla.workers"),
     "vla.intervals": (),
     "vla.evaluate": ("vla.spec", "vla.intervals", "vla.rollout", "vla.record", "vla.workers"),
     "vla.report": ("vla.spec", "vla.intervals", "vla.evaluate"),
@@ -58,7 +59,7 @@ PARTS = {
     "vla.progress": ("vla.models",),
     "vla.averaging": ("vla.models",),
     "vla.validation": ("vla.spec", "vla.models", "vla.intervals", "vla.evaluate"),
-    "vla.trainer": ("vla.averaging", "vla.check", "vla.progress", "vla.resume"),
+    "vla.trainer": ("vla.averaging", "vla.check", "vla.progress", "vla.resume", "vla.workers"),
     "vla.train": ("vla",),
     "vla.benchmark": ("vla",),
     "vla.parts": ("vla",),

@@ -35,6 +35,18 @@ def test_an_evaluation_that_was_interrupted_takes_what_the_training_had_chosen(t
     assert go_on(now, ["checkpoint=last", "job=train"]).checkpoint == str(run / "checkpoints/last.ckpt")
 
 
+def test_a_training_that_was_killed_between_its_last_save_and_its_end_is_gone_on_with(tmp_path: Path) -> None:
+    (tmp_path / "one/checkpoints").mkdir(parents=True)
+    now = composed("job=train", "checkpoint=last", f"output={tmp_path}/now")
+    content = {"config": plain(now), "spec": toy.SPEC.to_dict(), "state_dict": {}, "finished": True}
+    torch.save(content, tmp_path / "one/checkpoints/last.ckpt")
+    resumed = go_on(now, ["job=train", "checkpoint=last"])
+    assert resumed.output == str(tmp_path / "one") and resumed.resume
+    note_choice(tmp_path / "one", "last.ckpt")
+    with pytest.raises(ValueError, match="none of the 1 trainings"):
+        go_on(now, ["job=train", "checkpoint=last"])
+
+
 @pytest.mark.parametrize(("finished", "chosen"), [(False, ""), (True, ""), (True, "best.ckpt")])
 def test_a_training_is_taken_up_where_its_folder_has_it(tmp_path: Path, finished: bool, chosen: str) -> None:
     asked = composed(f"output={tmp_path}")

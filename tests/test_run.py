@@ -149,6 +149,23 @@ def test_preview_shows_resets_and_their_draws(home: Path) -> None:
     assert "placement" in done.stdout
 
 
+def test_a_success_rate_is_printed_even_where_the_report_cannot_be_written(home: Path) -> None:
+    (home / "blocked/report.png").mkdir(parents=True)  # where a file is to go
+    arguments = ("checkpoint=run/checkpoints/last.ckpt", "evaluate.episodes=1", "evaluate.workers=1", "recorder=none")
+    done = vla(home, *arguments, "output=blocked", ok=False)
+    assert done.stdout.strip().splitlines()[-1].startswith("success ")
+    errors = [line for line in done.stderr.splitlines() if line.startswith("error: ")]
+    assert len(errors) == 1 and "blocked/report.png cannot be written (" in errors[0]
+    assert sorted(path.name for path in (home / "blocked").iterdir()) == ["changes.yaml", "config.yaml", "report.png"]
+
+
+def test_a_finished_training_that_is_to_go_on_says_so(home: Path) -> None:
+    for asked in (("job=train",), ("resume=true",)):
+        done = vla(home, "checkpoint=run/checkpoints/last.ckpt", *asked, "output=beyond", ok=False)
+        assert "has reached trainer.max_steps=4: raise it, or evaluate it" in done.stderr
+    assert not (home / "beyond").exists()
+
+
 def test_export_writes_as_many_episodes_as_asked_for(home: Path) -> None:
     vla(home, *SMALL, "job=export", "export.folder=plain", "collect.episodes=5")
     assert len(list((home / "plain").glob("episode_*/manifest.json"))) == 5

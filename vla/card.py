@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import json
-import os
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
@@ -16,6 +15,7 @@ from rich.table import Table
 
 from vla.data.index import Entry, listed
 from vla.data.inspection import Findings, episode_of, parts_of
+from vla.files import atomic_path
 from vla.report import BLUE, GREEN, RED, contact_sheet, spans
 from vla.spec import flat
 
@@ -67,15 +67,10 @@ def write_card(findings: Findings) -> Path:
     """
     assert findings.whole, "there is nothing to show"
     folder = findings.store.folder
-    _replace(folder / "card.png", _page(findings))
-    _replace(folder / "card.md", _text(findings).encode())
+    for name, content in (("card.png", _page(findings)), ("card.md", _text(findings).encode())):
+        with atomic_path(folder / name) as draft:
+            draft.write_bytes(content)
     return folder / "card.md"
-
-
-def _replace(path: Path, content: bytes) -> None:
-    partial = path.with_name(f"{path.name}.partial")
-    partial.write_bytes(content)
-    os.replace(partial, path)
 
 
 def _summary(findings: Findings) -> str:

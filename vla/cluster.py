@@ -9,23 +9,20 @@ from __future__ import annotations
 import asyncio
 import logging
 import re
-import signal
 import struct
 import threading
 from collections.abc import Callable, Iterator
-from concurrent.futures import CancelledError, Future, ProcessPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
-from contextlib import AbstractContextManager, contextmanager
+from concurrent.futures import CancelledError, Future
+from contextlib import AbstractContextManager, closing, contextmanager
 from functools import partial
 from importlib.metadata import version
 from importlib.util import find_spec
-from multiprocessing import get_context
 from socket import gethostname
 from typing import TYPE_CHECKING, Any, Protocol
 from uuid import uuid4
 
 from vla.types import Count, Positive
-from vla.workers import cores, leave_with_parent, one_thread, one_thread_each
+from vla.workers import MakeWorker, Pool, Worker, WorkersLost, cores, one_thread, one_thread_each
 
 if TYPE_CHECKING:
     import distributed
@@ -36,19 +33,6 @@ CONNECT = 5.0  # [s] in which a scheduler that is there has answered
 LIBRARIES = ("dm-control", "mujoco", "numpy")  # whose versions decide what an episode looks like, bit for bit
 
 
-class Worker(Protocol):
-    """What turns seeds into results, one after the other."""
-
-    def attempt(self, seed: int) -> Any:
-        """What becomes of one seed."""
-        ...
-
-    def close(self) -> None:
-        """Free what the worker holds."""
-        ...
-
-
-MakeWorker = Callable[[], Worker]
 Wait = Callable[[], Any]
 
 
@@ -73,10 +57,6 @@ class Cluster(Protocol):
         ...
 
 
-class WorkersLost(ValueError):
-    """Processes crashed, were killed or went out of reach; new ones may fare better."""
-
-
 class Local:
     """Spawned processes of this machine; a single worker is this process itself."""
 
@@ -88,61 +68,40 @@ class Local:
     def team(self, make: MakeWorker) -> Iterator[Team]:
         """See `Cluster`."""
         with one_thread_each():
-            team = _Here(make) if self.workers == 1 else _Processes(make, self.workers)
-            try:
-                yield team
-            finally:
-                team.close()
+            if self.workers == 1:
+                with closing(make()) as worker:
+                    yield _Here(worker)
+            else:
+                with Pool(make, self.workers, "collect.workers") as pool:
+                    yield _Processes(pool, self.workers)
 
 
 class _Here:
     size = 1
 
-    def __init__(self, make: MakeWorker) -> None:
-        self._worker = make()
+    def __init__(self, worker: Worker) -> None:
+        self._worker = worker
 
     def submit(self, seed: int) -> Wait:
         return partial(self._worker.attempt, seed)
 
-    def close(self) -> None:
-        self._worker.close()
-
 
 class _Processes:
-    def __init__(self, make: MakeWorker, workers: int) -> None:
-        self.size = workers
-        self._attempt = partial(_attempt, uuid4().hex, make)
-        # A GL context does not survive a fork.
-        self._pool = ProcessPoolExecutor(workers, get_context("spawn"), leave_with_parent)
+    def __init__(self, pool: Pool, size: int) -> None:
+        self.size, self._pool = size, pool
 
     def submit(self, seed: int) -> Wait:
-        # Ctrl-C is for the process that commits: one that is spawned here never hears it.
-        before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-        try:
-            with _deaths_named():
-                future = self._pool.submit(self._attempt, seed)
-        finally:
-            signal.pthread_sigmask(signal.SIG_SETMASK, before)
-        return partial(self._result, future)
-
-    def close(self) -> None:
-        self._pool.shutdown(cancel_futures=True)
+        return partial(self._result, self._pool.submit(seed))
 
     @staticmethod
     def _result(future: Future[Any]) -> Any:
-        with _deaths_named():
+        try:
             return future.result()
-
-
-@contextmanager
-def _deaths_named() -> Iterator[None]:
-    try:
-        yield
-    except BrokenProcessPool as error:
-        raise WorkersLost(
-            "the collecting processes die, killed for their memory or by a crash outside Python: what was "
-            "committed is safe, run again with fewer collect.workers, or with 1 to see the crash"
-        ) from error
+        except WorkersLost as lost:
+            raise WorkersLost(
+                f"a collecting process crashed twice ({lost}): what was committed is safe, run again with fewer "
+                "collect.workers, or with 1 to see the crash"
+            ) from lost
 
 
 class Dask:

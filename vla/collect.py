@@ -6,7 +6,6 @@ Seeds are tried in order and committed in order, until the store holds as many s
 from __future__ import annotations
 
 import logging
-import os
 import time
 from collections import Counter, deque
 from collections.abc import Callable
@@ -18,11 +17,13 @@ from typing import Protocol
 
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from vla.cluster import Cluster, MakeWorker, Team, Wait, WorkersLost
+from vla.cluster import Cluster, Team, Wait
 from vla.data.episodes import EpisodeStore
 from vla.data.index import DAMAGED
+from vla.files import atomic_path
 from vla.rollout import replay, rollout
 from vla.spec import FIRST_SEED, Agent, Environment, Episode
+from vla.workers import MakeWorker, WorkersLost
 
 log = logging.getLogger(__name__)
 
@@ -118,11 +119,9 @@ def effort(store: EpisodeStore, episodes: int) -> float | None:
 def _note_effort(folder: Path, seconds: float) -> None:
     """Add to what is noted; on a full disk, of which the store complains, it stays as it is."""
     file = folder / EFFORT
-    draft = folder / f".{EFFORT}"
-    with suppress(OSError):
+    with suppress(OSError), atomic_path(file) as draft:
         before = float(file.read_text(encoding="utf-8")) if file.exists() else 0.0
         draft.write_text(f"{before + seconds:.1f}\n", encoding="utf-8")
-        os.replace(draft, file)
 
 
 def _require_first_seed(store: EpisodeStore, seed: int) -> None:

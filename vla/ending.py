@@ -25,6 +25,10 @@ def swift_end() -> Iterator[None]:
         return
     _around, status = True, 1
 
+    for name in ("stdout", "stderr"):
+        if getattr(sys, name) is None:  # closed by who started the program, so that the next file would take its place
+            setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))  # noqa: SIM115 for the rest of the program
+
     def end() -> None:
         logging.shutdown()
         sys.stdout.flush()

@@ -7,16 +7,13 @@ from __future__ import annotations
 
 import json
 import logging
-import signal
 import traceback
 from collections import Counter
 from collections.abc import Callable, Generator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from concurrent.futures.process import BrokenProcessPool
+from concurrent.futures import as_completed
 from contextlib import closing, suppress
 from dataclasses import dataclass, field
-from multiprocessing import get_context
-from multiprocessing.util import Finalize
+from functools import partial
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -24,13 +21,14 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from vla.intervals import wilson_interval
 from vla.rollout import rollout
-from vla.spec import FIRST_SEED, Agent, Environment, Recorder
-from vla.workers import cores, leave_with_parent, one_thread_each
+from vla.spec import FIRST_SEED, Agent, Environment, Episode, Recorder
+from vla.workers import Pool, WorkersLost, cores, one_thread_each
 
 log = logging.getLogger(__name__)
 
 SEEN = "seen"  # the condition that a policy was trained for
 TAKEN = ("success", "dropped", "not_placed", "timeout")  # outcomes of episodes in which the named block was taken
+WORKERS = "evaluate.workers"  # how many processes, in the configuration
 ERROR = "error"  # outcome of an episode that could not be played to its end
 
 
@@ -148,9 +146,9 @@ def evaluate(
         raise ValueError(f"evaluation needs seeds from {FIRST_SEED} on, which no policy is trained on; got {seeds}")
     workers = cores() if workers is None else workers
     if workers < 1:
-        raise ValueError(f"evaluation needs at least one worker, got evaluate.workers={workers}")
-    factories = _Factories(make_environment, make_agent, make_recorder)
-    play = _play_here(factories, seeds) if workers == 1 else _play_apart(factories, seeds, workers)
+        raise ValueError(f"evaluation needs at least one worker, got {WORKERS}={workers}")
+    make = partial(_Player, make_environment, make_agent, make_recorder)
+    play = _play_here(make, seeds) if workers == 1 else _play_apart(make, seeds, workers)
     columns = (TextColumn(name), BarColumn(), MofNCompleteColumn(), TextColumn("{task.fields[note]}"))
     results: dict[int, Result] = {}
     with one_thread_each(), closing(play), Progress(*columns, TimeRemainingColumn()) as bar:
@@ -194,22 +192,32 @@ def play(environment: Environment, agent: Agent, seed: int, recorder: Recorder |
     return Result(seed, episode.outcome, episode.instruction, len(episode.observations), draws)
 
 
-@dataclass(frozen=True)
-class _Factories:
-    environment: MakeEnvironment
-    agent: MakeAgent
-    recorder: MakeRecorder | None
+class _Onlooker:
+    """A recorder whose disk may fill up: its recordings only show results, so they cost no episode."""
+
+    def __init__(self, recorder: Recorder) -> None:
+        self._recorder = recorder
+        self.start, self.step = recorder.start, recorder.step
+
+    def end(self, episode: Episode) -> None:
+        """Write the recording, or say that it is missing."""
+        try:
+            self._recorder.end(episode)
+        except OSError as error:
+            log.warning("seed %d has no recording: %s", episode.seed, error)
 
 
 class _Player:
     """One process's environment, agent and recorder."""
 
-    def __init__(self, make: _Factories) -> None:
-        self._environment = make.environment()
-        self._agent = make.agent(self._environment)
-        self._recorder = None if make.recorder is None else make.recorder()
+    def __init__(
+        self, make_environment: MakeEnvironment, make_agent: MakeAgent, make_recorder: MakeRecorder | None
+    ) -> None:
+        self._environment = make_environment()
+        self._agent = make_agent(self._environment)
+        self._recorder = None if make_recorder is None else _Onlooker(make_recorder())
 
-    def play(self, seed: int) -> Result:
+    def attempt(self, seed: int) -> Result:
         """Play one episode."""
         return play(self._environment, self._agent, seed, self._recorder)
 
@@ -218,59 +226,19 @@ class _Player:
         self._environment.close()
 
 
-def _play_here(factories: _Factories, seeds: Sequence[int]) -> Generator[Result]:
-    with closing(_Player(factories)) as player:
+def _play_here(make: Callable[[], _Player], seeds: Sequence[int]) -> Generator[Result]:
+    with closing(make()) as player:
         for seed in seeds:
-            yield player.play(seed)
+            yield player.attempt(seed)
 
 
-def _play_apart(factories: _Factories, seeds: Sequence[int], workers: int) -> Generator[Result]:
-    """Results in the order in which they come, from other processes.
-
-    When one dies, the episodes that were under way are played again, one by one: in long runs a process was seen to
-    crash outside Python, and an episode that kills its process again is an error of its own.
-    """
-    left = list(seeds)
-    while left:
-        for result in _play_in_pool(factories, left, workers):
-            left.remove(result.seed)
-            yield result
-        suspects, left = left[:workers], left[workers:]
-        if suspects:
-            log.warning("a process died; playing the episodes that it may have been at again")
-        for seed in suspects:
-            what = "the process that played this episode died, twice; evaluate.workers=1 would show where"
-            yield from list(_play_in_pool(factories, [seed], 1)) or [Result(seed, ERROR, error=what)]
-
-
-def _play_in_pool(factories: _Factories, seeds: Sequence[int], workers: int) -> Generator[Result]:
-    """Results until all are there, or a process dies; they are spawned, as a GL context does not survive a fork."""
-    pool = ProcessPoolExecutor(min(workers, len(seeds)), get_context("spawn"), _start_worker, (factories,))
-    try:
-        for future in as_completed([pool.submit(_play_in_worker, seed) for seed in seeds]):
-            yield future.result()
-    except BrokenProcessPool:
-        return
-    finally:
-        pool.shutdown(cancel_futures=True)
-
-
-_factories: _Factories
-_player: _Player | None = None
-
-
-def _start_worker(factories: _Factories) -> None:
-    global _factories
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent process handles Ctrl-C
-    leave_with_parent()
-    _factories = factories
-
-
-def _play_in_worker(seed: int) -> Result:
-    """Built with the first episode, not at the start of the process: only then do exceptions reach the parent."""
-    global _player
-    if _player is None:
-        _player = _Player(_factories)
-        # Runs before atexit's callbacks, among which GL's end would come first.
-        Finalize(None, _player.close, exitpriority=0)
-    return _player.play(seed)
+def _play_apart(make: Callable[[], _Player], seeds: Sequence[int], workers: int) -> Generator[Result]:
+    """Results in the order in which they come, from other processes."""
+    with Pool(make, min(workers, len(seeds)), WORKERS) as pool:
+        seed_of = {pool.submit(seed): seed for seed in seeds}
+        for future in as_completed(seed_of):
+            try:
+                yield future.result()
+            except WorkersLost as lost:
+                what = f"the worker process for this episode crashed twice: {lost}. Run with {WORKERS}=1"
+                yield Result(seed_of[future], ERROR, error=f"{what} for the traceback.")

@@ -11,12 +11,14 @@ from collections.abc import Callable
 from contextlib import nullcontext
 from functools import partial
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
 from omegaconf import DictConfig
 from rich import print as show
 
 from vla.check import build, with_changes
+from vla.files import atomic_path, writing
 from vla.parts import (
     collected,
     make_environment,
@@ -52,15 +54,13 @@ def preview(config: DictConfig) -> None:
     environment = make_environment(plain(config.task))
     expert = make_expert(plain(config.expert), environment)
     seeds = range(config.preview.seed, config.preview.seed + config.preview.episodes)
-    recorder = RerunRecorder(output / "recordings")
-    episodes = [rollout(environment, expert, seed, recorder) for seed in seeds]
-    environment.close()
-    files = sorted((output / "recordings").glob("*.rrd"))
-    merge(files, output / "preview.rrd")
-    for file in files:
-        file.unlink()
-    (output / "recordings").rmdir()
-    contact_sheet(list(seeds), [episode.observations[0] for episode in episodes]).save(output / "preview.png")
+    with writing(output / "preview.rrd"), TemporaryDirectory(prefix=".recordings-", dir=output) as folder:
+        recorder = RerunRecorder(folder)
+        episodes = [rollout(environment, expert, seed, recorder) for seed in seeds]
+        environment.close()
+        merge(sorted(Path(folder).glob("*.rrd")), output / "preview.rrd")
+    with atomic_path(output / "preview.png") as draft:
+        contact_sheet(list(seeds), [episode.observations[0] for episode in episodes]).save(draft)
     show(draws_table(list(seeds), [episode.draws for episode in episodes]))
     log.info("wrote %s and %s", output / "preview.png", output / "preview.rrd")
 
@@ -99,7 +99,27 @@ def evaluate(config: DictConfig) -> float | None:
 
 
 def _reported(config: DictConfig, checkpoint: Path, output: Path) -> float:
-    """Play, write down how it went, and return the success rate."""
+    """Play, write down how it went, and return the success rate, which is printed even where it cannot be written."""
+    from vla.evaluate import SEEN
+
+    started = time.monotonic()
+    reports = _played(config, checkpoint, output / "recordings")
+    report = reports.pop(SEEN)
+    try:
+        with writing(output / "report.json"):
+            _write_reports(config, checkpoint, output, report, reports, started)
+    finally:
+        print(report)
+    errors = [error for each in (report, *reports.values()) for error in each.errors]
+    if errors:
+        raise ValueError(f"{len(errors)} episodes ended in an error, see {output / 'report.json'}")
+    return report.success
+
+
+def _write_reports(
+    config: DictConfig, checkpoint: Path, output: Path, report: Report, others: dict[str, Report], started: float
+) -> None:
+    """Write what came of an evaluation that `started` then [s], under the seen and the `others` of its conditions."""
     from vla.evaluate import SEEN, keep_recordings
     from vla.page import PAGE, optional, write_page
     from vla.policy import latency
@@ -107,9 +127,6 @@ def _reported(config: DictConfig, checkpoint: Path, output: Path) -> float:
     from vla.results import run_of
     from vla.suite import plot_suite, suite_table
 
-    started = time.monotonic()
-    reports = _played(config, checkpoint, output / "recordings")
-    report = reports.pop(SEEN)
     policy = make_policy(plain(config.policy), checkpoint)
     facts = {
         **plain(config.chosen),
@@ -121,20 +138,17 @@ def _reported(config: DictConfig, checkpoint: Path, output: Path) -> float:
     if config.recorder:
         with optional(output / "rollouts.rrd"):
             keep_recordings(report, output / "recordings", output / "rollouts.rrd", config.evaluate.recordings)
-    plot_report(report, output / "report.png")
-    if reports:
-        plot_suite({SEEN: report, **reports}, output / "suite.png")
-        show(suite_table({SEEN: report, **reports}))
+    with atomic_path(output / "report.png") as draft:
+        plot_report(report, draft)
+    if others:
+        with atomic_path(output / "suite.png") as draft:
+            plot_suite({SEEN: report, **others}, draft)
+        show(suite_table({SEEN: report, **others}))
     # Only now: whoever finds it does nothing of this again.
-    write_report(report, output / "report.json", str(checkpoint), plain(config), facts, reports)
+    write_report(report, output / "report.json", str(checkpoint), plain(config), facts, others)
     with optional(output / PAGE):
         write_page(output)
     log.info("wrote %s, report.json, report.png%s", output / PAGE, " and rollouts.rrd" if config.recorder else "")
-    print(report)
-    errors = [error for each in (report, *reports.values()) for error in each.errors]
-    if errors:
-        raise ValueError(f"{len(errors)} episodes ended in an error, see {output / 'report.json'}")
-    return report.success
 
 
 def _played(config: DictConfig, checkpoint: Path, recordings: Path) -> dict[str, Report]:

@@ -4,10 +4,9 @@
 
 from __future__ import annotations
 
+import io
 import json
 import logging
-import os
-import shutil
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -18,6 +17,7 @@ import torch
 from torch import Tensor, nn
 from torch.export import Dim, ExportedProgram
 
+from vla.files import atomic_path
 from vla.models.model import Batch, Model
 from vla.policy import Policy, noise
 from vla.types import Text
@@ -90,15 +90,10 @@ class Program:
             raise ValueError(f"{self._folder} exists already: choose another export.folder")
         if self._onnx:
             _require_onnx()
-        draft = self._folder.with_name(f".{self._folder.name}.unfinished")
-        shutil.rmtree(draft, ignore_errors=True)  # left by an export that was cut short
-        draft.mkdir(parents=True)
-        try:
+        with atomic_path(self._folder) as draft:
+            draft.mkdir(parents=True)
             told = self._write(draft, Policy("cpu", model=policy.model, spec=policy.spec))
             (draft / "program.json").write_text(json.dumps(told, indent=1) + "\n", encoding="utf-8")
-            os.rename(draft, self._folder)
-        finally:
-            shutil.rmtree(draft, ignore_errors=True)
         return self._folder
 
     def _write(self, folder: Path, policy: Policy) -> dict[str, Any]:
@@ -107,7 +102,9 @@ class Program:
         for name, steps in played(policy).items():
             whole = (Act if name == "act" else Encode)(model)
             captured = capture(whole, steps[0])
-            torch.export.save(captured, folder / f"{name}.pt2")
+            archive = io.BytesIO()
+            torch.export.save(captured, archive)
+            (folder / f"{name}.pt2").write_bytes(archive.getbuffer())  # torch would hide what the disk says
             runs: dict[str, Run] = {"model": whole, f"{name}.pt2": torch.export.load(folder / f"{name}.pt2").module()}
             if self._onnx:
                 runs[f"{name}.onnx"] = write_onnx(captured, steps[0], folder / f"{name}.onnx")

@@ -15,6 +15,7 @@ import rerun.blueprint as rrb
 import rerun_cli
 from PIL import Image
 
+from vla.files import atomic_path
 from vla.spec import Array, Environment, Episode, Observation, Shape, Spec
 from vla.types import Point
 
@@ -65,14 +66,13 @@ class RerunRecorder:
         self._poses.append(_copied(self._environment.poses()))
 
     def end(self, episode: Episode) -> None:
-        """Write the episode's file, under another name until it is whole."""
+        """Write the episode's file, whole or not at all; an OSError if the disk does not take it."""
         self._poses.append(_copied(self._environment.poses()))
         name, spec = recording_name(episode.seed, episode.outcome), self._environment.spec
-        partial = self._folder / f"{name}.rrd.partial"
         # The viewer merges recordings of the same id, and the same seeds are played by many policies.
         stream = rr.RecordingStream("vla", recording_id=f"{name}-{os.urandom(3).hex()}")
-        blueprint = _blueprint(spec, bool(self._probabilities), self._eye, self._look_at)
-        stream.set_sinks(rr.FileSink(partial), default_blueprint=blueprint)
+        content = rr.binary_stream(stream)  # a file of Rerun's own, on a full disk, was seen to wait for ever
+        stream.send_blueprint(_blueprint(spec, bool(self._probabilities), self._eye, self._look_at), make_active=False)
         writer = _Writer(stream, spec)
         writer.facts(episode)
         writer.shapes(self._shapes)
@@ -81,9 +81,9 @@ class RerunRecorder:
         writer.curves(episode)
         if self._probabilities:
             writer.tokens(np.array([*self._probabilities]), np.stack([*self._probabilities.values()]))
-        stream.flush()
+        with atomic_path(self._folder / f"{name}.rrd") as draft:
+            draft.write_bytes(content.read() or b"")
         stream.disconnect()
-        os.replace(partial, self._folder / f"{name}.rrd")
 
 
 def _copied(poses: Mapping[str, Array]) -> dict[str, Array]:
@@ -273,10 +273,9 @@ def merge(files: Sequence[Path], target: Path) -> None:
     """
     if not files:
         raise ValueError(f"no recordings to merge into {target}")
-    partial = target.with_name(f"{target.name}.partial")
-    command = [VIEWER, "rrd", "merge", *map(str, files), "-o", str(partial)]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    if done.returncode:
-        partial.unlink(missing_ok=True)
-        raise ValueError(f"rerun could not merge {len(files)} recordings into {target}: {done.stderr[-500:].strip()}")
-    os.replace(partial, target)
+    with atomic_path(target) as draft:
+        command = [VIEWER, "rrd", "merge", *map(str, files), "-o", str(draft)]
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        if done.returncode:
+            reason = done.stderr[-500:].strip()
+            raise ValueError(f"rerun could not merge {len(files)} recordings into {target}: {reason}")

@@ -111,7 +111,7 @@ def go_on(cfg: DictConfig, overrides: Sequence[str]) -> DictConfig:
     what the training follows from applies on top.
 
     Raises:
-        ValueError: there is none, or an override would make it another training.
+        ValueError: there is none, it has nothing left to do, or an override would make it another training.
     """
     from vla.policy import read_checkpoint
     from vla.results import run_of
@@ -141,7 +141,9 @@ def go_on(cfg: DictConfig, overrides: Sequence[str]) -> DictConfig:
             if name in saved.config.get("trainer", {}) and f"trainer.{name}" not in named:
                 OmegaConf.update(resumed, f"trainer.{name}", saved.config["trainer"][name], force_add=True)
     _require_same_sharing(resumed, saved)
-    resumed.checkpoint, resumed.resume = str(path), not saved.finished
+    if not last and saved.finished:
+        _require_steps_left(resumed, path)
+    resumed.checkpoint, resumed.resume = str(path), True
     if last and "output" not in named:
         resumed.output = str(path.parent.parent)
     if last and "job" not in named:
@@ -214,6 +216,17 @@ def _require_same_sharing(cfg: DictConfig, saved: Checkpoint) -> None:
         )
 
 
+def _require_steps_left(cfg: DictConfig, path: Path) -> None:
+    import torch
+
+    steps = torch.load(path, map_location="cpu", weights_only=True, mmap=True).get("global_step", 0)
+    if 0 <= cfg.trainer.max_steps <= steps:
+        raise ValueError(
+            f"{path} has reached trainer.max_steps={cfg.trainer.max_steps}: raise it, or evaluate it with "
+            f"checkpoint={path} alone"
+        )
+
+
 def _plain(cfg: DictConfig) -> dict[str, Any]:
     return cast("dict[str, Any]", OmegaConf.to_container(cfg, resolve=True))
 
@@ -241,6 +254,7 @@ def newest_interrupted(runs: Path) -> Path:
         ValueError: there is none.
     """
     from vla.policy import read_checkpoint
+    from vla.results import run_of
 
     files = sorted(runs.glob(f"*/checkpoints/{LAST}"), key=lambda path: path.stat().st_mtime, reverse=True)
     for path in files:
@@ -248,7 +262,8 @@ def newest_interrupted(runs: Path) -> Path:
             continue
         saved = read_checkpoint(path)
         unreported = saved.config.get("job") == "evaluate" and not (path.parent.parent / "report.json").exists()
-        if not saved.finished or unreported:
+        unchosen = run_of(path).chosen is None  # killed between its last save and its end
+        if not saved.finished or unchosen or unreported:
             return path
     raise ValueError(
         f"checkpoint=last: none of the {len(files)} trainings in {runs} was interrupted; checkpoint=FILE names one"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import shutil
 import sys
 import traceback
 from pathlib import Path
@@ -47,7 +48,15 @@ def sentence(error: Exception) -> str:
         return _unknown_key(cause)
     if isinstance(error, OmegaConfBaseException) and error.full_key:
         return f"{error.full_key}: {str(error).splitlines()[0]}"
-    return " ".join(str(error).split()) or type(error).__name__
+    if isinstance(error, OSError) and error.filename:
+        return f"{error.filename}: {error.strerror}"
+    if type(error).__name__ == "FatalError" and "OpenGL" in str(error):
+        backend = os.environ.get("MUJOCO_GL", "glfw")
+        return f"MuJoCo cannot render here with MUJOCO_GL={backend}: set it to egl, or osmesa"
+    text = " ".join(str(error).split())
+    if "failed to map segment" in text:
+        return f"the memory that this process may use is too little to load its libraries ({text}): raise ulimit -v"
+    return text or type(error).__name__
 
 
 def _unknown_key(error: OmegaConfBaseException) -> str:
@@ -105,6 +114,13 @@ def _devices(trainer: DictConfig) -> int:
     return max(device_count(), 1) * nodes
 
 
+def _remove_unused() -> None:
+    """Remove the folder that Hydra made for this run, which goes on in the folder of another one."""
+    folder = Path(HydraConfig.get().runtime.output_dir)
+    if HydraConfig.get().mode == RunMode.RUN and {path.name for path in folder.iterdir()} <= {".hydra"}:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
 def _do(cfg: DictConfig) -> float | None:
     from vla import jobs
 
@@ -117,6 +133,8 @@ def _do(cfg: DictConfig) -> float | None:
     if cfg.pretrained is not None:
         cfg = start_from(cfg, said)
     if cfg.checkpoint is not None and (cfg.checkpoint == "last" or cfg.resume or cfg.job == "train"):
+        if cfg.checkpoint == "last":
+            _remove_unused()
         cfg = go_on(cfg, said)
     elif cfg.checkpoint is not None and cfg.job in ADOPTING:
         from vla.policy import read_checkpoint

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from vla.files import atomic_path
 from vla.report import GREEN, GREY
 from vla.spec import Array, Spec
 
@@ -41,9 +41,8 @@ def draw_samples(batch: dict[str, Any], spec: Spec, path: Path) -> None:
             axes.imshow(np.asarray(batch["rgb"][camera])[index, -1])
             axes.axis("off")
         _plot_action(labels, actions[index], spec)
-    draft = path.with_name(f".{path.name}.{os.getpid()}")
-    figure.savefig(draft, format="png", dpi=130)
-    os.replace(draft, path)
+    with atomic_path(path) as draft:
+        figure.savefig(draft, format="png", dpi=130)
 
 
 def _plot_action(axes: Axes, action: Array, spec: Spec) -> None:

@@ -14,6 +14,7 @@ from omegaconf import DictConfig
 
 from vla.collect import effort
 from vla.data.episodes import EpisodeStore
+from vla.files import writing
 from vla.models.chunks import ChunkModel
 from vla.models.fidelity import beyond, fidelity
 from vla.models.learner import Learner
@@ -48,6 +49,8 @@ def trained(config: DictConfig) -> Path | None:
     checkpoints = output / "checkpoints"
     interruption = Interruption(checkpoints)
     closed_loop = _closed_loop(config, checkpoints)
+    if _endless(config):
+        log.info("trainer.max_steps=-1: training goes on until it is interrupted; Ctrl-C saves and stops")
     with alone(checkpoints):
         # Before anything is collected: the devices asked for may be missing, and so may be pretrained weights.
         trainer = make_trainer(config, checkpoints, *([closed_loop] if closed_loop else []), interruption)
@@ -61,6 +64,11 @@ def trained(config: DictConfig) -> Path | None:
         data = make_data(config, store, learner.model)
         _tell_losses(learner.model, store)
         data.setup()
+        if config.data.batch_size > len(data.training_windows):
+            raise ValueError(
+                f"data.batch_size={config.data.batch_size} is more than the {len(data.training_windows)} windows of "
+                f"the episodes in {store.folder}: lower it, or collect more"
+            )
         if not len(data.held_out_windows):
             trainer.limit_val_batches = 0  # else what waits for a validation would wait in vain
         first = data.gather(data.order(0)[:SHOWN])
@@ -68,7 +76,7 @@ def trained(config: DictConfig) -> Path | None:
             draw_samples(first, store.spec, output / FILE)
         if config.checkpoint:
             keep_metrics(trainer, Path(config.checkpoint))
-        with _told(config, trainer, interruption, learner, effort(store, config.collect.episodes)):
+        with writing(output), _told(config, trainer, interruption, learner, effort(store, config.collect.episodes)):
             try:
                 with enough_memory(config), interruption.listening():
                     trainer.fit(learner, datamodule=data, ckpt_path=config.checkpoint, weights_only=True)
@@ -84,6 +92,11 @@ def trained(config: DictConfig) -> Path | None:
     chosen = closed_loop.chosen(checkpoints / LAST) if closed_loop else checkpoints / LAST
     note_choice(output, chosen.name)
     return chosen
+
+
+def _endless(config: DictConfig) -> bool:
+    limits = [config.trainer.get(name) for name in ("max_steps", "max_epochs", "max_time")]
+    return all(limit in (None, -1) for limit in limits)
 
 
 def _tell_losses(model: Model, store: EpisodeStore) -> None:

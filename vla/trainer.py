@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 import torch
 from lightning import Callback, LightningModule, Trainer
+from lightning.pytorch.accelerators import CPUAccelerator
 from lightning.pytorch.callbacks import Checkpoint
 from lightning.pytorch.loggers import CSVLogger, Logger
 from lightning.pytorch.plugins import TorchCheckpointIO
@@ -29,8 +30,10 @@ from omegaconf import DictConfig
 
 from vla.averaging import Averaging
 from vla.check import build
+from vla.files import atomic_path
 from vla.progress import Pace, Progress
 from vla.resume import LAST
+from vla.workers import cores
 
 log = logging.getLogger(__name__)
 
@@ -157,19 +160,15 @@ class AtomicFiles(TorchCheckpointIO):
             OSError: it cannot be written; what was at `path` still is.
         """
         target = Path(path)
-        draft = target.with_name(f"{target.name}.partial")
         target.parent.mkdir(parents=True, exist_ok=True)
-        try:
-            with draft.open("wb") as file:
+        with atomic_path(target) as draft, draft.open("wb") as file:
+            try:
                 torch.save(checkpoint, file)
-                os.fsync(file.fileno())
-            os.replace(draft, target)
-        except (OSError, RuntimeError) as error:  # torch wraps what the disk says
-            raise OSError(
-                f"{target} cannot be written, the one before is kept: {str(error).splitlines()[0]}"
-            ) from error
-        finally:
-            draft.unlink(missing_ok=True)
+            except RuntimeError as error:
+                if isinstance(error.__context__, OSError):  # what the disk said
+                    raise error.__context__ from None
+                raise
+            os.fsync(file.fileno())
 
 
 class Draws(Callback):
@@ -210,13 +209,27 @@ def make_trainer(config: DictConfig, checkpoints: Path | None, *watching: Callba
         if isinstance(trainer.strategy, ParallelStrategy) and trainer.strategy.cluster_environment:
             # As many processes as a cluster started, of which Lightning would not speak before the training.
             trainer.strategy.cluster_environment.validate_settings(trainer.num_devices, trainer.num_nodes)
+    except RuntimeError as error:  # of a cluster that was asked for its processes in another way
+        raise ValueError(f"training cannot start in this environment: {error}") from error
     except (MisconfigurationException, ValueError) as error:
         names = ("accelerator", "devices", "num_nodes", "strategy", "precision")
         said = {name: config.trainer[name] for name in names if name in config.trainer}
         asked = [f"trainer.{name}={value}" for name, value in said.items() if not isinstance(value, DictConfig)]
         raise ValueError(f"{' '.join(asked)} cannot be had here ({error}): try trainer=cpu or trainer=auto") from error
+    _require_cores(trainer)
     trainer.strategy.checkpoint_io = AtomicFiles()
     return trainer
+
+
+def _require_cores(trainer: Trainer) -> None:
+    """Refuse more processes on this CPU than it has cores; processes of a cluster have each their own."""
+    environment = getattr(trainer.strategy, "cluster_environment", None)
+    elsewhere = environment is not None and environment.creates_processes_externally
+    if isinstance(trainer.accelerator, CPUAccelerator) and not elsewhere and trainer.num_devices > cores():
+        raise ValueError(
+            f"trainer.devices={trainer.num_devices} asks for more processes than this machine has cores: set "
+            f"trainer.devices={cores()} or fewer"
+        )
 
 
 @contextmanager

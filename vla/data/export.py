@@ -5,16 +5,12 @@ from __future__ import annotations
 import json
 import os
 import shutil
-import signal
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
+from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from functools import partial
-from multiprocessing import get_context
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 from filelock import FileLock, Timeout
@@ -24,9 +20,10 @@ from rich.progress import track
 from vla.data.episodes import EpisodeStore
 from vla.data.index import Entry
 from vla.documents import read_json
+from vla.files import writing
 from vla.spec import Array, Spec
 from vla.types import Count, Text
-from vla.workers import cores, leave_with_parent
+from vla.workers import Pool, WorkersLost, cores
 
 MILLIMETRE = np.float32(0.001)  # [m]
 
@@ -155,6 +152,7 @@ def unfinished(folder: Path) -> Iterator[Path]:
 
     Raises:
         ValueError: another process is exporting to `folder`.
+        OSError: the disk does not take it; the message names `folder`.
     """
     place = folder.with_name(f".{folder.name}.unfinished")
     place.mkdir(parents=True, exist_ok=True)
@@ -164,7 +162,8 @@ def unfinished(folder: Path) -> Iterator[Path]:
     except Timeout as error:
         raise ValueError(f"another export to {folder} is under way: wait, or choose another export.folder") from error
     try:
-        yield place
+        with writing(folder):
+            yield place
         shutil.rmtree(place)
     finally:
         with suppress(OSError):  # where nothing was begun, nothing needs to stay
@@ -175,41 +174,40 @@ def unfinished(folder: Path) -> Iterator[Path]:
 
 def each(
     work: Callable[[EpisodeStore, Item], Result], store: EpisodeStore, items: Sequence[Item], workers: int | None
-) -> Iterator[Result]:
+) -> Generator[Result]:
     """What `work` makes of the store and each of the items, in their order; null workers: one process per core.
 
     Raises:
-        ValueError: a process died; what `work` itself raises comes through.
+        ValueError: a process crashed twice; what `work` itself raises comes through.
     """
     workers = min(workers or cores(), len(items))
     if workers <= 1:
         yield from track((work(store, item) for item in items), "exporting", len(items))
         return
-    pool = ProcessPoolExecutor(workers, get_context("spawn"), _enter, (store.folder, len(store.episodes)))
-    try:
-        yield from track(pool.map(partial(_in_worker, work), items), "exporting", len(items))
-    except BrokenProcessPool as error:
-        raise ValueError(
-            "an exporting process died, killed for its memory or by a crash outside Python: run again to go on, "
-            "with export.workers=1 to see the crash"
-        ) from error
-    finally:
-        pool.shutdown(cancel_futures=True)
+    make = partial(_Exporting, work, store.folder, len(store.episodes))
+    with Pool(make, workers, "export.workers") as pool:
+        futures = [pool.submit(item) for item in items]
+        try:
+            yield from track((future.result() for future in futures), "exporting", len(items))
+        except WorkersLost as lost:
+            raise ValueError(
+                f"an exporting process crashed twice: {lost}. What is written stays; run again to go on, with "
+                "export.workers=1 for the traceback"
+            ) from lost
 
 
-_here: EpisodeStore | None = None  # the store, where this process is one of a pool
+class _Exporting(Generic[Item, Result]):
+    """The store and what is made of it, in a worker process."""
 
+    def __init__(self, work: Callable[[EpisodeStore, Item], Result], folder: Path, episodes: int) -> None:
+        self._work, self._store = work, EpisodeStore(folder, episodes)
 
-def _enter(folder: Path, episodes: int) -> None:
-    global _here
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the process that was started by hand
-    leave_with_parent()
-    _here = EpisodeStore(folder, episodes)
+    def attempt(self, item: Item) -> Result:
+        """What becomes of one item."""
+        return self._work(self._store, item)
 
-
-def _in_worker(work: Callable[[EpisodeStore, Item], Result], item: Item) -> Result:
-    assert _here is not None
-    return work(_here, item)
+    def close(self) -> None:
+        """Nothing to free."""
 
 
 def _numbers(values: Array) -> list[float]:

@@ -194,8 +194,13 @@ def put_together(
             seeds = [(seed, found) for part in chosen.values() for seed, found in sorted(part.items())]
             damaged = [seed for seed, found in track(seeds, "writing") if not _write(store, seed, found, repair)]
         os.rename(draft, folder)
-    except BaseException:
+    except BaseException as error:
         shutil.rmtree(draft, ignore_errors=True)
+        if isinstance(error.__cause__, OSError):  # of a store that grows, of which more would be left
+            raise ValueError(
+                f"{folder} cannot be written ({error.__cause__.strerror}), nothing of it is kept: make room there, or "
+                "choose another inspect.into"
+            ) from error
         raise
     return damaged
 

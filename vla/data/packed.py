@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 from collections.abc import Mapping, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -97,7 +97,8 @@ class Packed:
         with ExitStack() as stack:
             paths = {name: folder / f"{name}.{'pack' if name in lengths else 'bin'}" for name in store.fields}
             files = {name: stack.enter_context(path.open("wb")) for name, path in paths.items()}
-            episodes = each(self._pieces, store, range(len(store.episodes)), self._workers)
+            pieces_of = each(self._pieces, store, range(len(store.episodes)), self._workers)
+            episodes = stack.enter_context(closing(pieces_of))
             for entry in tried:
                 if entry.success:
                     pieces = next(episodes)

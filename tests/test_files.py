@@ -1,0 +1,45 @@
+"""What is written is there whole or not at all, and a disk that does not take it is named."""
+
+from __future__ import annotations
+
+import os
+from errno import ENOENT, ENOSPC
+from pathlib import Path
+
+import pytest
+
+from vla.files import atomic_path, writing
+
+
+def test_a_file_and_a_folder_take_their_place_at_the_end(tmp_path: Path) -> None:
+    for name in ("file.txt", "folder"):
+        with atomic_path(tmp_path / name) as draft:
+            assert draft.name.endswith(name) and draft.parent == tmp_path
+            place = draft
+            if name == "folder":
+                draft.mkdir()
+                place = draft / "inside"
+            place.write_text(name)
+            assert not (tmp_path / name).exists()
+    assert (tmp_path / "file.txt").read_text() == "file.txt"
+    assert (tmp_path / "folder/inside").read_text() == "folder"
+
+
+@pytest.mark.parametrize("before", ["", "before"])
+def test_a_full_disk_leaves_what_was_there_and_is_named(tmp_path: Path, before: str) -> None:
+    target = tmp_path / "file"
+    if before:
+        target.write_text(before)
+    with pytest.raises(OSError, match="make room there") as failed, atomic_path(target) as draft:
+        draft.write_text("half")
+        Path("/dev/full").write_text("the rest")
+    assert str(failed.value).startswith(f"{target} cannot be written (No space left on device)")
+    assert ("the one before it is kept" in str(failed.value)) == bool(before)
+    assert [path.read_text() for path in tmp_path.iterdir()] == [before] * bool(before)
+
+
+def test_only_what_a_disk_says_is_put_in_other_words(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError), writing(tmp_path):
+        raise OSError(ENOENT, os.strerror(ENOENT), "other")
+    with pytest.raises(OSError, match="inner cannot be written"), writing(tmp_path / "outer"), writing(Path("inner")):
+        raise OSError(ENOSPC, os.strerror(ENOSPC))

@@ -1,0 +1,81 @@
+"""Worker processes: what ends them, and what is heard of it."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+from functools import partial
+from multiprocessing import active_children
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import pytest
+
+from vla.workers import Pool, WorkersLost
+
+
+class Doubling:
+    """Doubles numbers; does to its own process what is asked of it."""
+
+    def __init__(self, marker: Path | None = None, status: int | None = None) -> None:
+        """Ends the process with exit `status`, or by a signal while there is no `marker`, which it leaves."""
+        if status is not None:
+            os._exit(status)
+        if marker is not None and not marker.exists():
+            marker.touch()
+            os.kill(os.getpid(), signal.SIGKILL)
+
+    def attempt(self, number: int) -> int:
+        """Twice the number; of 7 none, by the end of the process."""
+        if number == 7:
+            os.kill(os.getpid(), signal.SIGSEGV)
+        if number == 8:
+            raise Awkward("eight", 8)
+        return 2 * number
+
+    def close(self) -> None:
+        """Nothing to free."""
+
+
+class Awkward(Exception):
+    """Cannot be unpickled."""
+
+    def __init__(self, text: str, number: int) -> None:
+        super().__init__(f"{text} is {number}")
+
+
+def results(make: Any, *numbers: int) -> list[Any]:
+    """What becomes of the numbers, exceptions included."""
+    with Pool(make, 2, "some.workers") as pool:
+        futures = [pool.submit(number) for number in numbers]
+        found = [future.exception() or future.result() for future in futures]
+    assert not active_children()
+    return found
+
+
+def test_only_the_item_that_crashes_its_process_twice_is_lost() -> None:
+    one, lost, *others = results(Doubling, 1, 7, 2, 3)
+    assert (one, *others) == (2, 4, 6)
+    assert isinstance(lost, WorkersLost) and str(lost).startswith("it was ended by signal 11 (")
+
+
+def test_an_error_that_cannot_be_sent_is_told_in_words() -> None:
+    one, error = results(Doubling, 1, 8)
+    assert one == 2 and type(error) is RuntimeError and str(error) == "Awkward: eight is 8"
+
+
+def test_a_process_that_is_killed_while_it_starts_is_replaced(tmp_path: Path) -> None:
+    assert results(partial(Doubling, marker=tmp_path / "killed"), 1) == [2]
+
+
+def test_a_process_that_cannot_start_says_why(monkeypatch: pytest.MonkeyPatch) -> None:
+    (ended,) = results(partial(Doubling, status=3), 1)
+    assert type(ended) is ValueError and "could not start: it ended with exit status 3, see what" in str(ended)
+    assert "some.workers=1" in str(ended)
+    only_here = ModuleType("only_here")
+    only_here.Doubling = type("Doubling", (Doubling,), {"__module__": "only_here"})  # type: ignore[attr-defined]
+    monkeypatch.setitem(sys.modules, "only_here", only_here)
+    (missing,) = results(only_here.Doubling, 1)
+    assert isinstance(missing, ModuleNotFoundError) and "only_here" in str(missing)
