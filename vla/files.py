@@ -34,6 +34,13 @@ def atomic_path(target: Path) -> Iterator[Path]:
                 draft.unlink()
 
 
+def write_text(target: Path, text: str) -> None:
+    """Write a text file whole or not at all, into a folder that is made; see `atomic_path`."""
+    with atomic_path(target) as draft:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        draft.write_text(text, encoding="utf-8")
+
+
 @contextmanager
 def writing(target: Path) -> Iterator[None]:
     """Within, an error of the disk, which often names no file, becomes an OSError whose message names `target`."""

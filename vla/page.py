@@ -20,8 +20,9 @@ from markupsafe import Markup
 
 from vla.curves import colours, draw_run, draw_runs
 from vla.evaluate import ERROR, SEEN, Report, Result
+from vla.files import write_text
 from vla.report import BLUE, GREEN, GREY, RED
-from vla.results import ABSENT, Run, at, differences, read_run, require_run, write
+from vla.results import ABSENT, Run, at, differences, read_run, require_run
 from vla.suite import mcnemar
 
 log = logging.getLogger(__name__)
@@ -137,7 +138,7 @@ def _write(path: Path, template: str, **content: Any) -> Path:
     environment.filters.update(percent=_percent, duration=_duration, brief=_brief, embedded=_embedded, svg=Markup)
     environment.globals.update(green=GREEN, red=RED, blue=BLUE, grey=GREY)
     page = environment.get_template(template).render(written=f"{datetime.now():%Y-%m-%d %H:%M}", **content)
-    write(path, page)
+    write_text(path, page)
     return path
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from contextlib import nullcontext
 from dataclasses import replace
 from functools import cache, partial
 from pathlib import Path
@@ -110,12 +111,10 @@ def make_policy(policy: Node, checkpoint: Path, environment: Environment | None 
 
 def _model(node: Node, spec: Spec, tokenizer: ActionTokenizer, saved: Checkpoint | None) -> Model:
     """The model that a node describes; one whose weights come out of a checkpoint is no larger than that."""
-    import torch
+    from vla.policy import Allowance
 
-    if saved:
-        with torch.device("meta"):
-            saved.require_plausible(build(node, "model", spec=spec, tokenizer=tokenizer))
-    model: Model = build(node, "model", spec=spec, tokenizer=tokenizer)
+    with Allowance(saved.path) if saved else nullcontext():
+        model: Model = build(node, "model", spec=spec, tokenizer=tokenizer)
     return model
 
 

@@ -15,6 +15,7 @@ from zipfile import ZIP_STORED, BadZipFile, ZipFile
 import numpy as np
 import torch
 from torch import Tensor
+from torch.overrides import TorchFunctionMode
 
 from vla.documents import require_resolved
 from vla.models.model import Model
@@ -50,21 +51,6 @@ class Checkpoint:
         except (RuntimeError, TypeError, AttributeError) as error:  # the latter for values that are no tensors
             first = str(error).strip().splitlines()[-1].strip()[:200]
             raise ValueError(f"{self.path} does not fit the model of its own configuration: {first}") from error
-
-    def require_plausible(self, outline: torch.nn.Module) -> None:
-        """Refuse weights that the file cannot hold, before memory is given to them.
-
-        Args:
-            outline: the model of the configuration, on the device "meta".
-
-        Raises:
-            ValueError: it is far larger than the file.
-        """
-        size = sum(tensor.numel() * tensor.element_size() for tensor in (*outline.parameters(), *outline.buffers()))
-        if size > 2 * self.path.stat().st_size + 2**22:
-            raise ValueError(
-                f"{self.path} describes a model of {size >> 20} MiB, which it does not hold: it is damaged"
-            )
 
     def start(self, model: Model) -> None:
         """Load the weights, to train them further; the head that predicts the truth starts anew where that differs.
@@ -125,6 +111,39 @@ def _require_nodes(config: Any, path: Path) -> None:
     nodes = all(isinstance(config.get(name), dict) for name in NODES) if isinstance(config, dict) else False
     if not nodes or not all(isinstance(config.get(name, {}), dict) for name in OTHERS):
         raise ValueError(f"{path} is no checkpoint of this project: its configuration lacks {', '.join(NODES)}")
+
+
+class Allowance(TorchFunctionMode):
+    """Within, tensors are made up to a size that the weights in a checkpoint could fill.
+
+    A configuration that asks for more is refused at the tensor that exceeds it, before anything is written there.
+    """
+
+    FACTORIES = (torch.empty, torch.zeros, torch.ones, torch.full, torch.rand, torch.randn)
+
+    def __init__(self, checkpoint: Path) -> None:
+        super().__init__()
+        self._path, self._left = checkpoint, 2 * checkpoint.stat().st_size + 2**26
+
+    def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        """Call `func` and count what it made.
+
+        Raises:
+            ValueError: it is more than the file can hold.
+        """
+        try:
+            made = func(*args, **(kwargs or {}))
+            self._left -= made.nbytes if func in self.FACTORIES else 0
+        except RuntimeError as error:
+            if func not in self.FACTORIES:
+                raise
+            raise self._refusal() from error
+        if self._left < 0:
+            raise self._refusal()
+        return made
+
+    def _refusal(self) -> ValueError:
+        return ValueError(f"{self._path} describes a model that is larger than the file, which does not hold it")
 
 
 class Policy:

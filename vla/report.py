@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -14,6 +13,7 @@ from rich.table import Table
 
 from vla.evaluate import ERROR, Report, Result
 from vla.factors import association, factors, groups, numeric
+from vla.files import write_text
 from vla.intervals import wilson_interval
 from vla.spec import Array, Observation, flat, leaves
 
@@ -52,9 +52,7 @@ def write_report(
         "config": config,
         "per_episode": [asdict(result) for result in report.results],
     }
-    partial = path.with_name(f"{path.name}.partial")
-    partial.write_text(json.dumps(content, indent=1, allow_nan=False, ensure_ascii=False) + "\n", encoding="utf-8")
-    os.replace(partial, path)
+    write_text(path, json.dumps(content, indent=1, allow_nan=False, ensure_ascii=False) + "\n")
 
 
 def summary(report: Report) -> dict[str, Any]:

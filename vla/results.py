@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import io
 import json
-import os
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property, partial
@@ -17,6 +16,7 @@ import yaml
 
 from vla.documents import read_bounded, read_json, read_yaml
 from vla.evaluate import SEEN, Report, Result
+from vla.files import write_text
 from vla.run_files import Change, Node, ReportFile, Training
 from vla.spec import Array
 
@@ -118,7 +118,7 @@ def require_run(folder: Path) -> Run:
 def write_config(folder: Path, config: Mapping[str, Any], changes: list[Node]) -> None:
     """Write the resolved configuration, and what of it is not as by default."""
     for name, content in ((CONFIG, config), (CHANGES, changes)):
-        write(folder / name, yaml.safe_dump(content, sort_keys=False, allow_unicode=True, width=120))
+        write_text(folder / name, yaml.safe_dump(content, sort_keys=False, allow_unicode=True, width=120))
 
 
 def note_training(
@@ -159,16 +159,8 @@ def differences(one: Any, other: Any, key: str = "") -> list[tuple[str, Any, Any
     return found
 
 
-def write(path: Path, text: str) -> None:
-    """Write a file into a folder, which is made, all of it or nothing; several processes may do so at once."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    draft = path.with_name(f".{path.name}.{os.getpid()}")
-    draft.write_text(text, encoding="utf-8")
-    os.replace(draft, path)
-
-
 def _write_training(folder: Path, training: Training) -> None:
-    write(folder / TRAINING, json.dumps(asdict(training), ensure_ascii=False) + "\n")
+    write_text(folder / TRAINING, json.dumps(asdict(training), ensure_ascii=False) + "\n")
 
 
 def _read(path: Path, read: Callable[[Path], T], otherwise: T) -> T:

@@ -43,7 +43,10 @@ IDENTITY = (
 )
 # What somebody else's checkpoint decides of a training that goes on from it; where files lie, what is logged where and
 # on which devices it runs, the command line decides.
-OF_OTHERS = ("task", "expert", "data", "tokenizer", "model", "learner", "validate", "seed", "chosen")
+OF_OTHERS = (
+    *("task", "expert", "data", "tokenizer", "model", "learner", "validate", "seed", "chosen"),
+    *("evaluate", "policy", "recorder"),
+)
 # What the report on a policy says of its training.
 TOLD = ("expert", "collect", "data", "learner", "trainer", "validate", "seed", "pretrained")
 

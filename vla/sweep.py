@@ -6,8 +6,6 @@ A cell is a folder of the sweep; cells that differ in nothing but the seed of tr
 from __future__ import annotations
 
 import csv
-import os
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -18,6 +16,8 @@ from hydra.core.utils import JobReturn, JobStatus
 from hydra.experimental.callback import Callback
 from hydra.types import RunMode
 from omegaconf import DictConfig
+
+from vla.files import atomic_path, write_text
 
 DEMONSTRATIONS = "collect.episodes"  # the override over which success is drawn
 SEED = "seed"  # the override that distinguishes the cells of one row
@@ -104,9 +104,11 @@ def tabulate(folder: Path) -> list[Row]:
     if rows:
         from vla.sweep_plot import plot
 
-        _whole(folder / "sweep.csv", lambda path: _write_csv(rows, path))
-        _whole(folder / "sweep.md", lambda path: path.write_text(markdown(rows), encoding="utf-8"))
-        _whole(folder / "sweep.png", lambda path: plot(rows, path))
+        with atomic_path(folder / "sweep.csv") as draft:
+            _write_csv(rows, draft)
+        write_text(folder / "sweep.md", markdown(rows))
+        with atomic_path(folder / "sweep.png") as draft:
+            plot(rows, draft)
         _write_page(rows, folder)
     return rows
 
@@ -204,10 +206,3 @@ def _write_csv(rows: list[Row], path: Path) -> None:
                 counts = [row.successes[condition], row.episodes[condition], len(row.rates)]
                 costs = [row.parameters, round(row.latency, 3)]
                 writer.writerow([*row.choices.values(), condition, *row.interval(condition), *counts, *costs])
-
-
-def _whole(path: Path, write: Callable[[Path], Any]) -> None:
-    """Let `write` make a file that appears when it is complete; cells may end at the same time."""
-    draft = path.with_name(f".{path.name}.{os.getpid()}")
-    write(draft)
-    os.replace(draft, path)

@@ -7,13 +7,13 @@ is a module that is called as the user calls it.
 from __future__ import annotations
 
 import json
-import os
 from importlib import import_module
 from pathlib import Path
 
 from omegaconf import DictConfig
 
 from vla.benchmark.measure import Measure
+from vla.files import write_text
 
 STAGES = ("collect", "loader", "train", "policy", "deploy")
 
@@ -32,9 +32,7 @@ def benchmark(config: DictConfig, output: Path) -> dict[str, Measure]:
     measures: dict[str, Measure] = {}
     for name in config.benchmark.names:
         measures |= import_module(f"vla.benchmark.{name}").measures(config)
-    draft = output / "benchmark.json.partial"
-    draft.write_text(json.dumps(measures, indent=2), encoding="utf-8")
-    os.replace(draft, output / "benchmark.json")
+    write_text(output / "benchmark.json", json.dumps(measures, indent=2))
     _show(measures)
     return measures
 
