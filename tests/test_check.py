@@ -297,4 +297,4 @@ def test_what_would_judge_what_it_chose_or_trained_on_is_refused(override: dict[
 
 def test_any_error_is_one_line() -> None:
     assert sentence(ValueError("a\n  b")) == "a b"
-    assert sentence(OSError(28, "No space left on device", "f")) == "[Errno 28] No space left on device: 'f'"
+    assert sentence(OSError(28, "No space left on device", "f")) == "f: No space left on device"

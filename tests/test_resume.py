@@ -42,6 +42,7 @@ def test_a_training_that_was_killed_between_its_last_save_and_its_end_is_gone_on
     torch.save(content, tmp_path / "one/checkpoints/last.ckpt")
     resumed = go_on(now, ["job=train", "checkpoint=last"])
     assert resumed.output == str(tmp_path / "one") and resumed.resume
+    note_training(tmp_path / "one", 1, 1, 1.0, "done")
     note_choice(tmp_path / "one", "last.ckpt")
     with pytest.raises(ValueError, match="none of the 1 trainings"):
         go_on(now, ["job=train", "checkpoint=last"])

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import logging
-
-from omegaconf import DictConfig
+from collections.abc import Mapping
+from typing import Any
 
 from vla.check import JOBS
 
@@ -25,17 +25,17 @@ def has_bfloat16() -> bool:
     return torch.backends.mkldnn.is_available() and bool(torch.ops.mkldnn._is_mkldnn_bf16_supported())
 
 
-def warn_of_bfloat16(config: DictConfig) -> None:
+def warn_of_bfloat16(config: Mapping[str, Any]) -> None:
     """Log a warning for everything in a job's configuration that makes a processor compute in bfloat16 slowly."""
     for group, (device, full) in COMPUTING.items():
-        node = config[group] if group in JOBS[config.job] else None
+        node = config[group] if group in JOBS[config["job"]] else None
         if node is None or not str(node.get("precision")).startswith("bf16"):
             continue
         if computes_on_processor(node.get(device)) and not has_bfloat16():
             log.warning(
                 "%s.precision=%s is slow here: this processor has no instructions for bfloat16 and multiplies matrices "
                 "about a hundred times faster in 32 bits, %s.precision=%s",
-                *(group, node.precision, group, full),
+                *(group, node["precision"], group, full),
             )
 
 
