@@ -75,7 +75,7 @@ WRONG = (
         "checkpoint=CKPT policy.device=cuda",
         "checkpoint=CKPT task.control_hz=3",
         "evaluate.seed=0",
-        "validate.seed=1000000",
+        "validate.episodes=1 validate.seed=1000000",
     ),
     *(
         "job=deploy deploy=ros2 checkpoint=CKPT --ros-args --nonsense",

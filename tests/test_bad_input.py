@@ -64,6 +64,7 @@ NONSENSE = {
     "evaluate": ("evaluate.episodes=0", "evaluate.workers=0", "evaluate.seed=3", "policy.precision=16"),
     "benchmark": ("benchmark.names=[]", "benchmark.rounds=0"),
     "inspect": ("inspect.stores=[]", "inspect.folder="),
+    "export": ("export.folder=",),
     "report": ("report.runs=['']",),
 }
 

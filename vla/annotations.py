@@ -154,7 +154,7 @@ def _of_json(annotation: Any) -> Any:
     if kind in (Union, types.UnionType):
         return Union[tuple(map(_of_json, arguments))]  # noqa: UP007
     if (kind or annotation) in PATHS:
-        return str
+        return Annotated[str, MinLen(1)]
     if kind is tuple:
         return tuple[tuple(each if each is Ellipsis else _of_json(each) for each in arguments)]  # type: ignore[misc]
     if (kind or annotation) in SEQUENCES:
