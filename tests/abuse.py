@@ -265,7 +265,7 @@ def kills(root: Path, times: int = 20) -> Iterator[tuple[str, bool, str]]:
 def disks(root: Path) -> Iterator[tuple[str, bool, str]]:
     """Every job where no file may grow beyond 20 kB, which is what a full disk looks like."""
     for line in (
-        *("job=preview preview.episodes=1", "job=collect collect.episodes=12", "job=export export.folder=full"),
+        *("job=preview preview.episodes=1", "job=collect collect.episodes=12"),
         *(
             "job=export export=lerobot export.folder=full",
             "job=export export=program checkpoint=CKPT export.folder=full",
