@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -13,7 +14,7 @@ from fake_batch import make_bc, make_decoder, make_rt1
 from toy import SPEC, ToyEnvironment
 
 from vla.models.model import Model, TokenModel
-from vla.policy import Checkpoint, Policy, read_checkpoint
+from vla.policy import Checkpoint, Policy, keep_by_processor, read_checkpoint
 from vla.rollout import rollout
 from vla.spec import Observation
 
@@ -86,6 +87,19 @@ def test_compiled_it_acts_the_same() -> None:
     seen = observations(3)
     eager = act(Policy(model=model, spec=SPEC), seen)
     assert act(Policy(compile=True, model=model, spec=SPEC), seen) == pytest.approx(eager, abs=1e-5)
+
+
+def test_what_is_compiled_is_kept_apart_by_processor(monkeypatch: pytest.MonkeyPatch) -> None:
+    folders = set()
+    for instructions in ("AVX2", "AVX512_CORE", "AVX2"):
+        monkeypatch.delenv("TORCHINDUCTOR_CACHE_DIR", raising=False)
+        monkeypatch.setenv("ONEDNN_MAX_CPU_ISA", instructions)
+        keep_by_processor()
+        folders.add(os.environ["TORCHINDUCTOR_CACHE_DIR"])
+    assert len(folders) == 2
+    monkeypatch.setenv("TORCHINDUCTOR_CACHE_DIR", "chosen")
+    keep_by_processor()
+    assert os.environ["TORCHINDUCTOR_CACHE_DIR"] == "chosen"
 
 
 def test_another_sentence_is_not_compiled_anew() -> None:

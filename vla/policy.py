@@ -4,13 +4,17 @@
 
 from __future__ import annotations
 
+import os
 import time
 from collections import deque
 from dataclasses import dataclass, replace
+from getpass import getuser
 from pathlib import Path
 from pickle import UnpicklingError
+from tempfile import gettempdir
 from typing import Any, Literal
 from zipfile import ZIP_STORED, BadZipFile, ZipFile
+from zlib import crc32
 
 import numpy as np
 import torch
@@ -27,6 +31,7 @@ NODES = ("task", "tokenizer", "model")  # what a checkpoint's configuration says
 # What else it may say, also as mappings.
 OTHERS = ("chosen", "expert", "collect", "data", "learner", "trainer", "validate")
 OF_TRUTH = ("truth_head", "truth_scale")  # parts of a model that are needed in training only
+KEPT_IN = "TORCHINDUCTOR_CACHE_DIR"  # the variable from which PyTorch's compiler takes the folder
 LONG = " ".join(["sentence"] * 24)  # what is compiled for a text of this length is so for all shorter ones
 
 
@@ -181,6 +186,7 @@ class Policy:
         self._encode, self._decide = self.model.encode, self.model.predict
         self._beside = [LONG] if compile else []  # sentences to whose length others are filled up
         if compile:
+            keep_by_processor()
             how: dict[str, Any] = {"options": {"freezing": True}}
             if self.device.type == "cuda":
                 how = {"mode": "reduce-overhead"}
@@ -285,6 +291,18 @@ class Policy:
 
     def _tensor(self, values: Array) -> Tensor:
         return torch.from_numpy(values.copy())[None, None].to(self.device)
+
+
+def keep_by_processor() -> None:
+    """Set the folder in which PyTorch keeps compiled graphs, unless it is set, to one for this kind of processor.
+
+    Frozen weights are laid out for a processor. Graphs that were compiled on another one, of the same home folder or
+    with other instructions switched off, were seen to give other actions without an error.
+    """
+    if KEPT_IN not in os.environ:
+        features = torch.cpu.get_capabilities() if hasattr(torch.cpu, "get_capabilities") else {}
+        kind = (torch.backends.cpu.get_cpu_capability(), os.environ.get("ONEDNN_MAX_CPU_ISA"), features)
+        os.environ[KEPT_IN] = f"{gettempdir()}/torchinductor_{getuser()}_{crc32(repr(kind).encode()):08x}"
 
 
 def noise(spec: Spec, random: np.random.Generator) -> Observation:
