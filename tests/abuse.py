@@ -229,7 +229,7 @@ def checkpoints(root: Path) -> Iterator[tuple[str, bool, str]]:
             yield f"{attack}, {way}", not acted and ended in ("sentence", "done", "late"), f"{ended}: {last(printed)}"
 
 
-def kills(root: Path, times: int = 20) -> Iterator[tuple[str, bool, str]]:
+def kills(root: Path, times: int = 10) -> Iterator[tuple[str, bool, str]]:
     """Collections killed at a random moment, some of them by two interrupts, go on to the same bytes."""
     chance = random.Random(0)
     arguments = ("job=collect", *SMALL, "collect.folder=killed", "output=wrong")
