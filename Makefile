@@ -22,8 +22,8 @@ test: export LP_NUM_THREADS = 0
 test: setup
 	.venv/bin/ruff format --check
 	.venv/bin/ruff check
-	.venv/bin/mypy
-	.venv/bin/pytest -n 2 --dist loadfile -m "not realtime"
+	.venv/bin/pyrefly check
+	.venv/bin/pytest -n 2 --dist worksteal -m "not realtime"
 	.venv/bin/pytest -m realtime $$(grep -l realtime tests/test_*.py)
 
 setup: .venv/.installed
@@ -40,4 +40,4 @@ setup: .venv/.installed
 	@touch $@
 
 clean:
-	rm -rf .venv .mypy_cache .pytest_cache .ruff_cache
+	rm -rf .venv .pytest_cache .ruff_cache

@@ -14,13 +14,18 @@ import tempfile
 import time
 from pathlib import Path
 
+from PIL import Image, ImageDraw, ImageFont
 from rerun.experimental import ViewerClient
 
-from vla.record import VIEWER
+from vla.config.experiment import make_environment, make_policy
+from vla.policy import read_header
+from vla.rollouts.recorder import VIEWER
+from vla.spec import FIRST_SEED, Array
 
 DOCS = Path(__file__).parent
 HEIGHT = 1800  # of the page, as far as it is shown [px]
 STEP = 12  # at which the rollout is shown: about to grasp
+FILM_SIZE, FILM_EPISODES, FILM_PAUSE = 320, 5, 8  # of the moving picture: pixels, episodes, frames after each
 
 
 def vla(*arguments: str) -> None:
@@ -64,15 +69,47 @@ def photograph(page: Path, picture: Path, height: int) -> None:
     )
 
 
+def film(run: Path, picture: Path) -> None:
+    """Save rollouts of a run's policy as an animated WebP: both cameras, rendered larger, above the instruction."""
+    checkpoint = run / "checkpoints/last.ckpt"
+    config = read_header(checkpoint).config
+    environment = make_environment(config["task"])
+    larger = make_environment({**config["task"], "image_size": [FILM_SIZE, FILM_SIZE], "meshes": "full"})
+    policy = make_policy(config["policy"], checkpoint, environment)
+    frames: list[Image.Image] = []
+    for seed in range(FIRST_SEED, FIRST_SEED + FILM_EPISODES):
+        observation, view = environment.reset(seed), larger.reset(seed)
+        policy.reset(observation.instruction, seed)
+        while not environment.done:
+            frames.append(captioned(list(view.rgb.values()), observation.instruction))
+            action = policy.act(observation)
+            observation, view = environment.step(action), larger.step(action)
+        frames += [captioned(list(view.rgb.values()), observation.instruction)] * FILM_PAUSE
+    period = round(1000 / environment.spec.control_hz)
+    frames[0].save(picture, save_all=True, append_images=frames[1:], duration=period, loop=0, quality=60, method=6)
+
+
+def captioned(images: list[Array], text: str) -> Image.Image:
+    """Images side by side, above a line of text."""
+    height, width = images[0].shape[0], sum(image.shape[1] for image in images)
+    frame = Image.new("RGB", (width, height + 36), "white")
+    for index, image in enumerate(images):
+        frame.paste(Image.fromarray(image), (index * width // len(images), 0))
+    font = ImageFont.load_default(size=20)
+    ImageDraw.Draw(frame).text((width / 2, height + 18), text, "black", font, anchor="mm")
+    return frame
+
+
 def main(run: Path) -> None:
     """Previews, one rollout in the viewer, the card of a small store, the report of `run` and its page."""
+    film(run, DOCS / "rollouts.webp")
     with tempfile.TemporaryDirectory() as folder:
         vla("job=preview", "preview.episodes=6", f"output={folder}")
         shutil.copy(Path(folder) / "preview.png", DOCS / "preview.png")
         vla("job=preview", "task/goal=mixed", "task/randomize=wide", "preview.seed=1000000", f"output={folder}")
         shutil.copy(Path(folder) / "preview.png", DOCS / "wide.png")
         checkpoint = run / "checkpoints/last.ckpt"
-        vla(f"checkpoint={checkpoint}", "evaluate.episodes=1", "evaluate.workers=1", f"output={folder}")
+        vla(f"checkpoint={checkpoint}", "evaluate.episodes=1", "cluster.workers=1", f"output={folder}")
         screenshot(Path(folder) / "rollouts.rrd", DOCS / "rollout.png", STEP)
         store = f"collect.folder={folder}/episodes"
         vla("job=collect", "collect.episodes=60", store)

@@ -1,34 +1,29 @@
-"""Attacks in bulk, for the table in docs/safety.md: `python tests/abuse.py FOLDER [commands|checkpoints|kills …]`.
+"""Attacks in bulk, for the table in docs/safety.md: `python tests/abuse.py FOLDER [commands|checkpoints:2|kills …]`.
 
-Every trial is a real command in a process of its own, in a folder that is made. A trial holds when the command ends in
-time, and either succeeds or says in one line what is wrong, and when nothing that a file asked for was done.
+Every trial is a command in a process of its own, in a folder that is made. A trial holds when the command ends in time,
+and either succeeds or says in one line what is wrong, and when nothing that a file asked for was done.
 """
 
 from __future__ import annotations
 
-import hashlib
 import json
 import os
-import random
-import re
 import resource
 import shutil
 import signal
-import subprocess
 import sys
-import time
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
 import torch
-from test_trust import hostile
-
-SMALL = ("task.image_size=[32,32]", "task.shadows=false", "collect.episodes=12", "collect.workers=2")
-TRAIN = (*SMALL, "job=train", "validate.episodes=0", "data.batch_size=4", "trainer.max_steps=4", "trainer=cpu")
-EVALUATE = ("evaluate.episodes=1", "evaluate.workers=1", "recorder=none")
-LIMIT = 100.0  # [s] that a command may take
+from abuse_files import bags, datasets, runs
+from abuse_kills import kills
+from abuse_messages import messages
+from hostile import hostile
+from trials import CHECKPOINT, EVALUATE, TRAIN, Trials, last, run
 
 WRONG = (
     *(
@@ -117,45 +112,20 @@ WRONG = (
 )
 # `store.json` and lines of an index that no collection writes: where, and what stands there.
 HEADERS: tuple[tuple[str, Any], ...] = (
-    *((f"spec.{name}", 5) for name in ("cameras", "action", "units", "low", "image_size")),
+    *((f"spec.{name}", 5) for name in ("cameras", "action", "state", "state_units", "units", "low", "image_size")),
     *(("spec", 3), ("spec.image_size", [-1, -1]), ("spec.image_size", ["a", "b"]), ("spec.action", [])),
     *(("spec.control_hz", 0), ("spec.control_hz", "x"), ("packed", None), ("packed", "x"), ("config", None)),
-    *(("config", [1]), ("config", {"parts": None}), ("format", 0), ("format", None)),
+    *(("config", [1]), ("config", {"parts": None}), ("format", 0), ("format", 2), ("format", None)),
     *(("config", {"task": {"_target_": "os.system"}}), ("config", {"task": "${oc.env:PATH}"})),
 )
 
 
-def run(folder: Path, *arguments: str, limit: float = LIMIT, **options: Any) -> tuple[str, str]:
-    """What became of `python -m vla.run …` ("sentence", "done", "traceback", "silent", "late"), and what it printed."""
-    command = [sys.executable, "-m", "vla.run", *arguments]
-    process = subprocess.Popen(
-        command,
-        cwd=folder,
-        text=True,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        start_new_session=True,
-        **options,
-    )
-    try:
-        printed, _ = process.communicate(timeout=limit)
-    except subprocess.TimeoutExpired:
-        os.killpg(process.pid, signal.SIGKILL)
-        return "late", process.communicate()[0]
-    sentences = [line for line in printed.splitlines() if line.startswith("error: ")]
-    if "Traceback (most recent call last)" in printed:
-        return "traceback", printed
-    if process.returncode == 0:
-        return "done", printed
-    return ("sentence" if len(sentences) == 1 else "silent"), printed
-
-
 def prepared(root: Path) -> None:
     """A store, a trained checkpoint, and damaged runs in `root`."""
-    if not (root / "run/checkpoints/last.ckpt").exists():
+    if not (root / CHECKPOINT).exists():
         root.mkdir(parents=True, exist_ok=True)
-        ended, printed = run(root, *TRAIN, "collect.folder=store", "output=run", limit=400)
-        assert ended == "done", printed
+        how, printed = run(root, *TRAIN, "collect.folder=store", "output=run", limit=400)
+        assert how == "done", printed
     files = {"list": ("report.json", "[1]"), "config": ("config.yaml", "- 1"), "training": ("training.json", "[]")}
     files |= {"metrics": ("metrics.csv", "a,b\n1,2\n"), "empty": ("report.json", "{}")}
     files |= {"bomb": ("config.yaml", "a: &a [x, x]\n" + "".join(f"b{n}: &b{n} [*a, *a]\n" for n in range(9)))}
@@ -168,101 +138,62 @@ def prepared(root: Path) -> None:
     (root / "damaged/loop/report.json").symlink_to("report.json")
 
 
-def commands(root: Path) -> Iterator[tuple[str, bool, str]]:
+def commands(root: Path) -> Trials:
     """Command lines that ask for what cannot be: each ends in one sentence."""
-    stands = {"CKPT": "run/checkpoints/last.ckpt", "STORE": "store/store.json", "DAMAGED": "damaged"}
+    stands = {"CKPT": CHECKPOINT, "STORE": "store/store.json", "DAMAGED": "damaged"}
     for wrong in WRONG:
         line = wrong
         for name, path in stands.items():
             line = line.replace(name, path)
         groups = () if "job=" in line or "checkpoint=" in line else (*TRAIN, "collect.folder=store")
-        ended, printed = run(
+        how, printed = run(
             root, *groups, *line.split(" "), *(["output=wrong"] if "checkpoint=last" not in line else [])
         )
-        yield wrong, ended == "sentence", f"{ended}: {last(printed)}"
+        yield wrong, how == "sentence", f"{how}: {last(printed)}"
 
 
-def headers(root: Path) -> Iterator[tuple[str, bool, str]]:
+def headers(root: Path) -> Trials:
     """Stores that describe themselves in nonsense."""
     for key, value in HEADERS:
         copy = root / "header"
         shutil.rmtree(copy, ignore_errors=True)
         shutil.copytree(root / "store", copy)
         header = json.loads((copy / "store.json").read_text())
-        *parents, name = key.split(".")
-        holder = header
-        for parent in parents:
-            holder = holder[parent]
-        holder[name] = value
+        put(header, key, value)
         (copy / "store.json").write_text(json.dumps(header))
         for job in (("inspect.episode=0",), ()):
-            ended, printed = run(root, "job=inspect", "inspect.folder=header", "output=wrong", *job)
+            how, printed = run(root, "job=inspect", "inspect.folder=header", "output=wrong", *job)
             harmless = key == "config" and not job  # what only a replay reads
-            yield f"{key}={value!r} {job}", ended == "sentence" or (harmless and ended == "done"), last(printed)
+            yield f"{key}={value!r} {job}", how == "sentence" or (harmless and how == "done"), last(printed)
 
 
-def checkpoints(root: Path) -> Iterator[tuple[str, bool, str]]:
+def checkpoints(root: Path) -> Trials:
     """Checkpoints that name something to run, through every job that reads one."""
     mark = root / "mark"
+    evil = root / "evil/checkpoints/last.ckpt"
+    evil.parent.mkdir(parents=True, exist_ok=True)
+    named = f"checkpoint={evil}"
     ways: dict[str, tuple[str, ...]] = {
-        "evaluate": ("checkpoint=evil.ckpt", *EVALUATE),
-        "resume": ("checkpoint=evil.ckpt", "resume=true", "job=train"),
-        "pretrained": ("pretrained=evil.ckpt", *TRAIN, "collect.folder=store"),
-        "program": ("checkpoint=evil.ckpt", "job=export", "export=program", "export.folder=program"),
-        "deploy": ("checkpoint=evil.ckpt", "job=deploy", "deploy=ros2"),
+        "evaluate": (named, *EVALUATE, "output=wrong"),
+        "resume": ("resume=evil", "output=evil", "job=train"),
+        "pretrained": (f"pretrained={evil}", *TRAIN, "collect.folder=store", "output=wrong"),
+        "program": (named, "job=export", "export=program", "export.folder=program", "output=wrong"),
+        "deploy": (named, "job=deploy", "deploy=ros2", "output=wrong"),
     }
-    content = torch.load(root / "run/checkpoints/last.ckpt", weights_only=True)
+    content = torch.load(root / CHECKPOINT, weights_only=True)
     for attack, (key, value) in hostile(mark).items():
-        evil = json.loads(json.dumps(content["config"]))
-        *parents, name = key.split(".")
-        holder = evil
-        for parent in parents:
-            holder = holder[parent]
-        holder[name] = value
-        torch.save({**content, "config": evil}, root / "evil.ckpt")
+        config = json.loads(json.dumps(content["config"]))
+        put(config, key, value)
+        torch.save({**content, "config": config}, evil)
         for way, arguments in ways.items():
-            ended, printed = run(
-                root, *arguments, "output=wrong", env={**os.environ, "PATH": os.environ["PATH"]}, limit=60
-            )
-            acted = mark.exists()
+            how, printed = run(root, *arguments)
             shutil.rmtree(root / "wrong", ignore_errors=True)
-            yield f"{attack}, {way}", not acted and ended in ("sentence", "done", "late"), f"{ended}: {last(printed)}"
+            runs = how == "late" and way == "deploy" and "waiting: " in printed  # until it is stopped
+            held = not mark.exists() and (runs or how in ("sentence", "done"))
+            yield f"{attack}, {way}", held, f"{how}: {last(printed)}"
 
 
-def kills(root: Path, times: int = 10) -> Iterator[tuple[str, bool, str]]:
-    """Collections killed at a random moment, some of them by two interrupts, go on to the same bytes."""
-    chance = random.Random(0)
-    arguments = ("job=collect", *SMALL, "collect.folder=killed", "output=wrong")
-    expected = digest(root / "store")
-    trial = 0
-    while trial < times:
-        process = subprocess.Popen(
-            [sys.executable, "-m", "vla.run", *arguments],
-            cwd=root,
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.DEVNULL,
-            start_new_session=True,
-        )
-        time.sleep(chance.uniform(2, 9))
-        twice = trial % 4 == 0
-        for number in (signal.SIGINT, signal.SIGINT) if twice else (signal.SIGKILL,):
-            os.killpg(process.pid, number) if not twice else process.send_signal(number)
-            time.sleep(0.3)
-        try:
-            process.wait(15)
-            ended = True
-        except subprocess.TimeoutExpired:
-            os.killpg(process.pid, signal.SIGKILL)
-            ended = False
-        trial += 1
-        if trial % 5 == 0 or not ended:
-            done, _ = run(root, *arguments)
-            same = digest(root / "killed") == expected
-            shutil.rmtree(root / "killed", ignore_errors=True)
-            yield f"{trial} {'Ctrl-C twice' if twice else 'SIGKILL'}", ended and done == "done" and same, done
-
-
-def disks(root: Path) -> Iterator[tuple[str, bool, str]]:
+def disks(root: Path) -> Trials:
     """Every job where no file may grow beyond 20 kB, which is what a full disk looks like."""
     for line in (
         *("job=preview preview.episodes=1", "job=collect collect.episodes=12"),
@@ -271,12 +202,12 @@ def disks(root: Path) -> Iterator[tuple[str, bool, str]]:
             "job=export export=program checkpoint=CKPT export.folder=full",
         ),
         *("job=export export=packed export.folder=full", "job=inspect inspect.into=full inspect.stores=[store]"),
-        *("job=train trainer.max_steps=4", "checkpoint=CKPT evaluate.episodes=1 evaluate.workers=1"),
+        *("job=train trainer.max_steps=4", "checkpoint=CKPT evaluate.episodes=1 cluster.workers=1"),
     ):
-        arguments = line.replace("CKPT", "run/checkpoints/last.ckpt").split(" ")
+        arguments = line.replace("CKPT", CHECKPOINT).split(" ")
         small = () if "checkpoint" in line or "preview" in line or "inspect" in line else (*TRAIN[:-1],)
         folder = "collect.folder=full" if "job=collect" in line else "collect.folder=store"
-        ended, printed = run(root, *small, folder, *arguments, "output=wrong", preexec_fn=no_room)
+        how, printed = run(root, *small, folder, *arguments, "output=wrong", before=no_room)
         drafts = [
             path
             for path in (*root.rglob(".*.*"), *root.rglob("*.partial"))
@@ -286,7 +217,7 @@ def disks(root: Path) -> Iterator[tuple[str, bool, str]]:
             path.unlink()
         shutil.rmtree(root / "full", ignore_errors=True)
         shutil.rmtree(root / "wrong", ignore_errors=True)
-        yield line, ended == "sentence" and not drafts, f"{ended} {[str(path) for path in drafts]}: {last(printed)}"
+        yield line, how == "sentence" and not drafts, f"{how} {[str(path) for path in drafts]}: {last(printed)}"
 
 
 def no_room() -> None:
@@ -295,29 +226,26 @@ def no_room() -> None:
     resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))
 
 
-def digest(store: Path) -> dict[str, str]:
-    """File → hash of a store, apart from how long it took to collect."""
-    files = [path for path in sorted(store.rglob("*")) if path.is_file() and path.suffix in (".bin", ".json", ".jsonl")]
-    return {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
+def put(config: dict[str, Any], key: str, value: Any) -> None:
+    """Set what stands at a key with dots."""
+    *parents, name = key.split(".")
+    for parent in parents:
+        config = config[parent]
+    config[name] = value
 
 
-def last(printed: str) -> str:
-    """The sentence that a command ended with, or its last line."""
-    lines = [line for line in printed.splitlines() if line.strip()]
-    said = [line for line in lines if line.startswith("error: ")]
-    return re.sub(r"\s+", " ", (said or lines or [""])[-1])[:200]
-
-
-SECTIONS = {"commands": commands, "headers": headers, "checkpoints": checkpoints, "disks": disks, "kills": kills}
+SECTIONS = {section.__name__: section for section in (
+    *(commands, headers, checkpoints, disks, datasets, bags, runs, kills, messages),
+)}  # fmt: skip
 
 
 def main(folder: str, *names: str) -> None:
-    """Run sections and print what does not hold, and a line of the table for each."""
+    """Run sections and print what does not hold, and a line of the table for each; `NAME:N` runs its first N trials."""
     root = Path(folder).resolve()
     prepared(root)
-    for name in names or tuple(SECTIONS):
+    for name, _, most in (name.partition(":") for name in names or SECTIONS):
         counts: Counter[bool] = Counter()
-        for trial, held, how in SECTIONS[name](root):
+        for trial, held, how in islice(SECTIONS[name](root), int(most) if most else None):
             counts[held] += 1
             if not held or "-v" in os.environ.get("ABUSE", ""):
                 print(f"{'ok ' if held else 'BAD'} {name}: {trial}\n      {how}", flush=True)

@@ -5,18 +5,23 @@ from __future__ import annotations
 
 import gc
 import os
+import shutil
 import signal
 from collections.abc import Iterator
 from pathlib import Path
+from tempfile import mkdtemp
 from typing import TYPE_CHECKING, Any
 
 import pytest
+from filelock import FileLock
 
-from vla.tasks.backend import choose_backend
-from vla.workers import THREAD_SETTINGS
+from vla.parallel.processes import THREAD_SETTINGS
+from vla.tasks.gl import choose_backend
 
 if TYPE_CHECKING:
-    from vla.tasks.tabletop import Tabletop
+    from matplotlib.figure import Figure
+
+    from vla.tasks.tabletop.environment import Tabletop
 
 CONF = Path(__file__).parents[1] / "conf"
 
@@ -29,20 +34,43 @@ choose_backend()
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
+def pytest_configure(config: pytest.Config) -> None:
+    """Compiled graphs are kept in a folder of this run, not in one that other processors and versions have filled."""
+    if "TORCHINDUCTOR_CACHE_DIR" not in os.environ:
+        folder = os.environ["TORCHINDUCTOR_CACHE_DIR"] = mkdtemp(prefix="compiled-by-tests-")  # workers inherit it
+        config.add_cleanup(lambda: shutil.rmtree(folder, ignore_errors=True))
+
+
 def pytest_collection_finish() -> None:
     """What has been imported by now stays: nobody need look through it again and again for what could be freed."""
     gc.collect()
     gc.freeze()
 
 
+@pytest.fixture
+def figures(monkeypatch: pytest.MonkeyPatch) -> list[Figure]:
+    """The figures that the test has saved so far."""
+    from matplotlib.figure import Figure
+
+    saved: list[Figure] = []
+    write = Figure.savefig
+
+    def savefig(figure: Figure, *arguments: Any, **options: Any) -> None:
+        saved.append(figure)
+        write(figure, *arguments, **options)
+
+    monkeypatch.setattr(Figure, "savefig", savefig)
+    return saved
+
+
 def make_tabletop(*overrides: str) -> Tabletop:
-    """The environment that `task=tabletop` and `overrides` of it compose to."""
+    """The environment that `overrides` of the default configuration compose to."""
     from hydra import compose, initialize_config_dir
     from hydra.utils import instantiate
 
-    with initialize_config_dir(str(CONF / "task"), version_base="1.3"):
-        config: Any = compose("tabletop", overrides=list(overrides))
-    environment: Tabletop = instantiate(config, _convert_="all")
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        config: Any = compose("config", overrides=list(overrides))
+    environment: Tabletop = instantiate(config.task, _convert_="all")
     return environment
 
 
@@ -52,6 +80,28 @@ def tabletop() -> Iterator[Tabletop]:
     environment = make_tabletop()
     yield environment
     environment.close()
+
+
+@pytest.fixture(scope="session")
+def main_job(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of one small main job, in `run`, and of what it printed; done once for all workers, to be copied."""
+    import command_line
+
+    base = tmp_path_factory.getbasetemp()
+    folder = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "main_job"
+    with FileLock(f"{folder}.lock"):
+        if not (folder / "printed.txt").exists():
+            shutil.rmtree(folder, ignore_errors=True)  # of a worker that failed
+            folder.mkdir()
+            done = command_line.vla(folder, *command_line.SMALL, "validate.episodes=1", *command_line.IN_RUN)
+            (folder / "printed.txt").write_text(done.stdout)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def home(main_job: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder to work in, with the outcome of one small main job in `run`."""
+    return Path(shutil.copytree(main_job, tmp_path_factory.mktemp("home") / "home"))
 
 
 @pytest.fixture(scope="module")

@@ -8,21 +8,23 @@ from typing import Any
 
 import numpy as np
 import torch
+from defaults import defaults_of
 from toy import SPEC
 
 from vla.models.act import ACT
-from vla.models.action_tokenizer import ActionTokenizer, Uniform
 from vla.models.bc import BC
 from vla.models.decoder import Decoder
 from vla.models.denoiser import DenoisingModel
-from vla.models.image_tokenizer import FilmConv
 from vla.models.model import Model
 from vla.models.rt1 import RT1
-from vla.models.text import NGrams
+from vla.models.text.ngrams import NGrams
+from vla.models.tokenizers.tokenizer import ActionTokenizer, Uniform
+from vla.models.vision.image_tokenizer import FilmConv
+from vla.policy import Policy
 from vla.spec import Spec
 
-TINY_IMAGE = partial(FilmConv, [8, 8], [5, 3], [2, 1])
-TINY_TEXT = partial(NGrams, vocabulary=64)
+TINY_IMAGE = partial(FilmConv, [8, 8], [5, 3], [2, 1], chroma=True)
+TINY_TEXT = partial(NGrams, **defaults_of("model/text/ngrams", vocabulary=64, forget=0.0))
 
 
 class Motions:
@@ -46,7 +48,7 @@ def make_batch(frames: int, chunk: int = 1, size: int = 4, spec: Spec = SPEC) ->
     low, high = torch.tensor(spec.low), torch.tensor(spec.high)
     return {
         "rgb": {name: torch.randint(256, (size, frames, *spec.image_size, 3)).byte() for name in spec.cameras},
-        "proprio": torch.randn(size, frames, 2 * len(spec.joints) + 1),
+        "state": torch.randn(size, frames, len(spec.state)),
         "present": torch.ones(size, frames, dtype=torch.bool),
         "instruction": [f"lift the block number {number}" for number in range(size)],
         "action": low + (high - low) * torch.rand(size, frames, chunk, len(spec.action)),
@@ -70,8 +72,8 @@ def make_bc(
 ) -> BC:
     """A small BC."""
     return BC(
-        image,
-        text,
+        image=image,
+        text=text,
         chunk=chunk,
         keypoints=8,
         text_width=16,
@@ -79,7 +81,7 @@ def make_bc(
         shift=shift,
         auxiliary=auxiliary,
         spec=spec,
-        tokenizer=Uniform(bins=64, spec=spec),
+        tokenizer=Uniform(spec=spec, **defaults_of("tokenizer/uniform", bins=64)),
     )
 
 
@@ -93,8 +95,8 @@ def make_rt1(
 ) -> RT1:
     """A small RT-1 without random shifts."""
     return RT1(
-        TINY_IMAGE,
-        TINY_TEXT,
+        image=TINY_IMAGE,
+        text=TINY_TEXT,
         history=history,
         image_size=None,
         learned_tokens=2,
@@ -110,7 +112,7 @@ def make_rt1(
         dropout=dropout,
         shift=(0, 0),
         spec=SPEC,
-        tokenizer=Uniform(bins=64, spec=SPEC),
+        tokenizer=Uniform(spec=SPEC, **defaults_of("tokenizer/uniform", bins=64)),
     )
 
 
@@ -119,41 +121,47 @@ def make_decoder(
 ) -> Decoder:
     """A small decoder without dropout and random shifts."""
     return Decoder(
-        TINY_IMAGE,
-        TINY_TEXT,
-        history=history,
-        learned_tokens=2,
-        keypoints=8,
-        chunk=chunk,
-        auxiliary=auxiliary,
-        text_width=16,
-        width=32,
-        layers=2,
-        heads=2,
-        feedforward=64,
-        shift=(0, 0),
+        image=TINY_IMAGE,
+        text=TINY_TEXT,
         spec=SPEC,
-        tokenizer=tokenizer or Uniform(bins=64, spec=SPEC),
+        tokenizer=tokenizer or Uniform(spec=SPEC, **defaults_of("tokenizer/uniform", bins=64)),
+        **defaults_of(
+            "model/decoder",
+            history=history,
+            learned_tokens=2,
+            keypoints=8,
+            chunk=chunk,
+            auxiliary=auxiliary,
+            text_width=16,
+            width=32,
+            layers=2,
+            heads=2,
+            feedforward=64,
+            shift=(0, 0),
+        ),
     )
 
 
 def make_act(chunk: int = 4, execute: int = 2, auxiliary: float = 1.0, kl_weight: float = 10.0) -> ACT:
     """A small ACT without random shifts."""
     return ACT(
-        TINY_IMAGE,
-        TINY_TEXT,
-        chunk=chunk,
-        execute=execute,
-        keypoints=8,
-        text_width=16,
-        width=32,
-        heads=2,
-        latent=4,
-        kl_weight=kl_weight,
-        shift=(0, 0),
-        auxiliary=auxiliary,
+        image=TINY_IMAGE,
+        text=TINY_TEXT,
         spec=SPEC,
-        tokenizer=Uniform(spec=SPEC),
+        tokenizer=Uniform(spec=SPEC, **defaults_of("tokenizer/uniform")),
+        **defaults_of(
+            "model/act",
+            chunk=chunk,
+            execute=execute,
+            keypoints=8,
+            text_width=16,
+            width=32,
+            heads=2,
+            latent=4,
+            kl_weight=kl_weight,
+            shift=(0, 0),
+            auxiliary=auxiliary,
+        ),
     )
 
 
@@ -162,8 +170,8 @@ def make_denoising(
 ) -> DenoisingModel:
     """A small model that starts from noise, without random shifts."""
     return kind(
-        TINY_IMAGE,
-        TINY_TEXT,
+        image=TINY_IMAGE,
+        text=TINY_TEXT,
         chunk=chunk,
         execute=execute,
         keypoints=8,
@@ -172,11 +180,18 @@ def make_denoising(
         layers=2,
         heads=2,
         copies=8,
+        steps=10,
+        temperature=0.5,
         shift=(0, 0),
         auxiliary=auxiliary,
         spec=SPEC,
-        tokenizer=Uniform(spec=SPEC),
+        tokenizer=Uniform(spec=SPEC, **defaults_of("tokenizer/uniform")),
     )
+
+
+def as_policy(model: Model, spec: Spec = SPEC, **options: Any) -> Policy:
+    """The agent that the configuration makes of a model, with some changes."""
+    return Policy(**defaults_of("policy/default", **options), model=model, spec=spec)
 
 
 def overfit(model: Model, batch: dict[str, Any], steps: int = 150) -> torch.Tensor:

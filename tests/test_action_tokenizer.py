@@ -5,18 +5,20 @@ from __future__ import annotations
 from collections.abc import Callable
 from copy import deepcopy
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from defaults import defaults_of
 from fake_batch import Motions
 from toy import SPEC
 
-from vla.models.action_tokenizer import RT1, ActionTokenizer, PerComponent, Uniform
-from vla.models.fast import Fast
-from vla.models.fidelity import beyond, fidelity
-from vla.models.quantile import Quantile
+from vla.models.tokenizers.fast import Fast
+from vla.models.tokenizers.quantile import Quantile
+from vla.models.tokenizers.tokenization_error import describe_tokenization_error, out_of_bounds
+from vla.models.tokenizers.tokenizer import RT1, ActionTokenizer, PerComponent, Uniform
 
 
 @dataclass(frozen=True)
@@ -32,7 +34,10 @@ BOUNDS = Bounds(np.array([-0.02, -0.01, 0.0]), np.array([0.03, 0.04, 1.0]))
 
 
 def tokenizers() -> list[PerComponent]:
-    return [Uniform(spec=SPEC, statistics=BOUNDS), RT1(spec=SPEC)]
+    return [
+        Uniform(spec=SPEC, statistics=BOUNDS, **defaults_of("tokenizer/uniform")),
+        RT1(spec=SPEC, **defaults_of("tokenizer/rt1")),
+    ]
 
 
 @pytest.mark.parametrize("tokenizer", tokenizers(), ids=["uniform", "rt1"])
@@ -48,13 +53,13 @@ def test_actions_beyond_the_bounds_get_the_outermost_tokens(tokenizer: PerCompon
 
 
 def test_uniform_bounds_are_those_of_the_data_and_a_margin() -> None:
-    tokenizer = Uniform(margin=0.1, spec=SPEC, statistics=BOUNDS)
+    tokenizer = Uniform(spec=SPEC, statistics=BOUNDS, **defaults_of("tokenizer/uniform", margin=0.1))
     assert tokenizer.low.tolist() == pytest.approx([-0.025, -0.015, -0.1])
     assert tokenizer.high.tolist() == pytest.approx([0.035, 0.045, 1.1])
 
 
 def test_uniform_rounds_without_bias() -> None:
-    tokenizer = Uniform(spec=SPEC, statistics=BOUNDS)
+    tokenizer = Uniform(spec=SPEC, statistics=BOUNDS, **defaults_of("tokenizer/uniform"))
     action = torch.tensor(BOUNDS.low + (BOUNDS.high - BOUNDS.low) * np.random.default_rng(0).random((4000, 3))).float()
     error = tokenizer.decode(tokenizer.encode(action)) - action
     bin_width = (tokenizer.high - tokenizer.low) / 255
@@ -64,21 +69,22 @@ def test_uniform_rounds_without_bias() -> None:
 
 def test_a_component_that_never_changes_in_the_data_still_has_bins() -> None:
     constant = Bounds(np.array([0.0, 0.01, 1.0]), np.array([0.0, 0.01, 1.0]))
-    tokenizer = Uniform(spec=SPEC, statistics=constant)
+    tokenizer = Uniform(spec=SPEC, statistics=constant, **defaults_of("tokenizer/uniform"))
     assert (tokenizer.high > tokenizer.low).all()
     action = torch.tensor([0.0, 0.01, 1.0])
     assert torch.allclose(tokenizer.decode(tokenizer.encode(action)), action, atol=1e-3)
 
 
 def test_before_a_checkpoint_is_loaded_the_allowed_range_stands_in_and_the_checkpoint_replaces_it() -> None:
-    trained, fresh = Uniform(spec=SPEC, statistics=BOUNDS), Uniform(spec=SPEC)
+    uniform = defaults_of("tokenizer/uniform")
+    trained, fresh = Uniform(spec=SPEC, statistics=BOUNDS, **uniform), Uniform(spec=SPEC, **uniform)
     assert not torch.equal(fresh.low, trained.low)
     fresh.load_state_dict(trained.state_dict())
     assert torch.equal(fresh.low, trained.low) and torch.equal(fresh.high, trained.high)
 
 
 def test_rt1_has_fixed_bounds_by_unit_and_rounds_down() -> None:
-    tokenizer = RT1(spec=replace(SPEC, units=("m", "rad", "1")))
+    tokenizer = RT1(spec=replace(SPEC, units=("m", "rad", "1")), **defaults_of("tokenizer/rt1"))
     assert tokenizer.high.tolist() == pytest.approx([1.0, np.pi / 2, 1.0])
     # 0 lies at 127.5 of 255, a hair below the next bin at 127.9.
     action = torch.tensor([0.0, np.pi / 2 * (2 * 127.9 / 255 - 1), -1.0])
@@ -87,15 +93,19 @@ def test_rt1_has_fixed_bounds_by_unit_and_rounds_down() -> None:
 
 def test_units_without_a_bound_are_refused() -> None:
     with pytest.raises(ValueError, match="'kg'"):
-        RT1(spec=replace(SPEC, units=("m", "m", "kg")))
+        RT1(spec=replace(SPEC, units=("m", "m", "kg")), **defaults_of("tokenizer/rt1"))
 
 
 def test_statistics_of_other_actions_are_refused() -> None:
     with pytest.raises(ValueError, match="2 components, the spec has 3: x, y, gripper"):
-        Uniform(spec=SPEC, statistics=Bounds(np.zeros(2), np.ones(2)))
+        Uniform(spec=SPEC, statistics=Bounds(np.zeros(2), np.ones(2)), **defaults_of("tokenizer/uniform"))
 
 
-@pytest.mark.parametrize("tokenizer", [*tokenizers(), Uniform(smoothing=0, spec=SPEC)], ids=["uniform", "rt1", "hard"])
+@pytest.mark.parametrize(
+    "tokenizer",
+    [*tokenizers(), Uniform(spec=SPEC, **defaults_of("tokenizer/uniform", smoothing=0))],
+    ids=["uniform", "rt1", "hard"],
+)
 def test_minimising_the_loss_makes_the_action_the_one_that_is_read(tokenizer: PerComponent) -> None:
     action = torch.tensor([[0.0123, -0.0042, 0.9]])
     logits = torch.zeros(1, 3, 256, requires_grad=True)
@@ -105,23 +115,23 @@ def test_minimising_the_loss_makes_the_action_the_one_that_is_read(tokenizer: Pe
         tokenizer.loss(logits, action, torch.ones(1, dtype=torch.bool)).backward()
         optimizer.step()
     bin_width = (tokenizer.high - tokenizer.low) / 255
-    assert ((tokenizer.read(logits) - action).abs() <= 1.001 * bin_width).all()
+    assert ((tokenizer.decode_logits(logits) - action).abs() <= 1.001 * bin_width).all()
 
 
 def test_soft_targets_are_read_finer_than_a_bin() -> None:
-    tokenizer = Uniform(spec=SPEC, statistics=BOUNDS)
+    tokenizer = Uniform(spec=SPEC, statistics=BOUNDS, **defaults_of("tokenizer/uniform"))
     action = torch.tensor([0.0123, -0.0042, 0.9])
     position = (action - tokenizer.low) / (tokenizer.high - tokenizer.low) * 255
     logits = -0.5 * ((torch.arange(256) - position[:, None]) / 3).square()
     bin_width = (tokenizer.high - tokenizer.low) / 255
-    assert ((tokenizer.read(logits) - action).abs() < 0.05 * bin_width).all()
+    assert ((tokenizer.decode_logits(logits) - action).abs() < 0.05 * bin_width).all()
 
 
 def test_two_ways_to_act_are_not_averaged() -> None:
-    tokenizer = Uniform(spec=SPEC, statistics=BOUNDS)
+    tokenizer = Uniform(spec=SPEC, statistics=BOUNDS, **defaults_of("tokenizer/uniform"))
     logits = torch.full((3, 256), -20.0)
     logits[:, 40], logits[:, 200] = 1.0, 0.9
-    assert torch.allclose(tokenizer.read(logits), tokenizer.decode(torch.full((3,), 40.0)), atol=1e-4)
+    assert torch.allclose(tokenizer.decode_logits(logits), tokenizer.decode(torch.full((3,), 40.0)), atol=1e-4)
 
 
 @pytest.mark.parametrize("tokenizer", tokenizers(), ids=["uniform", "rt1"])
@@ -137,23 +147,20 @@ def test_labels_that_are_not_valid_do_not_count(tokenizer: PerComponent) -> None
     assert tokenizer.loss(logits, action, torch.zeros_like(valid)) == 0
 
 
-def test_a_single_bin_is_refused() -> None:
-    with pytest.raises(ValueError, match="at least 2 bins"):
-        Uniform(bins=1, spec=SPEC)
-
-
 def test_what_a_tokenizer_loses_is_told_in_the_units_of_people() -> None:
     # Bins of 1 m and 1 rad: an action of 0.25 m rounds down to 0 m and so loses 250 mm, always to the same side.
     tokenizer = RT1(bins=3, spec=SPEC)
-    told = fidelity(tokenizer, np.tile([0.25, 0.0, 1.0], (4, 1, 1)), SPEC.units)
+    told = describe_tokenization_error(tokenizer, np.tile([0.25, 0.0, 1.0], (4, 1, 1)), SPEC)
     assert (
         told.startswith("250.000 mm (bias 250.000, at most 250.000)")
         and "1 to 1 of 3 bins used; 3 tokens per action" in told
     )
     turning = replace(SPEC, units=("m", "rad", "1"))
-    told = fidelity(RT1(bins=3, spec=turning), np.tile([0.0, 0.25, 1.0], (4, 1, 1)), turning.units)
-    assert "14.324 ° (bias 14.324, at most 14.324)" in told
-    fine = fidelity(Uniform(spec=SPEC, statistics=BOUNDS), BOUNDS.chunks(1), SPEC.units)
+    told = describe_tokenization_error(RT1(bins=3, spec=turning), np.tile([0.0, 0.25, 1.0], (4, 1, 1)), turning)
+    assert "14.324 deg (bias 14.324, at most 14.324)" in told
+    fine = describe_tokenization_error(
+        Uniform(spec=SPEC, statistics=BOUNDS, **defaults_of("tokenizer/uniform")), BOUNDS.chunks(1), SPEC
+    )
     assert float(fine.split()[0]) < 0.2
 
 
@@ -161,7 +168,12 @@ MOTIONS = Motions()
 CHUNKS = MOTIONS.chunks(8)
 
 
-KINDS: dict[str, Callable[..., ActionTokenizer]] = {"uniform": Uniform, "rt1": RT1, "quantile": Quantile, "fast": Fast}
+KINDS: dict[str, Callable[..., ActionTokenizer]] = {
+    "uniform": partial(Uniform, **defaults_of("tokenizer/uniform")),
+    "rt1": partial(RT1, **defaults_of("tokenizer/rt1")),
+    "quantile": partial(Quantile, **defaults_of("tokenizer/quantile")),
+    "fast": partial(Fast, **defaults_of("tokenizer/fast", chunk=8)),
+}
 EVERY = {name: kind(spec=SPEC, statistics=MOTIONS) for name, kind in KINDS.items()}
 every = pytest.mark.parametrize("name", KINDS)
 
@@ -226,18 +238,18 @@ def test_a_copy_is_as_good(name: str) -> None:
 @every
 def test_all_tokenizers_say_what_they_lose(name: str) -> None:
     tokenizer = EVERY[name]
-    told = fidelity(tokenizer, CHUNKS, SPEC.units)
+    told = describe_tokenization_error(tokenizer, CHUNKS, SPEC)
     assert " mm (bias " in told and " used; " in told and told.endswith(" tokens per action")
     assert (float(told.split()[-4]) == 3) is isinstance(tokenizer, PerComponent)
 
 
 def test_what_lies_beyond_the_bounds_is_counted() -> None:
-    tokenizer = Uniform(spec=SPEC, statistics=BOUNDS)
+    tokenizer = Uniform(spec=SPEC, statistics=BOUNDS, **defaults_of("tokenizer/uniform"))
     chunks = BOUNDS.chunks(1).copy()
-    assert beyond(tokenizer, chunks) == 0
-    assert all(beyond(fitted, CHUNKS) == 0 for fitted in EVERY.values())
+    assert out_of_bounds(tokenizer, chunks) == 0
+    assert all(out_of_bounds(fitted, CHUNKS) == 0 for fitted in EVERY.values())
     chunks[0, 0, 0] = 9.0
-    assert beyond(tokenizer, chunks) == pytest.approx(1 / chunks.size)
+    assert out_of_bounds(tokenizer, chunks) == pytest.approx(1 / chunks.size)
 
 
 @every
@@ -250,9 +262,9 @@ def test_a_component_without_a_range_is_refused_by_name(name: str) -> None:
 
 
 def test_tokens_are_drawn_from_the_targets() -> None:
-    soft, hard = Uniform(spec=SPEC, statistics=MOTIONS), EVERY["quantile"]
+    soft, hard = Uniform(spec=SPEC, statistics=MOTIONS, **defaults_of("tokenizer/uniform")), EVERY["quantile"]
     chunks = torch.from_numpy(CHUNKS.copy())
     tokens = soft.tokenize(chunks)
-    off = (soft.drawn(tokens, chunks) - tokens)[:, :2].double()
+    off = (soft.sampled(tokens, chunks) - tokens)[:, :2].double()
     assert off.std().item() == pytest.approx(3.0, rel=0.1) and abs(off.mean().item()) < 0.2
-    assert torch.equal(hard.drawn(tokens, chunks), tokens)
+    assert torch.equal(hard.sampled(tokens, chunks), tokens)

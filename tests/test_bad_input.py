@@ -8,19 +8,23 @@ import sys
 from pathlib import Path
 
 import pytest
-from test_conf import composed
-from test_run import SMALL, vla
+from command_line import SMALL, here, vla
+from composing import composed
 
-from vla.check import build, check
-from vla.tasks.backend import TRIED
+from vla.config.build import build
+from vla.config.check import check
+from vla.config.experiment import plain
+from vla.tasks.gl import TRIED
 
 BAD_INPUT = {
     "misspelt key": (("colect.episodes=3",), "collect"),
     "misspelt option": (("model=rt2",), "rt1"),
     "wrong type": (("trainer.max_steps=many",), "trainer.max_steps"),
     "missing checkpoint": (("checkpoint=nowhere.ckpt",), "nowhere.ckpt"),
+    "a run that is no path": (("resume=true",), "resume=True is no path"),
+    "a checkpoint that is no path": (("checkpoint=3",), "checkpoint=3 is no path"),
     "nothing interrupted": (
-        ("checkpoint=last", "output=nowhere/now"),
+        ("resume=last", "output=nowhere/now"),
         "none of the 0 trainings in nowhere was interrupted",
     ),
     "no room on the table": (("job=preview", "task.blocks=4", "task.randomize.placement.x=[0.5,0.5]"), "no room"),
@@ -34,7 +38,7 @@ BAD_INPUT = {
 @pytest.mark.parametrize("name", BAD_INPUT)
 def test_bad_input_ends_in_one_clear_sentence(tmp_path: Path, name: str) -> None:
     arguments, says = BAD_INPUT[name]
-    done = vla(tmp_path, *arguments, ok=False)
+    done = here(tmp_path, *arguments, ok=False)
     errors = [line for line in done.stderr.splitlines() if line.startswith("error: ")]
     assert len(errors) == 1 and says in errors[0], done.stderr
     assert "Traceback" not in done.stderr
@@ -49,19 +53,33 @@ NONSENSE = {
         *("task.randomize.size.half_size=[0,0]", "task.randomize.size.half_size=[10,10]"),
         *("task.randomize.arm.x=[5,5]", "task.goal.language.phrasings=[]", "expert.perturb.rate=nan"),
         *("expert.perturb.rate=-1", "expert.perturb.noise=1e9", "expert.perturb.steps=[5,2]", "collect.folder="),
-        *("collect.workers=0", "collect.seed=-1", "cluster.workers=0", "collect.episodes=99999999999"),
+        *("collect.seed=-1", "cluster.workers=0", "collect.episodes=99999999999"),
     ),
     "train": (
         *("seed=99999999999999999999", "data.seed=-1", "data.validation_fraction=1.5", "model.chunk=0"),
         *("model.chunk=-1", "model.width=-1", "model.width=0", "model.width=10000000", "model.keypoints=0"),
         *("model.text_width=0", "model.shift=[-1,-1]", "model.auxiliary=nan", "model.auxiliary=-1"),
         *("model.image.strides=[0,1,1]", "model.image.kernels=[0,0,0]", "model.image.kernels=[99,99,99]"),
-        *("model.image.channels=[]", "tokenizer.smoothing=-1", "tokenizer.margin=-5", "tokenizer.bins=1000000"),
-        *("learner.lr=0", "learner.ema=1", "learner.ema=nan", "learner.warmup_steps=-1", "trainer.max_steps=0"),
+        *("model.text.vocabulary=1", "model.text.words=0", "model.text.characters=0", "model.text.forget=1"),
+        *(
+            "model.image.channels=[]",
+            "tokenizer.bins=1",
+            "tokenizer.smoothing=-1",
+            "tokenizer.margin=-5",
+            "tokenizer.bins=1000000",
+        ),
+        *(
+            "learner.lr=0",
+            "learner.weight_decay=-1",
+            "learner.ema=1",
+            "learner.ema=nan",
+            "learner.warmup_steps=-1",
+            "trainer.max_steps=0",
+        ),
         *("trainer.val_check_interval=0", "trainer.accumulate_grad_batches=0", "trainer.devices=-7"),
         *("trainer.gradient_clip_val=-1", "trainer.limit_val_batches=-1", "trainer.precision=17"),
     ),
-    "evaluate": ("evaluate.episodes=0", "evaluate.workers=0", "evaluate.seed=3", "policy.precision=16"),
+    "evaluate": ("evaluate.episodes=0", "evaluate.seed=3", "policy.precision=16"),
     "benchmark": ("benchmark.names=[]", "benchmark.rounds=0"),
     "inspect": ("inspect.stores=[]", "inspect.folder="),
     "export": ("export.folder=",),
@@ -83,7 +101,7 @@ def test_a_phrasing_that_is_no_phrasing_is_refused(phrasing: str) -> None:
     cfg = composed()
     cfg.task.goal.language.phrasings = [phrasing]
     with pytest.raises(ValueError, match=r"^task\.goal\.language"):
-        build(cfg.task, "task")
+        build(plain(cfg.task), "task")
 
 
 @pytest.mark.parametrize("launcher", ["basic", "joblib"])
@@ -91,6 +109,11 @@ def test_a_grid_whose_cells_want_several_processes_is_refused(tmp_path: Path, la
     several = ("trainer=ddp", "trainer.accelerator=cpu", "trainer.devices=2", "seed=0")
     done = vla(tmp_path, "-m", f"hydra/launcher={launcher}", *several, ok=False)
     assert "trainer.devices=1" in done.stderr and "submitit_slurm" in done.stderr and "Traceback" not in done.stderr
+
+
+def test_an_experiment_that_is_a_grid_is_refused_as_a_single_run(tmp_path: Path) -> None:
+    done = vla(tmp_path, "experiment=recipe", ok=False)
+    assert done.stderr.endswith("error: experiment=recipe is a grid of runs: add -m\n")
 
 
 def test_without_gl_the_error_says_what_to_install(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import random
 import shutil
 from pathlib import Path
@@ -91,7 +92,7 @@ def test_a_damaged_bag_is_played_or_refused_in_a_sentence(bag: Path, tmp_path: P
         (f"a: {'[' * 100_000}", "deeper than"),
         ("#" * (2 << 20), "more than the"),
         ("", "damaged or of another kind"),
-        ("rosbag2_bagfile_information: 1", "is damaged or no bag"),
+        ("rosbag2_bagfile_information: 1", "is damaged or not a bag"),
     ],
     ids=["bomb", "deep", "large", "empty", "number"],
 )
@@ -101,7 +102,15 @@ def test_a_description_that_is_none_is_refused(tmp_path: Path, text: str, words:
         played(tmp_path)
 
 
+def test_a_pipe_is_not_played(bag: Path, tmp_path: Path) -> None:
+    folder = Path(shutil.copytree(bag, tmp_path / "bag"))
+    (folder / "bag.mcap").unlink()
+    os.mkfifo(folder / "bag.mcap")
+    with pytest.raises(ValueError, match=r"bag\.mcap is a folder, a pipe or a device, not a file"):
+        played(folder)
+
+
 def test_where_no_bag_is_that_is_said(tmp_path: Path) -> None:
     for folder in (tmp_path, tmp_path / "nowhere"):
-        with pytest.raises(ValueError, match=r"is no bag: there is no .*metadata\.yaml"):
+        with pytest.raises(ValueError, match=r"is not a bag: it has no metadata\.yaml"):
             played(folder)

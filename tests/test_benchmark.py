@@ -6,12 +6,12 @@ from pathlib import Path
 
 import pytest
 import torch
-from omegaconf import OmegaConf
 
-from vla.benchmark import benchmark
-from vla.benchmark.measure import measure
-from vla.benchmark.memory import forget_peak, peak
-from vla.benchmark.train import measures
+from vla.config.experiment import Experiment
+from vla.jobs.benchmark import run
+from vla.jobs.benchmark.measure import measure
+from vla.jobs.benchmark.memory import peak, reset_peak
+from vla.jobs.benchmark.train import measures
 
 
 def test_a_measure_stands_beside_its_floor() -> None:
@@ -21,16 +21,16 @@ def test_a_measure_stands_beside_its_floor() -> None:
 
 def test_a_peak_of_memory_is_remembered_until_it_is_forgotten() -> None:
     device, size = torch.device("cpu"), 64_000_000
-    held = forget_peak(device)
+    held = reset_peak(device)
     torch.ones(size, dtype=torch.uint8)
     assert peak(device) - held > 0.9 * size
-    held = forget_peak(device)
+    held = reset_peak(device)
     assert peak(device) - held < 0.5 * size
 
 
 def test_a_benchmark_of_nothing_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"benchmark\.names is empty: the stages are collect, loader"):
-        benchmark(OmegaConf.create({"benchmark": {"names": []}}), tmp_path)
+        run(Experiment({"benchmark": {"names": []}, "output": str(tmp_path)}))
 
 
 @pytest.mark.parametrize(
@@ -42,4 +42,4 @@ def test_what_cannot_be_timed_is_refused_before_any_work(
     monkeypatch.setenv("CXX", "no-such-compiler")
     asked = {"benchmark": {"precisions": precisions, "compile": compiled}, "trainer": {"accelerator": "cpu"}}
     with pytest.raises(ValueError, match=problem):
-        measures(OmegaConf.create(asked))
+        measures(Experiment(asked))

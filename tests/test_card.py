@@ -9,13 +9,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from PIL import Image
+from figures import bars, heights, panels, texts
+from matplotlib.figure import Figure
 from rich.console import Console
-from test_episodes import EPISODES, add
+from toy_episodes import EPISODES, add
 
-from vla.card import store_table, write_card
 from vla.data.episodes import EpisodeStore
-from vla.data.inspection import examine, put_together
+from vla.data.verification import derive_store, verify_store
+from vla.reports.dataset_card import store_table, write_card
 
 DRAWS: list[dict[str, Any]] = [
     {
@@ -30,17 +31,16 @@ DRAWS: list[dict[str, Any]] = [
 ]
 
 
-def described(store: EpisodeStore) -> tuple[str, str, Image.Image]:
-    findings, console = examine(store), Console(width=120, record=True, file=io.StringIO())
+def described(store: EpisodeStore) -> tuple[str, str]:
+    findings, console = verify_store(store), Console(width=120, record=True, file=io.StringIO())
     console.print(store_table(findings))
-    card = write_card(findings)
-    return console.export_text(), card.read_text(encoding="utf-8"), Image.open(card.with_name("card.png"))
+    return console.export_text(), write_card(findings).read_text(encoding="utf-8")
 
 
-def test_the_card_tells_what_is_there(tmp_path: Path) -> None:
-    table, text, page = described(add(tmp_path / "store", EPISODES))
+def test_the_card_tells_what_is_there(tmp_path: Path, figures: list[Figure]) -> None:
+    table, text = described(add(tmp_path / "store", EPISODES))
     steps = sum(len(episode.actions) for episode in EPISODES if episode.success)
-    for words in ("4 whole ones, of 5 seeds tried: 0 to 4", f"{steps}, from", "80.0 %", "1 timeout", "front, wrist"):
+    for words in ("4 intact, of 5 seeds tried: 0 to 4", f"{steps}, from", "80.0 %", "1 timeout", "front, wrist"):
         assert words in table
     low, high = (ends for ends in zip(*(e.draws["point"] for e in EPISODES if e.success), strict=True))
     numbers = [*low, *high]
@@ -52,7 +52,15 @@ def test_the_card_tells_what_is_there(tmp_path: Path) -> None:
     assert "gripper | 1 | 0.0 | 1.0 | 1 | 0" in text
     assert f"rgb_front | (16, 16, 3) | uint8 | {steps * 768}" in text
     assert '"size": 1.0' in text and "collect.episodes=4" in text
-    assert page.width > 1000 and len(np.unique(np.array(page))) > 10
+    (page,) = figures
+    (outcomes,), (lengths,) = (panels(page, title) for title in ("outcomes of all seeds", "length of episodes [steps]"))
+    assert bars(outcomes) == [4, 1] and {"success", "timeout"} <= texts(outcomes)
+    assert sum(heights(lengths)) == 4
+    for component in ("x [m]", "y [m]", "gripper"):
+        (axes,) = panels(page, component)
+        assert sum(heights(axes)) == steps and len(axes.patches) == len(heights(axes)) + 1  # and an outline
+    (sheet,) = page.images
+    assert len(np.unique(sheet.get_array())) > 10
 
 
 def test_the_card_is_the_same_wherever_the_store_is(tmp_path: Path) -> None:
@@ -65,15 +73,20 @@ def test_the_card_is_the_same_wherever_the_store_is(tmp_path: Path) -> None:
     assert not list(second.glob("*.partial"))
 
 
-def test_anything_that_can_be_drawn_can_be_shown(tmp_path: Path) -> None:
+def test_anything_that_can_be_drawn_can_be_shown(tmp_path: Path, figures: list[Figure]) -> None:
     episodes = [replace(episode, draws=draws) for episode, draws in zip(EPISODES, DRAWS, strict=True)]
-    _, text, _ = described(add(tmp_path, episodes))
+    _, text = described(add(tmp_path / "five", episodes))
     assert "light.tint | 0 … 0.4" in text and r"names | $\|[0], $\|[1], $\|[2], $\|[4], red" in text
-    assert described(add(tmp_path / "one", episodes[:1]))[2].width > 1000
+    described(add(tmp_path / "one", episodes[:1]))
+    five, one = ({axes.get_title(): axes for axes in figure.axes} for figure in figures)
+    always = {"outcomes of all seeds", "length of episodes [steps]", "instructions", "x [m]", "y [m]", "gripper"}
+    assert {*one} == always
+    assert {*five} - always == {"light.tint", "light.on", "names", "n", "pad", "blocks", "four", "nested", "some"}
+    assert all(axes.has_data() for panel in (five, one) for axes in panel.values())
 
 
 def test_a_store_that_was_put_together_says_of_what(tmp_path: Path) -> None:
     store = add(tmp_path / "store", EPISODES)
-    put_together([store], tmp_path / "chosen", {"seed": [1, 2]})
-    _, text, _ = described(EpisodeStore(tmp_path / "chosen"))
+    derive_store([store], tmp_path / "chosen", {"seed": [1, 2]})
+    _, text = described(EpisodeStore(tmp_path / "chosen"))
     assert "Chosen by `inspect.where={'seed': [1, 2]}`." in text and "2 seeds, 1, 2:" in text

@@ -3,15 +3,21 @@
 from __future__ import annotations
 
 import hashlib
+import re
+from pathlib import Path
 from typing import Any
 
 import pytest
+import torch
 import toy
+from composing import composed
+from defaults import defaults_of
 from omegaconf import DictConfig, OmegaConf
-from test_conf import composed
 
-from vla.check import JOBS, PLAIN, build, check, digest, suggestion
-from vla.resume import adopt
+from vla.config.adopt import adopt
+from vla.config.build import build, suggestion
+from vla.config.check import check, digest
+from vla.config.experiment import plain
 from vla.run import sentence
 
 GRAMMAR = {
@@ -21,47 +27,20 @@ GRAMMAR = {
     "held_out_phrasings": ["{block} up"],
     "held_out_words": {"lift": ["raise"]},
 }
-MASSES = {"_target_": "vla.tasks.randomize.blocks.Masses", "factor": [0.5, 2.0]}
-PERTURBATION = {"_target_": "vla.tasks.expert.Perturbation", "start": 0.5, "steps": [2, 5]}
+MASSES = {"_target_": "vla.tasks.tabletop.randomize.blocks.Masses", "factor": [0.5, 2.0]}
+WAYPOINT = {"_target_": "vla.tasks.tabletop.expert.Waypoint", "_partial_": True}
+PERTURBED = {"_target_": "vla.tasks.perturb.Perturbed", "expert": WAYPOINT}
+PERTURBATION = {
+    "_target_": "vla.tasks.perturb.Perturbation",
+    **{"low": [0.3, -0.2, 0.0], "high": [0.6, 0.2, 0.3], "tool": "commanded_position"},
+    **{"move": ["dx", "dy", "dz"], "turn": "rz", "gripper": "gripper", "start": 0.5, "steps": [2, 5]},
+}
 
 
 def config(**changes: Any) -> DictConfig:
-    """A config that is right for job=collect, with dotted changes."""
-    cfg = OmegaConf.create(
-        {
-            "job": "collect",
-            "seed": 0,
-            "checkpoint": None,
-            "pretrained": None,
-            "resume": False,
-            "output": "outputs/runs/now",
-            "chosen": {"experiment": None, "model": "bc", "randomize": "default"},
-            "collect": {"episodes": 5, "seed": 0, "workers": None, "folder": "outputs/episodes/x"},
-            "evaluate": {"episodes": 5, "seed": 1_000_000, "workers": None, "recordings": 2, "conditions": {}},
-            "validate": {"episodes": 0, "seed": 2_000_000},
-            "preview": {"episodes": 1, "seed": 0},
-            "benchmark": {
-                "names": ["train"],
-                "episodes": 1,
-                "batches": 1,
-                "steps": 1,
-                "rounds": 1,
-                "precisions": ["fp32"],
-                "compile": [False],
-                "robosuite": None,
-                "lerobot": None,
-            },
-            "inspect": dict.fromkeys(("stores", "where", "into", "episode")) | {"folder": "x", "repair": False},
-            "report": {"runs": []},
-            "task": {
-                "_target_": "vla.tasks.tabletop.Tabletop",
-                "goal": {"_target_": "vla.tasks.goals.lift.Lift", "language": GRAMMAR, "height": 0.1},
-                "randomize": {"mass": MASSES, "size": None},
-            },
-            "expert": {"_target_": "vla.tasks.expert.Waypoint", "perturb": PERTURBATION},
-            "cluster": {"_target_": "vla.cluster.Local", "workers": None},
-        }
-    )
+    """The configuration of job=collect with a goal of one block, and dotted changes."""
+    cfg = composed("job=collect", "task/goal=lift")
+    OmegaConf.set_struct(cfg, False)
     for key, value in changes.items():
         OmegaConf.update(cfg, key, value, force_add=True, merge=False)
     return cfg
@@ -108,7 +87,7 @@ def test_an_unknown_key_is_named_with_what_was_probably_meant() -> None:
             "task.randomize.mass.factor must be tuple[float, float], each more than 0, in",
         ),
         ("expert.perturb.start", None, "expert.perturb.start must be float, at least 0, at most 1, got None"),
-        ("collect.workers", "all", "collect.workers must be int, at least 1 or null, got 'all'"),
+        ("cluster.workers", "all", "cluster.workers must be int, at least 1 or null, got 'all'"),
         ("seed", "first", "seed must be int, at least 0, at most 4294967295, got 'first'"),
         ("task.meshes", "lite", "task.meshes must be one of light, full, got 'lite', did you mean light?"),
         ("evaluate.episodes", 0, "evaluate.episodes must be int, at least 1, got 0"),
@@ -133,7 +112,7 @@ def test_a_missing_name_is_named_unless_the_program_gives_it() -> None:
     del cfg.task.goal
     with pytest.raises(ValueError, match=r"task\.goal is missing: Tabletop needs it"):
         check(cfg)
-    check(config(expert={"_target_": "vla.tasks.expert.Waypoint"}))  # spec comes from the task
+    check(config(expert={"_target_": "vla.tasks.tabletop.expert.Waypoint"}))  # spec comes from the task
     assert problem(**{"expert.spec": 1}).startswith("expert.spec is unknown")
 
 
@@ -150,16 +129,19 @@ def test_a_misspelt_job_is_answered_with_what_was_probably_meant() -> None:
     assert problem(job="evalute").endswith("got 'evalute', did you mean evaluate?")
 
 
-def test_the_job_menu_is_the_table_of_jobs() -> None:
-    assert set(PLAIN["job"].__args__) == set(JOBS)
-
-
 @pytest.mark.parametrize(
     "target",
-    ["os.system", "subprocess.Popen", "vla.evaluate.os.system", "vla.evaluate.Path", "torch.hub.load", "vla.check:os"],
+    [
+        "os.system",
+        "subprocess.Popen",
+        "vla.rollouts.evaluate.os.system",
+        "vla.rollouts.evaluate.Path",
+        "torch.hub.load",
+        "vla.config.check:os",
+    ],
 )
 def test_a_target_that_is_no_class_of_the_package_is_refused(target: str) -> None:
-    node = {"_target_": "vla.tasks.expert.Waypoint", "perturb": {"_target_": target}}
+    node = {**PERTURBED, "perturb": {"_target_": target}}
     with pytest.raises(ValueError, match=r"expert\.perturb\._target_ (must|is)"):
         build(node, "expert", spec=None)
     with pytest.raises(ValueError, match=r"expert\.perturb\._target_ (must|is)"):
@@ -167,36 +149,52 @@ def test_a_target_that_is_no_class_of_the_package_is_refused(target: str) -> Non
 
 
 def test_a_class_stands_only_where_its_kind_is_asked_for() -> None:
-    node = {"_target_": "vla.tasks.expert.Waypoint", "perturb": MASSES}
+    node = {**PERTURBED, "perturb": MASSES}
     with pytest.raises(ValueError, match=r"expert\.perturb must be Perturbation or null, got \{'_target_': .*Masses"):
         build(node, "expert", spec=None)
-    with pytest.raises(ValueError, match=r"expert\._target_ must name a class of kind Agent or Recorded, got .*Masses"):
+    kind = "a class of kind Agent or ImportedDemonstrations"
+    with pytest.raises(ValueError, match=rf"expert\._target_ must name {kind}, got .*Masses"):
         build(MASSES, "expert")
     assert problem(task=MASSES).startswith("task._target_ must name a class of kind Environment")
-    assert problem(**{"task.randomize.mass": GRAMMAR}).startswith("task.randomize must be Mapping[str, Axis or")
+    assert problem(**{"task.randomize.mass": GRAMMAR}).startswith("task.randomize must be Mapping[str, Randomizer or")
 
 
 def test_build_gives_plain_containers_runtime_arguments_and_nested_factories() -> None:
-    cluster = build(OmegaConf.create({"_target_": "vla.cluster.Local"}), "cluster", workers=3)
+    cluster = build({"_target_": "vla.parallel.pool.LocalCluster"}, "cluster", workers=3)
     assert cluster.workers == 3
-    image = {"_target_": "vla.models.image_tokenizer.FilmConv", "_partial_": True, "channels": [8]}
-    image |= {"kernels": [3], "strides": [2]}
-    text = {"_target_": "vla.models.text.NGrams", "_partial_": True}
-    node = OmegaConf.create({"_target_": "vla.models.bc.BC", "image": image, "text": text})
-    tokenizer = build({"_target_": "vla.models.action_tokenizer.Uniform"}, "tokenizer", spec=toy.SPEC)
+    image = {"_target_": "vla.models.vision.image_tokenizer.FilmConv", "_partial_": True, "channels": [8]}
+    image |= {"kernels": [3], "strides": [2], "chroma": True}
+    text = {"_target_": "vla.models.text.ngrams.NGrams", "_partial_": True, **defaults_of("model/text/ngrams")}
+    node = {"_target_": "vla.models.bc.BC", "image": image, "text": text, **defaults_of("model/bc")}
+    uniform = {"_target_": "vla.models.tokenizers.tokenizer.Uniform", **defaults_of("tokenizer/uniform")}
+    tokenizer = build(uniform, "tokenizer", spec=toy.SPEC)
     model = build(node, "model", spec=toy.SPEC, tokenizer=tokenizer)
     assert model.tokenizer is tokenizer and model.text.width == 64
 
 
+def test_a_class_takes_the_arguments_of_its_base_classes_too() -> None:
+    node = plain(composed("model=act").model)
+    for changes, message in (
+        ({"keypoint": 3}, "model.keypoint is unknown, did you mean keypoints? ACT takes text, "),
+        ({"chunk": 0}, "model.chunk must be int, at least 1"),
+        ({"inherited": 3}, "model.inherited is unknown"),
+    ):
+        with pytest.raises(ValueError, match=re.escape(message)):
+            build({**node, **changes}, "model", spec=toy.SPEC, tokenizer=None)
+    del node["text_width"]
+    with pytest.raises(ValueError, match=r"model\.text_width is missing: ACT needs it"):
+        build(node, "model", spec=toy.SPEC, tokenizer=None)
+
+
 def test_build_passes_on_what_a_nested_constructor_complains_about() -> None:
-    axis = {"_target_": "vla.tasks.randomize.blocks.Colours", "names": ["pink"]}
+    axis = {"_target_": "vla.tasks.tabletop.randomize.blocks.Colours", "names": ["pink"], "jitter": 0.0}
     with pytest.raises(ValueError, match="unknown colours"):
-        build(config(**{"task.randomize": {"colour": axis}}).task, "task")
+        build(plain(config(**{"task.randomize": {"colour": axis}}).task), "task")
 
 
 def test_what_is_checked_is_what_is_built() -> None:
     """A reference that is left would be looked up again, in another place than where it was checked."""
-    hidden = {"_target_": "vla.tasks.expert.Waypoint", "perturb": "${oc.create:{_target_:builtins.print}}"}
+    hidden = {**PERTURBED, "perturb": "${oc.create:{_target_:builtins.print}}"}
     with pytest.raises(ValueError, match=r"expert holds the reference"):
         build(hidden, "expert", spec=None)
 
@@ -207,6 +205,8 @@ def test_conditions_of_an_evaluation_are_checked_with_the_task_that_they_change(
         cfg = composed()
         cfg.evaluate.conditions = wrong
         check(cfg)
+    with pytest.raises(ValueError, match=r"task \(validate\.changes\)\.bloks is unknown, did you mean blocks"):
+        check(composed("+validate.changes.bloks=3"))
 
 
 def digested(cfg: DictConfig) -> str:
@@ -245,41 +245,65 @@ def test_a_suggestion_is_made_only_where_something_is_close() -> None:
 
 
 SAVED = {
-    "chosen": {"experiment": "standard", "model": "rt1", "randomize": "wide"},
-    "task": {"_target_": "vla.tasks.tabletop.Tabletop", "blocks": 4, "randomize": {"mass": None, "light": {"x": 1}}},
+    "chosen": {"experiment": "standard", "model": "rt1"},
+    "task": {
+        "_target_": "vla.tasks.tabletop.environment.Tabletop",
+        "blocks": 4,
+        "randomize": {"mass": None, "light": {"x": 1}},
+    },
     "tokenizer": {"bins": 64},
     "model": {"history": 6},
 }
 
 
-def test_a_checkpoint_brings_its_task_tokenizer_and_model_and_task_overrides_apply_on_top() -> None:
-    cfg = config(**{"task.blocks": 2, "tokenizer": {"bins": 256}, "model": None, "task.randomize": {"mass": {"a": 1}}})
-    untouched = adopt(cfg, SAVED, ["collect.episodes=3", "evaluate.seed=5"])
+@pytest.fixture
+def checkpoint(tmp_path: Path) -> Path:
+    path = tmp_path / "a.ckpt"
+    saved = {**SAVED, "collect": {"episodes": 50}, "learner": {"lr": 1e-4}}
+    torch.save({"config": saved, "spec": toy.SPEC.to_dict(), "state_dict": {}}, path)
+    return path
+
+
+def test_a_checkpoint_brings_its_task_tokenizer_and_model_and_task_overrides_apply_on_top(checkpoint: Path) -> None:
+    cfg = config(
+        **{
+            "job": "export",
+            "checkpoint": str(checkpoint),
+            "chosen": {"experiment": None, "model": "bc", "randomize": "default"},  # which Hydra fills in
+            "task.blocks": 2,
+            "tokenizer": {"bins": 256},
+            "model": None,
+            "task.randomize": {"mass": {"a": 1}},
+        }
+    )
+    untouched = adopt(cfg, ["collect.episodes=3", "evaluate.seed=5"])
     assert OmegaConf.to_container(untouched.task) == SAVED["task"]
     assert (untouched.tokenizer.bins, untouched.model.history, cfg.tokenizer.bins) == (64, 6, 256)
-    assert adopt(cfg, SAVED, ["task.blocks=2"]).task.blocks == 2
-    harder = adopt(cfg, SAVED, ["task/randomize=wide", "~task.goal"])
+    assert adopt(cfg, ["task.blocks=2"]).task.blocks == 2
+    harder = adopt(cfg, ["task/randomize=wide", "~task.goal"])
     assert OmegaConf.to_container(harder.task.randomize) == {"mass": {"a": 1}}
     assert harder.task.blocks == 4
     assert untouched.chosen == SAVED["chosen"]
-    assert harder.chosen == {"experiment": "standard", "model": "rt1", "randomize": "default"}
-    assert "light" not in adopt(cfg, SAVED, ["~task.randomize.light"]).task.randomize
+    assert "light" not in adopt(cfg, ["~task.randomize.light"]).task.randomize
 
 
 KEPT = ["tokenizer=rt1", "tokenizer.bins=32", "model/image=efficientnet", "+model.x=1", "experiment=few", "variant=rt1"]
 
 
 @pytest.mark.parametrize("override", KEPT)
-def test_a_checkpoint_keeps_its_tokenizer_and_model(override: str) -> None:
+def test_a_checkpoint_keeps_its_tokenizer_and_model(override: str, checkpoint: Path) -> None:
     with pytest.raises(ValueError, match="cannot be combined with a checkpoint"):
-        adopt(config(), SAVED, [override])
+        adopt(config(job="evaluate", checkpoint=str(checkpoint)), [override])
 
 
-def test_a_report_says_what_the_training_of_its_checkpoint_was() -> None:
-    cfg, saved = config(job="evaluate"), {**SAVED, "collect": {"episodes": 50}, "learner": {"lr": 1e-4}}
-    assert adopt(cfg, saved, []).collect.episodes == 50
+def test_a_report_says_what_the_training_of_its_checkpoint_was(checkpoint: Path) -> None:
+    cfg = config(job="evaluate", checkpoint=str(checkpoint))
+    assert adopt(cfg, []).collect.episodes == 50
     cfg.job = "export"
-    assert adopt(cfg, saved, []).collect.episodes != 50
+    assert adopt(cfg, []).collect.episodes != 50
+    cfg.job = "train"
+    with pytest.raises(ValueError, match="resume=RUN continues a run"):
+        adopt(cfg, [])
 
 
 @pytest.mark.parametrize(
@@ -287,7 +311,6 @@ def test_a_report_says_what_the_training_of_its_checkpoint_was() -> None:
     [
         ({"evaluate.seed": 0}, r"evaluate\.seed must be .*1000000"),
         ({"validate.seed": 1_000_004, "validate.episodes": 1}, "share episodes"),
-        ({"resume": True}, "checkpoint=last"),
     ],
 )
 def test_what_would_judge_what_it_chose_or_trained_on_is_refused(override: dict[str, Any], says: str) -> None:

@@ -1,49 +1,36 @@
-"""Collection on a Dask cluster, of processes on this machine: the same bytes, whatever becomes of its workers."""
+"""A Dask cluster of processes on this machine: the same bytes as without it, whatever becomes of its workers."""
 
 from __future__ import annotations
 
-import json
-import os
-import signal
-import subprocess
+import re
+import shlex
 import sys
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from socket import create_server
 from threading import Thread
+from typing import Any
 
 import pytest
 import toy
+import toy_recordable
+from clusters import Process, address_in, dask, until
+from collecting import EPISODES, TRIED, content, lines
+from command_line import SMALL, vla
+from defaults import defaults_of
 from distributed import Client
-from test_collect import EPISODES, TRIED, content, lines
-from test_run import SMALL, vla
+from documented import TEXT
+from exporting import content as files
+from exporting import exporter
 
-from vla.cluster import Cluster, Dask, Local
-from vla.collect import MakeEnvironment, collect
 from vla.data.episodes import EpisodeStore
+from vla.parallel.dask import DaskCluster
+from vla.parallel.pool import Cluster, LocalCluster
+from vla.rollouts.collect import EnvironmentFactory, collect
+from vla.rollouts.evaluate import FIRST_SEED, Report, evaluate
 
 HERE = ("--host", "127.0.0.1", "--dashboard-address", "127.0.0.1:0")
-PLACES = os.pathsep.join([str(Path(toy.__file__).parent), str(Path(toy.__file__).parents[1])])
-
-Process = subprocess.Popen[bytes]
-
-
-@contextmanager
-def dask(*arguments: str, **environment: str) -> Iterator[Process]:
-    """A `dask …` process that can import the toy world, killed at the end."""
-    process = subprocess.Popen(
-        [sys.executable, "-m", "dask", *arguments],
-        env={**os.environ, "PYTHONPATH": PLACES, **environment},
-        stderr=subprocess.DEVNULL,
-        start_new_session=True,
-    )
-    try:
-        yield process
-    finally:
-        os.killpg(process.pid, signal.SIGKILL)
-        process.wait()
 
 
 @contextmanager
@@ -55,18 +42,16 @@ def scheduler(folder: Path, **environment: str) -> Iterator[tuple[str, Process]]
         yield address_in(file), process
 
 
-def address_in(file: Path) -> str:
-    """The address that a scheduler is about to write to a file."""
-    until(lambda: file.exists() and file.read_text().rstrip().endswith("}"))
-    address: str = json.loads(file.read_text())["address"]
-    return address
-
-
 @pytest.fixture(scope="module")
 def address(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     """Where a scheduler listens."""
     with scheduler(tmp_path_factory.mktemp("scheduler")) as (address, _):
         yield address
+
+
+def cluster(address: str, **changes: Any) -> DaskCluster:
+    """The workers of a scheduler, as `cluster=dask` describes them."""
+    return DaskCluster(**defaults_of("cluster/dask", address=address, **changes))
 
 
 @contextmanager
@@ -78,16 +63,9 @@ def worker(address: str, *arguments: str) -> Iterator[Process]:
         yield process
 
 
-def gather(folder: Path, cluster: Cluster, make_environment: MakeEnvironment = toy.make_environment) -> None:
+def gather(folder: Path, cluster: Cluster, make_environment: EnvironmentFactory = toy.make_environment) -> None:
     store = EpisodeStore.create_or_open(folder, toy.SPEC, {})
     collect(store, make_environment, toy.make_expert, EPISODES, cluster, seed=0)
-
-
-def until(condition: Callable[[], bool]) -> None:
-    give_up = time.monotonic() + 60
-    while not condition():
-        assert time.monotonic() < give_up
-        time.sleep(0.01)
 
 
 @contextmanager
@@ -108,60 +86,116 @@ def killed(process: Process, folder: Path) -> Iterator[list[int]]:
 
 def test_killing_one_of_two_workers_changes_no_byte_of_what_is_collected(address: str, tmp_path: Path) -> None:
     arguments = [*SMALL, "job=collect", "task.image_size=[16,16]", "collect.episodes=14"]
+    arguments.remove("cluster.workers=1")
     remote = ["cluster=dask", f"cluster.address={address}", "collect.folder=remote"]
     doomed, other = (worker(address, "--no-nanny") for _ in range(2))
     with doomed as process, other, killed(process, tmp_path / "remote") as committed:
         vla(tmp_path, *arguments, *remote)
     assert committed[0] < 14
-    vla(tmp_path, *arguments, "collect.folder=local")
+    vla(tmp_path, *arguments, "cluster.workers=1", "collect.folder=local")
     assert content(tmp_path / "remote") == content(tmp_path / "local")
+
+
+def test_the_documented_commands_make_a_cluster(tmp_path: Path) -> None:
+    """On a free port of this machine, and with one worker."""
+    commands = re.findall(r"^dask (.*)$", TEXT, re.MULTILINE)
+    on_scheduler, on_worker = (shlex.split(re.sub(r"HOST\b|HERE\b", "127.0.0.1", command)) for command in commands)
+    file, whole = tmp_path / "scheduler.json", tmp_path / "whole"
+    with dask(*on_scheduler, "--port", "0", "--scheduler-file", str(file)):
+        address = address_in(file)
+        joined = [address if argument.startswith("tcp:") else argument for argument in on_worker]
+        with dask(*(argument.replace("=-1", "=1") for argument in joined)):
+            gather(tmp_path / "episodes", cluster(address))
+    gather(whole, LocalCluster(1))
+    assert content(tmp_path / "episodes") == content(whole)
+
+
+@pytest.fixture(scope="module")
+def two(tmp_path_factory: pytest.TempPathFactory) -> Iterator[DaskCluster]:
+    """A cluster of two workers."""
+    with scheduler(tmp_path_factory.mktemp("two")) as (address, _), worker(address, "--nworkers", "2"):
+        yield cluster(address)
+
+
+def test_an_evaluation_reports_and_records_the_same(two: DaskCluster, tmp_path: Path) -> None:
+    seeds = range(FIRST_SEED, FIRST_SEED + 6)
+
+    def played(folder: Path, cluster: Cluster) -> tuple[Report, list[str]]:
+        folder.mkdir()
+        recorder = toy_recordable.make_recorder(folder)
+        makers = toy_recordable.make_environment, toy_recordable.make_agent, recorder
+        report = evaluate(*makers, seeds, cluster, needs=[folder])
+        return report, sorted(path.name for path in folder.iterdir())
+
+    here = played(tmp_path / "here", LocalCluster(1))
+    assert played(tmp_path / "there", two) == here
+    assert len(here[1]) == len(seeds)
+
+
+@pytest.mark.parametrize("kind", ["files", "lerobot", "packed"])
+def test_exported_files_are_the_same(kind: str, two: DaskCluster, folder: Path, tmp_path: Path) -> None:
+    store = EpisodeStore(folder, 4)
+    here = exporter(kind, tmp_path / "here").export(store)
+    there = exporter(kind, tmp_path / "there").export(store, two)
+    assert files(here) == files(there) != {}
+
+
+def test_a_file_that_a_worker_does_not_have_is_named(two: DaskCluster, tmp_path: Path) -> None:
+    missing = tmp_path / "last.ckpt"
+    makers = toy_recordable.make_environment, toy_recordable.make_agent, None
+    with pytest.raises(ValueError, match=r" has no .*last\.ckpt: workers need it on a file system that all machines"):
+        evaluate(*makers, [FIRST_SEED], two, needs=[missing])
 
 
 def test_without_workers_it_gives_up_and_goes_on_elsewhere(address: str, tmp_path: Path) -> None:
     folder, whole = tmp_path / "episodes", tmp_path / "whole"
-    without = pytest.raises(ValueError, match=r"has had no worker for 0\.5 s: what was committed is safe")
+    without = pytest.raises(ValueError, match=r"has had no worker for 0\.5 s: start workers and run again")
     with worker(address, "--no-nanny") as only, killed(only, folder), without:
-        gather(folder, Dask(address, patience=0.5), toy.make_slow_environment)
+        gather(folder, cluster(address, patience=0.5), toy.make_slow_environment)
     assert 3 <= len(EpisodeStore(folder).tried) < TRIED
-    gather(folder, Local(1))
-    gather(whole, Local(1))
+    gather(folder, LocalCluster(1))
+    gather(whole, LocalCluster(1))
     assert content(folder) == content(whole)
 
 
 def test_a_seed_that_brings_down_every_worker_is_reported(tmp_path: Path) -> None:
     folder = tmp_path / "episodes"
-    death = pytest.raises(ValueError, match=r"the workers of tcp://\S+ die")
-    with scheduler(tmp_path, DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES="0") as (address, _), worker(address), death:
-        gather(folder, Dask(address), toy.make_deadly_environment)
+    death = pytest.raises(ValueError, match=r"the workers of tcp://\S+ die, .*; committed episodes are safe")
+    deadly, seeds = toy_recordable.make_deadly_environment, [toy_recordable.DEADLY_SEED]
+    with scheduler(tmp_path, DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES="0") as (address, _), worker(address):
+        with death:
+            gather(folder, cluster(address), toy.make_deadly_environment)
+        report = evaluate(deadly, toy_recordable.make_agent, None, seeds, cluster(address))
+    assert "die, killed for their memory" in report.errors[0].error
     assert [entry.seed for entry in EpisodeStore(folder).tried] == list(range(lines(folder)))
 
 
 def test_a_worker_with_other_versions_is_refused(address: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("vla.cluster.LIBRARIES", ("numpy",))
+    monkeypatch.setattr("vla.parallel.dask.LIBRARIES", ("numpy",))
     other = pytest.raises(ValueError, match=r" has .*'mujoco'.*: install the same versions everywhere")
     with worker(address, "--no-nanny"), other:
-        gather(tmp_path / "episodes", Dask(address))
+        gather(tmp_path / "episodes", cluster(address))
 
 
 def test_a_scheduler_that_is_not_there_or_goes_away_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("vla.cluster.CONNECT", 0.5)
+    monkeypatch.setattr("vla.parallel.dask.CONNECT", 0.5)
     folder = tmp_path / "episodes"
     silence = pytest.raises(ValueError, match="no Dask scheduler answers")
     with scheduler(tmp_path) as (address, process), worker(address, "--no-nanny"), killed(process, folder), silence:
-        gather(folder, Dask(address), toy.make_slow_environment)
+        gather(folder, cluster(address), toy.make_slow_environment)
     with create_server(("127.0.0.1", 0)) as mute, pytest.raises(ValueError, match="no Dask scheduler answers"):
-        gather(folder, Dask(f"tcp://127.0.0.1:{mute.getsockname()[1]}"))
+        gather(folder, cluster(f"tcp://127.0.0.1:{mute.getsockname()[1]}"))
     with pytest.raises(ValueError, match=r"must read tcp://HOST:PORT, got '8786'"):
-        Dask("8786")
+        cluster("8786")
 
 
 def test_what_a_scheduler_lacks_is_named(tmp_path: Path) -> None:
-    lack = pytest.raises(ValueError, match=r"lacks something \(No module named 'toy'\): install vla\[cluster\] there")
+    lack = pytest.raises(ValueError, match=r"lacks a package \(No module named 'toy'\): install vla\[cluster\] there")
     with scheduler(tmp_path, PYTHONPATH="") as (address, _), lack:
-        gather(tmp_path / "episodes", Dask(address))
+        gather(tmp_path / "episodes", cluster(address))
 
 
 def test_without_dask_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "distributed", None)
     with pytest.raises(ValueError, match=r"install vla\[cluster\]"):
-        Dask("tcp://127.0.0.1:8786")
+        cluster("tcp://127.0.0.1:8786")

@@ -2,18 +2,25 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from functools import cache
+from inspect import Parameter, signature
+from itertools import product
 from pathlib import Path
+from typing import Any
 
 import pytest
+from composing import CONF, composed
 from hydra import compose, initialize_config_dir
-from omegaconf import DictConfig, OmegaConf
+from hydra.utils import get_class
+from omegaconf import OmegaConf
 
-from vla.check import JOBS, check
+from vla.config.check import JOBS, check
+from vla.config.conditions import conditions
+from vla.config.experiment import plain
 
-CONF = Path(__file__).parents[1] / "conf"
 AXES = CONF / "task/randomize"  # a group for each, with levels of the same names
-LEVELS = sorted({path.stem for path in AXES.glob("*/*.yaml")})
+LEVELS = sorted({path.stem for path in AXES.glob("*/*.yaml")} - {"swapped"})
 OPTIONS = [
     (path.parent.relative_to(CONF).as_posix(), path.stem)
     for path in sorted(CONF.rglob("*.yaml"))
@@ -25,15 +32,11 @@ OPTIONS = [
 TOGETHER = {("tokenizer", "fast"): ["model=decoder"]}
 
 
-def composed(*overrides: str, whole: bool = False) -> DictConfig:
-    with initialize_config_dir(str(CONF), version_base="1.3"):
-        return compose("config", overrides=["output=outputs/runs/now", *overrides], return_hydra_config=whole)
-
-
 @cache
 def groups(*overrides: str) -> set[str]:
     """Those of which an option is chosen, if only by default."""
-    return {*composed(*overrides, whole=True).hydra.runtime.choices}
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        return {*compose("config", overrides=[*overrides], return_hydra_config=True).hydra.runtime.choices}
 
 
 @cache
@@ -64,29 +67,82 @@ def test_empty_batches_are_refused() -> None:
 def test_option(group: str, option: str) -> None:
     cfg = composed(*TOGETHER.get((group, option), brought_by(group)), f"{group}={option}")
     top = group.partition("/")[0]
-    cfg.job = next((job for job in ("evaluate", "export", "deploy") if top in JOBS[job] and cfg.get(top)), "evaluate")
+    cfg.job = next(
+        (job for job in ("evaluate", "export", "deploy") if top in JOBS[job].groups and cfg.get(top)), "evaluate"
+    )
     check(cfg)
 
 
 @pytest.mark.parametrize("level", LEVELS)
 def test_every_axis_of_randomisation_at_a_level(level: str) -> None:
-    axes = [f"task/randomize/{path.parent.name}" for path in sorted(AXES.glob(f"*/{level}.yaml"))]
-    check(composed(*(f"{'' if axis in groups() else '+'}{axis}={level}" for axis in axes)))
+    axes = [path.parent.name for path in sorted(AXES.glob(f"*/{level}.yaml")) if path.parent.name != "naming"]
+    check(composed(*(f"task/randomize/{axis}={level}" for axis in axes)))
+
+
+def test_an_axis_is_applied_at_its_place_however_it_was_switched_on() -> None:
+    one = composed("task/randomize/shape=wide", "task.randomize.light=null").task.randomize
+    assert list(one) == list(composed("task/randomize=wide").task.randomize) == list(composed().task.randomize)
+    default = {axis for axis, level in composed().task.randomize.items() if level}
+    assert {axis for axis, level in one.items() if level} == default - {"light"} | {"shape"}
 
 
 @pytest.mark.parametrize("level", ["none", "default", "wide"])
 def test_intensity_and_colour_of_the_light_are_changed_one_at_a_time(level: str) -> None:
     cfg = composed("evaluate=suite", f"task/randomize={level}")
     check(cfg)
-    conditions = OmegaConf.to_container(cfg.evaluate.conditions, resolve=True)
-    assert isinstance(conditions, dict)
+    suite = conditions(plain(cfg.evaluate))
     hard, intensity, colour = (
-        conditions[f"light{name}_hard"]["randomize"]["light"] for name in ("", "_intensity", "_colour")
+        suite[f"light{name}_hard"]["randomize"]["light"] for name in ("", "_intensity", "_colour")
     )
-    unchanged = {"_target_": hard["_target_"], "brightness": [0.55, 0.55], "tint": 0.0, "tilt": 0.0}  # as in the scene
+    unchanged = {"_target_": hard["_target_"], "brightness": None, "tint": 0.0, "tilt": 0.0}  # as in the scene
     own = {**unchanged, **(cfg.task.randomize.get("light") or {})}
     assert intensity == {**own, "brightness": hard["brightness"]}
     assert colour == {**own, "tint": hard["tint"]}
+
+
+def test_the_suite_has_every_axis_by_itself_at_each_level() -> None:
+    suite = conditions(plain(composed("evaluate=suite").evaluate))
+    levels = {level: composed(f"task/randomize={level}").task.randomize for level in ("wide", "hard")}
+    axes = [axis for axis in levels["wide"] if axis != "phrasing"]  # whose levels are the same
+    assert {"swapped", "impossible", "empty", "phrasing"} < set(suite)
+    for axis, level in product(axes, levels):
+        assert suite[f"{axis}_{level}"] == {"randomize": {axis: levels[level][axis]}}
+    assert len(suite) == 4 + 2 * len(axes) + 4  # intensity and colour of the light
+
+
+def test_a_misspelt_word_in_a_condition_is_found_before_anything_is_done() -> None:
+    wrong = composed("+evaluate.conditions.dark={randomize: {lihgt: {brightnes: [0, 0]}}}")
+    with pytest.raises(ValueError, match=r"evaluate\.conditions\.dark\)\.randomize"):
+        check(wrong)
+    light = OmegaConf.to_container(composed().task.randomize.light)
+    assert isinstance(light, dict)
+    wrong.evaluate.conditions = {"dark": {"randomize": {"light": {**light, "brightnes": [0, 0]}}}}
+    with pytest.raises(ValueError, match="brightnes is unknown, did you mean brightness"):
+        check(wrong)
+
+
+@pytest.mark.parametrize("experiment", ["standard", "few", "multitask"])
+def test_no_experiment_changes_how_rt1_is_augmented(experiment: str) -> None:
+    assert composed(f"experiment={experiment}", "model=rt1").model.shift == [20, 50]
+    assert composed(f"experiment={experiment}").model.shift == [4, 4]
+
+
+def test_a_model_changes_nothing_but_itself() -> None:
+    default = plain(composed())
+    for path in sorted((CONF / "model").glob("*.yaml")):
+        other = plain(composed(f"model={path.stem}"))
+        assert {name for name in default if other[name] != default[name]} <= {"model", "chosen"}, path.stem
+
+
+def test_options_are_named_as_the_command_line_names_them() -> None:
+    chosen = composed("experiment=few", "model=act").chosen
+    assert chosen == {"experiment": "few", "model": "act"}
+
+
+def test_a_file_says_whether_it_comes_before_or_after_what_it_is_composed_of() -> None:
+    for path in CONF.rglob("*.yaml"):
+        order = OmegaConf.select(OmegaConf.load(path), "defaults", default=["_self_"])
+        assert "_self_" in (order[0], order[-1]), path
 
 
 def test_a_model_of_one_token_per_component_takes_no_other_tokens() -> None:
@@ -103,3 +159,25 @@ def test_data_is_shared_by_everything_that_does_not_change_the_episodes() -> Non
     assert composed("seed=3", "collect.episodes=7", "expert=waypoint", "cluster=dask").collect.folder == folder
     assert composed("task/goal=lift").collect.folder != folder
     assert composed("collect.seed=1").collect.folder != folder
+
+
+def test_an_axis_that_is_off_is_as_one_that_is_not_there() -> None:
+    off, without = composed("task.randomize.light=null"), composed("~task.randomize.light")
+    assert off.task != without.task and off.collect.folder == without.collect.folder != composed().collect.folder
+
+
+def nodes(value: Any) -> Iterator[dict[str, Any]]:
+    """Every mapping with a `_target_` in a plain value."""
+    if isinstance(value, dict):
+        yield from [value] if "_target_" in value else []
+    for part in value.values() if isinstance(value, dict) else value if isinstance(value, list) else ():
+        yield from nodes(part)
+
+
+@pytest.mark.parametrize("path", sorted(CONF.rglob("*.yaml")), ids=lambda path: path.relative_to(CONF).as_posix())
+def test_what_stands_in_a_file_has_no_default_in_the_code(path: Path) -> None:
+    for node in nodes(OmegaConf.to_container(OmegaConf.load(path))):
+        if node["_target_"].startswith("vla."):
+            parameters = signature(get_class(node["_target_"])).parameters.values()
+            defaults = {each.name for each in parameters if each.default is not Parameter.empty}
+            assert defaults.isdisjoint(node), node["_target_"]

@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from vla.tasks.control import (
+from vla.robots.panda import (
     DOWN,
     HOME,
     JOINT_HIGH,
@@ -23,23 +23,23 @@ from vla.tasks.control import (
 )
 
 if TYPE_CHECKING:
-    from vla.tasks.tabletop import Tabletop
+    from vla.tasks.tabletop.environment import Tabletop
 
 
 @pytest.mark.parametrize("seed", range(5))
 def test_forward_kinematics_and_jacobian_equal_mujocos(tabletop: Tabletop, seed: int) -> None:
-    bound = tabletop.task.bound
-    data = mujoco.MjData(bound.model)
+    compiled = tabletop.dm_env.task.compiled
+    data = mujoco.MjData(compiled.model)
     joints = np.random.default_rng(seed).uniform(JOINT_LOW, JOINT_HIGH)
-    data.qpos[bound.joints] = joints
-    mujoco.mj_kinematics(bound.model, data)
-    mujoco.mj_comPos(bound.model, data)
-    linear, angular = np.empty((3, bound.model.nv)), np.empty((3, bound.model.nv))
-    mujoco.mj_jacSite(bound.model, data, linear, angular, bound.tcp)
+    data.qpos[compiled.joints] = joints
+    mujoco.mj_kinematics(compiled.model, data)
+    mujoco.mj_comPos(compiled.model, data)
+    linear, angular = np.empty((3, compiled.model.nv)), np.empty((3, compiled.model.nv))
+    mujoco.mj_jacSite(compiled.model, data, linear, angular, compiled.tcp)
     pose, jacobian = forward(joints)
-    np.testing.assert_allclose(pose[:3, 3], data.site_xpos[bound.tcp], atol=1e-6)
-    np.testing.assert_allclose(pose[:3, :3].ravel(), data.site_xmat[bound.tcp], atol=1e-6)
-    np.testing.assert_allclose(jacobian, np.concatenate([linear, angular])[:, bound.velocities], atol=1e-6)
+    np.testing.assert_allclose(pose[:3, 3], data.site_xpos[compiled.tcp], atol=1e-6)
+    np.testing.assert_allclose(pose[:3, :3].ravel(), data.site_xmat[compiled.tcp], atol=1e-6)
+    np.testing.assert_allclose(jacobian, np.concatenate([linear, angular])[:, compiled.velocities], atol=1e-6)
 
 
 def test_rotation_vectors_are_inverse_to_rotations() -> None:

@@ -8,23 +8,23 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from test_episodes import CONFIG, EPISODES, add
-from toy import SPEC
+from exporting import exporter
+from toy import ARM_SPEC
+from toy_episodes import CONFIG, EPISODES, add
 
+from vla.data.datamodule import WindowDataModule
 from vla.data.episodes import EpisodeStore
-from vla.data.packed import Packed
-from vla.data.windows import Windows
 
 SKIPPED = ("lock",)
 
 
 def train(folder: Path) -> None:
     """What a training does with a store before and while it learns from every step."""
-    store = EpisodeStore.create_or_open(folder, SPEC, CONFIG)
+    store = EpisodeStore.create_or_open(folder, ARM_SPEC, CONFIG)
     assert store.statistics.steps
-    windows = Windows(
+    windows = WindowDataModule(
         folder,
-        SPEC,
+        ARM_SPEC,
         history=1,
         chunk=1,
         seed=0,
@@ -36,7 +36,7 @@ def train(folder: Path) -> None:
     )
     windows.setup()
     for first in range(0, len(windows.training_windows), 8):
-        windows.gather(windows.training_windows[first : first + 8])
+        windows.make_batch(windows.training_windows[first : first + 8])
 
 
 def changes(folder: Path, names: list[str], change: Callable[[bytes, int], int], count: int) -> int:
@@ -84,7 +84,7 @@ def test_no_flipped_bit_is_trained_on(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("codec", ["lossless", "jpeg"])
 def test_no_flipped_bit_of_a_packed_store_is_trained_on(tmp_path: Path, codec: str) -> None:
-    Packed(tmp_path / "packed", codec=codec, workers=1).export(add(tmp_path / "store", EPISODES))  # type: ignore[arg-type]
+    exporter("packed", tmp_path / "packed", f"export.codec={codec}").export(add(tmp_path / "store", EPISODES))
     files = sorted(path.name for path in (tmp_path / "packed").iterdir() if path.suffix in (".pack", ".offsets"))
     assert changes(tmp_path / "packed", files, flip, 30) == 30
 
@@ -103,6 +103,6 @@ def test_all_damaged_episodes_are_named_with_the_way_out(tmp_path: Path) -> None
         data[entry.start * image] ^= 1
     path.write_bytes(data)
     with pytest.raises(ValueError, match=r"rows of the seeds 1, 2 in .*store .* job=inspect inspect\.repair=true"):
-        windows = Windows(store.folder, SPEC, 1, 1, 0, 48, 0, 8, False, 0)
+        windows = WindowDataModule(store.folder, ARM_SPEC, 1, 1, 0, 48, 0, 8, False, 0)
         windows.setup()
-        windows.gather(windows.training_windows)
+        windows.make_batch(windows.training_windows)

@@ -9,17 +9,18 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from fake_batch import TINY_IMAGE, TINY_TEXT, Motions, make_batch, make_decoder, overfit, with_text
-from test_learner import loader, make_learner, make_trainer
-from test_policy import act, observations
+from defaults import defaults_of
+from fake_batch import TINY_IMAGE, TINY_TEXT, Motions, as_policy, make_batch, make_decoder, overfit, with_text
+from observing import act, observations
+from small_training import loader, make_learner, make_trainer
 from toy import SPEC, ToyEnvironment
 
-from vla.models.action_tokenizer import RT1
 from vla.models.decoder import Decoder
-from vla.models.fast import Fast
-from vla.models.quantile import Quantile
-from vla.policy import Policy, read_checkpoint
-from vla.rollout import rollout
+from vla.models.tokenizers.fast import Fast
+from vla.models.tokenizers.quantile import Quantile
+from vla.models.tokenizers.tokenizer import RT1
+from vla.policy import read_checkpoint
+from vla.rollouts.rollout import rollout
 
 MOTIONS = Motions()
 
@@ -27,13 +28,13 @@ MOTIONS = Motions()
 def make_fast(chunk: int = 4, seed: int = 0) -> Decoder:
     """A decoder that writes chunks as FAST does."""
     torch.manual_seed(seed)
-    return make_decoder(chunk=chunk, tokenizer=Fast(bins=256, chunk=chunk, spec=SPEC, statistics=MOTIONS))
+    return make_decoder(chunk=chunk, tokenizer=Fast(bins=256, chunk=chunk, spec=SPEC, statistics=MOTIONS, scale=10.0))
 
 
 MODELS: dict[str, Callable[[], Decoder]] = {
     "uniform": make_decoder,
     "chunk": lambda: make_decoder(history=3, chunk=3),
-    "rt1": lambda: make_decoder(tokenizer=RT1(spec=SPEC)),
+    "rt1": lambda: make_decoder(tokenizer=RT1(spec=SPEC, **defaults_of("tokenizer/rt1"))),
     "quantile": lambda: make_decoder(tokenizer=Quantile(bins=64, spec=SPEC, statistics=MOTIONS)),
     "fast": make_fast,
 }
@@ -134,7 +135,7 @@ def test_the_instruction_and_every_frame_matter() -> None:
     assert not torch.allclose(model({**batch, "text": model.text.tokenize(["push the button"] * 4)})["logits"], logits)
     for frame in range(3):
         changed = {name: images.clone() for name, images in batch["rgb"].items()}
-        changed["wrist"][:, frame] = 0
+        changed["eye"][:, frame] = 0
         assert not torch.allclose(model({**batch, "rgb": changed})["logits"], logits)
 
 
@@ -142,7 +143,7 @@ def test_frames_that_are_missing_are_as_frames_that_are_padding() -> None:
     model = make_decoder(history=3).eval()
     batch = batch_for(model)
     batch["present"][:, :2] = False
-    alone = {name: batch[name][:, 2:] for name in ("proprio", "present")}
+    alone = {name: batch[name][:, 2:] for name in ("state", "present")}
     rgb = {camera: images[:, 2:] for camera, images in batch["rgb"].items()}
     prediction = model.predict({**alone, "rgb": rgb, "text": batch["text"]})
     assert torch.allclose(prediction.actions, model.predict(batch).actions, atol=1e-6)
@@ -168,12 +169,12 @@ def test_writing_ends_when_all_have_ended() -> None:
 
 def test_what_was_perceived_is_kept_while_the_window_moves_on() -> None:
     model = make_decoder(history=3)
-    policy = Policy(model=model, spec=SPEC)
+    policy = as_policy(model)
     frames: list[int] = []
     model.image.register_forward_pre_hook(lambda module, inputs: frames.append(len(inputs[0])))
     actions = act(policy, observations(5))
     assert frames == [1] * (5 * len(SPEC.cameras))
-    assert np.array_equal(act(Policy(model=model, spec=SPEC), observations(5)), actions)
+    assert np.array_equal(act(as_policy(model), observations(5)), actions)
 
 
 def test_a_trained_decoder_of_fast_tokens_plays_an_episode_from_its_checkpoint(tmp_path: Path) -> None:
@@ -181,14 +182,20 @@ def test_a_trained_decoder_of_fast_tokens_plays_an_episode_from_its_checkpoint(t
     trainer = make_trainer(3)
     trainer.fit(make_learner(model), loader(make_batch(2, chunk=4), 3))
     trainer.save_checkpoint(tmp_path / "fast.ckpt")
-    restored = make_decoder(chunk=4, tokenizer=Fast(bins=256, chunk=4, spec=SPEC))
+    restored = make_decoder(chunk=4, tokenizer=Fast(bins=256, chunk=4, spec=SPEC, scale=10.0))
     read_checkpoint(tmp_path / "fast.ckpt").restore(restored)
-    episode = rollout(ToyEnvironment(), Policy(model=restored, spec=SPEC), seed=3)
+    episode = rollout(ToyEnvironment(), as_policy(restored), seed=3)
     assert episode.actions.shape == (40, 3)
-    expected = rollout(ToyEnvironment(), Policy(model=model, spec=SPEC), seed=3)
+    expected = rollout(ToyEnvironment(), as_policy(model), seed=3)
     assert episode.actions == pytest.approx(expected.actions, abs=1e-6)
 
 
 def test_heads_that_do_not_divide_the_width_are_refused() -> None:
     with pytest.raises(ValueError, match=r"model\.width=32 must be a multiple of model\.heads=5"):
-        Decoder(TINY_IMAGE, TINY_TEXT, width=32, heads=5, spec=SPEC, tokenizer=RT1(spec=SPEC))
+        Decoder(
+            image=TINY_IMAGE,
+            text=TINY_TEXT,
+            spec=SPEC,
+            tokenizer=RT1(spec=SPEC, **defaults_of("tokenizer/rt1")),
+            **defaults_of("model/decoder", width=32, heads=5),
+        )

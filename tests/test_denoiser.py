@@ -11,7 +11,7 @@ from fake_batch import make_batch, make_denoising, with_text
 from torch import Tensor, nn
 
 from vla.models.denoiser import Denoiser, DenoisingModel
-from vla.models.diffusion import LEVELS, Diffusion, kept
+from vla.models.diffusion import LEVELS, Diffusion, alpha_bar
 from vla.models.flow import Flow
 
 
@@ -50,7 +50,7 @@ def test_the_schedule_is_what_its_steps_multiply_to() -> None:
 
     taken = [min(1 - ideal((step + 1) / LEVELS) / ideal(step / LEVELS), 0.999) for step in range(LEVELS)]
     expected = (1 - torch.tensor(taken)).cumprod(0)
-    assert torch.allclose(kept(torch.arange(LEVELS)), expected, rtol=1e-3, atol=1e-8)
+    assert torch.allclose(alpha_bar(torch.arange(LEVELS)), expected, rtol=1e-3, atol=1e-8)
 
 
 def test_a_level_of_noise_keeps_its_share_of_the_variance() -> None:
@@ -59,7 +59,7 @@ def test_a_level_of_noise_keeps_its_share_of_the_variance() -> None:
     noisy, time, target = model.corrupt(action, noise, torch.tensor([0.0, 0.505, 1.0]))
     assert time.tolist() == pytest.approx([0.0, 0.5, 0.99]) and torch.equal(target, noise)
     for row, level in zip(noisy, (0, 50, 99), strict=True):
-        share = kept(torch.tensor(level)).item()
+        share = alpha_bar(torch.tensor(level)).item()
         assert torch.allclose(row, torch.tensor(math.sqrt(share) * 0.5 - math.sqrt(1 - share) * 2))
 
 
@@ -70,7 +70,7 @@ def test_who_knows_the_noise_finds_the_actions(steps: int) -> None:
     action = 2 * torch.rand(2, 4, 3) - 1
 
     def noise_in(noisy: Tensor, time: Tensor) -> Tensor:
-        share = kept((time * LEVELS).round())[:, None, None]
+        share = alpha_bar((time * LEVELS).round())[:, None, None]
         return (noisy - share.sqrt() * action) / (1 - share).sqrt()
 
     model.denoiser = Told(noise_in)  # type: ignore[assignment]
@@ -84,7 +84,7 @@ def test_noise_that_tells_nothing_does_not_become_an_action(steps: int) -> None:
 
     def expected(noisy: Tensor, time: Tensor) -> Tensor:
         """The mean of the noise in what was made of normal actions around 0."""
-        share = kept((time * LEVELS).round())[:, None, None]
+        share = alpha_bar((time * LEVELS).round())[:, None, None]
         return (1 - share).sqrt() * noisy / (share * spread**2 + 1 - share)
 
     model.denoiser = Told(expected)  # type: ignore[assignment]

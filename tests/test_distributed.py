@@ -10,15 +10,15 @@ import pytest
 import torch
 import toy
 import warm
-from test_run import SMALL, vla
-from test_trainer import STOP, same
-from test_windows import windows
+from command_line import SMALL, vla
+from defaults import defaults_of
+from reading import windows
+from resuming import STOP, same
 from together import PAIRS, composed, train, untrained
 
+from vla.config.experiment import make_policy
 from vla.models.learner import Learner
-from vla.parts import make_policy
-from vla.policy import noise
-from vla.trainer import LAST, make_trainer
+from vla.training.trainer import LAST, make_trainer
 
 TORCHRUN = {"TORCHELASTIC_RUN_ID": "1", "RANK": "0", "LOCAL_RANK": "0", "WORLD_SIZE": "2"}  # what it sets
 
@@ -56,8 +56,8 @@ def test_two_processes_learn_what_one_learns_from_batches_twice_as_large(
 @pytest.mark.parametrize("pair", PAIRS)
 def test_what_several_processes_leave_is_a_checkpoint_like_any_other(together: Path, pair: str) -> None:
     path = together / pair / LAST
-    policy = make_policy({"_target_": "vla.policy.Policy", "device": "cpu"}, path)
-    action = policy.act(noise(toy.SPEC, np.random.default_rng(0)))
+    policy = make_policy({"_target_": "vla.policy.Policy", **defaults_of("policy/default", device="cpu")}, path)
+    action = policy.act(toy.SPEC.random_observation(np.random.default_rng(0)))
     assert action.shape == (3,) and np.isfinite(action).all()
 
 
@@ -84,7 +84,7 @@ def test_two_processes_of_a_trainer_see_every_window_once_between_them(folder: P
     count = len(module.training_windows)
     seen = np.stack([np.load(together / f"seen{rank}.npy") for rank in (0, 1)], axis=1)  # (steps, 2, B, …)
     drawn = seen.reshape(np.prod(seen.shape[:3]), -1)[:count]
-    every = module.gather(module.training_windows)["proprio"].numpy().reshape(count, -1)
+    every = module.make_batch(module.training_windows)["state"].numpy().reshape(count, -1)
     assert len(np.unique(every, axis=0)) == count  # no two windows look alike
     np.testing.assert_array_equal(np.unique(drawn, axis=0), np.unique(every, axis=0))
 
@@ -95,7 +95,6 @@ def test_two_processes_of_a_trainer_see_every_window_once_between_them(folder: P
         (("trainer=fsdp",), {}, "gpu"),
         (("trainer=ddp", "trainer.strategy=dpp"), {}, "dpp"),
         (("trainer=ddp", "trainer.devices=3"), TORCHRUN, "does not match the world size"),
-        (("trainer=fsdp", "trainer.precision=16-mixed"), {}, "16-mixed"),
     ],
 )
 def test_what_the_machine_lacks_is_said_before_anything_is_done(
@@ -104,13 +103,13 @@ def test_what_the_machine_lacks_is_said_before_anything_is_done(
     for name, value in environment.items():
         monkeypatch.setenv(name, value)
     on = [] if overrides == ("trainer=fsdp",) else ["trainer.accelerator=cpu"]
-    with pytest.raises(ValueError, match=f"cannot be had here .*{says}.*: try trainer=cpu"):
-        make_trainer(composed("model=rt1_tiny", *overrides, *on), None)
+    with pytest.raises(ValueError, match=f"is not available here .*{says}.*: try trainer=cpu"):
+        make_trainer(composed("model=rt1_tiny", *overrides, *on).config, None)
 
 
-def test_ddp_trains_on_two_processes_and_evaluates_once(tmp_path: Path) -> None:
-    few = ("collect.episodes=5", "recorder=none")
-    done = vla(tmp_path, *SMALL, *few, "trainer=ddp", "trainer.devices=2", "output=run", "hydra.run.dir=run")
+def test_ddp_trains_on_two_processes_and_evaluates_once(home: Path) -> None:
+    two = ("trainer=ddp", "trainer.devices=2", "recorder=none", "output=two", "hydra.run.dir=two")
+    done = vla(home, *SMALL, *two)
     assert done.stdout.count("trained 4 steps") == done.stdout.count("\nsuccess ") == 1
-    assert json.loads((tmp_path / "run/report.json").read_text())["episodes"] == 2
-    assert not (tmp_path / "outputs/runs").exists()
+    assert json.loads((home / "two/report.json").read_text())["episodes"] == 2
+    assert not (home / "outputs/runs").exists()

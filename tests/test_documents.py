@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from vla.documents import DEEPEST, STRICT, parse_json, parse_yaml, read_json, read_yaml, require_resolved
-from vla.types import Range
+from vla.io.documents import MAX_DEPTH, STRICT, parse_json, parse_yaml, read_json, read_yaml, require_resolved
+from vla.io.types import Range
 
 
 @dataclass
@@ -26,6 +27,14 @@ def test_a_file_is_read_as_its_type(tmp_path: Path) -> None:
     (tmp_path / "a.json").write_text('{"size": 1, "names": ["x"]}')
     (tmp_path / "a.yaml").write_text("size: 1\nnames: [x]\n")
     assert read_json(tmp_path / "a.json", Header) == read_yaml(tmp_path / "a.yaml", Header) == Header(1, ("x",))
+
+
+def test_a_pipe_or_a_device_is_not_read(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    (tmp_path / "endless").symlink_to("/dev/zero")
+    for name in ("pipe", "endless"):
+        with pytest.raises(ValueError, match=rf"{name} is a folder, a pipe or a device, not a file"):
+            read_json(tmp_path / name, Header)
 
 
 @pytest.mark.parametrize(
@@ -49,7 +58,7 @@ def test_json_of_another_kind_is_refused_by_name(text: str | bytes, kind: Any, s
     ("text", "says"),
     [
         ("a: &b [1]\nc: *b", "has aliases"),
-        ("- " * (DEEPEST + 1) + "1", f"deeper than {DEEPEST}"),
+        ("- " * (MAX_DEPTH + 1) + "1", f"deeper than {MAX_DEPTH}"),
         ("a: 2020-01-01", "date is not JSON"),
         ("!!python/object/apply:os.system [ls]", "constructor"),
         ("a: [", "expected"),
@@ -82,7 +91,7 @@ def test_a_configuration_that_refers_to_itself_or_grows_without_bound_is_refused
     endless: list[Any] = []
     endless.append(endless)
     doubling: list[Any] = []
-    for _ in range(DEEPEST - 1):
+    for _ in range(MAX_DEPTH - 1):
         doubling = [doubling, doubling]
     for value in (endless, doubling):
         with pytest.raises(ValueError, match="holds more than"):

@@ -11,56 +11,37 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from toy import SPEC, ToyEnvironment, ToyExpert
+from toy import ARM_SPEC
+from toy_episodes import CONFIG, EPISODES, add, content
 
 from vla.data.episodes import EpisodeStore
 from vla.data.header import fields_of
-from vla.rollout import rollout
-from vla.spec import Episode
 
-CONFIG = {"task": {"size": 1.0}, "seed": 0}
-FIELDS = tuple(fields_of(SPEC))
-EPISODES = [rollout(ToyEnvironment(), ToyExpert(), seed) for seed in range(5)]  # seed 3 fails
-
-
-def add(folder: Path, episodes: list[Episode]) -> EpisodeStore:
-    store = EpisodeStore.create_or_open(folder, SPEC, CONFIG)
-    with store.writing():
-        for episode in episodes:
-            if episode.success:
-                store.append(episode)
-            else:
-                store.fail(episode.seed, episode.outcome, episode.draws)
-    return store
-
-
-def content(folder: Path) -> dict[str, bytes]:
-    return {path.name: path.read_bytes() for path in folder.iterdir() if path.name != "lock"}
+FIELDS = tuple(fields_of(ARM_SPEC))
 
 
 def test_what_was_stored_is_read_back(tmp_path: Path) -> None:
     written, store = add(tmp_path, EPISODES), EpisodeStore(tmp_path)
     assert store.tried == written.tried
-    assert store.spec == SPEC
+    assert store.spec == ARM_SPEC
     assert [entry.seed for entry in store.episodes] == [0, 1, 2, 4]
     assert store.tried[3].outcome == "timeout" and store.tried[3].steps == 0
     assert store.next_seed == 5
     assert store.tried[0].draws["colour"] in ("red", "blue") and store.tried[0].draws["limit"] == 40
     for entry in store.episodes:
         episode, rows = EPISODES[entry.seed], store.read(entry)
-        assert entry.instruction == episode.instruction
+        assert entry.instruction == episode.instruction and entry.task in episode.instruction
+        assert entry.milestones == ("near",)
         np.testing.assert_array_equal(rows["action"], episode.actions)
         np.testing.assert_array_equal(rows["executed"], episode.executed)
         for step, seen in enumerate(episode.observations):
-            for camera in SPEC.cameras:
+            for camera in ARM_SPEC.cameras:
                 np.testing.assert_array_equal(rows[f"rgb_{camera}"][step], seen.rgb[camera])
                 np.testing.assert_array_equal(rows[f"depth_{camera}"][step], seen.depth[camera])
-            np.testing.assert_array_equal(rows["joints"][step], seen.joints)
-            np.testing.assert_array_equal(rows["velocities"][step], seen.velocities)
-            assert rows["gripper"][step] == np.float32(seen.gripper)
+            np.testing.assert_array_equal(rows["state"][step], seen.state)
             assert seen.truth is not None
             np.testing.assert_array_equal(rows["truth"][step], [*seen.truth["target"], *seen.truth["point"]])
-    assert len(store.rows("joints")) == sum(entry.steps for entry in store.episodes)
+    assert len(store.rows("state")) == sum(entry.steps for entry in store.episodes)
 
 
 def test_the_files_can_be_read_without_this_package(tmp_path: Path) -> None:
@@ -161,12 +142,12 @@ def test_a_full_disk_takes_no_store(tmp_path: Path) -> None:
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (100, hard))
     try:
-        with pytest.raises(ValueError, match=r"cannot take a store \(.*\): make room there"):
+        with pytest.raises(OSError, match=r"store\.json cannot be written \(.*\): make room there"):
             add(tmp_path, [])
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
     add(tmp_path, EPISODES)
-    assert "store.json" in content(tmp_path) and "store.json.draft" not in content(tmp_path)
+    assert not list(tmp_path.glob(".*")) and "store.json" in content(tmp_path)
 
 
 def test_episodes_that_have_lost_their_description_are_not_adopted(tmp_path: Path) -> None:
@@ -176,30 +157,30 @@ def test_episodes_that_have_lost_their_description_are_not_adopted(tmp_path: Pat
     before = content(tmp_path)
     for config in (CONFIG, {**CONFIG, "task": {"size": 2.0}}):
         with pytest.raises(ValueError, match=r"holds action\.bin without store\.json, which says what it means"):
-            EpisodeStore.create_or_open(tmp_path, SPEC, config)
+            EpisodeStore.create_or_open(tmp_path, ARM_SPEC, config)
     assert content(tmp_path) == before
     (tmp_path / "store.json").write_bytes(description)
-    assert len(EpisodeStore.create_or_open(tmp_path, SPEC, CONFIG).episodes) == 4
+    assert len(EpisodeStore.create_or_open(tmp_path, ARM_SPEC, CONFIG).episodes) == 4
 
 
 def test_a_store_of_another_task_is_refused(tmp_path: Path) -> None:
     add(tmp_path, EPISODES)
     with pytest.raises(ValueError, match=r"this task has control_hz = 20\.0, but the episode store .* has 10\.0"):
-        EpisodeStore.create_or_open(tmp_path, replace(SPEC, control_hz=20.0), CONFIG)
+        EpisodeStore.create_or_open(tmp_path, replace(ARM_SPEC, control_hz=20.0), CONFIG)
     with pytest.raises(ValueError, match=r"another config for \['task'\]"):
-        EpisodeStore.create_or_open(tmp_path, SPEC, {**CONFIG, "task": {"size": 2.0}})
+        EpisodeStore.create_or_open(tmp_path, ARM_SPEC, {**CONFIG, "task": {"size": 2.0}})
 
 
 def test_seeds_come_in_order(tmp_path: Path) -> None:
     store = add(tmp_path, EPISODES[:2])
-    with store.writing(), pytest.raises(ValueError, match="expects seed 2 next, seed 4 came"):
+    with store.writing(), pytest.raises(ValueError, match="expects seed 2 next, got seed 4"):
         store.append(EPISODES[4])
 
 
 def test_an_episode_that_does_not_fit_the_spec_is_refused(tmp_path: Path) -> None:
     store = add(tmp_path, [])
-    small = [replace(seen, joints=seen.joints[:6]) for seen in EPISODES[0].observations]
-    with store.writing(), pytest.raises(ValueError, match=r"joints must be \(12, 7\) float32, it came as \(12, 6\)"):
+    small = [replace(seen, state=seen.state[:6]) for seen in EPISODES[0].observations]
+    with store.writing(), pytest.raises(ValueError, match=r"state must be \(12, 15\) float32, got \(12, 6\)"):
         store.append(replace(EPISODES[0], observations=small))
     assert EpisodeStore(tmp_path).tried == []
 
@@ -215,8 +196,8 @@ def test_what_cannot_be_read_is_named(tmp_path: Path) -> None:
         (folder / name).write_bytes(change((whole / name).read_bytes()))
         return folder
 
-    with pytest.raises(ValueError, match="has format 9, this version reads 2: collect again"):
-        EpisodeStore(damaged("store.json", lambda data: data.replace(b'"format": 2', b'"format": 9')))
+    with pytest.raises(ValueError, match="has format 9, this version reads 3: collect again"):
+        EpisodeStore(damaged("store.json", lambda data: data.replace(b'"format": 3', b'"format": 9')))
     with pytest.raises(ValueError, match=r"depth_wrist\.bin is shorter than its index says"):
         EpisodeStore(damaged("depth_wrist.bin", lambda data: data[:-1]))
     with pytest.raises(ValueError, match=r"line 2 of .*index\.jsonl is damaged: it does not fit its checksum: keep"):
@@ -230,9 +211,9 @@ def test_what_cannot_be_read_is_named(tmp_path: Path) -> None:
         store.rows("rgb")
 
 
-@pytest.mark.parametrize("content", [b"{", b'{"format": 2}', b"[]", b"\xff\xfe"])
+@pytest.mark.parametrize("content", [b"{", b'{"format": 3}', b"[]", b"\xff\xfe"])
 def test_a_garbled_description_is_named_with_the_way_out(tmp_path: Path, content: bytes) -> None:
-    store = EpisodeStore.create_or_open(tmp_path, SPEC, {})
+    store = EpisodeStore.create_or_open(tmp_path, ARM_SPEC, {})
     (store.folder / "store.json").write_bytes(content)
     with pytest.raises(ValueError, match=r"store\.json is damaged or of another kind: .*collect again"):
         EpisodeStore(store.folder)

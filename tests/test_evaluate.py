@@ -10,8 +10,9 @@ import pytest
 import toy_recordable as toy
 from rerun.chunk import RrdReader
 
-from vla.evaluate import FIRST_SEED, Report, Result, evaluate, keep_recordings
-from vla.report import summary
+from vla.parallel.pool import LocalCluster
+from vla.reports.evaluation import summary
+from vla.rollouts.evaluate import FIRST_SEED, Report, Result, evaluate, keep_recordings
 from vla.spec import Environment
 
 SEEDS = range(FIRST_SEED, FIRST_SEED + 10)
@@ -26,22 +27,35 @@ def test_the_last_line_is_the_success_rate() -> None:
     assert str(report).splitlines() == ["dropped 17", "success 83/100 (83.0 %, 95 % CI 74.5-89.1)"]
 
 
-def test_several_goals_are_told_apart() -> None:
-    def asked(goal: str, *outcomes: str) -> list[Result]:
-        return [Result(FIRST_SEED, outcome, draws={"named": {"goal": goal}}) for outcome in outcomes]
+def test_several_tasks_are_told_apart() -> None:
+    def asked(task: str, *outcomes: str) -> list[Result]:
+        return [Result(FIRST_SEED, outcome, task=task) for outcome in outcomes]
 
-    push, lift = asked("Push", "success", "dropped", "error"), asked("Lift", "success", "success")
+    push, lift = asked("push", "success", "dropped", "error"), asked("lift", "success", "success")
     nothing = Result(FIRST_SEED, "error", error="ValueError: no scene")
     report = Report((*push, *lift, nothing))
-    assert report.goals == {"Lift": Report(tuple(lift)), "Push": Report(tuple(push))}
+    assert report.tasks == {"lift": Report(tuple(lift)), "push": Report(tuple(push))}
     assert str(report).splitlines()[-3:] == [
-        "Lift 2/2 (100.0 %, 95 % CI 34.2-100.0)",
-        "Push 1/2 (50.0 %, 95 % CI 9.5-90.5)",
+        "lift 2/2 (100.0 %, 95 % CI 34.2-100.0)",
+        "push 1/2 (50.0 %, 95 % CI 9.5-90.5)",
         "success 3/4 (75.0 %, 95 % CI 30.1-95.4)",
     ]
-    assert summary(report)["goals"] == {"Lift": summary(report.goals["Lift"]), "Push": summary(report.goals["Push"])}
+    assert summary(report)["tasks"] == {task: summary(report.tasks[task]) for task in ("lift", "push")}
     alone = Report(tuple(push))
-    assert "Push" not in str(alone) and summary(alone)["goals"] == {}
+    assert "push" not in str(alone) and summary(alone)["tasks"] == {}
+
+
+def test_milestones_have_a_rate_of_their_own() -> None:
+    reached = [("grasped",), ("grasped", "lifted"), (), ()]
+    report = Report(tuple(Result(FIRST_SEED, "dropped", milestones=names) for names in reached))
+    assert report.milestones == {"grasped": 2, "lifted": 1}
+    assert "grasped 2/4 (50.0 %, 95 % CI 15.0-85.0)" in str(report).splitlines()
+    assert summary(report)["milestones"]["lifted"] == {
+        "rate": 0.25,
+        "ci_low": pytest.approx(0.0456, abs=1e-4),
+        "ci_high": pytest.approx(0.6994, abs=1e-4),
+        "episodes": 1,
+    }
 
 
 def test_errors_are_neither_successes_nor_failures() -> None:
@@ -56,8 +70,8 @@ def test_a_report_of_errors_alone_has_the_widest_interval() -> None:
 
 
 def test_two_workers_report_what_one_reports() -> None:
-    alone = evaluate(toy.make_environment, toy.make_agent, None, SEEDS, workers=1)
-    assert evaluate(toy.make_environment, toy.make_agent, None, SEEDS, workers=2) == alone
+    alone = evaluate(toy.make_environment, toy.make_agent, None, SEEDS)
+    assert evaluate(toy.make_environment, toy.make_agent, None, SEEDS, LocalCluster(2)) == alone
     assert [result.seed for result in alone.results] == list(SEEDS)
     assert alone.taxonomy == {"success": 8, "timeout": 2}
     first = alone.results[0]
@@ -66,7 +80,7 @@ def test_two_workers_report_what_one_reports() -> None:
 
 
 def test_an_episode_that_raises_is_an_error_and_the_others_go_on() -> None:
-    report = evaluate(toy.make_broken_environment, toy.make_agent, None, SEEDS[:3], workers=1)
+    report = evaluate(toy.make_broken_environment, toy.make_agent, None, SEEDS[:3])
     assert [result.outcome for result in report.results] == ["success", "error", "success"]
     assert report.errors[0].seed == toy.BROKEN_SEED
     assert report.errors[0].error.startswith("ValueError: the block fell off the table (toy_recordable.py:")
@@ -74,34 +88,31 @@ def test_an_episode_that_raises_is_an_error_and_the_others_go_on() -> None:
 
 
 def test_an_episode_that_kills_its_process_is_an_error_and_the_others_are_played() -> None:
-    report = evaluate(toy.make_deadly_environment, toy.make_agent, None, SEEDS, workers=2)
+    report = evaluate(toy.make_deadly_environment, toy.make_agent, None, SEEDS, LocalCluster(2))
     assert [error.seed for error in report.errors] == [toy.DEADLY_SEED]
     assert report.errors[0].error == (
-        "the worker process for this episode crashed twice: it ended with exit status 1. Run with "
-        "evaluate.workers=1 for the traceback."
+        "a worker process crashed twice: it ended with exit status 1; cluster.workers=1 shows the traceback"
     )
     assert len(report.results) == len(SEEDS)
 
 
 def test_a_process_that_dies_once_costs_nothing(tmp_path: Path) -> None:
-    expected = evaluate(toy.make_environment, toy.make_agent, None, SEEDS, workers=1)
+    expected = evaluate(toy.make_environment, toy.make_agent, None, SEEDS)
     make_environment = partial(toy.OnceDeadlyEnvironment, tmp_path / "died")
-    assert evaluate(make_environment, toy.make_agent, None, SEEDS, workers=2) == expected
+    assert evaluate(make_environment, toy.make_agent, None, SEEDS, LocalCluster(2)) == expected
     assert (tmp_path / "died").exists()
 
 
 @pytest.mark.parametrize("workers", [1, 2])
 def test_an_environment_that_cannot_be_built_ends_the_evaluation(workers: int) -> None:
     with pytest.raises(ValueError, match="no such mesh"):
-        evaluate(toy.make_impossible_environment, toy.make_agent, None, SEEDS[:2], workers=workers)
+        evaluate(toy.make_impossible_environment, toy.make_agent, None, SEEDS[:2], LocalCluster(workers))
 
 
 def test_seeds_of_training_are_refused() -> None:
     for seeds in (range(0), range(FIRST_SEED - 1, FIRST_SEED + 1)):
         with pytest.raises(ValueError, match="seeds from 1000000 on"):
-            evaluate(toy.make_environment, toy.make_agent, None, seeds, workers=1)
-    with pytest.raises(ValueError, match="at least one worker"):
-        evaluate(toy.make_environment, toy.make_agent, None, SEEDS, workers=0)
+            evaluate(toy.make_environment, toy.make_agent, None, seeds)
 
 
 def test_libraries_use_one_thread_while_it_lasts(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -115,7 +126,7 @@ def test_libraries_use_one_thread_while_it_lasts(monkeypatch: pytest.MonkeyPatch
         seen.append((os.environ["OMP_NUM_THREADS"], torch.get_num_threads()))
         return toy.make_agent(environment)
 
-    evaluate(toy.make_environment, make_agent, None, SEEDS[:1], workers=1)
+    evaluate(toy.make_environment, make_agent, None, SEEDS[:1])
     assert seen == [("1", 1)]
     assert (os.environ["OMP_NUM_THREADS"], torch.get_num_threads()) == ("3", 2)
     torch.set_num_threads(before)
@@ -123,7 +134,7 @@ def test_libraries_use_one_thread_while_it_lasts(monkeypatch: pytest.MonkeyPatch
 
 def test_recordings_are_kept_in_one_file_failures_first(tmp_path: Path) -> None:
     folder, target = tmp_path / "recordings", tmp_path / "rollouts.rrd"
-    report = evaluate(toy.make_environment, toy.make_agent, toy.make_recorder(folder), SEEDS[:5], workers=1)
+    report = evaluate(toy.make_environment, toy.make_agent, toy.make_recorder(folder), SEEDS[:5])
     assert keep_recordings(report, folder, target, limit=3) == 3
     kept = [entry.recording_id.rpartition("-")[0] for entry in RrdReader(target).recordings()]
     assert kept == ["failure-01000003-timeout", "success-01000000", "success-01000001"]

@@ -3,36 +3,49 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
-from conftest import make_tabletop
+import toy
+from conftest import CONF, make_tabletop
+from omegaconf import OmegaConf
 
-from vla.rollout import rollout
-from vla.tasks.expert import Perturbation, Waypoint
+from vla.config.build import build
+from vla.rollouts.rollout import rollout
+from vla.spec import Observation, Spec
+from vla.tasks.perturb import Perturbation, Perturbed
+from vla.tasks.tabletop.expert import Waypoint
 
 if TYPE_CHECKING:
-    from vla.tasks.tabletop import Tabletop
+    from vla.tasks.tabletop.environment import Tabletop
 
 
+QUIET = {"start": 0.0, "noise": 0.0, "rate": 0.0, "unturned": 0.0, "missed": 0.0}
 GOALS = ("lift", "pick_place", "pick_place_two", "push", "stack", "stay")
 
 
+def perturbed(spec: Spec, **changes: Any) -> Perturbed:
+    """The expert of the configuration, with changes of how it is perturbed."""
+    node: Any = OmegaConf.to_container(OmegaConf.load(CONF / "expert/waypoint.yaml"))
+    made: Perturbed = build({**node, "perturb": {**node["perturb"], **changes}}, "expert", spec=spec)
+    return made
+
+
 @pytest.mark.parametrize("goal", GOALS)
-@pytest.mark.parametrize("perturbed", [False, True])
-def test_the_expert_solves_every_goal(goal: str, perturbed: bool) -> None:
-    environment = make_tabletop(f"goal={goal}")
-    expert = Waypoint(environment.spec, Perturbation() if perturbed else None)
+@pytest.mark.parametrize("led_astray", [False, True])
+def test_the_expert_solves_every_goal(goal: str, led_astray: bool) -> None:
+    environment = make_tabletop(f"task/goal={goal}")
+    expert = perturbed(environment.spec) if led_astray else Waypoint(environment.spec)
     with environment.blind():
         episodes = [rollout(environment, expert, seed) for seed in range(12)]
     environment.close()
-    assert sum(episode.success for episode in episodes) >= (11 if perturbed else 12)
+    assert sum(episode.success for episode in episodes) >= (11 if led_astray else 12)
 
 
 @pytest.mark.parametrize("goal", GOALS)
 def test_wide_randomisation_is_within_the_experts_reach(goal: str) -> None:
-    environment = make_tabletop(f"goal={goal}", "randomize=wide")
+    environment = make_tabletop(f"task/goal={goal}", "task/randomize=wide")
     expert = Waypoint(environment.spec)
     with environment.blind():
         outcomes = [rollout(environment, expert, seed).outcome for seed in range(10)]
@@ -41,7 +54,7 @@ def test_wide_randomisation_is_within_the_experts_reach(goal: str) -> None:
 
 
 def test_the_clean_action_is_recorded_where_another_one_is_executed(tabletop: Tabletop) -> None:
-    expert = Waypoint(tabletop.spec, Perturbation(start=1.0, noise=0.0, rate=0.0, start_steps=(4, 4)))
+    expert = perturbed(tabletop.spec, start=1.0, noise=0.0, rate=0.0, start_steps=[4, 4])
     with tabletop.blind():
         episode = rollout(tabletop, expert, 3)
     differs = (episode.actions != episode.executed).any(axis=1)
@@ -49,7 +62,7 @@ def test_the_clean_action_is_recorded_where_another_one_is_executed(tabletop: Ta
 
 
 def test_a_grasp_that_is_made_to_miss_is_made_good(tabletop: Tabletop) -> None:
-    expert = Waypoint(tabletop.spec, Perturbation(start=0.0, noise=0.0, rate=0.0, missed=1.0))
+    expert = perturbed(tabletop.spec, start=0.0, noise=0.0, rate=0.0, missed=1.0)
     with tabletop.blind():
         episode = rollout(tabletop, expert, 3)
     beside = (episode.actions[:, :2] != episode.executed[:, :2]).any(axis=1)
@@ -58,10 +71,9 @@ def test_a_grasp_that_is_made_to_miss_is_made_good(tabletop: Tabletop) -> None:
 
 
 def test_a_slow_episode_executes_a_share_of_its_motions_and_labels_the_whole(tabletop: Tabletop) -> None:
-    quiet = Perturbation(start=0.0, noise=0.0, rate=0.0, unturned=0.0, missed=0.0)
-    slow = Perturbation(start=0.0, noise=0.0, rate=0.0, unturned=0.0, missed=0.0, pace=(0.4, 0.5))
+    quiet, slow = perturbed(tabletop.spec, **QUIET), perturbed(tabletop.spec, **QUIET, pace=[0.4, 0.5])
     with tabletop.blind():
-        at_once, slowly = (rollout(tabletop, Waypoint(tabletop.spec, each), 3) for each in (quiet, slow))
+        at_once, slowly = (rollout(tabletop, expert, 3) for expert in (quiet, slow))
     assert slowly.success and len(slowly.actions) > 1.3 * len(at_once.actions)
     np.testing.assert_array_equal(slowly.actions[0], at_once.actions[0])
     moved = np.abs(slowly.actions[:, :6]) > 1e-4
@@ -73,14 +85,14 @@ def test_a_slow_episode_executes_a_share_of_its_motions_and_labels_the_whole(tab
 def test_labels_depend_on_the_state_alone(tabletop: Tabletop) -> None:
     """A fresh expert, shown a state from the middle of an episode, says what the one that lived through it said."""
     with tabletop.blind():
-        episode = rollout(tabletop, Waypoint(tabletop.spec, Perturbation()), 8)
+        episode = rollout(tabletop, perturbed(tabletop.spec), 8)
     for observation, action in zip(episode.observations, episode.actions, strict=True):
         np.testing.assert_array_equal(Waypoint(tabletop.spec).act(observation), action)
 
 
 def test_actions_stay_within_the_spec(tabletop: Tabletop) -> None:
     with tabletop.blind():
-        episode = rollout(tabletop, Waypoint(tabletop.spec, Perturbation(noise=1.0)), 2)
+        episode = rollout(tabletop, perturbed(tabletop.spec, noise=1.0), 2)
     for actions in (episode.actions, episode.executed):
         assert (actions >= np.array(tabletop.spec.low, np.float32)).all()
         assert (actions <= np.array(tabletop.spec.high, np.float32)).all()
@@ -90,3 +102,40 @@ def test_without_the_simulators_truth_the_expert_says_so(tabletop: Tabletop) -> 
     observation = dataclasses.replace(tabletop.reset(0), truth=None)
     with pytest.raises(ValueError, match="truth"):
         Waypoint(tabletop.spec).act(observation)
+
+
+@pytest.mark.parametrize("gripper", [0.0, 1.0])
+def test_any_expert_is_perturbed_in_the_components_that_are_named(gripper: float) -> None:
+    """The toy world has two dimensions and no turn."""
+    names: Any = {"tool": "point", "move": ("x", "y"), "turn": None, "gripper": "gripper"}
+    corner = (5.0, 5.0)  # further away than any step goes
+    names |= QUIET | {"start": 1.0, "start_steps": (3, 3), "steps": (2, 5), "closed": 1 - gripper, "pace": (1.0, 1.0)}
+    perturb = Perturbation(corner, corner, **names)
+    expert = Perturbed(toy.SPEC, lambda spec: toy.ToyExpert(noise=0.0), perturb)
+    episode = rollout(toy.ToyEnvironment(), expert, 0)
+    np.testing.assert_allclose(episode.executed[:3], np.tile([0.05, 0.05, gripper], (3, 1)))
+    np.testing.assert_array_equal(episode.executed[3:], episode.actions[3:])
+    with pytest.raises(ValueError, match=r"names dz; actions have x, y, gripper"):
+        Perturbation((0, 0, 0), corner + corner[:1], **names | {"move": ("x", "y", "dz")}).reset(toy.SPEC, 0)
+
+
+class Walker(toy.ToyExpert):
+    """The expert of a toy world without a gripper."""
+
+    def act(self, observation: Observation) -> np.ndarray:
+        """Towards the target."""
+        return super().act(observation)[:2]
+
+
+def test_an_expert_without_a_gripper_is_perturbed_and_misses_no_grasp() -> None:
+    ends: Any = {name: getattr(toy.SPEC, name)[:2] for name in ("action", "units", "low", "high")}
+    spec = dataclasses.replace(toy.SPEC, **ends)
+    names: Any = {"tool": "point", "move": ("x", "y"), "turn": None, "gripper": None}
+    names |= QUIET | {"start": 1.0, "start_steps": (3, 3), "steps": (2, 5), "closed": 0.5, "pace": (0.5, 0.5)}
+    expert = Perturbed(
+        spec, lambda spec: Walker(noise=0.0), Perturbation((5.0, 5.0), (5.0, 5.0), **names | {"missed": 1.0})
+    )
+    episode = rollout(toy.ToyEnvironment(spec=spec), expert, 0)
+    assert episode.success and episode.executed.shape[1] == 2
+    np.testing.assert_allclose(episode.executed[:3], np.full((3, 2), 0.05))
+    np.testing.assert_allclose(episode.executed[3:], episode.actions[3:] * 0.5)

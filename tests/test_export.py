@@ -9,57 +9,20 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
-from conftest import CONF
-from hydra import compose, initialize_config_dir
-from omegaconf import OmegaConf
+from exporting import composed, content, exporter, stored
 from PIL import Image
-from toy import SPEC, ToyEnvironment, ToyExpert
+from toy import ARM_SPEC
 
-from vla.check import build
 from vla.data.episodes import EpisodeStore
-from vla.data.export import Files, unfinished
-from vla.data.lerobot import LeRobot
-from vla.data.packed import Packed
-from vla.rollout import rollout
-from vla.spec import Episode, Spec
+from vla.data.formats.files import Files, staging_folder
+from vla.spec import Spec
 
 TESTS = os.pathsep.join([str(Path(__file__).parent), str(Path(__file__).parents[1])])
-
-
-def stored(folder: Path, spec: Spec = SPEC, seeds: range = range(2)) -> tuple[EpisodeStore, list[Episode]]:
-    """A store of toy episodes; seeds that are three more than a multiple of five fail."""
-    episodes = [rollout(ToyEnvironment(), ToyExpert(), seed) for seed in seeds]
-    store = EpisodeStore.create_or_open(folder, spec, {})
-    with store.writing():
-        for episode in episodes:
-            if episode.success:
-                store.append(episode)
-            else:
-                store.fail(episode.seed, episode.outcome, episode.draws)
-    return store, episodes
-
-
-def composed(name: str, folder: Path, *overrides: str) -> Any:
-    """The configuration of `export=name` and `overrides`."""
-    with initialize_config_dir(str(CONF), version_base="1.3"):
-        return compose("config", [f"output={folder}", f"export={name}", f"export.folder={folder}", *overrides]).export
-
-
-def exporter(name: str, folder: Path, *overrides: str) -> Any:
-    """What `export=name` and `overrides` describe."""
-    return build(composed(name, folder, *overrides), "export")
-
-
-def content(folder: Path) -> dict[str, bytes]:
-    """Every file below a folder."""
-    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
 def test_the_files_say_what_the_episode_was(tmp_path: Path) -> None:
@@ -70,26 +33,25 @@ def test_the_files_say_what_the_episode_was(tmp_path: Path) -> None:
         place = folder / f"episode_{number:05d}"
         manifest = json.loads((place / "manifest.json").read_text())
         assert manifest["instruction"] == episode.instruction and manifest["seed"] == number
-        assert Spec.from_dict(manifest["spec"]) == SPEC
+        assert Spec.from_dict(manifest["spec"]) == ARM_SPEC
         assert len(list(place.glob("step_*"))) == manifest["steps"] == len(episode.observations)
         for step, seen in enumerate(episode.observations):
             files = place / f"step_{step:04d}"
-            for camera in SPEC.cameras:
+            for camera in ARM_SPEC.cameras:
                 np.testing.assert_array_equal(Image.open(files / camera / "rgb_image.png"), seen.rgb[camera])
                 depth = np.load(files / camera / "depth_image.npy")
                 assert depth.dtype == np.float32
                 np.testing.assert_allclose(depth, seen.depth[camera] / 1000, rtol=1e-6)  # [mm] to [m]
             state = json.loads((files / "robot_state.json").read_text())
-            np.testing.assert_array_equal(np.float32(state["joint_positions"]), seen.joints)
-            np.testing.assert_array_equal(np.float32(state["joint_velocities"]), seen.velocities)
-            assert np.float32(state["gripper_opening"]) == np.float32(seen.gripper)
+            assert tuple(state) == ARM_SPEC.state
+            np.testing.assert_array_equal(np.array([*state.values()], np.float32), seen.state)
             action = json.loads((files / "expert_action.json").read_text())
             np.testing.assert_array_equal(np.float32(action["action"]), episode.actions[step])
             np.testing.assert_array_equal(np.float32(action["executed"]), episode.executed[step])
 
 
 def test_one_camera_needs_no_folder_of_its_own(tmp_path: Path) -> None:
-    store, _ = stored(tmp_path / "store", replace(SPEC, cameras=("front",)), range(1))
+    store, _ = stored(tmp_path / "store", replace(ARM_SPEC, cameras=("front",), depth=("front",)), range(1))
     folder = Files(tmp_path / "export").export(store)
     assert sorted(path.name for path in (folder / "episode_00000" / "step_0000").iterdir()) == [
         "depth_image.npy",
@@ -109,17 +71,15 @@ def test_what_is_there_is_left_alone(tmp_path: Path) -> None:
     assert (folder / "episode_00000/manifest.json").stat().st_mtime_ns == untouched
 
 
-@pytest.mark.parametrize("kind", [Files, LeRobot, Packed])
-def test_what_a_killed_export_left_beside_the_whole_one_is_removed(
-    kind: Callable[..., Files | LeRobot | Packed], tmp_path: Path
-) -> None:
+@pytest.mark.parametrize("kind", ["files", "lerobot", "packed"])
+def test_what_a_killed_export_left_beside_the_whole_one_is_removed(kind: str, tmp_path: Path) -> None:
     store, _ = stored(tmp_path / "store")
-    folder = kind(tmp_path / "export", workers=1).export(store)
+    folder = exporter(kind, tmp_path / "export").export(store)
     left = folder.with_name(".export.unfinished")
     left.mkdir()
     (left / "lock").touch()
     before = content(folder)
-    kind(folder, workers=1).export(store)
+    exporter(kind, folder).export(store)
     assert not left.exists() and content(folder) == before
 
 
@@ -140,7 +100,7 @@ def test_only_as_many_episodes_as_the_store_shows_are_exported(tmp_path: Path) -
 def test_two_exports_at_once_do_not_disturb_each_other(tmp_path: Path) -> None:
     store, _ = stored(tmp_path / "store")
     with (
-        unfinished(tmp_path / "export"),
+        staging_folder(tmp_path / "export"),
         pytest.raises(ValueError, match=r"another export to .*export is under way"),
     ):
         Files(tmp_path / "export").export(store)
@@ -161,22 +121,23 @@ def written(folder: Path) -> int:
 EXPORT = """
 if __name__ == "__main__":  # worker processes import this file
     from pathlib import Path
-    from vla.check import build
+    from vla.config.build import build
     from vla.data.episodes import EpisodeStore
-    build({config}, "export").export(EpisodeStore(Path({store!r}), {episodes}))
+    from vla.parallel.pool import LocalCluster
+    build({config}, "export").export(EpisodeStore(Path({store!r}), {episodes}), LocalCluster(2))
 """
 
 
 @pytest.mark.parametrize(("name", "episodes"), [("files", 30), ("lerobot", 60), ("mcap", 60)])
-def test_killed_seven_times_at_random_an_export_goes_on_and_ends_up_the_same(
+def test_killed_three_times_at_random_an_export_goes_on_and_ends_up_the_same(
     name: str, episodes: int, store: EpisodeStore, tmp_path: Path
 ) -> None:
     store = EpisodeStore(store.folder, episodes)
-    whole = exporter(name, tmp_path / "whole", "export.workers=1").export(store)
+    whole = exporter(name, tmp_path / "whole").export(store)
     killed, script = tmp_path / "killed", tmp_path / "export.py"
-    config = OmegaConf.to_container(composed(name, killed, "export.workers=2"))
+    config = composed(name, killed)
     script.write_text(EXPORT.format(config=config, store=str(store.folder), episodes=episodes))
-    for share in sorted(np.random.default_rng().uniform(0, 1, 7)):
+    for share in sorted(np.random.default_rng().uniform(0, 1, 3)):
         environment = {**os.environ, "PYTHONPATH": TESTS}
         process = subprocess.Popen(
             [sys.executable, str(script)], env=environment, stdout=subprocess.DEVNULL, start_new_session=True
@@ -185,6 +146,6 @@ def test_killed_seven_times_at_random_an_export_goes_on_and_ends_up_the_same(
             time.sleep(0.002)
         os.killpg(process.pid, signal.SIGKILL)  # with its workers, which would otherwise write on for a moment
         process.wait()
-    exporter(name, killed, "export.workers=1").export(store)
+    exporter(name, killed).export(store)
     assert content(killed) == content(whole)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["export.py", "killed", "whole"]

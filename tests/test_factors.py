@@ -6,8 +6,8 @@ from typing import Any
 
 import pytest
 
-from vla.evaluate import Result
-from vla.factors import association, factors, groups, in_words
+from vla.reports.factors import association, factors, groups, in_words
+from vla.rollouts.evaluate import Result
 
 
 @pytest.mark.parametrize(
@@ -18,7 +18,7 @@ from vla.factors import association, factors, groups, in_words
         ("colour.names[0]", "colour: name of block 1"),
         ("colour.rgb[1][2]", "colour: rgb 2, component 3"),
         ("placement.blocks[2]", "placement: block 3"),
-        ("named.half_size", "half size of the named block"),
+        ("named.half_size", "named: half size"),
         ("n", "n"),
     ],
 )

@@ -8,11 +8,11 @@ import torch
 from fake_batch import Motions
 from toy import SPEC
 
-from vla.models.fast import Fast, cosines
+from vla.models.tokenizers.fast import Fast, cosines
 
 MOTIONS = Motions()
 CHUNKS = MOTIONS.chunks(8)
-TOKENIZER = Fast(spec=SPEC, statistics=MOTIONS)
+TOKENIZER = Fast(spec=SPEC, statistics=MOTIONS, bins=1024, scale=10.0, chunk=8)
 
 
 def test_cosines_are_the_transform_of_the_book() -> None:
@@ -25,7 +25,7 @@ def test_cosines_are_the_transform_of_the_book() -> None:
 def test_fast_needs_fewer_tokens_than_there_are_components() -> None:
     tokenizer = TOKENIZER
     tokens = tokenizer.tokenize(torch.from_numpy(CHUNKS.copy()))
-    written = tokenizer.learned(tokens, torch.ones(len(CHUNKS), 8, dtype=torch.bool)).sum(1)
+    written = tokenizer.loss_mask(tokens, torch.ones(len(CHUNKS), 8, dtype=torch.bool)).sum(1)
     assert written.float().mean() < 0.6 * 8 * 3 and written.max() <= 25
     ends = tokens.gather(1, written[:, None] - 1)
     assert (ends == tokenizer.end).all()
@@ -42,7 +42,7 @@ def test_fast_writes_the_same_in_mixed_precision() -> None:
 def test_fast_is_finer_with_a_larger_scale() -> None:
     errors = []
     for scale in (5.0, 20.0):
-        tokenizer = Fast(scale=scale, spec=SPEC, statistics=MOTIONS)
+        tokenizer = Fast(scale=scale, spec=SPEC, statistics=MOTIONS, bins=1024, chunk=8)
         chunks = torch.from_numpy(CHUNKS.copy())
         errors.append((tokenizer.detokenize(tokenizer.tokenize(chunks)) - chunks)[..., :2].abs().mean().item())
     assert errors[1] < 0.4 * errors[0]
@@ -75,15 +75,15 @@ def test_a_chunk_counts_as_a_whole() -> None:
     tokens = tokenizer.tokenize(torch.from_numpy(CHUNKS[:2].copy()))
     valid = torch.zeros(2, 8, dtype=torch.bool)
     valid[0, :3] = True
-    counted = tokenizer.learned(tokens, valid)
+    counted = tokenizer.loss_mask(tokens, valid)
     assert counted[0].sum() == (tokens[0] != tokenizer.end).sum() + 1 and not counted[1].any()
 
 
 def test_too_few_tokens_for_the_coefficients_are_refused() -> None:
     with pytest.raises(ValueError, match=r"more than tokenizer\.bins=8 can tell apart"):
-        Fast(bins=8, spec=SPEC, statistics=MOTIONS)
+        Fast(bins=8, spec=SPEC, statistics=MOTIONS, scale=10.0, chunk=8)
 
 
 def test_chunks_of_another_length_are_refused() -> None:
-    with pytest.raises(ValueError, match=r"predicts 4 actions, its tokenizer reads 8: set tokenizer\.chunk=4"):
+    with pytest.raises(ValueError, match=r"predicts 4 actions, its tokenizer 8: set tokenizer\.chunk=4"):
         TOKENIZER.length(4)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from vla.files import atomic_path, writing
+from vla.io.files import atomic_path, writing
 
 
 def test_a_file_and_a_folder_take_their_place_at_the_end(tmp_path: Path) -> None:

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from test_episodes import EPISODES, add
-from toy import SPEC
+from toy import ARM_SPEC
+from toy_episodes import EPISODES, add
 
 from vla.data.episodes import EpisodeStore
 from vla.data.index import index_line
@@ -26,13 +26,17 @@ SPECS: list[dict[str, Any]] = [
     {"image_size": ["a", "b"]},
     {"image_size": [5000, 16]},
     {"action": []},
-    {"joints": ["x" * 10_000]},
+    {"state": ["x" * 10_000]},
+    {"state_units": ["m"]},
+    {"depth": ["side"]},
+    {"robot": {"joints": ["elbow"], "frame": "base"}},
+    {"robot": {"joints": ["joint1", "joint2"], "frame": "base", "velocities": ["speed1"]}},
     {"units": ["m"]},
     {"low": [1.0, 1.0, 1.0]},
     {"low": [NAN, 0.0, 0.0]},
     {"control_hz": 0},
     {"control_hz": NAN},
-    {"chain": [[0.0] * 7]},
+    {"robot": {"joints": ["joint1"], "frame": "base", "chain": [[0.0] * 7]}},
     {"truth": [["target", -2]]},
     {"more": 1},
 ]
@@ -43,7 +47,7 @@ SPECS: list[dict[str, Any]] = [
     [
         {"spec": 3},
         {"spec": None},
-        *({"spec": {**SPEC.to_dict(), **wrong}} for wrong in SPECS),
+        *({"spec": {**ARM_SPEC.to_dict(), **wrong}} for wrong in SPECS),
         {"packed": None},
         {"packed": "zlib"},
         {"packed": {"rgb_front": "zlib"}},
@@ -84,6 +88,8 @@ def test_a_description_without_a_config_is_refused(tmp_path: Path) -> None:
         {"outcome": 5},
         {"outcome": "timeout"},  # a failure has no steps
         {"steps": 0},
+        {"task": 5},
+        {"milestones": "near"},
         {"instruction": 5},
         {"instruction": "a" * (LONGEST_INSTRUCTION + 1)},
         {"seed": 10**30},
@@ -125,6 +131,6 @@ def test_what_could_not_be_read_back_is_not_stored(tmp_path: Path) -> None:
 
 
 def test_a_spec_comes_back_as_it_was() -> None:
-    assert Spec.from_dict(SPEC.to_dict()) == SPEC
+    assert Spec.from_dict(ARM_SPEC.to_dict()) == ARM_SPEC
     with pytest.raises(ValueError, match=r"^x\.ckpt is damaged or of another kind: .*set"):
-        Spec.from_dict({**SPEC.to_dict(), "cameras": {1}}, "x.ckpt")
+        Spec.from_dict({**ARM_SPEC.to_dict(), "cameras": {1}}, "x.ckpt")

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from huggingface_hub import constants
 
-from vla.models.hub import fetch
+from vla.models.vision.hub import fetch
 
 FILES = {"config.json": b"{}", "model.safetensors": b"weights", "pytorch_model.bin": b"pickle"}
 COMMIT = "0" * 40
@@ -84,7 +84,7 @@ def test_what_matches_is_downloaded_once_and_is_there_without_the_hub(
 
 @pytest.mark.parametrize("name", ["nobody/model", "no/name/at/all"])
 def test_a_model_that_the_hub_has_not_is_named(downloads: list[str], name: str) -> None:
-    with pytest.raises(OSError, match=f"it has no model {name}"):
+    with pytest.raises(OSError, match=f"it has no public model {name}"):
         fetch(name, "*")
 
 

@@ -12,11 +12,12 @@ from typing import Any
 import pytest
 import torch
 import transformers
+from defaults import defaults_of
 from fake_batch import make_batch, make_bc, overfit, with_text
 from huggingface_hub import constants
 from tiny_encoder import LONGEST, numbers, sizes, write_encoder
 
-from vla.models.huggingface import HuggingFace
+from vla.models.text.huggingface import HuggingFace
 
 SENTENCES = ["Lift the red block", "put the blue block on the red pad", ""]
 VISION = {**sizes(), "image_size": 32, "patch_size": 16}
@@ -78,15 +79,15 @@ def test_vectors_made_in_inference_mode_can_be_learned_from(folder: Path) -> Non
 def test_a_state_holds_the_whole_encoder(folder: Path, tmp_path: Path) -> None:
     encoder = HuggingFace(str(folder), width=8)
     torch.save(encoder.state_dict(), tmp_path / "state.pt")
-    again = HuggingFace(width=8)
+    again = HuggingFace(width=8, **defaults_of("model/text/huggingface", name=""))
     again.load_state_dict(torch.load(tmp_path / "state.pt", weights_only=True))
     assert torch.equal(again.tokenize(SENTENCES), encoder.tokenize(SENTENCES))
     assert torch.equal(again(again.tokenize(SENTENCES)), encoder(encoder.tokenize(SENTENCES)))
 
 
 def test_without_a_name_an_encoder_must_come_from_a_checkpoint() -> None:
-    with pytest.raises(ValueError, match="names no encoder"):
-        HuggingFace(width=8).tokenize(SENTENCES)
+    with pytest.raises(ValueError, match="is empty, and no checkpoint"):
+        HuggingFace(width=8, **defaults_of("model/text/huggingface", name="")).tokenize(SENTENCES)
 
 
 def test_loading_a_state_keeps_the_parameters_that_an_optimizer_knows(folder: Path) -> None:
@@ -119,7 +120,7 @@ def test_a_text_tower_is_read_where_it_was_trained_to_be(name: str, tmp_path: Pa
         expected = network.get_text_features(ids).pooler_output[0]
     assert torch.allclose(encoder.tokenize(SENTENCES)[0], expected, atol=1e-6)
     assert not any("vision" in key for key in encoder.get_extra_state()["weights"])
-    again = HuggingFace(width=8)
+    again = HuggingFace(width=8, **defaults_of("model/text/huggingface", name=""))
     again.load_state_dict(encoder.state_dict())
     weights, loaded = (each.get_extra_state()["weights"] for each in (encoder, again))
     assert weights.keys() == loaded.keys() and all(torch.equal(weights[key], loaded[key]) for key in weights)
@@ -166,7 +167,7 @@ def test_what_is_missing_or_damaged_is_named(folder: Path, tmp_path: Path) -> No
 
 
 def test_weights_of_another_network_are_named(folder: Path, tmp_path: Path) -> None:
-    config = transformers.BertConfig(**{**sizes(), "num_hidden_layers": 2})
+    config = transformers.BertConfig(**sizes() | {"num_hidden_layers": 2})
     write_encoder(tmp_path, transformers.BertModel(config))
     (tmp_path / "model.safetensors").write_bytes((folder / "model.safetensors").read_bytes())
     with pytest.raises(ValueError, match=r"those of another network: encoder\.layer\.1\..* is missing"):

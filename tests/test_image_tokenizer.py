@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from vla.models.image_tokenizer import FiLM, FilmConv, Keypoints, RandomShift, TokenLearner
+from vla.models.vision.image_tokenizer import FiLM, FilmConv, Keypoints, RandomShift, TokenLearner
 
 
 def test_film_starts_as_the_identity_where_it_should() -> None:
@@ -23,7 +23,7 @@ def test_film_scales_and_shifts_every_channel() -> None:
 
 
 def test_film_conv_listens_to_the_text() -> None:
-    encoder = FilmConv([4, 6], [5, 3], [2, 2], text_width=8)
+    encoder = FilmConv([4, 6], [5, 3], [2, 2], text_width=8, chroma=True)
     images = torch.rand(1, 3, 16, 16).expand(2, -1, -1, -1)
     features = encoder(images, torch.randn(2, 8))
     assert features.shape == (2, 6, 4, 4) and not torch.allclose(features[0], features[1])
@@ -31,7 +31,7 @@ def test_film_conv_listens_to_the_text() -> None:
 
 def test_with_chroma_alone_a_dimmer_lamp_changes_little() -> None:
     torch.manual_seed(0)
-    encoder = FilmConv([8], [5], [2], text_width=8)
+    encoder = FilmConv([8], [5], [2], text_width=8, chroma=True)
     torch.nn.init.zeros_(encoder.get_parameter("convs.0.weight"))  # so that only relative colours are left
     bright, text = 0.3 + 0.7 * torch.rand(1, 3, 16, 16), torch.randn(1, 8)
     with torch.no_grad():
@@ -41,18 +41,18 @@ def test_with_chroma_alone_a_dimmer_lamp_changes_little() -> None:
 
 def test_film_conv_wants_lists_of_one_length() -> None:
     with pytest.raises(ValueError, match="one entry per convolution"):
-        FilmConv([4, 6], [5], [2, 2], text_width=8)
+        FilmConv([4, 6], [5], [2, 2], text_width=8, chroma=True)
 
 
 def test_81_positions_become_8_tokens() -> None:
-    learner = TokenLearner(512)
+    learner = TokenLearner(512, 8)
     assert learner(torch.randn(2, 512, 9, 9)).shape == (2, 8, 512)
     assert sum(p.numel() for p in learner.parameters()) == 2 * 512 + 512 * 64 + 64 + 64 * 8 + 8  # 34 k
 
 
 def test_tokens_are_weighted_means_of_the_features_themselves() -> None:
     constant = torch.arange(6.0)[None, :, None, None].expand(1, 6, 3, 3)
-    assert torch.allclose(TokenLearner(6)(constant)[0, 0], torch.arange(6.0))
+    assert torch.allclose(TokenLearner(6, 8)(constant)[0, 0], torch.arange(6.0))
 
 
 def test_keypoints_say_where_they_look_and_what_is_there() -> None:

@@ -16,79 +16,39 @@ MODULES = {
     for path in sorted((ROOT / "vla").rglob("*.py"))
 }
 
-# What describes and reads plain values, and writes files; it imports nothing of the package.
-EVERYWHERE = ("vla.types", "vla.documents", "vla.files")
-# A part of the package → the parts that its modules may import; the entry and the jobs may import everything.
-PARTS = {
-    "vla.spec": (),
-    "vla.tasks": ("vla.spec", "vla.tasks"),
-    "vla.data": ("vla.spec", "vla.data", "vla.workers"),
-    "vla.models": ("vla.spec", "vla.models"),
-    "vla.policy": ("vla.spec", "vla.models"),
-    "vla.program": ("vla.spec", "vla.models", "vla.policy"),
-    "vla.rollout": ("vla.spec",),
-    "vla.record": ("vla.spec",),
-    "vla.files": (),
-    "vla.workers": (),
-    "vla.ending": (),
-    "vla.cluster": ("vla.workers",),
-    "vla.collect": ("vla.spec", "vla.rollout", "vla.data", "vla.cluster", "vla.workers"),
-    "vla.intervals": (),
-    "vla.evaluate": ("vla.spec", "vla.intervals", "vla.rollout", "vla.record", "vla.workers"),
-    "vla.factors": ("vla.spec", "vla.evaluate"),
-    "vla.report": ("vla.spec", "vla.intervals", "vla.evaluate", "vla.factors"),
-    "vla.suite": ("vla.evaluate", "vla.report"),
-    "vla.sweep": ("vla.intervals", "vla.evaluate", "vla.results", "vla.page", "vla.sweep_plot"),
-    "vla.sweep_plot": ("vla.intervals", "vla.results", "vla.sweep"),
-    "vla.run_files": ("vla.evaluate",),
-    "vla.results": ("vla.spec", "vla.evaluate", "vla.run_files"),
-    "vla.processor": ("vla.check",),
-    "vla.film": (),
-    "vla.curves": ("vla.report", "vla.results"),
-    "vla.samples": ("vla.spec", "vla.report"),
-    "vla.page": ("vla.evaluate", "vla.report", "vla.suite", "vla.results", "vla.curves", "vla.film"),
-    "vla.card": ("vla.spec", "vla.data", "vla.report"),
-    "vla.deploy": (
-        *("vla.spec", "vla.policy", "vla.tasks", "vla.data", "vla.evaluate", "vla.record", "vla.deploy"),
-        *("vla.documents", "vla.types"),
-    ),
-    "vla.stores": ("vla",),
-    "vla.types": (),
-    "vla.documents": (),
-    "vla.annotations": (),
-    "vla.check": ("vla.annotations", "vla.spec"),
-    "vla.peers": ("vla.workers",),
-    "vla.resume": ("vla.check", "vla.policy", "vla.results"),
-    "vla.progress": ("vla.models",),
-    "vla.averaging": ("vla.models",),
-    "vla.validation": ("vla.spec", "vla.models", "vla.intervals", "vla.evaluate"),
-    "vla.trainer": ("vla.averaging", "vla.check", "vla.progress", "vla.resume", "vla.workers"),
-    "vla.train": ("vla",),
-    "vla.benchmark": ("vla",),
-    "vla.parts": ("vla",),
-    "vla.jobs": ("vla",),
-    "vla.run": ("vla",),
-}
+# Parts import those of the rows above and nothing of their own row but themselves, lazy imports counted.
+LAYERS = (
+    ("vla.io", "vla.tasks.gl"),
+    ("vla.spec", "vla.parallel"),
+    ("vla.robots",),
+    ("vla.models", "vla.data", "vla.tasks"),
+    ("vla.policy", "vla.rollouts"),
+    ("vla.config", "vla.deploy"),
+    ("vla.runs", "vla.envs"),
+    ("vla.training", "vla.reports"),
+    ("vla.jobs",),
+    ("vla.run",),
+)
+
+# A part → the only others that may import it. Worlds are built from a configuration.
+ONLY_FOR = {"vla.robots": ("vla.tasks", "vla.deploy"), "vla.tasks": ()}
 
 # A library → the only parts that may import it.
 LIBRARIES = {
-    "hydra": ("vla.run", "vla.jobs", "vla.parts", "vla.check", "vla.benchmark", "vla.sweep", "vla.resume"),
-    "omegaconf": (
-        *("vla.run", "vla.jobs", "vla.parts", "vla.check", "vla.benchmark", "vla.sweep", "vla.resume"),
-        *("vla.train", "vla.trainer"),
-    ),
-    "mujoco": ("vla.tasks", "vla.benchmark"),
+    "hydra": ("vla.run", "vla.config", "vla.jobs.sweep"),
+    "omegaconf": ("vla.run", "vla.config", "vla.jobs.sweep"),
+    "mujoco": ("vla.tasks", "vla.jobs.benchmark"),
     "dm_control": ("vla.tasks",),
-    "dm_env": ("vla.tasks",),
-    "lightning": (
-        *("vla.models.learner", "vla.data.windows", "vla.trainer", "vla.progress", "vla.validation", "vla.resume"),
-        *("vla.averaging", "vla.train", "vla.benchmark"),
-    ),
-    "rerun": ("vla.record", "vla.film", "vla.deploy.view"),
+    "moderngl": ("vla.tasks.rendering",),
+    "fast_simplification": ("vla.tasks.rendering.decimate",),
+    "dm_env": ("vla.tasks", "vla.envs"),
+    "gymnasium": ("vla.envs",),
+    "lightning": ("vla.models.learner", "vla.data.datamodule", "vla.training", "vla.runs", "vla.jobs"),
+    "rerun": ("vla.rollouts.recorder", "vla.reports.filmstrips", "vla.deploy.view"),
     "rclpy": ("vla.deploy",),
-    "distributed": ("vla.cluster",),
-    "timm": ("vla.models.trunks",),
-    "transformers": ("vla.models.huggingface",),
+    "distributed": ("vla.parallel.dask",),
+    "timm": ("vla.models.vision.timm_encoders",),
+    "transformers": ("vla.models.text.huggingface",),
 }
 HEAVY = ("torch", "lightning", "mujoco", "dm_control", "rerun", "matplotlib", "distributed")
 
@@ -97,8 +57,14 @@ def within(module: str, parts: tuple[str, ...]) -> bool:
     return any(f"{module}.".startswith(f"{part}.") for part in parts)
 
 
-def part_of(module: str) -> str:
-    return max((part for part in PARTS if within(module, (part,))), key=len)
+def importable_by(module: str) -> tuple[str, ...]:
+    """The parts that a module may import: its own, and those of the rows above."""
+    for number, layer in enumerate(LAYERS):
+        for part in layer:
+            if within(module, (part,)):
+                lower = [below for row in LAYERS[:number] for below in row]
+                return (part, *(below for below in lower if within(module, ONLY_FOR.get(below, (module,)))))
+    raise AssertionError(f"say in LAYERS where {module} belongs")
 
 
 def imports(node: ast.AST) -> Iterator[str]:
@@ -122,22 +88,30 @@ def imports_at_once(path: Path) -> Iterator[str]:
 
 @pytest.mark.parametrize("module", [module for module in MODULES if module != "vla"])
 def test_parts_import_only_what_they_may(module: str) -> None:
-    assert any(within(module, (part,)) for part in PARTS), f"say in PARTS what {module} may import"
     names = set(imports(ast.parse(MODULES[module].read_text(encoding="utf-8"))))
-    allowed = (*PARTS[part_of(module)], *EVERYWHERE)
+    allowed = importable_by(module)
     assert [name for name in names if within(name, ("vla",)) and not within(name, allowed)] == []
     for library, users in LIBRARIES.items():
         if not within(module, users):
             assert [name for name in names if within(name, (library,))] == []
 
 
+def test_the_entry_dispatches_with_few_modules() -> None:
+    code = "import sys, vla.run; print(*(name for name in sys.modules if name.split('.')[0] == 'vla'))"
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, timeout=60)
+    modules = [name for name in done.stdout.split() if MODULES.get(name, ROOT / "__init__.py").name != "__init__.py"]
+    assert "vla.config.check" in modules and len(modules) <= 25, sorted(modules)
+
+
 def test_the_simulator_needs_no_torch() -> None:
     for module, path in MODULES.items():
-        if within(module, ("vla.tasks", "vla.spec", "vla.rollout", "vla.cluster", "vla.collect")):
+        if within(module, ("vla.tasks", "vla.spec", "vla.rollouts.rollout", "vla.parallel", "vla.rollouts.collect")):
             assert not {name.split(".")[0] for name in imports(ast.parse(path.read_text(encoding="utf-8")))} & {"torch"}
 
 
-@pytest.mark.parametrize("module", ["vla.run", "vla.check", "vla.jobs", "vla.parts"])
+@pytest.mark.parametrize(
+    "module", ["vla.run", "vla.config.check", "vla.jobs", "vla.config.experiment", "vla.runs.resume"]
+)
 def test_the_entry_imports_nothing_heavy_at_once(module: str) -> None:
     assert [name for name in imports_at_once(MODULES[module]) if within(name, HEAVY)] == []
 
@@ -149,7 +123,7 @@ def test_questions_are_answered_without_heavy_imports(option: list[str]) -> None
     assert done.returncode == 0, done.stderr[-500:]
     assert "evaluate" in done.stdout
     imported = {line.rpartition("|")[2].strip() for line in done.stderr.splitlines()}
-    assert "vla.check" in imported
+    assert "vla.config.check" in imported
     assert imported.isdisjoint(HEAVY)
 
 

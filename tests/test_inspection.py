@@ -1,4 +1,4 @@
-"""Stores looked into and put together anew: all damage is found, and what is whole comes through byte for byte."""
+"""Verification and derivation of stores: all damage is found, and undamaged episodes are copied byte for byte."""
 
 from __future__ import annotations
 
@@ -11,18 +11,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from test_episodes import CONFIG, EPISODES, add, content
-from toy import SPEC, ToyEnvironment, ToyExpert, make_environment, make_expert
+from toy import ARM_SPEC, make_arm, make_environment, make_expert
+from toy_episodes import CONFIG, EPISODES, MORE, add, change, content, flip
 
-from vla.cluster import Local
-from vla.collect import collect
 from vla.data.episodes import EpisodeStore
 from vla.data.index import listed
-from vla.data.inspection import episode_of, examine, find, put_together, require_whole
-from vla.rollout import rollout
+from vla.data.verification import derive_store, episode_of, find_episode, require_whole, verify_store
+from vla.parallel.pool import LocalCluster
+from vla.rollouts.collect import collect
 from vla.spec import Episode
-
-MORE = [*EPISODES, *(rollout(ToyEnvironment(), ToyExpert(), seed) for seed in range(5, 9))]  # seeds 3 and 8 fail
 
 
 def of_another_task(folder: Path, episodes: list[Episode]) -> EpisodeStore:
@@ -32,30 +29,23 @@ def of_another_task(folder: Path, episodes: list[Episode]) -> EpisodeStore:
     return EpisodeStore(folder)
 
 
-def change(path: Path, edit: Callable[[bytes], bytes]) -> None:
-    path.write_bytes(edit(path.read_bytes()))
-
-
-def flip(data: bytes, place: int) -> bytes:
-    return data[:place] + bytes([data[place] ^ 1]) + data[place + 1 :]
-
-
 def test_an_episode_comes_out_as_it_went_in(tmp_path: Path) -> None:
     store = add(tmp_path, EPISODES)
     for entry in store.episodes:
         came, went = episode_of(store, entry), EPISODES[entry.seed]
         assert (came.seed, came.instruction, came.outcome) == (went.seed, went.instruction, went.outcome)
+        assert (came.task, came.milestones) == (went.task, went.milestones)
         np.testing.assert_array_equal(came.actions, went.actions)
         np.testing.assert_array_equal(came.executed, went.executed)
         for seen, was in zip(came.observations, went.observations, strict=True):
             assert seen.truth is not None and was.truth is not None and list(seen.truth) == list(was.truth)
             np.testing.assert_array_equal(seen.truth["point"], was.truth["point"])
             np.testing.assert_array_equal(seen.depth["wrist"], was.depth["wrist"])
-            assert np.float32(seen.gripper) == np.float32(was.gripper)
+            np.testing.assert_array_equal(seen.state, was.state)
 
 
 def test_a_whole_store_is_described(tmp_path: Path) -> None:
-    found = examine(add(tmp_path, EPISODES))
+    found = verify_store(add(tmp_path, EPISODES))
     require_whole(found)
     steps = sum(len(episode.actions) for episode in EPISODES if episode.success)
     assert found.outcomes == {"success": 4, "timeout": 1} and found.success_rate == 0.8
@@ -66,7 +56,7 @@ def test_a_whole_store_is_described(tmp_path: Path) -> None:
 
 def test_an_empty_store_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="holds no episodes yet: collect some first"):
-        require_whole(examine(add(tmp_path, [])))
+        require_whole(verify_store(add(tmp_path, [])))
 
 
 def lose_a_line(folder: Path) -> None:
@@ -82,14 +72,14 @@ def lose_a_field(folder: Path) -> None:
 
 
 def lose_a_tail(folder: Path) -> None:
-    os.truncate(folder / "joints.bin", (folder / "joints.bin").stat().st_size - 1)
+    os.truncate(folder / "state.bin", (folder / "state.bin").stat().st_size - 1)
 
 
 def poison(folder: Path) -> None:
     store = add(folder / "new", [])
     with store.writing():
         seen = EPISODES[0].observations
-        store.append(replace(EPISODES[0], observations=[replace(seen[0], joints=seen[0].joints * np.nan), *seen[1:]]))
+        store.append(replace(EPISODES[0], observations=[replace(seen[0], state=seen[0].state * np.nan), *seen[1:]]))
     for path in (folder / "new").iterdir():
         os.replace(path, folder / path.name)
     (folder / "new").rmdir()
@@ -143,13 +133,13 @@ def test_damage_is_found_named_and_left_behind(tmp_path: Path, name: str) -> Non
     add(folder, tried)
     damage(folder)
     before = content(folder)
-    found = examine(EpisodeStore(folder, damaged=True))
+    found = verify_store(EpisodeStore(folder, damaged=True))
     assert sorted(seed for some in found.damaged.values() for seed in some) == seeds
     with pytest.raises(ValueError, match=rf"{len(seeds)} damaged episodes .*{problem}.*inspect\.repair=true"):
         require_whole(found)
     if len(seeds) == len(tried):
         return
-    assert put_together([EpisodeStore(folder, damaged=True)], repaired, repair=True) == seeds
+    assert derive_store([EpisodeStore(folder, damaged=True)], repaired, repair=True) == seeds
     assert content(folder) == before
     store = EpisodeStore(repaired)
     assert [entry.outcome for entry in store.tried] == [
@@ -165,9 +155,9 @@ def test_damage_is_found_named_and_left_behind(tmp_path: Path, name: str) -> Non
 def test_collection_goes_on_in_a_repaired_store(tmp_path: Path) -> None:
     store = add(tmp_path / "store", EPISODES)
     change(tmp_path / "store" / "action.bin", lambda data: flip(data, 0))
-    put_together([EpisodeStore(store.folder, damaged=True)], tmp_path / "repaired", repair=True)
-    repaired = EpisodeStore.create_or_open(tmp_path / "repaired", SPEC, CONFIG)
-    summary = collect(repaired, make_environment, make_expert, episodes=4, cluster=Local(1), seed=0)
+    derive_store([EpisodeStore(store.folder, damaged=True)], tmp_path / "repaired", repair=True)
+    repaired = EpisodeStore.create_or_open(tmp_path / "repaired", ARM_SPEC, CONFIG)
+    summary = collect(repaired, make_arm, make_expert, episodes=4, cluster=LocalCluster(1), seed=0)
     assert (summary.tried, summary.failures) == (5, {"timeout": 1}) and summary.success_rate == 0.8
     assert [(entry.seed, entry.outcome) for entry in repaired.tried][::5] == [(0, "damaged"), (5, "success")]
 
@@ -175,7 +165,7 @@ def test_collection_goes_on_in_a_repaired_store(tmp_path: Path) -> None:
 def test_stores_of_one_config_become_what_one_collection_would_have_made(tmp_path: Path) -> None:
     early, late = add(tmp_path / "early", MORE[:5]), add(tmp_path / "late", MORE[3:])
     add(tmp_path / "whole", MORE)
-    put_together([late, early], tmp_path / "merged")
+    derive_store([late, early], tmp_path / "merged")
     assert content(tmp_path / "merged") == content(tmp_path / "whole")
 
 
@@ -184,37 +174,37 @@ def test_copies_with_different_damage_make_a_whole_one(tmp_path: Path) -> None:
     for copy in copies:
         add(copy, EPISODES)
     change(copies[0] / "action.bin", lambda data: flip(data, 0))
-    change(copies[1] / "joints.bin", lambda data: flip(data, len(data) - 1))
+    change(copies[1] / "state.bin", lambda data: flip(data, len(data) - 1))
     stores = [EpisodeStore(copy, damaged=True) for copy in copies]
-    assert put_together(stores, tmp_path / "merged", repair=True) == []
+    assert derive_store(stores, tmp_path / "merged", repair=True) == []
     assert content(tmp_path / "merged") == content(add(tmp_path / "whole", EPISODES).folder)
 
 
 def test_stores_of_several_configs_keep_them_apart(tmp_path: Path) -> None:
     first, second = add(tmp_path / "first", EPISODES[:2]), of_another_task(tmp_path / "second", EPISODES[1:3])
-    put_together([first, second], tmp_path / "merged")
+    derive_store([first, second], tmp_path / "merged")
     merged = EpisodeStore(tmp_path / "merged")
-    require_whole(examine(merged))
+    require_whole(verify_store(merged))
     assert [entry.seed for entry in merged.episodes] == [0, 1, 1, 2]
-    assert find(merged, 0)[0] == CONFIG and find(merged, 2)[0] == {"task": {"size": 2.0}}
+    assert find_episode(merged, 0)[0] == CONFIG and find_episode(merged, 2)[0] == {"task": {"size": 2.0}}
     with pytest.raises(ValueError, match="has 2 episodes of seed 1: ask one of the stores"):
-        find(merged, 1)
+        find_episode(merged, 1)
     add(tmp_path / "third", MORE[6:7])
-    put_together([merged, EpisodeStore(tmp_path / "third")], tmp_path / "again")
+    derive_store([merged, EpisodeStore(tmp_path / "third")], tmp_path / "again")
     assert [entry.seed for entry in EpisodeStore(tmp_path / "again").episodes] == [0, 1, 6, 1, 2]
 
 
 def test_a_store_that_was_put_together_serves_training_and_does_not_grow(tmp_path: Path) -> None:
-    put_together([add(tmp_path / "store", EPISODES)], tmp_path / "chosen", {"seed": [1, 2]})
-    chosen = EpisodeStore.create_or_open(tmp_path / "chosen", SPEC, {"task": {"size": 3.0}})
+    derive_store([add(tmp_path / "store", EPISODES)], tmp_path / "chosen", {"seed": [1, 2]})
+    chosen = EpisodeStore.create_or_open(tmp_path / "chosen", ARM_SPEC, {"task": {"size": 3.0}})
     assert [entry.seed for entry in chosen.episodes] == [1, 2] and chosen.derived
     assert chosen.statistics.steps == len(EPISODES[1].actions) + len(EPISODES[2].actions)
-    assert collect(chosen, make_environment, make_expert, episodes=2, cluster=Local(1), seed=0).added == 0
-    with pytest.raises(ValueError, match=r"does not grow: set collect\.episodes=2"):
-        collect(chosen, make_environment, make_expert, episodes=3, cluster=Local(1), seed=0)
+    assert collect(chosen, make_environment, make_expert, episodes=2, cluster=LocalCluster(1), seed=0).added == 0
+    with pytest.raises(ValueError, match=r"cannot grow: set collect\.episodes=2"):
+        collect(chosen, make_environment, make_expert, episodes=3, cluster=LocalCluster(1), seed=0)
     change(chosen.folder / "index.jsonl", lambda data: data[: data.index(b"\n") + 1])
-    with pytest.raises(ValueError, match="has lost lines: put it together again"):
-        examine(EpisodeStore(chosen.folder, damaged=True))
+    with pytest.raises(ValueError, match="has lost lines: derive it again"):
+        verify_store(EpisodeStore(chosen.folder, damaged=True))
 
 
 CHOICES: dict[str, tuple[dict[str, object], Callable[[Episode], bool]]] = {
@@ -231,58 +221,58 @@ CHOICES: dict[str, tuple[dict[str, object], Callable[[Episode], bool]]] = {
 @pytest.mark.parametrize("name", CHOICES)
 def test_conditions_choose_episodes(tmp_path: Path, name: str) -> None:
     where, fits = CHOICES[name]
-    put_together([add(tmp_path / "store", MORE)], tmp_path / "chosen", where)
+    derive_store([add(tmp_path / "store", MORE)], tmp_path / "chosen", where)
     store = EpisodeStore(tmp_path / "chosen")
     assert [entry.seed for entry in store.tried] == [episode.seed for episode in MORE if fits(episode)]
     assert store.config["where"] == [where]
-    require_whole(examine(store))
+    require_whole(verify_store(store))
 
 
 def test_conditions_that_cannot_be_meant_are_refused(tmp_path: Path) -> None:
     store = add(tmp_path / "store", EPISODES)
     for where, words in {
         "colur": r"no episode has colur, did you mean colour\?",
-        "zzz": "no episode has zzz: there are seed, instruction, outcome, steps, point, colour, limit",
+        "zzz": "no episode has zzz: there are seed, task, instruction, outcome, steps, point, colour, limit",
     }.items():
         with pytest.raises(ValueError, match=words):
-            put_together([store], tmp_path / "new", {where: "red"})
+            derive_store([store], tmp_path / "new", {where: "red"})
     conditions: list[object] = [{}, [1, 2, 3], [None, None], [], None]
     for condition in conditions:
         with pytest.raises(ValueError, match="colour must be a text"):
-            put_together([store], tmp_path / "new", {"colour": condition})
+            derive_store([store], tmp_path / "new", {"colour": condition})
     with pytest.raises(ValueError, match=r"store: there are no episodes that fit inspect\.where={'colour': 'green'}"):
-        put_together([store], tmp_path / "new", {"colour": "green"})
+        derive_store([store], tmp_path / "new", {"colour": "green"})
     assert not (tmp_path / "new").exists()
 
 
 def test_nothing_is_overwritten_or_left_half_written(tmp_path: Path) -> None:
     store = add(tmp_path / "store", EPISODES)
     with pytest.raises(ValueError, match=r"store exists already and is left alone: choose another inspect\.into"):
-        put_together([store], store.folder)
-    other = EpisodeStore.create_or_open(tmp_path / "other", replace(SPEC, frame="tool"), CONFIG)
-    with pytest.raises(ValueError, match=r"other has frame = tool, but .*store has base"):
-        put_together([store, other], tmp_path / "new")
+        derive_store([store], store.folder)
+    other = EpisodeStore.create_or_open(tmp_path / "other", replace(ARM_SPEC, control_hz=20.0), CONFIG)
+    with pytest.raises(ValueError, match=r"other has control_hz = 20.0, but .*store has 10.0"):
+        derive_store([store, other], tmp_path / "new")
     change(store.folder / "action.bin", lambda data: flip(data, len(data) - 1))
     with pytest.raises(ValueError, match=r"seed 4 in .* is damaged \(rows changed or lost\): inspect\.repair=true"):
-        put_together([store], tmp_path / "new")
+        derive_store([store], tmp_path / "new")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["other", "store"]
     shutil.copytree(store.folder, tmp_path / ".new.draft")  # as if killed there
-    put_together([EpisodeStore(store.folder, damaged=True)], tmp_path / "new", repair=True)
+    derive_store([EpisodeStore(store.folder, damaged=True)], tmp_path / "new", repair=True)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["new", "other", "store"]
 
 
 def test_a_seed_that_is_not_there_is_named(tmp_path: Path) -> None:
     store = add(tmp_path, EPISODES)
-    assert find(store, 2)[1].seed == 2
+    assert find_episode(store, 2)[1].seed == 2
     with pytest.raises(ValueError, match="has no seed 7: it holds 0 to 4"):
-        find(store, 7)
+        find_episode(store, 7)
     with pytest.raises(
         ValueError, match=r"seed 3 in .* ended as timeout, and only successes are kept: there is 2 or 4"
     ):
-        find(store, 3)
+        find_episode(store, 3)
     change(tmp_path / "action.bin", lambda data: flip(data, 0))
     with pytest.raises(ValueError, match=r"seed 0 in .* is damaged"):
-        find(EpisodeStore(tmp_path), 0)
+        find_episode(EpisodeStore(tmp_path), 0)
 
 
 def test_seeds_are_listed_in_words() -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from vla.intervals import pooled_interval, wilson_interval
+from vla.rollouts.statistics import pooled_interval, wilson_interval
 
 Trainings = list[dict[int, bool]]
 

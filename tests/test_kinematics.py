@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 import torch
 from fake_batch import make_batch, make_bc, with_text
-from toy import SPEC
+from toy import ARM, ARM_SPEC
 
 from vla.models.kinematics import ForwardKinematics
+from vla.robots.chain import frame_positions
+from vla.robots.panda import CHAIN, JOINT_HIGH, JOINT_LOW, forward
 from vla.spec import Spec
-from vla.tasks.control import JOINT_HIGH, JOINT_LOW, forward
-from vla.tasks.franka import CHAIN
 
 
 @pytest.mark.parametrize("autocast", [False, True])
@@ -26,22 +26,35 @@ def test_it_is_what_the_controller_calculates(autocast: bool) -> None:
     np.testing.assert_allclose(poses.reshape(-1, 9).numpy(), exact, atol=1e-6)
 
 
+def test_a_view_draws_what_the_controller_calculates() -> None:
+    for joints in np.random.default_rng(0).uniform(JOINT_LOW, JOINT_HIGH, (20, 7)):
+        positions = frame_positions(CHAIN, joints)
+        assert positions.shape == (9, 3)
+        np.testing.assert_allclose(positions[-1], forward(joints)[0][:3, 3], atol=1e-12)
+
+
+def with_chain(*frames: tuple[float, ...]) -> Spec:
+    return replace(ARM_SPEC, robot=replace(ARM, chain=frames))
+
+
 def test_a_model_is_told_only_where_the_chain_is_known() -> None:
-    batch = with_text(make_bc(), make_batch(1))
-    without, told = make_bc(spec=replace(SPEC, chain=())), make_bc(spec=replace(SPEC, chain=CHAIN))
-    joints = [*range(7), 14]  # of positions, velocities and the opening
-    assert torch.equal(without.posture(batch), batch["proprio"][..., joints])
-    assert torch.equal(told.posture(batch)[..., :8], without.posture(batch))
-    assert torch.equal(told.posture(batch)[..., 8:], ForwardKinematics(CHAIN)(batch["proprio"][..., :7]))
+    without, told = make_bc(spec=with_chain()), make_bc(spec=with_chain(*CHAIN))
+    batch = with_text(without, make_batch(1, spec=ARM_SPEC))
+    pose = [*range(7), 14]  # of positions, velocities and the opening
+    assert torch.equal(without.robot_state(batch), batch["state"][..., pose])
+    assert torch.equal(told.robot_state(batch)[..., :8], without.robot_state(batch))
+    assert torch.equal(told.robot_state(batch)[..., 8:], ForwardKinematics(CHAIN)(batch["state"][..., :7]))
 
 
 def test_a_chain_travels_and_one_that_is_not_known_is_no_difference() -> None:
-    known, unknown = replace(SPEC, chain=CHAIN), replace(SPEC, chain=())
+    known, unknown = with_chain(*CHAIN), with_chain()
     assert Spec.from_dict(known.to_dict()) == known
     old = unknown.to_dict()
-    del old["chain"]
+    del old["robot"]["chain"]
     assert Spec.from_dict(old) == unknown
     known.require(unknown, "one", "the other")
     unknown.require(known, "one", "the other")
-    with pytest.raises(ValueError, match="one has chain"):
-        known.require(replace(SPEC, chain=CHAIN[:-1]), "one", "the other")
+    with pytest.raises(ValueError, match=r"one has robot\.chain"):
+        known.require(with_chain(*CHAIN[:-1]), "one", "the other")
+    with pytest.raises(ValueError, match=r"one has robot = an arm, but the other has None"):
+        known.require(replace(known, robot=None), "one", "the other")

@@ -10,8 +10,8 @@ from conftest import make_tabletop
 from hydra.errors import InstantiationException
 
 from vla.spec import FIRST_SEED
-from vla.tasks.language import Grammar, Novelty
-from vla.tasks.scene import COLOURS
+from vla.tasks.language import Grammar, HeldOut
+from vla.tasks.tabletop.scene import COLOURS
 
 GRAMMAR = Grammar(
     phrasings=["{put} the {block} block there", "the {block} block, please"],
@@ -22,30 +22,30 @@ GRAMMAR = Grammar(
 )
 
 
-def said(novelty: Novelty | None) -> set[str]:
-    return {GRAMMAR.say({"block": "blue"}, novelty, np.random.RandomState(seed)) for seed in range(50)}
+def instructions(held_out: HeldOut | None) -> set[str]:
+    return {GRAMMAR.say({"block": "blue"}, held_out, np.random.RandomState(seed)) for seed in range(50)}
 
 
-def test_training_hears_every_phrasing_and_word_that_is_not_held_out() -> None:
-    heard = {"put the blue block there", "place the blue block there", "the blue block, please"}
-    assert said(None) == said("combinations") == heard
+def test_training_uses_every_phrasing_and_word_that_is_not_held_out() -> None:
+    expected = {"put the blue block there", "place the blue block there", "the blue block, please"}
+    assert instructions(None) == instructions("combinations") == expected
 
 
 def test_what_is_held_out_is_new_in_one_way_at_a_time() -> None:
-    assert said("words") == {"set the blue block there"}
-    assert said("phrasings") == {"there goes the blue block"}
-    assert GRAMMAR.novelties == ("words", "phrasings", "combinations")
+    assert instructions("words") == {"set the blue block there"}
+    assert instructions("phrasings") == {"there goes the blue block"}
+    assert GRAMMAR.held_out_kinds == ("words", "phrasings", "combinations")
 
 
-def test_a_held_out_part_that_training_hears_is_refused() -> None:
-    with pytest.raises(ValueError, match=r"also in the part that training hears: \['put'\]"):
+def test_a_held_out_part_that_training_uses_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"what training also uses: \['put'\]"):
         Grammar(["{put} {block}"], {"put": ["put"]}, ["{block}"], {"put": ["put"]})
     with pytest.raises(ValueError, match="empty"):
         Grammar(["{put} {block}"], {"put": ["put"]}, [], {"put": ["set"]})
 
 
 def draws(goal: str, level: str, first: int, count: int) -> list[dict[str, Any]]:
-    environment = make_tabletop(f"goal={goal}", f"randomize={level}")
+    environment = make_tabletop(f"task/goal={goal}", f"task/randomize={level}")
     drawn = []
     with environment.blind():
         for seed in range(first, first + count):
@@ -59,8 +59,8 @@ def test_wide_evaluation_says_only_what_training_never_says() -> None:
     training = {draw["language"]["instruction"] for draw in draws("pick_place", "wide", 0, 150)}
     evaluation = [draw["language"] for draw in draws("pick_place", "wide", FIRST_SEED, 60)]
     assert not training & {language["instruction"] for language in evaluation}
-    assert {language["novelty"] for language in evaluation} == {"words", "phrasings"}
-    assert {draw["language"]["novelty"] for draw in draws("pick_place", "default", FIRST_SEED, 5)} == {"none"}
+    assert {language["held_out"] for language in evaluation} == {"words", "phrasings"}
+    assert {draw["language"]["held_out"] for draw in draws("pick_place", "default", FIRST_SEED, 5)} == {"none"}
 
 
 def test_in_a_mixture_some_colours_are_named_with_some_goals_in_evaluation_only() -> None:
@@ -68,33 +68,33 @@ def test_in_a_mixture_some_colours_are_named_with_some_goals_in_evaluation_only(
     training = draws("mixed", "wide", 0, 150)
     assert {draw["named"]["goal"] for draw in training} == {*held_out, "PickPlaceTwo"}
     assert all(draw["named"]["colour"] != held_out.get(draw["named"]["goal"]) for draw in training)
-    new = [draw for draw in draws("mixed", "wide", FIRST_SEED, 100) if draw["language"]["novelty"] == "combinations"]
+    new = [draw for draw in draws("mixed", "wide", FIRST_SEED, 100) if draw["language"]["held_out"] == "combinations"]
     assert new and all(draw["named"]["colour"] == held_out[draw["named"]["goal"]] for draw in new)
 
 
 def test_who_is_named_does_not_depend_on_how_it_is_said() -> None:
-    environment = make_tabletop("randomize=wide")
+    environment = make_tabletop("task/randomize=wide")
     with environment.blind():
         for seed in range(FIRST_SEED, FIRST_SEED + 10):
             environment.reset(seed)
             new = environment.draws
-            phrasing, environment.task.randomize = (
-                environment.task.randomize,
+            phrasing, environment.dm_env.task.randomize = (
+                environment.dm_env.task.randomize,
                 {
-                    **environment.task.randomize,
+                    **environment.dm_env.task.randomize,
                     "phrasing": None,
                 },
             )
             environment.reset(seed)
-            environment.task.randomize = phrasing
+            environment.dm_env.task.randomize = phrasing
             assert environment.draws["named"] == new["named"]
             assert environment.draws["language"] != new["language"]
     environment.close()
 
 
 def test_the_same_scene_is_asked_for_another_block() -> None:
-    one = make_tabletop("randomize=wide")
-    other = make_tabletop("randomize=wide", "+randomize/naming=swapped")
+    one = make_tabletop("task/randomize=wide")
+    other = make_tabletop("task/randomize=wide", "+task/randomize/naming=swapped")
     for seed in range(FIRST_SEED, FIRST_SEED + 10):
         first, second = one.reset(seed), other.reset(seed)
         np.testing.assert_array_equal(first.rgb["front"], second.rgb["front"])
@@ -106,13 +106,13 @@ def test_the_same_scene_is_asked_for_another_block() -> None:
 
 
 def test_what_cannot_be_done_is_about_a_block_that_is_not_there() -> None:
-    environment = make_tabletop("goal=stay", "randomize=wide")
+    environment = make_tabletop("task/goal=stay", "task/randomize=wide")
     with environment.blind():
         for seed in range(20):
             instruction = environment.reset(seed).instruction
-            bound = environment.task.bound
-            assert not any(colour in instruction for colour in bound.block_names[: bound.present])
+            compiled = environment.dm_env.task.compiled
+            assert not any(colour in instruction for colour in compiled.block_names[: compiled.present])
             assert any(colour in instruction for colour in COLOURS)
     environment.close()
-    with pytest.raises(InstantiationException, match=r"task\.blocks is from 2 to 5"):
-        make_tabletop("goal=stay", "blocks=6")
+    with pytest.raises(InstantiationException, match=r"task\.blocks must be from 2 to 5"):
+        make_tabletop("task/goal=stay", "task.blocks=6")

@@ -10,44 +10,13 @@ import lightning
 import pytest
 import torch
 from fake_batch import make_batch, make_bc, make_decoder, make_rt1
+from small_training import CONFIG, fit, loader, make_learner, make_trainer
 from torch.utils.data import DataLoader
 from toy import SPEC
 
-from vla.models.learner import Learner
 from vla.models.model import Model
 from vla.policy import read_checkpoint
-from vla.trainer import AtomicFiles
-
-MODEL = {"_target_": "vla.models.bc.BC", "shift": [0, 0]}
-CONFIG: dict[str, Any] = {"task": {}, "tokenizer": {}, "model": MODEL, "seed": 0}
-
-
-def make_learner(model: Model | None = None, **options: Any) -> Learner:
-    return Learner(**options, model=model or make_bc(), spec=SPEC, config=CONFIG)
-
-
-def make_trainer(steps: int, *callbacks: lightning.Callback, precision: Any = "32-true") -> lightning.Trainer:
-    return lightning.Trainer(
-        accelerator="cpu",
-        max_steps=steps,
-        precision=precision,
-        logger=False,
-        callbacks=list(callbacks),
-        enable_checkpointing=False,
-        enable_progress_bar=False,
-        enable_model_summary=False,
-        num_sanity_val_steps=0,
-    )
-
-
-def loader(batch: dict[str, Any], steps: int) -> DataLoader[Any]:
-    return DataLoader([batch] * steps, batch_size=None)  # type: ignore[arg-type]
-
-
-def fit(learner: Learner, batch: dict[str, Any], steps: int, **options: Any) -> lightning.Trainer:
-    trainer = make_trainer(steps, **options)
-    trainer.fit(learner, loader(batch, steps), loader(batch, 1))
-    return trainer
+from vla.training.trainer import AtomicCheckpointIO
 
 
 def test_training_lowers_the_loss_and_validation_reports_errors_in_readable_units() -> None:
@@ -69,7 +38,7 @@ def test_the_error_of_a_component_is_the_mean_distance_over_what_is_valid() -> N
     batch["valid"][0] = False
     metrics = make_trainer(1).validate(learner, loader(batch, 1), verbose=False)[0]
     logits = model(learner.prepare(batch))["logits"]
-    error = (model.tokenizer.read(logits) - batch["action"]).abs()[1:, ..., 0].mean() * 1000
+    error = (model.tokenizer.decode_logits(logits) - batch["action"]).abs()[1:, ..., 0].mean() * 1000
     assert metrics["val/error_x_mm"] == pytest.approx(error.item(), rel=1e-4)
 
 
@@ -81,7 +50,7 @@ def test_bfloat16_trains(model: Model) -> None:
 
 def test_a_loss_that_is_not_finite_stops_training_and_names_the_step() -> None:
     batch = make_batch(1)
-    batch["proprio"][:] = math.nan
+    batch["state"][:] = math.nan
     with pytest.raises(ValueError, match="at step 0"):
         fit(make_learner(), batch, 1)
 
@@ -89,7 +58,7 @@ def test_a_loss_that_is_not_finite_stops_training_and_names_the_step() -> None:
 def test_the_step_is_named_whose_loss_was_the_first_that_was_not_finite(tmp_path: Path) -> None:
     """Though it is looked for less often than every step, nothing is saved in between."""
     good, bad = make_batch(1), make_batch(1)
-    bad["proprio"][:] = math.nan
+    bad["state"][:] = math.nan
     batches: DataLoader[Any] = DataLoader([good, good, bad, good, good], batch_size=None)  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="at step 2: lower"):
         make_trainer(5).fit(make_learner(), batches)
@@ -157,7 +126,7 @@ def test_compiling_keeps_the_names_in_the_checkpoint() -> None:
 
 
 def test_a_checkpoint_that_cannot_be_written_leaves_the_one_before(tmp_path: Path) -> None:
-    files = AtomicFiles()
+    files = AtomicCheckpointIO()
     files.save_checkpoint({"step": 1}, tmp_path / "last.ckpt")
 
     class Unwritable:
@@ -168,9 +137,3 @@ def test_a_checkpoint_that_cannot_be_written_leaves_the_one_before(tmp_path: Pat
         files.save_checkpoint({"step": 2, "more": Unwritable()}, tmp_path / "last.ckpt")
     assert torch.load(tmp_path / "last.ckpt", weights_only=True) == {"step": 1}
     assert [path.name for path in tmp_path.iterdir()] == ["last.ckpt"]
-
-
-@pytest.mark.parametrize("wrong", [{"lr": -1.0}, {"weight_decay": -0.1}, {"ema": 1.0}])
-def test_a_learner_that_cannot_learn_is_refused(wrong: dict[str, float]) -> None:
-    with pytest.raises(ValueError, match=r"learner\.lr"):
-        Learner(**wrong, model=None, spec=None, config={})  # type: ignore[arg-type]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
 from collections import Counter
@@ -12,13 +13,12 @@ from pathlib import Path
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+from exporting import content, exporter, stored
 from rerun.chunk import RrdReader
-from test_export import content, stored
-from toy import SPEC
+from toy import ARM_SPEC
 
 from vla.data.episodes import EpisodeStore
-from vla.data.lerobot import LeRobot
-from vla.data.video import decode
+from vla.data.formats.video import decode, encode
 
 
 @pytest.fixture(scope="module")
@@ -26,8 +26,14 @@ def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A `store` of 53 episodes, enough for two videos per camera, and the `dataset` made of it."""
     home = tmp_path_factory.mktemp("home")
     store, _ = stored(home / "store", seeds=range(66))
-    LeRobot(home / "dataset", workers=1).export(store)
+    exporter("lerobot", home / "dataset").export(store)
     return home
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="the encoder asks for real-time priority on Linux only")
+def test_a_video_leaves_the_priority_of_all_threads(tmp_path: Path) -> None:
+    encode(tmp_path / "video.mp4", np.zeros((1, 3, 64, 64, 3), np.uint8), (64, 64), Fraction(10), 30)
+    assert os.SCHED_FIFO not in {os.sched_getscheduler(int(thread)) for thread in os.listdir("/proc/self/task")}
 
 
 def test_every_row_is_that_of_the_store(home: Path) -> None:
@@ -44,10 +50,9 @@ def test_every_row_is_that_of_the_store(home: Path) -> None:
     for number, (entry, episode) in enumerate(zip(store.episodes, episodes, strict=True)):
         expected, begin, end = store.read(entry), episode["dataset_from_index"], episode["dataset_to_index"]
         here = rows.slice(begin, end - begin).to_pydict()
-        np.testing.assert_array_equal(
-            np.float32(here["observation.state"]), np.hstack([expected["joints"], expected["gripper"]])
-        )
-        for name in ("action", "executed", "velocities"):
+        np.testing.assert_array_equal(np.float32(here["observation.state"]), expected["state"][:, ARM_SPEC.pose])
+        np.testing.assert_array_equal(np.float32(here["velocities"]), expected["state"][:, ARM_SPEC.rates])
+        for name in ("action", "executed"):
             np.testing.assert_array_equal(np.float32(here[name]), expected[name])
         assert here["index"] == list(range(begin, end)) and here["frame_index"] == list(range(entry.steps))
         assert here["episode_index"] == [number] * entry.steps and episode["length"] == entry.steps
@@ -61,12 +66,12 @@ def test_every_image_is_close_to_that_of_the_store(home: Path) -> None:
     assert {episode["videos/observation.images.front/file_index"] for episode in episodes} == {0, 1}
     for number in (0, 1, 49, 50, 52):
         expected, episode = store.read(store.episodes[number]), episodes[number]
-        for camera in SPEC.cameras:
+        for camera in ARM_SPEC.cameras:
             video = f"videos/observation.images.{camera}"
             file = home / "dataset" / video / f"chunk-000/file-{episode[f'{video}/file_index']:03d}.mp4"
             begin, end = episode[f"{video}/from_timestamp"], episode[f"{video}/to_timestamp"]
             assert end - begin == pytest.approx(episode["length"] / 10)
-            images = decode(file, begin, episode["length"], Fraction(10), SPEC.image_size)
+            images = decode(file, begin, episode["length"], Fraction(10), ARM_SPEC.image_size)
             green = images[..., 1].mean((1, 2))  # counts the steps in the toy world
             np.testing.assert_allclose(green, expected[f"rgb_{camera}"][..., 1].mean((1, 2)), atol=6)
 
@@ -102,7 +107,7 @@ def test_statistics_are_those_of_all_rows_and_pixels(home: Path) -> None:
 
 def test_rerun_opens_it(home: Path, tmp_path: Path) -> None:
     store, _ = stored(tmp_path / "store", seeds=range(2))
-    folder, recording = LeRobot(tmp_path / "dataset", workers=1).export(store), tmp_path / "dataset.rrd"
+    folder, recording = exporter("lerobot", tmp_path / "dataset").export(store), tmp_path / "dataset.rrd"
     command = [sys.executable, "-m", "rerun", str(folder), "--bind", "127.0.0.1", "--save", str(recording)]
     done = subprocess.run(command, capture_output=True, text=True, timeout=60)
     assert done.returncode == 0 and "WARN" not in done.stdout + done.stderr, done.stdout + done.stderr
@@ -113,19 +118,19 @@ def test_rerun_opens_it(home: Path, tmp_path: Path) -> None:
         for chunk in reader.stream(store=one):
             if "VideoStream:sample" in chunk.to_record_batch().schema.names:
                 frames[chunk.entity_path] += chunk.num_rows
-        assert frames == {f"/observation.images.{camera}": entry.steps for camera in SPEC.cameras}
+        assert frames == {f"/observation.images.{camera}": entry.steps for camera in ARM_SPEC.cameras}
 
 
 def test_a_dataset_that_is_there_is_left_alone_and_another_one_is_refused(home: Path, tmp_path: Path) -> None:
     store, before = EpisodeStore(home / "store"), content(home / "dataset")
     stamp = (home / "dataset/meta/info.json").stat().st_mtime_ns
-    LeRobot(home / "dataset").export(store)
+    exporter("lerobot", home / "dataset").export(store)
     assert (home / "dataset/meta/info.json").stat().st_mtime_ns == stamp
-    with pytest.raises(ValueError, match=r"dataset holds something else .*: choose another export\.folder"):
-        LeRobot(home / "dataset").export(EpisodeStore(home / "store", episodes=3))
+    with pytest.raises(ValueError, match=r"dataset has content other .*: choose another export\.folder"):
+        exporter("lerobot", home / "dataset").export(EpisodeStore(home / "store", episodes=3))
     assert content(home / "dataset") == before
-    with pytest.raises(ValueError, match=r"export\.crf is from 0 to 63, not 64"):
-        LeRobot(tmp_path / "none", crf=64)
+    with pytest.raises(ValueError, match=r"export\.crf must be int, at least 0, at most 63, got 64"):
+        exporter("lerobot", tmp_path / "none", "export.crf=64")
     with pytest.raises(ValueError, match="no episodes yet"):
-        LeRobot(tmp_path / "none").export(EpisodeStore.create_or_open(tmp_path / "empty", SPEC, {}))
+        exporter("lerobot", tmp_path / "none").export(EpisodeStore.create_or_open(tmp_path / "empty", ARM_SPEC, {}))
     assert [path.name for path in tmp_path.iterdir()] == ["empty"]

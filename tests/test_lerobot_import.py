@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import os
 import shutil
 from collections.abc import Callable
 from dataclasses import replace
@@ -15,29 +16,30 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from exporting import exporter, stored
 from PIL import Image
-from test_episodes import content
-from test_export import stored
-from toy import SPEC, ToyEnvironment
+from toy import ARM, ARM_SPEC, make_arm
+from toy_episodes import content
 
+from vla.config.experiment import make_expert
 from vla.data.episodes import EpisodeStore
-from vla.data.lerobot import LeRobot as Export
-from vla.data.lerobot_import import LeRobot
-from vla.data.video import encode
-from vla.parts import make_expert
+from vla.data.formats.lerobot_import import LeRobotDemonstrations
+from vla.data.formats.video import encode
 from vla.spec import Spec
+
+SHORTER = replace(ARM_SPEC, state=ARM_SPEC.state[1:], state_units=ARM_SPEC.state_units[1:], robot=None)
 
 
 @pytest.fixture(scope="module")
 def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A `store` of three episodes, and the `dataset` made of it."""
     home = tmp_path_factory.mktemp("home")
-    Export(home / "dataset", crf=5, workers=1).export(stored(home / "store", seeds=range(3))[0])
+    exporter("lerobot", home / "dataset", "export.crf=5").export(stored(home / "store", seeds=range(3))[0])
     return home
 
 
 def imported(dataset: Path, folder: Path, episodes: int = 3) -> EpisodeStore:
-    expert = LeRobot(str(dataset), spec=SPEC)
+    expert = LeRobotDemonstrations(str(dataset), spec=ARM_SPEC)
     store = EpisodeStore.create_or_open(folder, expert.spec, {})
     expert.fill(store, episodes)
     return store
@@ -45,13 +47,13 @@ def imported(dataset: Path, folder: Path, episodes: int = 3) -> EpisodeStore:
 
 def test_what_was_exported_comes_back(home: Path, tmp_path: Path) -> None:
     before, after = EpisodeStore(home / "store"), imported(home / "dataset", tmp_path / "store")
-    assert after.spec == replace(SPEC, truth=()) and "truth" not in after.fields
+    assert after.spec == replace(ARM_SPEC, truth=()) and "truth" not in after.fields
     for there, here in zip(before.episodes, after.episodes, strict=True):
         assert here.instruction == there.instruction
         expected, rows = before.read(there), after.read(here)
-        for name in ("joints", "velocities", "gripper", "action", "executed"):
+        for name in ("state", "action", "executed"):
             np.testing.assert_array_equal(rows[name], expected[name])
-        for camera in SPEC.cameras:
+        for camera in ARM_SPEC.cameras:
             assert np.abs(rows[f"rgb_{camera}"].astype(float) - expected[f"rgb_{camera}"]).mean() < 10
             assert not rows[f"depth_{camera}"].any()
         assert here.draws == {"recorded": {"episode": here.seed, "lacks": ["depth"]}}
@@ -59,10 +61,10 @@ def test_what_was_exported_comes_back(home: Path, tmp_path: Path) -> None:
 
 def test_depth_comes_back_bit_for_bit_if_it_was_exported(home: Path, tmp_path: Path) -> None:
     before = EpisodeStore(home / "store")
-    after = imported(Export(tmp_path / "dataset", depth=True, workers=1).export(before), tmp_path / "store")
+    after = imported(exporter("lerobot", tmp_path / "dataset", "export.depth=true").export(before), tmp_path / "store")
     for there, here in zip(before.episodes, after.episodes, strict=True):
         expected, rows = before.read(there), after.read(here)
-        for camera in SPEC.cameras:
+        for camera in ARM_SPEC.cameras:
             np.testing.assert_array_equal(rows[f"depth_{camera}"], expected[f"depth_{camera}"])
         assert here.draws["recorded"]["lacks"] == []
 
@@ -74,8 +76,8 @@ def test_an_import_goes_on_where_it_was(home: Path, tmp_path: Path) -> None:
     assert content(tmp_path / "store") == content(tmp_path / "whole")
     with pytest.raises(ValueError, match=r"only 3 recorded episodes: set collect\.episodes=3"):
         imported(home / "dataset", tmp_path / "store", episodes=4)
-    other = Export(tmp_path / "other", workers=1).export(stored(tmp_path / "another", seeds=range(4, 7))[0])
-    with pytest.raises(ValueError, match=r"holds other episodes than are recorded now: choose another collect\.folder"):
+    other = exporter("lerobot", tmp_path / "other").export(stored(tmp_path / "another", seeds=range(4, 7))[0])
+    with pytest.raises(ValueError, match=r"holds other episodes than these: choose another collect\.folder"):
         imported(other, tmp_path / "store")
 
 
@@ -106,7 +108,7 @@ def test_what_other_people_leave_out_is_made_up_and_said(home: Path, tmp_path: P
         features = info["features"]
         del features["executed"], features["velocities"]
         features["action"]["names"] = None  # anonymous components count as ours
-        features["observation.state"]["names"] = {"motors": [*SPEC.joints, "gripper"]}
+        features["observation.state"]["names"] = {"motors": [*ARM.joints, "gripper"]}
         features["observation.images.front"] |= {"shape": [3, 16, 16], "names": ["channels", "height", "width"]}
 
     dataset = changed_info(home, tmp_path, change)
@@ -118,29 +120,30 @@ def test_what_other_people_leave_out_is_made_up_and_said(home: Path, tmp_path: P
     assert store.episodes[0].draws["recorded"]["lacks"] == ["depth", "executed", "velocities"]
     rows = store.read(store.episodes[0])
     np.testing.assert_array_equal(rows["executed"], rows["action"])
-    np.testing.assert_allclose(rows["velocities"][1:], np.diff(rows["joints"], axis=0) * 10, rtol=1e-6)
-    assert not rows["velocities"][0].any()
+    velocities = rows["state"][:, 7:14]
+    np.testing.assert_allclose(velocities[1:], np.diff(rows["state"][:, :7], axis=0) * 10, rtol=1e-6)
+    assert not velocities[0].any()
 
 
 @pytest.mark.parametrize(
     ("spec", "says"),
     [
-        (replace(SPEC, control_hz=20.0), r"a rate of 10 Hz, the task has 20 Hz"),
+        (replace(ARM_SPEC, control_hz=20.0), r"a rate of 10 Hz, the task has 20 Hz"),
         (
-            replace(SPEC, cameras=("side", "top")),
+            replace(ARM_SPEC, cameras=("side", "top"), depth=()),
             r"no images observation\.images\.side and observation\.images\.top, it has observation\.images\.front, ob",
         ),
         (
-            replace(SPEC, image_size=(16, 32)),
+            replace(ARM_SPEC, image_size=(16, 32)),
             r"images\.front of 16 x 16 pixels, the task has 16 x 32 pixels; .*wrist of",
         ),
         (
-            replace(SPEC, joints=SPEC.joints[:6]),
-            r"state of shape \[8\] \(joint1, .*\), the task has \[7\] \(joint1, .*\)",
+            SHORTER,
+            r"state of shape \[8\] \(joint1, .*\), the task has \[7\] \(joint2, .*\)",
         ),
-        (replace(SPEC, action=("x", "z", "gripper")), r"action of x, y, gripper, the task has x, z, gripper"),
+        (replace(ARM_SPEC, action=("x", "z", "gripper")), r"action of x, y, gripper, the task has x, z, gripper"),
         (
-            replace(SPEC, high=(0.01, 0.01, 0.5)),
+            replace(ARM_SPEC, high=(0.01, 0.01, 0.5)),
             r"x in action from .* 0\.01 m \(other units, or absolute\?\); y .*; gripper .* has 0 to 0\.5 \(other units",
         ),
     ],
@@ -148,15 +151,13 @@ def test_what_other_people_leave_out_is_made_up_and_said(home: Path, tmp_path: P
 )
 def test_differences_from_the_task_are_named(home: Path, spec: Spec, says: str) -> None:
     with pytest.raises(ValueError, match=rf"dataset is not of the task's kind of step: .*{says}"):
-        LeRobot(str(home / "dataset"), spec=spec)
+        LeRobotDemonstrations(str(home / "dataset"), spec=spec)
 
 
 def test_all_differences_are_named_at_once(home: Path, tmp_path: Path) -> None:
-    other = replace(
-        SPEC, control_hz=20.0, image_size=(8, 8), joints=SPEC.joints[:6], action=("a", "b", "c"), high=(0.01, 0.05, 1.0)
-    )
+    other = replace(SHORTER, control_hz=20.0, image_size=(8, 8), action=("a", "b", "c"), high=(0.01, 0.05, 1.0))
     with pytest.raises(ValueError) as caught:
-        LeRobot(str(home / "dataset"), spec=other)
+        LeRobotDemonstrations(str(home / "dataset"), spec=other)
     assert [difference.split(" ")[0] for difference in str(caught.value).split(": ", 1)[1].split("; ")] == [
         "a", "observation.images.front", "observation.images.wrist", "observation.state", "action", "a"
     ]  # fmt: skip
@@ -166,7 +167,7 @@ def test_all_differences_are_named_at_once(home: Path, tmp_path: Path) -> None:
         info["features"]["action"] = {"dtype": "float32", "shape": [6], "names": None}
 
     with pytest.raises(ValueError, match=r"it has none at all; action of shape \[6\], the task has \[3\] \(x, y, grip"):
-        LeRobot(str(changed_info(home, tmp_path, foreign)), spec=SPEC)
+        LeRobotDemonstrations(str(changed_info(home, tmp_path, foreign)), spec=ARM_SPEC)
 
 
 def as_pictures(home: Path, folder: Path, size: tuple[int, int] = (16, 16)) -> Path:
@@ -176,7 +177,7 @@ def as_pictures(home: Path, folder: Path, size: tuple[int, int] = (16, 16)) -> P
     info = json.loads((dataset / "meta/info.json").read_text())
     path = dataset / "data/chunk-000/file-000.parquet"
     table = pq.read_table(path)
-    for camera in SPEC.cameras:
+    for camera in ARM_SPEC.cameras:
         key = f"observation.images.{camera}"
         info["features"][key] = {"dtype": "image", "shape": [3, 16, 16], "names": ["channels", "height", "width"]}
         pictures = []
@@ -198,44 +199,46 @@ def test_pictures_in_the_table_come_back_bit_for_bit(home: Path, tmp_path: Path)
     before, after = EpisodeStore(home / "store"), imported(as_pictures(home, tmp_path / "data"), tmp_path / "store")
     for there, here in zip(before.episodes, after.episodes, strict=True):
         expected, rows = before.read(there), after.read(here)
-        for camera in SPEC.cameras:
+        for camera in ARM_SPEC.cameras:
             np.testing.assert_array_equal(rows[f"rgb_{camera}"], expected[f"rgb_{camera}"])
 
 
 def test_pictures_of_another_kind_are_refused_by_name(home: Path, tmp_path: Path) -> None:
     path, key = "data/chunk-000/file-000.parquet", "observation.images.front"
     with pytest.raises(ValueError, match=rf"{path}: {key} of episode 0: the image is 300 x 400 pixels of RGB"):
-        LeRobot(str(as_pictures(home, tmp_path / "large", (400, 300))), spec=SPEC).episode(0)
+        LeRobotDemonstrations(str(as_pictures(home, tmp_path / "large", (400, 300))), spec=ARM_SPEC).episode(0)
     kinds: dict[str, Callable[[pa.Table], pa.Array]] = {
         "lacks images": lambda table: pa.array(
             [{"bytes": None, "path": "a.png"}] * len(table), pa.struct({"bytes": pa.binary(), "path": pa.string()})
         ),
         "cannot be decoded": lambda table: pa.array([{"bytes": b"\x89PNG", "path": ""}] * len(table)),
-        "something else than images": lambda table: pa.array(["a.png"] * len(table)),
+        "does not hold images": lambda table: pa.array(["a.png"] * len(table)),
     }
     for number, (says, values) in enumerate(kinds.items()):
         dataset = as_pictures(home, tmp_path / f"data{number}")
         changed_table(dataset / path, key, values)
         with pytest.raises(ValueError, match=rf"{path}.*{says}"):
-            LeRobot(str(dataset), spec=SPEC).episode(0)
+            LeRobotDemonstrations(str(dataset), spec=ARM_SPEC).episode(0)
 
 
 def test_a_recording_does_not_act(home: Path) -> None:
-    node = {"_target_": "vla.data.lerobot_import.LeRobot", "folder": str(home / "dataset")}
+    node = {"_target_": "vla.data.formats.lerobot_import.LeRobotDemonstrations", "folder": str(home / "dataset")}
     with pytest.raises(ValueError, match="cannot act: this job needs another expert"):
-        make_expert(node, ToyEnvironment())
+        make_expert(node, make_arm())
 
 
 def test_what_cannot_be_read_is_named(home: Path, tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"expert\.folder=DIR"):
-        LeRobot(spec=SPEC)
+        LeRobotDemonstrations(None, spec=ARM_SPEC)
     with pytest.raises(ValueError, match=r"no LeRobot dataset in .*nowhere"):
-        LeRobot(str(tmp_path / "nowhere"), spec=SPEC)
+        LeRobotDemonstrations(str(tmp_path / "nowhere"), spec=ARM_SPEC)
     old = changed_info(home, tmp_path / "old", lambda info: info.update(codebase_version="v2.1"))
     with pytest.raises(ValueError, match=r"info\.json has version v2\.1: convert the dataset to v3\.0"):
-        LeRobot(str(old), spec=SPEC)
+        LeRobotDemonstrations(str(old), spec=ARM_SPEC)
     with pytest.raises(ValueError, match=r"info\.json is damaged or of another kind: features: Field required"):
-        LeRobot(str(changed_info(home, tmp_path / "bare", lambda info: info.pop("features"))), spec=SPEC)
+        LeRobotDemonstrations(
+            str(changed_info(home, tmp_path / "bare", lambda info: info.pop("features"))), spec=ARM_SPEC
+        )
     for name, says in {
         "data/chunk-000/file-000.parquet": "cannot be read",
         "meta/episodes/chunk-000/file-000.parquet": "cannot be read",
@@ -245,7 +248,22 @@ def test_what_cannot_be_read_is_named(home: Path, tmp_path: Path) -> None:
         dataset = copied(home, tmp_path / name.replace("/", "_"))
         (dataset / name).write_bytes((dataset / name).read_bytes()[:100])
         with pytest.raises(ValueError, match=says):
-            LeRobot(str(dataset), spec=SPEC).episode(0)
+            LeRobotDemonstrations(str(dataset), spec=ARM_SPEC).episode(0)
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        *("meta/info.json", "meta/tasks.parquet", "meta/episodes/chunk-000/file-000.parquet"),
+        *("data/chunk-000/file-000.parquet", "videos/observation.images.wrist/chunk-000/file-000.mp4"),
+    ],
+)
+def test_a_pipe_is_not_read(home: Path, tmp_path: Path, name: str) -> None:
+    dataset = copied(home, tmp_path / "dataset")
+    (dataset / name).unlink()
+    os.mkfifo(dataset / name)
+    with pytest.raises(ValueError, match=rf"{name} is a folder, a pipe or a device, not a file"):
+        LeRobotDemonstrations(str(dataset), spec=ARM_SPEC).episode(0)
 
 
 def test_an_episode_that_the_data_does_not_hold_is_refused(home: Path, tmp_path: Path) -> None:
@@ -253,8 +271,8 @@ def test_an_episode_that_the_data_does_not_hold_is_refused(home: Path, tmp_path:
     path = dataset / "data/chunk-000/file-000.parquet"
     rows = pq.read_table(path)
     pq.write_table(rows.slice(0, len(rows) - 1), path)
-    with pytest.raises(ValueError, match="says of episode 2 what its data does not hold"):
-        LeRobot(str(dataset), spec=SPEC)
+    with pytest.raises(ValueError, match="metadata of episode 2 contradicts the data"):
+        LeRobotDemonstrations(str(dataset), spec=ARM_SPEC)
 
 
 @pytest.mark.parametrize(
@@ -277,7 +295,7 @@ def test_nonsense_in_the_description_is_refused_by_name(
     home: Path, tmp_path: Path, change: dict[str, Any], says: str
 ) -> None:
     with pytest.raises(ValueError, match=says) as caught:
-        LeRobot(str(changed_info(home, tmp_path, lambda info: info.update(change))), spec=SPEC)
+        LeRobotDemonstrations(str(changed_info(home, tmp_path, lambda info: info.update(change))), spec=ARM_SPEC)
     assert str(tmp_path) in str(caught.value) and len(str(caught.value)) < 2000
 
 
@@ -285,7 +303,7 @@ def test_a_description_nested_without_end_is_refused(home: Path, tmp_path: Path)
     dataset = copied(home, tmp_path / "dataset")
     (dataset / "meta/info.json").write_text('{"codebase_version": "v3.0", "features": ' + "[" * 100_000)
     with pytest.raises(ValueError, match=r"info\.json is damaged or of another kind"):
-        LeRobot(str(dataset), spec=SPEC)
+        LeRobotDemonstrations(str(dataset), spec=ARM_SPEC)
 
 
 VIDEO, EPISODES, ROWS = (
@@ -314,7 +332,7 @@ VIDEO, EPISODES, ROWS = (
         (ROWS, "episode_index", None, "integers from 0 on"),
         ("meta/tasks.parquet", "task", None, "text"),
         ("meta/tasks.parquet", "task", "a" * 1001, "tasks of more than 1000 characters: 0"),
-        ("meta/tasks.parquet", "task_index", "0", "columns task_index, task|something else than integers"),
+        ("meta/tasks.parquet", "task_index", "0", "columns task_index, task|does not hold integers"),
     ],
 )
 def test_nonsense_in_a_table_is_refused_by_name(
@@ -323,15 +341,18 @@ def test_nonsense_in_a_table_is_refused_by_name(
     dataset = copied(home, tmp_path / "dataset")
     changed_table(dataset / file, column, lambda table: pa.array([value] * len(table)))
     with pytest.raises(ValueError, match=rf"{file.split('/chunk')[0]}.*{says}"):
-        LeRobot(str(dataset), spec=SPEC)
+        LeRobotDemonstrations(str(dataset), spec=ARM_SPEC)
 
 
+@pytest.mark.parametrize(
+    ("limit", "says"), [("MOST_ROWS", r"has \d+ rows, more than the 5"), ("MOST_BYTES", r"unpacks to .* GB, more than")]
+)
 def test_a_table_that_unpacks_without_end_is_not_read(
-    home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, limit: str, says: str
 ) -> None:
-    monkeypatch.setattr("vla.data.lerobot_tables.MOST_ROWS", 5)
-    with pytest.raises(ValueError, match=r"file-000\.parquet has \d+ rows, more than the 5"):
-        LeRobot(str(copied(home, tmp_path / "dataset")), spec=SPEC)
+    monkeypatch.setattr(f"vla.data.formats.lerobot_tables.{limit}", 5)
+    with pytest.raises(ValueError, match=rf"file-000\.parquet {says}"):
+        LeRobotDemonstrations(str(copied(home, tmp_path / "dataset")), spec=ARM_SPEC)
 
 
 def test_a_video_of_another_size_is_not_decoded(home: Path, tmp_path: Path) -> None:
@@ -339,7 +360,7 @@ def test_a_video_of_another_size_is_not_decoded(home: Path, tmp_path: Path) -> N
     path = dataset / "videos/observation.images.wrist/chunk-000/file-000.mp4"
     encode(path, [np.zeros((20, 64, 64, 3), np.uint8)], (64, 64), Fraction(10), 50)
     with pytest.raises(ValueError, match=r"file-000\.mp4 has images of 64 x 64 pixels, not 16 x 16"):
-        LeRobot(str(dataset), spec=SPEC).episode(0)
+        LeRobotDemonstrations(str(dataset), spec=ARM_SPEC).episode(0)
 
 
 def test_no_flipped_bit_is_imported(home: Path, tmp_path: Path) -> None:
@@ -350,9 +371,9 @@ def test_no_flipped_bit_is_imported(home: Path, tmp_path: Path) -> None:
         for place in random.integers(len(whole), size=6).tolist():
             path.write_bytes(whole[:place] + bytes([whole[place] ^ 1 << place % 8]) + whole[place + 1 :])
             with pytest.raises(ValueError, match=r"dataset.*copy the dataset again from where it is whole"):
-                LeRobot(str(dataset), spec=SPEC)
+                LeRobotDemonstrations(str(dataset), spec=ARM_SPEC)
         path.write_bytes(whole)
-    assert len(LeRobot(str(dataset), spec=SPEC)) == 3
+    assert len(LeRobotDemonstrations(str(dataset), spec=ARM_SPEC)) == 3
 
 
 def test_a_page_of_a_table_that_was_changed_is_not_imported(home: Path, tmp_path: Path) -> None:
@@ -364,4 +385,4 @@ def test_a_page_of_a_table_that_was_changed_is_not_imported(home: Path, tmp_path
     data[column.data_page_offset + column.total_compressed_size - 3] ^= 1
     path.write_bytes(data)
     with pytest.raises(ValueError, match=r"file-000\.parquet cannot be read \(.*CRC"):
-        LeRobot(str(dataset), spec=SPEC)
+        LeRobotDemonstrations(str(dataset), spec=ARM_SPEC)

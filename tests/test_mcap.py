@@ -11,11 +11,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from exporting import exporter, stored
 from rerun.chunk import RrdReader
 from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_typestore
-from test_export import exporter, stored
-from toy import SPEC
+from toy import ARM_SPEC
 
 from vla.data.episodes import EpisodeStore
 
@@ -27,7 +27,7 @@ CAMERAS = {"front": "/isaac/camera", "wrist": "/isaac/wrist_camera"}
 def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A `store` of two episodes, and the `bags` made of it."""
     home = tmp_path_factory.mktemp("home")
-    exporter("mcap", home / "bags", "export.workers=1").export(stored(home / "store")[0])
+    exporter("mcap", home / "bags").export(stored(home / "store")[0])
     return home
 
 
@@ -58,14 +58,14 @@ def test_every_message_is_a_row_of_the_store(home: Path) -> None:
                 np.testing.assert_array_equal(depth, rows[f"depth_{camera}"][step])
         for step, (_, state) in enumerate(topics["/isaac/franka/joint_states"]):
             assert state.name == [*ROBOT, "panda_finger_joint1", "panda_finger_joint2"]
-            np.testing.assert_array_equal(np.float32(state.position[:7]), rows["joints"][step])
-            np.testing.assert_array_equal(np.float32(state.velocity[:7]), rows["velocities"][step])
-            assert np.float32(state.position[7:].sum()) == rows["gripper"][step, 0]
+            np.testing.assert_array_equal(np.float32(state.position[:7]), rows["state"][step, :7])
+            np.testing.assert_array_equal(np.float32(state.velocity[:7]), rows["state"][step, 7:14])
+            assert np.float32(state.position[7:].sum()) == rows["state"][step, 14]
         for topic, field in (("/vla/action", "action"), ("/vla/executed_action", "executed")):
             np.testing.assert_array_equal([message.data for _, message in topics[topic]], rows[field])
             assert topics[topic][0][1].layout.dim[0].label == "x y gripper"
         manifest = json.loads((home / f"bags/episode_{number:05d}/manifest.json").read_text())
-        assert manifest["seed"] == entry.seed and manifest["spec"]["units"] == list(SPEC.units)
+        assert manifest["seed"] == entry.seed and manifest["spec"]["units"] == list(ARM_SPEC.units)
 
 
 def test_rerun_converts_it(home: Path, tmp_path: Path) -> None:
@@ -78,11 +78,11 @@ def test_rerun_converts_it(home: Path, tmp_path: Path) -> None:
 
 
 def test_other_files_or_topics_are_told_from_the_same_ones(home: Path, tmp_path: Path) -> None:
-    store, again = EpisodeStore(home / "store"), ("export.workers=1",)
-    exporter("mcap", home / "bags", *again).export(store)
+    store = EpisodeStore(home / "store")
+    exporter("mcap", home / "bags").export(store)
     for name, options in (("mcap", ("export.action=/elsewhere",)), ("files", ())):
         with pytest.raises(ValueError, match=r"or as other files: choose another export\.folder"):
-            exporter(name, home / "bags", *again, *options).export(store)
+            exporter(name, home / "bags", *options).export(store)
 
 
 def test_without_rosbags_the_sentence_says_what_to_install(tmp_path: Path) -> None:
@@ -111,5 +111,5 @@ def test_without_rosbags_the_sentence_says_what_to_install(tmp_path: Path) -> No
 )
 def test_a_robot_that_does_not_fit_is_refused(home: Path, tmp_path: Path, override: str, says: str) -> None:
     with pytest.raises(ValueError, match=says):
-        exporter("mcap", tmp_path / "bags", override, "export.workers=1").export(EpisodeStore(home / "store"))
+        exporter("mcap", tmp_path / "bags", override).export(EpisodeStore(home / "store"))
     assert list(tmp_path.iterdir()) == []

@@ -1,4 +1,4 @@
-"""Messages as arrays: what the middleware lets through, these functions do not."""
+"""Messages as arrays: invalid messages are refused."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from vla.deploy import messages
-from vla.deploy.governor import Robot
-from vla.deploy.session import Command
+from vla.deploy.control_loop import Command
+from vla.deploy.joint_limiter import Robot
 
 ROBOT = Robot(
     joints=["one", "two"],
@@ -19,6 +19,11 @@ ROBOT = Robot(
     speed=[1.0] * 2,
     acceleration=[1.0] * 2,
     fingers=["left", "right"],
+    finger_travel=0.04,
+    margin=0.05,
+    overshoot=0.01,
+    speed_share=0.25,
+    acceleration_share=0.25,
 )
 PIXELS = np.arange(2 * 3 * 3, dtype=np.uint8).reshape(2, 3, 3)  # (H, W, 3)
 
@@ -58,7 +63,7 @@ def test_padded_rows_and_other_encodings_are_understood() -> None:
         ({"data": b"abc"}, "3 bytes, 2 rows of 9 are 18"),
         ({"step": 8}, "step is 8 bytes, 3 pixels of rgb8 need 9"),
         ({"step": 10}, "2 rows of 10"),
-        ({"encoding": "x" * 10**6}, "encoding is 'x{79}…', understood"),
+        ({"encoding": "x" * 10**6}, "encoding is 'x{79}…', expected"),
         ({"height": 0, "data": b""}, "3 by 0 pixels"),
         ({"height": 2**31, "width": 2**31, "step": 2**33}, "18 bytes"),
     ],

@@ -8,20 +8,20 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from test_episodes import CONFIG, EPISODES, add, content
-from toy import SPEC, make_environment, make_expert
+from exporting import exporter
+from toy import ARM_SPEC, make_environment, make_expert
+from toy_episodes import CONFIG, EPISODES, add, content
 
-from vla.cluster import Local
-from vla.collect import collect
 from vla.data.episodes import EpisodeStore
-from vla.data.gather import Gather
-from vla.data.inspection import examine, put_together, require_whole
-from vla.data.packed import Packed
+from vla.data.verification import derive_store, require_whole, verify_store
+from vla.data.window_batches import WindowBatcher
+from vla.parallel.pool import LocalCluster
+from vla.rollouts.collect import collect
 
 
-def packed(tmp_path: Path, **settings: Any) -> EpisodeStore:
+def packed(tmp_path: Path, *overrides: str) -> EpisodeStore:
     """The episodes of `test_episodes`, packed by this process."""
-    return EpisodeStore(Packed(tmp_path / "packed", workers=1, **settings).export(add(tmp_path / "store", EPISODES)))
+    return EpisodeStore(exporter("packed", tmp_path / "packed", *overrides).export(add(tmp_path / "store", EPISODES)))
 
 
 def same(one: Any, other: Any) -> bool:
@@ -36,7 +36,9 @@ def test_without_loss_batches_and_episodes_are_the_same_bit_for_bit(tmp_path: Pa
     assert small.tried == whole.tried and small.config == whole.config
     rows = np.arange(len(whole.rows("action")))
     for history in (1, 6):
-        assert same(Gather(small, history, 2, depth=True)(rows), Gather(whole, history, 2, depth=True)(rows))
+        assert same(
+            WindowBatcher(small, history, 2, depth=True)(rows), WindowBatcher(whole, history, 2, depth=True)(rows)
+        )
     for entry in whole.episodes:
         expected = whole.read(entry)
         for field, values in small.read(entry).items():
@@ -45,39 +47,39 @@ def test_without_loss_batches_and_episodes_are_the_same_bit_for_bit(tmp_path: Pa
 
 
 def test_jpeg_is_close_and_depth_exact(tmp_path: Path) -> None:
-    small, whole = packed(tmp_path, codec="jpeg", quality=95), EpisodeStore(tmp_path / "store")
-    require_whole(examine(small))
+    small, whole = packed(tmp_path, "export.codec=jpeg", "export.quality=95"), EpisodeStore(tmp_path / "store")
+    require_whole(verify_store(small))
     for entry, source in zip(small.episodes, whole.episodes, strict=True):
         rows, expected = small.read(entry), whole.read(source)
         np.testing.assert_array_equal(rows["depth_wrist"], expected["depth_wrist"])
         difference = rows["rgb_front"].astype(float) - expected["rgb_front"]
         assert 0 < np.abs(difference).mean() < 12
-    with pytest.raises(ValueError, match="holds JPEG, which gets no better"):
-        Packed(tmp_path / "again").export(small)
-    put_together([small], tmp_path / "merged")
+    with pytest.raises(ValueError, match="holds JPEG, which must not"):
+        exporter("packed", tmp_path / "again").export(small)
+    derive_store([small], tmp_path / "merged")
     assert EpisodeStore(tmp_path / "merged").derived  # it is not what one collection would have made
 
 
 def test_a_packed_store_is_looked_into_and_put_together_like_any(tmp_path: Path) -> None:
     small = packed(tmp_path)
-    found = examine(small)
+    found = verify_store(small)
     require_whole(found)
     assert found.sizes["rgb_front"] == (small.folder / "rgb_front.pack").stat().st_size
-    put_together([small], tmp_path / "unpacked")
+    derive_store([small], tmp_path / "unpacked")
     assert content(tmp_path / "unpacked") == content(tmp_path / "store")
 
 
 def test_it_does_not_grow(tmp_path: Path) -> None:
     packed(tmp_path)
-    store = EpisodeStore.create_or_open(tmp_path / "packed", SPEC, CONFIG)
-    assert collect(store, make_environment, make_expert, 4, Local(1), seed=0).added == 0
+    store = EpisodeStore.create_or_open(tmp_path / "packed", ARM_SPEC, CONFIG)
+    assert collect(store, make_environment, make_expert, 4, LocalCluster(1), seed=0).added == 0
     with pytest.raises(ValueError, match=r"packed is packed and does not grow: set collect\.episodes=4"):
-        collect(store, make_environment, make_expert, 5, Local(1), seed=0)
+        collect(store, make_environment, make_expert, 5, LocalCluster(1), seed=0)
 
 
 @pytest.mark.parametrize("codec", ["lossless", "jpeg"])
 def test_damage_is_named_by_seed(tmp_path: Path, codec: str) -> None:
-    store = packed(tmp_path, codec=codec)
+    store = packed(tmp_path, f"export.codec={codec}")
     path = store.folder / "rgb_wrist.pack"
     data = bytearray(path.read_bytes())
     begins = int(np.fromfile(store.folder / "rgb_wrist.offsets", "<u8")[store.tried[1].start])
@@ -86,29 +88,29 @@ def test_damage_is_named_by_seed(tmp_path: Path, codec: str) -> None:
     with pytest.raises(ValueError, match=r"the rows of seed 1 in .*packed were changed on disk"):
         store.read(store.tried[1])
     with pytest.raises(ValueError, match=r"the rows of seed 1 in .*packed were changed on disk"):
-        Gather(store, 1, 1)(np.array([0, store.tried[1].start]))
-    assert store.read(store.tried[0]) and examine(store).damaged == {"rows changed or lost": [1]}
+        WindowBatcher(store, 1, 1)(np.array([0, store.tried[1].start]))
+    assert store.read(store.tried[0]) and verify_store(store).damaged == {"rows changed or lost": [1]}
     path.write_bytes(data[:-1])
     with pytest.raises(ValueError, match=r"rgb_wrist\.pack is shorter than its index says"):
         EpisodeStore(store.folder)
-    assert examine(EpisodeStore(store.folder, damaged=True)).damaged == {"rows changed or lost": [1, 4]}
+    assert verify_store(EpisodeStore(store.folder, damaged=True)).damaged == {"rows changed or lost": [1, 4]}
 
 
 def test_only_what_the_store_shows_is_packed_once(tmp_path: Path) -> None:
     whole = add(tmp_path / "store", EPISODES)
     shown = EpisodeStore(whole.folder, episodes=2)
-    folder = Packed(tmp_path / "few", workers=1).export(shown)
+    folder = exporter("packed", tmp_path / "few").export(shown)
     assert EpisodeStore(folder).tried == whole.tried[:2]
     before = {path.name: path.stat().st_mtime_ns for path in folder.iterdir()}
-    Packed(tmp_path / "few", workers=1).export(shown)
+    exporter("packed", tmp_path / "few").export(shown)
     assert {path.name: path.stat().st_mtime_ns for path in folder.iterdir()} == before
-    with pytest.raises(ValueError, match=r"few holds something else than these episodes: choose another export"):
-        Packed(tmp_path / "few", workers=1).export(whole)
+    with pytest.raises(ValueError, match=r"few has content other than these episodes: choose another export"):
+        exporter("packed", tmp_path / "few").export(whole)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["few", "store"]
 
 
 def test_stores_that_cannot_be_packed_are_refused(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="holds no episodes yet"):
-        Packed(tmp_path / "new").export(add(tmp_path / "empty", []))
-    with pytest.raises(ValueError, match=r"export\.quality is from 1 to 95, not 100"):
-        Packed(tmp_path / "new", quality=100)
+        exporter("packed", tmp_path / "new").export(add(tmp_path / "empty", []))
+    with pytest.raises(ValueError, match=r"export\.quality must be int, at least 1, at most 95, got 100"):
+        exporter("packed", tmp_path / "new", "export.quality=100")

@@ -7,74 +7,30 @@ import io
 import json
 import logging
 import re
-from dataclasses import replace
 from html import unescape
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from finished_runs import CONFIG, CURVES, SAID, a_report, a_run
 from PIL import Image
 from toy_recordable import ThinkingAgent, make_environment
 
-from vla.curves import draw_run, draw_runs
-from vla.evaluate import FIRST_SEED, Report, Result, keep_recordings
-from vla.film import MOMENTS, read_strips
-from vla.intervals import pooled_interval
-from vla.page import optional, write_comparison, write_page
-from vla.record import RerunRecorder
-from vla.report import plot_report, write_report
-from vla.results import differences, note_training, read_run, write_config
-from vla.rollout import rollout
-from vla.samples import draw_samples
-from vla.sweep import tabulate
+from vla.config.differences import differences
+from vla.reports.evaluation import plot_report, write_report
+from vla.reports.filmstrips import MOMENTS, read_filmstrips
+from vla.reports.first_batch import draw_samples
+from vla.reports.html import optional, write_comparison, write_page
+from vla.reports.sweep import tabulate
+from vla.reports.training_curves import draw_run, draw_runs
+from vla.rollouts.evaluate import FIRST_SEED, Report, Result, keep_recordings
+from vla.rollouts.recorder import RerunRecorder
+from vla.rollouts.rollout import rollout
+from vla.rollouts.statistics import pooled_interval
+from vla.runs.folder import read_run, save_config, save_training
 
-SAID = "lift the <script>alert('red')</script> block"
 SEEN = [FIRST_SEED, FIRST_SEED + 1, FIRST_SEED + 3]  # the toy world fails at the last
-CONFIG = {
-    "task": {"blocks": 3},
-    "model": {"_target_": "vla.models.bc.BC", "width": 16},
-    "trainer": {"max_steps": 400},
-    "output": "there",
-}
-CURVES = """\
-epoch,step,lr,train/loss,train/truth_loss,val/error_dx_mm,val/error_dy_mm,val/error_gripper,val/loss
-0,9,0.001,4.5,1.0,,,,
-0,19,0.0005,1.5,0.5,,,,
-0,19,,,,3.0,4.0,0.1,2.5
-0,29,0.0001,0.1,0.1,,,,
-0,39,,,,1.0,2.0,0.05,0.125
-"""
-
-
-def a_report(*outcomes: str) -> Report:
-    return Report(tuple(Result(FIRST_SEED + n, outcome, SAID, 20, {"n": n}) for n, outcome in enumerate(outcomes)))
-
-
-def a_run(
-    folder: Path,
-    outcomes: str = "ssss",
-    width: int = 16,
-    curves: str = CURVES,
-    light: float | None = None,
-    dark: str = "",
-) -> Path:
-    """A folder as an evaluation leaves it, without pictures and recordings; s is a success, d a drop, and in the dark
-    all are drops unless told."""
-    folder.mkdir(parents=True)
-    report, in_the_dark = (
-        a_report(*({"s": "success", "d": "dropped"}[outcome] for outcome in all_of_them))
-        for all_of_them in (outcomes, dark or "d" * len(outcomes))
-    )
-    if light is not None:
-        report = Report(tuple(replace(result, draws={**result.draws, "light": light}) for result in report.results))
-    told = {"evaluate": {"conditions": {"dark": {"light": light}}}}
-    config = {**CONFIG, **told, "model": {"_target_": "vla.models.bc.BC", "width": width}}
-    size = {"parameters": 1_500_000, "latency_ms": 2.5}
-    write_report(report, folder / "report.json", f"{folder}/checkpoints/last.ckpt", config, size, {"dark": in_the_dark})
-    (folder / "metrics.csv").write_text(curves)
-    write_config(folder, config, [{"key": "model.width", "here": width, "default": 32}])
-    return folder
 
 
 def text(page: Path) -> str:
@@ -92,7 +48,7 @@ def pictures(page: Path) -> list[Image.Image]:
 def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run that left everything, of the toy world."""
     folder = a_run(tmp_path_factory.mktemp("runs") / "whole", "sssdsd")
-    note_training(folder, 1_500_000, 40, 400.0, "done")
+    save_training(folder, 1_500_000, 40, 400.0, "done")
     environment, recorder = make_environment(), RerunRecorder(folder / "recordings")
     episodes = [rollout(environment, ThinkingAgent(), seed, recorder) for seed in SEEN]
     report = Report(tuple(Result(each.seed, each.outcome, each.instruction) for each in episodes))
@@ -128,7 +84,7 @@ def test_the_page_tells_everything_that_lies_in_the_folder(whole: Path) -> None:
 
 
 def test_failures_come_first_and_every_camera_is_shown_at_eight_moments(whole: Path) -> None:
-    strips = read_strips(whole / "rollouts.rrd", failures=2, successes=1)
+    strips = read_filmstrips(whole / "rollouts.rrd", failures=2, successes=1)
     assert [(strip.seed, strip.outcome) for strip in strips] == [(SEEN[2], "timeout"), (SEEN[0], "success")]
     failure = strips[0]
     assert (failure.length, failure.steps[0], failure.steps[-1], len(failure.steps)) == (40, 0, 39, MOMENTS)
@@ -140,7 +96,7 @@ def test_failures_come_first_and_every_camera_is_shown_at_eight_moments(whole: P
     page = (whole / "report.html").read_text()
     assert page.index(">timeout<") < page.index(f"seed {SEEN[0]}")
     assert 'href="rollouts.rrd"' in page
-    shown_twice = [len(strip.steps) for strip in read_strips(whole / "rollouts.rrd", 9, 9)]
+    shown_twice = [len(strip.steps) for strip in read_filmstrips(whole / "rollouts.rrd", 9, 9)]
     assert len(pictures(whole / "report.html")) == 2 * sum(shown_twice) + 2  # and two plots
 
 
@@ -156,20 +112,20 @@ def test_a_page_refers_to_nothing_outside_and_runs_nothing(whole: Path, tmp_path
 
 def test_words_of_others_are_escaped(tmp_path: Path) -> None:
     folder = a_run(tmp_path / "run")
-    write_config(folder, CONFIG, [{"key": "task.said", "here": SAID, "default": "<b>"}])
-    note_training(folder, 1, 1, 1.0, "the loss is <nan>")
+    save_config(folder, CONFIG, [{"key": "task.said", "here": SAID, "default": "<b>"}])
+    save_training(folder, 1, 1, 1.0, "the loss is <nan>")
     page = write_page(folder)
     assert SAID in text(page) and "Training failed: the loss is <nan>" in text(page)
     assert "<script" not in page.read_text() and "<nan>" not in page.read_text()
 
 
-def test_goals_have_their_own_rates_where_there_are_several(tmp_path: Path) -> None:
-    goals = ["Push", "Lift", "Lift"]
-    results = [Result(FIRST_SEED + n, "success", SAID, 20, {"named": {"goal": goal}}) for n, goal in enumerate(goals)]
+def test_tasks_have_their_own_rates_where_there_are_several(tmp_path: Path) -> None:
+    tasks = ["push", "lift", "lift"]
+    results = [Result(FIRST_SEED + n, "success", SAID, 20, task=task) for n, task in enumerate(tasks)]
     for name, played in {"one": results[1:], "two": results}.items():
         (tmp_path / name).mkdir()
         write_report(Report(tuple(played)), tmp_path / name / "report.json", None, CONFIG)
-    assert "goal success [%] episodes Lift 100.0 (34.2-100.0) 2/2 Push 100.0 (20.7-100.0) 1/1" in text(
+    assert "task success [%] episodes lift 100.0 (34.2-100.0) 2/2 push 100.0 (20.7-100.0) 1/1" in text(
         write_page(tmp_path / "two")
     )
     assert "Lift" not in text(write_page(tmp_path / "one"))
@@ -181,7 +137,7 @@ def test_what_is_missing_is_left_out(tmp_path: Path) -> None:
     for section in ("success", "Training", "Rollouts", "conditions", "differs"):
         assert section not in told
     (tmp_path / "metrics.csv").write_text(CURVES)
-    note_training(tmp_path, 1, 39, 3.0, "interrupted")
+    save_training(tmp_path, 1, 39, 3.0, "interrupted")
     told = text(write_page(tmp_path))
     assert "Training was interrupted after 39 steps" in told and "Rollouts" not in told
 
@@ -259,7 +215,7 @@ def test_runs_with_nothing_to_compare_are_refused(tmp_path: Path) -> None:
     for folders, says in (
         ([], r"report\.runs=\[RUN,RUN\]"),
         ([run, tmp_path / "empty"], "empty is no run: it has neither report.json nor metrics.csv"),
-        ([run, tmp_path / "run/../run"], "names a folder twice"),
+        ([run, tmp_path / "run/../run"], "contains a folder twice"),
     ):
         with pytest.raises(ValueError, match=says):
             write_comparison(folders, tmp_path / "new")
@@ -277,7 +233,7 @@ def test_a_page_that_cannot_be_made_is_a_warning(tmp_path: Path, caplog: pytest.
     (tmp_path / "report.json").write_text("{")
     with caplog.at_level(logging.WARNING), optional(tmp_path / "report.html"):
         write_page(tmp_path)
-    assert "report.html could not be made" in caplog.text and "report.json is damaged" in caplog.text
+    assert "could not write" in caplog.text and "report.html" in caplog.text and "report.json is damaged" in caplog.text
     assert [file.name for file in tmp_path.iterdir()] == ["report.json"]
 
 

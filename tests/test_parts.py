@@ -13,31 +13,32 @@ import numpy as np
 import pytest
 import timm
 import torch
-from fake_batch import make_batch
+from composing import composed
+from defaults import defaults_of
+from fake_batch import as_policy, make_batch
 from safetensors.torch import save_file
-from test_conf import composed
 from tiny_encoder import write_encoder
 from torch.utils.data import DataLoader
 
 from vla import jobs
-from vla.averaging import Averaging
-from vla.parts import make_policy, unfitted_learner
+from vla.config.experiment import Experiment, make_policy
 from vla.policy import Policy, read_checkpoint
+from vla.training.ema import EMA
 
 if TYPE_CHECKING:
-    from vla.tasks.tabletop import Tabletop
+    from vla.tasks.tabletop.environment import Tabletop
 
-CPU = {"_target_": "vla.policy.Policy", "device": "cpu"}
+CPU = {"_target_": "vla.policy.Policy", **defaults_of("policy/default", device="cpu")}
 SMALL = ("task.image_size=[32,32]", "trainer=cpu", "recorder=none")
 
 
 def trained(tmp_path: Path, tabletop: Tabletop, *overrides: str) -> tuple[Policy, Path]:
     """A policy after two steps on noise, and the checkpoint of it."""
-    learner = unfitted_learner(composed(*SMALL, *overrides), tabletop.spec)
+    learner = Experiment.of(composed(*SMALL, *overrides)).learner(tabletop.spec)
     trainer = lightning.Trainer(
         accelerator="cpu",
         max_steps=2,
-        callbacks=[Averaging(0.9)],
+        callbacks=[EMA(0.9)],
         logger=False,
         enable_checkpointing=False,
         enable_progress_bar=False,
@@ -47,7 +48,7 @@ def trained(tmp_path: Path, tabletop: Tabletop, *overrides: str) -> tuple[Policy
     trainer.fit(learner, DataLoader(batches, batch_size=None))
     trainer.save_checkpoint(tmp_path / "last.ckpt")
     read_checkpoint(tmp_path / "last.ckpt").restore(learner.model)  # the averages
-    return Policy("cpu", model=learner.model, spec=tabletop.spec), tmp_path / "last.ckpt"
+    return as_policy(learner.model, tabletop.spec, device="cpu"), tmp_path / "last.ckpt"
 
 
 def test_a_checkpoint_brings_the_encoder_of_its_instructions(tmp_path: Path, tabletop: Tabletop) -> None:
@@ -103,7 +104,7 @@ def test_what_cannot_be_built_is_named_before_anything_is_collected(
 ) -> None:
     overrides = [f"collect.folder={tmp_path}/store", f"output={tmp_path}/run", "job=train", *prepare(tmp_path)]
     with pytest.raises(ValueError, match=message):
-        jobs.run(composed(*SMALL, *overrides))
+        jobs.run(Experiment.of(composed(*SMALL, *overrides)))
     assert not (tmp_path / "store").exists()
 
 
@@ -121,8 +122,10 @@ def test_training_starts_from_a_policy_whose_demonstrations_held_another_truth(
     tmp_path: Path, tabletop: Tabletop
 ) -> None:
     _, checkpoint = trained(tmp_path, tabletop)
-    without = replace(tabletop.spec, truth=(), chain=())  # as recordings of a real robot are
-    model = unfitted_learner(composed(*SMALL, f"pretrained={checkpoint}"), without).model
+    assert tabletop.spec.robot is not None
+    robot = replace(tabletop.spec.robot, chain=())
+    without = replace(tabletop.spec, truth=(), robot=robot)  # as recordings of a real robot are
+    model = Experiment.of(composed(*SMALL)).learner(without, checkpoint).model
     own, saved = model.state_dict(), read_checkpoint(checkpoint).state
     assert {name for name in saved if name not in own} == {name for name in saved if name.startswith("truth_")} != set()
     assert all(torch.equal(saved[name], value) for name, value in own.items())

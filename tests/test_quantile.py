@@ -8,7 +8,7 @@ import torch
 from fake_batch import Motions
 from toy import SPEC
 
-from vla.models.quantile import Quantile
+from vla.models.tokenizers.quantile import Quantile
 
 MOTIONS = Motions()
 

@@ -1,69 +1,105 @@
-"""Every command of the README and of the pages beside it runs, on small numbers."""
+"""Every command of the README and of the pages beside it: all compose and pass the check, the first ones run."""
 
 from __future__ import annotations
 
+import importlib
 import json
 import math
-import os
 import re
 import shlex
-import signal
-import subprocess
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import abuse
 import pytest
 import torch
-from test_cluster import address_in, dask
-from test_run import SMALL, vla
-from tiny_encoder import write_encoder
+from command_line import SMALL, here
+from command_line import vla as vla_process
+from composing import CONF, composed
+from documented import README, ROOT, commands
+from omegaconf import OmegaConf
 
-from vla.processor import has_bfloat16
-from vla.workers import cores
+from vla import jobs
+from vla.config.check import check
+from vla.deploy import ros
+from vla.jobs.bfloat16 import has_bfloat16
+from vla.parallel.processes import cores
 
-DOCS = Path(__file__).parents[1] / "docs"
-README = (Path(__file__).parents[1] / "README.md").read_text(encoding="utf-8")
-TEXTS = "\n".join([README, *(page.read_text(encoding="utf-8") for page in sorted(DOCS.glob("*.md")))])
-COMMANDS = sorted(set(re.findall(r"^python -m vla\.run ?(.*?)(?: +#.*)?$", TEXTS, re.MULTILINE)))
-QUICK = (*SMALL, "collect.episodes=8", "evaluate.episodes=1", "task.time_limit=5", "recorder=none")
-os.environ["ROS_DOMAIN_ID"] = str(18 + 20 * (int(os.environ.get("PYTEST_XDIST_WORKER", "gw0")[2:]) % 5))
-
-
-@pytest.fixture(scope="module")
-def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with a small RUN and its checkpoint, FILE, an interrupted run, a LeRobot DATASET and an ENCODER."""
-    folder = tmp_path_factory.mktemp("readme")
-    write_encoder(folder / "encoder")
-    vla(folder, *QUICK, "job=train", "output=run")
-    half = torch.load(folder / "run/checkpoints/last.ckpt", weights_only=True) | {"finished": False}
-    (folder / "outputs/runs/half/checkpoints").mkdir(parents=True)
-    torch.save(half, folder / "outputs/runs/half/checkpoints/last.ckpt")
-    vla(folder, *QUICK, "job=export", "export=lerobot", "export.folder=dataset")
-    return folder
+COMMANDS = [command for command in commands("vla.run") if command != "--help"]  # which is for `test_run`
+TOOLS = [(tool, command) for tool in ("say", "watch", "view", "bag") for command in commands(f"vla.deploy.{tool}")]
+TOOLS.remove(("bag", "play"))  # which a sentence names without its argument
+FILE = "outputs/runs/half/checkpoints/last.ckpt"
+STANDS = {
+    "ENCODER": "encoder",
+    "FILE": FILE,
+    "HOST": "127.0.0.1",
+    "RUN,RUN": "run",
+    "resume=RUN": "resume=outputs/runs/half",
+}
+FROM_A_RUN = [command for command in COMMANDS if re.search("checkpoint=|pretrained=|resume=", command)]
 
 
-def serves(folder: Path, *arguments: str) -> None:
-    """Start what runs until it is interrupted, and interrupt it once it says something."""
-    command = [sys.executable, "-u", "-m", "vla.run", *arguments]
-    process = subprocess.Popen(command, cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
-    assert process.stdout is not None and process.stdout.readline()
-    process.send_signal(signal.SIGINT)
-    assert process.wait(30) == 0, process.stdout.read()
+def test_all_the_commands_are_found() -> None:
+    assert len(COMMANDS) > 50 and len(TOOLS) >= 10 and commands("tests/abuse.py") == ["FOLDER"]
 
 
 @pytest.fixture(scope="module")
-def address(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
-    """Where a cluster listens that the README's commands start, on a free port."""
-    file = tmp_path_factory.mktemp("cluster") / "scheduler.json"
-    scheduler, worker = re.findall(
-        r"^dask (.*)$", README.replace("HOST", "127.0.0.1").replace("HERE", "127.0.0.1"), re.M
-    )
-    with dask(*shlex.split(scheduler), "--port", "0", "--scheduler-file", str(file)):
-        address = address_in(file)
-        with dask(*shlex.split(worker.replace("tcp://127.0.0.1:8786", address))):
-            yield address
+def folder(home: Path) -> Path:
+    """A folder with a RUN and an interrupted one, with its checkpoint FILE."""
+    half = torch.load(home / "run/checkpoints/last.ckpt", weights_only=True) | {"finished": False}
+    (home / FILE).parent.mkdir(parents=True)
+    torch.save(half, home / FILE)
+    return home
+
+
+def arguments_of(command: str) -> list[str]:
+    """The arguments, with what stands for the names in capital letters."""
+    for name, path in STANDS.items():
+        command = command.replace(name, path)
+    return shlex.split(command)
+
+
+def cell(command: str, number: int) -> list[str]:
+    """The arguments of the first (0) or last (-1) cell of a sweep."""
+    swept = [argument for argument in arguments_of(command) if argument != "-m"]
+    if "-m" in command.split():
+        for name in [argument.partition("=")[2] for argument in swept if argument.startswith("experiment=")]:
+            params = OmegaConf.load(CONF / f"experiment/{name}.yaml").hydra.sweeper.params
+            swept += [f"{key}={values}" for key, values in params.items()]
+        pairs = [argument.partition("=")[::2] for argument in swept]
+        swept = [f"{key}={values.split(',')[number].strip()}" for key, values in pairs]
+    return swept
+
+
+@pytest.mark.parametrize("command", sorted({*COMMANDS} - {*FROM_A_RUN}))
+def test_the_command_composes_and_passes_the_check(command: str) -> None:
+    for number in (0, -1) if command.startswith("-m") else (0,):
+        check(composed(*cell(command, number)))
+
+
+@pytest.mark.parametrize("command", FROM_A_RUN)
+def test_the_command_goes_on_from_a_run(folder: Path, command: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It gets as far as its job."""
+    asked: list[Any] = []
+    monkeypatch.setattr(jobs, "run", asked.append)
+    here(folder, *arguments_of(command))
+    assert len(asked) == 1
+
+
+@pytest.mark.parametrize(("tool", "command"), TOOLS)
+def test_a_tool_for_the_robot_takes_the_arguments(tool: str, command: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """They run in `test_deploy`; here they get as far as the network."""
+    module = importlib.import_module(f"vla.deploy.{tool}")
+
+    def unplugged(*_: Any, **__: Any) -> None:
+        raise ValueError("no network")
+
+    monkeypatch.setattr(ros, "ros", unplugged)
+    monkeypatch.setattr(sys, "argv", [tool, *shlex.split(command)])
+    with pytest.raises(SystemExit) as ended:
+        module.main()
+    assert ended.value.code == "error: no network"
 
 
 def require_floors(measures: dict[str, dict[str, Any]]) -> None:
@@ -85,74 +121,43 @@ def require_floors(measures: dict[str, dict[str, Any]]) -> None:
         assert measures[f"train: {precision}: MFU"]["ratio"] <= 1
 
 
-def small(arguments: list[str]) -> list[str]:
-    """The small numbers for a command."""
-    said = set(arguments)
-    if "deploy=loop" in said:
-        return ["deploy.episodes=1", "task.time_limit=1", "benchmark.episodes=1"]
-    if said >= {"checkpoint=FILE", "job=train"} or said & {"checkpoint=last", "resume=true"}:
-        return ["trainer.max_steps=6"]
-    few = ["evaluate.episodes=1", "evaluate.workers=1"]
-    if "checkpoint=FILE" in said:
-        return few
-    few = [*QUICK, *few, "preview.episodes=1", "benchmark.episodes=1", "benchmark.batches=2", "benchmark.steps=2"]
-    few += ["benchmark.rounds=1", "benchmark.compile=[false]"]
-    if said & {"job=collect", "task.image_size=[128,128]"}:
-        few += ["collect.episodes=4"]
-    if "cluster=dask" in said:
-        few += ["collect.folder=remote"]
-    if "hydra/launcher=joblib" in said:  # its processes, which begin without the libraries, are for `test_run`
-        few += ["hydra.launcher.n_jobs=1"]
-    if "experiment=ablation" in said:
-        few += ["variant=no_transformer,no_history", "seed=0", "hydra.sweep.dir=ablation"]
-    if "experiment=recipe" in said:
-        few += ["variant=chunked"]
-    if "experiment=learning_curve" in said:
-        few += ["task/randomize=default", "collect.episodes=6,8", "hydra.sweep.dir=curve"]
-    if "model=rt1" in said:  # at full size a second per frame
-        few += ["model.history=1", "model.image_size=32", "model.image.name=efficientnet_b0", "model.layers=1"]
-        few += ["data.batch_size=2", "data.validation_windows=1", "trainer.max_steps=1", "trainer.limit_val_batches=0"]
-    if arguments == ["job=benchmark"]:
-        few += ["output=speed"]
-    return few
+def test_the_benchmark_measures_every_stage_against_its_floor(folder: Path) -> None:
+    few = ("benchmark.episodes=1", "benchmark.batches=2", "benchmark.steps=2", "benchmark.rounds=1")
+    run(folder, "job=benchmark", *SMALL, *few, "benchmark.compile=[false]", "output=speed")
+    require_floors(json.loads((folder / "speed/benchmark.json").read_text()))
 
 
-def require_results(home: Path, arguments: list[str], printed: str) -> None:
-    """What some commands leave, and print, beside doing without an error."""
-    if "--help" in arguments:
-        assert "pick_place" in printed
-    if arguments == ["job=benchmark"]:
-        require_floors(json.loads((home / "speed/benchmark.json").read_text()))
-    if "learner.lr=1e-3,3e-4" in arguments:
-        assert printed.count("8 episodes, 0 of them new") == 4
-        assert printed.count("\ntrained 4 steps") == 4
-    if "experiment=ablation" in arguments:
-        lines = (home / "ablation/sweep.md").read_text().splitlines()
-        assert "| variant | seen [%] | instructions [%] | distractors [%] | backgrounds [%] |" in lines[0]
-        assert [line.split()[1] for line in lines[2:]] == ["no_transformer", "no_history"]
-    if "experiment=learning_curve" in arguments:
-        lines = (home / "curve/sweep.md").read_text().splitlines()
-        assert "| collect.episodes | seen [%] | wide [%] |" in lines[0] and len(lines) == 4
+def test_an_ablation_ends_in_a_table(folder: Path) -> None:
+    few = (*SMALL, "variant=no_transformer,no_history", "seed=0", "evaluate.episodes=1", "task.time_limit=5")
+    run(folder, "-m experiment=ablation", *few, "hydra.sweep.dir=ablation")
+    lines = (folder / "ablation/sweep.md").read_text().splitlines()
+    assert "| variant | seen [%] | instructions [%] | distractors [%] | backgrounds [%] |" in lines[0]
+    assert [line.split()[1] for line in lines[2:]] == ["no_transformer", "no_history"]
 
 
-@pytest.mark.parametrize("command", COMMANDS)
-def test_the_command_runs(home: Path, command: str, request: pytest.FixtureRequest) -> None:
-    arguments = shlex.split(command)
-    numbers = [] if arguments == ["--help"] else small(arguments)
-    folder = f"new{COMMANDS.index(command)}"
-    stands = {"DATASET": "dataset", "ENCODER": "encoder", "FILE": "run/checkpoints/last.ckpt", "RUN,RUN": "run"}
-    if "cluster=dask" in command:
-        stands["tcp://HOST:8786"] = request.getfixturevalue("address")
-    for name, path in {**stands, "DIR": folder}.items():
-        command = command.replace(name, path)
-    if "job=deploy" in arguments and "deploy=loop" not in arguments:
-        serves(home, *shlex.split(command))
-    else:
-        require_results(home, arguments, vla(home, *shlex.split(command), *numbers).stdout)
+def test_cells_run_as_jobs_of_a_queue(folder: Path) -> None:
+    few = ("collect.episodes=1", "cluster.workers=1", "task.image_size=[32,32]")
+    command = "-m hydra/launcher=local_queue job=collect task/goal=lift,push"
+    run(folder, command, *few, "hydra.sweep.dir=queue")
+    assert sorted(path.name for path in (folder / "queue").iterdir() if path.name.isdigit()) == ["0", "1"]
+
+
+def run(folder: Path, command: str, *arguments: str) -> str:
+    """What a documented command prints, in a process of its own and with small numbers."""
+    assert command in COMMANDS
+    return vla_process(folder, *arguments_of(command), *arguments).stdout
+
+
+def test_the_attacks_in_bulk_are_ready(main_job: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Two trials of those that docs/safety.md counts."""
+    (tmp_path / "run").symlink_to(main_job / "run")
+    (store,) = (main_job / "outputs/episodes").glob("*/store.json")
+    (tmp_path / "store").symlink_to(store.parent)
+    abuse.main(str(tmp_path), "headers:2")
+    assert capsys.readouterr().out == "| headers | 2 | 2 |\n"
 
 
 def test_the_two_commands_are_what_ci_runs() -> None:
-    root = Path(__file__).parents[1]
     assert "make run" in README and "make test" in README
-    assert "make test" in (root / ".ci/run").read_text()
-    assert re.search(r"^run:.*\n\t\.venv/bin/python -m vla\.run$", (root / "Makefile").read_text(), re.MULTILINE)
+    assert "make test" in (ROOT / ".ci/run").read_text()
+    assert re.search(r"^run:.*\n\t\.venv/bin/python -m vla\.run$", (ROOT / "Makefile").read_text(), re.MULTILINE)

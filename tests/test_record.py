@@ -13,8 +13,8 @@ from PIL import Image
 from rerun.chunk import RrdReader
 from toy_recordable import ThinkingAgent, make_environment
 
-from vla.record import VIEWER, RerunRecorder, merge, recording_name
-from vla.rollout import rollout
+from vla.rollouts.recorder import VIEWER, RerunRecorder, merge, recording_name
+from vla.rollouts.rollout import rollout
 from vla.spec import Episode
 
 SUCCESS, FAILURE = 1_000_000, 1_000_003  # the toy world fails at seeds that are three more than a multiple of five
@@ -47,11 +47,19 @@ def test_every_step_is_recorded(recorded: tuple[Path, dict[int, Episode]]) -> No
     episode = episodes[SUCCESS]
     steps = len(episode.observations)
     entities = columns(folder / f"{recording_name(SUCCESS, 'success')}.rrd")
-    per_step = ["robot/joints", "robot/gripper", "tokens", "action/m/executed", "action/m/clean", "action/1/executed"]
+    per_step = [
+        "state/rad",
+        "state/rad.s",
+        "state/m",
+        "tokens",
+        "action/m/executed",
+        "action/m/clean",
+        "action/1/executed",
+    ]
     per_step += [f"camera/{name}/{kind}" for name in ("front", "wrist") for kind in ("rgb", "depth")]
     for path in per_step:
         assert entities[f"/{path}"]["step"] == list(range(steps)), path
-    seconds = [time.total_seconds() for time in entities["/robot/joints"]["time"]]
+    seconds = [time.total_seconds() for time in entities["/state/rad"]["time"]]
     np.testing.assert_allclose(seconds, np.arange(steps) / 10)
     executed = np.array(entities["/action/m/executed"]["Scalars:scalars"])
     np.testing.assert_allclose(executed, episode.executed[:, :2], atol=1e-7)
@@ -104,7 +112,7 @@ def test_merged_episodes_stay_apart_and_failures_come_first(
         [joints] = [
             chunk
             for chunk in reader.stream(store=entry).to_chunks()
-            if chunk.entity_path == "/robot/joints" and not chunk.is_static
+            if chunk.entity_path == "/state/rad" and not chunk.is_static
         ]
         assert joints.num_rows == len(episodes[seed].observations)
     assert list(tmp_path.iterdir()) == [target]

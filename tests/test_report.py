@@ -8,13 +8,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from figures import bars, texts
+from matplotlib.figure import Figure
 from PIL import Image
 from rich.console import Console
 from toy_recordable import make_environment
 
-from vla.evaluate import FIRST_SEED, Report, Result
-from vla.intervals import wilson_interval
-from vla.report import contact_sheet, draws_table, plot_report, write_report
+from vla.reports.evaluation import contact_sheet, draws_table, plot_report, write_report
+from vla.reports.factors import factors
+from vla.rollouts.evaluate import FIRST_SEED, Report, Result
+from vla.rollouts.statistics import wilson_interval
 
 
 def a_report(episodes: int = 60) -> Report:
@@ -44,11 +47,16 @@ def test_report_json_tells_everything(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("report", [a_report(), a_report(1), a_report(0)], ids=["sixty", "one", "none"])
-def test_plots_are_drawn_whatever_happened(report: Report, tmp_path: Path) -> None:
+def test_plots_are_drawn_whatever_happened(report: Report, tmp_path: Path, figures: list[Figure]) -> None:
     plot_report(report, tmp_path / "report.png")
-    page = Image.open(tmp_path / "report.png")
-    assert page.width > 1000
-    assert len(np.unique(np.array(page))) > 10
+    outcomes, lengths, *others = figures[0].axes
+    assert bars(outcomes) == [*report.taxonomy.values()][::-1]
+    played = [result for result in report.results if result.outcome != "error"]
+    # Stacked: those of the failures stand on those of the successes.
+    tops = [bar.get_y() + bar.get_height() for bar in lengths.patches]  # type: ignore[attr-defined]
+    assert max(tops) > 0 if played else not any(tops)
+    assert all(axes.has_data() and texts(axes) & {*factors(played)} for axes in others)
+    assert Image.open(tmp_path / "report.png").width > 1000
 
 
 def test_contact_sheet_shows_the_observations() -> None:

@@ -9,11 +9,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from test_page import CONFIG, a_run
+from finished_runs import CONFIG, a_run
 
-from vla.page import write_comparison
-from vla.results import note_choice, note_training, read_run, run_of
-from vla.run_files import Change, Training
+from vla.reports.html import write_comparison
+from vla.runs.files import Change, Training
+from vla.runs.folder import read_run, run_of, save_choice, save_training
 
 BOMB = "a: &a [x, x]\nb: &b [*a, *a]\nc: [*b, *b]\n"
 
@@ -25,11 +25,11 @@ def changed(**values: Any) -> Callable[[str], str]:
 
 def test_what_was_written_is_read(tmp_path: Path) -> None:
     folder = a_run(tmp_path / "run", "sd")
-    note_training(folder, 12, 40, 3.04, "done", 2.0)
-    note_choice(folder, "best.ckpt")
+    save_training(folder, 12, 40, 3.04, "done", 2.0)
+    save_choice(folder, "best.ckpt")
     run = run_of(folder / "checkpoints/best.ckpt")
     assert run.training == Training(12, 40, 3.0, "done", 2.0, "best.ckpt")
-    assert (run.chosen, run.model, run.goal, run.budget(1.0)) == ("best.ckpt", "BC", "", 6.0)
+    assert (run.chosen, run.model, run.tasks, run.wall_time(1.0)) == ("best.ckpt", "BC", [], 6.0)
     assert run.changes == [Change("model.width", 16, 32)] and run.config["task"] == CONFIG["task"]
     assert run.report is not None and run.report.successes == 1
     assert [result.outcome for result in run.reports["seen"].results] == ["success", "dropped"]
@@ -45,7 +45,7 @@ def test_what_was_written_is_read(tmp_path: Path) -> None:
         ("report.json", "[" * 10**6, r"report\.json is damaged .*recursion limit"),
         ("report.json", changed(success=2), r"success: Input should be less than or equal to 1"),
         ("report.json", changed(success=float("nan")), r"success: Input should be a finite number"),
-        ("report.json", changed(seeds=[1]), r"per_episode is about other episodes than seeds"),
+        ("report.json", changed(seeds=[1]), r"per_episode has other episodes than seeds"),
         ("report.json", changed(per_episode=[{"seed": "x", "outcome": 1}]), r"per_episode\[0\]\.seed: "),
         ("report.json", changed(conditions={"dark": 3}), r"conditions\.dark: "),
         ("config.yaml", "- 1", r"config\.yaml is damaged or of another kind: Input should be an object"),
@@ -70,13 +70,13 @@ def test_a_file_of_another_kind_is_refused_by_name_with_a_way_out(
     file: str, content: str | Callable[[str], str], says: str, tmp_path: Path
 ) -> None:
     folder = a_run(tmp_path / "run")
-    note_training(folder, 12, 40, 3.0, "done")
+    save_training(folder, 12, 40, 3.0, "done")
     path = folder / file
     path.write_text(content if isinstance(content, str) else content(path.read_text()))
     with pytest.raises(ValueError, match=says) as refused:
         write_comparison([folder], tmp_path / "new")
     told = str(refused.value)
-    assert str(path) in told and told.endswith("; remove the file to do without it, or repeat the run")
+    assert str(path) in told and told.endswith("; remove the file, or repeat the run")
     assert "\n" not in told and len(told) < 1000 and not (tmp_path / "new").exists()
 
 

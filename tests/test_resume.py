@@ -1,85 +1,91 @@
-"""Which run is gone on with, and how."""
+"""Which run is resumed, and how."""
 
 from __future__ import annotations
 
 import os
 import time
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
 import toy
-from test_conf import composed
+from composing import composed
 
-from vla.evaluate import Report, Result
-from vla.parts import plain
-from vla.report import write_report
-from vla.results import note_choice, note_training
-from vla.resume import go_on, reported, taken_up
+from vla.config.adopt import resume
+from vla.config.experiment import plain
+from vla.reports.evaluation import write_report
+from vla.rollouts.evaluate import Report, Result
+from vla.runs.folder import save_choice, save_training
+from vla.runs.resume import FOUND, TrainingProgress, cached_success, interrupted_run, training_progress
 
 
-def test_an_evaluation_that_was_interrupted_takes_what_the_training_had_chosen(tmp_path: Path) -> None:
-    run = tmp_path / "runs/one"
+def leave(run: Path, config: dict[str, Any], finished: bool, chosen: str = "") -> None:
+    """What a training of `max_steps` leaves; one that was killed at its end may have chosen nothing."""
     (run / "checkpoints").mkdir(parents=True)
-    now = composed("checkpoint=last", f"output={tmp_path}/runs/now")
-    content = {"config": plain(now), "spec": toy.SPEC.to_dict(), "state_dict": {}, "finished": True}
-    torch.save(content, run / "checkpoints/last.ckpt")
-    note_training(run, 1, 1, 1.0, "done")
-    note_choice(run, "best.ckpt")
-    resumed = go_on(now, ["checkpoint=last"])
-    assert (resumed.checkpoint, resumed.output) == (str(run / "checkpoints/best.ckpt"), str(run))
-    assert not resumed.resume
-    another = go_on(now, ["checkpoint=last", "trainer=cpu", "trainer.gradient_clip_val=2"])
-    assert another.trainer.max_steps == now.trainer.max_steps
-    now.job = "train"
-    assert go_on(now, ["checkpoint=last", "job=train"]).checkpoint == str(run / "checkpoints/last.ckpt")
+    steps = config["trainer"]["max_steps"] if finished else 1
+    content = {"config": config, "spec": toy.SPEC.to_dict(), "state_dict": {}, "finished": finished}
+    torch.save({**content, "global_step": steps}, run / "checkpoints/last.ckpt")
+    if chosen:
+        save_training(run, 1, 1, 1.0, "done")
+        save_choice(run, chosen)
 
 
-def test_a_training_that_was_killed_between_its_last_save_and_its_end_is_gone_on_with(tmp_path: Path) -> None:
-    (tmp_path / "one/checkpoints").mkdir(parents=True)
-    now = composed("job=train", "checkpoint=last", f"output={tmp_path}/now")
-    content = {"config": plain(now), "spec": toy.SPEC.to_dict(), "state_dict": {}, "finished": True}
-    torch.save(content, tmp_path / "one/checkpoints/last.ckpt")
-    resumed = go_on(now, ["job=train", "checkpoint=last"])
-    assert resumed.output == str(tmp_path / "one") and resumed.resume
-    note_training(tmp_path / "one", 1, 1, 1.0, "done")
-    note_choice(tmp_path / "one", "last.ckpt")
+@pytest.fixture(autouse=True)
+def nothing_found(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(FOUND, "")
+
+
+def test_the_newest_run_that_did_not_end_is_found(tmp_path: Path) -> None:
+    evaluated, trained = plain(composed()), plain(composed("job=train"))
+    leave(tmp_path / "whole", trained, finished=True, chosen="last.ckpt")
     with pytest.raises(ValueError, match="none of the 1 trainings"):
-        go_on(now, ["job=train", "checkpoint=last"])
+        interrupted_run(tmp_path)
+    leave(tmp_path / "unreported", evaluated, finished=True, chosen="last.ckpt")
+    assert interrupted_run(tmp_path) == tmp_path / "unreported"
+    leave(tmp_path / "unchosen", trained, finished=True)
+    assert interrupted_run(tmp_path) == tmp_path / "unchosen"
+    leave(tmp_path / "unfinished", trained, finished=False)
+    assert interrupted_run(tmp_path) == tmp_path / "unfinished"
+
+
+def test_a_run_is_resumed_with_its_config_in_its_folder(tmp_path: Path) -> None:
+    leave(tmp_path / "one", plain(composed("job=train", "model.width=17", "collect.episodes=3")), finished=False)
+    now = composed(f"output={tmp_path}/now", "trainer=cpu", "trainer.gradient_clip_val=2", "evaluate.episodes=7")
+    said = ["trainer=cpu", "trainer.gradient_clip_val=2", "evaluate.episodes=7"]
+    resumed = resume(now, tmp_path / "one", said)
+    assert (resumed.job, resumed.output) == ("train", str(tmp_path / "one"))
+    assert (resumed.model.width, resumed.collect.episodes, resumed.evaluate.episodes) == (17, 3, 7)
+    assert (resumed.trainer.accelerator, resumed.trainer.gradient_clip_val) == ("cpu", 2)
+    with pytest.raises(ValueError, match="omit checkpoint="):
+        resume(composed(f"output={tmp_path}/now", "checkpoint=x.ckpt"), tmp_path / "one", [])
+    with pytest.raises(ValueError, match="nothing was trained in that folder"):
+        resume(now, tmp_path / "other", [])
+    with pytest.raises(ValueError, match="experiment=few cannot be combined"):
+        resume(now, tmp_path / "one", ["experiment=few"])
 
 
 @pytest.mark.parametrize(("finished", "chosen"), [(False, ""), (True, ""), (True, "best.ckpt")])
-def test_a_training_is_taken_up_where_its_folder_has_it(tmp_path: Path, finished: bool, chosen: str) -> None:
-    asked = composed(f"output={tmp_path}")
-    assert taken_up(asked) is asked  # there is none yet
-    (tmp_path / "checkpoints").mkdir()
-    content = {"config": plain(asked), "spec": toy.SPEC.to_dict(), "state_dict": {}, "finished": finished}
-    torch.save(content, tmp_path / "checkpoints/last.ckpt")
-    if chosen:  # which a process that was killed may not have come to
-        note_training(tmp_path, 1, 1, 1.0, "done")
-        note_choice(tmp_path, chosen)
-    asked.evaluate.workers = 1  # not what a training follows from
-    found = taken_up(asked)
-    assert found is not None
-    assert (found.checkpoint, found.resume) == (str(tmp_path / "checkpoints" / (chosen or "last.ckpt")), not chosen)
-    asked.job = "train"
-    assert (taken_up(asked) is None) == bool(chosen)
-    elsewhere = composed(f"output={tmp_path}", "checkpoint=other/last.ckpt", "resume=true", "model.width=17")
-    with pytest.raises(ValueError, match="differs in model"):
-        taken_up(elsewhere)
+def test_a_run_continues_in_its_folder(tmp_path: Path, finished: bool, chosen: str) -> None:
+    config = plain(composed())
+    assert training_progress(tmp_path, config) == TrainingProgress()
+    leave(tmp_path, config, finished, chosen)
+    last = tmp_path / "checkpoints/last.ckpt"
+    expected = TrainingProgress(chosen=last.with_name(chosen)) if chosen else TrainingProgress(resume_from=last)
+    assert training_progress(tmp_path, plain(composed("cluster.workers=1"))) == expected
+    assert training_progress(tmp_path, plain(composed("trainer.max_steps=1"))) == expected
+    assert training_progress(tmp_path, plain(composed("trainer.max_steps=99999"))) == TrainingProgress(resume_from=last)
     with pytest.raises(ValueError, match=r"differs in model\.width: choose another output=DIR"):
-        taken_up(composed(f"output={tmp_path}", "model.width=17"))
+        training_progress(tmp_path, plain(composed("model.width=17")))
 
 
 def test_a_report_of_weights_that_were_trained_for_longer_since_is_not_this_one(tmp_path: Path) -> None:
-    asked = composed(f"output={tmp_path}")
+    asked = plain(composed())
     checkpoint = tmp_path / "last.ckpt"
     checkpoint.touch()
     report = Report((Result(1_000_000, "success"), Result(1_000_001, "dropped")))
-    write_report(report, tmp_path / "report.json", str(checkpoint), plain(asked))
-    assert reported(asked, checkpoint) == 0.5
-    asked.evaluate.episodes += 1
-    assert reported(asked, checkpoint) is None
-    asked.evaluate.episodes -= 1
+    write_report(report, tmp_path / "report.json", str(checkpoint), asked)
+    assert cached_success(tmp_path, asked, checkpoint) == 0.5
+    assert cached_success(tmp_path, plain(composed("evaluate.episodes=9")), checkpoint) is None
     os.utime(checkpoint, (time.time() + 10, time.time() + 10))
-    assert reported(asked, checkpoint) is None
+    assert cached_success(tmp_path, asked, checkpoint) is None

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from toy import ToyEnvironment, ToyExpert
 
-from vla.rollout import replay, rollout
+from vla.rollouts.rollout import replay, rollout
 
 EPISODE = rollout(ToyEnvironment(), ToyExpert(), 1)
 STEPS = len(EPISODE.executed)

@@ -8,13 +8,14 @@ from typing import Any
 
 import pytest
 import torch
-from fake_batch import make_batch, make_rt1, with_text
+from defaults import defaults_of
+from fake_batch import TINY_TEXT, make_batch, make_rt1, with_text
 from toy import SPEC
 
-from vla.models.action_tokenizer import RT1 as RT1Tokenizer
 from vla.models.rt1 import RT1, attention_mask
-from vla.models.text import NGrams
-from vla.models.trunks import FilmEfficientNet
+from vla.models.text.ngrams import NGrams
+from vla.models.tokenizers.tokenizer import RT1 as RT1Tokenizer
+from vla.models.vision.timm_encoders import FilmEfficientNet
 
 
 def test_the_mask_is_causal_and_hides_actions_from_actions() -> None:
@@ -80,7 +81,7 @@ def test_fewer_frames_than_the_history_give_what_the_first_slots_of_a_full_windo
 def test_frames_are_encoded_independently() -> None:
     model = make_rt1(history=3, proprioception=True).eval()
     batch = with_text(model, make_batch(3))
-    newest = {name: batch[name][:, 2:] for name in ("proprio", "present")}
+    newest = {name: batch[name][:, 2:] for name in ("state", "present")}
     rgb = {camera: images[:, 2:] for camera, images in batch["rgb"].items()}
     alone = model.encode({**newest, "rgb": rgb, "text": batch["text"]})
     assert torch.allclose(alone[:, 0], model.encode(batch)[:, 2], atol=1e-5)
@@ -101,8 +102,14 @@ def test_every_frame_of_the_window_is_learned_from() -> None:
 def test_the_tokens_of_the_cameras_stand_side_by_side(cameras: tuple[str, ...]) -> None:
     image = partial(FilmEfficientNet, "efficientnet_b0", pretrained=False, channels=16)
     spec = replace(SPEC, cameras=cameras)
-    tokenizer = RT1Tokenizer(spec=spec)
-    model = RT1(image, NGrams, 2, 64, width=32, text_width=8, layers=1, heads=1, spec=spec, tokenizer=tokenizer).eval()
+    tokenizer = RT1Tokenizer(spec=spec, **defaults_of("tokenizer/rt1"))
+    model = RT1(
+        image=image,
+        text=TINY_TEXT,
+        spec=spec,
+        tokenizer=tokenizer,
+        **defaults_of("model/rt1", history=2, image_size=64, width=32, text_width=8, layers=1, heads=1),
+    ).eval()
     batch = with_text(model, make_batch(2, spec=spec))
     assert model.encode(batch).shape == (4, 2, 8 * len(cameras), 32)
     assert model(batch)["logits"].shape == (4, 2, 1, 3, 256)
@@ -122,8 +129,14 @@ def test_the_paper_network_has_its_size_and_its_81_positions() -> None:
         low=(-1.0,) * 11,
         high=(1.0,) * 11,
     )
-    image = partial(FilmEfficientNet, pretrained=False)
-    model: Any = RT1(image, NGrams, spec=spec, tokenizer=RT1Tokenizer(spec=spec)).eval()
+    image = partial(FilmEfficientNet, **defaults_of("model/image/film_efficientnet", pretrained=False))
+    model: Any = RT1(
+        image=image,
+        text=partial(NGrams, **defaults_of("model/text/ngrams")),
+        spec=spec,
+        tokenizer=RT1Tokenizer(spec=spec, **defaults_of("tokenizer/rt1")),
+        **defaults_of("model/rt1"),
+    ).eval()
     language = parameters_of(model.text)  # a frozen encoder in the paper
     transformer = [model.image_tokens, model.positions, model.layers, model.head]
     parts = parameters_of(model.image), parameters_of(model.token_learners), sum(map(parameters_of, transformer))

@@ -7,15 +7,15 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from test_episodes import EPISODES, add, content
-from test_inspection import MORE, change, flip
+from toy_episodes import EPISODES, MORE, add, change, content, flip
 
 from vla.data.episodes import EpisodeStore
-from vla.stores import look_into, replay_into
+from vla.jobs.inspect import inspect_store, replay_episode
 
 
 def inspect(folder: Path, **arguments: Any) -> None:
-    look_into(**{"folder": str(folder), "stores": None, "where": None, "repair": False, "into": None, **arguments})
+    defaults: dict[str, Any] = {"stores": None, "where": None, "repair": False, "into": None}
+    inspect_store(str(folder), **defaults | arguments)
 
 
 def stored(folder: Path) -> dict[str, bytes]:
@@ -30,7 +30,7 @@ def test_what_is_damaged_is_described_and_repaired_beside_it(
     damaged = stored(store.folder)
     with pytest.raises(ValueError, match=r"store has 1 damaged episodes \(seeds 0: rows changed or lost\)"):
         inspect(store.folder)
-    assert "3 whole ones, of 5 seeds tried" in capsys.readouterr().out
+    assert "3 intact, of 5 seeds tried" in capsys.readouterr().out
     inspect(store.folder, repair=True)
     assert [entry.seed for entry in EpisodeStore(tmp_path / "store-repaired").episodes] == [1, 2, 4]
     assert stored(store.folder) == damaged and (tmp_path / "store-repaired/card.md").exists()
@@ -47,7 +47,7 @@ def test_what_is_whole_is_not_repaired(tmp_path: Path, caplog: pytest.LogCapture
 
 def test_no_stores_are_none(tmp_path: Path) -> None:
     add(tmp_path / "store", EPISODES)
-    with pytest.raises(ValueError, match=r"inspect\.stores=\[\] names no store"):
+    with pytest.raises(ValueError, match=r"inspect\.stores=\[\] is empty"):
         inspect(tmp_path / "store", stores=[], into=str(tmp_path / "new"))
     assert not (tmp_path / "new").exists()
 
@@ -60,7 +60,7 @@ def test_stores_are_merged(tmp_path: Path) -> None:
 
 def test_a_new_store_needs_a_folder(tmp_path: Path) -> None:
     for asked in ({"where": {"seed": 1}}, {"stores": ["a", "b"]}):
-        with pytest.raises(ValueError, match=r"say where, with inspect\.into=DIR"):
+        with pytest.raises(ValueError, match=r"give its folder, inspect\.into=DIR"):
             inspect(tmp_path, **asked)
 
 
@@ -68,5 +68,5 @@ def test_an_episode_without_a_task_has_no_scene(tmp_path: Path) -> None:
     store = EpisodeStore.create_or_open(tmp_path / "store", add(tmp_path / "other", []).spec, {})
     with store.writing():
         store.append(EPISODES[0])
-    with pytest.raises(ValueError, match="does not say in which task seed 0 was made"):
-        replay_into(tmp_path, store.folder, 0)
+    with pytest.raises(ValueError, match="does not contain the task of seed 0"):
+        replay_episode(tmp_path, store.folder, 0)

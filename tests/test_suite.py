@@ -6,11 +6,13 @@ import io
 from pathlib import Path
 
 import pytest
+from figures import points, spans, texts
+from matplotlib.figure import Figure
 from PIL import Image
 from rich.console import Console
 
-from vla.evaluate import FIRST_SEED, Report, Result
-from vla.suite import mcnemar, plot_suite, suite_table
+from vla.reports.conditions import conditions_table, plot_conditions
+from vla.rollouts.evaluate import FIRST_SEED, Report, Result
 
 
 def a_report(outcomes: str) -> Report:
@@ -21,23 +23,28 @@ def a_report(outcomes: str) -> Report:
 
 def test_only_pairs_that_differ_count() -> None:
     # one lost, five won: 2 · (1 + 6) / 2^6
-    assert mcnemar(a_report("1000001111"), a_report("0111111111")) == pytest.approx(14 / 64)
-    assert mcnemar(a_report("1100"), a_report("1100")) == 1.0
-    assert mcnemar(a_report("1e00"), a_report("1000")) == 1.0
+    assert a_report("1000001111").p_value(a_report("0111111111")) == pytest.approx(14 / 64)
+    assert a_report("1100").p_value(a_report("1100")) == 1.0
+    assert a_report("1e00").p_value(a_report("1000")) == 1.0
     # ten lost, none won: 2 / 2^10
-    assert mcnemar(a_report("1" * 10), a_report("0" * 10)) == pytest.approx(2 / 1024)
+    assert a_report("1" * 10).p_value(a_report("0" * 10)) == pytest.approx(2 / 1024)
 
 
 def test_reports_on_different_seeds_are_not_compared() -> None:
     with pytest.raises(ValueError, match="same seeds"):
-        mcnemar(a_report("11"), a_report("1"))
+        a_report("11").p_value(a_report("1"))
 
 
-def test_the_table_and_the_picture_show_every_condition(tmp_path: Path) -> None:
-    reports = {"seen": a_report("1" * 20), "light_hard": a_report("1" * 10 + "0" * 10)}
+def test_the_table_and_the_picture_show_every_condition(tmp_path: Path, figures: list[Figure]) -> None:
+    hard, wide = (a_report("1" * count + "0" * (20 - count)) for count in (10, 15))
+    reports = {"seen": a_report("1" * 20), "light_hard": hard, "light_wide": wide}
     console = Console(file=io.StringIO(), width=100)
-    console.print(suite_table(reports))
+    console.print(conditions_table(reports))
     told = console.file.getvalue()  # type: ignore[attr-defined]
     assert "light_hard" in told and "50.0" in told and "29.9-70.1" in told and "0.002" in told
-    plot_suite(reports, tmp_path / "suite.png")
+    plot_conditions(reports, tmp_path / "suite.png")
+    (axes,) = figures[0].axes
+    assert points(axes) == [(1.0, 1.0), (0.75, 0.13), (0.5, -0.13)]
+    assert spans(axes) == [(0.839, 1.0), (0.531, 0.888), (0.299, 0.701)]
+    assert {"seen", "light", "wide", "hard", "success, 95 % CI"} <= texts(axes)
     assert Image.open(tmp_path / "suite.png").width > 500

@@ -7,13 +7,14 @@ import json
 from pathlib import Path
 
 import pytest
-from PIL import Image
+from figures import curves, panels, points, spans, texts
+from matplotlib.figure import Figure
 
-from vla.evaluate import Report, Result
-from vla.intervals import pooled_interval
-from vla.report import write_report
-from vla.sweep import tabulate
-from vla.sweep_plot import pareto, validated
+from vla.reports.evaluation import write_report
+from vla.reports.sweep import tabulate
+from vla.reports.sweep_plot import pareto, validated
+from vla.rollouts.evaluate import Report, Result
+from vla.rollouts.statistics import pooled_interval
 
 
 def cell(sweep: Path, number: int, overrides: list[str], successes: int, latency: float = 2.0, dark: int = 1) -> None:
@@ -28,7 +29,7 @@ def cell(sweep: Path, number: int, overrides: list[str], successes: int, latency
     write_report(plain, folder / "report.json", None, {}, size, {"dark": other})
 
 
-def test_seeds_are_put_together_and_the_rest_is_told_apart(tmp_path: Path) -> None:
+def test_seeds_are_put_together_and_the_rest_is_told_apart(tmp_path: Path, figures: list[Figure]) -> None:
     for number, (model, seed, successes) in enumerate([("bc", 0, 9), ("bc", 1, 7), ("rt1", 0, 10), ("rt1", 1, 8)]):
         cell(tmp_path, number, ["trainer.max_steps=5", f"model={model}", f"seed={seed}"], successes, 9.0 - 7 * seed)
     bc, rt1 = tabulate(tmp_path)
@@ -47,7 +48,10 @@ def test_seeds_are_put_together_and_the_rest_is_told_apart(tmp_path: Path) -> No
         ("rt1", "dark"),
     ]
     assert float(rows[0]["success"]) == pytest.approx(0.8) and rows[0]["cells"] == "2"
-    assert Image.open(tmp_path / "sweep.png").width > 500
+    (seen,), (dark,) = (panels(figures[0], title) for title in ("seen", "dark"))
+    assert points(seen) == [(0.8, 0.0), (0.9, 1.0)] and points(dark) == [(0.2, 0.0), (0.2, 1.0)]
+    assert spans(seen)[0] == (round(low / 100, 3), round(high / 100, 3))
+    assert {"bc, 2.00 M", "rt1, 2.00 M"} <= texts(seen)
     assert not list(tmp_path.glob(".*"))
 
 
@@ -82,39 +86,45 @@ def test_what_is_slower_and_no_better_is_off_the_front(tmp_path: Path) -> None:
     assert [row.name for row in pareto(rows, "dark")] == ["a"]
 
 
-def test_success_is_drawn_over_the_time_of_an_action_only_where_that_differs(tmp_path: Path) -> None:
+def test_success_is_drawn_over_the_time_of_an_action_only_where_that_differs(
+    tmp_path: Path, figures: list[Figure]
+) -> None:
     for number, latency in enumerate((1.0, 1.9)):
         cell(tmp_path, number, [f"model={number}"], 7, latency)
     tabulate(tmp_path)
-    without = Image.open(tmp_path / "sweep.png").height
     (tmp_path / "1/report.json").unlink()
-    cell(tmp_path, 2, ["model=2"], 7, latency=2.1)
+    cell(tmp_path, 2, ["model=2"], 8, latency=2.1)
     tabulate(tmp_path)
-    assert Image.open(tmp_path / "sweep.png").height > 2 * without
+    without, both = (panels(figure, "seen") for figure in figures)
+    assert [axes.get_xlabel() for axes in without] == ["success, 95 % CI"]
+    rates, costs = both
+    assert points(rates) == [(0.7, 0.0), (0.8, 1.0)] and points(costs) == [(1.0, 0.7), (2.1, 0.8)]
+    assert costs.get_xlabel() == "time per action [ms]" and len(costs.collections) > 2
 
 
-def test_over_the_number_of_demonstrations_success_is_a_curve_under_each_condition(tmp_path: Path) -> None:
-    for number, (level, count) in enumerate([("default", 1000), ("default", 50), ("wide", 50), ("wide", 1000)]):
-        cell(tmp_path, number, [f"task/randomize={level}", f"collect.episodes={count}"], 5)
+def test_over_the_number_of_demonstrations_success_is_a_curve_under_each_condition(
+    tmp_path: Path, figures: list[Figure]
+) -> None:
+    numbers = [("default", 1000, 9), ("default", 50, 8), ("wide", 50, 3), ("wide", 1000, 4)]
+    for number, (level, count, successes) in enumerate(numbers):
+        cell(tmp_path, number, [f"task/randomize={level}", f"collect.episodes={count}"], successes)
     tabulate(tmp_path)
-    wide = Image.open(tmp_path / "sweep.png").width
-    cell(tmp_path, 4, ["task/randomize=wide", "collect.episodes=50", "trainer.max_steps=1"], 5)
-    (tmp_path / "one").mkdir()
-    cell(tmp_path / "one", 0, ["collect.episodes=50"], 5)
-    cell(tmp_path / "one", 1, ["collect.episodes=70"], 5)
-    tabulate(tmp_path / "one")
-    assert wide == Image.open(tmp_path / "one/sweep.png").width  # two conditions, side by side
+    (seen,), (dark,) = (panels(figures[0], title) for title in ("seen", "dark"))
+    assert points(seen) == [(50, 0.8), (1000, 0.9), (50, 0.3), (1000, 0.4)]
+    assert points(dark) == [(50, 0.2), (1000, 0.2)] * 2
+    assert {"default", "wide"} <= texts(seen) and {"50", "1000", "demonstrations"} <= texts(dark)
 
 
-def test_success_over_training_is_that_of_all_seeds_in_validation(tmp_path: Path) -> None:
+def test_success_over_training_is_that_of_all_seeds_in_validation(tmp_path: Path, figures: list[Figure]) -> None:
     for number, (count, seed) in enumerate([(50, 0), (50, 1), (100, 0), (100, 1)]):
         cell(tmp_path, number, [f"collect.episodes={count}", f"seed={seed}"], 5)
     few, many = tabulate(tmp_path)
-    without = Image.open(tmp_path / "sweep.png").height
-    assert validated(few) == {}
+    assert validated(few) == {} and panels(figures[0], "in validation") == []
     for seed, share in enumerate((0.25, 0.75)):
         (tmp_path / f"{seed}/config.yaml").write_text("validate: {episodes: 20}")
         (tmp_path / f"{seed}/metrics.csv").write_text(f"step,val/success\n699,{share - 0.25}\n1399,{share}\n")
     assert validated(few) == {700: (10, 40), 1400: (20, 40)} and validated(many) == {}
     tabulate(tmp_path)
-    assert Image.open(tmp_path / "sweep.png").height == 2 * without  # a row of its own
+    (training,) = panels(figures[1], "in validation")
+    assert curves(training) == {"50": [(700, 0.25), (1400, 0.5)], "100": []}
+    assert "demonstrations" in texts(training) and len(panels(figures[1], "seen")) == 1

@@ -9,7 +9,7 @@ import pytest
 from conftest import make_tabletop
 
 if TYPE_CHECKING:
-    from vla.tasks.tabletop import Tabletop
+    from vla.tasks.tabletop.environment import Tabletop
 
 
 def test_observations_are_what_the_spec_says(tabletop: Tabletop) -> None:
@@ -18,7 +18,8 @@ def test_observations_are_what_the_spec_says(tabletop: Tabletop) -> None:
     for camera in spec.cameras:
         assert observation.rgb[camera].shape == (*spec.image_size, 3) and observation.rgb[camera].dtype == np.uint8
         assert observation.depth[camera].shape == spec.image_size and observation.depth[camera].dtype == np.uint16
-    assert observation.joints.shape == observation.velocities.shape == (7,)
+    assert tabletop.task == "pick_place" and tabletop.milestones == frozenset()
+    assert observation.state.shape == (15,) == (len(spec.state),) and observation.state.dtype == np.float32
     assert observation.truth is not None
     assert {name: observation.truth[name].size for name, _ in spec.truth} == dict(spec.truth)
 
@@ -28,7 +29,7 @@ def test_the_same_seed_and_actions_give_the_same_episode_bit_for_bit(tabletop: T
 
     def play(environment: Tabletop) -> list[Any]:
         seen = [environment.reset(11), *(environment.step(action) for action in actions)]
-        return [(item.joints.tobytes(), item.rgb["front"].tobytes(), item.depth["wrist"].tobytes()) for item in seen]
+        return [(item.state.tobytes(), item.rgb["front"].tobytes(), item.depth["wrist"].tobytes()) for item in seen]
 
     first = play(tabletop)
     tabletop.reset(12)  # another episode in between leaves nothing behind
@@ -41,22 +42,22 @@ def test_the_same_seed_and_actions_give_the_same_episode_bit_for_bit(tabletop: T
 
 def test_depth_is_the_distance_along_the_optical_axis(tabletop: Tabletop) -> None:
     """The table, seen through the middle of the image, lies where the camera's geometry puts it."""
-    environment = make_tabletop("randomize=none")
+    environment = make_tabletop("task/randomize=none")
     environment.reset(0)
-    bound = environment.task.bound
+    compiled = environment.dm_env.task.compiled
     # Look at bare table, far from everything.
     position, spot = np.array([0.9, -0.6, 0.5]), np.array([0.7, -0.6, 0.0])
-    from vla.tasks.scene import look_at
+    from vla.tasks.tabletop.scene import look_at
 
-    camera = bound.cameras["front"]
-    bound.model.cam_pos[camera] = position
+    camera = compiled.cameras["front"]
+    compiled.model.cam_pos[camera] = position
     quaternion = np.empty(4)
     import mujoco
 
     mujoco.mju_mat2Quat(quaternion, look_at(position, spot, (0, 0, 1)).ravel())
-    bound.model.cam_quat[camera] = quaternion
-    mujoco.mj_forward(bound.model, bound.data)
-    depth = environment._observe().depth["front"]
+    compiled.model.cam_quat[camera] = quaternion
+    mujoco.mj_forward(compiled.model, compiled.data)
+    depth = environment.look().depth["front"]
     height, width = depth.shape
     middle = depth[height // 2 - 1 : height // 2 + 1, width // 2 - 1 : width // 2 + 1].mean()
     assert middle == pytest.approx(1000 * np.linalg.norm(position - spot), abs=3)
@@ -68,13 +69,13 @@ def test_blocks_rest_and_the_arm_holds_still(tabletop: Tabletop) -> None:
     with tabletop.blind():
         for seed in range(10):
             tabletop.reset(seed)
-            bound = tabletop.task.bound
-            start = bound.block_centres()
-            joints = bound.data.qpos[bound.joints].copy()
+            compiled = tabletop.dm_env.task.compiled
+            start = compiled.block_centres()
+            joints = compiled.data.qpos[compiled.joints].copy()
             for _ in range(10):
                 tabletop.step(np.array([0, 0, 0, 0, 0, 0, 1.0]))
-            assert np.abs(bound.block_centres() - start).max() < 1e-3
-            assert np.abs(bound.data.qpos[bound.joints] - joints).max() < 1e-3
+            assert np.abs(compiled.block_centres() - start).max() < 1e-3
+            assert np.abs(compiled.data.qpos[compiled.joints] - joints).max() < 1e-3
 
 
 def test_the_arm_follows_what_is_commanded(tabletop: Tabletop) -> None:
@@ -99,19 +100,19 @@ def test_an_episode_without_success_ends_at_the_time_limit_and_says_why(tabletop
         tabletop.step(np.zeros(7))
 
 
-def test_it_is_a_dm_env_environment() -> None:
-    environment = make_tabletop()
-    spec = environment.dm_env.action_spec()
-    timestep = environment.dm_env.reset()
-    assert timestep.first()
-    timestep = environment.dm_env.step(np.clip(np.zeros(7), spec.minimum, spec.maximum))
-    assert timestep.reward == 0.0
-    environment.close()
+def test_a_seed_is_for_one_reset_and_composer_draws_the_others(tabletop: Tabletop) -> None:
+    tabletop.reset(3)
+    places = [tabletop.draws["placement"]["blocks"]]
+    for _ in range(2):
+        assert tabletop.dm_env.reset().first()
+        assert tabletop.dm_env.step(np.zeros(7)).reward == 0.0
+        places.append(tabletop.dm_env.task.draws["placement"]["blocks"])
+    assert places[0] != places[1] != places[2] != places[0]
 
 
 def test_an_unknown_camera_is_named() -> None:
     with pytest.raises(Exception, match="'front', 'wrist'"):
-        make_tabletop("cameras=[side]")
+        make_tabletop("task.cameras=[side]")
 
 
 def test_shapes_and_poses_describe_the_scene(tabletop: Tabletop) -> None:
@@ -124,13 +125,13 @@ def test_shapes_and_poses_describe_the_scene(tabletop: Tabletop) -> None:
 
 
 def test_the_robot_can_be_drawn_with_all_its_faces(tabletop: Tabletop) -> None:
-    full = make_tabletop("meshes=full")
+    full = make_tabletop("task.meshes=full")
     faces = [sum(len(shape.faces) for shape in env.shapes() if shape.faces is not None) for env in (tabletop, full)]
     assert faces[0] < 5_000 and faces[1] > 100_000
-    np.testing.assert_array_equal(full.reset(0).joints, tabletop.reset(0).joints)
+    np.testing.assert_array_equal(full.reset(0).state, tabletop.reset(0).state)
     full.close()
 
 
 def test_more_blocks_than_colours_are_refused() -> None:
-    with pytest.raises(Exception, match=r"task\.blocks is from 2 to 6"):
-        make_tabletop("blocks=7")
+    with pytest.raises(Exception, match=r"task\.blocks must be from 2 to 6"):
+        make_tabletop("task.blocks=7")

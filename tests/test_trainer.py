@@ -14,17 +14,18 @@ import lightning
 import pytest
 import torch
 import toy
+from defaults import defaults_of
 from fake_batch import make_act, make_batch, make_bc, make_denoising, make_rt1
-from lightning import Callback
-from omegaconf import DictConfig, OmegaConf
-from test_learner import fit, make_learner
-from test_windows import windows
+from omegaconf import OmegaConf
+from reading import windows
+from resuming import STEPS, STOP, VALIDATED, config, same, train
+from small_training import fit, make_learner
 
 from vla.models.diffusion import Diffusion
 from vla.models.learner import Learner
 from vla.models.model import Model
-from vla.trainer import Interruption, enough_memory, keep_metrics, make_trainer
-from vla.validation import ClosedLoop
+from vla.training.closed_loop import ClosedLoop
+from vla.training.trainer import GracefulStop, explain_memory_errors, make_trainer
 
 MODELS: dict[str, Callable[[], Model]] = {
     "bc": lambda: make_bc(shift=(64, 64)),
@@ -32,67 +33,6 @@ MODELS: dict[str, Callable[[], Model]] = {
     "act, which draws": make_act,
     "diffusion, which draws": lambda: make_denoising(Diffusion),
 }
-STEPS, STOP = 11, 6
-VALIDATED = 4  # every so many steps
-
-
-def config(**trainer: Any) -> DictConfig:
-    defaults = {
-        "accelerator": "cpu",
-        "max_steps": STEPS,
-        "max_epochs": -1,
-        "val_check_interval": VALIDATED,
-        "check_val_every_n_epoch": None,
-        "num_sanity_val_steps": 0,
-        "log_every_n_steps": 2,
-        "gradient_clip_val": 1.0,
-        "enable_model_summary": False,
-    }
-    csv_logger = {"_target_": "lightning.pytorch.loggers.CSVLogger", "name": "", "version": ""}
-    return OmegaConf.create(
-        {
-            "seed": 3,
-            "learner": {"ema": 0.9},
-            "logger": {"csv": csv_logger},
-            "trainer": {"_target_": "lightning.Trainer", **defaults, **trainer},
-        }
-    )
-
-
-class StopAfter(Callback):
-    """Interrupts a training, as a signal would, during the batch after which so many steps are done."""
-
-    def __init__(self, interruption: Interruption, steps: int) -> None:
-        self._interruption, self._steps = interruption, steps
-
-    def on_train_batch_start(self, trainer: lightning.Trainer, *_: Any) -> None:
-        self._interruption.asked = trainer.global_step + 1 >= self._steps
-
-
-def train(
-    model: Model,
-    store: Path,
-    output: Path,
-    stop: int | None = None,
-    checkpoint: Path | None = None,
-    killer: lightning.Callback | None = None,
-    **trainer: Any,
-) -> dict[str, Any]:
-    """What the checkpoint holds that a training leaves behind."""
-    lightning.seed_everything(0 if checkpoint is None else 1, verbose=False)  # what came before must not matter
-    interruption = Interruption(output / "checkpoints")
-    watching = [interruption, *([StopAfter(interruption, stop)] if stop else []), *([killer] if killer else [])]
-    made = make_trainer(config(**trainer), output / "checkpoints", *watching)
-    if checkpoint:
-        keep_metrics(made, checkpoint)
-    learner = Learner(warmup_steps=3, model=model, spec=toy.SPEC, config={})
-    data = windows(store, history=model.history, chunk=model.chunk)
-    made.fit(learner, datamodule=data, ckpt_path=checkpoint, weights_only=True)
-    path = output / "checkpoints/last.ckpt"
-    if not interruption.asked:
-        made.save_checkpoint(path)
-    content: dict[str, Any] = torch.load(path, weights_only=True)
-    return content
 
 
 def logged(output: Path) -> list[dict[str, str]]:
@@ -100,14 +40,6 @@ def logged(output: Path) -> list[dict[str, str]]:
     with (output / "metrics.csv").open(newline="") as file:
         rows = [{key: row[key] for key in sorted(row) if not key.startswith("pace/")} for row in csv.DictReader(file)]
     return [row for row in rows if any(value for key, value in row.items() if key not in ("step", "epoch"))]
-
-
-def same(one: Any, other: Any) -> bool:
-    if isinstance(one, dict):
-        return one.keys() == other.keys() and all(same(one[key], other[key]) for key in one)
-    if isinstance(one, (list, tuple)):
-        return len(one) == len(other) and all(map(same, one, other))
-    return torch.equal(one, other) if isinstance(one, torch.Tensor) else bool(one == other)
 
 
 @pytest.mark.parametrize("name", MODELS)
@@ -157,7 +89,7 @@ def test_what_ends_at_a_step_that_is_validated_does_not_lose_the_validation(
 
     train(fresh(), folder, tmp_path / "whole")
     if killed:
-        monkeypatch.setattr("vla.trainer.SAVE_EVERY", VALIDATED)
+        monkeypatch.setattr("vla.training.trainer.SAVE_EVERY", VALIDATED)
         with pytest.raises(RuntimeError, match="killed"):
             train(fresh(), folder, tmp_path / "half", killer=DieAt(VALIDATED + 1))
     else:
@@ -183,7 +115,7 @@ def test_gradients_that_are_gathered_over_batches_are_not_cut_in_half(folder: Pa
 
 def test_other_demonstrations_are_refused(folder: Path, tmp_path: Path) -> None:
     train(make_bc(), folder, tmp_path, stop=2)
-    learner = Learner(model=make_bc(), spec=toy.SPEC, config={})
+    learner = Learner(model=make_bc(), spec=toy.SPEC, config={}, **defaults_of("learner/default", lr=0.001))
     with pytest.raises(ValueError, match="was started with other demonstrations"):
         make_trainer(config(), None).fit(
             learner, datamodule=windows(folder, episodes=8), ckpt_path=tmp_path / "checkpoints/last.ckpt"
@@ -206,31 +138,31 @@ def test_want_of_memory_names_what_to_lower() -> None:
     batch["rgb"] = {name: image[:, :, :1, :1].expand(-1, -1, 10**8, 10**8, -1) for name, image in batch["rgb"].items()}
     sizes = OmegaConf.create({"data": {"batch_size": 4}, "model": {"history": 3, "image_size": None, "width": 32}})
     wanted = r"lower data\.batch_size \(now 4\), model\.history \(now 3\), model\.width"
-    with pytest.raises(ValueError, match=wanted), enough_memory(sizes):
+    with pytest.raises(ValueError, match=wanted), explain_memory_errors(sizes):
         fit(make_learner(make_rt1()), batch, 1)
 
 
 @pytest.mark.parametrize("error", [torch.OutOfMemoryError("CUDA out of memory"), MemoryError()])
 def test_memory_of_a_gpu_or_of_the_loader_is_named_alike(error: Exception) -> None:
     sizes = OmegaConf.create({"data": {"batch_size": 4}, "model": {}})
-    with pytest.raises(ValueError, match=r"trainer\.precision=bf16"), enough_memory(sizes):
+    with pytest.raises(ValueError, match=r"trainer\.precision=bf16"), explain_memory_errors(sizes):
         raise error
 
 
 def test_other_errors_stay_what_they_are() -> None:
-    with pytest.raises(RuntimeError, match="shapes"), enough_memory(OmegaConf.create({})):
+    with pytest.raises(RuntimeError, match="shapes"), explain_memory_errors(OmegaConf.create({})):
         raise RuntimeError("shapes differ")
 
 
 def test_the_second_signal_of_a_process_stops_at_once_and_leaves_the_checkpoint_before(tmp_path: Path) -> None:
-    interruption = Interruption(tmp_path)
-    with interruption.listening():
-        interruption.asked = True  # as another process was, which heard of it before this one
+    graceful_stop = GracefulStop(tmp_path)
+    with graceful_stop.handling_signals():
+        graceful_stop.requested = True  # as if requested by another process before
         os.kill(os.getpid(), signal.SIGTERM)
-        assert not interruption.stopped
+        assert not graceful_stop.stopped
         with pytest.raises(KeyboardInterrupt):
             os.kill(os.getpid(), signal.SIGTERM)
-    assert interruption.stopped
+    assert graceful_stop.stopped
 
 
 class Stumbling(toy.ToyExpert):
@@ -248,4 +180,4 @@ def test_an_episode_that_cannot_be_played_in_validation_costs_no_training(
     closed_loop = ClosedLoop(toy.make_environment, lambda model: Stumbling(), range(4), tmp_path / "run/checkpoints")
     train(make_bc(), folder, tmp_path / "run", killer=closed_loop)
     assert closed_loop.success == pytest.approx(0.5)  # seed 3 fails in this world
-    assert "seed 1 could not be played in validation: RuntimeError: the simulation diverged" in caplog.text
+    assert "validation: seed 1 could not be played: RuntimeError: the simulation diverged" in caplog.text

@@ -14,19 +14,18 @@ from zipfile import ZIP_DEFLATED, ZipFile
 import pytest
 import torch
 import toy
-from omegaconf import OmegaConf
-from test_conf import CONF, composed
-from test_run import vla
+from command_line import here
+from composing import CONF, composed
+from hostile import HANDLER, command, hostile, node
 
-from vla.annotations import LIBRARY, OWN, locate
-from vla.check import check
-from vla.parts import make_policy, plain
+from vla.config.adopt import adopt, finetune, resume
+from vla.config.annotations import LIBRARY, OWN, locate
+from vla.config.check import check
+from vla.config.experiment import make_policy, plain
 from vla.policy import read_checkpoint
-from vla.resume import adopt, go_on, start_from
 
 # Everything under these could be named once, and some of it acts when it is built.
 PREFIXES = ("torch", "lightning", "dm_control.composer.variation")
-HANDLER = "torch.distributed.elastic.multiprocessing.subprocess_handler.subprocess_handler.SubprocessHandler"
 
 
 def classes(package: str) -> Iterator[str]:
@@ -54,61 +53,6 @@ def test_the_library_classes_that_may_be_built_are_those_of_the_options() -> Non
     assert {name for name in named if not name.startswith(OWN)} == set(LIBRARY)
 
 
-def command(mark: Path) -> dict[str, Any]:
-    """A node that runs a command when it is built."""
-    arguments: dict[str, Any] = {
-        "args": ["-c", f"id > {mark}"],
-        "env": {},
-        "stdout": None,
-        "stderr": None,
-        "local_rank_id": 0,
-    }
-    return {"_target_": HANDLER, "entrypoint": "/bin/sh", **arguments, "numa_options": None}
-
-
-def node(target: str, **arguments: Any) -> dict[str, Any]:
-    return {"_target_": target, **arguments}
-
-
-def hostile(mark: Path) -> dict[str, tuple[str, Any]]:
-    """Attack → the key of a configuration, and what it holds; each of them once acted, mostly by leaving `mark`."""
-    created = "${oc.select:model.text,${oc.create:{_target_:%s}}}"
-    files = {"file_name": str(mark), "log_dir": str(mark), "f": str(mark), "name": str(mark), "filename": str(mark)}
-    return {
-        **{f"a command as {key}": (key, command(mark)) for key in ("model.image", "model.text", "task.goal")},
-        "a command as an axis": ("task.randomize.mass", command(mark)),
-        "a command as a plugin": ("trainer.plugins", [command(mark)]),
-        "a library": ("model.image", node("torch._inductor.codecache.DLLWrapper", lib_path=files["f"])),
-        "an allocator": (
-            "model.image",
-            node(
-                "torch.cuda.memory.CUDAPluggableAllocator",
-                path_to_so_file=str(mark),
-                alloc_fn_name="a",
-                free_fn_name="b",
-            ),
-        ),
-        "a file emptied": ("model.image", node("torch.serialization._open_file", name=str(mark), mode="w")),
-        "an archive": ("model.image", node("torch.package.PackageExporter", f=str(mark))),
-        "a folder": (
-            "model.image",
-            node("lightning.fabric.loggers.csv_logs._ExperimentWriter", log_dir=str(mark)),
-        ),
-        "an event file": ("model.image", node("torch.utils.tensorboard.SummaryWriter", log_dir=str(mark))),
-        "a process": ("model.image", node("torch._inductor.autotune_process.TuningProcess")),
-        "a pool": ("model.image", node("torch._inductor.compile_worker.subproc_pool.SubprocPool", nprocs=1)),
-        "a server": ("model.image", node("torch.distributed.debug._frontend.FrontendServer", port=0)),
-        "code behind a reference": (
-            "model.image",
-            created % f"torch._inductor.codecache.PyCodeCache.load,_args_:[\"open({str(mark)!r},'w')\"]",
-        ),
-        "a log behind a reference": ("model.image", created % f"logging.FileHandler,filename:{mark}"),
-        "an array behind a reference": ("model.image", created % f"numpy.savetxt,fname:{mark},X:[1]"),
-        "the environment": ("chosen.experiment", "${oc.env:PATH}"),
-        "the working folder": ("task.goal.language.phrasings", ["take {block} ${hydra:runtime.cwd}"]),
-    }
-
-
 ATTACKS = list(hostile(Path()))
 
 
@@ -133,11 +77,11 @@ def test_nothing_that_a_checkpoint_names_is_run(tmp_path: Path, attack: str, mon
     output = f"output={tmp_path}/runs/mine"  # beside it, as if it were an own run
     evaluated = composed(output, f"checkpoint={path}")
     started = composed(output, f"pretrained={path}")
-    resumed = composed(output, f"checkpoint={path}", "resume=true")
+    resumed = composed(f"output={path.parent.parent}")
     adopted = {
-        "evaluate": lambda: check(adopt(evaluated, read_checkpoint(path).config, [])),
-        "resume": lambda: check(go_on(resumed, [])),
-        "pretrained": lambda: check(start_from(started, [])),
+        "evaluate": lambda: check(adopt(evaluated, [])),
+        "resume": lambda: check(resume(resumed, path.parent.parent, [])),
+        "pretrained": lambda: check(finetune(started, [])),
         "policy": lambda: make_policy(plain(evaluated.policy), path),
     }
     untouched = {"a command as a plugin": {"evaluate", "pretrained", "policy"}}
@@ -152,11 +96,11 @@ def test_nothing_that_a_checkpoint_names_is_run(tmp_path: Path, attack: str, mon
 
 
 WAYS = {
-    "evaluate": ("checkpoint=theirs/checkpoints/last.ckpt", "evaluate.episodes=1", "recorder=none"),
-    "resume": ("checkpoint=theirs/checkpoints/last.ckpt", "resume=true", "job=train"),
-    "pretrained": ("pretrained=theirs/checkpoints/last.ckpt", "job=train"),
-    "export": ("checkpoint=theirs/checkpoints/last.ckpt", "job=export", "export=program", "export.folder=new"),
-    "deploy": ("checkpoint=theirs/checkpoints/last.ckpt", "job=deploy", "deploy=ros2"),
+    "evaluate": ("checkpoint=runs/theirs/checkpoints/last.ckpt", "evaluate.episodes=1", "recorder=none"),
+    "resume": ("resume=runs/theirs", "output=runs/mine", "job=train"),
+    "pretrained": ("pretrained=runs/theirs/checkpoints/last.ckpt", "job=train"),
+    "export": ("checkpoint=runs/theirs/checkpoints/last.ckpt", "job=export", "export=program", "export.folder=new"),
+    "deploy": ("checkpoint=runs/theirs/checkpoints/last.ckpt", "job=deploy", "deploy=ros2"),
     "inspect": ("job=inspect", "inspect.folder=store", "inspect.episode=0"),
 }
 
@@ -164,44 +108,36 @@ WAYS = {
 @pytest.mark.parametrize("way", WAYS)
 def test_a_hostile_file_ends_every_job_in_one_sentence(tmp_path: Path, folder: Path, way: str) -> None:
     mark = tmp_path / "mark"
-    checkpoint(tmp_path / "theirs/checkpoints/last.ckpt", "model.image", command(mark))
+    checkpoint(tmp_path / "runs/theirs/checkpoints/last.ckpt", "model.image", command(mark))
     shutil.copytree(folder, tmp_path / "store")
     header = json.loads((tmp_path / "store/store.json").read_text())
     header["config"] = {"task": plain(composed()).get("task"), "expert": {}}
     header["config"]["task"]["goal"] = command(mark)
     (tmp_path / "store/store.json").write_text(json.dumps(header))
-    done = vla(tmp_path, *WAYS[way], ok=False)
+    done = here(tmp_path, *WAYS[way], ok=False)
     errors = [line for line in done.stderr.splitlines() if line.startswith("error: ")]
     assert len(errors) == 1 and "_target_ must name a class" in errors[0], done.stderr
     assert "Traceback" not in done.stderr and not mark.exists()
 
 
-def test_somebody_elses_checkpoint_does_not_say_where_files_go(tmp_path: Path) -> None:
-    theirs: dict[str, Any] = {
-        "collect.folder": "/nowhere",
-        "logger": {"mlflow": node("lightning.pytorch.loggers.MLFlowLogger")},
-    }
-    theirs |= {"trainer.default_root_dir": "/nowhere", "trainer.max_steps": 7}
-    config = OmegaConf.create(plain(composed()))
-    for key, value in theirs.items():
-        OmegaConf.update(config, key, value, force_add=True, merge=False)
+def test_only_ones_own_runs_are_resumed(tmp_path: Path) -> None:
     path = tmp_path / "theirs/checkpoints/last.ckpt"
     path.parent.mkdir(parents=True)
-    torch.save({"config": plain(config), "spec": toy.SPEC.to_dict(), "state_dict": {}}, path)
-    mine = composed(f"output={tmp_path}/elsewhere/mine", f"checkpoint={path}", "resume=true")
-    resumed = go_on(mine, [])
-    assert "/nowhere" not in json.dumps(plain(resumed)) and "mlflow" not in resumed.logger
-    assert resumed.trainer.max_steps == 7  # how far, which is no more than a number
-    own = composed(f"output={tmp_path}/mine", f"checkpoint={path}", "resume=true")
-    assert go_on(own, []).collect.folder == "/nowhere"  # a run beside one's own is one's own
+    config = plain(composed("collect.folder=/nowhere"))
+    torch.save({"config": config, "spec": toy.SPEC.to_dict(), "state_dict": {}}, path)
+    elsewhere = composed(f"output={tmp_path}/elsewhere/mine")
+    with pytest.raises(ValueError, match="is not among your runs"):
+        resume(elsewhere, tmp_path / "theirs", [])
+    beside = composed(f"output={tmp_path}/mine")
+    assert resume(beside, tmp_path / "theirs", []).collect.folder == "/nowhere"
 
 
 def test_a_path_in_somebody_elses_checkpoint_is_refused(tmp_path: Path) -> None:
-    config = plain(composed("expert=lerobot", "expert.folder=/nowhere"))
-    path = tmp_path / "last.ckpt"
+    config, path = plain(composed()), tmp_path / "last.ckpt"
+    config["task"]["goal"] = node("vla.data.formats.lerobot_import.LeRobotDemonstrations", folder="/nowhere")
     torch.save({"config": config, "spec": toy.SPEC.to_dict(), "state_dict": {}}, path)
-    with pytest.raises(ValueError, match=r"last\.ckpt names a path in expert\.folder"):
-        go_on(composed(f"output={tmp_path}/elsewhere/mine", f"checkpoint={path}", "resume=true"), [])
+    with pytest.raises(ValueError, match=r"last\.ckpt names a path in task\.goal\.folder"):
+        adopt(composed(f"checkpoint={path}"), [])
 
 
 def test_a_model_that_its_checkpoint_cannot_hold_is_refused_before_it_is_made(tmp_path: Path) -> None:

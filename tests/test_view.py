@@ -1,16 +1,18 @@
-"""What the live view draws of messages: states when they change, small images without loss, and the arm."""
+"""The live view: states when they change, small images without loss, and the arm."""
 
 from __future__ import annotations
 
 import io
 from collections import defaultdict
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
+from arm import ROBOT
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 from PIL import Image as Picture
 from rerun.chunk import RrdReader
@@ -19,12 +21,15 @@ from std_msgs.msg import String
 
 from vla.deploy import messages
 from vla.deploy.view import View
+from vla.robots.panda import CHAIN
+from vla.spec import RobotModel, Shell
+from vla.tasks.tabletop.arm import Arm
 
 FIGURES = ("image age p50", "image age p99", "inference p50", "inference p99", "tick p50", "tick p99", "wait p50")
 
 
 def status(words: str) -> DiagnosticStatus:
-    """What an agent says of itself."""
+    """A status message of the agent."""
     values = [KeyValue(key=f"{figure} [ms]", value="12.5") for figure in FIGURES]
     return DiagnosticStatus(name="vla_agent", message=words, values=[*values, KeyValue(key="odd [ms]", value="?")])
 
@@ -33,16 +38,16 @@ def status(words: str) -> DiagnosticStatus:
 def drawn(tmp_path: Path) -> Callable[..., dict[str, list[Any]]]:
     """Draws (topic, message) pairs; gives entity → its chunks of data."""
 
-    def draw(*heard: tuple[str, Any]) -> dict[str, list[Any]]:
+    def draw(*received: tuple[str, Any], shell: Shell | None = None) -> dict[str, list[Any]]:
         ignore = SimpleNamespace(
             get_topic_names_and_types=list, create_timer=lambda *arguments: None, destroy_timer=lambda timer: None
         )
-        view = View(ignore, tmp_path / "view.rrd")
-        for topic, message in heard:
+        view = View(ignore, tmp_path / "view.rrd", shell)
+        for topic, message in received:
             package, kind = type(message).__module__.split(".")[0], type(message).__name__
-            hear = view.hearer(topic, f"{package}/msg/{kind}")
-            assert hear is not None
-            hear(message)
+            callback = view.callback_for(topic, f"{package}/msg/{kind}")
+            assert callback is not None
+            callback(message)
         view.close()
         chunks = defaultdict(list)
         for chunk in RrdReader(tmp_path / "view.rrd").stream():
@@ -85,16 +90,56 @@ def test_a_small_image_is_drawn_without_loss(drawn: Callable[..., dict[str, list
     assert values(chunks["/camera/large"], "media_type") == ["image/jpeg"]
 
 
+def described(joints: list[str], fingers: list[str], chain: Any) -> tuple[str, String]:
+    """What an agent says of its arm."""
+    limits: Any = dict.fromkeys(("low", "high", "speed", "acceleration"), [1.0] * len(joints))
+    robot = replace(ROBOT, joints=joints, fingers=fingers, **limits)
+    return "/vla_agent/arm", messages.fill_arm(String(), robot, RobotModel(tuple(joints), "base", chain=chain))
+
+
 def test_the_arm_stands_as_joint_states_say(drawn: Callable[..., dict[str, list[Any]]]) -> None:
     names = [*(f"fr3_joint{number}" for number in range(7, 0, -1)), "fr3_finger_joint1", "fr3_finger_joint2"]
     still = JointState(name=names, position=[0.0] * 7 + [0.04, 0.04])
     chunks = drawn(
+        ("/joint_states", JointState(name=names, position=[0.5] * 9)),  # of an arm that is not known yet
+        described(names[6::-1], names[7:], CHAIN),
         ("/isaac/franka/joint_commands", JointState(name=names, position=[1.0] * 9)),
         ("/joint_states", JointState(name=names, position=[float("nan")] * 9)),
         ("/joint_states", JointState(name=names[:3], position=[0.0] * 3)),
         ("/joint_states", still),
+        shell=Arm(),
     )
+    assert "/world/arm" not in chunks
     (hand,) = values(chunks["/world/panda.hand"], "translation")
     np.testing.assert_allclose(hand, [0.088, 0.0, 0.333 + 0.316 + 0.384 - 0.107], atol=1e-5)
     left, right = (values(chunks[f"/world/panda.{side}_finger"], "translation")[0] for side in ("left", "right"))
     assert np.linalg.norm(np.subtract(left, right)) == pytest.approx(0.08, abs=1e-5)
+
+
+def test_any_other_arm_is_drawn_as_lines_between_its_joints(drawn: Callable[..., dict[str, list[Any]]]) -> None:
+    """Six joints, each 0.1 m above the one before; the first makes a quarter turn, and the tool is beside the last."""
+    step, back = (0.0, 0.0, 0.1), (1.0, 1.0, 0.0, 0.0)
+    chain = (*((*step, 1.0, 0.0, 0.0, 0.0),) * 6, (0.0, 0.1, 0.0, *back))
+    joints, positions = ["base", "shoulder", "elbow", "yaw", "pitch", "roll"], [np.pi / 2, 0.0, 0.0, 0.0, 0.0, 0.0]
+    chunks = drawn(
+        described(joints, ["claw"], chain),
+        ("/states", JointState(name=["claw", *joints], position=[0.01, *positions])),
+        shell=Arm(),
+    )
+    (lines,) = values(chunks["/world/arm"], "strips")
+    np.testing.assert_allclose(lines, [[0, 0, 0.1 * each] for each in range(7)] + [[-0.1, 0, 0.6]], atol=1e-6)
+    assert not [entity for entity in chunks if "panda" in entity]
+    assert {f"/joints/measured/{joint}" for joint in joints} | {"/gripper/measured/claw"} <= {*chunks}
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("{}", "joints: Field required"),
+        ('{"joints": ["a"], "fingers": [], "chain": [[1, 2]]}', "7 numbers for each of 1"),
+    ],
+)
+def test_a_bad_description_of_an_arm_is_said(drawn: Callable[..., dict[str, list[Any]]], text: str, words: str) -> None:
+    chunks = drawn(("/vla_agent/arm", String(data=text)), ("/states", JointState(name=["a"], position=[0.0])))
+    (said,) = values(chunks["/words"], "text")
+    assert words in said and "/joints/measured/a" in chunks and "/world/arm" not in chunks

@@ -13,7 +13,7 @@ from typing import Any
 
 import pytest
 
-from vla.workers import Pool, WorkersLost
+from vla.parallel.pool import Crashed, ProcessPool
 
 
 class Doubling:
@@ -48,7 +48,7 @@ class Awkward(Exception):
 
 def results(make: Any, *numbers: int) -> list[Any]:
     """What becomes of the numbers, exceptions included."""
-    with Pool(make, 2, "some.workers") as pool:
+    with ProcessPool(make, 2) as pool:
         futures = [pool.submit(number) for number in numbers]
         found = [future.exception() or future.result() for future in futures]
     assert not active_children()
@@ -58,7 +58,9 @@ def results(make: Any, *numbers: int) -> list[Any]:
 def test_only_the_item_that_crashes_its_process_twice_is_lost() -> None:
     one, lost, *others = results(Doubling, 1, 7, 2, 3)
     assert (one, *others) == (2, 4, 6)
-    assert isinstance(lost, WorkersLost) and str(lost).startswith("it was ended by signal 11 (")
+    assert isinstance(lost, Crashed) and str(lost).startswith(
+        "a worker process crashed twice: it was ended by signal 11 ("
+    )
 
 
 def test_an_error_that_cannot_be_sent_is_told_in_words() -> None:
@@ -72,8 +74,8 @@ def test_a_process_that_is_killed_while_it_starts_is_replaced(tmp_path: Path) ->
 
 def test_a_process_that_cannot_start_says_why(monkeypatch: pytest.MonkeyPatch) -> None:
     (ended,) = results(partial(Doubling, status=3), 1)
-    assert type(ended) is ValueError and "could not start: it ended with exit status 3, see what" in str(ended)
-    assert "some.workers=1" in str(ended)
+    assert type(ended) is ValueError and "could not start: it ended with exit status 3, see its output" in str(ended)
+    assert "cluster.workers=1" in str(ended)
     only_here = ModuleType("only_here")
     only_here.Doubling = type("Doubling", (Doubling,), {"__module__": "only_here"})  # type: ignore[attr-defined]
     monkeypatch.setitem(sys.modules, "only_here", only_here)

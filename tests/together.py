@@ -10,17 +10,17 @@ from pathlib import Path
 
 import lightning
 import numpy as np
-import test_trainer
-import test_windows
+import reading
+import resuming
 import torch
 from fake_batch import make_rt1
 from hydra import compose, initialize_config_dir
-from omegaconf import DictConfig
 
+from vla.config.experiment import Experiment
 from vla.data.episodes import EpisodeStore
 from vla.models.learner import Learner
-from vla.parts import make_data, make_learner
-from vla.trainer import LAST, make_trainer, quiet_lightning
+from vla.runs.folder import LAST
+from vla.training.trainer import make_trainer, quiet_lightning
 
 PAIRS = ("ddp,rt1_tiny", "fsdp,rt1_tiny", "fsdp,decoder")  # trainer, model
 CONF = Path(__file__).parents[1] / "conf"
@@ -40,25 +40,25 @@ SMALL = (
 )
 
 
-def composed(*overrides: str) -> DictConfig:
-    """A configuration of few and small steps."""
+def composed(*overrides: str) -> Experiment:
+    """An experiment of few and small steps."""
     with initialize_config_dir(str(CONF), version_base="1.3"):
-        return compose("config", overrides=["output=out", *SMALL, *overrides])
+        return Experiment.of(compose("config", overrides=["output=out", *SMALL, *overrides]))
 
 
 def untrained(store: Path, *overrides: str) -> Learner:
     """The same weights every time."""
     lightning.seed_everything(0, verbose=False)
-    return make_learner(composed(*overrides), EpisodeStore(store))
+    return composed(*overrides).fitted_learner(EpisodeStore(store))
 
 
 def train(store: Path, folder: Path, *overrides: str, checkpoint: Path | None = None) -> dict[str, float]:
     """Train, from a checkpoint on if there is one, leave `last.ckpt` and return what the last validation found."""
-    config = composed(*overrides)
+    experiment = composed(*overrides)
     quiet_lightning()
     learner = untrained(store, *overrides)
-    trainer = make_trainer(config, folder)
-    data = make_data(config, EpisodeStore(store), learner.model)
+    trainer = make_trainer(experiment.config, folder)
+    data = experiment.data(EpisodeStore(store), learner.model.history, learner.model.chunk)
     trainer.fit(learner, datamodule=data, ckpt_path=checkpoint, weights_only=True)
     trainer.save_checkpoint(folder / LAST)
     return {name: value.item() for name, value in trainer.callback_metrics.items() if name.startswith("val/")}
@@ -78,15 +78,15 @@ def train_in_pieces(store: Path, folder: Path) -> None:
     model = make_rt1(dropout=0.2)
     start = {name: value.clone() for name, value in model.state_dict().items()}
     half = folder / "half/checkpoints" / LAST
-    for name, stop, checkpoint in (("whole", None, None), ("half", test_trainer.STOP, None), ("rest", None, half)):
+    for name, stop, checkpoint in (("whole", None, None), ("half", resuming.STOP, None), ("rest", None, half)):
         model.load_state_dict(start)
-        test_trainer.train(model, store, folder / name, stop, checkpoint, devices=2, strategy="ddp")
+        resuming.train(model, store, folder / name, stop, checkpoint, devices=2, strategy="ddp")
 
 
 def see_windows(store: Path, folder: Path) -> None:
     """Leave what this process saw while the two saw every window once."""
-    steps = -(-len(test_windows.windows(store).training_windows) // (8 * 2))
-    model = test_windows.fit(store, steps, devices=2)
+    steps = -(-len(reading.windows(store).training_windows) // (8 * 2))
+    model = reading.fit(store, steps, devices=2)
     np.save(folder / f"seen{model.global_rank}.npy", np.stack([seen.numpy() for seen in model.seen]))
 
 

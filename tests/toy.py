@@ -1,45 +1,73 @@
-"""A world small enough to test with: a point is moved to a target, and two little cameras look on."""
+"""A world small enough to test with: a point is moved to a target, and a little camera looks on.
+
+Of no robot, depth or scene to draw it knows anything; where a test is about these, `ARM_SPEC` has them.
+"""
 
 from __future__ import annotations
 
 import os
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from vla.cluster import Local
-from vla.collect import collect
 from vla.data.episodes import EpisodeStore
-from vla.spec import Array, Environment, Observation, Shape, Spec
+from vla.parallel.pool import LocalCluster
+from vla.rollouts.collect import collect
+from vla.spec import Array, Environment, Observation, RobotModel, Spec
 
 SPEC = Spec(
-    cameras=("front", "wrist"),
+    cameras=("eye",),
     image_size=(16, 16),
-    joints=tuple(f"joint{number}" for number in range(1, 8)),
+    state=("east", "north"),
+    state_units=("m", "m"),
     action=("x", "y", "gripper"),
     units=("m", "m", "1"),
     low=(-0.05, -0.05, 0.0),
     high=(0.05, 0.05, 1.0),
-    frame="base",
     control_hz=10.0,
     truth=(("target", 2), ("point", 2)),
+)
+ARM = RobotModel(
+    joints=tuple(f"joint{number}" for number in range(1, 8)),
+    frame="base",
+    velocities=tuple(f"speed{number}" for number in range(1, 8)),
+    gripper="gripper",
     chain=tuple((0.0, 0.0, 0.1, 1.0, float(number % 2), 0.0, 0.0) for number in range(8)),
+)
+ARM_SPEC = replace(
+    SPEC,
+    cameras=("front", "wrist"),
+    state=ARM.components,
+    state_units=("rad",) * 7 + ("rad/s",) * 7 + ("m",),
+    depth=("front", "wrist"),
+    robot=ARM,
 )
 
 EPISODES = 30  # of `make_store`
 
 
 class ToyEnvironment:
-    """A point in a 1 m square reaches its target, unless the seed is three more than a multiple of five."""
+    """A point in a 1 m square reaches its target, unless the seed is three more than a multiple of five.
 
-    def __init__(self, seconds_per_step: float = 0.0, forgetful: bool = False, deadly_seed: int | None = None) -> None:
+    The task is "red" or "blue"; "near" is a milestone on the way.
+    """
+
+    def __init__(
+        self,
+        seconds_per_step: float = 0.0,
+        forgetful: bool = False,
+        deadly_seed: int | None = None,
+        spec: Spec = SPEC,
+    ) -> None:
         """`forgetful` carries something over from one episode to the next; `deadly_seed` ends the process."""
-        self.spec = SPEC
-        self.done, self.outcome = False, "timeout"
+        self.spec = spec
+        self.done, self.outcome, self.task = False, "timeout", ""
+        self.milestones: frozenset[str] = frozenset()
         self.draws: dict[str, Any] = {}
         self._seconds_per_step, self._forgetful, self._deadly_seed = seconds_per_step, forgetful, deadly_seed
         self._blind = False
@@ -54,27 +82,22 @@ class ToyEnvironment:
         self._point, self._target = random.uniform(0, 1, 2), random.uniform(0, 1, 2)
         if self._forgetful:
             self._point += 1e-6 * self._resets
-        self.done, self.outcome = False, "timeout"
+        self.done, self.outcome, self.milestones = False, "timeout", frozenset()
         self.draws = {"point": self._point, "colour": random.choice(["red", "blue"]), "limit": np.int64(40)}
+        self.task = str(self.draws["colour"])
         return self._look()
 
     def step(self, action: Array) -> Observation:
         """Move the point by the first two components [m]."""
         time.sleep(0 if self._blind else self._seconds_per_step)
         self._steps += 1
-        self._point = self._point + np.clip(action, SPEC.low, SPEC.high)[:2]
-        reached = bool(np.linalg.norm(self._point - self._target) < 0.02) and self._seed % 5 != 3
+        self._point = self._point + np.clip(action[:2], SPEC.low[:2], SPEC.high[:2])
+        away = np.linalg.norm(self._point - self._target)
+        self.milestones |= {"near"} if away < 0.2 else set()
+        reached = bool(away < 0.02) and self._seed % 5 != 3
         self.outcome = "success" if reached else "timeout"
         self.done = reached or self._steps == 40
         return self._look()
-
-    def shapes(self) -> list[Shape]:
-        """Nothing to draw."""
-        return []
-
-    def poses(self) -> dict[str, Array]:
-        """Nothing to draw."""
-        return {}
 
     @contextmanager
     def blind(self) -> Iterator[None]:
@@ -91,17 +114,17 @@ class ToyEnvironment:
     def _look(self) -> Observation:
         rgb: dict[str, Array] = {}
         depth: dict[str, Array] = {}
-        for number, camera in enumerate(() if self._blind else SPEC.cameras):
+        for number, camera in enumerate(() if self._blind else self.spec.cameras):
             grid = np.hypot(*(np.mgrid[:16, :16] / 16 - self._point[:, None, None]))
             rgb[camera] = np.stack([255 * (grid % 1), grid * 0 + self._steps, grid * 0 + number], -1).astype(np.uint8)
-            depth[camera] = (500 + 40000 * (grid % 1) + number).astype(np.uint16)
-        joints = np.linspace(self._point[0], self._point[1], 7, dtype=np.float32)
+            if camera in self.spec.depth:
+                depth[camera] = (500 + 40000 * (grid % 1) + number).astype(np.uint16)
+        joints = np.linspace(self._point[0], self._point[1], 7)
+        arm = self.spec.robot is not None
         return Observation(
             rgb=rgb,
             depth=depth,
-            joints=joints,
-            velocities=joints / 10,
-            gripper=0.04,
+            state=np.array([*joints, *joints / 10, 0.04] if arm else self._point, np.float32),
             instruction=f"go to the {self.draws['colour']} target",
             truth={"target": self._target.astype(np.float32), "point": self._point.astype(np.float32)},
         )
@@ -133,6 +156,11 @@ def make_environment() -> ToyEnvironment:
     return ToyEnvironment()
 
 
+def make_arm() -> ToyEnvironment:
+    """The same with a robot and depth."""
+    return ToyEnvironment(spec=ARM_SPEC)
+
+
 def make_expert(environment: Environment) -> ToyExpert:
     """The expert of the plain world."""
     return ToyExpert()
@@ -158,8 +186,8 @@ def make_lost_expert(environment: Environment) -> ToyExpert:
     return ToyExpert(noise=0.0, lost=True)
 
 
-def make_store(folder: Path) -> EpisodeStore:
+def make_store(folder: Path, make: Callable[[], ToyEnvironment] = make_environment) -> EpisodeStore:
     """A store of the expert's first episodes."""
-    store = EpisodeStore.create_or_open(folder, SPEC, {})
-    collect(store, make_environment, make_expert, EPISODES, Local(1), seed=0)
+    store = EpisodeStore.create_or_open(folder, make().spec, {})
+    collect(store, make, make_expert, EPISODES, LocalCluster(1), seed=0)
     return store

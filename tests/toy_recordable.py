@@ -7,7 +7,7 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-from toy import SPEC, ToyEnvironment, ToyExpert
+from toy import ARM_SPEC, SPEC, ToyEnvironment, ToyExpert
 
 from vla.spec import Array, Environment, Observation, Recorder, Shape
 
@@ -18,8 +18,10 @@ BROKEN_SEED, DEADLY_SEED = 1_000_001, 1_000_002
 class RecordableEnvironment(ToyEnvironment):
     """Every kind of solid on one body that moves, and a table that does not; the seed `BROKEN_SEED` raises."""
 
+    viewpoint = ((1.0, -1.0, 1.0), (0.5, 0.5, 0.0))
+
     def __init__(self, broken: bool = False, deadly_seed: int | None = None) -> None:
-        super().__init__(deadly_seed=deadly_seed)
+        super().__init__(deadly_seed=deadly_seed, spec=ARM_SPEC)
         self._broken = broken
 
     def reset(self, seed: int) -> Observation:
@@ -96,6 +98,6 @@ def make_agent(environment: Environment) -> ThinkingAgent:
 
 def make_recorder(folder: Path) -> Callable[[], Recorder]:
     """A factory that a worker process can be given."""
-    from vla.record import RerunRecorder  # the other worlds start faster without it
+    from vla.rollouts.recorder import RerunRecorder  # the other worlds start faster without it
 
     return partial(RerunRecorder, folder)

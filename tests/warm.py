@@ -21,17 +21,19 @@ from socket import create_server
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from vla.ending import swift_end
-from vla.tasks.backend import choose_backend
+from vla.parallel.fast_exit import fast_exit
+from vla.tasks.gl import choose_backend
 
-PATIENCE = 300  # [s]
+PATIENCE = 450  # [s]
 
 Meanwhile = Callable[[int], None]  # is given the process
 
 
-def run(folder: Path, *arguments: str, meanwhile: Meanwhile | None = None) -> subprocess.CompletedProcess[str]:
-    """What `python -m vla.run` with these arguments does in a folder, whatever is done to it `meanwhile`."""
-    return _done(folder, "vla.run", arguments, [{}], meanwhile)[0]
+def run(
+    folder: Path, *arguments: str, program: str = "vla.run", meanwhile: Meanwhile | None = None
+) -> subprocess.CompletedProcess[str]:
+    """What `python -m PROGRAM` with these arguments does in a folder, whatever is done to it `meanwhile`."""
+    return _done(folder, program, arguments, [{}], meanwhile)[0]
 
 
 def run_together(folder: Path, program: str, *arguments: str) -> None:
@@ -97,7 +99,10 @@ def _become(order: dict[str, Any]) -> None:
         os.dup2(opened, number)
         os.close(opened)
     sys.argv[1:] = order["arguments"]
-    sys.path.insert(0, order["folder"])
+    places = os.environ.get("PYTHONPATH", "").split(os.pathsep)
+    sys.path[:0] = [order["folder"], *(place for place in places if place and place not in sys.path)]
+    for name in [name for name in sys.modules if name.partition(".")[0] == "vla"]:
+        del sys.modules[name]  # the folder may have another
     runpy.run_module(order["program"], run_name="__main__", alter_sys=True)
 
 
@@ -140,5 +145,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    with swift_end():
+    with fast_exit():
         main()

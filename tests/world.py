@@ -1,4 +1,4 @@
-"""What an agent under test lives with: cameras, an arm that does what it is told, and a person who speaks."""
+"""The surroundings of a policy node under test: cameras, an arm that follows its commands, and an operator."""
 
 from __future__ import annotations
 
@@ -9,7 +9,9 @@ from typing import Any
 
 import numpy as np
 import rclpy
+from arm import FORWARD, ROBOT, SAFETY, SPEC
 from builtin_interfaces.msg import Time
+from defaults import defaults_of
 from diagnostic_msgs.msg import DiagnosticStatus
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
@@ -18,14 +20,14 @@ from rclpy.executors import SingleThreadedExecutor
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import Image, JointState
 from std_msgs.msg import Float64MultiArray, String
-from test_session import FORWARD, HOME, ROBOT, SPEC
 from trajectory_msgs.msg import JointTrajectory
 
 from vla.deploy import messages
-from vla.deploy.agent import Agent
+from vla.deploy.control_loop import State
+from vla.deploy.policy_node import PolicyNode
 from vla.deploy.ros import Network
-from vla.deploy.ros2 import Ros2, Topics
-from vla.deploy.session import State
+from vla.deploy.ros2 import PolicyDeployment, Topics
+from vla.robots.panda import HOME
 from vla.spec import Array, Observation
 
 TOPICS = Topics({"front": "/front", "wrist": "/wrist"}, "/joint_states", "/words", "/commands", "/gripper")
@@ -33,7 +35,7 @@ KINDS = {"joint_state": JointState, "trajectory": JointTrajectory, "forward": Fl
 
 
 class Forward:
-    """A policy that always goes on, and remembers what it was shown."""
+    """A policy that moves forward and records its observations."""
 
     spec = SPEC
     execute = 1
@@ -44,10 +46,10 @@ class Forward:
         self.action: Callable[[], Array] = lambda: FORWARD
 
     def reset(self, instruction: str, seed: int) -> None:
-        """Forget nothing: there is nothing to forget."""
+        """Do nothing: the policy has no state."""
 
     def plan(self, observation: Observation) -> Array:
-        """One centimetre along x, again and again, or what a test wants."""
+        """Return a step of one centimetre along x, or the action of a test."""
         self.seen.append(observation)
         time.sleep(self.takes)
         if self.fails:
@@ -56,25 +58,26 @@ class Forward:
 
 
 class World:
-    """Cameras, an arm that does what it is told, and a person; the agent lives in the same thread."""
+    """Cameras, an arm that follows its commands, and an operator; the policy node runs in the same thread."""
 
     def __init__(self, domain: int, command: Any, arguments: list[str]) -> None:
-        Network("SYSTEM_DEFAULT", "loopback").apply()
+        Network.named("loopback").apply()
         self.contexts = [Context(), Context()]
         for context, given in zip(self.contexts, (arguments, None), strict=True):
             rclpy.init(args=given, context=context, domain_id=domain)
         self.policy = Forward()
         nothing: Any = None
-        self.settings = Ros2(
+        self.settings = PolicyDeployment(
             robot=ROBOT,
-            network=Network("SYSTEM_DEFAULT"),
+            network=Network.named("loopback"),
             topics=TOPICS,
-            command=command,
+            safety=SAFETY,
+            **defaults_of("deploy/ros2", command=command),
             policy=nothing,
             environment=nothing,
             output=Path(),
         )
-        self.agent = Agent(self.policy, self.settings, context=self.contexts[0])  # type: ignore[arg-type]
+        self.agent = PolicyNode(self.policy, self.settings, context=self.contexts[0])  # type: ignore[arg-type]
         self.node = rclpy.create_node("world", context=self.contexts[1])
         self.executors = [SingleThreadedExecutor(context=context) for context in self.contexts]
         for executor, node in zip(self.executors, (self.agent, self.node), strict=True):
@@ -87,16 +90,16 @@ class World:
         self.statuses: list[DiagnosticStatus] = []
         self.node.create_subscription(DiagnosticStatus, "/vla_agent/status", self.statuses.append, 100)
         self.joints = HOME.copy()
-        self.cameras, self.feels = list(SPEC.cameras), True
+        self.cameras, self.measures = list(SPEC.cameras), True
         self.changed: Callable[[Image], None] = lambda image: None
         self.clock = self.node.create_publisher(Clock, "/clock", 1)
-        self.simulated: float | None = None  # time [s], where it is
+        self.simulated: float | None = None  # simulated time [s], if any
 
     def spin(self, until: Callable[[], Any], seconds: float = 10.0) -> None:
-        """Let both sides live until something holds."""
-        give_up = time.monotonic() + seconds
+        """Spin both nodes until a condition holds."""
+        deadline = time.monotonic() + seconds
         while not until():
-            assert time.monotonic() < give_up, f"state {self.agent.session and self.agent.session.state}"
+            assert time.monotonic() < deadline, f"state {self.agent.loop and self.agent.loop.state}"
             for executor in self.executors:
                 executor.spin_once(timeout_sec=0.001)
 
@@ -105,13 +108,13 @@ class World:
         self.spin(lambda: time.monotonic() >= end)
 
     def live(self, seconds: float, until: Callable[[], Any] = lambda: False) -> None:
-        """The world goes on, images at 10 Hz and joint states at 50 Hz, for so long or until something holds."""
+        """Publish images at 10 Hz and joint states at 50 Hz, for some seconds or until a condition holds."""
         end, tick = time.monotonic() + seconds, 0
         while time.monotonic() < end and not until():
             if self.simulated is not None:
                 self.simulated += 0.02
                 self.clock.publish(Clock(clock=self._now()))
-            if self.feels:
+            if self.measures:
                 if self.commands:
                     self.joints = positions(self.commands[-1])[0]
                 self.states.publish(joint_state(self.joints))
@@ -131,7 +134,7 @@ class World:
         return Time(sec=int(seconds), nanosec=int(rest * 1e9))
 
     def ask(self, kind: Any, name: str, request: Any) -> Any:
-        """What a service of the agent answers."""
+        """Call a service of the agent."""
         client = self.node.create_client(kind, f"/vla_agent/{name}")
         self.spin(client.service_is_ready)
         answer = client.call_async(request)
@@ -139,30 +142,30 @@ class World:
         return answer.result()
 
     def change(self, transition: int) -> bool:
-        """Ask for a change of the lifecycle's state."""
+        """Request a lifecycle transition."""
         request = ChangeState.Request(transition=Transition(id=transition))
         return bool(self.ask(ChangeState, "change_state", request).success)
 
     def start(self) -> None:
-        """Configure, activate, connect, and give the word."""
+        """Configure, activate, connect, and send the instruction."""
         assert self.change(Transition.TRANSITION_CONFIGURE) and self.change(Transition.TRANSITION_ACTIVATE)
-        everybody = [*self.images.values(), self.states, self.words]
-        self.spin(lambda: all(publisher.get_subscription_count() for publisher in everybody))
+        publishers = [*self.images.values(), self.states, self.words]
+        self.spin(lambda: all(publisher.get_subscription_count() for publisher in publishers))
         self.live(2.0, until=lambda: self.commands)
         self.words.publish(String(data="put the red block on the pad"))
         self.live(2.0, until=lambda: self.policy.seen[-1].instruction)
         self.live(0.1)
 
     def becomes(self, state: State) -> bool:
-        """Whether the agent gets there, within some seconds of the world's life."""
+        """Return whether the agent reaches a state within some seconds."""
         self.live(5.0, until=lambda: self.state is state)
         return self.state is state
 
     @property
     def state(self) -> State:
-        """What the agent is doing."""
-        assert self.agent.session is not None
-        return self.agent.session.state
+        """State of the agent."""
+        assert self.agent.loop is not None
+        return self.agent.loop.state
 
     def close(self) -> None:
         """End both sides."""
@@ -175,13 +178,13 @@ class World:
 
 
 def positions(command: Any) -> Array:
-    """(N, 7) where a command sends the arm, tick by tick [rad]."""
+    """Return the positions (N, 7) of a command, one per tick [rad]."""
     if isinstance(command, JointTrajectory):
         return np.array([point.positions for point in command.points])
     return np.array([command.position[:7] if isinstance(command, JointState) else command.data])
 
 
 def joint_state(joints: Array) -> JointState:
-    """What the robot says of itself, in an order of its own and with a joint too many."""
-    names = [*reversed(ROBOT.joints), *ROBOT.fingers, "of_somebody_else"]
+    """Return a joint state in another order and with an additional joint."""
+    names = [*reversed(ROBOT.joints), *ROBOT.fingers, "of_another_robot"]
     return JointState(name=names, position=[*joints[::-1].tolist(), 0.04, 0.04, 1.0])

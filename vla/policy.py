@@ -1,75 +1,85 @@
-"""A trained model as an agent: observations in, actions out."""
+"""Checkpoints, and a trained model as an agent: observations in, actions out."""
 
-# T frames of history, k action chunk, D action components, K bins
+# k action chunk, D action components, K bins
 
 from __future__ import annotations
 
-import os
 import time
 from collections import deque
 from dataclasses import dataclass, replace
-from getpass import getuser
 from pathlib import Path
 from pickle import UnpicklingError
-from tempfile import gettempdir
 from typing import Any, Literal
-from zipfile import ZIP_STORED, BadZipFile, ZipFile
-from zlib import crc32
+from zipfile import ZIP_STORED, BadZipFile, ZipFile, ZipInfo
 
 import numpy as np
 import torch
 from torch import Tensor
 from torch.overrides import TorchFunctionMode
 
-from vla.documents import require_resolved
-from vla.models.model import Model
+from vla.io.documents import require_resolved
+from vla.models.compile_cache import set_compile_cache
+from vla.models.model import Batch, Model
 from vla.spec import LONGEST_INSTRUCTION, Array, Observation, Spec
 
-Batch = dict[str, Any]
-
-NODES = ("task", "tokenizer", "model")  # what a checkpoint's configuration says of a policy
-# What else it may say, also as mappings.
-OTHERS = ("chosen", "expert", "collect", "data", "learner", "trainer", "validate")
-OF_TRUTH = ("truth_head", "truth_scale")  # parts of a model that are needed in training only
-KEPT_IN = "TORCHINDUCTOR_CACHE_DIR"  # the variable from which PyTorch's compiler takes the folder
-LONG = " ".join(["sentence"] * 24)  # what is compiled for a text of this length is so for all shorter ones
+REQUIRED_NODES = ("task", "tokenizer", "model")  # of the config in a checkpoint
+OPTIONAL_NODES = ("chosen", "expert", "collect", "data", "learner", "trainer", "validate")
+TRUTH_MODULES = ("truth_head", "truth_scale")  # modules of a model used in training only
+LONG_SENTENCE = " ".join(["sentence"] * 24)  # shorter instructions are padded to it for a constant shape
 
 
 @dataclass(frozen=True)
-class Checkpoint:
-    """What a checkpoint holds of a policy."""
+class Header:
+    """A checkpoint without its weights."""
 
     path: Path
-    config: dict[str, Any]  # the configuration that trained it
+    config: dict[str, Any]  # of the training
     spec: Spec
+    finished: bool  # the training was completed
+    steps: int  # optimiser steps
+
+
+@dataclass(frozen=True)
+class Checkpoint(Header):
+    """A checkpoint with the weights of its model."""
+
     state: dict[str, Tensor]  # of the model
-    finished: bool  # whether the training came to its end
 
     def restore(self, model: torch.nn.Module) -> None:
-        """Load the weights.
+        """Load the weights into `model`.
 
         Raises:
-            ValueError: they are those of another model.
+            ValueError: they belong to another model.
         """
         try:
             model.load_state_dict(self.state)
-        except (RuntimeError, TypeError, AttributeError) as error:  # the latter for values that are no tensors
+        except (RuntimeError, TypeError, AttributeError) as error:  # the latter two for values that are not tensors
             first = str(error).strip().splitlines()[-1].strip()[:200]
             raise ValueError(f"{self.path} does not fit the model of its own configuration: {first}") from error
 
-    def start(self, model: Model) -> None:
-        """Load the weights, to train them further; the head that predicts the truth starts anew where that differs.
+    def initialize(self, model: Model) -> None:
+        """Load the weights for fine-tuning; the truth head keeps its initial weights if the truth differs.
 
         Raises:
-            ValueError: they are those of another model.
+            ValueError: they belong to another model.
         """
         state = self.state
         if self.spec.truth != model.spec.truth:
-            state = {name: value for name, value in state.items() if name.partition(".")[0] not in OF_TRUTH}
+            state = {name: value for name, value in state.items() if name.partition(".")[0] not in TRUTH_MODULES}
             for part, module in model.named_children():
-                if part in OF_TRUTH:
+                if part in TRUTH_MODULES:
                     state |= {f"{part}.{name}": value for name, value in module.state_dict().items()}
         replace(self, state=state).restore(model)
+
+
+def read_header(path: str | Path) -> Header:
+    """Read a checkpoint without its weights, which takes the same time for any size.
+
+    Raises:
+        ValueError: there is no file, it is damaged, or it is not a checkpoint of this project.
+        OSError: the file cannot be read.
+    """
+    return _header(Path(path), _load(Path(path), weights=False))
 
 
 def read_checkpoint(path: str | Path) -> Checkpoint:
@@ -77,128 +87,140 @@ def read_checkpoint(path: str | Path) -> Checkpoint:
 
     Raises:
         ValueError: there is no file, it is damaged, or it is not a checkpoint of this project.
-        OSError: it may not be read.
+        OSError: the file cannot be read.
     """
-    path = Path(path)
-    if not path.is_file():
-        raise ValueError(f"there is no checkpoint {path}: those of a run lie in outputs/runs/…/checkpoints")
-    content = _load(path)
-    config, spec, state = (content.get(name) for name in ("config", "spec", "state_dict"))
-    if config is None or spec is None:
-        raise ValueError(f"{path} is no checkpoint of this project: it carries no configuration and spec")
-    require_resolved(config, f"the configuration in {path}")
-    _require_nodes(config, path)
+    content = _load(Path(path), weights=True)
+    header = _header(Path(path), content)
+    state = content.get("state_dict")
     if not isinstance(state, dict) or not all(isinstance(key, str) for key in state):
         raise ValueError(f"{path} holds no weights: copy it again from where it is whole")
     prefix = "model."
     state = {key[len(prefix) :]: value for key, value in state.items() if key.startswith(prefix)}
-    return Checkpoint(path, config, Spec.from_dict(spec), state, content.get("finished") is True)
+    return Checkpoint(**vars(header), state=state)
 
 
-def _load(path: Path) -> dict[str, Any]:
+def _header(path: Path, content: dict[str, Any]) -> Header:
+    config, spec, steps = (content.get(name) for name in ("config", "spec", "global_step"))
+    if config is None or spec is None:
+        raise ValueError(f"{path} is no checkpoint of this project: it carries no configuration and spec")
+    require_resolved(config, f"the configuration in {path}")
+    nodes = config if isinstance(config, dict) else {}
+    present = [nodes[name] for name in (*REQUIRED_NODES, *OPTIONAL_NODES) if name in nodes]
+    if not nodes.keys() >= {*REQUIRED_NODES} or not all(isinstance(node, dict) for node in present):
+        raise ValueError(
+            f"{path} is no checkpoint of this project: its configuration lacks {', '.join(REQUIRED_NODES)}"
+        )
+    finished = content.get("finished") is True
+    return Header(path, config, Spec.from_dict(spec), finished, steps if isinstance(steps, int) else 0)
+
+
+def _load(path: Path, weights: bool) -> dict[str, Any]:
+    """Read the content of a checkpoint; without `weights` tensors are memory-mapped, neither read nor verified."""
+    if not path.is_file():
+        raise ValueError(f"there is no checkpoint {path}: those of a run lie in outputs/runs/…/checkpoints")
     try:
-        # Old pickles, which torch would read too, fail in any way they like.
+        # Only the zip format: legacy pickles raise arbitrary exceptions.
         with path.open("rb") as file, ZipFile(file) as archive:
             entries = archive.infolist()
-            # torch compresses nothing, so what unpacks to more than the file would fill the memory on purpose.
+            # torch does not compress, so content larger than the file is an attack on the memory.
             packed = any(entry.compress_type != ZIP_STORED for entry in entries)
             if packed or sum(entry.file_size for entry in entries) > path.stat().st_size:
                 raise BadZipFile("its parts are compressed or overlap")
-            if archive.testzip() is not None:  # torch does not look at the checksums
-                raise BadZipFile("checksums do not fit")
-        content = torch.load(path, map_location="cpu", weights_only=True)
+            for entry in entries:
+                if weights or entry.filename.endswith("/data.pkl"):
+                    _verify(archive, entry)  # torch does not verify checksums
+        content = torch.load(path, map_location="cpu", weights_only=True, mmap=not weights)
     except (RuntimeError, UnpicklingError, EOFError, LookupError, TypeError, AttributeError, BadZipFile) as error:
         raise ValueError(f"{path} cannot be read as a checkpoint, it is damaged or something else") from error
     return content if isinstance(content, dict) else {}
 
 
-def _require_nodes(config: Any, path: Path) -> None:
-    nodes = all(isinstance(config.get(name), dict) for name in NODES) if isinstance(config, dict) else False
-    if not nodes or not all(isinstance(config.get(name, {}), dict) for name in OTHERS):
-        raise ValueError(f"{path} is no checkpoint of this project: its configuration lacks {', '.join(NODES)}")
+def _verify(archive: ZipFile, entry: ZipInfo) -> None:
+    """Read an entry to its end, where zipfile verifies the checksum; raises BadZipFile if it differs."""
+    with archive.open(entry) as part:
+        while part.read(2**20):
+            pass
 
 
-class Allowance(TorchFunctionMode):
-    """Within, tensors are made up to a size that the weights in a checkpoint could fill.
+class TensorBudget(TorchFunctionMode):
+    """Context that limits the total size of created tensors to what the weights in a checkpoint could fill.
 
-    A configuration that asks for more is refused at the tensor that exceeds it, before anything is written there.
+    A config that requires more is refused at the first tensor above the limit, before memory is written.
     """
 
     FACTORIES = (torch.empty, torch.zeros, torch.ones, torch.full, torch.rand, torch.randn)
 
     def __init__(self, checkpoint: Path) -> None:
         super().__init__()
-        self._path, self._left = checkpoint, 2 * checkpoint.stat().st_size + 2**26
+        self._path, self._remaining = checkpoint, 2 * checkpoint.stat().st_size + 2**26
 
     def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
-        """Call `func` and count what it made.
+        """Call `func` and subtract the size of its result from the budget.
 
         Raises:
-            ValueError: it is more than the file can hold.
+            ValueError: the budget is exceeded.
         """
         try:
-            made = func(*args, **(kwargs or {}))
-            self._left -= made.nbytes if func in self.FACTORIES else 0
+            result = func(*args, **(kwargs or {}))
+            self._remaining -= result.nbytes if func in self.FACTORIES else 0
         except RuntimeError as error:
             if func not in self.FACTORIES:
                 raise
-            raise self._refusal() from error
-        if self._left < 0:
-            raise self._refusal()
-        return made
+            raise self._error() from error
+        if self._remaining < 0:
+            raise self._error()
+        return result
 
-    def _refusal(self) -> ValueError:
+    def _error(self) -> ValueError:
         return ValueError(f"{self._path} describes a model that is larger than the file, which does not hold it")
 
 
 class Policy:
-    """Acts with a model: keeps its history, encodes every frame once, executes as much of each chunk as the model says.
+    """An agent around a model: caches encoded frames of the history, and executes the first actions of each chunk.
 
     Args:
-        device: where to compute; "auto" takes a GPU if there is one.
-        precision: 32, or "bf16" for matrix products in bfloat16.
-        compile: compile the model, which takes up to a minute at the first action and needs g++ on a CPU: there its
-            constants are folded into its weights, on a GPU it becomes CUDA graphs.
+        device: "auto" is a GPU if there is one.
+        precision: "fp32", or "bf16" for matrix products in bfloat16.
+        compile: compile the model, which takes up to a minute at the first action and needs g++ on a CPU. On a GPU
+            CUDA graphs are used. Weights stay inputs of the graphs, so that models of one class share them.
         model: the network, with its tokenizer.
-        spec: what a step looks like.
+        spec: observation and action spaces.
 
     Raises:
-        ValueError: a GPU is asked for where there is none.
+        ValueError: device="cuda" without a GPU.
     """
 
     def __init__(
         self,
-        device: Literal["auto", "cpu", "cuda"] = "auto",
-        precision: Literal[32, "bf16"] = 32,
-        compile: bool = False,
+        device: Literal["auto", "cpu", "cuda"],
+        precision: Literal["fp32", "bf16"],
+        compile: bool,
         *,
         model: Model,
         spec: Spec,
     ) -> None:
         if device == "cuda" and not torch.cuda.is_available():
-            raise ValueError("policy.device=cuda, but PyTorch finds no GPU here: policy.device=auto does with the CPU")
-        usable = "cuda" if torch.cuda.is_available() else "cpu"
-        self.device = torch.device(usable if device == "auto" else device)
+            raise ValueError("policy.device=cuda, but PyTorch finds no GPU here: policy.device=auto uses the CPU")
+        available = "cuda" if torch.cuda.is_available() else "cpu"
+        self.device = torch.device(available if device == "auto" else device)
         self.model, self.spec = model.eval().to(self.device), spec
-        self.execute = model.execute  # so many actions of a chunk, before it looks again
+        self.execute = model.execute  # number of actions of a chunk to execute
         self.info: dict[str, Any] = {}
-        self._half = precision == "bf16"
-        self._encode, self._decide = self.model.encode, self.model.predict
-        self._beside = [LONG] if compile else []  # sentences to whose length others are filled up
+        self._bf16 = precision == "bf16"
+        self._encode, self._predict_chunk = self.model.encode, self.model.predict
+        self._padding_sentences = [LONG_SENTENCE] if compile else []
         if compile:
-            keep_by_processor()
-            how: dict[str, Any] = {"options": {"freezing": True}}
-            if self.device.type == "cuda":
-                how = {"mode": "reduce-overhead"}
-            self._encode = torch.compile(self.model.encode, **how)
-            self._decide = torch.compile(self.model.predict, **how)
+            set_compile_cache()
+            mode = "reduce-overhead" if self.device.type == "cuda" else None
+            self._encode = torch.compile(self.model.encode, mode=mode)
+            self._predict_chunk = torch.compile(self.model.predict, mode=mode)
         self._low, self._high = np.array(spec.low, np.float32), np.array(spec.high, np.float32)
         self._frames: deque[dict[str, Tensor]] = deque(maxlen=model.history)
         self._chunk: deque[tuple[Array, dict[str, Any]]] = deque()
         self.reset("", 0)
 
     def reset(self, instruction: str, seed: int) -> None:
-        """Forget the past; what the model draws from now on follows from `seed`.
+        """Clear the history, and seed the noise of the model.
 
         Raises:
             ValueError: the instruction has more than `LONGEST_INSTRUCTION` characters.
@@ -209,119 +231,102 @@ class Policy:
         self._frames.clear()
         self._chunk.clear()
         self._instruction = instruction
-        self._text = self.model.text.tokenize([instruction, *self._beside])[:1].to(self.device)
+        self._text = self.model.text.tokenize([instruction, *self._padding_sentences])[:1].to(self.device)
 
     def act(self, observation: Observation) -> Array:
-        """The (D,) float32 action to execute, within the spec's bounds; `info` may have its token probabilities (D, K).
+        """Return the action to execute, (D,) float32, clipped to the spec; `info` may have token probabilities (D, K).
 
         Raises:
-            ValueError: the observation is not what the policy was trained on.
+            ValueError: the observation does not match the spec.
         """
-        self._see(observation)
+        self._observe(observation)
         if not self._chunk:
             actions, probabilities = self._predict()
-            told = [{}] * len(actions) if probabilities is None else [{"probabilities": each} for each in probabilities]
-            self._chunk.extend(list(zip(actions, told, strict=True))[: self.execute])
+            infos = [{}] * len(actions) if probabilities is None else [{"probabilities": p} for p in probabilities]
+            self._chunk.extend(list(zip(actions, infos, strict=True))[: self.execute])
         action, self.info = self._chunk.popleft()
         return action
 
     def plan(self, observation: Observation) -> Array:
-        """The (k, D) float32 actions of a whole chunk, within the spec's bounds, of which the first `execute` are to be
-        executed, for those who time them themselves.
+        """Return a chunk of actions, (k, D) float32, clipped to the spec; the caller executes the first `execute`.
 
         Raises:
-            ValueError: the observation is not what the policy was trained on.
+            ValueError: the observation does not match the spec.
         """
-        self._see(observation)
+        self._observe(observation)
         return self._predict()[0]
 
-    def _see(self, observation: Observation) -> None:
+    def _observe(self, observation: Observation) -> None:
         if observation.instruction != self._instruction:
             self.reset(observation.instruction, 0)
-        self._frames.append(self._kept(self.frame(observation)))
+        self._frames.append(self._encoded(self.frame(observation)))
 
     @torch.inference_mode()
     def _predict(self) -> tuple[Array, Array | None]:
-        """Actions (k, D), clipped, and token probabilities (k, D, K), where the model has them."""
-        drawn = self.model.draw(self._random)
-        noise = {} if drawn is None else {"noise": drawn.to(self.device)}
-        with self._computing():
-            actions, probabilities = self._decide({**self.window(), **noise})
-        told = None if probabilities is None else probabilities[0].float().cpu().numpy()
-        return np.clip(actions[0].float().cpu().numpy(), self._low, self._high), told
+        """Return clipped actions, (k, D), and token probabilities, (k, D, K), if the model has them."""
+        noise = self.model.sample_noise(self._random)
+        inputs = self.window() if noise is None else {**self.window(), "noise": noise.to(self.device)}
+        with self._autocast():
+            actions, probabilities = self._predict_chunk(inputs)
+        array = None if probabilities is None else probabilities[0].float().cpu().numpy()
+        return np.clip(actions[0].float().cpu().numpy(), self._low, self._high), array
 
-    def _computing(self) -> torch.autocast:
-        return torch.autocast(self.device.type, torch.bfloat16, enabled=self._half)
+    def _autocast(self) -> torch.autocast:
+        return torch.autocast(self.device.type, torch.bfloat16, enabled=self._bf16)
 
     def window(self) -> Batch:
-        """What the model is given now, a batch of one: the frames seen so far, and absent ones up to its history."""
-        absent = {name: torch.zeros_like(values) for name, values in self._frames[0].items()}
-        frames = [*self._frames, *[absent] * (self.model.history - len(self._frames))]
-        joined = {name: torch.cat([frame[name] for frame in frames], 1) for name in absent}
+        """Return the current model input, a batch of one: the frames so far, padded to the history of the model."""
+        padding = {name: torch.zeros_like(values) for name, values in self._frames[0].items()}
+        frames = [*self._frames, *[padding] * (self.model.history - len(self._frames))]
+        joined = {name: torch.cat([frame[name] for frame in frames], 1) for name in padding}
         rgb = {name: joined.pop(name) for name in self.spec.cameras if name in joined}
         return {**joined, "rgb": rgb, "text": self._text}
 
     def frame(self, observation: Observation) -> Batch:
-        """One observation as a batch of one frame.
+        """Convert an observation to a batch of one frame.
 
         Raises:
-            ValueError: the observation is not what the policy was trained on.
+            ValueError: the observation does not match the spec.
         """
         shape = (*self.spec.image_size, 3)
-        seen = {camera: image.shape for camera, image in observation.rgb.items()}
-        if any(seen.get(camera) != shape for camera in self.spec.cameras):
-            raise ValueError(f"the policy looks through {self.spec.cameras} in {shape}, the observation has {seen}")
-        proprio = np.concatenate([observation.joints, observation.velocities, [observation.gripper]])
+        shapes = {camera: image.shape for camera, image in observation.rgb.items()}
+        if any(shapes.get(camera) != shape for camera in self.spec.cameras):
+            raise ValueError(f"the policy needs cameras {self.spec.cameras} of {shape}, the observation has {shapes}")
+        if observation.state.shape != (len(self.spec.state),):
+            raise ValueError(f"the policy's state is {self.spec.state}, the observation's {observation.state.shape}")
         return {
             "rgb": {camera: self._tensor(observation.rgb[camera]) for camera in self.spec.cameras},
-            "proprio": self._tensor(proprio.astype(np.float32)),
+            "state": self._tensor(observation.state),
             "present": torch.ones(1, 1, dtype=torch.bool, device=self.device),
             "text": self._text,
         }
 
     @torch.inference_mode()
-    def _kept(self, frame: Batch) -> dict[str, Tensor]:
-        """What is kept of a frame, (1, 1, …): its tokens where the model can do with them, else all of it."""
-        with self._computing():
+    def _encoded(self, frame: Batch) -> dict[str, Tensor]:
+        """Return the part of a frame to cache, (1, 1, …): its tokens if the model encodes frames, else all of it."""
+        with self._autocast():
             tokens = self._encode(frame)
         if tokens is None:
-            return {**frame["rgb"], "proprio": frame["proprio"], "present": frame["present"]}
-        # A CUDA graph writes its next result where it wrote this one.
+            return {**frame["rgb"], "state": frame["state"], "present": frame["present"]}
+        # A CUDA graph overwrites its output in the next call.
         return {"tokens": tokens.clone(), "present": frame["present"]}
 
     def _tensor(self, values: Array) -> Tensor:
         return torch.from_numpy(values.copy())[None, None].to(self.device)
 
 
-def keep_by_processor() -> None:
-    """Set the folder in which PyTorch keeps compiled graphs, unless it is set, to one for this kind of processor.
+def latency(policy: Policy) -> float:
+    """Measure the time from an observation to its action with a full history [ms].
 
-    Frozen weights are laid out for a processor. Graphs that were compiled on another one, of the same home folder or
-    with other instructions switched off, were seen to give other actions without an error.
+    It is the smallest of five medians over twenty plans, because other load only adds time.
     """
-    if KEPT_IN not in os.environ:
-        features = torch.cpu.get_capabilities() if hasattr(torch.cpu, "get_capabilities") else {}
-        kind = (torch.backends.cpu.get_cpu_capability(), os.environ.get("ONEDNN_MAX_CPU_ISA"), features)
-        os.environ[KEPT_IN] = f"{gettempdir()}/torchinductor_{getuser()}_{crc32(repr(kind).encode()):08x}"
-
-
-def noise(spec: Spec, random: np.random.Generator) -> Observation:
-    """An observation in which everything is random but the instruction."""
-    rgb = {camera: random.integers(256, size=(*spec.image_size, 3), dtype=np.uint8) for camera in spec.cameras}
-    joints, velocities = random.uniform(-1, 1, (2, len(spec.joints))).astype(np.float32)
-    return Observation(rgb, {}, joints, velocities, random.uniform(0, 0.08), "lift the red block")
-
-
-def latency(policy: Policy, rounds: int = 5, plans: int = 20) -> float:
-    """Time from an observation to its action, with a full history [ms]: of several medians the least, as whatever else
-    the machine is busy with only adds."""
-    observation = noise(policy.spec, np.random.default_rng(0))
+    observation = policy.spec.random_observation(np.random.default_rng(0))
     for _ in range(policy.model.history):
         policy.plan(observation)
     medians = []
-    for _ in range(rounds):
+    for _ in range(5):
         seconds = []
-        for _ in range(plans):
+        for _ in range(20):
             started = time.perf_counter()
             policy.plan(observation)
             seconds.append(time.perf_counter() - started)

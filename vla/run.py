@@ -1,4 +1,4 @@
-"""The entry, `python -m vla.run [job=…] [GROUP=OPTION …] [KEY=VALUE …]`: compose a config, check it, do the job."""
+"""Entry point, `python -m vla.run [job=…] [GROUP=OPTION …] [KEY=VALUE …]`: compose a config, check it, run the job."""
 
 from __future__ import annotations
 
@@ -9,9 +9,10 @@ import sys
 import traceback
 from pathlib import Path
 from string import Template
-from typing import NoReturn
+from typing import Any, NoReturn
 
 import hydra
+from hydra import compose
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import ConfigCompositionException, HydraException, MissingConfigException, OverrideParseException
 from hydra.types import RunMode
@@ -19,23 +20,25 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
-from vla.check import JOBS, check, suggestion
+from vla import jobs
+from vla.config.annotations import targets
+from vla.config.build import suggestion
+from vla.config.check import JOBS, check
+from vla.config.compose import CONF
+from vla.config.experiment import Experiment
+from vla.config.packages import offer_options, option_folders, trust
 from vla.deploy import ros
-from vla.ending import swift_end
-from vla.resume import adopt, go_on, start_from, taken_up
-from vla.sweep import failures, note_failure
+from vla.parallel.fast_exit import fast_exit
+from vla.runs.sweep import failures, save_failure
+from vla.tasks.gl import choose_backend
 
 PACKAGE = Path(__file__).resolve().parent
-# Inside the package where it was installed from a wheel, beside it in a clone.
-CONF = next(path for path in (PACKAGE / "conf", PACKAGE.parent / "conf") if (path / "config.yaml").is_file())
-
-ADOPTING = ("evaluate", "export", "deploy", "benchmark")  # jobs that use a checkpoint's own task, tokenizer and model
-SWEEP = "in the sweep "  # note on the error of a cell
-TRACEBACKS = "VLA_TRACEBACKS"  # the user's wish for tracebacks, kept for the processes that a trainer starts
+SWEEP = "in the sweep "  # prefix of a note on a cell's error
+TRACEBACKS = "VLA_TRACEBACKS"  # environment variable that passes the user's HYDRA_FULL_ERROR to child processes
 
 
 def sentence(error: Exception) -> str:
-    """One line that says what is wrong, and what was probably meant."""
+    """Describe an error in one line, with a suggestion where possible."""
     cause = error.__cause__
     if isinstance(error, MissingConfigException) and error.missing_cfg_file and error.options is not None:
         group, _, option = error.missing_cfg_file.rpartition("/")
@@ -69,14 +72,14 @@ def _unknown_key(error: OmegaConfBaseException) -> str:
 
 
 def _meant_for_user(error: Exception) -> bool:
-    """Whether `error` speaks about the command line, a file or the machine, rather than about a bug.
+    """Return whether `error` is about the command line, a file or the machine rather than a bug.
 
-    Libraries raise ValueError and RuntimeError for bugs as well; the traceback of one that our own code raises on
-    purpose, here or in a worker process, ends with a `raise` in this package (or in Hydra, for the command line).
+    Libraries also raise ValueError and RuntimeError for bugs. The traceback of a deliberate error, here or in a worker
+    process, ends with a `raise` in this package, or in Hydra for the command line.
     """
     if isinstance(error, (OSError, HydraException, OmegaConfBaseException)):
         return True
-    # Lightning's, which would take seconds to import, MuJoCo's for want of a display, and those about YAML files.
+    # By name, because importing Lightning takes seconds; MuJoCo raises FatalError without a display.
     if type(error).__name__ in ("MisconfigurationException", "FatalError") or isinstance(error, YAMLError):
         return True
     remote = type(error.__cause__).__name__ == "_RemoteTraceback"
@@ -90,15 +93,27 @@ def _meant_for_user(error: Exception) -> bool:
 
 
 def _require_sweepable(cfg: DictConfig) -> None:
-    """Processes that a trainer starts repeat the command line, which under -m would be the whole sweep."""
+    """Refuse -m with several devices: processes that a trainer starts repeat the command line, here the whole sweep."""
     choices = HydraConfig.get().runtime.choices
     if HydraConfig.get().mode != RunMode.MULTIRUN or choices["hydra/launcher"] == "submitit_slurm":
         return
-    if "trainer" in JOBS.get(cfg.job, ()) and cfg.trainer is not None and _devices(cfg.trainer) > 1:
+    if "trainer" in _groups(cfg) and cfg.trainer is not None and _devices(cfg.trainer) > 1:
         raise ValueError(
             "-m cannot train on several devices in this launcher: add trainer.devices=1, "
-            "or hydra/launcher=submitit_slurm, which starts every process of a cell by itself"
+            "or hydra/launcher=submitit_slurm, which starts every process of a cell itself"
         )
+
+
+def _require_swept() -> None:
+    """Refuse an experiment that is a grid without -m, which would run one cell only."""
+    choices = HydraConfig.get().runtime.choices
+    if HydraConfig.get().mode == RunMode.RUN and HydraConfig.get().sweeper.params:
+        raise ValueError(f"experiment={choices['experiment']} is a grid of runs: add -m")
+
+
+def _groups(cfg: DictConfig) -> tuple[str, ...]:
+    """Return the groups that the job needs; none for an unknown job, which `check` refuses."""
+    return JOBS[cfg.job].groups if cfg.job in JOBS else ()
 
 
 def _devices(trainer: DictConfig) -> int:
@@ -109,50 +124,59 @@ def _devices(trainer: DictConfig) -> int:
         return (len(devices.split(",")) if "," in str(devices) else int(devices)) * nodes
     if trainer.get("accelerator", "auto") == "cpu":
         return int(nodes)
-    from torch.cuda import device_count  # slow to import, and needed in this case only
+    from torch.cuda import device_count  # slow to import
 
     return max(device_count(), 1) * nodes
 
 
 def _remove_unused() -> None:
-    """Remove the folder that Hydra made for this run, which goes on in the folder of another one."""
+    """Remove the empty folder that Hydra created for this run, because it resumes in another folder."""
     folder = Path(HydraConfig.get().runtime.output_dir)
     if HydraConfig.get().mode == RunMode.RUN and {path.name for path in folder.iterdir()} <= {".hydra"}:
         shutil.rmtree(folder, ignore_errors=True)
 
 
 def _do(cfg: DictConfig) -> float | None:
-    from vla import jobs
-
-    if cfg.checkpoint is not None or "task" in JOBS.get(cfg.job, ()):
-        from vla.tasks.backend import choose_backend
-
-        # Before a check imports MuJoCo, which reads MUJOCO_GL at once; a policy on a robot does not render.
+    _require_swept()
+    if cfg.checkpoint is not None or "task" in _groups(cfg):
+        # Before the check imports MuJoCo, which reads MUJOCO_GL then; a policy on a robot does not render.
         choose_backend(required=cfg.job != "deploy")
-    said = HydraConfig.get().overrides.task
-    if cfg.pretrained is not None:
-        cfg = start_from(cfg, said)
-    if cfg.checkpoint is not None and (cfg.checkpoint == "last" or cfg.resume or cfg.job == "train"):
-        if cfg.checkpoint == "last":
-            _remove_unused()
-        cfg = go_on(cfg, said)
-    elif cfg.checkpoint is not None and cfg.job in ADOPTING:
-        from vla.policy import read_checkpoint
-
-        cfg = adopt(cfg, read_checkpoint(cfg.checkpoint).config, said)
-    _require_sweepable(cfg)  # with the trainer that a checkpoint brings
+    composed: Any = OmegaConf.to_container(cfg, resolve=False)
+    trust(composed.get("trust"), targets(composed))  # before anything is read from a file
+    cfg = _adopted(cfg, HydraConfig.get().overrides.task)
+    _require_sweepable(cfg)  # with the trainer that a run brings
     check(cfg)
-    left = taken_up(cfg) if cfg.job in ("train", "evaluate") else cfg
-    return jobs.run(left) if left is not None else None
+    return jobs.run(Experiment.of(cfg, compose("config")))
+
+
+def _adopted(cfg: DictConfig, overrides: list[str]) -> DictConfig:
+    """Return `cfg` merged with the run, checkpoint or pretrained weights that it names.
+
+    Raises:
+        ValueError: a value is no path, or the named file cannot be used.
+    """
+    for key in ("resume", "checkpoint", "pretrained"):
+        if not isinstance(cfg[key], str | None):
+            raise ValueError(f"{key}={cfg[key]} is no path: give a folder or file, in quotes if it is called so")
+    if cfg.resume is cfg.pretrained is cfg.checkpoint is None:
+        return cfg
+    from vla.config.adopt import adopt, finetune, resume  # imports PyTorch, as the next one does
+    from vla.runs.resume import interrupted_run
+
+    if cfg.resume is not None:
+        _remove_unused()
+        run = interrupted_run(Path(cfg.output).parent) if cfg.resume == "last" else Path(cfg.resume)
+        return resume(cfg, run, overrides)
+    return finetune(cfg, overrides) if cfg.pretrained is not None else adopt(cfg, overrides)
 
 
 def _fail(error: Exception) -> NoReturn:
-    """Raise the error of a cell, which may be in another process than the sweep and leave its traceback there."""
+    """Save a cell's error in its folder and raise it with a note, because the sweep may run in another process."""
     cell = Path(HydraConfig.get().runtime.output_dir)
     if _meant_for_user(error):
-        note_failure(cell, sentence(error))
+        save_failure(cell, sentence(error))
     else:
-        note_failure(cell, "".join([*traceback.format_exception_only(error), *traceback.format_exception(error)]))
+        save_failure(cell, "".join([*traceback.format_exception_only(error), *traceback.format_exception(error)]))
     error.add_note(f"{SWEEP}{cell.parent}")
     raise error
 
@@ -174,32 +198,33 @@ def _compose(cfg: DictConfig) -> float | None:
         return _do(cfg)
     except Exception as error:
         if HydraConfig.get().mode == RunMode.MULTIRUN:
-            _fail(error)  # a sweeper may want to go on with the next job
+            _fail(error)  # a sweeper may continue with the next job
         _end(error)
 
 
 def _menu() -> str:
-    """What --help prints. Hydra asks each of its sources for every group anew, several times, which takes most of a
-    second."""
+    """Return the text of --help; Hydra's own search through its config sources takes most of a second."""
     groups: dict[str, list[str]] = {}
-    for file in CONF.rglob("*.yaml"):
-        group = file.parent.relative_to(CONF)
-        if group.parts[:1] not in ((), ("hydra",)):
-            groups.setdefault(group.as_posix(), []).append(file.stem)
-    lines = [f"{group}: {', '.join(sorted(options))}\n" for group, options in sorted(groups.items())]
+    for folder in (CONF, *(folder for _, folder in option_folders())):
+        for file in folder.rglob("*.yaml"):
+            group = file.parent.relative_to(folder)
+            if group.parts[:1] not in ((), ("hydra",)):
+                groups.setdefault(group.as_posix(), []).append(file.stem)
+    lines = [f"{group}: {', '.join(sorted({*options}))}\n" for group, options in sorted(groups.items())]
     template = OmegaConf.select(OmegaConf.load(CONF / "config.yaml"), "hydra.help.template")
     return Template(template).substitute(APP_CONFIG_GROUPS="".join(lines))
 
 
 def main() -> None:
-    """Do what the command line says; what the user can mend ends in one sentence, unless HYDRA_FULL_ERROR=1."""
-    if sys.argv[1:] in (["--help"], ["-h"]):  # with overrides or other folders of options, Hydra looks for itself
-        print(_menu())
-        return
+    """Run the command line; errors that the user can fix end in one sentence unless HYDRA_FULL_ERROR=1."""
     os.environ.setdefault(TRACEBACKS, os.environ.get("HYDRA_FULL_ERROR", "0"))
     os.environ["HYDRA_FULL_ERROR"] = "1"  # otherwise Hydra prints errors itself
     sys.argv[1:], ros.arguments[:] = ros.split_arguments(sys.argv[1:])
     try:
+        if sys.argv[1:] in (["--help"], ["-h"]):  # with further arguments Hydra composes the help itself
+            print(_menu())
+            return
+        offer_options()
         _compose()
     except KeyboardInterrupt:
         sys.exit(130)
@@ -208,5 +233,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    with swift_end():
+    with fast_exit():
         main()

@@ -1,84 +1,137 @@
-"""The contract between task, data, model and robot: what one control step looks like, and who talks to whom.
+"""The contract between task, data, model and robot: the layout of one control step, and the interfaces between them.
 
-Everything that passes between the parts of `vla` is one of the types below. The modules on either side import this
-file and never each other.
+Tasks, data, models and deployment exchange only the types below: they import this module and never each other.
 """
 
 from __future__ import annotations
 
 import json
+import math
 import re
-from collections.abc import Iterator, Mapping
-from dataclasses import asdict, dataclass, fields, replace
-from typing import Annotated, Any, Literal, Protocol
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import AbstractContextManager
+from dataclasses import asdict, dataclass, field, replace
+from typing import Annotated, Any, Literal, Protocol, runtime_checkable
 
 import numpy as np
 from annotated_types import Ge, Le, MaxLen, MinLen, Predicate
 
-from vla.documents import STRICT, parse_json
-from vla.types import Count, Positive, unique
+from vla.io.documents import STRICT, parse_json
+from vla.io.types import Count, Point, Positive, unique
 
 Array = np.ndarray
 
-FIRST_SEED = 1_000_000  # of evaluation; collection, which starts at small ones, never gets this far
+FIRST_SEED = 1_000_000  # of evaluation; collection uses smaller seeds only
 LONGEST_INSTRUCTION = 1000  # characters
 
 
 def names_a_file(name: str) -> bool:
-    """fit to be a part of a file's name"""
+    """usable in a file name"""
     return re.fullmatch(r"\w[\w.-]*", name) is not None
 
 
-# What a spec out of a file may hold.
+# Limits of a spec that is read from a file.
 Name = Annotated[str, MinLen(1), MaxLen(100)]
 Names = Annotated[tuple[Name, ...], MinLen(1), MaxLen(100), Predicate(unique)]
 Camera = Annotated[Name, Predicate(names_a_file)]
 Cameras = Annotated[tuple[Camera, ...], MinLen(1), MaxLen(100), Predicate(unique)]
 Pixels = Annotated[int, Ge(1), Le(4096)]
+Units = Annotated[tuple[Name, ...], MaxLen(100)]
 Numbers = Annotated[tuple[float, ...], MaxLen(100)]
 
 
 @dataclass(frozen=True)
+class RobotModel:
+    """Arm whose joints are part of the state; kinematics and deployment need it."""
+
+    __pydantic_config__ = STRICT
+
+    joints: Names  # joint positions [rad] in the state, base to tip
+    frame: Annotated[str, MaxLen(100)]  # reference frame of Cartesian actions
+    velocities: Annotated[tuple[Name, ...], MaxLen(100), Predicate(unique)] = ()  # joint velocities, in the same order
+    gripper: Name | None = None  # gripper opening [m] in the state
+    # (J + 1, 7) pose of each joint frame, and of the tool frame, in the frame before: offset [m], quaternion wxyz.
+    # Joints rotate about z. Empty if unknown.
+    chain: Annotated[tuple[Numbers, ...], MaxLen(101)] = ()
+
+    @property
+    def components(self) -> tuple[str, ...]:
+        """Names of all state components of the robot."""
+        return (*self.joints, *self.velocities, *([self.gripper] if self.gripper else []))
+
+
+@dataclass(frozen=True)
 class Spec:
-    """What one step looks like; stored with episodes and checkpoints and compared wherever the two meet."""
+    """Layout of one step; stored with episodes and checkpoints, which must agree."""
 
     __pydantic_config__ = STRICT
 
     cameras: Cameras
     image_size: tuple[Pixels, Pixels]  # height, width [px]
-    joints: Names  # base to tip
+    state: Names  # (P,) measured components beside the images
+    state_units: Units  # (P,) "m" | "rad" | "m/s" | "rad/s" | "1"
     action: Names  # (D,) components
-    units: Annotated[tuple[Name, ...], MaxLen(100)]  # (D,) "m" | "rad" | "1"
+    units: Units  # (D,) of the action
     low: Numbers  # (D,) smallest action
     high: Numbers  # (D,) largest action
-    frame: Annotated[str, MaxLen(100)]  # frame in which Cartesian actions are expressed
     control_hz: Positive  # [Hz]
+    depth: Annotated[tuple[Camera, ...], MaxLen(100), Predicate(unique)] = ()  # the cameras that also give depth
     # simulator state kept as an auxiliary training target: name, size
     truth: Annotated[tuple[tuple[Name, Count], ...], MaxLen(100)] = ()
-    # (J + 1, 7) where the frame of each joint, which turns about its z axis, and last that of the tool lies in the
-    # frame before: offset [m], quaternion wxyz; nothing where it is not known
-    chain: Annotated[tuple[Numbers, ...], MaxLen(101)] = ()
+    robot: RobotModel | None = None  # None: no kinematics and no deployment
 
     @property
     def truth_size(self) -> int:
-        """Number of scalars in a flattened truth vector."""
+        """Number of scalars in the flattened truth vector."""
         return sum(size for _, size in self.truth)
 
     @property
-    def perceived(self) -> Spec:
-        """The same without the truth, which a policy never sees."""
+    def without_truth(self) -> Spec:
+        """The spec without simulator truth, which is never an input of a policy."""
         return replace(self, truth=())
 
+    @property
+    def rates(self) -> list[int]:
+        """Indices of the state components that are rates of change, by their units."""
+        return [index for index, unit in enumerate(self.state_units) if unit.endswith("/s")]
+
+    @property
+    def pose(self) -> list[int]:
+        """Indices of the other state components."""
+        return [index for index in range(len(self.state)) if index not in self.rates]
+
+    def indices(self, names: Iterable[str]) -> list[int]:
+        """Return the indices of state components by name."""
+        return [self.state.index(name) for name in names]
+
+    def require_robot(self, what: str) -> RobotModel:
+        """Return the robot.
+
+        Raises:
+            ValueError: there is none; the message says that `what` needs it.
+        """
+        if self.robot is None:
+            raise ValueError(f"{what} needs a robot, and the spec has none (robot=None): its state is {self.state}")
+        return self.robot
+
+    def random_observation(self, random: np.random.Generator) -> Observation:
+        """Return an observation with random images and state, a fixed instruction and no truth."""
+        rgb = {camera: random.integers(256, size=(*self.image_size, 3), dtype=np.uint8) for camera in self.cameras}
+        depth = {camera: random.integers(2**16, size=self.image_size, dtype=np.uint16) for camera in self.depth}
+        state = random.uniform(-1, 1, len(self.state)).astype(np.float32)
+        return Observation(rgb, state, "do what is to be done", depth)
+
     def to_dict(self) -> dict[str, Any]:
-        """Plain lists, numbers and strings, fit for JSON and for a checkpoint loaded with `weights_only=True`."""
-        return {name: _plain(value) for name, value in asdict(self).items()}
+        """Return plain lists, numbers and strings, for JSON and for checkpoints loaded with `weights_only=True`."""
+        values: dict[str, Any] = _plain(asdict(self))
+        return values
 
     @classmethod
     def from_dict(cls, values: Any, name: str = "the spec") -> Spec:
-        """The inverse of `to_dict`, of values that anybody may have written; fields that have a default may be missing.
+        """Invert `to_dict` on untrusted values; fields with a default may be missing.
 
         Raises:
-            ValueError: `values`, called `name` in errors, are no spec.
+            ValueError: `values` are no spec; the message calls them `name`.
         """
         try:
             text = json.dumps(values)
@@ -92,48 +145,70 @@ class Spec:
     def require(self, other: Spec, what: str, against: str) -> None:
         """Raise a ValueError naming the first field in which the spec of `what` (self) differs from `against`.
 
-        A chain that one of them does not know is no difference.
+        A chain that is unknown to one of them is no difference.
         """
-        for field in fields(self):
-            mine, theirs = getattr(self, field.name), getattr(other, field.name)
-            if mine != theirs and not (field.name == "chain" and () in (mine, theirs)):
-                raise ValueError(f"{what} has {field.name} = {str(mine)[:200]}, but {against} has {str(theirs)[:200]}")
+        mine, theirs = _fields(self), _fields(other)
+        for name, value in mine.items():
+            unknown = name == "robot.chain" and () in (value, theirs.get(name))
+            if value != theirs.get(name) and not unknown:
+                raise ValueError(
+                    f"{what} has {name} = {str(value)[:200]}, but {against} has {str(theirs.get(name))[:200]}"
+                )
+
+
+def _fields(spec: Spec) -> dict[str, Any]:
+    """Return field → value, with the fields of the robot under dotted names."""
+    robot = {f"robot.{name}": value for name, value in vars(spec.robot).items()} if spec.robot else {}
+    return {**vars(spec), "robot": "an arm" if spec.robot else None, **robot}
 
 
 def _plain(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {name: _plain(item) for name, item in value.items()}
     return [_plain(item) for item in value] if isinstance(value, (tuple, list)) else value
 
 
 def _contradictions(spec: Spec) -> Iterator[str]:
-    """How fields that fit their types do not fit each other."""
+    """Yield the inconsistencies between fields that are valid on their own."""
+    if len(spec.state_units) != len(spec.state):
+        yield f"state_units has {len(spec.state_units)} components, state {len(spec.state)}"
     for name in ("units", "low", "high"):
         if len(getattr(spec, name)) != len(spec.action):
             yield f"{name} has {len(getattr(spec, name))} components, action {len(spec.action)}"
     for name, low, high in zip(spec.action, spec.low, spec.high, strict=False):
         if not low < high:
             yield f"low of {name} is {low}, not less than high, {high}"
-    if spec.chain and [len(frame) for frame in spec.chain] != [7] * (len(spec.joints) + 1):
-        yield f"chain is not 7 numbers for each of {len(spec.joints)} joints and the tool"
+    if unknown := [camera for camera in spec.depth if camera not in spec.cameras]:
+        yield f"depth names {', '.join(unknown)}, which is not among the cameras"
     if not unique([name for name, _ in spec.truth]) or spec.truth_size > 4096:
         yield "truth has a name twice, or more than 4096 numbers"
+    if spec.robot is not None:
+        yield from _contradictions_of_robot(spec.robot, spec)
+
+
+def _contradictions_of_robot(robot: RobotModel, spec: Spec) -> Iterator[str]:
+    if unknown := [name for name in robot.components if name not in spec.state]:
+        yield f"robot names {', '.join(unknown)}, which is not in the state"
+    if len(robot.velocities) not in (0, len(robot.joints)):
+        yield f"robot has {len(robot.velocities)} velocities and {len(robot.joints)} joints"
+    if robot.chain and [len(frame) for frame in robot.chain] != [7] * (len(robot.joints) + 1):
+        yield f"chain is not 7 numbers for each of {len(robot.joints)} joints and the tool"
 
 
 @dataclass(frozen=True)
 class Observation:
-    """What an agent is given at one step."""
+    """Input of an agent at one step."""
 
     rgb: dict[str, Array]  # camera → (H, W, 3) uint8
-    depth: dict[str, Array]  # camera → (H, W) uint16 [mm], 0 where there is no return (ROS 16UC1)
-    joints: Array  # (7,) float32 [rad]
-    velocities: Array  # (7,) float32 [rad/s]
-    gripper: float  # opening between the fingers [m]
+    state: Array  # (P,) float32
     instruction: str
-    truth: dict[str, Array] | None = None  # simulator only: experts may read it, policies never do
+    depth: dict[str, Array] = field(default_factory=dict)  # camera → (H, W) uint16 [mm], 0: no return (ROS 16UC1)
+    truth: dict[str, Array] | None = None  # simulator only: for experts, never for policies
 
 
 @dataclass(frozen=True)
 class Shape:
-    """One visible solid, rigidly attached to a body: enough for a recorder to draw the scene."""
+    """Visible solid, rigidly attached to a body, as a recorder draws it."""
 
     body: str
     name: str
@@ -146,111 +221,164 @@ class Shape:
     faces: Array | None = None  # (F, 3) int32, meshes only
 
 
-def flat(draws: Mapping[str, Any]) -> dict[str, Any]:
-    """Dotted name → value of everything that was drawn in an episode."""
-    values: dict[str, Any] = {}
-    for name, draw in draws.items():
-        if isinstance(draw, Mapping):
-            values |= {f"{name}.{key}": value for key, value in flat(draw).items()}
-        else:
-            values[str(name)] = draw
-    return values
-
-
-def leaves(value: Any) -> list[Any]:
-    """The numbers and words in a draw, however deep they lie in lists."""
-    plain = value.tolist() if isinstance(value, (np.ndarray, np.generic)) else value
-    return [leaf for item in plain for leaf in leaves(item)] if isinstance(plain, (list, tuple)) else [plain]
-
-
 @dataclass
 class Episode:
-    """One finished rollout of N steps."""
+    """Finished rollout of N steps."""
 
     seed: int
+    task: str  # as in `Environment`
     instruction: str
     outcome: str  # "success" or the name of the failure
-    draws: dict[str, Any]  # randomisation axis → what was drawn, JSON-able
-    observations: list[Observation]  # N, each one what the agent saw before the action of the same index
-    actions: Array  # (N, D) float32, what the agent means to be imitated
-    executed: Array  # (N, D) float32, what was sent to the robot: differs where an expert perturbs itself
+    milestones: frozenset[str]  # as in `Environment`
+    draws: dict[str, Any]  # randomisation axis → drawn values, JSON-able
+    observations: list[Observation]  # N, each one before the action of the same index
+    actions: Array  # (N, D) float32, labels for imitation
+    executed: Array  # (N, D) float32, as sent to the robot: differ where the expert is perturbed
 
     @property
     def success(self) -> bool:
-        """Whether the goal was reached and held."""
+        """True if the goal was reached and held."""
         return self.outcome == "success"
 
 
 class Environment(Protocol):
-    """A world that an agent can act in."""
+    """World that an agent acts in."""
 
     spec: Spec
+    task: str  # name of the task of this episode, such as "pick_place"; reports group by it
     done: bool  # the goal was reached and held, or the time is up
     outcome: str  # "success" or why it is not (yet) one
-    draws: dict[str, Any]  # randomisation axis → what was drawn at the last reset, JSON-able
+    milestones: frozenset[str]  # reached so far in this episode, such as "grasped"
+    draws: dict[str, Any]  # randomisation axis → values drawn at the last reset, JSON-able
 
     def reset(self, seed: int) -> Observation:
-        """Start the episode that `seed` names: the same seed gives the same episode, bit for bit."""
+        """Start the episode of `seed`: the same seed gives the same episode, bit for bit."""
         ...
 
     def step(self, action: Array) -> Observation:
-        """Apply one (D,) action for one control period and look again."""
+        """Apply one (D,) action for one control period and return the next observation."""
         ...
 
+    def blind(self) -> AbstractContextManager[None]:
+        """Return a context in which observations carry no images, which makes a replay cheap."""
+        ...
+
+    def close(self) -> None:
+        """Free the resources of the environment."""
+        ...
+
+
+@runtime_checkable
+class Drawable(Protocol):
+    """Environment that a recorder can draw in three dimensions."""
+
+    viewpoint: tuple[Point, Point]  # position of the viewer and the point looked at [m]
+
     def shapes(self) -> list[Shape]:
-        """The visible solids of the current episode, for recorders."""
+        """Return the visible solids of the current episode."""
         ...
 
     def poses(self) -> dict[str, Array]:
-        """Body name → (7,) position [m] and quaternion wxyz in the world, for recorders."""
+        """Return body name → (7,) position [m] and quaternion wxyz in the world."""
+        ...
+
+
+class Shell(Protocol):
+    """Surface of an arm, for views of a robot."""
+
+    chain: tuple[Numbers, ...]  # of the arms that it fits, as in `RobotModel`
+
+    def shapes(self) -> list[Shape]:
+        """Return the visible solids."""
+        ...
+
+    def poses(self, joints: Array, opening: float) -> dict[str, Array]:
+        """Return body name → (7,) position [m] and quaternion wxyz in the base frame.
+
+        Args:
+            joints: (J,) [rad].
+            opening: of the gripper [m].
+        """
+        ...
+
+
+@runtime_checkable
+class Drivable(Protocol):
+    """Environment whose arm also takes joint targets, independently of control periods, like a robot driver."""
+
+    def drive(self, joints: Array, opening: float, seconds: float) -> None:
+        """Move towards joint targets (J,) [rad] and a gripper opening 0…1 for `seconds` [s]."""
+        ...
+
+    def judge(self) -> None:
+        """Update the outcome after one control period of driving; the episode may end."""
+        ...
+
+    def look(self) -> Observation:
+        """Return the current observation."""
         ...
 
 
 class Agent(Protocol):
-    """Something that acts: an expert, a policy, a person."""
+    """Source of actions: an expert, a policy, a person."""
 
-    info: dict[str, Any]  # what a recorder may want to know of the last action: "clean" (D,), "probabilities" (D, K)
+    info: dict[str, Any]  # about the last action, for recorders: "clean" (D,), "probabilities" (D, K)
 
     def reset(self, instruction: str, seed: int) -> None:
-        """Forget the past; `seed` feeds the agent's own randomness, if it has any."""
+        """Start an episode without history; `seed` initialises the random generator of the agent, if it has one."""
         ...
 
     def act(self, observation: Observation) -> Array:
-        """The (D,) float32 action to execute now."""
+        """Return the (D,) float32 action to execute now."""
         ...
 
 
 class Recorder(Protocol):
-    """Somebody who watches a rollout."""
+    """Observer of a rollout."""
 
     def start(self, name: str, environment: Environment) -> None:
-        """A new episode begins."""
+        """Begin an episode."""
         ...
 
     def step(self, observation: Observation, action: Array, info: Mapping[str, Any]) -> None:
-        """One step was decided: what was seen, and the (D,) action that follows."""
+        """Record one step: the observation and the (D,) action chosen for it."""
         ...
 
     def end(self, episode: Episode) -> None:
-        """The episode is over."""
+        """Finish the episode."""
         ...
 
 
 class Exporter(Protocol):
-    """Something that writes an episode store, or a policy, in another format."""
+    """Writer of episode stores in another format."""
 
-    def export(self, source: Any) -> Any:
-        """Write all of it; returns the path of what was written."""
+    def export(self, store: Any, cluster: Any) -> Any:
+        """Write the episodes of a `vla.data.episodes.EpisodeStore` with the workers of a `vla.parallel.pool.Cluster`.
+
+        Returns the path of the export.
+        """
+        ...
+
+
+class PolicyExporter(Protocol):
+    """Writer of policies in another format."""
+
+    def export_policy(self, policy: Any) -> Any:
+        """Write a `vla.policy.Policy`; returns the path of the export."""
         ...
 
 
 class Deployment(Protocol):
-    """A way to put a policy to work; built as `Deployment(**yaml, policy=…, environment=…, output=…)`.
+    """Execution of a policy outside training; built as `Deployment(**yaml, policy=…, environment=…, output=…)`.
 
-    `policy` and `environment` make the checkpoint's policy and its task's environment, for those who need them;
+    `policy` and `environment` are factories of the checkpoint's policy and of its task's environment, called on demand;
     `output` is a folder to write to.
     """
 
     def run(self) -> Any:
-        """Work until done or interrupted; what is measured on the way comes back as a `vla.evaluate.Report`."""
+        """Run until finished or interrupted; returns a `vla.rollouts.evaluate.Report` if success was measured."""
         ...
+
+
+# Unit of an action → factor and unit for display.
+READABLE = {"m": (1000.0, "mm"), "rad": (180 / math.pi, "deg"), "1": (1.0, "")}

@@ -1,1 +1,1 @@
-"""The episode store, the window loader and exporters."""
+"""Episode store, window loader and dataset formats."""

@@ -1,13 +1,13 @@
-"""The episode store: one flat file per field, one index line per tried seed, and nothing else.
+"""Episode store: one flat file per field and one index line per tried seed.
 
-A folder holds `store.json` (what the rows mean), `<field>.bin` (the rows of every episode, one after the other) and
-`index.jsonl`. An episode exists once its index line does: its rows are flushed to disk before the line is, so a
-process killed at any moment leaves at most a tail that no line speaks of, and the next writer cuts it off. The bytes
-depend on the episodes only, never on when or by how many processes they were made.
+A folder holds `store.json` (the layout of the rows), `<field>.bin` (the rows of all episodes, in order) and
+`index.jsonl`. An episode exists once its index line does: its rows are written before the line, so a process killed at
+any moment leaves at most rows without a line, which the next writer truncates. The bytes depend on the episodes only,
+never on time or on the number of processes.
 
-A store that was collected holds consecutive seeds of one config, and grows. One that was put together from others
-(`vla.data.inspection`) has their configs as `parts` in its own, holds whatever seeds were chosen, and does not grow.
-Nor does one with packed images (`vla.data.packed`), in which `store.json` says which field is packed how.
+A collected store holds consecutive seeds of one config and can grow. A derived store (`vla.data.verification`) lists
+the configs of its sources as `parts`, holds any seeds, and cannot grow. Nor can a store with packed images
+(`vla.data.formats.packed`), whose `store.json` gives the codec of every packed field.
 """
 
 from __future__ import annotations
@@ -24,27 +24,37 @@ from typing import Any, BinaryIO
 import numpy as np
 from filelock import FileLock, Timeout
 
-from vla.data.header import fields_of, header_of, read_header, write_header
+from vla.data.header import fields_of, header_of, images_of, read_header, write_header
+from vla.data.image_codec import JPEG, PackedRows, whole_rows
 from vla.data.index import SALVAGE, Entry, dumps, index_line, listed, parse_line, read_index
-from vla.data.pack import JPEG, PackedRows, whole_rows
 from vla.data.statistics import Statistics, statistics_of
-from vla.spec import Array, Episode, Spec
+from vla.spec import Array, Episode, Observation, Spec
 
 Rows = Array | PackedRows
 
-BLOCK = 256  # rows whose checksum is computed at once
+BLOCK = 256  # rows per update of a checksum
 
 log = logging.getLogger(__name__)
 
 
 class EpisodeStore:
-    """Episodes on disk, opened for reading; `create_or_open` and `writing` make it grow.
+    """Episodes on disk, opened for reading; `create_or_open` and `writing` extend it.
 
-    Attributes: `header`, all that `store.json` says; `spec`; `config`, what made the episodes; `fields`, as
-    `fields_of`; `packed`, field of packed images → codec; `tried`, one entry per seed. With `episodes` only the first
-    so many are seen. With `damaged` a store whose files are cut short or whose index has unreadable lines is opened as
-    well, to read what is left; the seeds of such lines are `LOST`. Raises a ValueError where there is no store, its
-    format is unknown, it is damaged, or it holds fewer than `episodes`.
+    Attributes:
+        header: content of `store.json`.
+        spec: layout of a step.
+        config: of the task and the expert of the episodes.
+        fields: field → shape and dtype of a row, see `fields_of`.
+        packed: packed field → codec.
+        tried: one entry per seed.
+
+    Args:
+        folder: of the store.
+        episodes: use only the first so many; all of them when None.
+        damaged: also open a store with truncated files or unreadable index lines; the seeds of the latter are `LOST`.
+
+    Raises:
+        ValueError: the folder holds no store, or one that has another format, is damaged, or is too short.
     """
 
     def __init__(self, folder: str | Path, episodes: int | None = None, damaged: bool = False) -> None:
@@ -61,9 +71,10 @@ class EpisodeStore:
 
     @classmethod
     def create_or_open(cls, folder: str | Path, spec: Spec, config: Mapping[str, Any]) -> EpisodeStore:
-        """The store in `folder`, made there if there is none; a ValueError if it has another spec or config.
+        """Open the store in `folder`, or create an empty one.
 
-        Another is for episodes that lie there without the `store.json` that would say what they are.
+        Raises:
+            ValueError: the store has another spec or config, or lacks its `store.json`.
         """
         folder = Path(folder)
         plain = json.loads(dumps(config))
@@ -73,39 +84,56 @@ class EpisodeStore:
                 write_header(folder, header_of(spec, plain))
         store = cls(folder)
         spec.require(store.spec, "this task", f"the episode store {folder}")
-        different = sorted(key for key in {*plain, *store.config} if plain.get(key) != store.config.get(key))
-        if different and not store.derived:  # which was put together by somebody who knows why
-            raise ValueError(f"{folder} was collected with another config for {different}: choose another folder")
+        store.require(plain)
         return store
+
+    def require(self, config: Mapping[str, Any], seed: int | None = None) -> None:
+        """Raise a ValueError if the episodes have another config or start at another seed.
+
+        A derived store may differ: its episodes were chosen explicitly.
+        """
+        if self.derived:
+            return
+        asked, there = _without_nulls(json.loads(dumps(config))), _without_nulls(self.config)
+        different = sorted(key for key in {*asked, *there} if asked.get(key) != there.get(key))
+        if different:
+            raise ValueError(f"{self.folder} was collected with another config for {different}: choose another folder")
+        if seed is not None and self.tried and self.tried[0].seed != seed:
+            first = self.tried[0].seed
+            raise ValueError(f"{self.folder} starts at seed {first}, not {seed}: set collect.seed={first}")
+
+    def require_episodes(self) -> None:
+        """Raise a ValueError if there are no episodes."""
+        if not self.episodes:
+            raise ValueError(f"{self.folder} holds no episodes yet: collect some first")
 
     @property
     def episodes(self) -> list[Entry]:
-        """The entries of the stored episodes: the tried seeds that succeeded."""
+        """Entries of the stored episodes, that is, of the seeds that succeeded."""
         return [entry for entry in self.tried if entry.success][: self._limit]
 
     @property
     def derived(self) -> bool:
-        """Whether the episodes were chosen from other stores, rather than collected."""
+        """True if the episodes were copied from other stores rather than collected."""
         return "parts" in self.config
 
     @property
     def next_seed(self) -> int | None:
-        """The seed to try next; None while none has been tried, or where any may follow."""
+        """Next seed to try; None if none has been tried yet, or if any may follow."""
         return self.tried[-1].seed + 1 if self.tried and not self.derived else None
 
     @property
     def statistics(self) -> Statistics:
-        """Moments of the actions in `episodes`, and a sample of them; a ValueError if there are none, or damaged."""
-        if not self.episodes:
-            raise ValueError(f"{self.folder} holds no episodes yet: collect some first")
+        """Moments and a sample of the actions in `episodes`; a ValueError if there are none, or if they are damaged."""
+        self.require_episodes()
         actions = self.rows("action")
         self.verify(self.episodes, {"action": actions})
         return statistics_of(self.episodes, np.asarray(actions))
 
     def rows(self, field: str) -> Rows:
-        """All committed rows of `field`, (N, …): nothing is read until it is indexed.
+        """Return all committed rows of `field`, (N, …), which are read when they are indexed.
 
-        An array, memory-mapped, or `PackedRows`, which raise a ValueError that names the seed of what is damaged.
+        They are a memory-mapped array, or `PackedRows`, which raise a ValueError with the seed of a damaged image.
         """
         if field not in self.fields:
             raise ValueError(f"{self.folder} has no field {field!r}: it has {sorted(self.fields)}")
@@ -117,22 +145,21 @@ class EpisodeStore:
         return np.asarray(np.memmap(self._path(field), dtype, mode="r", shape=(self._rows, *shape)))
 
     def read(self, entry: Entry) -> dict[str, Array]:
-        """Field → (steps, …) rows of one episode; a ValueError if they are not those that were written."""
-        span = slice(entry.start, entry.start + entry.steps)
+        """Read one episode as field → (steps, …) rows; a ValueError if a checksum differs."""
         sources = {field: self.rows(field) for field in self.fields}
-        rows = {field: np.array(source[span]) for field, source in sources.items()}
+        rows = {field: np.array(source[entry.span]) for field, source in sources.items()}
         for field, values in rows.items():
-            # Decoders may differ in how they round, so what is checked of a JPEG is the file.
-            checked = stored(sources[field], span) if self.lossy(field) else values
+            # JPEG decoders may round differently, so the checksum of a JPEG is that of its file.
+            checked = stored(sources[field], entry.span) if self.lossy(field) else values
             if len(values) < entry.steps or zlib.crc32(checked.data) != entry.crc.get(field):
                 raise self._changed([entry.seed])
         return rows
 
     def verify(self, entries: Iterable[Entry], rows: Mapping[str, Rows]) -> None:
-        """Compare the rows of episodes, field → what `rows` gives, with their checksums.
+        """Compare the `rows` of episodes, by field, with their checksums.
 
         Raises:
-            ValueError: some are not those that were written; names the seeds.
+            ValueError: some differ; the message names their seeds.
         """
         changed = [
             entry.seed
@@ -143,17 +170,17 @@ class EpisodeStore:
             raise self._changed(changed)
 
     def _intact(self, entry: Entry, field: str, rows: Rows) -> bool:
-        crc, end = 0, entry.start + entry.steps
+        crc = 0
         try:
-            for first in range(entry.start, end, BLOCK):
-                span = slice(first, min(first + BLOCK, end))
+            for first in range(entry.start, entry.end, BLOCK):
+                span = slice(first, min(first + BLOCK, entry.end))
                 crc = zlib.crc32((stored(rows, span) if self.lossy(field) else rows[span]).data, crc)
         except ValueError:  # an image that cannot be decoded
             return False
         return crc == entry.crc.get(field)
 
     def lossy(self, field: str) -> bool:
-        """Whether the rows of `field` are only like those that were recorded."""
+        """Return whether the rows of `field` are compressed with loss."""
         return self.packed.get(field) == JPEG
 
     def _changed(self, seeds: Sequence[int]) -> ValueError:
@@ -161,11 +188,11 @@ class EpisodeStore:
         return ValueError(f"the rows of {which} in {self.folder} were changed on disk: {SALVAGE}")
 
     def _changed_at(self, row: int) -> ValueError:
-        return self._changed([entry.seed for entry in self.episodes if row < entry.start + entry.steps][:1])
+        return self._changed([entry.seed for entry in self.episodes if row < entry.end][:1])
 
     @contextmanager
     def writing(self) -> Iterator[None]:
-        """Hold the store for writing: waits for another writer, then cuts off what a killed one left unfinished."""
+        """Lock the store for writing, after any other writer, and truncate what a killed one left incomplete."""
         assert not self._damaged, "a damaged store is left as it is"
         if self.packed:
             raise ValueError(
@@ -186,31 +213,36 @@ class EpisodeStore:
             stack.callback(self._files.clear)
             self._cut()
             yield
-            # Once, not per episode, which would cost more than making it. A power cut before this point may garble the
-            # newest episodes, which their checksums tell; a killed process loses nothing, the system has its writes.
+            # Once, because it costs more than collecting an episode. A power cut before this point may damage the
+            # newest episodes, which their checksums detect; a killed process loses nothing, the kernel has its writes.
             for file in self._files.values():
                 os.fsync(file.fileno())
 
     def append(self, episode: Episode) -> None:
-        """Store a successful episode: all of it or, whatever happens on the way, nothing.
+        """Store a successful episode atomically.
 
-        A ValueError says that it does not fit the spec, is not the next, or that the disk does not take it.
+        Raises:
+            ValueError: it does not match the spec, has another seed than the next, or cannot be written.
         """
         assert episode.success, "failures go to `fail`"
         rows = self._rows_of(episode)
-        what = (episode.seed, episode.outcome, episode.instruction, self._rows, len(episode.actions))
-        self._commit(Entry(*what, dict(episode.draws), checksums(rows)), rows)
+        self._commit(self._entry(episode, episode.instruction, len(episode.actions), checksums(rows)), rows)
 
-    def fail(self, seed: int, outcome: str, draws: Mapping[str, Any]) -> None:
-        """Note that `seed` was tried and why it failed; no rows are stored. Raises as `append` does."""
-        self._commit(Entry(seed, outcome, "", self._rows, 0, dict(draws), {}), {})
+    def fail(self, episode: Episode) -> None:
+        """Store the outcome of a failed seed, without rows. Raises as `append` does."""
+        self._commit(self._entry(episode, "", 0, {}), {})
+
+    def _entry(self, episode: Episode, instruction: str, steps: int, crc: dict[str, int]) -> Entry:
+        milestones = tuple(sorted(episode.milestones))
+        what = (episode.seed, episode.task, episode.outcome, milestones, instruction)
+        return Entry(*what, self._rows, steps, dict(episode.draws), crc)
 
     def _commit(self, entry: Entry, rows: Mapping[str, Array]) -> None:
         assert self._files, "append and fail work inside `with store.writing()`"
         if self.next_seed not in (None, entry.seed):
-            raise ValueError(f"{self.folder} expects seed {self.next_seed} next, seed {entry.seed} came")
+            raise ValueError(f"{self.folder} expects seed {self.next_seed} next, got seed {entry.seed}")
         line = index_line(entry)
-        entry = parse_line(line[:-1], f"{self.folder}: the entry of seed {entry.seed}")  # as a reader will see it
+        entry = parse_line(line[:-1], f"{self.folder}: the entry of seed {entry.seed}")  # validated as a reader does
         try:
             for name, values in rows.items():
                 _write(self._files[name], values.data.cast("B"))
@@ -219,20 +251,20 @@ class EpisodeStore:
             self._rows += entry.steps
             self._index_size += len(line)
         except OSError as error:
-            safe = f"the {len(self.episodes)} episodes before it are safe, make room and run again to go on"
+            safe = f"the {len(self.episodes)} episodes before it are safe, make room and run again to continue"
             raise ValueError(f"{self.folder} cannot take seed {entry.seed} ({error.strerror}): {safe}") from error
         finally:
             self._cut()
 
     def _cut(self) -> None:
-        # The index first: at no moment may a line speak of rows that are gone.
+        # The index first: no line may refer to truncated rows at any moment.
         os.truncate(self._path("index"), self._index_size)
         for field in self.fields:
             os.truncate(self._path(field), self._size(field))
 
     def _refresh(self) -> None:
         self.tried, self._index_size = read_index(self._path("index"), self.derived, self._damaged)
-        self._rows = max((entry.start + entry.steps for entry in self.tried), default=0)
+        self._rows = max((entry.end for entry in self.tried), default=0)
         for field in self.fields if self._rows else ():
             whole = self._whole(field)
             if whole < self._rows and not self._damaged:
@@ -247,25 +279,23 @@ class EpisodeStore:
         return self._rows if size >= needed else self._rows * size // needed
 
     def _rows_of(self, episode: Episode) -> dict[str, Array]:
-        seen = episode.observations
+        observations = episode.observations
         columns: dict[str, Any] = {"action": episode.actions, "executed": episode.executed}
-        columns["gripper"] = [[observation.gripper] for observation in seen]
-        for camera in self.spec.cameras:
-            columns[f"rgb_{camera}"] = [observation.rgb[camera] for observation in seen]
-            columns[f"depth_{camera}"] = [observation.depth[camera] for observation in seen]
-        for name in ("joints", "velocities"):
-            columns[name] = [getattr(observation, name) for observation in seen]
+        columns["state"] = [observation.state for observation in observations]
+        for name in images_of(self.spec):
+            kind, _, camera = name.partition("_")
+            columns[name] = [getattr(observation, kind)[camera] for observation in observations]
         if self.spec.truth:
             columns["truth"] = [
-                np.hstack([np.ravel((one.truth or {})[key]) for key, _ in self.spec.truth]) for one in seen
+                np.hstack([np.ravel((one.truth or {})[key]) for key, _ in self.spec.truth]) for one in observations
             ]
-        return {name: self._column(name, columns[name], len(seen)) for name in self.fields}
+        return {name: self._column(name, columns[name], len(observations)) for name in self.fields}
 
     def _column(self, name: str, values: Any, steps: int) -> Array:
         shape, dtype = self.fields[name]
         column = np.asarray(values)
         if column.shape != (steps, *shape) or not np.can_cast(column.dtype, dtype, "same_kind"):
-            raise ValueError(f"{name} must be {(steps, *shape)} {dtype}, it came as {column.shape} {column.dtype}")
+            raise ValueError(f"{name} must be {(steps, *shape)} {dtype}, got {column.shape} {column.dtype}")
         return np.ascontiguousarray(column, dtype)
 
     def _size(self, field: str) -> int:
@@ -278,16 +308,40 @@ class EpisodeStore:
         return self.folder / ("index.jsonl" if name == "index" else f"{name}.bin")
 
 
+def observations_of(spec: Spec, rows: Mapping[str, Array], instruction: str) -> list[Observation]:
+    """Return the observations of an episode from its rows, field → (steps, …)."""
+    names, ends = [name for name, _ in spec.truth], np.cumsum([size for _, size in spec.truth])
+    return [
+        Observation(
+            rgb={camera: rows[f"rgb_{camera}"][step] for camera in spec.cameras},
+            state=rows["state"][step],
+            instruction=instruction,
+            depth={camera: rows[f"depth_{camera}"][step] for camera in spec.depth},
+            truth=dict(zip(names, np.split(rows["truth"][step], ends[:-1]), strict=True)) if names else None,
+        )
+        for step in range(len(rows["state"]))
+    ]
+
+
 def stored(rows: Rows, span: slice) -> Array:
-    """Consecutive rows as they lie on the disk: themselves, or bytes (M,)."""
+    """Return consecutive rows as stored on disk: the rows, or compressed bytes (M,)."""
     return rows[span] if isinstance(rows, np.ndarray) else rows.stored(span)
 
 
+def _without_nulls(value: Any) -> Any:
+    """Remove the keys that are null from a plain value, at every level."""
+    if isinstance(value, list):
+        return [_without_nulls(item) for item in value]
+    if not isinstance(value, dict):
+        return value
+    return {name: _without_nulls(item) for name, item in value.items() if item is not None}
+
+
 def checksums(rows: Mapping[str, Array]) -> dict[str, int]:
-    """What an entry keeps of the rows of its episode: field → CRC-32."""
+    """Compute field → CRC-32 of rows."""
     return {field: zlib.crc32(values.data) for field, values in rows.items()}
 
 
 def _write(file: BinaryIO, data: memoryview) -> None:
-    while data:  # an unbuffered write may take only a part
+    while data:  # an unbuffered write may be partial
         data = data[file.write(data) :]

@@ -1,4 +1,4 @@
-"""The index of an episode store: one line of JSON per tried seed, which ends with a checksum of itself."""
+"""Index of an episode store: one line of JSON per tried seed, with a checksum of the line at its end."""
 
 from __future__ import annotations
 
@@ -12,16 +12,17 @@ from typing import Annotated, Any
 import numpy as np
 from annotated_types import Ge, Le, MaxLen, Predicate
 
-from vla.documents import STRICT, parse_json
+from vla.io.documents import STRICT, parse_json
+from vla.io.files import require_file
+from vla.io.types import Seed
 from vla.spec import LONGEST_INSTRUCTION, Name
-from vla.types import Seed
 
 REMEDY = "copy the folder again from where it is whole, or delete it and collect again"
 SALVAGE = f"keep what is whole with job=inspect inspect.repair=true, {REMEDY}"
-DAMAGED = "damaged"  # outcome of a seed whose episode could not be kept by a repair
-LOST = "lost"  # outcome of a seed of which a damaged index tells nothing
-CHECK = b', "check": '  # before the CRC-32 of the line without it, which is the last in every line
-LISTED = 8  # numbers in a sentence
+DAMAGED = "damaged"  # outcome of a seed whose episode a repair could not save
+LOST = "lost"  # outcome of a seed whose index line is unreadable
+CHECK = b', "check": '  # precedes the CRC-32 of the line without it, at the end of every line
+LISTED = 8  # largest number of numbers in a message
 
 
 def moderate(value: Any) -> bool:
@@ -31,38 +32,54 @@ def moderate(value: Any) -> bool:
     return not isinstance(value, (int, float)) or abs(value) <= 2**63
 
 
-Plain = Annotated[dict[str, Any], Predicate(moderate)]  # out of JSON
+Plain = Annotated[dict[str, Any], Predicate(moderate)]  # from JSON
 Offset = Annotated[int, Ge(0), Le(2**53)]
 Crc = Annotated[int, Ge(0), Le(2**32 - 1)]
 
 
 @dataclass(frozen=True)
 class Entry:
-    """One index line: a seed that was tried; one that failed has no steps."""
+    """Index line of a tried seed; a failed one has no steps."""
 
     __pydantic_config__ = STRICT
 
     seed: Seed
+    task: Annotated[str, MaxLen(100)]  # empty if unknown
     outcome: Name  # "success" or the name of the failure
+    milestones: tuple[Name, ...]  # in alphabetical order
     instruction: Annotated[str, MaxLen(LONGEST_INSTRUCTION)]
     start: Offset  # first row of the episode in every field file
     steps: Offset
-    draws: Plain  # randomisation axis → what was drawn
-    crc: dict[str, Crc]  # field → CRC-32 of its rows; of JPEG, of the files; empty for failures
+    draws: Plain  # randomisation axis → drawn values
+    crc: dict[str, Crc]  # field → CRC-32 of its rows, or of the files if they are JPEG; empty for failures
 
     @property
     def success(self) -> bool:
-        """Whether the episode is stored."""
+        """True if the episode is stored."""
         return self.outcome == "success"
+
+    @property
+    def end(self) -> int:
+        """The row after the last of the episode."""
+        return self.start + self.steps
+
+    @property
+    def span(self) -> slice:
+        """The rows of the episode in every field file."""
+        return slice(self.start, self.end)
 
 
 def index_line(entry: Entry) -> bytes:
-    """An entry as the index has it."""
+    """Encode an entry as a line of the index."""
     return _sealed(dumps(asdict(entry)).encode()) + b"\n"
 
 
 def parse_line(line: bytes, name: str) -> Entry:
-    """The entry of a line without its end; a ValueError that begins with `name` if it is not what was written."""
+    """Decode a line without its line end.
+
+    Raises:
+        ValueError: the line is damaged; the message begins with `name`.
+    """
     body = line.rpartition(CHECK)[0] + b"}"
     if _sealed(body) != line:
         raise ValueError(f"{name} is damaged: it does not fit its checksum")
@@ -77,7 +94,7 @@ def _sealed(body: bytes) -> bytes:
 
 
 def dumps(value: Any) -> str:
-    """JSON on one line, with arrays as lists; a ValueError for what is none of numbers, strings, lists and dicts."""
+    """Encode as JSON on one line, with arrays as lists; a ValueError for other types than JSON has."""
     return json.dumps(value, default=_plain, allow_nan=False, ensure_ascii=False)
 
 
@@ -88,7 +105,7 @@ def _plain(value: Any) -> Any:
 
 
 def listed(numbers: Sequence[int]) -> str:
-    """Seeds or lines in words, not too many."""
+    """Format seeds or line numbers for a message, abbreviated if they are many."""
     ordered = sorted(set(numbers))
     if len(ordered) > 2 and ordered[-1] - ordered[0] == len(ordered) - 1:
         return f"{ordered[0]} to {ordered[-1]}"
@@ -97,12 +114,12 @@ def listed(numbers: Sequence[int]) -> str:
 
 
 def read_index(path: Path, any_seed: bool, damaged: bool) -> tuple[list[Entry], int]:
-    """The entries and the number of bytes they take: a last line that was cut short does not count.
+    """Return the entries and their size in bytes, without an incomplete last line.
 
-    Unless `any_seed`, seeds are consecutive, so that it can be told which are `LOST` in a `damaged` index.
+    Unless `any_seed`, seeds are consecutive, which identifies the `LOST` ones in a `damaged` index.
 
     Raises:
-        ValueError: lines are damaged, all of which are named, or do not follow each other.
+        ValueError: lines are damaged, and named in the message, or do not follow each other.
     """
     lines = _lines(path)
     entries: dict[int, Entry] = {}  # line number → entry
@@ -124,31 +141,32 @@ def read_index(path: Path, any_seed: bool, damaged: bool) -> tuple[list[Entry], 
     for number, entry in entries.items():
         if entry.start != rows or (entry.seed != seed and seed is not None and not any_seed):
             raise ValueError(f"line {number} of {path} does not follow the line before it: {remedy}")
-        rows, seed = entry.start + entry.steps, entry.seed + 1
+        rows, seed = entry.end, entry.seed + 1
     return [*entries.values()], sum(len(line) + 1 for line in lines)
 
 
 def _lines(path: Path) -> list[bytes]:
-    """Every line that was written completely, without its end."""
+    """Return every complete line, without its line end."""
+    require_file(path)
     *lines, rest = path.read_bytes().split(b"\n") if path.exists() else [b""]
-    # What a process leaves that is killed in a line is shorter: here only the line end was damaged.
+    # A process killed within a line leaves a shorter one: here only the line end is damaged.
     whole = _sealed(rest[:-1].rpartition(CHECK)[0] + b"}") == rest[:-1]
     return [*lines, rest] if whole else lines
 
 
 def _with_lost(entries: dict[int, Entry], lines: int) -> list[Entry]:
-    """The entries of consecutive seeds with a `LOST` one for each that is missing between them, before and after."""
+    """Insert a `LOST` entry for every missing seed before, between and after the readable ones."""
     found: list[Entry] = []
     rows = last = 0
     for number, entry in entries.items():
         before = found[-1].seed if found else entry.seed - number
-        if not 1 <= entry.seed - before <= number - last + 1:  # a lost line end makes one line of two
+        if not 1 <= entry.seed - before <= number - last + 1:  # a damaged line end joins two lines
             continue
         found += [_lost(seed, rows) for seed in range(max(before + 1, 0), entry.seed)]
         found.append(entry)
-        rows, last = entry.start + entry.steps, number
+        rows, last = entry.end, number
     return found + [_lost(found[-1].seed + 1 + number, rows) for number in range(lines - last)]
 
 
 def _lost(seed: int, row: int) -> Entry:
-    return Entry(seed, LOST, "", row, 0, {}, {})
+    return Entry(seed, "", LOST, (), "", row, 0, {}, {})

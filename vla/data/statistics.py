@@ -1,4 +1,4 @@
-"""Statistics of the actions of an episode store, and a sample of them.
+"""Statistics and a sample of the actions of an episode store.
 
 Shapes: N steps, E episodes, D action components.
 """
@@ -13,12 +13,12 @@ import numpy as np
 from vla.data.index import Entry
 from vla.spec import Array
 
-SAMPLE = 2**18  # actions that a sample has at most, whatever the size of the store
+SAMPLE = 2**18  # largest number of actions in a sample
 
 
 @dataclass(frozen=True)
 class Statistics:
-    """Moments of the actions over all stored steps, each (D,) float64, and where to take a sample from."""
+    """Moments of the actions over all stored steps, each (D,) float64, and the source of a sample."""
 
     low: Array
     high: Array
@@ -29,9 +29,9 @@ class Statistics:
     ends: Array  # (E,) the row after the last of every episode
 
     def chunks(self, length: int) -> Array:
-        """(M, length, D) float32: the actions from evenly spaced steps on, or from every step if they are few.
+        """Return chunks of actions, (M, length, D) float32, that start at evenly spaced steps, or at every step if few.
 
-        Beyond the end of an episode its last action is repeated, as in the windows that are trained on.
+        Beyond the end of an episode its last action is repeated, as in training windows.
         """
         count = min(self.steps, max(SAMPLE // length, 1))
         rows = np.linspace(0, self.steps - 1, count).round().astype(np.int64)
@@ -41,12 +41,12 @@ class Statistics:
 
 
 def statistics_of(entries: Sequence[Entry], actions: Array) -> Statistics:
-    """The statistics of the (N, D) actions of stored episodes, which are as `entries` say."""
-    ends = np.array([entry.start + entry.steps for entry in entries])
+    """Compute the statistics of the (N, D) actions of the episodes `entries`."""
+    ends = np.array([entry.end for entry in entries])
     shown = actions[: ends[-1]]
     total, squares = np.zeros((2, shown.shape[1]))
-    for entry in entries:  # one after the other: in double precision, all at once might not fit into memory
-        wide = shown[entry.start : entry.start + entry.steps].astype(np.float64)
+    for entry in entries:  # episode by episode: all of them in double precision might not fit into memory
+        wide = shown[entry.span].astype(np.float64)
         total += wide.sum(0)
         squares += (wide**2).sum(0)
     mean = total / len(shown)

@@ -1,1 +1,1 @@
-"""Putting a trained policy on a robot."""
+"""Deployment of a trained policy on a robot."""

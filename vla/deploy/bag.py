@@ -1,9 +1,9 @@
-"""Record what goes over the topics as a rosbag2 folder, and play one back.
+"""Record all topics as a rosbag2 folder, and play a bag back.
 
     python -m vla.deploy.bag record FOLDER      until interrupted; `rerun FOLDER/*.mcap` shows it
-    python -m vla.deploy.bag play FOLDER        images, joint states and words as they came, for an agent to act on
+    python -m vla.deploy.bag play FOLDER        images, joint states and instructions at their original times
 
-What else is in a bag, commands to an arm above all, is not played unless it is named.
+Other topics of a bag, in particular commands to an arm, are played only if named by --topics.
 """
 
 from __future__ import annotations
@@ -18,24 +18,30 @@ from pathlib import Path
 from threading import Event
 from typing import Any
 
-from vla.deploy.messages import cut
-from vla.deploy.overhear import Eavesdropper, message_class
-from vla.deploy.ros import NETWORKS, Network, plain_errors, ros, spin
-from vla.documents import read_yaml
+from vla.deploy.messages import shorten
+from vla.deploy.ros import NETWORKS, command_node, spin
+from vla.deploy.topic_listener import TopicListener, message_class
+from vla.io.documents import read_yaml
+from vla.io.files import require_file
 
-# What an agent hears, of conf/deploy/topics/isaac.yaml.
-HEARD = ("/isaac/camera/image_raw", "/isaac/wrist_camera/image_raw", "/isaac/franka/joint_states", "/user/command")
-LARGEST_MEMORY = 2 << 30  # that playing may take [bytes] …
-LARGEST_FILE = 8 << 30  # … and of a file, when a bag is compressed as a whole [bytes]
+# The inputs of a policy in conf/deploy/topics/isaac.yaml.
+POLICY_INPUTS = (
+    "/isaac/camera/image_raw",
+    "/isaac/wrist_camera/image_raw",
+    "/isaac/franka/joint_states",
+    "/user/command",
+)
+MAX_MEMORY = 2 << 30  # of the process that plays a bag [bytes]
+MAX_FILE_SIZE = 8 << 30  # of a decompressed bag [bytes]
 
 
-class Recorder(Eavesdropper):
-    """Writes every message on every topic, as it came, into a bag; ends with `close`."""
+class BagRecorder(TopicListener):
+    """Writes the messages of every topic to a bag until `close`."""
 
     raw = True
 
     def __init__(self, node: Any, folder: Path) -> None:
-        """Args: the node whose spinning records; the folder of the bag, which must not exist.
+        """Args: the node that subscribes, which the caller spins; the folder of the bag, which must not exist.
 
         Raises:
             ValueError: the folder exists.
@@ -44,7 +50,7 @@ class Recorder(Eavesdropper):
         from rosbags.typesys import Stores, get_typestore
 
         if folder.exists():
-            raise ValueError(f"there already is a {folder}: name a folder that does not exist")
+            raise ValueError(f"{folder} exists already: choose another folder")
         folder.parent.mkdir(parents=True, exist_ok=True)
         self._types = get_typestore(Stores.ROS2_JAZZY)
         self._writer = Writer(folder, version=9, storage_plugin=StoragePlugin.MCAP)
@@ -52,8 +58,8 @@ class Recorder(Eavesdropper):
         self.messages = 0
         super().__init__(node)
 
-    def hearer(self, topic: str, kind: str) -> Callable[[bytes], None]:
-        """Write the messages of a topic."""
+    def callback_for(self, topic: str, kind: str) -> Callable[[bytes], None]:
+        """Return a callback that writes the messages of a topic."""
         connection = self._writer.add_connection(topic, kind, typestore=self._types)
 
         def write(message: bytes) -> None:
@@ -69,10 +75,10 @@ class Recorder(Eavesdropper):
 
 
 def play(node: Any, folder: Path, topics: Collection[str], stopped: Event, speed: float = 1.0) -> int:
-    """Publish the messages of a bag on some topics at the times they came; the number of messages.
+    """Publish the messages of some topics of a bag at their original times; returns the number of messages.
 
     Raises:
-        ValueError: there is no bag in the folder, it is damaged, or a topic is not in the bag.
+        ValueError: the folder is not a bag, it is damaged, or it lacks a topic.
     """
     published = 0
     with opened(folder) as reader:
@@ -80,15 +86,17 @@ def play(node: Any, folder: Path, topics: Collection[str], stopped: Event, speed
         classes = {connection.topic: message_class(connection.msgtype) for connection in connections}
         if missing := ", ".join(topic for topic in topics if classes.get(topic) is None):
             there = ", ".join(sorted({connection.topic for connection in reader.connections})) or "nothing"
-            raise ValueError(f"{folder} has no {missing} to play, it has {cut(there, 500)}: name topics by --topics")
+            raise ValueError(
+                f"{folder} has no topic {missing}, it has {shorten(there, 500)}: choose topics with --topics"
+            )
         publishers = {topic: node.create_publisher(kind, topic, 10) for topic, kind in classes.items()}
-        give_up = time.monotonic() + 2.0  # somebody may need a moment to find these publishers
-        while time.monotonic() < give_up and not all(p.get_subscription_count() for p in publishers.values()):
+        deadline = time.monotonic() + 2.0  # for the discovery of these publishers
+        while time.monotonic() < deadline and not all(p.get_subscription_count() for p in publishers.values()):
             stopped.wait(0.02)
         begin, start, end = time.monotonic(), reader.start_time, reader.end_time
         for topic, stamp, raw in _messages(reader, connections, folder):
             if not start <= stamp <= end:
-                raise ValueError(f"{folder} is damaged: it has a message from outside the time that it covers")
+                raise ValueError(f"{folder} is damaged: a message lies outside its time range")
             with _damage(folder):
                 message = _stamped_now(node, raw, classes[topic])
             stopped.wait(max(0.0, begin + (stamp - start) * 1e-9 / speed - time.monotonic()))
@@ -101,17 +109,19 @@ def play(node: Any, folder: Path, topics: Collection[str], stopped: Event, speed
 
 @contextmanager
 def opened(folder: Path) -> Iterator[Any]:
-    """A reader of the bag in a folder.
+    """Open a reader of the bag in a folder.
 
     Raises:
-        ValueError: there is no bag in the folder, or it is damaged.
+        ValueError: the folder is not a bag, or it is damaged.
     """
     from rosbags.rosbag2 import Reader
 
     description = folder / "metadata.yaml"
     if not description.is_file():
-        raise ValueError(f"{folder} is no bag: there is no {description}")
-    read_yaml(description, dict[str, Any])  # rosbags looks neither at its size nor at its depth
+        raise ValueError(f"{folder} is not a bag: it has no {description.name}")
+    read_yaml(description, dict[str, Any])  # rosbags limits neither its size nor its depth
+    for path in folder.iterdir():
+        require_file(path)
     with _damage(folder):
         reader = Reader(folder)
         reader.open()
@@ -122,7 +132,7 @@ def opened(folder: Path) -> Iterator[Any]:
 
 
 def _messages(reader: Any, connections: Sequence[Any], folder: Path) -> Iterator[tuple[str, int, bytes]]:
-    """Topic, time [ns] and bytes of every message of some connections."""
+    """Yield topic, time [ns] and bytes of every message of some connections."""
     messages = reader.messages(connections)
     while True:
         with _damage(folder):
@@ -135,27 +145,27 @@ def _messages(reader: Any, connections: Sequence[Any], folder: Path) -> Iterator
 
 @contextmanager
 def _damage(folder: Path) -> Iterator[None]:
-    """What rosbags and ROS raise when they read, which is anything, means that the bag is damaged."""
+    """Turn the exceptions of rosbags and ROS, which can be of any type, into a ValueError about the bag."""
     try:
         yield
     except Exception as error:
-        why = cut(" ".join(str(error).split()), 200) or type(error).__name__
-        raise ValueError(f"{folder} is damaged or no bag: {why}") from error
+        why = shorten(" ".join(str(error).split()), 200) or type(error).__name__
+        raise ValueError(f"{folder} is damaged or not a bag: {why}") from error
 
 
 def _stamped_now(node: Any, message: bytes, kind: Any) -> Any:
-    """The message as if it were made now: an agent rightly refuses to act on an old one."""
+    """Deserialise a message and set its time stamp to now: an agent refuses to act on old messages."""
     from rclpy.serialization import deserialize_message
 
-    made = deserialize_message(bytes(message), kind)
-    if hasattr(made, "header"):
-        made.header.stamp = node.get_clock().now().to_msg()
-    return made
+    decoded = deserialize_message(bytes(message), kind)
+    if hasattr(decoded, "header"):
+        decoded.header.stamp = node.get_clock().now().to_msg()
+    return decoded
 
 
 def _limit_memory() -> None:
-    """A small file can say that it holds any number of bytes."""
-    for limit, most in ((resource.RLIMIT_DATA, LARGEST_MEMORY), (resource.RLIMIT_FSIZE, LARGEST_FILE)):
+    """Limit memory and file size: a small compressed file can decompress to any size."""
+    for limit, most in ((resource.RLIMIT_DATA, MAX_MEMORY), (resource.RLIMIT_FSIZE, MAX_FILE_SIZE)):
         _, hard = resource.getrlimit(limit)
         resource.setrlimit(limit, (most if hard == resource.RLIM_INFINITY else min(most, hard), hard))
 
@@ -166,24 +176,20 @@ def main() -> None:
     parser.add_argument("do", choices=("record", "play"))
     parser.add_argument("folder", type=Path)
     parser.add_argument("--network", choices=NETWORKS, default="loopback")
-    parser.add_argument("--speed", type=float, default=1.0, help="of playing, against how it was recorded")
-    parser.add_argument("--topics", nargs="+", help="what to play", default=HEARD)
+    parser.add_argument("--speed", type=float, default=1.0, help="playback speed, 1 is that of the recording")
+    parser.add_argument("--topics", nargs="+", help="topics to play", default=POLICY_INPUTS)
     options = parser.parse_args()
     if not 0 < options.speed < math.inf:
         parser.error("--speed must be above 0")
-    with plain_errors(), ros(Network.named(options.network)) as stopped:
-        import rclpy
-
-        node = rclpy.create_node("vla_bag")
+    with command_node("vla_bag", options.network) as (node, stopped):
         if options.do == "play":
             _limit_memory()
             print(f"{play(node, options.folder, options.topics, stopped, options.speed)} messages")
         else:
-            recorder = Recorder(node, options.folder)
+            recorder = BagRecorder(node, options.folder)
             spin(node, stopped)
             recorder.close()
             print(f"{recorder.messages} messages in {options.folder}")
-        node.destroy_node()
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Camera images of any size, in the size that a policy was trained on.
+"""Resizing of camera images to the size that a policy was trained with.
 
 Shapes: H by W pixels.
 """
@@ -15,32 +15,32 @@ from vla.spec import Array
 Crop = Literal["centre", "none"]
 
 
-def fitted(image: Array, size: tuple[int, int], crop: Crop) -> Array:
-    """An (H, W, 3) uint8 image in another size (height, width); one that has it already is returned as it is.
+def resize(image: Array, size: tuple[int, int], crop: Crop) -> Array:
+    """Resize an (H, W, 3) uint8 image to `size` (height, width); an image of that size is returned as is.
 
-    "centre" first cuts out the largest centred part that has the aspect ratio of `size`; "none" squeezes the whole
-    image. Each pixel is a weighted mean of all those that it covers (bilinear, antialiased).
+    "centre" first crops to the largest centred part with the aspect ratio of `size`; "none" distorts the whole image.
+    The interpolation is bilinear and antialiased.
     """
     if image.shape[:2] == size:
         return image
-    rows, columns = _used(image.shape, size, crop)
-    used = Image.fromarray(image[rows, columns])
-    # Far too large images are first made smaller by a whole factor, which is faster and hardly differs.
-    return np.array(used.resize((size[1], size[0]), Image.Resampling.BILINEAR, reducing_gap=3.0))
+    rows, columns = _crop_region(image.shape, size, crop)
+    cropped = Image.fromarray(image[rows, columns])
+    # Reduce very large images by an integer factor first, which is faster and hardly differs.
+    return np.array(cropped.resize((size[1], size[0]), Image.Resampling.BILINEAR, reducing_gap=3.0))
 
 
-def change(image: Array, size: tuple[int, int], crop: Crop) -> str:
-    """What `fitted` does to an image (H, W, 3), in words; nothing where it has the size already."""
+def describe_resize(image: Array, size: tuple[int, int], crop: Crop) -> str:
+    """Describe what `resize` does to an image (H, W, 3); empty if it has that size already."""
     if image.shape[:2] == size:
         return ""
-    rows, columns = _used(image.shape, size, crop)
+    rows, columns = _crop_region(image.shape, size, crop)
     height, width = rows.stop - rows.start, columns.stop - columns.start
-    cut = f"cropped at the centre to {width} by {height} and " if (height, width) != image.shape[:2] else ""
-    return f"images of {image.shape[1]} by {image.shape[0]} pixels are {cut}resized to {size[1]} by {size[0]}"
+    crop_text = f"cropped at the centre to {width} by {height} and " if (height, width) != image.shape[:2] else ""
+    return f"images of {image.shape[1]} by {image.shape[0]} pixels are {crop_text}resized to {size[1]} by {size[0]}"
 
 
-def _used(shape: tuple[int, ...], size: tuple[int, int], crop: Crop) -> tuple[slice, slice]:
-    """Rows and columns of an image (H, W, …) that are used."""
+def _crop_region(shape: tuple[int, ...], size: tuple[int, int], crop: Crop) -> tuple[slice, slice]:
+    """Rows and columns of an image (H, W, …) that are kept."""
     height, width = shape[:2]
     if crop == "none":
         return slice(0, height), slice(0, width)

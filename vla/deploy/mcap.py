@@ -14,34 +14,34 @@ from typing import Any
 import numpy as np
 
 from vla.data.episodes import EpisodeStore
-from vla.data.export import Folders
+from vla.data.formats.files import FolderExporter
 from vla.data.index import Entry
-from vla.deploy.governor import Robot
+from vla.deploy.joint_limiter import Robot
 from vla.deploy.ros2 import Topics
+from vla.io.types import Text
+from vla.parallel.pool import THIS_PROCESS, Cluster
 from vla.spec import Array, Spec
-from vla.types import Count, Text
 
 SECOND = 1_000_000_000  # [ns]
 
 
-class Mcap(Folders):
+class Mcap(FolderExporter):
     """One bag per episode, which `rerun`, Foxglove and `ros2 bag` open, and `python -m vla.deploy.bag play` plays.
 
         episode_00000/episode_00000.mcap   the messages
-        episode_00000/metadata.yaml        what ROS wants to know of a bag
-        episode_00000/manifest.json        what the numbers mean, and how the episode came about
+        episode_00000/metadata.yaml        the description that ROS requires
+        episode_00000/manifest.json        units and names, seed and draws of the episode
 
-    Images are rgb8, depths 16UC1 [mm], 0 where there is no return; joint states carry the fingers, as on the robot; the
-    instruction comes once, at the start; actions are float32 arrays of D components. Time starts at 1 s.
+    Images are rgb8, depths 16UC1 [mm] with 0 for no return. Joint states include the fingers, as on the robot. The
+    instruction is sent once, at the start. Actions are float32 arrays of D components. Time starts at 1 s.
 
     Args:
-        folder: where to write.
-        topics: names of the topics of images, joint states and the instruction, as those of a deployed policy.
-        robot: what the joints are called.
-        depths: camera → topic of its depth.
-        action: topic of the actions to imitate.
+        folder: output folder.
+        topics: topics of images, joint states and the instruction, as for a deployed policy.
+        robot: joint names of the arm.
+        depths: camera → topic of its depth images.
+        action: topic of the expert's actions, the labels for imitation.
         executed: topic of the actions that were executed.
-        workers: processes; null: one per core. The files do not depend on it.
 
     Raises:
         ValueError: `rosbags` is not installed.
@@ -55,9 +55,8 @@ class Mcap(Folders):
         depths: dict[str, str],
         action: str,
         executed: str,
-        workers: Count | None = None,
     ) -> None:
-        super().__init__(folder, workers)
+        super().__init__(folder)
         self._topics, self._robot, self._depths = topics, robot, depths
         self._action, self._executed = action, executed
         try:
@@ -65,17 +64,18 @@ class Mcap(Folders):
         except ImportError as error:
             raise ValueError("export=mcap needs the package rosbags: pip install 'vla[ros]' or rosbags") from error
 
-    def export(self, store: EpisodeStore) -> Path:
-        """Write the bags that are not there yet, each whole or not at all; returns the folder.
+    def export(self, store: EpisodeStore, cluster: Cluster = THIS_PROCESS) -> Path:
+        """Write the missing bags, each one atomically; returns the folder.
 
         Raises:
-            ValueError: a camera has no topic, the robot has another number of joints, or as for other formats.
+            ValueError: the episodes have no robot or one with another number of joints, a camera has no topic, or the
+                base class refuses the folder.
         """
         self._require_fit(store.spec)
-        return super().export(store)
+        return super().export(store, cluster)
 
     def settings(self) -> dict[str, Any]:
-        """Topics and names of joints."""
+        """Return topics and joint names."""
         actions = {"action": self._action, "executed": self._executed}
         joints = {"joints": self._robot.joints, "fingers": self._robot.fingers}
         return {"topics": {**asdict(self._topics), "depths": self._depths, **actions}, **joints}
@@ -98,39 +98,45 @@ class Mcap(Folders):
                     writer.write(connections[topic], stamp, types.serialize_cdr(message, kind))
 
     def _require_fit(self, spec: Spec) -> None:
-        for what, topics in (("topics.images", self._topics.images), ("depths", self._depths)):
-            missing = [camera for camera in spec.cameras if camera not in topics]
-            if missing:
-                raise ValueError(f"export.{what} has no topic for {', '.join(missing)}: it has {', '.join(topics)}")
-        if len(self._robot.joints) != len(spec.joints):
+        robot = spec.require_robot("export=mcap")
+        images, depths = (spec.cameras, self._topics.images), (spec.depth, self._depths)
+        for key, (cameras, topics) in {"topics.images": images, "depths": depths}.items():
+            if missing := [camera for camera in cameras if camera not in topics]:
+                raise ValueError(f"export.{key} has no topic for {', '.join(missing)}: it has {', '.join(topics)}")
+        if len(self._robot.joints) != len(robot.joints):
             raise ValueError(
-                f"export.robot has {len(self._robot.joints)} joints, the episodes {len(spec.joints)}: "
+                f"export.robot has {len(self._robot.joints)} joints, the episodes {len(robot.joints)}: "
                 "choose another export.robot"
             )
 
     def _messages(
         self, spec: Spec, entry: Entry, rows: dict[str, Array], step: int, stamp: int
     ) -> Iterator[tuple[str, Any]]:
-        """Topic and message of all there is to say at a step, `stamp` [ns]."""
+        """Yield topic and message of everything published at a step, `stamp` [ns]."""
         if step == 0:
             yield self._topics.instruction, _make("std_msgs/msg/String", data=entry.instruction)
         for camera in spec.cameras:
             header = _header(stamp, f"{camera}_camera_optical_frame")
             yield self._topics.images[camera], _image(header, rows[f"rgb_{camera}"][step], "rgb8")
-            yield self._depths[camera], _image(header, rows[f"depth_{camera}"][step], "16UC1")
-        yield self._topics.joint_states, self._joint_state(stamp, rows, step)
+            if camera in spec.depth:
+                yield self._depths[camera], _image(header, rows[f"depth_{camera}"][step], "16UC1")
+        yield self._topics.joint_states, self._joint_state(stamp, spec, rows["state"][step])
         for topic, field in ((self._action, "action"), (self._executed, "executed")):
             yield topic, _action(rows[field][step], spec)
 
-    def _joint_state(self, stamp: int, rows: dict[str, Array], step: int) -> Any:
-        fingers = len(self._robot.fingers)
-        opening = [float(rows["gripper"][step, 0]) / max(fingers, 1)] * fingers
+    def _joint_state(self, stamp: int, spec: Spec, state: Array) -> Any:
+        robot = spec.require_robot("export=mcap")
+        joints, velocities = (state[spec.indices(names)] for names in (robot.joints, robot.velocities))
+        fingers = self._robot.fingers if robot.gripper else []
+        opening = (
+            [float(state[spec.indices([robot.gripper])[0]]) / len(fingers) for _ in fingers] if robot.gripper else []
+        )
         return _make(
             "sensor_msgs/msg/JointState",
             header=_header(stamp, ""),
-            name=[*self._robot.joints, *self._robot.fingers],
-            position=np.array([*rows["joints"][step], *opening], float),
-            velocity=np.array([*rows["velocities"][step], *[0.0] * fingers], float),
+            name=[*self._robot.joints, *fingers],
+            position=np.array([*joints, *opening], float),
+            velocity=np.array([*velocities, *[0.0] * len(fingers)] if len(velocities) else [], float),
             effort=np.empty(0),
         )
 
@@ -154,7 +160,7 @@ def _header(stamp: int, frame: str) -> Any:
 
 
 def _image(header: Any, image: Array, encoding: str) -> Any:
-    """A sensor_msgs/Image of an (H, W, …) array, little-endian."""
+    """Return a sensor_msgs/Image of an (H, W, …) array, little-endian."""
     rows = image.reshape(len(image), -1).view("uint8")
     return _make(
         "sensor_msgs/msg/Image",
@@ -169,7 +175,7 @@ def _image(header: Any, image: Array, encoding: str) -> Any:
 
 
 def _action(action: Array, spec: Spec) -> Any:
-    """A std_msgs/Float32MultiArray of (D,) components, labelled with their names."""
+    """Return a std_msgs/Float32MultiArray of (D,) components, labelled with their names."""
     size = len(action)
     dimension = _make("std_msgs/msg/MultiArrayDimension", label=" ".join(spec.action), size=size, stride=size)
     layout = _make("std_msgs/msg/MultiArrayLayout", dim=[dimension], data_offset=0)

@@ -1,22 +1,26 @@
-"""ROS messages as arrays and back, checked: middleware delivers NaN, wrong lengths and wrong sizes without a word.
+"""Checked conversion between ROS messages and arrays: the middleware also delivers NaN and wrong lengths and sizes.
 
-Functions take message objects and fill them; nothing here imports ROS.
+The functions read and fill message objects; nothing here imports ROS.
 
 Shapes: H by W pixels, J joints.
 """
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
-from typing import Any
+from dataclasses import asdict, dataclass
+from typing import Annotated, Any
 
 import numpy as np
+from annotated_types import MaxLen
 
-from vla.deploy.governor import Robot
-from vla.deploy.session import Command
-from vla.spec import Array
+from vla.deploy.control_loop import Command
+from vla.deploy.joint_limiter import Robot
+from vla.io.documents import STRICT, parse_json
+from vla.spec import Array, Name, Names, Numbers, RobotModel
 
-# Encoding → bytes per pixel, and where in them red, green and blue are.
+# Encoding → bytes per pixel, and the places of red, green and blue among them.
 ENCODINGS = {
     "rgb8": (3, slice(0, 3)),
     "bgr8": (3, slice(2, None, -1)),
@@ -25,19 +29,30 @@ ENCODINGS = {
 }
 
 
-def cut(text: str, longest: int = 80) -> str:
-    """Text of any length as logs show it, with at most `longest` characters."""
+@dataclass(frozen=True)
+class ArmDescription:
+    """What a view needs to know of an arm; the JSON text of `/vla_agent/arm`."""
+
+    __pydantic_config__ = STRICT
+
+    joints: Names  # in joint states and commands, base to tip
+    fingers: Annotated[tuple[Name, ...], MaxLen(100)]
+    chain: Annotated[tuple[Numbers, ...], MaxLen(101)]  # as in `RobotModel`, empty if unknown
+
+
+def shorten(text: str, longest: int = 80) -> str:
+    """Truncate text to at most `longest` characters, for logs."""
     return text if len(text) <= longest else f"{text[: longest - 1]}…"
 
 
 def image_from(message: Any) -> Array:
-    """The (H, W, 3) uint8 RGB image of a sensor_msgs/Image.
+    """Read the (H, W, 3) uint8 RGB image of a sensor_msgs/Image.
 
     Raises:
-        ValueError: an encoding that is no colour image, no pixels, or fewer bytes than it promises.
+        ValueError: the encoding is not supported, or the size is zero or does not match the data.
     """
     if message.encoding not in ENCODINGS:
-        raise ValueError(f"image encoding is {cut(message.encoding)!r}, understood are {', '.join(ENCODINGS)}")
+        raise ValueError(f"image encoding is {shorten(message.encoding)!r}, expected one of {', '.join(ENCODINGS)}")
     depth, order = ENCODINGS[message.encoding]
     height, width, step = message.height, message.width, message.step
     if not height or not width:
@@ -51,7 +66,7 @@ def image_from(message: Any) -> Array:
 
 
 def fill_image(message: Any, image: Array, frame: str) -> Any:
-    """A sensor_msgs/Image that holds the (H, W, 3) uint8 RGB `image`."""
+    """Fill a sensor_msgs/Image with an (H, W, 3) uint8 RGB image; returns the message."""
     message.height, message.width = image.shape[:2]
     message.encoding, message.step = "rgb8", 3 * image.shape[1]
     message.header.frame_id = frame
@@ -59,13 +74,33 @@ def fill_image(message: Any, image: Array, frame: str) -> Any:
     return message
 
 
-def joints_from(message: Any, robot: Robot) -> tuple[Array, Array, float]:
-    """Positions (J,) [rad], velocities (J,) [rad/s] and gripper opening [m] of a sensor_msgs/JointState, by name.
+def fill_arm(message: Any, robot: Robot, model: RobotModel) -> Any:
+    """Fill a std_msgs/String with the description of the arm; returns the message."""
+    description = ArmDescription(tuple(robot.joints), tuple(robot.fingers), model.chain)
+    message.data = json.dumps(asdict(description))
+    return message
 
-    Velocities that are not given are zero.
+
+def arm_from(message: Any) -> ArmDescription:
+    """Read the description of an arm from a std_msgs/String.
 
     Raises:
-        ValueError: a joint is missing or named twice, lists do not fit together, or a number is not finite.
+        ValueError: it is no such description, or its chain does not fit its joints.
+    """
+    arm = parse_json(message.data, ArmDescription, "the description of the arm")
+    fits = [len(frame) for frame in arm.chain] == [7] * (len(arm.joints) + 1) and all(any(f[3:]) for f in arm.chain)
+    if arm.chain and not fits:
+        raise ValueError(f"the arm's chain is not 7 numbers for each of {len(arm.joints)} joints and the tool")
+    return arm
+
+
+def joints_from(message: Any, robot: Robot) -> tuple[Array, Array, float]:
+    """Read positions (J,) [rad], velocities (J,) [rad/s] and gripper opening [m] of a sensor_msgs/JointState, by name.
+
+    Missing velocities become zero.
+
+    Raises:
+        ValueError: a joint is missing or named twice, the lengths differ, or a number is not finite.
     """
     names = list(message.name)
     if len(set(names)) != len(names):
@@ -87,7 +122,7 @@ def joints_from(message: Any, robot: Robot) -> tuple[Array, Array, float]:
 
 
 def fill_joint_state(message: Any, robot: Robot, command: Command) -> Any:
-    """A sensor_msgs/JointState with target positions of arm and fingers, and nothing else, as Isaac Sim takes it."""
+    """Fill a sensor_msgs/JointState with target positions of arm and fingers only, as Isaac Sim expects."""
     message.name = [*robot.joints, *robot.fingers]
     message.position = [*command.position.tolist(), *finger_positions(robot, command)]
     return message
@@ -96,37 +131,37 @@ def fill_joint_state(message: Any, robot: Robot, command: Command) -> Any:
 def fill_trajectory(
     message: Any, point: type, duration: type, robot: Robot, commands: Sequence[Command], tick: float
 ) -> Any:
-    """A trajectory_msgs/JointTrajectory that starts now, one point per tick, the last one at rest.
+    """Fill a trajectory_msgs/JointTrajectory that starts now, with one point per tick and the last one at rest.
 
-    If no other one follows, the arm stops by itself. `point` and `duration` are the classes of its parts.
+    The arm therefore stops if no other trajectory follows. `point` and `duration` are the message classes of the parts.
     """
     message.joint_names = list(robot.joints)
     for number, command in enumerate(commands, 1):
         seconds, rest = divmod(number * tick, 1.0)
-        when = duration(sec=int(seconds), nanosec=int(rest * 1e9))
+        time_from_start = duration(sec=int(seconds), nanosec=int(rest * 1e9))
         positions, velocities = command.position.tolist(), command.velocity.tolist()
         if number == len(commands):
             velocities = [0.0] * len(velocities)
-        message.points.append(point(positions=positions, velocities=velocities, time_from_start=when))
+        message.points.append(point(positions=positions, velocities=velocities, time_from_start=time_from_start))
     return message
 
 
 def finger_positions(robot: Robot, command: Command) -> list[float]:
-    """Target position of every finger joint [m]."""
+    """Return the target position of every finger joint [m]."""
     return [command.opening * robot.finger_travel] * len(robot.fingers)
 
 
 def command_from(message: Any, robot: Robot) -> tuple[Array, float | None]:
-    """Target positions (J,) [rad] and opening 0 … 1, or None if not given, of a JointState, by name.
+    """Read target positions (J,) [rad] and opening 0 … 1, or None without fingers, of a JointState, by name.
 
     Raises:
-        ValueError: a joint is missing, lists do not fit together, or a number is not finite.
+        ValueError: a joint is missing, the lengths differ, or a number is not finite.
     """
     names, positions = list(message.name), np.array(message.position, dtype=float)
     missing = [name for name in robot.joints if name not in names]
     if missing or len(names) != len(positions) or not np.isfinite(positions).all():
-        what = f"lacks {', '.join(missing)}" if missing else "has names and finite positions that do not fit together"
-        raise ValueError(f"joint command {what}")
+        problem = f"lacks {', '.join(missing)}" if missing else "needs one finite position per name"
+        raise ValueError(f"joint command {problem}")
     fingers = [positions[names.index(name)] for name in robot.fingers if name in names]
     opening = float(np.mean(fingers)) / robot.finger_travel if fingers else None
     return positions[[names.index(name) for name in robot.joints]], opening

@@ -1,4 +1,4 @@
-"""Starting and ending ROS: the network, the arguments, the signals."""
+"""Initialisation and shutdown of ROS: network, arguments, signals."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ from typing import Annotated, Any, Literal
 
 from annotated_types import Ge, Le
 
-LAST_DOMAIN = 232  # beyond it there are no ports
+MAX_DOMAIN = 232  # larger domains have no UDP ports
 LOOPBACK = Path(__file__).with_name("loopback.xml")
 
-# What stood behind --ros-args on the command line; it belongs to ROS, and Hydra must not see it.
+# The arguments after --ros-args on the command line, which Hydra must not parse.
 arguments: list[str] = []
 
 
 def split_arguments(argv: Sequence[str]) -> tuple[list[str], list[str]]:
-    """What is for Hydra, and the stretch from --ros-args to -- or the end, which is for ROS."""
+    """Split off the arguments of ROS, from --ros-args to -- or the end; returns those of Hydra and those of ROS."""
     if "--ros-args" not in argv:
         return list(argv), []
     start = list(argv).index("--ros-args")
@@ -38,32 +38,29 @@ NETWORKS: dict[str, Range] = {"loopback": "SYSTEM_DEFAULT", "localhost": "LOCALH
 
 
 class Network:
-    """Who can hear and be heard."""
+    """The part of the network that ROS communicates with."""
 
     def __init__(
-        self,
-        discovery: Range,
-        profile: str | None = None,
-        domain: Annotated[int, Ge(0), Le(LAST_DOMAIN)] | None = None,
+        self, discovery: Range, profile: str | None, domain: Annotated[int, Ge(0), Le(MAX_DOMAIN)] | None
     ) -> None:
         """Args:
         discovery: ROS_AUTOMATIC_DISCOVERY_RANGE.
-        profile: a Fast DDS profile; "loopback" is the one that comes with this package, on 127.0.0.1 only.
-        domain: ROS_DOMAIN_ID; None leaves it to the environment.
+        profile: file with a Fast DDS profile; "loopback" is that of this package, for 127.0.0.1 only.
+        domain: ROS_DOMAIN_ID; None: that of the environment.
         """
         self.discovery, self.domain = discovery, domain
         self.profile = str(LOOPBACK) if profile == "loopback" else profile
 
     @classmethod
     def named(cls, name: str) -> Network:
-        """One of the options of `deploy/network`, for the little tools that compose no configuration."""
-        return cls(NETWORKS[name], "loopback" if name == "loopback" else None)
+        """Return an option of `deploy/network`, for commands that do not compose a config."""
+        return cls(NETWORKS[name], "loopback" if name == "loopback" else None, domain=None)
 
     def apply(self) -> None:
-        """Set the environment, which ROS reads when it starts.
+        """Set the environment variables that ROS reads at start.
 
         Raises:
-            ValueError: there is no such profile or domain.
+            ValueError: the profile or the domain does not exist.
         """
         os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = self.discovery
         if self.profile is not None:
@@ -73,20 +70,22 @@ class Network:
         if self.domain is not None:
             os.environ["ROS_DOMAIN_ID"] = str(self.domain)
         domain = os.environ.get("ROS_DOMAIN_ID") or "0"
-        if not (domain.isdecimal() and int(domain) <= LAST_DOMAIN):
-            raise ValueError(f"deploy.network.domain, or ROS_DOMAIN_ID, is {domain!r}: 0 to {LAST_DOMAIN} exist")
+        if not (domain.isdecimal() and int(domain) <= MAX_DOMAIN):
+            raise ValueError(f"deploy.network.domain, or ROS_DOMAIN_ID, is {domain!r}, expected 0 to {MAX_DOMAIN}")
 
 
 @contextmanager
 def ros(network: Network, log_folder: Path | None = None) -> Iterator[Event]:
-    """ROS, started; gives an event that SIGINT and SIGTERM set. ROS' own handlers would end it before a last word.
+    """Run ROS; yields an event that SIGINT and SIGTERM set.
+
+    The handlers of ROS would shut it down before a node can publish its last command.
 
     Raises:
         ImportError: rclpy cannot be imported.
-        ValueError: ROS does not start with this network and these arguments.
+        ValueError: ROS does not accept this network or these arguments.
     """
     network.apply()
-    # dm_control has DeprecationWarnings shown; those of other people's packages are nothing that a user could mend.
+    # dm_control enables DeprecationWarnings; users cannot fix those of other packages.
     warnings.filterwarnings("ignore", category=DeprecationWarning, module="lark")
     if log_folder is not None:
         os.environ.setdefault("ROS_LOG_DIR", str(log_folder))
@@ -95,8 +94,8 @@ def ros(network: Network, log_folder: Path | None = None) -> Iterator[Event]:
         from rclpy.signals import SignalHandlerOptions
     except ImportError as error:
         raise ImportError(
-            "ROS 2 is not here: install vla[ros] (Linux, x86-64), or source the setup.bash of a ROS 2 Jazzy whose "
-            f"Python is this one ({error})"
+            "ROS 2 is not installed: install vla[ros] (Linux, x86-64), or source the setup.bash of a ROS 2 Jazzy for "
+            f"this version of Python ({error})"
         ) from error
     stopped = Event()
 
@@ -119,20 +118,34 @@ def ros(network: Network, log_folder: Path | None = None) -> Iterator[Event]:
 
 @contextmanager
 def plain_errors() -> Iterator[None]:
-    """Ends the process with one sentence for what the user can mend."""
+    """Exit with one sentence on user errors."""
     try:
         yield
     except (ValueError, ImportError) as error:
         sys.exit(f"error: {error}")
 
 
+@contextmanager
+def command_node(name: str, network: str) -> Iterator[tuple[Any, Event]]:
+    """Run a command as a ROS node on an option of `deploy/network`; user errors exit with one sentence.
+
+    Yields the node, and the event of `ros`.
+    """
+    with plain_errors(), ros(Network.named(network)) as stopped:
+        from rclpy import create_node
+
+        node = create_node(name)
+        yield node, stopped
+        node.destroy_node()
+
+
 def spin(node: Any, stopped: Event) -> None:
-    """Serve a node's callbacks in this thread until stopped."""
+    """Run a node's callbacks in this thread until stopped."""
     from rclpy.executors import SingleThreadedExecutor
 
     executor = SingleThreadedExecutor()
     executor.add_node(node)
-    # All that was imported and built stays: the collector need not look through it while an arm moves, nor at the end.
+    # Exclude all existing objects, which stay alive, from garbage collection while an arm moves.
     gc.freeze()
     try:
         while not stopped.is_set():

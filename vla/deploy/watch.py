@@ -1,35 +1,32 @@
-"""See how a deployed policy is doing: python -m vla.deploy.watch"""
+"""Print the state of a deployed policy: python -m vla.deploy.watch"""
 
 from __future__ import annotations
 
 import argparse
 from typing import Any
 
-from vla.deploy.ros import NETWORKS, Network, plain_errors, ros, spin
+from vla.deploy.ros import NETWORKS, command_node, spin
 
 
 def main() -> None:
-    """Print every status of the agent until interrupted."""
+    """Print every status message of the agent until interrupted."""
     parser = argparse.ArgumentParser(prog="python -m vla.deploy.watch", description=__doc__)
     parser.add_argument("--agent", default="/vla_agent")
     parser.add_argument("--network", choices=NETWORKS, default="loopback")
     options = parser.parse_args()
-    with plain_errors(), ros(Network.named(options.network)) as stopped:
-        import rclpy
+    with command_node("vla_watch", options.network) as (node, stopped):
         from diagnostic_msgs.msg import DiagnosticStatus
 
         def show(status: Any) -> None:
             values = {pair.key: pair.value for pair in status.values}
-            figures = "  ".join(
+            latencies = "  ".join(
                 f"{key} {value}" for key, value in values.items() if key not in ("state", "instruction")
             )
             state, instruction = values.get("state", "?"), values.get("instruction", "")
-            print(f"{state:8} {status.message:40} '{instruction}'  {figures}", flush=True)
+            print(f"{state:8} {status.message:40} '{instruction}'  {latencies}", flush=True)
 
-        node = rclpy.create_node("vla_watch")
         node.create_subscription(DiagnosticStatus, f"{options.agent}/status", show, 10)
         spin(node, stopped)
-        node.destroy_node()
 
 
 if __name__ == "__main__":

@@ -1,1 +1,1 @@
-"""Action tokenizers, image tokenizers, text encoders, policies' networks and the learner."""
+"""Action tokenizers, image encoders, text encoders, policy networks and the learner."""

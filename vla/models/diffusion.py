@@ -1,4 +1,4 @@
-"""Diffusion policy: noise becomes a chunk of actions by taking away, step by step, what a network takes for noise.
+"""Diffusion policy: iterative denoising of an action chunk.
 
 C. Chi et al., "Diffusion Policy: Visuomotor Policy Learning via Action Diffusion", arXiv 2303.04137; DDIM: J. Song, C.
 Meng, S. Ermon, arXiv 2010.02502; the schedule: A. Nichol, P. Dhariwal, arXiv 2102.09672.
@@ -15,36 +15,36 @@ from torch import Tensor
 
 from vla.models.denoiser import DenoisingModel
 
-LEVELS = 100  # of noise
-START = 90  # level to act from: noise but for 2 % of its variance; further up nothing is told of the action
-OFFSET = 0.008  # of the schedule, so that there is some noise from the start
-LEAST = 2.5e-7  # share kept at the last level, as where no step may take away more than 0.999 of the variance
+LEVELS = 100  # noise levels of training
+START = 90  # first level of sampling: 2 % of the variance is signal; higher levels carry no information
+OFFSET = 0.008  # of the cosine schedule, for some noise at level 0
+MIN_ALPHA_BAR = 2.5e-7  # as if no step removed more than 0.999 of the variance
 
 
 class Diffusion(DenoisingModel):
-    """Predicts the noise in chunks of actions; acts by DDIM without fresh noise, with every estimate clipped."""
+    """Noise prediction on action chunks, sampled by deterministic DDIM with clipped estimates."""
 
     def corrupt(self, action: Tensor, noise: Tensor, uniform: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Actions at a level of noise, each as likely as any other; the target is the noise."""
+        """Add noise at a uniformly distributed level; the target is the noise."""
         level = (uniform * LEVELS).floor().clamp(max=LEVELS - 1)  # (B,)
-        share = kept(level)[:, None, None]
-        return share.sqrt() * action + (1 - share).sqrt() * noise, level / LEVELS, noise
+        signal = alpha_bar(level)[:, None, None]
+        return signal.sqrt() * action + (1 - signal).sqrt() * noise, level / LEVELS, noise
 
     def sample(self, noise: Tensor, context: Tensor) -> Tensor:
-        """DDIM with eta = 0 over evenly spread levels, from START to, where there is more than one, 0."""
+        """Run DDIM with eta = 0 over evenly spaced levels from START to 0."""
         levels = torch.linspace(START, 0, self.steps, device=noise.device).round()
-        shares = [*kept(levels), torch.ones((), device=noise.device)]
+        signals = [*alpha_bar(levels), torch.ones((), device=noise.device)]
         x = noise
-        for level, share, following in zip(levels, shares[:-1], shares[1:], strict=True):
-            found = self.denoiser(x, (level / LEVELS).expand(len(x)), context).float()
-            action = ((x - (1 - share).sqrt() * found) / share.sqrt()).clamp(-1, 1)
-            found = (x - share.sqrt() * action) / (1 - share).sqrt()  # what is left beside the clipped estimate
-            x = following.sqrt() * action + (1 - following).sqrt() * found
+        for level, signal, next_signal in zip(levels, signals[:-1], signals[1:], strict=True):
+            noise = self.denoiser(x, (level / LEVELS).expand(len(x)), context).float()
+            action = ((x - (1 - signal).sqrt() * noise) / signal.sqrt()).clamp(-1, 1)
+            noise = (x - signal.sqrt() * action) / (1 - signal).sqrt()  # consistent with the clipped estimate
+            x = next_signal.sqrt() * action + (1 - next_signal).sqrt() * noise
         return x
 
 
-def kept(level: Tensor) -> Tensor:
-    """Share of the variance of the actions that is kept at levels 0 … LEVELS - 1 of noise: a squared cosine."""
+def alpha_bar(level: Tensor) -> Tensor:
+    """Return the signal share of the variance at noise levels 0 … LEVELS - 1, by the squared cosine schedule."""
     angle = ((level + 1) / LEVELS + OFFSET) / (1 + OFFSET) * math.pi / 2
     start = OFFSET / (1 + OFFSET) * math.pi / 2
-    return (angle.cos() / math.cos(start)).square().clamp(min=LEAST)
+    return (angle.cos() / math.cos(start)).square().clamp(min=MIN_ALPHA_BAR)

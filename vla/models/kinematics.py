@@ -1,4 +1,4 @@
-"""Where the tool is, from how the joints stand."""
+"""Forward kinematics of a serial arm."""
 
 from __future__ import annotations
 
@@ -7,18 +7,17 @@ from torch import Tensor, nn
 
 
 class ForwardKinematics(nn.Module):
-    """Pose of the tool in the base frame by multiplying the transforms of a chain of revolute joints.
+    """Pose of the tool in the base frame, by multiplying the transforms of a chain of revolute joints.
 
-    Known exactly, it need not be learned: after a hundred demonstrations a network that had to find it from joint
-    angles was centimetres off.
+    A network that learned it from the joint angles of a hundred demonstrations was off by centimetres.
 
     Args:
-        chain: (J + 1, 7) where the frame of each joint, and last that of the tool, lies in the frame before: offset [m]
-            and quaternion wxyz. Joints turn about their z axis.
+        chain: (J + 1, 7) pose of the frame of each joint, and last of the tool, in the frame before: offset [m] and
+            quaternion wxyz. Joints rotate about their z axis.
     """
 
     links: Tensor
-    WIDTH = 9  # of what it returns
+    WIDTH = 9  # of the output
 
     def __init__(self, chain: tuple[tuple[float, ...], ...]) -> None:
         super().__init__()
@@ -28,8 +27,8 @@ class ForwardKinematics(nn.Module):
         self.register_buffer("links", links.float(), persistent=False)
 
     def forward(self, joints: Tensor) -> Tensor:
-        """(…, J) joint positions [rad] to (…, 9): position [m] and the tool's x and y axes, float32."""
-        # Products of bfloat16 would be millimetres off.
+        """Map (…, J) joint positions [rad] to (…, 9): position [m] and x and y axes of the tool, float32."""
+        # In bfloat16 the error would be millimetres.
         with torch.autocast(joints.device.type, enabled=False):
             angles = joints.float().unsqueeze(-1)
             cosine, sine = angles.cos(), angles.sin()
@@ -42,7 +41,7 @@ class ForwardKinematics(nn.Module):
 
 
 def _rotation(quaternions: Tensor) -> Tensor:
-    """(N, 4) quaternions wxyz of any length as (N, 3, 3) rotations."""
+    """Convert (N, 4) quaternions wxyz of any length to (N, 3, 3) rotation matrices."""
     w, x, y, z = (quaternions / quaternions.norm(dim=-1, keepdim=True)).unbind(-1)
     rows = [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)]
     rows += [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)]

@@ -1,31 +1,33 @@
-"""What every model is: from a batch of windows to actions, most of them by way of logits over action tokens.
+"""Base classes of models, which map a batch of windows to actions, and layers that they share.
 
-Shapes: B batch, T history frames, k action chunk, D action components, K bins, S truth scalars, P proprioception.
+Shapes: B batch, T history frames, k action chunk, D action components, K bins, S truth scalars, P state components.
 """
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from vla.models.action_tokenizer import ActionTokenizer, PerComponent
+from vla.io.types import Inherited, NonNegative, Steps, Width
+from vla.models.fsdp import sum_over_processes
 from vla.models.kinematics import ForwardKinematics
-from vla.models.sharding import summed
-from vla.models.text import TextEncoder
+from vla.models.text.ngrams import TextEncoder
+from vla.models.tokenizers.tokenizer import ActionTokenizer, PerComponent
 from vla.spec import Spec
 
 Batch = dict[str, Any]
 
 
-class Standardize(nn.Module):
-    """Zero mean and unit variance by statistics that are gathered in training and kept in the checkpoint.
+class RunningNormalizer(nn.Module):
+    """Normalisation to zero mean and unit variance by running statistics, which are saved in checkpoints.
 
-    Unlike batch normalisation it never uses the statistics of the current batch alone, whose noise would blur what
-    a joint angle means. Processes that train together gather what all of them see.
+    Unlike batch normalisation it never uses the statistics of the current batch alone. Statistics are reduced over all
+    processes of a training.
 
     Args:
         width: number of components.
@@ -33,133 +35,147 @@ class Standardize(nn.Module):
 
     count: Tensor
     mean: Tensor
-    square: Tensor
+    variance: Tensor
 
-    LEAST_DEVIATION = 1e-3  # a component that never moved in the data must not explode when it does
-    LARGEST = 5.0  # standard deviations; what lies further out was never seen
+    MIN_STD = 1e-3  # a component that is constant in the data must not explode when it moves
+    LIMIT = 5.0  # standard deviations; values are clipped to it
 
     def __init__(self, width: int) -> None:
         super().__init__()
         self.register_buffer("count", torch.zeros(()))
         self.register_buffer("mean", torch.zeros(width))
-        self.register_buffer("square", torch.zeros(width))  # mean squared distance from the mean
+        self.register_buffer("variance", torch.zeros(width))
 
     @property
-    def deviation(self) -> Tensor:
-        """(width,) standard deviations."""
-        return self.square.sqrt().clamp(min=self.LEAST_DEVIATION)
+    def std(self) -> Tensor:
+        """Return the standard deviations, (width,)."""
+        return self.variance.sqrt().clamp(min=self.MIN_STD)
 
     def forward(self, values: Tensor, present: Tensor) -> Tensor:
-        """(B, T, width) values, of which the (B, T) bool `present` are real, to the same shape; the rest become 0."""
+        """Normalise (B, T, width) values where the (B, T) bool `present` is true; the others become 0."""
         if self.training:
-            self._gather(values.detach(), present.unsqueeze(-1).to(values.dtype))
-        standard = ((values - self.mean) / self.deviation).clamp(-self.LARGEST, self.LARGEST)
-        return standard * present.unsqueeze(-1)
+            self._update(values.detach(), present.unsqueeze(-1).to(values.dtype))
+        normalized = ((values - self.mean) / self.std).clamp(-self.LIMIT, self.LIMIT)
+        return normalized * present.unsqueeze(-1)
 
-    def inverse(self, standard: Tensor) -> Tensor:
-        """(…, width) standardised values in their own units again."""
-        return standard * self.deviation + self.mean
-
-    def _gather(self, values: Tensor, weight: Tensor) -> None:
-        added = summed(weight.sum())
+    def _update(self, values: Tensor, weight: Tensor) -> None:
+        added = sum_over_processes(weight.sum())
         total = (self.count + added).clamp(min=1)
-        mean = summed((values * weight).sum((0, 1))) / added.clamp(min=1)
-        square = summed(((values - mean).square() * weight).sum((0, 1)))
-        # Two groups merged into one (Chan et al. 1979).
+        mean = sum_over_processes((values * weight).sum((0, 1))) / added.clamp(min=1)
+        squares = sum_over_processes(((values - mean).square() * weight).sum((0, 1)))
+        # Parallel variance algorithm (Chan et al. 1979).
         shift = mean - self.mean
         between = shift.square() * self.count * added / total
-        self.square.copy_((self.square * self.count + square + between) / total)
+        self.variance.copy_((self.variance * self.count + squares + between) / total)
         self.mean.add_(shift * added / total)
         self.count.add_(added)
 
 
 class Prediction(NamedTuple):
-    """What a model would do after the newest frame of each window."""
+    """Predicted actions after the newest frame of each window."""
 
-    actions: Tensor  # (B, k, D) float32, in the units of the spec, not yet clipped to its bounds
-    probabilities: Tensor | None = None  # (B, k, D, K) float32 of the tokens, if they are one per component
+    actions: Tensor  # (B, k, D) float32, in the units of the spec, not clipped to its bounds
+    probabilities: Tensor | None = None  # (B, k, D, K) float32, for tokenizers with one token per component
 
 
 class Model(nn.Module, ABC):
-    """A policy's network: a batch of windows → actions; it knows no simulator.
+    """A policy network: batch of windows → actions.
 
     A batch is a dict:
-        rgb: camera → (B, T, H, W, 3) uint8; proprio: (B, T, P) float32; present: (B, T) bool, false for padding;
-        text: from `model.text.tokenize`; and to learn from, action: (B, T, k, D) float32,
-        valid: (B, T, k) bool, true for the first so many of a frame, truth: (B, T, S) float32. A model that draws its
-        actions draws them with noise: (B, k, D) float32, standard normal, where it is given.
+        rgb: camera → (B, T, H, W, 3) uint8; state: (B, T, P) float32; present: (B, T) bool, false for padding;
+        text: from `model.text.tokenize`. For training also action: (B, T, k, D) float32; valid: (B, T, k) bool, the
+        loss mask, true for a prefix of each chunk; truth: (B, T, S) float32. For generative models optionally noise:
+        (B, k, D) float32, standard normal.
 
-    Of the k actions a policy executes `execute`, all unless a model says otherwise, before it looks again.
+    A policy executes the first `execute` of the k actions, by default all of them, before it predicts again.
 
     Args:
-        history: T, the frames the model looks at.
-        chunk: k, the actions it predicts for a frame.
-        text: the encoder of the instruction.
-        auxiliary: weight of the loss of the head that predicts the truth; 0 leaves the head out.
-        truth_width: length of the features which that head reads.
-        spec: what a step looks like.
-        tokenizer: how actions and tokens belong together, and between which bounds actions lie.
+        text: factory of the text encoder, called with `width`.
+        text_width: length of the instruction vector.
+        chunk: k, number of actions predicted for a frame.
+        width: hidden width; in a transformer that of a token.
+        auxiliary: loss weight of the head that predicts the simulator state, used in training only; 0 omits it.
+        spec: observation and action spaces.
+        tokenizer: converts between actions and tokens, and gives the action bounds.
     """
+
+    history = 1  # T, number of frames in the input
+    TRUTH_INPUT = 1  # length of the features that the auxiliary head reads [width]
+
+    pose: Tensor  # indices of the state components that are not rates
+    joints: Tensor  # indices of the joint positions in the state
 
     def __init__(
         self,
-        history: int,
-        chunk: int,
-        text: TextEncoder,
-        auxiliary: float,
-        truth_width: int,
+        text: Callable[..., TextEncoder],
+        text_width: Width,
+        chunk: Steps,
+        width: Width,
+        auxiliary: NonNegative,
+        *,
         spec: Spec,
         tokenizer: ActionTokenizer,
     ) -> None:
         super().__init__()
-        self.history, self.chunk, self.auxiliary = history, chunk, auxiliary
-        self.execute = chunk
-        self.spec, self.tokenizer, self.text = spec, tokenizer, text
-        self.kinematics = ForwardKinematics(spec.chain) if spec.chain else None
-        self.posture_width = len(spec.joints) + 1 + (ForwardKinematics.WIDTH if spec.chain else 0)
+        self.chunk = self.execute = chunk
+        self.width, self.auxiliary, self.spec, self.tokenizer = width, auxiliary, spec, tokenizer
+        self.text = text(width=text_width)
+        chain = spec.robot.chain if spec.robot else ()
+        self.kinematics = ForwardKinematics(chain) if chain else None
+        self.register_buffer("pose", torch.tensor(spec.pose, dtype=torch.long), persistent=False)
+        joints = spec.indices(spec.robot.joints) if spec.robot else []
+        self.register_buffer("joints", torch.tensor(joints, dtype=torch.long), persistent=False)
+        self.robot_state_width = len(spec.pose) + (ForwardKinematics.WIDTH if chain else 0)
         self.truth_head: nn.Linear | None = None
         if auxiliary > 0 and spec.truth_size > 0:
-            self.truth_head = nn.Linear(truth_width, spec.truth_size)
-            self.truth_scale = Standardize(spec.truth_size)
+            self.truth_head = nn.Linear(self.TRUTH_INPUT * width, spec.truth_size)
+            self.truth_scale = RunningNormalizer(spec.truth_size)
 
-    def posture(self, batch: Batch) -> Tensor:
-        """(B, T, posture_width) joint positions, gripper opening and, where the chain is known, pose of the tool.
+    def robot_state(self, batch: Batch) -> Tensor:
+        """Return (B, T, robot_state_width): the state without rates, and the pose of the tool if kinematics are known.
 
-        Without velocities: a learner that sees them learns that an arm at rest stays at rest.
+        Velocities are left out because a policy that observes them learns that an arm at rest stays at rest.
         """
-        count = len(self.spec.joints)
-        joints, rest = batch["proprio"][..., :count], batch["proprio"][..., 2 * count :]
-        return torch.cat([joints, rest] if self.kinematics is None else [joints, rest, self.kinematics(joints)], -1)
+        pose = batch["state"].index_select(-1, self.pose)
+        if self.kinematics is None:
+            return pose
+        return torch.cat([pose, self.kinematics(batch["state"].index_select(-1, self.joints))], -1)
 
     def encode(self, batch: Batch) -> Tensor | None:
-        """What of each frame can be kept while a window moves on, (B, T, N, E); None for a model that keeps nothing.
+        """Return tokens of each frame, (B, T, N, E), to cache and pass to `forward` as "tokens" instead of images.
 
-        `forward` then takes it as "tokens" in place of images.
+        None for a model without such a cache.
         """
         return None
 
-    def draw(self, random: torch.Generator) -> Tensor | None:
-        """The "noise" to act with once, (1, k, D); None of a model that draws nothing."""
+    def sample_noise(self, random: torch.Generator) -> Tensor | None:
+        """Sample the "noise" of one prediction, (1, k, D); None for a deterministic model."""
         return None
+
+    def predict_truth(self, features: Tensor) -> dict[str, Tensor]:
+        """Return truth: (B, T', S), normalised, given (B, T', …) features; nothing without an auxiliary head."""
+        return {} if self.truth_head is None else {"truth": self.truth_head(features)}
 
     @abstractmethod
     def forward(self, batch: Batch) -> dict[str, Tensor]:
-        """What `action_loss` reads, for the last T' of the T frames; with an auxiliary head also truth: (B, T', S),
-        standardised. This is the part that compiles."""
+        """Return the inputs of `action_loss` for the last T' of the T frames; this part is compiled.
+
+        Also the result of `predict_truth`.
+        """
 
     @abstractmethod
     def action_loss(self, output: dict[str, Tensor], batch: Batch) -> dict[str, Tensor]:
-        """The scalar `action_loss` of what `forward` made of a batch, and whatever else is worth logging."""
+        """Return the scalar `action_loss` given the output of `forward`, and other values to log."""
 
     @abstractmethod
     def predict(self, batch: Batch) -> Prediction:
-        """What to do after the newest frame, the last one that is present: what follows it must not matter.
+        """Predict the actions after the newest present frame; later padding must have no effect.
 
-        Needs "present", "text", and the images and joints or the "tokens" of all frames.
+        Requires "present", "text", and the images and states or the "tokens" of all frames.
         """
 
     def loss(self, batch: Batch) -> dict[str, Tensor]:
-        """The scalar `loss` to minimise, and its parts by name."""
+        """Return the scalar `loss` to minimise, and its parts by name."""
         output = self(batch)
         losses = self.action_loss(output, batch)
         losses["loss"] = losses["action_loss"]
@@ -174,56 +190,59 @@ class Model(nn.Module, ABC):
 
 
 class TokenModel(Model):
-    """A model that scores, in one pass, every bin of every component of an action.
+    """A model that predicts logits of every bin of every action component in one pass.
 
-    Its `forward` gives logits: (B, T', k, D, K).
+    Its `forward` returns logits: (B, T', k, D, K).
     """
 
     tokenizer: PerComponent
 
+    def __init__(self, *, tokenizer: PerComponent, **inherited: Inherited) -> None:
+        super().__init__(tokenizer=tokenizer, **inherited)
+
     @property
     def logits_shape(self) -> tuple[int, int, int]:
-        """k, D and K."""
+        """Return k, D and K."""
         return self.chunk, len(self.spec.action), self.tokenizer.bins
 
     def action_loss(self, output: dict[str, Tensor], batch: Batch) -> dict[str, Tensor]:
-        """The tokenizer's loss over all frames and, outside training, the share of tokens that are right."""
+        """Return the tokenizer's loss over all frames and, outside training, the token accuracy."""
         logits = output["logits"]
         frames = logits.shape[1]
         action, valid = batch["action"][:, -frames:], batch["valid"][:, -frames:]
         losses = {"action_loss": self.tokenizer.loss(logits, action, valid)}
         if not self.training:
-            right = logits.argmax(-1) == self.tokenizer.encode(action)  # (B, T', k, D)
-            losses["token_accuracy"] = right[valid].float().mean()
+            correct = logits.argmax(-1) == self.tokenizer.encode(action)  # (B, T', k, D)
+            losses["token_accuracy"] = correct[valid].float().mean()
         return losses
 
     def predict(self, batch: Batch) -> Prediction:
-        """The actions that the tokenizer reads from the logits of the newest frame."""
-        place = newest(batch["present"])
-        logits = self(batch)["logits"][torch.arange(len(place)), place].float()  # (B, k, D, K)
-        return Prediction(self.tokenizer.read(logits), logits.softmax(-1))
+        """Decode the logits of the newest frame."""
+        frame = newest(batch["present"])
+        logits = self(batch)["logits"][torch.arange(len(frame)), frame].float()  # (B, k, D, K)
+        return Prediction(self.tokenizer.decode_logits(logits), logits.softmax(-1))
 
 
-def perceptron(inputs: int, width: int) -> nn.Sequential:
-    """What many features of any size meet in: three layers from `inputs` to `width`, normalised on the way."""
+def mlp(inputs: int, width: int) -> nn.Sequential:
+    """Build an MLP of three layers from `inputs` to `width` features, with layer normalisation and GELU."""
     first = [nn.Linear(inputs, width), nn.LayerNorm(width), nn.GELU()]
     second = [nn.Linear(width, width), nn.LayerNorm(width), nn.GELU()]
     return nn.Sequential(*first, *second, nn.Linear(width, width), nn.GELU())
 
 
 def require_heads(width: int, heads: int) -> None:
-    """Raise a ValueError unless attention can share `width` out among so many heads."""
+    """Raise a ValueError unless `width` is a multiple of `heads`."""
     if width % heads:
         raise ValueError(f"model.width={width} must be a multiple of model.heads={heads}")
 
 
 def newest(present: Tensor) -> Tensor:
-    """(B,) place of the last of the (B, T) frames that is present."""
+    """Return the (B,) index of the last of the (B, T) frames that is present."""
     return (present * torch.arange(1, present.shape[1] + 1, device=present.device)).argmax(1)
 
 
 def pixels(images: Tensor, size: int | None = None) -> Tensor:
-    """(B, T, H, W, 3) uint8 as (B·T, 3, H, W) float32 in 0 … 1, resized to a square of `size` [px] if given."""
+    """Convert (B, T, H, W, 3) uint8 to (B·T, 3, H, W) float32 in 0 … 1, resized to a square of `size` [px] if given."""
     x = images.flatten(0, 1).permute(0, 3, 1, 2).float().div_(255)
     if size is not None and x.shape[-2:] != (size, size):
         x = F.interpolate(x, (size, size), mode="bilinear")

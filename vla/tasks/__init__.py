@@ -1,1 +1,1 @@
-"""The simulated Franka tabletop: scene, randomisation, goals, controller and scripted expert."""
+"""Simulated worlds, one folder each, and the modules that they share."""

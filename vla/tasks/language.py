@@ -1,4 +1,4 @@
-"""Instructions: a grammar of phrasings and synonyms, part of which training never hears."""
+"""Instructions: a grammar of phrasings and synonyms, part of which is held out from training."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from annotated_types import MaxLen, MinLen
 Phrasings = Annotated[Sequence[Annotated[str, MaxLen(300)]], MinLen(1)]
 Words = Annotated[Sequence[Annotated[str, MinLen(1), MaxLen(60)]], MinLen(1)]
 
-Novelty = Literal["words", "phrasings", "combinations"]
+HeldOut = Literal["words", "phrasings", "combinations"]
 
 
 class Grammar:
-    """Phrasings with slots such as {block}, which the goal fills, and {put}, which stands for any of several words.
+    """Phrasings with slots: the goal fills {block}, a random synonym fills {put}.
 
-    What is held out: words that stand for others, whole phrasings, and colours that this goal never names.
+    Held out from training: some synonyms, some phrasings, and some colours of the named block.
     """
 
     def __init__(
@@ -29,38 +29,42 @@ class Grammar:
         held_out_words: Mapping[str, Words],
         held_out_colours: Sequence[str] = (),
     ) -> None:
-        """Args: what is said in training, slot → words for it; the same for what is new; colours of blocks that are
-        not named in training.
+        """Args:
+        phrasings: training phrasings.
+        words: slot → training synonyms.
+        held_out_phrasings: phrasings for evaluation only.
+        held_out_words: slot → synonyms for evaluation only.
+        held_out_colours: block colours that training instructions never name.
 
         Raises:
-            ValueError: a held-out part is empty, or heard in training after all, or braces in a phrasing are not those
-                of a slot.
+            ValueError: a held-out part is empty or overlaps with training, or a phrasing has a malformed slot.
         """
-        self.phrasings, self.words = tuple(phrasings), {slot: tuple(said) for slot, said in words.items()}
+        self.phrasings, self.words = tuple(phrasings), {slot: tuple(choices) for slot, choices in words.items()}
         self.held_out_phrasings = tuple(held_out_phrasings)
-        self.held_out_words = {slot: tuple(said) for slot, said in held_out_words.items()}
+        self.held_out_words = {slot: tuple(choices) for slot, choices in held_out_words.items()}
         self.held_out_colours = tuple(held_out_colours)
         leaked = set(phrasings) & set(held_out_phrasings)
-        leaked |= {word for slot, said in held_out_words.items() for word in said if word in words.get(slot, ())}
-        if leaked or not held_out_phrasings or not held_out_words:
-            what = f"also in the part that training hears: {sorted(leaked)}" if leaked else "empty"
-            raise ValueError(f"the held-out part of task.goal.language is {what}")
+        leaked |= {word for slot, new in held_out_words.items() for word in new if word in words.get(slot, ())}
+        if leaked:
+            raise ValueError(f"task.goal.language holds out what training also uses: {sorted(leaked)}")
+        if not held_out_phrasings or not held_out_words:
+            raise ValueError("the held-out part of task.goal.language is empty")
         self.slots = {slot for phrasing in (*phrasings, *held_out_phrasings) for slot in _slots(phrasing)} - {*words}
 
     @property
-    def novelties(self) -> tuple[Novelty, ...]:
-        """The ways in which a held-out instruction of this grammar may be new."""
+    def held_out_kinds(self) -> tuple[HeldOut, ...]:
+        """Kinds of held-out instructions that this grammar can generate."""
         return ("words", "phrasings", "combinations") if self.held_out_colours else ("words", "phrasings")
 
-    def say(self, slots: Mapping[str, str], novelty: Novelty | None, random_state: np.random.RandomState) -> str:
-        """An instruction whose goal's slots are filled; nothing in it is new, or one thing is."""
-        phrasings = self.held_out_phrasings if novelty == "phrasings" else self.phrasings
-        if novelty == "words":  # only where there is a word to replace
+    def say(self, slots: Mapping[str, str], held_out: HeldOut | None, random_state: np.random.RandomState) -> str:
+        """Draw an instruction with the goal's `slots` filled; one part of it is held out, or nothing if None."""
+        phrasings = self.held_out_phrasings if held_out == "phrasings" else self.phrasings
+        if held_out == "words":  # only phrasings that have a word to replace
             phrasings = tuple(one for one in phrasings if any(f"{{{slot}}}" in one for slot in self.held_out_words))
         phrasing = phrasings[random_state.randint(len(phrasings))]
-        said = {**self.words, **(self.held_out_words if novelty == "words" else {})}
+        words = {**self.words, **(self.held_out_words if held_out == "words" else {})}
         chosen = {
-            slot: said[slot][random_state.randint(len(said[slot]))] for slot in sorted(_slots(phrasing) & set(said))
+            slot: words[slot][random_state.randint(len(words[slot]))] for slot in sorted(_slots(phrasing) & set(words))
         }
         return phrasing.format(**chosen, **slots)
 
@@ -71,7 +75,7 @@ def _slots(phrasing: str) -> set[str]:
     except ValueError as error:
         raise ValueError(f"task.goal.language: {phrasing!r} has braces that do not match: {error}") from error
     slots = {name for _, name, _, _ in fields if name is not None}
-    # A field of str.format may also reach into attributes and pad without bound.
-    if not all(name.isidentifier() for name in slots) or any(form or turned for _, _, form, turned in fields):
+    # A field of str.format could also access attributes or pad to any width.
+    if not all(name.isidentifier() for name in slots) or any(form or conversion for _, _, form, conversion in fields):
         raise ValueError(f"task.goal.language: in {phrasing!r} braces hold more than the name of a slot")
     return slots

@@ -7,7 +7,7 @@ from launch_ros.actions import LifecycleNode
 
 
 def generate_launch_description() -> LaunchDescription:
-    """The policy node, which configures and activates itself."""
+    """Launch the policy node, which configures and activates itself."""
     return LaunchDescription(
         [
             DeclareLaunchArgument("checkpoint", description="a trained policy"),

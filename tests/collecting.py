@@ -1,0 +1,19 @@
+"""The collection of a known number of episodes, and what it leaves in a folder."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from vla.rollouts.collect import COLLECTION_TIME
+
+EPISODES = 30
+TRIED = 37  # seeds 3, 8, 13, … fail
+
+
+def content(folder: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in folder.iterdir() if path.name not in ("lock", COLLECTION_TIME)}
+
+
+def lines(folder: Path) -> int:
+    index = folder / "index.jsonl"
+    return index.read_bytes().count(b"\n") if index.exists() else 0

@@ -1,0 +1,34 @@
+"""The configuration, composed as the command line composes it."""
+
+from __future__ import annotations
+
+from copy import deepcopy
+from functools import cache
+
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from omegaconf import DictConfig, OmegaConf
+
+from vla.config.compose import CONF as CONF
+from vla.config.compose import compose
+
+
+def composed(*overrides: str) -> DictConfig:
+    """What the command line composes.
+
+    Composing takes half a second, so options are composed once, and values set in a copy, as Hydra does it last.
+    """
+    values = [override for override in overrides if _is_value(override)]
+    config = deepcopy(_composed_once(tuple(override for override in overrides if override not in values)))
+    for override in OverridesParser.create().parse_overrides(values):
+        OmegaConf.update(config, override.key_or_group, override.value(), merge=True)
+    return config
+
+
+def _is_value(override: str) -> bool:
+    key = override.partition("=")[0]
+    return key[0] not in "+~" and not key.startswith("hydra") and "/" not in key and not (CONF / key).is_dir()
+
+
+@cache
+def _composed_once(overrides: tuple[str, ...]) -> DictConfig:
+    return compose("output=outputs/runs/now", *overrides)

@@ -1,0 +1,1 @@
+"""A world of one point, and what learns and acts in it."""

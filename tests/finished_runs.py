@@ -1,0 +1,58 @@
+"""Run folders as an evaluation leaves them, without their pictures."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+from vla.reports.evaluation import write_report
+from vla.rollouts.evaluate import FIRST_SEED, Report, Result
+from vla.runs.folder import save_config
+
+SAID = "lift the <script>alert('red')</script> block"
+
+CONFIG = {
+    "task": {"blocks": 3},
+    "model": {"_target_": "vla.models.bc.BC", "width": 16},
+    "trainer": {"max_steps": 400},
+    "output": "there",
+}
+
+CURVES = """\
+epoch,step,lr,train/loss,train/truth_loss,val/error_dx_mm,val/error_dy_mm,val/error_gripper,val/loss
+0,9,0.001,4.5,1.0,,,,
+0,19,0.0005,1.5,0.5,,,,
+0,19,,,,3.0,4.0,0.1,2.5
+0,29,0.0001,0.1,0.1,,,,
+0,39,,,,1.0,2.0,0.05,0.125
+"""
+
+
+def a_report(*outcomes: str) -> Report:
+    return Report(tuple(Result(FIRST_SEED + n, outcome, SAID, 20, {"n": n}) for n, outcome in enumerate(outcomes)))
+
+
+def a_run(
+    folder: Path,
+    outcomes: str = "ssss",
+    width: int = 16,
+    curves: str = CURVES,
+    light: float | None = None,
+    dark: str = "",
+) -> Path:
+    """A folder as an evaluation leaves it, without pictures and recordings; s is a success, d a drop, and in the dark
+    all are drops unless told."""
+    folder.mkdir(parents=True)
+    report, in_the_dark = (
+        a_report(*({"s": "success", "d": "dropped"}[outcome] for outcome in all_of_them))
+        for all_of_them in (outcomes, dark or "d" * len(outcomes))
+    )
+    if light is not None:
+        report = Report(tuple(replace(result, draws={**result.draws, "light": light}) for result in report.results))
+    told = {"evaluate": {"conditions": {"dark": {"light": light}}}}
+    config = {**CONFIG, **told, "model": {"_target_": "vla.models.bc.BC", "width": width}}
+    size = {"parameters": 1_500_000, "latency_ms": 2.5}
+    write_report(report, folder / "report.json", f"{folder}/checkpoints/last.ckpt", config, size, {"dark": in_the_dark})
+    (folder / "metrics.csv").write_text(curves)
+    save_config(folder, config, [{"key": "model.width", "here": width, "default": 32}])
+    return folder

@@ -1,0 +1,76 @@
+"""The data module on a small store, and a model that keeps what it is given."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import torch
+import toy
+from lightning import LightningModule, Trainer
+from lightning.pytorch.callbacks import ModelCheckpoint
+
+from vla.data.datamodule import WindowDataModule
+
+
+def windows(folder: Path, **changes: Any) -> WindowDataModule:
+    settings: dict[str, Any] = {
+        "spec": toy.SPEC,
+        "history": 3,
+        "chunk": 2,
+        "seed": 1,
+        "batch_size": 8,
+        "validation_fraction": 0.2,
+        "validation_windows": 40,
+        "depth": False,
+        "ahead": 2,
+    }
+    module = WindowDataModule(folder, **{**settings, **changes})
+    module.setup()
+    return module
+
+
+class Seen(LightningModule):
+    """Remembers the windows it was shown; its one weight depends on all of them and on their order."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.weight = torch.nn.Parameter(torch.zeros(1))
+        self.seen: list[torch.Tensor] = []
+
+    def training_step(self, batch: dict[str, Any], index: int) -> torch.Tensor:
+        self.seen.append(batch["state"])
+        return (self.weight - batch["state"].mean()).square().mean()
+
+    def validation_step(self, batch: dict[str, Any], index: int) -> None:
+        assert batch["action"].shape == (8, 3, 2, 3)
+
+    def configure_optimizers(self) -> torch.optim.Optimizer:
+        return torch.optim.Adam(self.parameters(), lr=0.1)
+
+
+def fit(
+    folder: Path,
+    steps: int,
+    accumulate: int = 1,
+    checkpoint: Path | None = None,
+    save: Path | None = None,
+    devices: int = 1,
+) -> Seen:
+    model = Seen()
+    trainer = Trainer(
+        accelerator="cpu",
+        devices=devices,
+        max_steps=steps,
+        accumulate_grad_batches=accumulate,
+        val_check_interval=4,
+        check_val_every_n_epoch=None,
+        num_sanity_val_steps=0,
+        logger=False,
+        enable_progress_bar=False,
+        enable_model_summary=False,
+        enable_checkpointing=save is not None,
+        callbacks=[ModelCheckpoint(save, "at_{step}", every_n_train_steps=1, save_top_k=-1)] if save else [],
+    )
+    trainer.fit(model, datamodule=windows(folder), ckpt_path=checkpoint, weights_only=True)
+    return model

@@ -1,0 +1,47 @@
+"""Small learners, trainers and batches."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import lightning
+from defaults import defaults_of
+from fake_batch import make_bc
+from torch.utils.data import DataLoader
+from toy import SPEC
+
+from vla.models.learner import Learner
+from vla.models.model import Model
+
+MODEL = {"_target_": "vla.models.bc.BC", "shift": [0, 0]}
+
+CONFIG: dict[str, Any] = {"task": {}, "tokenizer": {}, "model": MODEL, "seed": 0}
+
+
+def make_learner(model: Model | None = None, **options: Any) -> Learner:
+    arguments = defaults_of("learner/default", **{"lr": 1e-3, **options})
+    return Learner(**arguments, model=model or make_bc(), spec=SPEC, config=CONFIG)
+
+
+def make_trainer(steps: int, *callbacks: lightning.Callback, precision: Any = "32-true") -> lightning.Trainer:
+    return lightning.Trainer(
+        accelerator="cpu",
+        max_steps=steps,
+        precision=precision,
+        logger=False,
+        callbacks=list(callbacks),
+        enable_checkpointing=False,
+        enable_progress_bar=False,
+        enable_model_summary=False,
+        num_sanity_val_steps=0,
+    )
+
+
+def loader(batch: dict[str, Any], steps: int) -> DataLoader[Any]:
+    return DataLoader([batch] * steps, batch_size=None)  # type: ignore[arg-type]
+
+
+def fit(learner: Learner, batch: dict[str, Any], steps: int, **options: Any) -> lightning.Trainer:
+    trainer = make_trainer(steps, **options)
+    trainer.fit(learner, loader(batch, steps), loader(batch, 1))
+    return trainer

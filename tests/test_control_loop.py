@@ -1,0 +1,329 @@
+"""The control loop: fresh inputs move the arm, late or invalid ones make it brake and hold."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from arm import ARM, FORWARD, ROBOT, SAFETY, SPEC
+
+from vla.deploy.control_loop import Command, ControlLoop, Safety, State
+from vla.deploy.joint_limiter import Robot
+from vla.robots.panda import CHAIN, HOME, JOINT_HIGH, forward
+from vla.spec import Observation, Spec
+
+IMAGE = np.zeros((8, 8, 3), np.uint8)
+
+
+class World:
+    """A simulated arm that follows its commands, two cameras, and a clock."""
+
+    def __init__(self, safety: Safety = SAFETY) -> None:
+        self.loop = ControlLoop(SPEC, ROBOT, safety, 50.0)
+        self.now, self.joints = 100.0, HOME.copy()
+        self.cameras, self.measures, self.follows = ["front", "wrist"], True, True
+        self.apart = 0.0  # delay of the wrist's images [s]
+        self.answer: Callable[[Observation], np.ndarray | None] = lambda observation: FORWARD
+
+    def ticks(self, seconds: float) -> Iterator[Command]:
+        """Run for some seconds: joint states and commands at 50 Hz, images at 10 Hz."""
+        for tick in range(round(seconds * 50)):
+            self.now += 0.02
+            if self.measures:
+                self.loop.on_joint_state(self.joints, np.zeros(7), 0.08, self.now)
+            if tick % 5 == 0:
+                for camera in self.cameras:
+                    self.loop.on_image(camera, IMAGE, self.now - (self.apart if camera == "wrist" else 0.0))
+            observation = self.loop.next_observation(self.now)
+            if observation is not None:
+                actions = self.answer(observation)
+                if actions is not None:
+                    self.loop.set_plan(actions, self.now)
+            command = self.loop.command(self.now)
+            if command is not None:
+                if self.follows:
+                    self.joints = command.position.copy()
+                yield command
+
+    def run(self, seconds: float) -> list[Command]:
+        return list(self.ticks(seconds))
+
+    @property
+    def tool(self) -> np.ndarray:
+        return forward(self.joints)[0][:3, 3]
+
+
+@pytest.fixture
+def world() -> World:
+    """A running loop."""
+    world = World()
+    world.run(0.1)
+    world.loop.on_instruction("put the red block on the pad", world.now)
+    world.run(0.2)
+    assert world.loop.state is State.RUNNING
+    return world
+
+
+def test_nothing_is_commanded_before_the_first_joint_state() -> None:
+    world = World()
+    world.measures = False
+    assert world.run(0.5) == [] and world.loop.state is State.WAITING
+
+
+def test_without_an_instruction_the_measured_pose_is_held() -> None:
+    world = World()
+    for command in world.run(0.5):
+        np.testing.assert_array_equal(command.position, HOME)
+        assert command.opening == 1.0
+    assert world.loop.state is State.WAITING and "instruction" in world.loop.reason
+
+
+def test_actions_move_the_tool_as_far_as_they_say(world: World) -> None:
+    world.answer = lambda observation: 0 * FORWARD
+    world.run(1.0)
+    start, actions = world.tool, iter([FORWARD] * 8)
+    world.answer = lambda observation: next(actions, 0 * FORWARD)
+    world.run(1.5)
+    np.testing.assert_allclose(world.tool - start, [0.08, 0, 0], atol=0.002)
+
+
+def test_a_chunk_is_executed_to_its_end_before_the_policy_is_asked_again() -> None:
+    world, asked = World(), []
+
+    def answer(observation: Observation) -> np.ndarray:
+        asked.append(world.now)
+        return np.repeat(FORWARD, 4, 0)
+
+    world.answer = answer
+    world.run(0.1)
+    world.loop.on_instruction("go", world.now)
+    start = world.tool
+    world.run(1.2)
+    assert np.diff(asked) == pytest.approx([0.4] * (len(asked) - 1), abs=0.021) and len(asked) >= 3
+    np.testing.assert_allclose((world.tool - start)[0], 0.11, atol=0.015)
+
+
+def test_a_late_answer_still_ends_where_and_when_it_should(world: World) -> None:
+    """Its observation is older, so less time is left for the motions."""
+    world.answer = lambda observation: 0 * FORWARD
+    world.run(0.5)
+    asked: list[float] = []
+    world.answer = lambda observation: asked.append(world.now)
+    start, ticks = world.tool, world.ticks(1.0)
+    while not asked or world.now < asked[0] + 0.11:
+        next(ticks)
+    world.loop.set_plan(np.repeat(FORWARD, 3, 0), world.now)
+    while world.now < asked[0] + 0.34:
+        next(ticks)
+    assert (world.tool - start)[0] == pytest.approx(0.03, abs=0.004)
+
+
+@pytest.mark.parametrize(
+    ("break_it", "reason"),
+    [
+        (lambda world: setattr(world, "cameras", ["front"]), "camera wrist is older"),
+        (lambda world: setattr(world, "cameras", []), "camera front is older"),
+        (lambda world: setattr(world, "apart", 0.08), "images of front, wrist are more than 0.05 s apart"),
+        (lambda world: setattr(world, "measures", False), "joint state is older"),
+        (lambda world: setattr(world, "answer", lambda observation: None), "inference takes longer"),
+    ],
+    ids=["one camera", "no camera", "cameras out of step", "no joint states", "no answer"],
+)
+def test_late_inputs_brake_and_hold_the_arm(world: World, break_it: Callable[[World], None], reason: str) -> None:
+    world.run(0.3)
+    break_it(world)
+    commands = world.run(1.2)
+    assert world.loop.state is State.HOLDING and reason in world.loop.reason
+    resting = [index for index, command in enumerate(commands) if not command.velocity.any()]
+    assert resting[0] * 0.02 < 0.7 and resting == list(range(resting[0], len(commands)))
+
+
+def test_a_frame_counts_once_every_camera_has_a_newer_one(world: World) -> None:
+    world.loop.hold("a hand in the way")
+
+    def after(*cameras: str) -> State:
+        world.now += 0.01
+        world.loop.on_joint_state(world.joints, np.zeros(7), 0.08, world.now)
+        for camera in cameras:
+            world.loop.on_image(camera, IMAGE, world.now)
+        world.loop.command(world.now)
+        return world.loop.state
+
+    for cameras in (("front", "wrist"), ("wrist",), ("front",), ("wrist",)):  # two of each, and a wrist's
+        assert after(*cameras) is State.HOLDING
+    assert after("front") is State.RUNNING
+
+
+def test_a_held_loop_runs_again_after_fresh_frames(world: World) -> None:
+    world.cameras = []
+    world.run(0.6)
+    assert world.loop.state is State.HOLDING
+    world.cameras = ["front", "wrist"]
+    world.run(0.2)  # two of each camera
+    assert world.loop.state is State.HOLDING
+    world.run(0.2)
+    assert world.loop.state is State.RUNNING
+
+
+@pytest.mark.parametrize("actions", [np.full((1, 7), np.nan), np.zeros((1, 6)), np.zeros((0, 7)), np.zeros(7)])
+def test_an_unusable_answer_holds_and_three_in_a_row_are_a_fault(world: World, actions: np.ndarray) -> None:
+    before = world.tool
+    world.answer = lambda observation: actions
+    world.run(0.12)
+    assert world.loop.state is State.HOLDING and "policy" in world.loop.reason
+    world.run(3.0)
+    assert world.loop.state is State.FAULT and "3 times" in world.loop.reason
+    assert np.linalg.norm(world.tool - before) < 0.03
+    world.loop.on_instruction("go on", world.now)
+    assert not world.loop.resume(world.now)
+    world.run(0.2)
+    assert world.loop.state is State.FAULT
+
+
+def test_a_stop_lasts_until_resumed(world: World) -> None:
+    world.loop.stop("by hand")
+    commands = world.run(1.0)
+    assert world.loop.state is State.STOPPED and not commands[-1].velocity.any()
+    assert world.loop.reason.startswith("by hand; to continue: python -m vla.deploy.say --resume")
+    assert not world.loop.on_instruction("put the blue block on the pad", world.now)
+    world.run(0.2)
+    assert world.loop.state is State.STOPPED
+    assert world.loop.resume(world.now)
+    world.run(0.5)
+    assert world.loop.state is State.RUNNING
+
+
+def test_an_empty_instruction_stops(world: World) -> None:
+    world.loop.on_instruction("  ", world.now)
+    assert world.loop.state is State.STOPPED
+
+
+def test_an_instruction_times_out() -> None:
+    world = World(replace(SAFETY, instruction=1.0))
+    world.run(0.1)
+    world.loop.on_instruction("go", world.now)
+    world.answer = lambda observation: np.zeros((1, 7))
+    world.run(1.5)
+    assert world.loop.state is State.STOPPED
+    assert world.loop.reason == "time-out: 1 s on one instruction; to continue: send the next instruction"
+
+
+def test_the_next_instruction_ends_a_stop_by_time_out_and_no_other() -> None:
+    world = World(replace(SAFETY, instruction=1.0))
+    world.run(0.1)
+    world.loop.on_instruction("go", world.now)
+    world.run(1.5)
+    assert world.loop.state is State.STOPPED
+    assert world.loop.on_instruction("go", world.now)
+    world.run(0.5)
+    assert world.loop.state is State.RUNNING
+    world.run(1.0)
+    assert world.loop.state is State.STOPPED
+    world.loop.stop("by hand")  # on top of the other one
+    assert not world.loop.on_instruction("go on", world.now)
+    world.run(0.5)
+    assert world.loop.state is State.STOPPED and "by hand" in world.loop.reason
+
+
+def test_an_arm_that_does_not_follow_is_a_fault(world: World) -> None:
+    world.follows = False
+    world.run(3.0)
+    assert world.loop.state is State.FAULT and "away from its command" in world.loop.reason
+
+
+def test_the_tool_stays_in_the_workspace() -> None:
+    x, y, z = forward(HOME)[0][:3, 3]
+    world = World(replace(SAFETY, workspace=((x - 0.1, y - 0.1, z - 0.1), (x + 0.05, y + 0.1, z + 0.1))))
+    world.run(0.1)
+    world.loop.on_instruction("go", world.now)
+    world.run(2.0)
+    assert world.tool[0] == pytest.approx(x + 0.05, abs=0.002)
+
+
+def test_an_arm_outside_its_limits_is_a_fault() -> None:
+    world = World()
+    world.joints = JOINT_HIGH - 0.01
+    assert world.run(0.2) == [] and world.loop.state is State.FAULT and "outside" in world.loop.reason
+
+
+def test_the_horizon_ends_at_rest(world: World) -> None:
+    ticks = world.ticks(1.0)
+    while not next(ticks).velocity.any():
+        pass
+    ahead = world.loop.horizon(world.now)
+    assert not ahead[-1].velocity.any() and ahead[0].velocity.any()
+    moved = np.diff([command.position for command in ahead], axis=0) / 0.02
+    assert (np.abs(moved) <= ROBOT.max_speed + 1e-9).all()
+
+
+def test_the_horizon_is_continuous_with_the_commands() -> None:
+    """A controller that is sent a new trajectory every tick, and one that is sent no more, keep to the limits."""
+    world = World()
+    generator = np.random.default_rng(0)
+    world.answer = lambda observation: generator.uniform(SPEC.low, SPEC.high, (1, 7))
+    world.run(0.1)
+    world.loop.on_instruction("go", world.now)
+    sent: list[np.ndarray] = []
+    for command in world.ticks(2.0):
+        ahead = [each.position for each in world.loop.horizon(world.now)]
+        sent.append(command.position)
+        speeds = np.diff([*sent[-3:], *ahead], axis=0) / 0.02
+        assert (np.abs(speeds) <= ROBOT.max_speed + 1e-9).all()
+        assert (np.abs(np.diff(speeds, axis=0)) / 0.02 <= ROBOT.max_acceleration + 1e-6).all()
+    assert np.ptp(sent, axis=0).max() > 0.1
+
+
+def test_a_new_instruction_reaches_the_policy_with_the_next_frame(world: World) -> None:
+    received: list[str] = []
+
+    def answer(observation: Observation) -> np.ndarray:
+        received.append(observation.instruction)
+        return np.repeat(FORWARD * [0, 0, 0, 0, 0, 0, 1], 20, 0)
+
+    world.answer = answer
+    world.run(0.2)
+    world.loop.on_instruction("lift the red block", world.now)
+    world.run(0.2)
+    assert received[-1] == "lift the red block"
+
+
+def six(spec: Spec, robot: Robot) -> tuple[Spec, Robot]:
+    """The same for an arm of six joints."""
+    state = tuple(name for name in SPEC.state if "joint7" not in name)
+    arm = replace(ARM, joints=ARM.joints[:6], velocities=ARM.velocities[:6])
+    limits: Any = {name: getattr(robot, name)[:6] for name in ("joints", "low", "high", "speed", "acceleration")}
+    units = ("rad",) * 6 + ("rad/s",) * 6 + ("m",)
+    return replace(spec, state=state, state_units=units, robot=arm), replace(robot, **limits)
+
+
+def with_chain(*chain: tuple[float, ...]) -> tuple[Spec, Robot]:
+    return replace(SPEC, robot=replace(ARM, chain=chain)), ROBOT
+
+
+@pytest.mark.parametrize(
+    ("policy", "words"),
+    [
+        (
+            (replace(SPEC, action=("x", "y"), units=("m", "m"), low=(0, 0), high=(1, 1)), ROBOT),
+            "action is x .m., y .m., ",
+        ),
+        ((replace(SPEC, units=("mm",) * 3 + SPEC.units[3:]), ROBOT), r"action is dx .mm., .* expected dx .m., "),
+        (six(SPEC, ROBOT), "arm has 6 joints, the Panda 7: another arm needs"),
+        (with_chain(*CHAIN[1:], CHAIN[0]), "another kinematic chain than the Panda"),
+    ],
+    ids=["action", "units", "joints", "chain"],
+)
+def test_a_policy_of_another_arm_or_action_is_refused(policy: tuple[Spec, Robot], words: str) -> None:
+    with pytest.raises(ValueError, match=words):
+        ControlLoop(*policy, SAFETY, 50.0)
+
+
+def test_a_policy_and_its_own_arm_fit() -> None:
+    ControlLoop(*with_chain(*CHAIN), SAFETY, 50.0)
+    with pytest.raises(ValueError, match="command_hz"):
+        ControlLoop(SPEC, ROBOT, SAFETY, 5.0)
+    with pytest.raises(ValueError, match="trained with 7 joints, the robot has 6"):
+        ControlLoop(SPEC, six(SPEC, ROBOT)[1], SAFETY, 50.0)

@@ -1,0 +1,233 @@
+"""Training windows: equal to a naive loop over the episodes, in an order that resumes exactly."""
+
+from __future__ import annotations
+
+import shutil
+from dataclasses import replace
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+import toy
+from reading import fit, windows
+
+from vla.data.datamodule import Prefetcher, held_out
+from vla.data.episodes import EpisodeStore
+from vla.data.verification import derive_store
+from vla.data.window_batches import WindowBatcher, disturbed
+from vla.parallel.pool import LocalCluster
+from vla.rollouts.collect import collect
+from vla.spec import Array
+
+EPISODES = toy.EPISODES
+
+
+def naive(store: EpisodeStore, row: int, history: int, chunk: int) -> dict[str, Any]:
+    """The window whose newest frame is `row`, built frame by frame."""
+    entry = next(entry for entry in store.episodes if entry.start <= row < entry.start + entry.steps)
+    rows = store.read(entry)
+    newest = row - entry.start
+    frames: list[dict[str, Any]] = []
+    for step in range(newest - history + 1, newest + 1):
+        present = step >= 0
+        seen = {name: values[max(step, 0)] * present for name, values in rows.items()}
+        labels = [min(max(step + ahead, 0), entry.steps - 1) if present else 0 for ahead in range(chunk)]
+        seen["labels"] = [rows["action"][label] for label in labels]
+        off = disturbed(rows["action"], rows["executed"], store.spec)
+        seen["valid"] = [
+            present and step + ahead < entry.steps and not off[step : step + ahead].any() for ahead in range(chunk)
+        ]
+        seen["present"] = present
+        frames.append(seen)
+    return {name: np.stack([frame[name] for frame in frames]) for name in frames[0]} | {"text": entry.instruction}
+
+
+@pytest.fixture(scope="module")
+def arms(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A store of the world with a robot and depth."""
+    return toy.make_store(tmp_path_factory.mktemp("arms"), toy.make_arm).folder
+
+
+@pytest.mark.parametrize(("history", "chunk"), [(1, 1), (3, 2), (6, 8)])
+def test_a_batch_is_what_a_loop_over_the_episodes_gives(arms: Path, history: int, chunk: int) -> None:
+    store = EpisodeStore(arms)
+    chosen = np.concatenate([np.arange(store.episodes[5].start - 2, store.episodes[5].start + 9), [0, 1]])
+    batch = WindowBatcher(store, history, chunk, depth=True)(chosen)
+    for place, row in enumerate(chosen):
+        expected = naive(store, row, history, chunk)
+        for camera in toy.ARM_SPEC.cameras:
+            np.testing.assert_array_equal(batch["rgb"][camera][place], expected[f"rgb_{camera}"])
+            np.testing.assert_array_equal(batch["depth"][camera][place], expected[f"depth_{camera}"])
+        for name in ("state", "truth", "present", "valid"):
+            np.testing.assert_array_equal(batch[name][place], expected[name])
+        usable = expected["valid"]
+        np.testing.assert_array_equal(batch["action"][place].numpy()[usable], expected["labels"][usable])
+        beyond = ~usable & expected["present"][:, None]
+        np.testing.assert_array_equal(batch["action"][place].numpy()[beyond], expected["labels"][beyond])
+        assert batch["instruction"][place] == expected["text"]
+
+
+def test_chosen_episodes_give_the_windows_that_they_gave(folder: Path, tmp_path: Path) -> None:
+    whole = EpisodeStore(folder)
+    derive_store([whole], tmp_path / "chosen", {"colour": "red", "seed": [4, None]})
+    module, entry = windows(tmp_path / "chosen"), EpisodeStore(tmp_path / "chosen").episodes[0]
+    same = next(other for other in whole.episodes if other.seed == entry.seed)
+    one, other = module.make_batch(np.array([entry.start])), WindowBatcher(whole, 3, 2)(np.array([same.start]))
+    assert same.start > entry.start == 0
+    torch.testing.assert_close(one["action"], other["action"], rtol=0, atol=0)
+    torch.testing.assert_close(one["rgb"]["eye"], other["rgb"]["eye"], rtol=0, atol=0)
+
+
+def test_shapes_and_types_are_those_of_the_contract(folder: Path, arms: Path) -> None:
+    batch = next(iter(windows(arms, spec=toy.ARM_SPEC, depth=True).train_dataloader()))
+    assert {name: (tuple(image.shape), image.dtype) for name, image in batch["rgb"].items()} == {
+        "front": ((8, 3, 16, 16, 3), torch.uint8),
+        "wrist": ((8, 3, 16, 16, 3), torch.uint8),
+    }
+    assert batch["depth"]["wrist"].shape == (8, 3, 16, 16) and batch["depth"]["wrist"].dtype == torch.int32
+    assert {name: (tuple(batch[name].shape), batch[name].dtype) for name in ("state", "truth", "action")} == {
+        "state": ((8, 3, 15), torch.float32),
+        "truth": ((8, 3, 4), torch.float32),
+        "action": ((8, 3, 2, 3), torch.float32),
+    }
+    assert batch["present"].shape == (8, 3) and batch["present"].dtype == torch.bool
+    assert batch["valid"].shape == (8, 3, 2) and batch["valid"].dtype == torch.bool
+    assert len(batch["instruction"]) == 8
+    assert "depth" not in next(iter(windows(folder).train_dataloader()))
+    assert next(iter(windows(folder, depth=True).train_dataloader()))["depth"] == {}
+
+
+def test_nothing_is_labelled_before_the_start_or_beyond_the_end(folder: Path) -> None:
+    store = EpisodeStore(folder)
+    off = disturbed(store.rows("action")[:], store.rows("executed")[:], store.spec)
+    entry = next(
+        entry
+        for entry in store.episodes
+        for last in [entry.start + entry.steps - 1]
+        if not off[[entry.start, last - 2, last - 1, last]].any()
+    )
+    batch = WindowBatcher(store, history=3, chunk=2)(np.array([entry.start, entry.start + entry.steps - 1]))
+    assert batch["present"].tolist() == [[False, False, True], [True, True, True]]
+    assert batch["valid"][0].tolist() == [[False, False], [False, False], [True, True]]
+    assert batch["valid"][1].tolist() == [[True, True], [True, True], [True, False]]
+    assert not batch["rgb"]["eye"][0, :2].any() and not batch["state"][0, :2].any()
+    assert torch.equal(batch["action"][1, 2, 0], batch["action"][1, 2, 1])
+
+
+def test_every_window_comes_once_per_shuffle(folder: Path) -> None:
+    module = windows(folder)
+    count = len(module.training_windows)
+    drawn = np.concatenate([module.order(step) for step in range(2 * count // 8 + 1)])
+    for first in (0, count):
+        np.testing.assert_array_equal(np.sort(drawn[first : first + count]), module.training_windows)
+    assert not np.array_equal(drawn[:count], drawn[count : 2 * count])
+    assert not np.array_equal(windows(folder, seed=2).order(0), module.order(0))
+    larger = windows(folder, batch_size=2 * count + 5)
+    assert np.bincount(larger.order(0))[module.training_windows].min() == 2
+
+
+def test_ranks_share_the_windows_out(folder: Path) -> None:
+    module = windows(folder)
+    steps = len(module.training_windows) // (8 * 2)
+    drawn = [np.concatenate([module.order(step, rank, 2) for step in range(steps)]) for rank in (0, 1)]
+    assert not set(drawn[0]) & set(drawn[1])
+    assert len(set(drawn[0]) | set(drawn[1])) == steps * 8 * 2
+
+
+def test_the_split_is_by_episode_and_does_not_move_when_episodes_are_added(folder: Path) -> None:
+    few, many = windows(folder, episodes=20), windows(folder)
+    assert set(few.held_out_windows) < set(many.held_out_windows)
+    assert set(few.training_windows) < set(many.training_windows)
+    for entry in EpisodeStore(folder).episodes:
+        side = many.held_out_windows if held_out(entry.seed, 0.2) else many.training_windows
+        assert np.isin(np.arange(entry.start, entry.start + entry.steps), side).all()
+
+
+@pytest.mark.parametrize("fraction", [0.05, 0.1, 0.5])
+def test_every_stretch_of_seeds_holds_out_its_share(fraction: float) -> None:
+    held = np.array([held_out(seed, fraction) for seed in range(10_000)])
+    assert abs(held.mean() - fraction) < 0.001
+    length = round(2 / fraction)
+    assert all(held[first : first + length].any() for first in range(0, 10_000 - length))
+
+
+def test_validation_is_the_same_pass_in_whole_batches(folder: Path) -> None:
+    module = windows(folder)
+    loader = module.val_dataloader()
+    assert len(loader) == 5  # 40 windows
+    first, second = list(loader), list(loader)
+    assert len(first) == len(second) == 5
+    assert all(torch.equal(one["rgb"]["eye"], two["rgb"]["eye"]) for one, two in zip(first, second, strict=True))
+    assert all(len(batch["action"]) == 8 for batch in first)
+    assert windows(folder, validation_fraction=0.0).val_dataloader() == []
+
+
+def test_the_stream_is_made_ahead_but_not_without_bound(folder: Path) -> None:
+    module, made = windows(folder, ahead=2), []
+    gather = module.make_batch
+    module.make_batch = lambda rows: (made.append(len(rows)), gather(rows))[1]  # type: ignore[assignment,func-returns-value]
+    stream = iter(module.train_dataloader())
+    for _ in islice(stream, 4):
+        pass
+    stream.close()  # type: ignore[attr-defined]
+    assert len(made) <= 4 + 2
+
+
+def test_what_is_kept_of_a_batch_does_not_change(folder: Path) -> None:
+    module = windows(folder)
+    stream = iter(module.train_dataloader())
+    kept = [next(stream)["rgb"]["eye"][1:, 0].numpy()[:3] for _ in range(5)]
+    for _ in islice(stream, 10):
+        pass
+    for step, images in enumerate(kept):
+        expected = WindowBatcher(EpisodeStore(folder), 3, 2)(module.order(step))["rgb"]["eye"][1:4, 0]
+        np.testing.assert_array_equal(images, expected)
+
+
+def test_an_error_in_the_thread_is_raised_where_the_batch_is_waited_for() -> None:
+    def fail(rows: Array) -> dict[str, Any]:
+        raise ValueError(f"row {rows[0]} is gone")
+
+    with pytest.raises(ValueError, match="row 7 is gone"):
+        next(iter(Prefetcher(fail, lambda: [np.array([7])], 2)))
+
+
+@pytest.mark.parametrize("accumulate", [1, 2])
+def test_a_resumed_training_sees_what_an_uninterrupted_one_sees(folder: Path, tmp_path: Path, accumulate: int) -> None:
+    whole = fit(folder, 9, accumulate, save=tmp_path)
+    for step in (3, 4):
+        resumed = fit(folder, 9, accumulate, checkpoint=next(tmp_path.glob(f"at_step={step}.ckpt")))
+        assert len(resumed.seen) == (9 - step) * accumulate
+        tail = whole.seen[step * accumulate :]
+        assert all(torch.equal(one, two) for one, two in zip(resumed.seen, tail, strict=True))
+        assert torch.equal(resumed.weight, whole.weight)
+
+
+def test_training_leaves_the_store_as_it_is(folder: Path, tmp_path: Path) -> None:
+    """Also where nothing could be written; who runs this may be root, whom no permission keeps from it."""
+    store = tmp_path / "store"
+    shutil.copytree(folder, store)
+    for path in (*store.iterdir(), store):
+        path.chmod(0o555 if path.is_dir() else 0o444)
+    before = {path.name: path.stat() for path in store.iterdir()} | {".": store.stat()}
+    # What job=train does: it looks whether there are episodes enough, and trains on them.
+    complete = EpisodeStore.create_or_open(store, toy.SPEC, {})
+    assert collect(complete, toy.make_environment, toy.make_expert, EPISODES, LocalCluster(1), seed=0).added == 0
+    seen = fit(store, 5).seen
+    assert all(torch.equal(one, two) for one, two in zip(seen, fit(folder, 5).seen, strict=True))
+    after = {path.name: path.stat() for path in store.iterdir()} | {".": store.stat()}
+    assert before.keys() == after.keys()
+    assert all(after[name].st_mtime_ns == stat.st_mtime_ns for name, stat in before.items())
+    opened = EpisodeStore(store)
+    assert all(isinstance(rows, np.ndarray) and not rows.flags.writeable for rows in map(opened.rows, opened.fields))
+    store.chmod(0o755)  # so that it can be tidied away
+
+
+def test_what_cannot_be_trained_on_is_refused(folder: Path) -> None:
+    with pytest.raises(ValueError, match=r"the model has control_hz = 5\.0, but the episode store .* has 10\.0"):
+        windows(folder, spec=replace(toy.SPEC, control_hz=5.0))
+    with pytest.raises(ValueError, match=r"1 episodes leave 0 for training and 1 for .*: raise collect\.episodes"):
+        windows(folder, episodes=1)

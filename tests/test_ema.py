@@ -1,0 +1,60 @@
+"""The average of the weights: what it is, where it is used, and that it goes on."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import torch
+from fake_batch import make_batch
+from lightning import Callback
+from small_training import loader, make_learner, make_trainer
+
+from vla.policy import read_checkpoint
+from vla.training.ema import EMA, EVERY
+
+DECAY = 0.9
+
+
+class Watch(Callback):
+    """What one weight is after every step, and in every validation."""
+
+    def __init__(self) -> None:
+        self.trained: list[torch.Tensor] = []
+        self.validated: list[torch.Tensor] = []
+
+    def on_train_batch_end(self, trainer: Any, pl_module: Any, *_: Any) -> None:
+        self.trained.append(pl_module.model.head.weight.detach().clone())
+
+    def on_validation_batch_end(self, trainer: Any, pl_module: Any, *_: Any) -> None:
+        self.validated.append(pl_module.model.head.weight.detach().clone())
+
+
+def test_it_is_the_exponential_average_of_the_steps_and_what_is_validated_and_saved(tmp_path: Path) -> None:
+    batch, watch, steps = make_batch(1), Watch(), 2 * EVERY + 1
+    trainer = make_trainer(steps, EMA(DECAY), watch)
+    trainer.fit(make_learner(lr=1e-2, warmup_steps=0), loader(batch, steps), loader(batch, 1))
+    trainer.save_checkpoint(tmp_path / "last.ckpt")
+    average, share = watch.trained[0], DECAY**EVERY
+    for weight in watch.trained[EVERY - 1 :: EVERY]:
+        average = share * average + (1 - share) * weight
+    torch.testing.assert_close(watch.validated[-1], average)
+    torch.testing.assert_close(read_checkpoint(tmp_path / "last.ckpt").state["head.weight"], average)
+    saved = torch.load(tmp_path / "last.ckpt", weights_only=True)
+    torch.testing.assert_close(saved["current_model_state"]["model.head.weight"], watch.trained[-1])
+
+
+def test_going_on_from_a_checkpoint_gives_what_one_run_gives(tmp_path: Path) -> None:
+    batch, ends = make_batch(1), []
+    for name, stops in (("whole", [4]), ("halves", [2, 4])):
+        torch.manual_seed(0)
+        path = None
+        for stop in stops:
+            trainer = make_trainer(stop, EMA(DECAY))
+            learner = make_learner(schedule="constant", warmup_steps=2)
+            trainer.fit(learner, loader(batch, 4), ckpt_path=path, weights_only=True)
+            path = tmp_path / f"{name}{stop}.ckpt"
+            trainer.save_checkpoint(path)
+        ends.append(torch.load(tmp_path / f"{name}4.ckpt", weights_only=True))
+    for state in ("state_dict", "current_model_state"):
+        torch.testing.assert_close(ends[0][state], ends[1][state])

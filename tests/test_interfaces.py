@@ -1,0 +1,143 @@
+"""Tasks through gymnasium and dm_env: their own conformity checks, and the same episodes as everywhere else."""
+
+from __future__ import annotations
+
+import re
+import warnings
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, ClassVar
+
+import gymnasium
+import numpy as np
+import pytest
+from absl.testing import absltest
+from dm_env import test_utils
+from gymnasium.utils.env_checker import check_env
+from hydra import compose, initialize_config_dir
+from hydra.core.global_hydra import GlobalHydra
+from toy import ToyEnvironment
+
+from vla.config.compose import CONF, compose_task
+from vla.envs.dm_env import DmEnvironment, load
+from vla.envs.gym import GymEnvironment
+from vla.spec import FIRST_SEED, Observation
+
+WORLDS = Path(__file__).parents[1] / "docs/worlds.md"
+TASK = "vla.envs:vla/Tabletop-v0"
+
+
+@pytest.fixture(scope="module")
+def lift() -> Iterator[Any]:
+    """A small task, made by gymnasium."""
+    environment = gymnasium.make(
+        TASK, goal="lift", randomize="wide", image_size=(32, 48), time_limit=1.0, render_mode="rgb_array"
+    )
+    yield environment
+    environment.close()
+
+
+def test_gymnasium_finds_no_fault(lift: Any) -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        check_env(lift.unwrapped)
+
+
+def test_a_seed_names_the_same_episode_everywhere(lift: Any) -> None:
+    world, actions = lift.unwrapped.environment, np.random.default_rng(0).uniform(-0.02, 0.02, (2, 7))
+    for seed in (3, FIRST_SEED + 3):
+        seen = [lift.reset(seed=seed), *(lift.step(action) for action in actions)]
+        own: list[Observation] = [world.reset(seed), *(world.step(action) for action in actions)]
+        assert seen[0][1]["draws"] == world.draws
+        for (arrays, *_), observation in zip(seen, own, strict=True):
+            assert arrays["instruction"] == observation.instruction
+            np.testing.assert_array_equal(arrays["front"], observation.rgb["front"])
+            np.testing.assert_array_equal(arrays["wrist"], observation.rgb["wrist"])
+            np.testing.assert_array_equal(arrays["state"], observation.state)
+
+
+def test_without_a_seed_every_episode_is_new_and_none_is_of_evaluation(lift: Any) -> None:
+    drawn = [lift.reset(seed=seed)[1]["draws"]["placement"]["blocks"] for seed in (5, None, None)]
+    assert drawn[0] != drawn[1] != drawn[2]
+    assert lift.reset(seed=5)[1]["draws"]["placement"]["blocks"] == drawn[0]
+    assert lift.reset()[1]["draws"]["placement"]["blocks"] == drawn[1]
+
+    class Seeds(ToyEnvironment):
+        def reset(self, seed: int) -> Observation:
+            assert seed < FIRST_SEED
+            return super().reset(seed)
+
+    for _ in range(20):
+        GymEnvironment(Seeds()).reset()
+        DmEnvironment(Seeds()).reset()
+
+
+@pytest.mark.parametrize(("seed", "success"), [(0, True), (3, False)])
+def test_success_terminates_and_the_time_limit_truncates(seed: int, success: bool) -> None:
+    wrapped, world = GymEnvironment(ToyEnvironment(), "rgb_array"), ToyEnvironment()
+    timed = DmEnvironment(ToyEnvironment())
+    seen, _ = wrapped.reset(seed=seed)
+    observation, step = world.reset(seed), timed.reset(seed)
+    rewards: list[float] = []
+    terminated = truncated = False
+    info: dict[str, Any] = {}
+    action = np.zeros(3)
+    while not (terminated or truncated):
+        assert observation.truth is not None
+        action = np.append(np.clip(observation.truth["target"] - observation.truth["point"], -0.05, 0.05), 1.0)
+        observation, step = world.step(action), timed.step(action)
+        seen, reward, terminated, truncated, info = wrapped.step(action)
+        rewards.append(reward)
+        assert step.last() == (terminated or truncated) and step.reward == reward
+    assert (terminated, truncated) == (success, not success)
+    assert rewards == [0.0] * (len(rewards) - 1) + [float(success)]
+    assert step.discount == float(not success)
+    assert info["outcome"] == world.outcome
+    np.testing.assert_array_equal(wrapped.render(), seen["eye"])
+    assert timed.step(action).first()
+
+
+def test_a_task_is_composed_as_on_the_command_line_and_hydra_is_left_as_it_was() -> None:
+    overrides = {"goal": "lift", "randomize": "wide", "randomize/light": "hard", "goal.height": 0.1}
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        before = GlobalHydra.instance().hydra
+        node = compose_task("tabletop", image_size=(64, 48), **overrides)
+        assert GlobalHydra.instance().hydra is before
+        said = ["task/goal=lift", "task/randomize=wide", "task/randomize/light=hard"]
+        assert node == compose("config", [*said, "task.goal.height=0.1", "task.image_size=[64,48]"]).task
+    assert not GlobalHydra.instance().is_initialized()
+    with pytest.raises(Exception, match="pick_place"):
+        compose_task("tabletop", goal="lft")
+    assert not GlobalHydra.instance().is_initialized()
+
+
+class TestDmEnv(test_utils.EnvironmentTestMixin, absltest.TestCase):
+    """The conformity tests of dm_env, with episodes that end after three steps."""
+
+    tabletop: ClassVar[DmEnvironment]
+
+    @classmethod
+    def setUpClass(cls) -> None:
+        cls.tabletop = load("tabletop", goal="lift", image_size=(16, 16), time_limit=0.3)
+
+    @classmethod
+    def tearDownClass(cls) -> None:
+        cls.tabletop.close()
+
+    def tearDown(self) -> None:
+        """Nothing is closed: the tests share one simulator."""
+
+    def make_object_under_test(self) -> DmEnvironment:
+        return DmEnvironment(self.tabletop.environment, random_state=0)
+
+    def test_every_reset_starts_another_episode(self) -> None:
+        """Environments with equal random states go through the same ones."""
+        one, other = self.make_object_under_test(), self.make_object_under_test()
+        states = [one.reset().observation["state"].tobytes() for _ in range(3)]
+        assert len(set(states)) == 3
+        assert [other.reset().observation["state"].tobytes() for _ in range(3)] == states
+
+
+@pytest.mark.parametrize("code", re.findall(r"```python\n(.*?)```", WORLDS.read_text(encoding="utf-8"), re.DOTALL))
+def test_the_page_runs(code: str) -> None:
+    exec(code, {})

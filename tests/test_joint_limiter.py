@@ -1,0 +1,105 @@
+"""Commands keep to the limits, for any goal."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from vla.deploy.joint_limiter import JointLimiter, Robot
+
+PERIOD = 0.02
+ROBOT = Robot(
+    joints=["a", "b"],
+    low=[-1.0, -2.0],
+    high=[1.0, 2.0],
+    speed=[2.0, 1.0],
+    acceleration=[10.0, 5.0],
+    fingers=[],
+    finger_travel=0.04,
+    margin=0.05,
+    overshoot=0.01,
+    speed_share=0.5,
+    acceleration_share=0.5,
+)
+
+
+@pytest.fixture
+def limiter() -> JointLimiter:
+    limiter = JointLimiter(ROBOT, PERIOD)
+    limiter.start(np.zeros(2))
+    return limiter
+
+
+def assert_within_limits(commands: list[np.ndarray]) -> None:
+    """Position, speed and acceleration of a series of commands that begins at rest."""
+    positions = np.array(commands)
+    velocities = np.diff(positions, axis=0, prepend=positions[:1]) / PERIOD
+    accelerations = np.diff(velocities, axis=0, prepend=np.zeros((1, 2))) / PERIOD
+    assert (positions >= ROBOT.min_position - 1e-9).all() and (positions <= ROBOT.max_position + 1e-9).all()
+    assert (np.abs(velocities) <= ROBOT.max_speed + 1e-9).all()
+    assert (np.abs(accelerations) <= ROBOT.max_acceleration + 1e-6).all()
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_limits_hold_for_random_goals(limiter: JointLimiter, seed: int) -> None:
+    random = np.random.default_rng(seed)
+    commands = [limiter.position]
+    for _ in range(400):
+        goal, remaining = random.uniform(-5, 5, 2), random.uniform(-0.1, 0.3)
+        commands.append(limiter.brake() if random.uniform() < 0.1 else limiter.step(goal, remaining))
+    assert_within_limits(commands)
+
+
+def test_limits_hold_against_the_end_of_the_range(limiter: JointLimiter) -> None:
+    commands = [limiter.position] + [limiter.step(np.array([9.0, -9.0])) for _ in range(300)]
+    assert_within_limits(commands)
+    np.testing.assert_allclose(commands[-1], [ROBOT.max_position[0], ROBOT.min_position[1]], atol=1e-3)
+
+
+def test_a_goal_is_reached_when_it_is_due_and_not_overshot(limiter: JointLimiter) -> None:
+    goal, due = np.array([0.02, -0.02]), 0.3
+    commands = [limiter.step(goal, due - tick * PERIOD) for tick in range(60)]
+    assert np.abs(commands[14] - goal).max() < 0.005
+    np.testing.assert_allclose(commands[-1], goal, atol=1e-6)
+    assert commands[-1][0] <= max(command[0] for command in commands) <= goal[0] + 1e-9
+
+
+def test_braking_ends_at_rest_within_what_the_acceleration_allows(limiter: JointLimiter) -> None:
+    for _ in range(50):
+        limiter.step(np.array([0.9, 1.9]))
+    ticks = int(np.ceil((np.abs(limiter.velocity) / ROBOT.max_acceleration).max() / PERIOD))
+    assert ticks > 3
+    for _ in range(ticks):
+        limiter.brake()
+    assert limiter.resting
+
+
+def test_a_speed_limit_that_is_lowered_on_the_way_is_reached_by_braking(limiter: JointLimiter) -> None:
+    for _ in range(50):
+        limiter.step(np.array([0.9, 1.9]))
+    fast = limiter.velocity
+    limiter.robot = replace(ROBOT, speed_share=0.1)
+    steps = [fast, *(limiter.velocity for _ in range(30) if limiter.step(np.array([0.9, 1.9])) is not None)]
+    assert (np.abs(np.diff(steps, axis=0)) <= ROBOT.max_acceleration * PERIOD + 1e-9).all()
+    assert (np.abs(fast) > limiter.robot.max_speed).any() and (
+        np.abs(steps[-1]) <= limiter.robot.max_speed + 1e-9
+    ).all()
+
+
+def test_the_first_command_is_the_measured_pose() -> None:
+    limiter = JointLimiter(ROBOT, PERIOD)
+    limiter.start(np.array([0.3, -0.4]))
+    np.testing.assert_array_equal(limiter.brake(), [0.3, -0.4])
+
+
+def test_an_arm_outside_its_limits_is_not_taken_over() -> None:
+    with pytest.raises(ValueError, match=r"b is at 1\.990 rad, outside -1\.950 to 1\.950"):
+        JointLimiter(ROBOT, PERIOD).start(np.array([0.0, 1.99]))
+
+
+@pytest.mark.parametrize("wrong", [{"low": [0.0]}, {"speed_share": 0.0}, {"acceleration_share": 1.5}])
+def test_a_robot_that_cannot_be_is_refused(wrong: dict) -> None:
+    with pytest.raises(ValueError, match=r"deploy\.robot"):
+        replace(ROBOT, **wrong)

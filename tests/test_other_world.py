@@ -1,0 +1,172 @@
+"""Everything works in a world without a robot, depth, a scene to draw, or any axis of the tabletop."""
+
+from __future__ import annotations
+
+import json
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import toy
+from conftest import CONF
+from exporting import exporter
+from fake_batch import as_policy
+from hydra import compose, initialize_config_dir
+from lightning import Trainer
+from omegaconf import DictConfig
+from rerun.chunk import RrdReader
+
+from vla.config.check import with_changes
+from vla.config.experiment import Experiment
+from vla.data.episodes import EpisodeStore
+from vla.data.formats.lerobot_import import LeRobotDemonstrations
+from vla.data.verification import require_whole, verify_store
+from vla.policy import Policy
+from vla.reports.dataset_card import store_table, write_card
+from vla.reports.evaluation import contact_sheet, plot_report, write_report
+from vla.reports.html import write_page
+from vla.reports.sweep import tabulate
+from vla.rollouts.evaluate import FIRST_SEED, evaluate, keep_recordings
+from vla.rollouts.recorder import RerunRecorder
+from vla.runs.folder import save_config
+
+TINY = {
+    "bc": ("model.width=16", "model.text_width=8", "model.keypoints=4"),
+    "rt1_tiny": (
+        "model.width=16",
+        "model.heads=2",
+        "model.layers=1",
+        "model.text_width=8",
+        "model.proprioception=true",
+    ),
+    "decoder": ("model.width=16", "model.heads=2", "model.layers=1", "model.text_width=8"),
+    "act": ("model.width=16", "model.heads=2", "model.text_width=8"),
+    "diffusion": ("model.width=16", "model.heads=2", "model.text_width=8"),
+    "flow": ("model.width=16", "model.heads=2", "model.text_width=8"),
+}
+
+
+OWN = {"expert": "clean", "evaluate": "generalisation"}
+
+
+def composed(model: str) -> DictConfig:
+    small = ("collect.episodes=30", "data.batch_size=4", "data.validation_fraction=0", "learner.warmup_steps=0")
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        return compose("config", overrides=["output=out", f"model={model}", *small, *TINY[model]])
+
+
+def policy_of(model: str, store: Path, environment: Any = None) -> Policy:
+    """A policy after two steps of training."""
+    experiment, opened = Experiment.of(composed(model)), EpisodeStore(store)
+    learner = experiment.fitted_learner(opened)
+    data = experiment.data(opened, learner.model.history, learner.model.chunk)
+    quiet = {"logger": False, "enable_progress_bar": False, "enable_model_summary": False}
+    trainer = Trainer(accelerator="cpu", max_steps=2, enable_checkpointing=False, **quiet)  # type: ignore[arg-type]
+    trainer.fit(learner, datamodule=data)
+    return as_policy(learner.model, opened.spec)
+
+
+@pytest.mark.parametrize("model", TINY)
+def test_every_model_learns_and_acts(folder: Path, model: str) -> None:
+    policy = policy_of(model, folder)
+    action = policy.act(toy.make_environment().reset(FIRST_SEED))
+    assert action.shape == (3,)
+    assert (np.array(toy.SPEC.low, np.float32) <= action).all() and (
+        action <= np.array(toy.SPEC.high, np.float32)
+    ).all()
+
+
+def test_a_policy_is_evaluated_recorded_and_reported(folder: Path, tmp_path: Path) -> None:
+    cell = tmp_path / "0"
+    (cell / ".hydra").mkdir(parents=True)
+    (cell / ".hydra/overrides.yaml").write_text("- model=bc\n")
+    seeds, recorder = range(FIRST_SEED, FIRST_SEED + 3), partial(RerunRecorder, cell / "recordings")
+    report = evaluate(toy.make_environment, partial(policy_of, "bc", folder), recorder, seeds)
+    assert report.episodes == 3 and {*report.tasks} == {
+        toy.make_environment().reset(seed).instruction.split()[3] for seed in seeds
+    }
+    assert keep_recordings(report, cell / "recordings", cell / "rollouts.rrd", None) == 3
+    entities = {chunk.entity_path for chunk in RrdReader(cell / "rollouts.rrd").stream()}
+    assert {"/camera/eye/rgb", "/state/m", "/action/1/executed"} <= entities
+    assert not any(entity.startswith("/world") or "depth" in entity for entity in entities)
+    plot_report(report, cell / "report.png")
+    save_config(cell, {"task": {"_target_": "somewhere.World"}}, [])
+    write_report(report, cell / "report.json", None, {}, {"parameters": 1, "latency_ms": 1.0}, {"dim": report})
+    page = write_page(cell).read_text()
+    assert "dim" in page and json.loads((cell / "report.json").read_text())["tasks"].keys() == report.tasks.keys()
+    tabulate(tmp_path)
+    assert (tmp_path / "sweep.html").is_file()
+
+
+@pytest.mark.parametrize("kind", ["files", "lerobot", "packed"])
+def test_episodes_are_exported(folder: Path, tmp_path: Path, kind: str) -> None:
+    store = EpisodeStore(folder, episodes=3)
+    exporter(kind, tmp_path / "export").export(store)
+    if kind == "files":
+        state = json.loads((tmp_path / "export/episode_00000/step_0000/robot_state.json").read_text())
+        assert np.array([state["east"], state["north"]], np.float32).tolist() == store.rows("state")[:1][0].tolist()
+        assert not list((tmp_path / "export").rglob("depth*"))
+    elif kind == "packed":
+        assert EpisodeStore(tmp_path / "export").packed == {"rgb_eye": "zlib"}
+    else:
+        expert = LeRobotDemonstrations(tmp_path / "export", spec=toy.SPEC)
+        episode = expert.episode(0)
+        assert episode.draws["recorded"]["lacks"] == []
+        state = np.stack([seen.state for seen in episode.observations])
+        np.testing.assert_array_equal(state, store.rows("state")[: len(state)])
+
+
+def test_what_needs_a_robot_is_refused_in_one_sentence(folder: Path, tmp_path: Path) -> None:
+    from arm import SAFETY
+
+    from vla.deploy.control_loop import ControlLoop
+
+    with pytest.raises(ValueError, match=r"export=mcap needs a robot, and the spec has none"):
+        exporter("mcap", tmp_path / "bags").export(EpisodeStore(folder))
+    with pytest.raises(ValueError, match=r"deployment needs a robot, and the spec has none"):
+        ControlLoop(toy.SPEC, None, SAFETY, 50.0)  # type: ignore[arg-type]
+
+
+def test_a_store_is_verified_and_described(folder: Path) -> None:
+    findings = verify_store(EpisodeStore(folder))
+    require_whole(findings)
+    assert store_table(findings).row_count > 10
+    card = write_card(findings).read_text()
+    assert "east | m" in card and "frame" not in card.split("## One step")[1].split("## What")[0]
+
+
+def test_resets_are_shown() -> None:
+    environment = toy.make_environment()
+    sheet = np.array(contact_sheet([0, 1], [environment.reset(seed) for seed in (0, 1)]), int)
+    assert (np.ptp(sheet, axis=-1) > 60).sum() > 1000  # pixels in colour, of which text has none
+
+
+def test_changes_are_merged_and_a_class_replaces_a_class() -> None:
+    node: dict[str, Any] = {
+        "size": 1,
+        "wind": {"force": [0, 1], "gusts": True},
+        "goal": {"_target_": "a.Goal", "radius": 2},
+    }
+    changes = {"wind": {"gusts": None}, "goal": {"_target_": "b.Goal"}, "rain": {"rate": 1}}
+    assert with_changes(node, changes) == {
+        "size": 1,
+        "wind": {"force": [0, 1], "gusts": None},
+        "goal": {"_target_": "b.Goal"},
+        "rain": {"rate": 1},
+    }
+    assert node["wind"]["gusts"] is True
+    assert with_changes(node, {"goal": {"radius": 3}})["goal"] == {"_target_": "a.Goal", "radius": 3}
+
+
+def test_a_world_chooses_its_expert_and_evaluations_and_the_command_line_has_the_last_word(tmp_path: Path) -> None:
+    (tmp_path / "task").mkdir()
+    chosen = "".join(f"  - override /{group}@_global_.{group}: {name}\n" for group, name in OWN.items())
+    (tmp_path / "task/other.yaml").write_text(f"defaults:\n  - _self_\n{chosen}\n_target_: somewhere.World\n")
+    there = [f"hydra.searchpath=[file://{tmp_path}]", "output=out", "task=other"]
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        own, said = (compose("config", overrides=[*there, *more]) for more in ([], ["expert=waypoint"]))
+    assert own.task == {"_target_": "somewhere.World"} and own.validate.changes == {}
+    assert "perturb" not in own.expert and [*own.evaluate.conditions] == ["wide"]
+    assert "perturb" in said.expert and [*said.evaluate.conditions] == ["wide"]

@@ -1,0 +1,247 @@
+"""A package of somebody else: installed, it adds options, and goes through every job from a folder of its own."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+import toy
+from clusters import PLACES, address_in, dask
+from collecting import content
+from command_line import vla
+from composing import composed
+
+from vla.config import packages
+from vla.config.adopt import adopt, finetune, resume
+from vla.config.annotations import locate
+from vla.config.build import build
+from vla.config.compose import compose_task
+from vla.config.experiment import plain
+
+EXAMPLE = Path(__file__).parent / "example_package"
+PAGE = (Path(__file__).parents[1] / "docs/packages.md").read_text(encoding="utf-8")
+COMMANDS = re.findall(r"^python -m vla\.run (.*)$", PAGE, re.MULTILINE)
+MODEL = "mypackage.models.Mine"
+TINY = (
+    *("validate.episodes=2", "collect.episodes=12", "cluster.workers=2", "evaluate.episodes=3", "trainer=cpu"),
+    *("trainer.max_steps=4", "trainer.val_check_interval=2", "data.batch_size=8", "data.validation_windows=8"),
+)
+
+
+@pytest.fixture(scope="module")
+def installed(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """The folder into which the package is installed; programs that are started find it there."""
+    source, target = (tmp_path_factory.mktemp("package") / name for name in ("mypackage", "target"))
+    shutil.copytree(EXAMPLE, source)  # building leaves files beside the source
+    options = ("-q", "--no-index", "--no-deps", "--no-build-isolation", "--disable-pip-version-check")
+    subprocess.run([sys.executable, "-m", "pip", "install", *options, "--target", target, source], check=True)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("PYTHONPATH", os.pathsep.join([str(target), PLACES]))
+        yield target
+
+
+@pytest.fixture(scope="module")
+def home(installed: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """An empty folder to work in, with the outcome of the main job in `run`, done by two workers in each stage."""
+    folder = tmp_path_factory.mktemp("home")
+    vla(folder, "experiment=mine", *TINY, "collect.folder=episodes", "output=run")
+    return folder
+
+
+@pytest.fixture
+def importable(installed: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Within, this process finds the package as well, and trusts nothing."""
+    monkeypatch.syspath_prepend(installed)
+    monkeypatch.setenv(packages.TRUSTED, "")
+    caches = (packages.option_folders, packages.can_be_trusted)
+    for cached in caches:
+        cached.cache_clear()
+    yield
+    for cached in caches:
+        cached.cache_clear()
+    for name in [name for name in sys.modules if name.partition(".")[0] == "mypackage"]:
+        del sys.modules[name]
+
+
+def test_the_page_shows_what_the_package_holds() -> None:
+    sources = "\n".join(path.read_text(encoding="utf-8") for path in EXAMPLE.rglob("*") if path.is_file())
+    blocks = re.findall(r"^```(?:toml|yaml|python)\n(.*?)^```", PAGE, re.MULTILINE | re.DOTALL)
+    assert len(blocks) == 5
+    for block in blocks:
+        assert block in sources
+
+
+def test_installing_it_adds_its_options(home: Path) -> None:
+    assert COMMANDS[0] == "--help"
+    listed = vla(home, COMMANDS[0]).stdout
+    for group in ("task", "expert", "model", "tokenizer", "recorder", "deploy", "experiment"):
+        assert re.search(rf"^\W*{group}: .*\bmine\b", listed, re.MULTILINE), group
+    assert f"_target_: {MODEL}" in vla(home, "model=mine", "--cfg", "job").stdout
+
+
+def test_its_parts_do_the_main_job(home: Path) -> None:
+    assert COMMANDS[1] == "experiment=mine"
+    report = json.loads((home / "run/report.json").read_text())
+    assert (report["episodes"], report["errors"], report["model"]) == (3, 0, "mine")
+    assert report["config"]["model"]["_target_"] == MODEL and report["config"]["trust"] == []
+    recordings = [(home / f"run/recordings/{seed}.jsonl").read_text().splitlines() for seed in report["seeds"]]
+    assert [json.loads(lines[-1]) for lines in recordings] == [each["outcome"] for each in report["per_episode"]]
+
+
+def test_each_stage_is_a_job_of_its_own(home: Path) -> None:
+    """And gives what the main job gave."""
+    mine = ("experiment=mine", *TINY, "collect.folder=alone", "output=staged")
+    vla(home, "job=collect", *mine)
+    assert content(home / "alone") == content(home / "episodes")
+    vla(home, "job=train", *mine)
+    assert not (home / "staged/report.json").exists()
+    vla(home, "job=evaluate", *mine)
+    whole, staged = (json.loads((home / folder / "report.json").read_text()) for folder in ("run", "staged"))
+    assert staged["per_episode"] == whole["per_episode"]
+
+
+def test_its_demonstrations_are_described_replayed_and_exported(home: Path) -> None:
+    replay = ("job=inspect", "inspect.folder=episodes", "inspect.episode=0", "output=replay")
+    assert "12 intact" in vla(home, "job=inspect", "inspect.folder=episodes").stdout
+    assert "dx | m" in (home / "episodes/card.md").read_text()
+    assert "add trust=[mypackage]" in vla(home, *replay, ok=False).stderr
+    assert "bit for bit" in vla(home, *replay, "trust=[mypackage]").stdout
+    assert (home / "replay/episode-0.rrd").stat().st_size > 1000
+    vla(home, "job=export", "experiment=mine", *TINY, "collect.folder=episodes", "export.folder=files")
+    state = json.loads((home / "files/episode_00000/step_0000/robot_state.json").read_text())
+    assert {"x", "y"} <= {*state} and (home / "files/episode_00000/step_0000/rgb_image.png").is_file()
+
+
+def test_its_runs_are_compared_and_swept(home: Path) -> None:
+    small = (*TINY, "cluster.workers=1", "validate.episodes=0", "evaluate.episodes=2", "collect.folder=episodes")
+    vla(home, "-m", "hydra.sweep.dir=grid", "experiment=mine", *small, "learner.lr=0.1,0.2")
+    head, _, *lines = (home / "grid/sweep.md").read_text().splitlines()
+    reports = [json.loads((home / f"grid/{cell}/report.json").read_text()) for cell in (0, 1)]
+    assert {(report["model"], report["episodes"]) for report in reports} == {("mine", 2)}
+    assert head.startswith("| learner.lr | ") and [line.split(" | ")[0] for line in lines] == ["| 0.1", "| 0.2"]
+    assert all(f" | {100 * report['success']:.1f} (" in line for report, line in zip(reports, lines, strict=True))
+    vla(home, "job=report", "report.runs=[run,grid/1]", "output=compared")
+    page = (home / "compared/comparison.html").read_text()
+    assert all(f'href="../{run}/report.html"' in page for run in ("run", "grid/1"))
+
+
+def test_workers_of_a_cluster_collect_the_same_bytes(home: Path, installed: Path, tmp_path: Path) -> None:
+    command = next(command for command in COMMANDS if "cluster=dask" in command)
+    here = ("--host", "127.0.0.1", "--dashboard-address", "127.0.0.1:0")
+    file = tmp_path / "scheduler.json"
+    with dask("scheduler", *here, "--port", "0", "--scheduler-file", str(file)):
+        address = address_in(file)
+        with dask("worker", address, *here, "--nthreads", "1", "--no-nanny", PYTHONPATH=os.environ["PYTHONPATH"]):
+            arguments = shlex.split(command.replace("tcp://HOST:8786", address))
+            tiny = [item for item in TINY if not item.startswith("cluster.")]
+            vla(home, *arguments, *tiny, "collect.folder=remote")
+    assert content(home / "remote") == content(home / "episodes")
+
+
+def test_a_checkpoint_is_refused_until_the_package_is_trusted(home: Path) -> None:
+    report = json.loads((home / "run/report.json").read_text())
+    evaluating, deploying = (shlex.split(each.replace("FILE", report["checkpoint"])) for each in COMMANDS[3:])
+    *untrusting, trusting = evaluating
+    assert trusting == deploying[-1] == "trust=[mypackage]"
+    numbers = ("evaluate.episodes=3", "cluster.workers=1", "output=again")
+    refused = vla(home, *untrusting, *numbers, ok=False).stderr
+    assert refused.splitlines()[-1] == (
+        f"error: {report['checkpoint']} names mypackage.world.Square, which is not trusted: "
+        "add trust=[mypackage] if you trust its source"
+    )
+    assert "Traceback" not in refused and not (home / "again").exists()
+    vla(home, *evaluating, *numbers)
+    assert json.loads((home / "again/report.json").read_text())["per_episode"] == report["per_episode"]
+    vla(home, *deploying, "deploy.episodes=2", "output=deployed")
+    assert json.loads((home / "deployed/report.json").read_text())["episodes"] == 2
+
+
+def test_a_checkpoint_never_trusts_itself(importable: None, tmp_path: Path) -> None:
+    path = tmp_path / "runs/theirs/checkpoints/last.ckpt"
+    path.parent.mkdir(parents=True)
+    config = plain(composed()) | {"trust": ["mypackage"]}
+    config["task"] = config["data"] = {"_target_": "vla.spec.Environment"}  # which is cheap to import
+    config["model"] = {"_target_": MODEL, "width": 8, "text": config["model"]["text"]}
+    torch.save({"config": config, "spec": toy.SPEC.to_dict(), "state_dict": {}}, path)
+    mine = f"output={tmp_path}/runs/mine"  # beside it, as if it were an own run
+    evaluating, starting = composed(mine, f"checkpoint={path}"), composed(mine, f"pretrained={path}")
+    ways = (
+        lambda: adopt(evaluating, []),
+        lambda: finetune(starting, []),
+        lambda: resume(composed(mine), path.parents[1], []),
+    )
+    packages.trust([], [])
+    for way in ways:
+        with pytest.raises(
+            ValueError, match=r"last\.ckpt names mypackage\.models\.Mine, which is not trusted: add trust="
+        ):
+            way()
+    packages.trust(["mypackage"], [])
+    for way in ways:
+        assert plain(way())["trust"] == []
+
+
+def test_programs_find_its_options(importable: None) -> None:
+    assert compose_task("mine", steps=5) == {"_target_": "mypackage.world.Square", "size": 16, "steps": 5}
+
+
+def test_a_choice_trusts_one_class(importable: None) -> None:
+    packages.trust([], [MODEL, "other.models.Mine"])
+    assert packages.trusted() == [MODEL]
+    assert locate("model._target_", MODEL).__name__ == "Mine"
+    for target in ("mypackage.models.Few", "mypackage.world.Square", "other.models.Mine"):
+        with pytest.raises(ValueError, match=rf"^node names {re.escape(target)}, which is not trusted: add trust="):
+            locate("node", target)
+
+
+def test_a_package_is_trusted_by_its_whole_name(importable: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(packages.TRUST, "another, mypackage")
+    packages.trust([], [])
+    assert packages.trusted() == ["another", "mypackage"]
+    assert locate("node", MODEL).__name__ == "Mine"
+    with pytest.raises(ValueError, match=r"mypackage_evil\.Model, which is not trusted: add trust=\[mypackage_evil\]"):
+        locate("node", "mypackage_evil.Model")
+    with pytest.raises(ValueError, match=r"cannot be imported on \S+, where another must be installed: No module"):
+        locate("node", "another.models.Model")
+
+
+def test_what_a_trusted_package_imports_is_not_trusted(importable: None) -> None:
+    packages.trust(["mypackage"], [])
+    with pytest.raises(
+        ValueError, match=r"must name a class that is defined in mypackage, got 'mypackage\.recorder\.P"
+    ):
+        locate("node", "mypackage.recorder.Path")
+    with pytest.raises(
+        ValueError, match=r"recorder\._target_ must name a class of kind Recorder, got mypackage\.world"
+    ):
+        build({"_target_": "mypackage.world.Straight", "noise": 0.1}, "recorder", folder=Path())
+
+
+@pytest.mark.parametrize("name", ["os", "builtins", "subprocess", "torch", "lightning", "numpy", "__main__"])
+def test_libraries_cannot_be_trusted(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(packages.TRUSTED, name)  # as if somebody had got past the first check
+    with pytest.raises(ValueError, match=r"^trust cannot name .*it takes packages made for vla"):
+        packages.trust([name], [])
+    with pytest.raises(ValueError, match=r"^node must name a class of vla, of a package that trust=\[…\] names"):
+        locate("node", f"{name}.Thing")
+
+
+@pytest.mark.parametrize("wrong", ["mypackage", None, ["mypackage.models"], [""], [3]])
+def test_trust_is_a_list_of_packages(wrong: Any) -> None:
+    with pytest.raises(ValueError, match=r"^trust (must be a list of packages|cannot name)"):
+        packages.trust(wrong, [])
+
+
+def test_what_is_trusted_travels_with_the_job(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(packages.TRUSTED, "here")
+    assert packages.with_trust(["there"], packages.trusted) == ["here", "there"]

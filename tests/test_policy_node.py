@@ -1,0 +1,315 @@
+"""The policy as a ROS 2 node: real rclpy, real middleware on the loopback, simulated cameras and arm."""
+
+from __future__ import annotations
+
+import itertools
+import os
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+from arm import ROBOT, SPEC
+from builtin_interfaces.msg import Time
+from diagnostic_msgs.msg import DiagnosticStatus
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import GetState
+from rclpy.parameter import Parameter
+from sensor_msgs.msg import Image, JointState
+from std_msgs.msg import Float64MultiArray, String
+from std_srvs.srv import Trigger
+from world import KINDS, World, positions
+
+from vla.deploy import messages
+from vla.deploy.control_loop import State
+from vla.robots.panda import HOME
+
+pytestmark = pytest.mark.realtime
+
+FROZEN = Time(sec=5, nanosec=5)
+WORKER = int(os.environ.get("PYTEST_XDIST_WORKER", "gw0").removeprefix("gw"))
+domains = itertools.count(1 + 20 * (WORKER % 5))
+
+
+@pytest.fixture
+def make_world() -> Iterator[Callable[..., World]]:
+    """A world on a domain of its own."""
+    worlds: list[World] = []
+
+    def make(command: str = "joint_state", *arguments: str) -> World:
+        worlds.append(World(next(domains), command, list(arguments)))
+        return worlds[-1]
+
+    yield make
+    for world in worlds:
+        world.close()
+
+
+@pytest.fixture
+def world(make_world: Callable[..., World]) -> World:
+    """A world whose arm the agent moves."""
+    world = make_world()
+    world.start()
+    assert world.state is State.RUNNING, world.agent.loop and world.agent.loop.reason
+    return world
+
+
+def test_the_first_command_is_the_measured_pose_and_the_arm_then_moves(world: World) -> None:
+    first = world.commands[0]
+    assert first.name == [*ROBOT.joints, *ROBOT.fingers]
+    np.testing.assert_allclose(first.position[:7], HOME)
+    assert list(first.velocity) == list(first.effort) == []
+    world.live(0.5)
+    steps = np.diff([command.position[:7] for command in world.commands], axis=0)
+    assert np.abs(steps).sum() > 0.1
+    assert (np.abs(steps) <= ROBOT.max_speed * 0.02 + 1e-9).all()
+
+
+def test_observations_are_those_of_the_messages(world: World) -> None:
+    seen = world.policy.seen[-1]
+    assert seen.instruction == "put the red block on the pad" and set(seen.rgb) == {"front", "wrist"}
+    assert seen.state[14] == pytest.approx(0.08) and seen.truth is None
+    assert np.abs(seen.state[:7] - world.joints).max() < 0.2  # in the order of the spec, not of the message
+    world.live(1.0)
+    status = {pair.key: pair.value for pair in world.statuses[-1].values}
+    assert status["state"] == "running" and float(status["inference p99 [ms]"]) > 0
+
+
+def test_a_missing_camera_holds_the_arm_until_its_images_return(world: World) -> None:
+    world.cameras = ["front"]
+    assert world.becomes(State.HOLDING)
+    world.live(0.4)
+    assert world.commands[-1].position == world.commands[-5].position
+    assert "wrist" in world.statuses[-1].message and world.statuses[-1].level == DiagnosticStatus.WARN
+    world.cameras = ["front", "wrist"]
+    assert world.becomes(State.RUNNING)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda image: setattr(image, "data", image.data[:-1]), "bytes"),
+        (lambda image: setattr(image, "encoding", "mono8"), "encoding"),
+        (lambda image: setattr(image, "step", 7), "step"),
+        (lambda image: setattr(image.header, "stamp", FROZEN), "same time stamp"),
+    ],
+    ids=["truncated", "encoding", "step", "frozen clock"],
+)
+def test_invalid_images_hold_the_arm(world: World, change: Any, words: str, capfd: pytest.CaptureFixture[str]) -> None:
+    world.changed = change
+    world.live(0.8)
+    assert world.state is State.HOLDING
+    world.live(0.4)
+    assert int({pair.key: pair.value for pair in world.statuses[-1].values}["messages dropped"]) > 3
+    assert words in capfd.readouterr().err
+
+
+def test_simulated_time_stamps_the_images_and_holds_the_arm_when_it_is_frozen(
+    make_world: Callable[..., World],
+) -> None:
+    world = make_world("joint_state", "--ros-args", "-p", "use_sim_time:=true")
+    world.simulated = 50.0
+    world.start()
+    assert world.state is State.RUNNING, world.agent.loop and world.agent.loop.reason
+    assert world.agent.get_clock().now().nanoseconds * 1e-9 == pytest.approx(world.simulated, abs=5)
+    frozen = world.simulated
+    world.changed = lambda image: setattr(image.header, "stamp", Time(sec=int(frozen)))
+    world.live(0.8)
+    assert world.state is State.HOLDING
+
+
+def test_joint_states_that_stop_hold_the_arm(world: World) -> None:
+    world.measures = False
+    assert world.becomes(State.HOLDING)
+
+
+def test_a_slow_policy_skips_ticks_and_a_stuck_one_holds_the_arm(world: World) -> None:
+    world.policy.takes = 0.15
+    world.live(1.0)
+    assert world.state is State.RUNNING
+    assert world.agent.loop is not None and world.agent.loop.overruns > 2
+    world.policy.takes = 1.0
+    assert world.becomes(State.HOLDING)
+
+
+def test_of_a_chunk_as_much_is_executed_as_in_evaluation(world: World) -> None:
+    world.policy.chunk, world.policy.execute = 8, 3
+    world.live(0.5)
+    before = len(world.policy.seen)
+    world.live(1.5)
+    assert 4 <= len(world.policy.seen) - before <= 6
+
+
+def test_a_policy_that_fails_is_a_fault_that_only_deactivation_ends(world: World) -> None:
+    world.policy.fails = True
+    assert world.becomes(State.FAULT)
+    world.live(0.4)
+    assert world.commands[-1].position == world.commands[-5].position
+    world.policy.fails = False
+    assert not world.ask(Trigger, "resume", Trigger.Request()).success
+    assert world.change(Transition.TRANSITION_DEACTIVATE) and world.change(Transition.TRANSITION_ACTIVATE)
+    assert world.becomes(State.WAITING)
+
+
+def test_stop_and_resume(world: World) -> None:
+    assert world.ask(Trigger, "stop", Trigger.Request()).success
+    world.live(0.6)
+    assert world.state is State.STOPPED
+    assert world.commands[-1].position == world.commands[-5].position
+    assert world.ask(Trigger, "resume", Trigger.Request()).success
+    assert world.becomes(State.RUNNING)
+
+
+def test_an_instruction_that_is_ignored_after_a_stop_is_reported(
+    world: World, capfd: pytest.CaptureFixture[str]
+) -> None:
+    assert world.ask(Trigger, "stop", Trigger.Request()).success
+    world.words.publish(String(data="put the blue block on the pad"))
+    said = (
+        "instruction ignored while stopped: 'put the blue block on the pad'; stopped by request; to continue: python -m"
+    )
+    world.live(5.0, until=lambda: world.statuses[-1].message.startswith(said))
+    world.live(0.2)
+    assert world.statuses[-1].message.startswith(said)
+    assert world.state is State.STOPPED and capfd.readouterr().err.count(said) == 1
+    assert world.ask(Trigger, "resume", Trigger.Request()).success
+    assert world.becomes(State.RUNNING)
+    world.live(5.0, until=lambda: world.policy.seen[-1].instruction == "put the blue block on the pad")
+    assert world.policy.seen[-1].instruction == "put the blue block on the pad"
+
+
+def test_an_instruction_too_long_is_dropped_and_the_former_one_followed(
+    world: World, capfd: pytest.CaptureFixture[str]
+) -> None:
+    world.words.publish(String(data="push " * 10**5))
+    world.live(1.0)
+    assert world.becomes(State.RUNNING) and world.policy.seen[-1].instruction == "put the red block on the pad"
+    printed = capfd.readouterr().err
+    assert "an instruction of 500000 characters, the limit is 1000" in printed and len(printed) < 2000
+    world.words.publish(String(data=("push " * 200).strip()))
+    world.live(5.0, until=lambda: world.policy.seen[-1].instruction.startswith("push"))
+    status = {pair.key: pair.value for pair in world.statuses[-1].values}
+    assert len(world.policy.seen[-1].instruction) == 999 and len(status["instruction"]) <= 80
+
+
+def test_images_of_another_size_are_resized_and_that_is_logged_once(
+    world: World, capfd: pytest.CaptureFixture[str]
+) -> None:
+    pixels = np.zeros((30, 40, 3), np.uint8)
+    pixels[:, 5:35] = 200  # the centre
+
+    def enlarge(image: Image) -> None:
+        messages.fill_image(image, pixels, "camera")
+
+    world.changed = enlarge
+    world.live(0.8)
+    assert world.becomes(State.RUNNING)
+    assert {image.shape for image in world.policy.seen[-1].rgb.values()} == {(8, 8, 3)}
+    assert all((image == 200).all() for image in world.policy.seen[-1].rgb.values())
+    said = "images of 40 by 30 pixels are cropped at the centre to 30 by 30 and resized to 8 by 8"
+    assert capfd.readouterr().err.count(said) == 2  # cameras
+
+
+def test_another_node_that_commands_the_arm_is_a_fault(world: World) -> None:
+    other = world.node.create_publisher(JointState, "/commands", 1)
+    assert world.becomes(State.FAULT)
+    assert world.change(Transition.TRANSITION_DEACTIVATE)
+    assert not world.change(Transition.TRANSITION_ACTIVATE)
+    world.node.destroy_publisher(other)
+
+
+def test_two_cameras_on_one_topic_hold_the_arm(world: World) -> None:
+    world.node.create_publisher(Image, "/front", 1)
+    assert world.becomes(State.HOLDING)
+
+
+def test_wrong_requests_of_the_lifecycle_are_refused_and_survived(world: World) -> None:
+    assert not world.change(Transition.TRANSITION_CONFIGURE)
+    assert not world.change(99)
+    world.live(0.2)
+    assert world.state is State.RUNNING
+    assert world.change(Transition.TRANSITION_DEACTIVATE)
+    assert not world.change(Transition.TRANSITION_DEACTIVATE)
+    assert world.change(Transition.TRANSITION_CLEANUP)
+    assert world.ask(GetState, "get_state", GetState.Request()).current_state.label == "unconfigured"
+    world.start()
+    assert world.state is State.RUNNING
+
+
+def test_deactivation_brakes_first(world: World) -> None:
+    world.live(0.4)
+    count = len(world.commands)
+    assert world.change(Transition.TRANSITION_DEACTIVATE)
+    world.spin(lambda: len(world.commands) > count)
+    world.live(0.2)
+    steps = np.diff([command.position[:7] for command in world.commands], axis=0)
+    assert np.abs(steps[count // 2 : count]).max() > 0 and not steps[-1].any()
+    change = np.abs(np.diff(steps, axis=0)).max(0)
+    assert (change <= ROBOT.max_acceleration * 0.02**2 + 1e-9).all()
+
+
+@pytest.mark.parametrize("command", KINDS)
+def test_limits_hold_from_one_message_to_the_next(make_world: Callable[..., World], command: str) -> None:
+    """A controller replaces the rest of a trajectory by the next one, while the goals jump."""
+    world = make_world(command, "--ros-args", "-p", "speed_share:=0.25", "-p", "acceleration_share:=0.05")
+    generator = np.random.default_rng(0)
+    world.policy.action = lambda: generator.uniform(SPEC.low, SPEC.high, (1, 7)).astype(np.float32)
+    world.start()
+    world.live(1.5)
+    reached: list[np.ndarray] = []
+    fastest, hardest = 0.25 * np.array(ROBOT.speed), 0.05 * np.array(ROBOT.acceleration)
+    for ahead in map(positions, world.commands):
+        speeds = np.diff([*reached[-2:], *ahead], axis=0) / 0.02
+        assert (np.abs(speeds) <= fastest + 1e-9).all()
+        assert (np.abs(np.diff(speeds, axis=0)) / 0.02 <= hardest + 1e-6).all()
+        reached.append(ahead[0])
+    assert len(reached) > 50 and np.ptp(reached, axis=0).max() > 0.05
+
+
+def test_trajectories_end_at_rest(make_world: Callable[..., World]) -> None:
+    world = make_world("trajectory")
+    world.start()
+    world.live(0.3)
+    message = max(world.commands, key=lambda command: len(command.points))
+    assert list(message.joint_names) == ROBOT.joints and len(message.points) > 3
+    assert not any(message.points[-1].velocities)
+    times = [point.time_from_start.sec + 1e-9 * point.time_from_start.nanosec for point in message.points]
+    assert (np.diff(times) > 0).all()
+
+
+def test_plain_positions_for_a_forward_controller(make_world: Callable[..., World]) -> None:
+    world = make_world("forward")
+    fingers: list[Float64MultiArray] = []
+    world.node.create_subscription(Float64MultiArray, "/gripper", fingers.append, 10)
+    world.start()
+    assert len(world.commands[-1].data) == 7 and list(fingers[-1].data) == [0.04, 0.04]
+
+
+def test_ros_arguments_remap_and_set_parameters(make_world: Callable[..., World]) -> None:
+    arguments = ["--ros-args", "-r", "/front:=/isaac/front", "-p", "command_hz:=25.0", "-p", "speed_share:=0.5"]
+    world = make_world("joint_state", *arguments)
+    assert world.change(Transition.TRANSITION_CONFIGURE)
+    assert world.agent.loop is not None and world.agent.loop.tick == 0.04
+    assert world.agent.loop.robot.speed_share == 0.5
+    assert world.agent.resolve_topic_name("/front") == "/isaac/front"
+    assert any(name == "/isaac/front" for name, _ in world.agent.get_topic_names_and_types())
+
+
+def test_speed_is_lowered_at_any_time_and_raised_at_rest_only(world: World) -> None:
+    def set_share(value: float) -> Any:
+        return world.agent.set_parameters([Parameter("speed_share", value=value)])[0]
+
+    assert set_share(0.1).successful
+    assert world.agent.loop is not None and world.agent.loop.robot.speed_share == 0.1
+    assert "deactivate" in set_share(0.5).reason
+    assert not set_share(2.0).successful
+    result = world.agent.set_parameters([Parameter("command_hz", value=10.0)])[0]
+    assert not result.successful and "clean up" in result.reason
+    assert world.change(Transition.TRANSITION_DEACTIVATE)
+    assert set_share(0.5).successful
+
+
+def test_a_robot_that_does_not_fit_refuses_to_configure(make_world: Callable[..., World]) -> None:
+    world = make_world("joint_state", "--ros-args", "-p", "joints:=[one, two]")
+    assert not world.change(Transition.TRANSITION_CONFIGURE)
+    assert world.ask(GetState, "get_state", GetState.Request()).current_state.label == "unconfigured"

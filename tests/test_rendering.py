@@ -1,0 +1,241 @@
+"""The fast renderer beside MuJoCo's own."""
+
+from __future__ import annotations
+
+import hashlib
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import moderngl
+import mujoco
+import numpy as np
+import pytest
+from conftest import CONF, make_tabletop
+from gallery import gallery
+from hydra import compose, initialize_config_dir
+
+from vla.spec import Array
+from vla.tasks.rendering.fast import Fast, FastRenderer
+from vla.tasks.rendering.reference import Reference, ReferenceRenderer
+from vla.tasks.rendering.renderer import Renderer, View
+from vla.tasks.tabletop.environment import Tabletop
+
+SIZE = 64
+EDGE = 0.02  # difference of depth to a neighbour at the edge of an object [m]
+
+
+def fast(samples: Any = 0, soft: int = 0, light: Any = "auto", faces: int | None = None) -> Fast:
+    return Fast(samples=samples, soft=soft, light=light, faces=faces)
+
+
+def smooth(depth: Array) -> Array:
+    """Return which pixels of (H, W) have neighbours at nearly the same depth."""
+    padded = np.pad(depth, 1, mode="edge")
+    height, width = depth.shape
+    around = [padded[y : y + height, x : x + width] for y in range(3) for x in range(3)]
+    return np.max(around, axis=0) - np.min(around, axis=0) < EDGE
+
+
+def grey_levels(first: Array, second: Array) -> Array:
+    """Return the mean difference of every picture."""
+    return np.abs(first.astype(int) - second).mean(axis=(1, 2, 3))
+
+
+@pytest.fixture(scope="module")
+def wide() -> Iterator[tuple[Tabletop, Renderer, ReferenceRenderer]]:
+    environment = make_tabletop("task/randomize=wide", "task.blocks=6")
+    with environment.blind():
+        environment.reset(0)  # compiles the model
+    model, view = environment._task.compiled.model, View((0, 1), SIZE, SIZE, geom_groups=(2,))
+    first, second = fast().open(model, view), Reference().open(model, view)
+    yield environment, first, second
+    for each in (first, second, environment):
+        each.close()
+
+
+def start(environment: Tabletop, seed: int, *renderers: Renderer) -> mujoco.MjData:
+    with environment.blind():
+        environment.reset(seed)
+    compiled = environment._task.compiled
+    for renderer in renderers:
+        renderer.update(range(compiled.model.ntex))
+    return compiled.data
+
+
+def test_pictures_of_a_hundred_scenes_equal_mujocos(wide: tuple[Tabletop, Renderer, ReferenceRenderer]) -> None:
+    environment, first, second = wide
+    differences = []
+    for seed in range(100):
+        data = start(environment, seed, first, second)
+        (rgb, depth), (reference, distance) = first.render(data), second.render(data)
+        inside = np.stack([smooth(each) & smooth(other) for each, other in zip(depth, distance, strict=True)])
+        assert inside.mean() > 0.5
+        # Beside edges a tenth of a percent may still see another surface, through a gap of less than a pixel.
+        assert (np.abs(depth - distance)[inside] > 0.001).mean() < 0.001, seed
+        differences.append(grey_levels(rgb, reference))
+    assert np.mean(differences) < 1
+    assert np.max(differences) < 5  # at the edges of shadows
+
+
+def test_no_object_is_missing(wide: tuple[Tabletop, Renderer, ReferenceRenderer]) -> None:
+    environment, first, second = wide
+    model = environment._task.compiled.model
+    head = model.vis.headlight
+    before = [np.array(values) for values in (head.ambient, head.diffuse, model.light_active)]
+    for seed in range(20):
+        data = start(environment, seed)
+        model.geom_matid[:] = -1
+        identity = np.arange(model.ngeom)
+        model.geom_rgba[:, :3] = (
+            np.stack([10 * (identity % 25) + 5, 100 * (identity // 25) + 50, 0 * identity], 1) / 255
+        )
+        head.ambient, head.diffuse, model.light_active[:] = 1, 0, False
+        first.update()
+        rgb = first.render(data)[0].astype(int)
+        seen = np.where(rgb.any(axis=3), rgb[..., 0] // 10 + 25 * (rgb[..., 1] // 100), -1)
+        for camera in (0, 1):
+            expected = second.segment(data, camera)
+            assert (seen[camera] == expected)[expected >= 0].mean() > 0.99
+            found, counts = np.unique(expected, return_counts=True)
+            assert set(found[(counts > 5) & (found >= 0)]) <= set(seen[camera].ravel())
+    head.ambient, head.diffuse, model.light_active[:] = before
+
+
+def test_changes_of_a_model_are_taken_over(wide: tuple[Tabletop, Renderer, ReferenceRenderer]) -> None:
+    """A renderer that has seen other episodes draws the same bytes as a new one."""
+    environment, first, _ = wide
+    for seed in (3, 50, 7):
+        data = start(environment, seed, first)
+        new = fast().open(environment._task.compiled.model, View((0, 1), SIZE, SIZE, geom_groups=(2,)))
+        for ours, theirs in zip(first.render(data), new.render(data), strict=True):
+            np.testing.assert_array_equal(ours, theirs)
+        new.close()
+
+
+def test_geoms_come_and_go() -> None:
+    text = '<mujoco><worldbody><geom size=".2" rgba="1 0 0 1"/><camera pos="0 0 1"/></worldbody></mujoco>'
+    model = mujoco.MjModel.from_xml_string(text)
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    renderer = fast().open(model, View((0,), SIZE, SIZE))
+    reds, depths = [], []
+    for alpha in (1.0, 0.0, 0.5, 1.0):
+        model.geom_rgba[0, 3] = alpha
+        renderer.update()
+        rgb, depth = renderer.render(data)
+        reds.append(int(rgb[0, SIZE // 2, SIZE // 2, 0]))
+        depths.append(float(depth[0, SIZE // 2, SIZE // 2]))
+    renderer.close()
+    assert reds[0] == reds[3] > reds[2] > reds[1] == 0
+    assert depths == pytest.approx([0.8, 0, 0, 0.8], abs=1e-3)  # what is transparent has no depth, as in MuJoCo
+
+
+@pytest.mark.parametrize(
+    ("lights", "floor"), [("directional", "2 2 .1"), ("spot", "2 2 .1"), ("several", "2 2 .1"), ("headlight", "0 3 .1")]
+)
+def test_every_shape_texture_light_and_camera(lights: str, floor: str) -> None:
+    model, data = gallery(lights, floor)
+    view = View(range(model.ncam), 96, 120, site_groups=(0,))
+    first, second = fast().open(model, view), Reference().open(model, view)
+    (rgb, depth), (reference, distance) = first.render(data), second.render(data)
+    first.close()
+    second.close()
+    for picture, other, near, far in zip(rgb, reference, depth, distance, strict=True):
+        inside = smooth(near) & smooth(far)
+        assert (np.abs(near - far)[inside] > 0.002).mean() < 0.002
+        assert np.abs(picture.astype(int) - other)[inside].mean() < 3
+        assert np.median(np.abs(picture.astype(int) - other)) <= 1
+
+
+def test_edges_are_smooth_where_asked() -> None:
+    model, data = gallery("directional")
+    colours, views = {}, View((0,), SIZE, SIZE)
+    for name, choice in {
+        "plain": fast(),
+        "smooth": fast(samples=4),
+        "soft": fast(soft=1),
+        "pixel": fast(light="pixel"),
+    }.items():
+        renderer = choice.open(model, views)
+        colours[name] = renderer.render(data)[0]
+        renderer.close()
+    for name in ("smooth", "soft", "pixel"):
+        assert 0 < grey_levels(colours["plain"], colours[name])[0] < 6, name
+        assert name == "pixel" or len(np.unique(colours[name].reshape(-1, 3), axis=0)) > len(
+            np.unique(colours["plain"].reshape(-1, 3), axis=0)
+        )
+
+
+def test_another_process_draws_the_same_bytes(tmp_path: Path) -> None:
+    code = (
+        "import hashlib; from conftest import make_tabletop\n"
+        "env = make_tabletop('task/renderer=fast', 'task/randomize=wide'); seen = env.reset(5)\n"
+        "content = b''.join(x[name].tobytes() for x in (seen.rgb, seen.depth) for name in sorted(x))\n"
+        "env.close(); print(hashlib.sha256(content).hexdigest())"
+    )
+    environment = make_tabletop("task/renderer=fast", "task/randomize=wide")
+    environment.reset(9)
+    seen = environment.reset(5)
+    environment.close()
+    content = b"".join(images[name].tobytes() for images in (seen.rgb, seen.depth) for name in sorted(images))
+    done = subprocess.run([sys.executable, "-c", code], cwd=Path(__file__).parent, capture_output=True, text=True)
+    assert done.stdout.split()[-1] == hashlib.sha256(content).hexdigest(), done.stderr[-500:]
+
+
+def test_a_store_belongs_to_a_renderer() -> None:
+    folders, names = zip(*(collected_with(renderer) for renderer in ("fast", "mujoco")), strict=True)
+    assert len(set(folders)) == 2
+    assert [name.rpartition(".")[2] for name in names] == ["Fast", "Reference"]
+
+
+def collected_with(renderer: str) -> tuple[str, str]:
+    """Return the folder of the store and the class of the renderer, which its header tells."""
+    import vla.config.check  # noqa: F401  registers the resolvers
+
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        config = compose("config", overrides=[f"task/renderer={renderer}"])
+    return config.collect.folder, config.task.renderer._target_
+
+
+def test_what_is_left_out_is_named(caplog: pytest.LogCaptureFixture) -> None:
+    model, _ = gallery("spot", "0 0 .1")
+    fast().open(model, View((0,), 8, 8)).close()
+    assert "the fast renderer leaves out haze at the horizon; task/renderer=mujoco draws them" in caplog.text
+
+
+def test_without_egl_the_error_names_the_other_renderer(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(**_: object) -> None:
+        raise Exception("libEGL.so not found")
+
+    monkeypatch.setattr(moderngl, "create_standalone_context", refuse)
+    model, _ = gallery("spot")
+    with pytest.raises(RuntimeError, match=r"lacks \(libEGL.so not found\): .*, or choose task/renderer=mujoco"):
+        fast().open(model, View((0,), 8, 8))
+
+
+def test_heavy_meshes_are_decimated_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    azimuth, height = np.meshgrid(np.linspace(0, 2 * np.pi, 60, endpoint=False), np.linspace(-0.99, 0.99, 40))
+    ring = np.sqrt(1 - height**2)
+    points = np.stack([ring * np.cos(azimuth), ring * np.sin(azimuth), height], axis=2).reshape(-1, 3)
+    text = " ".join(f"{value:.5f}" for value in points.ravel())
+    model = mujoco.MjModel.from_xml_string(
+        f'<mujoco><asset><mesh name="ball" vertex="{text}"/></asset><worldbody><geom type="mesh" mesh="ball"/>'
+        '<camera pos="0 0 4"/></worldbody></mujoco>'
+    )
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    depths, faces = [], []
+    for most in (None, 500, 500):
+        renderer = fast(faces=most).open(model, View((0,), SIZE, SIZE))
+        assert isinstance(renderer, FastRenderer)
+        depths.append(renderer.render(data)[1])
+        faces.append(sum(len(block.triangles) for block in renderer._geometry.blocks))
+        renderer.close()
+    assert faces[0] > 4000 and faces[1] == faces[2] <= 520
+    assert len(list((tmp_path / "vla" / "meshes").iterdir())) == 1
+    np.testing.assert_array_equal(depths[1], depths[2])
+    assert np.abs(depths[0] - depths[1])[smooth(depths[0][0])[None]].max() < 0.05

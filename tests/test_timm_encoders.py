@@ -1,0 +1,174 @@
+"""Image encoders around networks of timm, and where their weights come from."""
+
+from __future__ import annotations
+
+import logging
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import pytest
+import timm
+import torch
+from defaults import defaults_of
+from fake_batch import make_batch, make_bc, overfit, with_text
+from huggingface_hub import constants
+from safetensors.torch import save_file
+
+from vla.models.vision import timm_encoders
+from vla.models.vision.timm_encoders import WEIGHTS, FilmBackbone, FilmEfficientNet, load_backbone
+
+
+@pytest.fixture
+def alone(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
+    """A machine that reaches no hub; the folder where it keeps what it downloaded before."""
+    monkeypatch.setattr(constants, "ENDPOINT", "http://127.0.0.1:9")
+    monkeypatch.setattr(constants, "HF_HUB_CACHE", str(tmp_path / "cache"))
+    return tmp_path / "cache"
+
+
+def test_at_the_start_the_efficientnet_is_the_plain_one_bit_for_bit() -> None:
+    torch.manual_seed(0)
+    plain: Any = timm.create_model("efficientnet_b0", num_classes=0).eval()
+    ours: Any = FilmEfficientNet("efficientnet_b0", pretrained=False, channels=32, text_width=8).eval()
+    blocks = torch.nn.ModuleList(block for stage in plain.blocks for block in stage)
+    for module, source in (
+        (ours.stem, torch.nn.Sequential(plain.conv_stem, plain.bn1)),
+        (ours.blocks, blocks),
+        (ours.top, torch.nn.Sequential(plain.conv_head, plain.bn2)),
+    ):
+        module.load_state_dict(source.state_dict())
+    images = torch.rand(2, 3, 64, 64)
+    plain.to(memory_format=torch.channels_last)
+    with torch.inference_mode():
+        expected = ours.projection(plain.forward_features(ours.normalize(images)))
+        assert torch.equal(ours(images, torch.randn(2, 8)), expected)
+    assert len(ours.films) == len(ours.blocks) == 16
+
+
+NETWORKS = [("test_vit", 32), ("test_resnet", None), ("test_vit4", None), ("vit_base_patch16_siglip_224", 32)]
+
+
+@pytest.mark.parametrize(("name", "size"), NETWORKS)
+def test_at_the_start_a_feature_map_is_that_of_the_network(name: str, size: int | None, tmp_path: Path) -> None:
+    torch.manual_seed(0)
+    plain: Any = timm.create_model(name, num_classes=0, img_size=size if "vit" in name else None).eval()
+    save_file(plain.state_dict(), tmp_path / WEIGHTS)
+    ours = FilmBackbone(
+        text_width=4,
+        **defaults_of("model/image/timm", name=name, pretrained=str(tmp_path / WEIGHTS), size=size, channels=8),
+    ).eval()
+    side = ours.size
+    assert side == (size or plain.pretrained_cfg["input_size"][-1])
+    images = torch.rand(2, 3, side, side)
+    mean, std = (torch.tensor(plain.pretrained_cfg[key]).view(3, 1, 1) for key in ("mean", "std"))
+    with torch.inference_mode():
+        expected = plain.forward_features((images - mean) / std)
+        if "vit" in name:  # (N, prefix + h·w, C)
+            patches = expected[:, plain.num_prefix_tokens :]
+            h = round(patches.shape[1] ** 0.5)
+            expected = patches.mT.unflatten(-1, (h, h))
+        features = ours(images, torch.randn(2, 4))
+        # On some processors the last bits of a ViT's attention depend on where its memory happens to lie.
+        bound = 1e-6 if "vit" in name else 0
+        torch.testing.assert_close(features, ours.projection(expected), atol=bound, rtol=bound)
+        smaller = ours(torch.rand(2, 3, 24, 20), torch.randn(2, 4))  # resized first
+        assert smaller.shape == (2, 8, *expected.shape[-2:])
+
+
+def test_a_frozen_network_stays_what_it_was_while_what_reads_it_learns() -> None:
+    torch.manual_seed(0)
+    model = make_bc(image=partial(FilmBackbone, "test_resnet", False, frozen=True, size=32, channels=8))
+    encoder: Any = model.images[0]
+    trunk = encoder.backbone
+    before = {name: value.clone() for name, value in trunk.state_dict().items()}
+    batch = with_text(model.train(), make_batch(1))
+    untrained = model.loss(batch)["loss"].item()
+    overfit(model, batch, steps=20)
+    assert all(torch.equal(before[name], value) for name, value in trunk.state_dict().items())
+    assert model.loss(batch)["loss"].item() < 0.9 * untrained
+    assert encoder.film.gamma.weight.abs().max() > 0
+
+
+def test_a_network_that_is_not_frozen_learns_in_all_its_parts() -> None:
+    encoder = FilmBackbone("test_vit", False, frozen=False, size=32, channels=8, text_width=4).train()
+    encoder(torch.rand(2, 3, 32, 32), torch.randn(2, 4)).square().sum().backward()
+    assert [name for name, parameter in encoder.backbone.named_parameters() if parameter.grad is None] == []
+
+
+@pytest.mark.parametrize("ending", ["pth", "safetensors"])
+def test_weights_come_from_a_file(ending: str, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    source: Any = timm.create_model("efficientnet_b0")
+    path = tmp_path / f"weights.{ending}"
+    (torch.save if ending == "pth" else save_file)(source.state_dict(), path)
+    with caplog.at_level(logging.INFO, logger=timm_encoders.__name__):
+        net = load_backbone("efficientnet_b0", str(path))
+    assert torch.equal(net.conv_stem.weight, source.conv_stem.weight) and f"weights loaded from {path}" in caplog.text
+    with pytest.raises(ValueError, match="does not hold the weights of timm's efficientnet_b1"):
+        load_backbone("efficientnet_b1", str(path))
+
+
+def test_weights_that_were_downloaded_before_need_no_hub(alone: Path, caplog: pytest.LogCaptureFixture) -> None:
+    source: Any = timm.create_model("test_vit")
+    folder = alone / f"models--timm--{source.pretrained_cfg['architecture']}.{source.pretrained_cfg['tag']}"
+    (folder / "snapshots/abc").mkdir(parents=True)
+    (folder / "refs").mkdir()
+    (folder / "refs/main").write_text("abc")
+    save_file(source.state_dict(), folder / "snapshots/abc" / WEIGHTS)
+    with caplog.at_level(logging.INFO, logger=timm_encoders.__name__):
+        net = load_backbone("test_vit", True)
+    assert torch.equal(net.pos_embed, source.pos_embed) and "test_vit: weights loaded" in caplog.text
+
+
+def test_weights_are_never_random_in_silence(alone: Path, caplog: pytest.LogCaptureFixture) -> None:
+    with pytest.raises(ValueError, match=r"refused.*path of a weights file, or false"):
+        load_backbone("efficientnet_b0", True)
+    with caplog.at_level(logging.INFO, logger=timm_encoders.__name__):
+        load_backbone("efficientnet_b0", "auto")
+        load_backbone("efficientnet_b0", False)
+    warning, asked_for = caplog.records
+    assert warning.levelname == "WARNING" and "starts at RANDOM" in warning.message and "refused" in warning.message
+    assert asked_for.levelname == "INFO" and asked_for.message == "efficientnet_b0 is built without pretrained weights"
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (
+            {"name": "vit_smal_patch16_dinov3"},
+            "no network called 'vit_smal_patch16_dinov3', it has .*vit_small_patch16_",
+        ),
+        ({"name": "test_vit.nowhere"}, r"no network called 'test_vit.nowhere', it has test_vit"),
+        ({"name": "test_vit", "size": 40}, "size=40 must be a multiple of 16"),
+        ({"name": "test_vit", "pretrained": "nowhere.pth"}, "no file nowhere.pth"),
+    ],
+)
+def test_what_cannot_be_had_is_named(options: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        FilmBackbone(
+            text_width=4, **defaults_of("model/image/timm", **{"pretrained": False, "frozen": True, **options})
+        )
+
+
+def test_only_an_efficientnet_is_an_efficientnet() -> None:
+    with pytest.raises(ValueError, match=r"no efficientnet called 'resnet18', it has .*efficientnet"):
+        FilmEfficientNet(
+            text_width=4, **defaults_of("model/image/film_efficientnet", name="resnet18", pretrained=False)
+        )
+
+
+def test_files_that_hold_no_weights_are_named(tmp_path: Path) -> None:
+    class Attack:
+        def __reduce__(self) -> tuple[Any, tuple[Path]]:
+            return Path.touch, (tmp_path / "attacked",)
+
+    torch.save({"stem.weight": Attack()}, tmp_path / "attack.pth")
+    (tmp_path / "torn.safetensors").write_bytes(b"\x10")
+    (tmp_path / "empty.pth").write_bytes(b"")
+    for name in ("attack.pth", "torn.safetensors", "empty.pth"):
+        with pytest.raises(ValueError, match=f"{name} cannot be read as weights"):
+            load_backbone("test_vit", str(tmp_path / name))
+    assert not (tmp_path / "attacked").exists()
+    torch.save({}, tmp_path / "nothing.pth")
+    with pytest.raises(ValueError, match="holds no weights"):
+        load_backbone("test_vit", str(tmp_path / "nothing.pth"))

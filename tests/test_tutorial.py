@@ -1,0 +1,39 @@
+"""The tutorial, followed in a copy of the project: its files as printed, its commands on small numbers."""
+
+from __future__ import annotations
+
+import re
+import shlex
+import shutil
+from pathlib import Path
+
+from command_line import SMALL, vla
+
+ROOT = Path(__file__).parents[1]
+PAGE = (ROOT / "docs/tutorial.md").read_text(encoding="utf-8")
+FILES = re.findall(r"^```(?:python|yaml)\n# (\S+)\n(.*?)^```", PAGE, re.MULTILINE | re.DOTALL)
+COMMANDS = re.findall(r"^python -m vla\.run (.*)$", PAGE, re.MULTILINE)
+
+
+def small(command: str) -> list[str]:
+    if "job=report" in command:
+        return []
+    if "job=preview" in command:
+        return ["preview.episodes=1"]
+    if "checkpoint=" in command:
+        return ["evaluate.episodes=1", "cluster.workers=1", "recorder=none"]
+    return [*SMALL, "task.time_limit=5", "recorder=none"]
+
+
+def test_the_tutorial_ends_with_a_policy_for_its_own_goal(tmp_path: Path) -> None:
+    for part in ("vla", "conf"):
+        shutil.copytree(ROOT / part, tmp_path / part, ignore=shutil.ignore_patterns("__pycache__"))
+    for name, text in FILES:
+        assert not (tmp_path / name).exists()
+        (tmp_path / name).write_text(text, encoding="utf-8")
+    assert len(FILES) == 2 and len(COMMANDS) == 5
+    for command in COMMANDS:
+        vla(tmp_path, *shlex.split(command), *small(command))
+    page = (tmp_path / "outputs/runs/left_of/report.html").read_text(encoding="utf-8")
+    assert "LeftOf" in page or "left_of" in page
+    assert (tmp_path / "comparison.html").exists() or list(tmp_path.glob("outputs/runs/*/comparison.html"))

@@ -1,0 +1,34 @@
+"""What batches are gathered into, and which labels are left out."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+import toy
+
+from vla.data.window_batches import BufferPool, disturbed
+
+
+def test_what_follows_an_excursion_is_no_label_for_what_came_before() -> None:
+    label = np.array([0.04, -0.01, 1.0])
+    executed = [
+        label,
+        label * [1.4, 0.7, 1],
+        label + np.array([0, 0.004, 0]),
+        [0.0, -0.01, 1.0],
+        label * [1, -1, 1],
+        [0.04, 0, 0],
+    ]
+    off = disturbed(np.tile(label, (6, 1)), np.array(executed), toy.SPEC)
+    assert off.tolist() == [False, False, False, True, True, True]
+
+
+def test_memory_is_used_again_once_nothing_refers_to_it() -> None:
+    memory = BufferPool()
+    first = memory.empty((2, 3), np.uint8)
+    tensor = torch.from_numpy(first).view(3, 2)[1:]
+    place = first.__array_interface__["data"]
+    del first
+    assert memory.empty((2, 3), np.uint8).__array_interface__["data"] != place
+    del tensor
+    assert memory.empty((2, 3), np.uint8).__array_interface__["data"] == place

@@ -1,0 +1,42 @@
+"""Episodes of the toy world, and small stores of them to damage."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+from toy import ARM_SPEC, ToyExpert, make_arm
+
+from vla.data.episodes import EpisodeStore
+from vla.rollouts.rollout import rollout
+from vla.spec import Episode
+
+CONFIG = {"task": {"size": 1.0}, "seed": 0}
+
+EPISODES = [rollout(make_arm(), ToyExpert(), seed) for seed in range(5)]  # seed 3 fails
+
+
+def add(folder: Path, episodes: list[Episode]) -> EpisodeStore:
+    store = EpisodeStore.create_or_open(folder, ARM_SPEC, CONFIG)
+    with store.writing():
+        for episode in episodes:
+            if episode.success:
+                store.append(episode)
+            else:
+                store.fail(episode)
+    return store
+
+
+def content(folder: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in folder.iterdir() if path.name != "lock"}
+
+
+MORE = [*EPISODES, *(rollout(make_arm(), ToyExpert(), seed) for seed in range(5, 9))]  # seeds 3 and 8 fail
+
+
+def change(path: Path, edit: Callable[[bytes], bytes]) -> None:
+    path.write_bytes(edit(path.read_bytes()))
+
+
+def flip(data: bytes, place: int) -> bytes:
+    return data[:place] + bytes([data[place] ^ 1]) + data[place + 1 :]

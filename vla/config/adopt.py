@@ -1,0 +1,138 @@
+"""Merge of a composed config with the checkpoint or run that it names.
+
+`checkpoint=FILE` takes task, tokenizer and model from a policy, `pretrained=FILE` tokenizer, model and data for a new
+training, `resume=RUN` the whole config of a run. Overrides of these nodes on the command line apply on top.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import Override
+from omegaconf import DictConfig, OmegaConf, open_dict
+
+from vla.config.build import require_no_paths, require_trust
+from vla.policy import read_header
+
+ADOPTING = ("evaluate", "export", "deploy", "benchmark")  # jobs that take a checkpoint
+OF_POLICY = ("task", "tokenizer", "model")
+OF_MODEL = ("tokenizer", "model", "data")  # the batch size depends on the model
+# Nodes of the training that a report on its policy includes.
+REPORTED = ("expert", "collect", "data", "learner", "trainer", "validate", "seed", "pretrained")
+CHOSEN = {"experiment": "experiment", "model": "model"}  # name in `chosen` → group
+PRESETS = ("experiment", "variant", "shift")  # groups and keys that change other groups
+OF_A_RUN = ("job", "output", "resume", "trust")  # keys that are not taken from a resumed run
+LENGTHS = ("max_steps", "max_epochs", "val_check_interval", "accumulate_grad_batches", "gradient_clip_val")
+
+
+def adopt(cfg: DictConfig, overrides: Sequence[str]) -> DictConfig:
+    """Return `cfg` with task, tokenizer and model of `cfg.checkpoint`, and for an evaluation also its training nodes.
+
+    Raises:
+        ValueError: the job takes no checkpoint, the file does not exist, or an override contradicts its weights.
+    """
+    if cfg.job not in ADOPTING:
+        raise ValueError(
+            f"job={cfg.job} takes no checkpoint: resume=RUN continues a run, pretrained={cfg.checkpoint} starts a new "
+            "training from its weights"
+        )
+    parsed = _parsed(overrides)
+    _require_own_parts(parsed, ("tokenizer", "model", *PRESETS))
+    saved = read_header(cfg.checkpoint).config
+    require_no_paths(saved, OF_POLICY, cfg.checkpoint)
+    named, kept = {override.key_or_group for override in parsed}, saved.get("chosen", {})
+    chosen = {name: cfg.chosen[name] if group in named else kept.get(name) for name, group in CHOSEN.items()}
+    names = [*OF_POLICY, *(name for name in REPORTED if cfg.job == "evaluate" and name in saved)]
+    return _on_top(cfg, {**{name: saved[name] for name in names}, "chosen": chosen}, parsed)
+
+
+def finetune(cfg: DictConfig, overrides: Sequence[str]) -> DictConfig:
+    """Return `cfg` with tokenizer, model and data of the policy `cfg.pretrained`, the initial weights of a training.
+
+    Raises:
+        ValueError: the file does not exist, the job does not train, or an override contradicts the weights.
+    """
+    if cfg.checkpoint is not None or cfg.job not in ("train", "evaluate"):
+        raise ValueError(
+            f"pretrained={cfg.pretrained} initialises a new training: use it with job=train or evaluate, and "
+            "without checkpoint=, which evaluates a policy"
+        )
+    parsed = _parsed(overrides)
+    _require_own_parts(parsed, ("tokenizer", "model", *PRESETS))
+    own = Path(cfg.output) / "checkpoints/last.ckpt"  # of this training; `pretrained` may have been deleted since
+    saved = read_header(own if own.exists() and not Path(cfg.pretrained).exists() else cfg.pretrained).config
+    require_no_paths(saved, OF_MODEL, cfg.pretrained)
+    chosen = {**cfg.chosen, "model": saved.get("chosen", {}).get("model")}
+    return _on_top(cfg, {**{name: saved[name] for name in OF_MODEL if name in saved}, "chosen": chosen}, parsed)
+
+
+def resume(cfg: DictConfig, run: Path, overrides: Sequence[str]) -> DictConfig:
+    """Return the config of `run`, to continue it in its folder.
+
+    Raises:
+        ValueError: the folder has no training, is not one of the user's own runs, or `cfg` names another policy.
+    """
+    if cfg.checkpoint is not None or cfg.pretrained is not None:
+        raise ValueError(f"resume={cfg.resume} continues a run unchanged: omit checkpoint= and pretrained=")
+    last = run / "checkpoints/last.ckpt"
+    if not last.is_file():
+        raise ValueError(f"resume={run}: nothing was trained in that folder, there is no {last}")
+    output = Path(cfg.output).resolve()
+    if run.resolve().parent != output.parent and run.resolve() != output:
+        raise ValueError(
+            f"resume={run} is not among your runs in {output.parent}: a run's config names files and folders, so only "
+            f"your own are resumed. If it is yours, add output={run}; to use somebody else's weights: pretrained={last}"
+        )
+    saved, parsed = read_header(last).config, _parsed(overrides)
+    _require_own_parts(parsed, PRESETS)
+    require_trust(saved, [name for name in saved if name not in OF_A_RUN], last)
+    resumed = _on_top(cfg, {str(name): saved[name] for name in cfg if name in saved and name not in OF_A_RUN}, parsed)
+    named = {_path(override) for override in parsed}
+    if "trainer" in named:  # another option changes the speed of training, not its length
+        for name in LENGTHS:
+            if name in saved["trainer"] and f"trainer.{name}" not in named:
+                OmegaConf.update(resumed, f"trainer.{name}", saved["trainer"][name], force_add=True)
+    resumed.output, resumed.resume = str(run), str(run)
+    if "job" not in named:
+        resumed.job = saved.get("job", cfg.job)
+    return resumed
+
+
+def _require_own_parts(parsed: Sequence[Override], groups: Sequence[str]) -> None:
+    for override in parsed:
+        group = _path(override).partition(".")[0]
+        if group in groups:
+            raise ValueError(
+                f"{override.input_line} cannot be combined with a checkpoint, whose weights belong to the {group} "
+                "they were trained with: omit one of the two; task/randomize=wide and evaluate=suite can be combined"
+            )
+
+
+def _parsed(overrides: Sequence[str]) -> list[Override]:
+    return OverridesParser.create().parse_overrides(list(overrides))
+
+
+def _path(override: Override) -> str:
+    return override.key_or_group.replace("/", ".")
+
+
+def _on_top(cfg: DictConfig, saved: Mapping[str, Any], parsed: Sequence[Override]) -> DictConfig:
+    """Return `cfg` with the saved nodes, and the command line's overrides on top of these."""
+    adopted = copy.deepcopy(cfg)
+    with open_dict(adopted):
+        for name, node in saved.items():
+            adopted[name] = node
+        for override in parsed:
+            path = _path(override)
+            if path.partition(".")[0] not in saved:
+                continue
+            if override.is_delete():
+                parent, _, name = path.rpartition(".")
+                OmegaConf.select(adopted, parent).pop(name, None)
+            else:
+                OmegaConf.update(adopted, path, OmegaConf.select(cfg, path), merge=False, force_add=True)
+    return adopted

@@ -1,0 +1,231 @@
+"""Construction of objects from config nodes.
+
+A node names a class in `_target_`. The signature of its `__init__` is the schema of the node: names, required
+arguments, types and allowed values. A node is checked against that signature before anything is built.
+"""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from difflib import get_close_matches
+from functools import cache
+from importlib import import_module
+from typing import Annotated, Any, Literal, get_args, get_origin
+
+from annotated_types import Gt, Le, MinLen
+from hydra.errors import InstantiationException
+from hydra.utils import instantiate
+
+from vla.config.annotations import describe, fits, is_node, locate, matches, require_trusted, takes_path, targets
+from vla.io.documents import require_resolved
+from vla.io.types import Count, Inherited, Natural, NonNegative, Share, Text
+
+HYDRA_KEYS = ("_target_", "_partial_")
+
+
+@dataclass(frozen=True)
+class Group:
+    """The kind of objects that a config group describes."""
+
+    makes: tuple[str, ...]  # alternative base classes or protocols
+    runtime: tuple[str, ...] = ()  # constructor arguments from the program, never from YAML
+    optional: bool = False  # jobs run without it
+    several: bool = False  # an option is a mapping of name → node
+
+
+GROUPS = {
+    "task": Group(("vla.spec.Environment",)),
+    "expert": Group(("vla.spec.Agent", "vla.data.formats.imported_demonstrations.ImportedDemonstrations"), ("spec",)),
+    "cluster": Group(("vla.parallel.pool.Cluster",)),
+    "data": Group(("vla.data.datamodule.WindowDataModule",), ("folder", "spec", "history", "chunk", "episodes")),
+    "tokenizer": Group(("vla.models.tokenizers.tokenizer.ActionTokenizer",), ("spec", "statistics")),
+    "model": Group(("vla.models.model.Model",), ("spec", "tokenizer")),
+    "learner": Group(("vla.models.learner.Learner",), ("model", "spec", "config")),
+    "trainer": Group(("lightning.Trainer",), ("callbacks", "logger")),
+    "logger": Group(("lightning.pytorch.loggers.Logger",), ("save_dir",), optional=True, several=True),
+    "policy": Group(("vla.policy.Policy",), ("model", "spec")),
+    "recorder": Group(("vla.spec.Recorder",), ("folder",), optional=True),
+    "export": Group(("vla.spec.Exporter", "vla.spec.PolicyExporter")),
+    "deploy": Group(("vla.spec.Deployment",), ("policy", "environment", "output")),
+}
+
+# Narrower than Lightning's annotations: with other values its trainer fails late, or silently trains nothing.
+NARROWER: dict[str, dict[str, Any]] = {
+    "lightning.Trainer": {
+        "max_steps": Literal[-1] | Count,
+        "max_epochs": Literal[-1] | Count | None,
+        "devices": Literal["auto", -1] | Count | Annotated[list[Natural], MinLen(1)] | Text,
+        "num_nodes": Count,
+        "accumulate_grad_batches": Count,
+        "gradient_clip_val": NonNegative | None,
+        "val_check_interval": Count | Annotated[float, Gt(0), Le(1)] | None,
+        "limit_val_batches": Natural | Share | None,
+        "limit_train_batches": Natural | Share | None,
+        "log_every_n_steps": Count,
+        "precision": Literal["fp32", "bf16"],
+    }
+}
+
+
+def build(node: Mapping[str, Any], group: str, **runtime: Any) -> Any:
+    """Build the object that a plain `node` of a group such as "model" describes.
+
+    Nested nodes are built first; those with `_partial_: true` become factories. Unresolved references such as `${seed}`
+    are refused, so the checked mapping is the one that is built.
+
+    Args:
+        node: class in `_target_`, and its arguments.
+        group: config group, which determines the base class.
+        runtime: arguments from the program.
+
+    Raises:
+        ValueError: a class that is not allowed or of another kind, wrong arguments, or an error of the constructor.
+    """
+    require_resolved(node, group)
+    check_node(group, node, makes(group), tuple(runtime))
+    try:
+        factory = instantiate(dict(node), _convert_="all", _partial_=True)
+    except InstantiationException as error:
+        if isinstance(error.__cause__, ValueError):
+            raise ValueError(str(error.__cause__)) from error
+        raise
+    return factory(**runtime)
+
+
+@cache
+def makes(group: str) -> Any:
+    """Return the class, protocol or union of the objects that a group describes."""
+    classes = [
+        getattr(import_module(module), name) for module, _, name in (p.rpartition(".") for p in GROUPS[group].makes)
+    ]
+    return classes[0] if len(classes) == 1 else classes[0] | classes[1]
+
+
+def check_node(key: str, node: Any, expected: Any, runtime: Sequence[str] = ()) -> None:
+    """Check a plain node at `key` against the signature of its class, without the `runtime` arguments.
+
+    Raises:
+        ValueError: the class is no `expected`, or a key is unknown, missing or ill-typed; with its dotted name and the
+            allowed values.
+    """
+    if not is_node(node):
+        raise ValueError(f"{key} must be a node with a _target_, got {_short(node)}")
+    target = locate(f"{key}._target_", node["_target_"])
+    if not fits(target, expected):
+        raise ValueError(f"{key}._target_ must name a class of kind {describe(expected)}, got {node['_target_']}")
+    parameters = arguments(target)
+    several = [name for name, each in parameters.items() if each.kind is inspect.Parameter.VAR_KEYWORD]
+    known = [name for name in parameters if name not in (*runtime, *several)]
+    hints = {name: each.annotation for name, each in parameters.items()} | NARROWER.get(node["_target_"], {})
+    for name, value in node.items():
+        if name in HYDRA_KEYS:
+            continue
+        if not several or str(name).startswith("_"):
+            require_known(key, name, known, target.__name__)
+        check_value(f"{key}.{name}", value, hints.get(name, Any))
+    for name in () if node.get("_partial_") else known:
+        if name not in node and parameters[name].default is inspect.Parameter.empty:
+            raise ValueError(f"{key}.{name} is missing: {target.__name__} needs it")
+
+
+def require_trust(config: Mapping[str, Any], names: Iterable[Any], source: object) -> None:
+    """Raise a ValueError if a node among `names` of the file `source` names a class that is not trusted."""
+    for target in targets([config.get(name) for name in names]):
+        require_trusted(source, target)
+
+
+def require_no_paths(config: Mapping[str, Any], names: Collection[str], source: object) -> None:
+    """Refuse nodes out of a file in which a class is given a file or folder to read or write.
+
+    Args:
+        config: plain, with the nodes `names`, as far as there are any.
+        source: where it comes from, for the error.
+
+    Raises:
+        ValueError: with the dotted name of the first such argument, or a class that may not be built.
+    """
+    require_trust(config, names, source)
+    for key in (key for name in names for key in _paths_in(config.get(name), name)):
+        raise ValueError(f"{source} names a path in {key}: paths are taken from your own runs and commands only")
+
+
+def _paths_in(node: Any, key: str) -> Iterator[str]:
+    """Dotted names of the arguments in a node, called `key`, that name a file or folder."""
+    if is_node(node):
+        known = arguments(locate(f"{key}._target_", node["_target_"]))
+        yield from (
+            f"{key}.{name}"
+            for name, value in node.items()
+            if value and name in known and takes_path(known[name].annotation)
+        )
+    for name, part in node.items() if isinstance(node, dict) else enumerate(node) if isinstance(node, list) else ():
+        yield from _paths_in(part, f"{key}.{name}")
+
+
+def check_value(key: str, value: Any, annotation: Any) -> None:
+    """Raise a ValueError with the dotted name `key` if a value does not match an annotation."""
+    _check_nodes(key, value)  # first, because an error within a node is more specific
+    if not matches(value, annotation):
+        choices = [str(choice) for choice in get_args(annotation)] if get_origin(annotation) is Literal else []
+        hint = suggestion(str(value), choices)
+        raise ValueError(f"{key} must be {describe(annotation)}, got {_short(value)}{hint}")
+
+
+def _check_nodes(key: str, value: Any) -> None:
+    """Check all nodes in a value against their signatures."""
+    if is_node(value):
+        return check_node(key, value, object)
+    children = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
+    for name, child in children:
+        _check_nodes(f"{key}.{name}" if isinstance(value, dict) else f"{key}[{name}]", child)
+    return None
+
+
+def _short(value: Any) -> str:
+    text = repr(value)
+    return text if len(text) <= 200 else f"{text[:200]}…"
+
+
+def require_known(key: str, name: str, known: Collection[str], owner: str) -> None:
+    """Raise a ValueError with a suggestion for a name that `owner` does not take."""
+    if name not in known:
+        prefix = f"{key}." if key else ""
+        hint = suggestion(name, known) or ":"
+        raise ValueError(f"{prefix}{name} is unknown{hint} {owner} takes {', '.join(known)}")
+
+
+def arguments(target: type) -> dict[str, inspect.Parameter]:
+    """Return name → constructor argument of a class, with evaluated annotations.
+
+    `**inherited: Inherited` is replaced by the arguments of the next base class with a constructor.
+    """
+    found: dict[str, inspect.Parameter] = {}
+    for init in (vars(base)["__init__"] for base in target.__mro__[:-1] if "__init__" in vars(base)):
+        own = _parameters(init)
+        found = {**own, **found}
+        if all(each.annotation is not Inherited for each in own.values()):
+            break
+    return {name: each for name, each in found.items() if each.annotation is not Inherited}
+
+
+def _parameters(init: Any) -> dict[str, inspect.Parameter]:
+    """Return the arguments of a constructor without `self`."""
+    scope = inspect.unwrap(init).__globals__
+    found = {}
+    for name, each in list(inspect.signature(init).parameters.items())[1:]:
+        annotation = each.annotation
+        if isinstance(annotation, str):
+            try:
+                annotation = eval(annotation, scope)
+            except NameError:  # imported for type checking only
+                annotation = Any
+        found[name] = each.replace(annotation=annotation)
+    return found
+
+
+def suggestion(name: str, known: Iterable[str]) -> str:
+    """Return `, did you mean …?`, or an empty string without a similar name."""
+    close = get_close_matches(name, list(known), n=1)
+    return f", did you mean {close[0]}?" if close else ""

@@ -1,0 +1,69 @@
+"""The folder of options, and composition of configs outside of the command line."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import hydra
+from hydra.core.config_loader import ConfigLoader
+from hydra.core.global_hydra import GlobalHydra
+from hydra.version import VersionBase
+from omegaconf import DictConfig, OmegaConf, open_dict
+
+import vla.config.check  # noqa: F401  registers the resolvers
+from vla.config.experiment import Node, plain
+from vla.config.packages import offer_options
+
+PACKAGE = Path(__file__).resolve().parents[1]
+# Inside the package if installed from a wheel, beside it in a clone.
+CONF = next(path for path in (PACKAGE / "conf", PACKAGE.parent / "conf") if (path / "config.yaml").is_file())
+
+
+def compose(*overrides: str) -> DictConfig:
+    """Compose the config that `python -m vla.run` composes from the same overrides.
+
+    Add `output=DIR`: only the command line creates a folder per run.
+    """
+    with _hydra():
+        config = hydra.compose("config", list(overrides), return_hydra_config=True)
+    OmegaConf.resolve(config.chosen)  # needs Hydra's node
+    with open_dict(config):
+        del config["hydra"]
+    return config
+
+
+def compose_task(task: str, **overrides: Any) -> Node:
+    """Compose the node of a task, as `task=TASK task/GROUP=OPTION task.KEY=VALUE` does on the command line.
+
+    Args:
+        task: an option of the group `task`.
+        overrides: GROUP=OPTION for a group below it, such as goal="lift" or **{"randomize/light": "wide"}, and
+            KEY=VALUE for an argument, such as image_size=(64, 64) or **{"goal.radius": 0.03}.
+
+    Raises:
+        hydra.errors.HydraException: an option or key does not exist.
+    """
+    with _hydra() as loader:
+        groups = {name for name in overrides if loader.get_group_options(f"task/{name}")}
+        given = [
+            f"task{'/' if name in groups else '.'}{name}={json.dumps(value, ensure_ascii=False)}"
+            for name, value in overrides.items()
+        ]
+        return plain(hydra.compose("config", [f"task={task}", *given]).task)
+
+
+@contextmanager
+def _hydra() -> Iterator[ConfigLoader]:
+    """Initialise Hydra with `CONF` and restore its global state afterwards, for programs that use Hydra themselves."""
+    before = GlobalHydra.instance().hydra, VersionBase.instance().version_base
+    GlobalHydra.instance().clear()
+    offer_options()
+    try:
+        with hydra.initialize_config_dir(str(CONF), version_base="1.3"):
+            yield GlobalHydra.instance().config_loader()
+    finally:
+        GlobalHydra.instance().hydra, VersionBase.instance().version_base = before

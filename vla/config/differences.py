@@ -1,0 +1,34 @@
+"""Comparison of two plain configs."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+# Keys that do not change the result of a run.
+NOT_COMPARED = ("output", "cluster", "job", "resume", "trust", "preview", "inspect", "export", "benchmark", "report")
+ABSENT = "-"  # value of a key that one of two configs lacks
+
+
+def at(config: Any, key: str, absent: Any = ABSENT) -> Any:
+    """Return the value of a plain config at a dotted key, or `absent`."""
+    for name in key.split("."):
+        if not isinstance(config, Mapping) or name not in config:
+            return absent
+        config = config[name]
+    return config
+
+
+def differences(one: Any, other: Any, key: str = "") -> list[tuple[str, Any, Any]]:
+    """Return dotted key and both values of every difference between two plain configs, except `NOT_COMPARED`.
+
+    A node that only one of them has is one entry, with `ABSENT` for the other.
+    """
+    if not (isinstance(one, Mapping) and isinstance(other, Mapping)):
+        return [] if one == other else [(key, one, other)]
+    found = []
+    for name in dict.fromkeys((*one, *other)):
+        if key or name not in NOT_COMPARED:
+            values = one.get(name, ABSENT), other.get(name, ABSENT)
+            found += differences(*values, f"{key}.{name}" if key else str(name))
+    return found

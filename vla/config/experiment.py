@@ -1,0 +1,239 @@
+"""A composed config as plain values, and factories of environment, expert, model, policy and data."""
+
+from __future__ import annotations
+
+import copy
+import logging
+from collections.abc import Callable, Mapping
+from contextlib import nullcontext
+from dataclasses import dataclass, field, replace
+from functools import partial, reduce
+from operator import getitem
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from omegaconf import DictConfig, OmegaConf
+
+from vla.config.build import build
+from vla.config.check import with_changes
+from vla.config.differences import differences
+from vla.config.packages import trusted, with_trust
+from vla.tasks.gl import choose_backend
+
+if TYPE_CHECKING:
+    from vla.data.datamodule import WindowDataModule
+    from vla.data.episodes import EpisodeStore
+    from vla.models.learner import Learner
+    from vla.models.model import Model
+    from vla.models.tokenizers.tokenizer import ActionTokenizer
+    from vla.parallel.pool import Cluster
+    from vla.policy import Checkpoint, Policy
+    from vla.spec import Agent, Environment, Recorder, Spec
+
+log = logging.getLogger(__name__)
+
+Node = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """A checked config as plain values, with a factory per part.
+
+    Factories for worker processes hold only plain values, so they can be pickled, and the list of trusted packages.
+    """
+
+    config: Node  # resolved
+    changes: list[Node] = field(default_factory=list)  # key, value and default of every difference from the default
+
+    @classmethod
+    def of(cls, cfg: DictConfig, default: DictConfig | None = None) -> Experiment:
+        """Create the experiment of a composed config; `default` is the config without overrides."""
+        chosen, standard = (OmegaConf.to_container(each, resolve=False) for each in (cfg, default or cfg))
+        changes = [{"key": key, "here": here, "default": before} for key, here, before in differences(chosen, standard)]
+        return cls(plain(cfg), changes)
+
+    def __getitem__(self, key: str) -> Any:
+        """Return a top-level node or value."""
+        return self.config[key]
+
+    def with_values(self, values: Mapping[str, Any]) -> Experiment:
+        """Return a copy with other values at dotted keys."""
+        config = copy.deepcopy(self.config)
+        for key, value in values.items():
+            *path, name = key.split(".")
+            node: Any = reduce(getitem, path, config)
+            node[name] = value
+        return replace(self, config=config)
+
+    @property
+    def output(self) -> Path:
+        """Folder of the results, created if missing."""
+        folder = Path(self["output"])
+        folder.mkdir(parents=True, exist_ok=True)
+        return folder
+
+    @property
+    def checkpoint(self) -> Path | None:
+        """Checkpoint of the policy that the job uses, if given."""
+        return Path(self["checkpoint"]) if self["checkpoint"] else None
+
+    @property
+    def source(self) -> Node:
+        """The nodes that determine the demonstrations."""
+        return {"task": self["task"], "expert": self["expert"]}
+
+    def make_environment(self, changes: Node | None = None) -> Callable[[], Environment]:
+        """Return the factory of the environment, with the `changes` of a condition."""
+        return partial(with_trust, trusted(), make_environment, with_changes(self["task"], changes or {}))
+
+    def make_expert(self) -> Callable[[Environment], Agent]:
+        """Return the factory of the expert for an environment."""
+        return partial(with_trust, trusted(), make_expert, self["expert"])
+
+    def make_policy(self, checkpoint: Path | None = None) -> Callable[..., Policy]:
+        """Return the factory of the policy in a checkpoint, by default `checkpoint` of the config.
+
+        Raises:
+            ValueError: no checkpoint is given.
+        """
+        checkpoint = checkpoint or self.checkpoint
+        if checkpoint is None:
+            raise ValueError("this needs a trained policy: checkpoint=FILE")
+        return partial(with_trust, trusted(), make_policy, self["policy"], checkpoint)
+
+    def make_recorder(self, folder: Path) -> Callable[[], Recorder] | None:
+        """Return the factory of the recorder that writes into a folder, or None without a recorder."""
+        if not self["recorder"]:
+            return None
+        return partial(with_trust, trusted(), build, self["recorder"], "recorder", folder=folder)
+
+    def cluster(self) -> Cluster:
+        """Build the cluster."""
+        made: Cluster = build(self["cluster"], "cluster")
+        return made
+
+    def learner(self, spec: Spec, origin: Path | None = None) -> Learner:
+        """Build the learner; without `origin`, fit its tokenizer afterwards with `fit_tokenizer`.
+
+        Args:
+            spec: of the demonstrations.
+            origin: checkpoint with the initial weights.
+
+        Raises:
+            ValueError: `origin` is no checkpoint, or its policy has another spec.
+        """
+        from vla.policy import read_checkpoint
+
+        node = self["model"]
+        saved = read_checkpoint(origin) if origin else None
+        if saved:
+            saved.spec.without_truth.require(
+                spec.without_truth, f"the checkpoint {origin}", "what it is to be trained on"
+            )
+            spec, node = replace(spec, robot=saved.spec.robot), _without_pretraining(node)
+        model = _model(node, spec, build(self["tokenizer"], "tokenizer", spec=spec), saved)
+        if saved:
+            saved.initialize(model)
+        made: Learner = build(self["learner"], "learner", model=model, spec=spec, config=self.config)
+        return made
+
+    def fit_tokenizer(self, tokenizer: ActionTokenizer, store: EpisodeStore) -> None:
+        """Fit a tokenizer to a store's actions."""
+        fitted = build(self["tokenizer"], "tokenizer", spec=store.spec, statistics=store.statistics)
+        tokenizer.load_state_dict(fitted.state_dict())
+
+    @property
+    def pretrained(self) -> Path | None:
+        """Checkpoint with the initial weights of a training, if given."""
+        return Path(self["pretrained"]) if self["pretrained"] else None
+
+    def fitted_learner(self, store: EpisodeStore) -> Learner:
+        """Build the learner of a new training, with a tokenizer from `pretrained` or fitted to the store's actions."""
+        learner = self.learner(store.spec, self.pretrained)
+        if self.pretrained is None:
+            self.fit_tokenizer(learner.model.tokenizer, store)
+        return learner
+
+    def data(self, store: EpisodeStore, history: int, chunk: int) -> WindowDataModule:
+        """Build windows of `history` frames and `chunk` actions from the first `collect.episodes` of a store."""
+        made: WindowDataModule = build(
+            self["data"],
+            "data",
+            folder=store.folder,
+            spec=store.spec,
+            history=history,
+            chunk=chunk,
+            episodes=self["collect"]["episodes"],
+        )
+        return made
+
+
+def plain(node: DictConfig) -> Node:
+    """Convert a composed node to dicts and lists."""
+    plain = OmegaConf.to_container(node, resolve=True)
+    assert isinstance(plain, dict)
+    return {str(key): value for key, value in plain.items()}
+
+
+def make_environment(task: Node) -> Environment:
+    """Build the environment of a task node, with a GL backend that works on this machine."""
+    choose_backend()
+    environment: Environment = build(task, "task")
+    return environment
+
+
+def make_expert(expert: Node, environment: Environment) -> Agent:
+    """Build the expert for an environment.
+
+    Raises:
+        ValueError: the expert is a recording, which cannot act.
+    """
+    from vla.data.formats.imported_demonstrations import ImportedDemonstrations
+
+    agent: Agent = build(expert, "expert", spec=environment.spec)
+    if isinstance(agent, ImportedDemonstrations):
+        raise ValueError("recorded demonstrations cannot act: this job needs another expert, such as expert=waypoint")
+    return agent
+
+
+def make_policy(policy: Node, checkpoint: Path, environment: Environment | None = None) -> Policy:
+    """Build the policy in a checkpoint with the options of a policy node.
+
+    Raises:
+        ValueError: there is no checkpoint, or its spec differs from the environment's.
+    """
+    from vla.policy import read_checkpoint
+
+    saved = read_checkpoint(checkpoint)
+    if environment is not None:
+        saved.spec.without_truth.require(environment.spec.without_truth, f"the checkpoint {checkpoint}", "the task")
+    tokenizer = build(saved.config["tokenizer"], "tokenizer", spec=saved.spec)
+    model = _model(_without_pretraining(saved.config["model"]), saved.spec, tokenizer, saved)
+    saved.restore(model)
+    made: Policy = build(policy, "policy", model=model, spec=saved.spec)
+    return made
+
+
+def training_policy(policy: Node, model: Model) -> Policy:
+    """Build the policy of a model in training, on the model's device and without a second compilation."""
+    here = {**policy, "device": next(model.parameters()).device.type, "compile": False}
+    made: Policy = build(here, "policy", model=model, spec=model.spec)
+    return made
+
+
+def _model(node: Node, spec: Spec, tokenizer: ActionTokenizer, saved: Checkpoint | None) -> Model:
+    """Build the model of a node; with a checkpoint, refuse a model larger than its file."""
+    from vla.policy import TensorBudget
+
+    with TensorBudget(saved.path) if saved else nullcontext():
+        model: Model = build(node, "model", spec=spec, tokenizer=tokenizer)
+    return model
+
+
+def _without_pretraining(model: Node) -> Node:
+    """Remove pretrained weights from a model node whose weights all come from a checkpoint."""
+    nowhere = {"image": "pretrained", "text": "name"}
+    parts = {
+        part: model[part] for part, key in nowhere.items() if isinstance(model.get(part), dict) and key in model[part]
+    }
+    return {**model, **{part: {**node, nowhere[part]: ""} for part, node in parts.items()}}

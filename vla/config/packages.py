@@ -1,0 +1,121 @@
+"""Third-party packages: their config options, and trust in their classes.
+
+A package adds options by an entry point of the group `vla.conf`, which names the folder of its YAML files. Its classes
+are built only if the user trusts the package by name, or chooses the class on the command line.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import sys
+from collections.abc import Iterable
+from functools import cache
+from importlib.metadata import entry_points, packages_distributions, requires
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+from hydra.core.config_search_path import ConfigSearchPath
+from hydra.core.plugins import Plugins
+from hydra.plugins.search_path_plugin import SearchPathPlugin
+
+TRUST = "VLA_TRUST"  # environment variable of the user: packages, separated by commas
+TRUSTED = "VLA_TRUSTED"  # environment variable that passes trusted packages and classes to child processes
+ENTRY_POINTS = "vla.conf"
+
+
+class InstalledOptions(SearchPathPlugin):
+    """Adds the options of installed packages to Hydra's search path, after those of `vla`, which take precedence."""
+
+    def manipulate_search_path(self, search_path: ConfigSearchPath) -> None:
+        """Append the folder of every package."""
+        for package, folder in option_folders():
+            search_path.append(package, f"file://{folder}")
+
+
+def offer_options() -> None:
+    """Register the options of installed packages with Hydra."""
+    Plugins.instance().register(InstalledOptions)
+
+
+@cache
+def option_folders() -> tuple[tuple[str, Path], ...]:
+    """Return (package, folder of options) of installed packages, without importing them.
+
+    Raises:
+        ValueError: an installed package names a folder that does not exist.
+    """
+    found = []
+    for entry in sorted(entry_points(group=ENTRY_POINTS), key=lambda entry: entry.value):
+        package, *parts = entry.value.split(".")
+        spec = find_spec(package)
+        places = spec.submodule_search_locations or () if spec else ()
+        folder = next((path for place in places if (path := Path(place, *parts)).is_dir()), None)
+        if folder is None:
+            raise ValueError(
+                f"the installed package {package} names {entry.value} as its options, which is no folder: its wheel "
+                "must include the YAML files"
+            )
+        found.append((package, folder.resolve()))
+    return tuple(found)
+
+
+def trust(packages: Any, chosen: Iterable[Any]) -> None:
+    """Set the third-party classes that this process and its children may build.
+
+    Args:
+        packages: names of packages, in addition to those in the environment variable `VLA_TRUST`.
+        chosen: every `_target_` in the config composed from the command line, before any file is read. Of packages that
+            add options, exactly these classes are trusted.
+
+    Raises:
+        ValueError: `packages` is not a list, or names a package that cannot be trusted.
+    """
+    if not isinstance(packages, list):
+        raise ValueError(f"trust must be a list of packages, as in trust=[mypackage], got {packages!r}")
+    named = [*packages, *_names(TRUST)]
+    for name in named:
+        if not isinstance(name, str) or not can_be_trusted(name):
+            raise ValueError(
+                f"trust cannot name {name!r}: it takes packages made for vla, which have it among their dependencies"
+            )
+    offering = {package for package, _ in option_folders()}
+    classes = {each for each in chosen if isinstance(each, str) and each.partition(".")[0] in offering}
+    os.environ[TRUSTED] = ",".join(sorted({*named, *classes}))
+
+
+def trusted() -> list[str]:
+    """Return the trusted packages and classes; outside a run, those in the environment variable `VLA_TRUST`."""
+    return _names(TRUSTED if TRUSTED in os.environ else TRUST)
+
+
+def is_trusted(target: str) -> bool:
+    """Return whether the third-party class `target` may be built."""
+    matches = any(f"{target}.".startswith(f"{name}.") for name in trusted())
+    return matches and can_be_trusted(target.partition(".")[0])
+
+
+@cache
+def can_be_trusted(package: str) -> bool:
+    """Return whether a top-level package can be trusted: it depends on `vla`, or belongs to no distribution.
+
+    Constructors of the standard library and of other libraries may act on files, processes and networks.
+    """
+    if not package.isidentifier() or package.startswith("_") or package in sys.stdlib_module_names:
+        return False
+    return all(map(_needs_vla, packages_distributions().get(package, ())))
+
+
+def with_trust(names: list[str], function: Any, *arguments: Any, **named: Any) -> Any:
+    """Call a function in a process of this or another machine with the trust of the calling process."""
+    os.environ[TRUSTED] = ",".join(sorted({*trusted(), *names}))
+    return function(*arguments, **named)
+
+
+def _names(variable: str) -> list[str]:
+    return [name for each in os.environ.get(variable, "").split(",") if (name := each.strip())]
+
+
+def _needs_vla(distribution: str) -> bool:
+    return any(re.fullmatch(r"vla\b(?![.-]).*", requirement, re.DOTALL) for requirement in requires(distribution) or ())

@@ -1,0 +1,208 @@
+"""Data module of training windows: a history of frames and a chunk of the actions that follow.
+
+A batch is one gather per field from the memory-mapped rows of the episode store, made by one thread while the model
+works on earlier batches. Its windows depend on the seed and the step number alone, so a resumed run is trained on
+exactly the batches of an uninterrupted one.
+"""
+
+# B batch, T history frames, k action chunk, D action components, S truth scalars
+
+from __future__ import annotations
+
+import hashlib
+import time
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+from lightning import LightningDataModule
+
+from vla.data.episodes import EpisodeStore
+from vla.data.window_batches import Batch, WindowBatcher
+from vla.io.types import Count, Natural, Rate, Seed
+from vla.spec import Array, Spec
+
+# Multiplying by the golden ratio spreads consecutive seeds evenly over the circle of 32-bit numbers (Knuth, The Art of
+# Computer Programming 3, section 6.4): every stretch of seeds gets its share of held-out episodes.
+GOLDEN = 2654435769
+
+
+def held_out(seed: Seed, fraction: float) -> bool:
+    """Return whether the episode of `seed` is held out for validation, independently of other episodes."""
+    return seed * GOLDEN % 2**32 < fraction * 2**32
+
+
+class Prefetcher:
+    """Iterable of batches, made by one background thread.
+
+    Args:
+        make_batch: windows (B,) → batch.
+        plan: returns the windows of every batch, in order.
+        ahead: number of batches made in advance.
+
+    Attributes:
+        waited: total time that the consumer waited for batches [s].
+    """
+
+    def __init__(self, make_batch: Callable[[Array], Batch], plan: Callable[[], Iterable[Array]], ahead: int) -> None:
+        self._make_batch, self._plan, self._ahead = make_batch, plan, ahead
+        self.waited = 0.0
+
+    def __iter__(self) -> Iterator[Batch]:
+        maker = ThreadPoolExecutor(1, "windows")  # unlike a daemon thread, joined at exit
+        pending: deque[Future[Batch]] = deque()
+        try:
+            for windows in self._plan():
+                pending.append(maker.submit(self._make_batch, windows))
+                if len(pending) > self._ahead:
+                    yield self._wait_for(pending.popleft())
+            while pending:
+                yield self._wait_for(pending.popleft())
+        finally:
+            maker.shutdown(wait=False, cancel_futures=True)
+
+    def _wait_for(self, batch: Future[Batch]) -> Batch:
+        started = time.perf_counter()
+        made = batch.result()
+        self.waited += time.perf_counter() - started
+        return made
+
+
+class SizedPrefetcher(Prefetcher):
+    """Prefetcher of a known number of batches."""
+
+    def __init__(self, make_batch: Callable[[Array], Batch], batches: list[Array], ahead: int) -> None:
+        super().__init__(make_batch, lambda: batches, ahead)
+        self._length = len(batches)
+
+    def __len__(self) -> int:
+        return self._length
+
+
+class WindowDataModule(LightningDataModule):
+    """Windows of an episode store, split by episode and divided among the processes of a trainer.
+
+    Training batches are endless (bounded by the trainer's `max_steps`); validation is one pass over windows spaced
+    evenly over the held-out episodes, in whole batches.
+
+    Args:
+        folder: the episode store.
+        spec: layout of a step that the model expects.
+        history: frames T in a window.
+        chunk: actions k that label a frame.
+        seed: of the order of training windows.
+        batch_size: windows B in a batch, per process.
+        validation_fraction: share of the episodes held out, 0…1; 0 trains on all of them and does not validate.
+        validation_windows: approximate number of held-out windows per validation, over all processes.
+        depth: include depth in batches.
+        ahead: batches made in advance.
+        episodes: use only the first so many episodes; all of them when None.
+    """
+
+    def __init__(
+        self,
+        folder: str | Path,
+        spec: Spec,
+        history: int,
+        chunk: int,
+        seed: Seed,
+        batch_size: Count,
+        validation_fraction: Rate,
+        validation_windows: Count,
+        depth: bool,
+        ahead: Natural,
+        episodes: Count | None = None,
+    ) -> None:
+        super().__init__()
+        self.batch_size = batch_size
+        self._folder, self._spec, self._episodes = Path(folder), spec, episodes
+        self._history, self._chunk, self._depth = history, chunk, depth
+        self._seed, self._ahead = seed, ahead
+        self._fraction, self._validation_windows = validation_fraction, validation_windows
+
+    def setup(self, stage: str | None = None) -> None:
+        """Open the store and split its episodes.
+
+        Raises:
+            ValueError: the store cannot be read, has another spec, or too few episodes to split.
+        """
+        store = EpisodeStore(self._folder, self._episodes)
+        self._spec.require(store.spec, "the model", f"the episode store {self._folder}")
+        sides: dict[bool, list[Array]] = {False: [], True: []}
+        for entry in store.episodes:
+            sides[held_out(entry.seed, self._fraction)].append(np.arange(entry.start, entry.end))
+        if not sides[False] or (self._fraction > 0 and not sides[True]):
+            raise ValueError(
+                f"{len(store.episodes)} episodes leave {len(sides[False])} for training and {len(sides[True])} for "
+                f"validation: raise collect.episodes, or set data.validation_fraction (now {self._fraction})"
+            )
+        entries = repr([(entry.seed, entry.steps, entry.crc) for entry in store.episodes])
+        self._digest = hashlib.sha256(entries.encode()).hexdigest()[:12]
+        self.training_windows = np.concatenate(sides[False])  # row numbers
+        self.held_out_windows = np.concatenate(sides[True]) if sides[True] else np.empty(0, np.int64)
+        self.make_batch = WindowBatcher(store, self._history, self._chunk, self._depth, self._on_gpu())
+
+    def state_dict(self) -> dict[str, str]:
+        """Return a digest of the demonstrations, which is saved with checkpoints."""
+        return {"windows": self._digest}
+
+    def load_state_dict(self, state: dict[str, str]) -> None:
+        """Compare the demonstrations with those of the resumed training.
+
+        Raises:
+            ValueError: they differ.
+        """
+        if state["windows"] != self._digest:
+            raise ValueError(
+                f"the resumed training was started with other demonstrations than those in {self._folder}: "
+                "set collect.folder=DIR to their folder, or start a new training without checkpoint="
+            )
+
+    def train_dataloader(self) -> Prefetcher:
+        """Return endless batches, from the trainer's current step on."""
+        return Prefetcher(self.make_batch, self._training_plan, self._ahead)
+
+    def val_dataloader(self) -> SizedPrefetcher | list[Batch]:
+        """Return the validation batches, the same every time."""
+        if not len(self.held_out_windows):
+            return []
+        rank, processes = self._place()
+        share = self.batch_size * processes
+        batches = max(1, min(self._validation_windows, len(self.held_out_windows)) // share)
+        # Whole batches: one shape for a compiled model, and the same number of steps in all processes.
+        spread = np.linspace(0, len(self.held_out_windows) - 1, batches * share).round().astype(np.int64)
+        windows = self.held_out_windows[spread].reshape(batches, self.batch_size, processes)
+        return SizedPrefetcher(self.make_batch, list(windows[:, :, rank]), self._ahead)
+
+    def order(self, step: int, rank: int = 0, processes: int = 1) -> Array:
+        """Return the windows (B,) of training step `step` in process `rank`, as row numbers.
+
+        The order is a sequence of permutations of all windows, divided into runs of B.
+        """
+        first = (step * processes + rank) * self.batch_size
+        count = len(self.training_windows)
+        shuffle, place = np.divmod(np.arange(first, first + self.batch_size), count)
+        numbers = range(shuffle[0], shuffle[-1] + 1)
+        chosen = [_shuffled(count, self._seed, number)[place[shuffle == number]] for number in numbers]
+        return self.training_windows[np.concatenate(chosen)]
+
+    def _training_plan(self) -> Iterator[Array]:
+        rank, processes = self._place()
+        step = self.trainer.global_step * self.trainer.accumulate_grad_batches if self.trainer else 0
+        while True:
+            yield self.order(step, rank, processes)
+            step += 1
+
+    def _place(self) -> tuple[int, int]:
+        return (self.trainer.global_rank, self.trainer.world_size) if self.trainer else (0, 1)
+
+    def _on_gpu(self) -> bool:
+        return self.trainer is not None and self.trainer.strategy.root_device.type == "cuda"
+
+
+@lru_cache(maxsize=2)
+def _shuffled(count: int, seed: Seed, number: int) -> Array:
+    return np.random.default_rng([seed, number]).permutation(count)

@@ -1,0 +1,208 @@
+"""Exporters of an episode store: their common base, and the export to plain files."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from abc import ABC, abstractmethod
+from collections import deque
+from collections.abc import Callable, Generator, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from functools import partial
+from pathlib import Path
+from typing import Any, Generic, TypeVar
+
+import numpy as np
+from filelock import FileLock, Timeout
+from PIL import Image
+from rich.progress import track
+
+from vla.data.episodes import EpisodeStore
+from vla.data.index import Entry
+from vla.io.documents import read_json
+from vla.io.files import writing
+from vla.io.types import Text
+from vla.parallel.pool import THIS_PROCESS, Cluster, WorkersLost
+from vla.spec import Array, Spec
+
+MILLIMETRE = np.float32(0.001)  # [m]
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+
+
+class FolderExporter(ABC):
+    """Base class of exports with one folder per episode, whose `manifest.json` gives its provenance.
+
+    Args:
+        folder: of the export.
+    """
+
+    def __init__(self, folder: Text | Path) -> None:
+        self._folder = Path(folder).resolve()
+
+    def export(self, store: EpisodeStore, cluster: Cluster = THIS_PROCESS) -> Path:
+        """Write the missing episodes, each atomically; returns the folder.
+
+        Raises:
+            ValueError: the folder holds an episode of another store, or the store is damaged.
+        """
+        self._folder.mkdir(parents=True, exist_ok=True)
+        with staging_folder(self._folder) as place:
+            missing = [number for number in range(len(store.episodes)) if not self._is_exported(store, number)]
+            for _ in map_episodes(partial(self._export, place), store, missing, cluster, place):
+                pass
+        return self._folder
+
+    def _is_exported(self, store: EpisodeStore, number: int) -> bool:
+        folder = self._folder / f"episode_{number:05d}"
+        if not folder.exists():
+            return False
+        manifest = self._manifest(store, number)
+        if read_json(folder / "manifest.json", dict[str, Any]) != manifest:
+            raise ValueError(
+                f"{folder} was exported from other episodes, or as other files: choose another export.folder"
+            )
+        return True
+
+    def _manifest(self, store: EpisodeStore, number: int) -> dict[str, Any]:
+        entry, layout = store.episodes[number], {"layout": type(self).__name__, **self.settings()}
+        return provenance(entry) | layout | {"spec": store.spec.to_dict()}
+
+    def _export(self, place: Path, store: EpisodeStore, number: int) -> None:
+        entry = store.episodes[number]
+        draft = place / f"episode_{number:05d}"
+        shutil.rmtree(draft, ignore_errors=True)  # left by an interrupted export
+        self.write(draft, store.spec, entry, store.read(entry))
+        write_json(draft / "manifest.json", self._manifest(store, number))
+        os.rename(draft, self._folder / draft.name)
+
+    def settings(self) -> dict[str, Any]:
+        """Return the settings that the files depend on, as JSON values."""
+        return {}
+
+    @abstractmethod
+    def write(self, folder: Path, spec: Spec, entry: Entry, rows: dict[str, Array]) -> None:
+        """Write the (steps, …) rows of an episode, by field, into the new folder `folder`."""
+
+
+class Files(FolderExporter):
+    """Export with one folder per episode and one folder of plain files per step.
+
+        episode_00000/manifest.json                  spec and provenance of the episode
+        episode_00000/step_0000/rgb_image.png        (H, W, 3) uint8
+        episode_00000/step_0000/depth_image.npy      (H, W) float32 [m], 0: no return; of depth cameras
+        episode_00000/step_0000/robot_state.json     component of the state → value
+        episode_00000/step_0000/expert_action.json   the action to imitate and the executed one, each (D,)
+
+    With several cameras the images of each are in a folder of its name: `step_0000/front/rgb_image.png`.
+    """
+
+    def write(self, folder: Path, spec: Spec, entry: Entry, rows: dict[str, Array]) -> None:
+        """Write one episode."""
+        for step in range(entry.steps):
+            place = folder / f"step_{step:04d}"
+            for camera in spec.cameras:
+                images = place / camera if len(spec.cameras) > 1 else place
+                images.mkdir(parents=True)
+                Image.fromarray(rows[f"rgb_{camera}"][step]).save(images / "rgb_image.png", compress_level=1)
+                if camera in spec.depth:
+                    np.save(images / "depth_image.npy", rows[f"depth_{camera}"][step] * MILLIMETRE)
+            state = dict(zip(spec.state, rows["state"][step].tolist(), strict=True))
+            write_json(place / "robot_state.json", state)
+            action = {name: rows[name][step].tolist() for name in ("action", "executed")}
+            write_json(place / "expert_action.json", action)
+
+
+def provenance(entry: Entry) -> dict[str, Any]:
+    """Return seed, instruction, outcome, draws and checksums of an episode, as JSON values."""
+    return {
+        "seed": entry.seed,
+        "task": entry.task,
+        "instruction": entry.instruction,
+        "outcome": entry.outcome,
+        "milestones": list(entry.milestones),
+        "steps": entry.steps,
+        "draws": entry.draws,
+        "crc": entry.crc,
+    }
+
+
+def write_json(path: Path, value: Any) -> None:
+    """Write readable JSON."""
+    path.write_text(json.dumps(value, ensure_ascii=False, indent=1) + "\n", encoding="utf-8")
+
+
+def require_empty(folder: Path) -> None:
+    """Require a folder to be missing or empty.
+
+    Raises:
+        ValueError: the folder has content, or is a file.
+    """
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise ValueError(f"{folder} has content other than these episodes: choose another export.folder")
+
+
+@contextmanager
+def staging_folder(folder: Path) -> Iterator[Path]:
+    """Yield a hidden folder beside `folder` for incomplete files; it is removed on success and kept on failure.
+
+    Raises:
+        ValueError: another process is exporting to `folder`.
+        OSError: the export cannot be written; the message names `folder`.
+    """
+    place = folder.with_name(f".{folder.name}.unfinished")
+    place.mkdir(parents=True, exist_ok=True)
+    lock = FileLock(place / "lock")
+    try:
+        lock.acquire(timeout=0)
+    except Timeout as error:
+        raise ValueError(f"another export to {folder} is under way: wait, or choose another export.folder") from error
+    try:
+        with writing(folder):
+            yield place
+        shutil.rmtree(place)
+    finally:
+        with suppress(OSError):  # removes the folder only if it is empty
+            (place / "lock").unlink()
+            place.rmdir()
+        lock.release()
+
+
+def map_episodes(
+    work: Callable[[EpisodeStore, Item], Result],
+    store: EpisodeStore,
+    items: Sequence[Item],
+    cluster: Cluster,
+    *needs: Path,
+) -> Generator[Result]:
+    """Yield the results of `work(store, item)` in the order of the items, computed on a cluster.
+
+    Workers also access the paths `needs`.
+
+    Raises:
+        ValueError: raised by `work` or by the cluster.
+    """
+    folder = store.folder.resolve()
+    make = partial(_ExportWorker, work, folder, len(store.episodes))
+    with cluster.pool(make, (folder, *needs)) as pool:
+        pending = deque(map(pool.submit, items))
+        try:
+            yield from track((pending.popleft().result() for _ in items), "exporting", len(items))
+        except WorkersLost as lost:
+            raise WorkersLost(f"{lost}; written files are kept, run again to continue") from lost
+
+
+class _ExportWorker(Generic[Item, Result]):
+    """Worker that opens the store once per process."""
+
+    def __init__(self, work: Callable[[EpisodeStore, Item], Result], folder: Path, episodes: int) -> None:
+        self._work, self._store = work, EpisodeStore(folder, episodes)
+
+    def attempt(self, item: Item) -> Result:
+        """Process one item."""
+        return self._work(self._store, item)
+
+    def close(self) -> None:
+        """Do nothing: there are no resources to free."""

@@ -1,0 +1,133 @@
+"""Reader of untrusted tables of a LeRobot dataset: bounded in rows, and of the expected types."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.parquet as pq
+
+from vla.io.files import require_file
+from vla.spec import Array
+
+REMEDY = "copy the dataset again from where it is whole"
+MOST_ROWS = 10_000_000  # of a file: 280 hours at 10 Hz
+MOST_BYTES = 2**33  # to unpack at once
+LONGEST = 1e6  # video [s]
+
+Kind = Callable[[pa.ChunkedArray], bool]  # predicate of a column; its docstring is the expected type
+
+
+def counts(column: pa.ChunkedArray) -> bool:
+    """integers from 0 on"""
+    return pa.types.is_integer(column.type) and _within(column, 0, 2**53)
+
+
+def times(column: pa.ChunkedArray) -> bool:
+    """seconds"""
+    return pa.types.is_floating(column.type) and _within(column, 0, LONGEST)
+
+
+def texts(column: pa.ChunkedArray) -> bool:
+    """text"""
+    return (pa.types.is_string(column.type) or pa.types.is_large_string(column.type)) and not column.null_count
+
+
+def numbers(column: pa.ChunkedArray) -> bool:
+    """lists of numbers"""
+    of = column.type.value_type if _is_list(column.type) else column.type
+    return pa.types.is_floating(of) or pa.types.is_integer(of)
+
+
+def pixels(column: pa.ChunkedArray) -> bool:
+    """lists of lists of unsigned 16-bit integers"""
+    nested = _is_list(column.type) and _is_list(column.type.value_type)
+    return nested and bool(pa.types.is_uint16(column.type.value_type.value_type))
+
+
+def pictures(column: pa.ChunkedArray) -> bool:
+    """images, as the bytes of a file"""
+    if not pa.types.is_struct(column.type) or column.type.get_field_index("bytes") < 0:
+        return False
+    content = column.type.field("bytes").type
+    return pa.types.is_binary(content) or pa.types.is_large_binary(content)
+
+
+def read(paths: Sequence[Path], columns: Mapping[str, Kind], only: Any = None) -> pa.Table:
+    """Read the named columns of Parquet files, concatenated; `only` filters rows.
+
+    Raises:
+        ValueError: a file is damaged, too large, or lacks a column of the expected type.
+    """
+    found = [_read(path, columns, only) for path in paths]
+    try:
+        return pa.concat_tables(found, promote_options="permissive")
+    except pa.ArrowException as error:
+        raise ValueError(f"{paths[0]} and others beside it differ ({str(error)[:200]}): {REMEDY}") from error
+
+
+def columns_of(path: Path) -> list[str]:
+    """Return the names of the columns of a Parquet file.
+
+    Raises:
+        ValueError: it is damaged, no ordinary file, or has too many rows.
+    """
+    require_file(path)
+    try:
+        with pq.ParquetFile(path) as file:
+            rows, names = file.metadata.num_rows, file.schema_arrow.names
+    except (pa.ArrowException, OSError, UnicodeDecodeError) as error:
+        raise ValueError(f"{path} cannot be read ({str(error)[:200]}): {REMEDY}") from error
+    if rows > MOST_ROWS:
+        raise ValueError(f"{path} has {rows} rows, more than the {MOST_ROWS} that such a file can have")
+    return list(names)
+
+
+def _read(path: Path, columns: Mapping[str, Kind], only: Any) -> pa.Table:
+    present = columns_of(path)
+    if missing := [name for name in columns if name not in present]:
+        raise ValueError(f"{path} lacks the columns {', '.join(missing)}: {REMEDY}")
+    if (unpacked := _unpacked_size(path, columns, only is not None)) > MOST_BYTES:
+        raise ValueError(f"{path} unpacks to {unpacked / 1e9:.0f} GB, more than the {MOST_BYTES / 1e9:.0f} GB it may")
+    try:
+        table = pq.read_table(path, columns=[*columns], filters=only, page_checksum_verification=True)
+        table.validate(full=True)
+    except (pa.ArrowException, OSError) as error:
+        raise ValueError(f"{path} cannot be read ({str(error)[:200]}): {REMEDY}") from error
+    for name, is_kind in columns.items():
+        if not is_kind(table[name]):
+            raise ValueError(f"{path}: {name} does not hold {is_kind.__doc__}: {REMEDY}")
+    return table
+
+
+def _unpacked_size(path: Path, columns: Collection[str], filtered: bool) -> int:
+    """Return the size of columns without compression and run lengths [bytes], of the largest group of rows if filtered.
+
+    The file says so itself. Rows that repeat one text of a dictionary are larger.
+    """
+    metadata, sizes = pq.read_metadata(path), []
+    for group in (metadata.row_group(number) for number in range(metadata.num_row_groups)):
+        of = [group.column(number) for number in range(group.num_columns)]
+        chosen = [column for column in of if column.path_in_schema.partition(".")[0] in columns]
+        sizes.append(sum(max(column.total_uncompressed_size, 8 * column.num_values) for column in chosen))
+    return (max if filtered else sum)([0, *sizes])
+
+
+def matrix(column: pa.ChunkedArray, size: int) -> Array | None:
+    """Return a column of `numbers` as (N, size) float32; None if rows have another size or are not finite."""
+    flat = pc.list_flatten(column) if _is_list(column.type) else column
+    values = np.asarray(flat.combine_chunks(), np.float32)
+    return values.reshape(-1, size) if len(values) == len(column) * size and np.isfinite(values).all() else None
+
+
+def _is_list(kind: pa.DataType) -> bool:
+    return pa.types.is_list(kind) or pa.types.is_fixed_size_list(kind) or pa.types.is_large_list(kind)
+
+
+def _within(column: pa.ChunkedArray, low: float, high: float) -> bool:
+    values = column.to_numpy()  # nulls become NaN
+    return not column.null_count and bool(((values >= low) & (values <= high)).all())

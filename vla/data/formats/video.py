@@ -1,0 +1,95 @@
+"""AV1 video of camera images, encoded and decoded with PyAV."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Iterable
+from contextlib import suppress
+from fractions import Fraction
+from pathlib import Path
+
+import av
+import numpy as np
+from av.video.frame import PictureType
+
+from vla.io.files import require_file
+from vla.spec import Array
+
+CODEC = "libsvtav1"
+PIXELS = "yuv420p"  # the only layout that the encoder supports
+
+
+def encode(path: Path, clips: Iterable[Array], size: tuple[int, int], fps: Fraction, crf: int) -> None:
+    """Write clips, each (N, H, W, 3) uint8 with images of `size` (H, W), in sequence as one MP4.
+
+    Every clip begins with a key frame, and at least every second frame is one, for fast random access. The same clips
+    give the same bytes. `crf` is the quality, from 0 (best) to 63.
+    """
+    os.environ.setdefault("SVT_LOG", "1")  # errors only: the encoder prints its settings for every file otherwise
+    options = {"g": "2", "crf": str(crf), "preset": "12", "svtav1-params": "lp=1"}  # files run in parallel
+    with av.open(path, "w", format="mp4", options={"fflags": "+bitexact"}) as file:
+        stream = file.add_stream(CODEC, rate=fps, options=options)
+        assert isinstance(stream, av.VideoStream)
+        stream.pix_fmt = PIXELS
+        stream.height, stream.width = size
+        _open_codec(stream)
+        number = 0
+        for clip in clips:
+            for place, image in enumerate(clip):
+                frame = av.VideoFrame.from_ndarray(image, format="rgb24")
+                frame.pts, frame.time_base = number, 1 / fps
+                if place == 0:
+                    frame.pict_type = PictureType.I
+                file.mux(stream.encode(frame))
+                number += 1
+        file.mux(stream.encode(None))
+
+
+def _open_codec(stream: av.VideoStream) -> None:
+    """Open the encoder of a stream, and undo the real-time priority that SVT-AV1 takes.
+
+    Run by root, it moves its threads and the calling one to SCHED_FIFO with priority 99, which starves every other
+    process of the machine, also after the video is closed.
+    """
+    if sys.platform != "linux":
+        return
+    policy, parameters = os.sched_getscheduler(0), os.sched_getparam(0)
+    stream.codec_context.open()
+    for thread in os.listdir("/proc/self/task"):
+        with suppress(ProcessLookupError):  # it has ended
+            if os.sched_getscheduler(int(thread)) == os.SCHED_FIFO:
+                os.sched_setscheduler(int(thread), policy, parameters)
+
+
+def decode(path: Path, start: float, count: int, fps: Fraction, size: tuple[int, int]) -> Array:
+    """Decode `count` frames of a video from `start` [s] on, as (count, H, W, 3) uint8 with images of `size` (H, W).
+
+    Raises:
+        ValueError: the video cannot be read, has images of another size, or lacks a frame.
+    """
+    images: dict[int, Array] = {}
+    require_file(path)
+    try:
+        with av.open(path) as file:
+            stream = file.streams.video[0]
+            _require_size(path, stream, size)  # before anything is decoded
+            file.seek(round(start / (stream.time_base or 1)), stream=stream)  # the key frame before it
+            for frame in file.decode(stream):
+                _require_size(path, frame, size)
+                number = -1 if frame.time is None else round((frame.time - start) * float(fps))
+                if number >= count:
+                    break
+                if number >= 0:
+                    images[number] = frame.to_ndarray(format="rgb24")
+    except (av.error.FFmpegError, OSError, IndexError) as error:
+        raise ValueError(f"{path} cannot be read as a video: {error}") from error
+    missing = [number for number in range(count) if number not in images]
+    if missing:
+        raise ValueError(f"{path} lacks the frame at {start + missing[0] / float(fps):.3f} s")
+    return np.stack([images[number] for number in range(count)])
+
+
+def _require_size(path: Path, images: av.VideoStream | av.VideoFrame, size: tuple[int, int]) -> None:
+    if (images.height, images.width) != size:
+        raise ValueError(f"{path} has images of {images.height} x {images.width} pixels, not {size[0]} x {size[1]}")

@@ -1,0 +1,258 @@
+"""Verification of episode stores, and derivation of new ones by repair, filtering and merging.
+
+Nothing is changed in place: a new store is written to a temporary folder and renamed when it is complete.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.progress import track
+
+from vla.data.episode_filter import EpisodeFilter
+from vla.data.episodes import EpisodeStore, observations_of, stored
+from vla.data.index import DAMAGED, LOST, Entry, listed
+from vla.spec import Array, Episode
+
+# N steps, D action components
+
+Found = tuple[EpisodeStore, Entry]
+
+
+class DamageError(ValueError):
+    """Difference of an episode from its checksums."""
+
+
+@dataclass(frozen=True)
+class StoreReport:
+    """Result of the verification of a store."""
+
+    store: EpisodeStore
+    whole: list[Entry]  # the undamaged episodes
+    damaged: dict[str, list[int]]  # kind of damage → seeds
+    actions: Array  # (N, D) float32, of the undamaged episodes
+    executed: Array  # (N, D) float32
+
+    @property
+    def hours(self) -> float:
+        """Robot time of the undamaged episodes [h]."""
+        return len(self.actions) / self.store.spec.control_hz / 3600
+
+    @property
+    def outcomes(self) -> dict[str, int]:
+        """Outcome → number of tried seeds, the most frequent first."""
+        failures = Counter(entry.outcome for entry in self.store.tried if not entry.success and entry.outcome != LOST)
+        failures[DAMAGED] += sum(map(len, self.damaged.values()))
+        return {"success": len(self.whole), **{cause: count for cause, count in failures.most_common() if count}}
+
+    @property
+    def success_rate(self) -> float:
+        """Share of the solved seeds among those of known outcome, 0…1."""
+        known = sum(self.outcomes.values()) - self.outcomes.get(DAMAGED, 0)
+        return len(self.whole) / known if known else 0.0
+
+    @property
+    def sizes(self) -> dict[str, int]:
+        """Field → bytes of the undamaged episodes."""
+        fields = {name: self.store.rows(name) for name in self.store.fields}
+        return {name: sum(stored(rows, entry.span).nbytes for entry in self.whole) for name, rows in fields.items()}
+
+
+def verify_store(store: EpisodeStore) -> StoreReport:
+    """Verify checksums, index, finite numbers and seeds of every episode of a store that may be damaged."""
+    damaged: dict[str, list[int]] = {}
+    whole, actions, executed = [], [], []
+    if lost := [entry.seed for entry in store.tried if entry.outcome == LOST]:
+        damaged["no readable line in the index"] = lost
+    if twice := _repeated_seeds(store):
+        damaged["in the index more than once"] = twice
+    for entry in track(store.episodes, description="verifying"):
+        rows, problem = _rows_of(store, entry)
+        if problem:
+            damaged.setdefault(problem, []).append(entry.seed)
+        else:
+            whole.append(entry)
+            actions.append(rows["action"])
+            executed.append(rows["executed"])
+    none = np.empty((0, len(store.spec.action)), np.float32)
+    return StoreReport(store, whole, damaged, np.concatenate([none, *actions]), np.concatenate([none, *executed]))
+
+
+def require_whole(report: StoreReport) -> None:
+    """Raise a ValueError if a store has damaged episodes or none."""
+    folder, count = report.store.folder, sum(map(len, report.damaged.values()))
+    if report.damaged:
+        problems = "; ".join(f"seeds {listed(seeds)}: {problem}" for problem, seeds in report.damaged.items())
+        raise ValueError(
+            f"{folder} has {count} damaged episodes ({problems}): inspect.repair=true leaves them out of a copy"
+        )
+    report.store.require_episodes()
+
+
+def find_episode(store: EpisodeStore, seed: int) -> tuple[dict[str, Any], Episode]:
+    """Return the config and the episode of a seed.
+
+    Raises:
+        ValueError: the seed was not tried, failed or occurs twice, or its episode is damaged.
+    """
+    found = [(config, entry) for config, entries in entries_by_config(store) for entry in entries if entry.seed == seed]
+    if not found:
+        seeds = [entry.seed for entry in store.tried]
+        raise ValueError(f"{store.folder} has no seed {seed}: it holds {listed(seeds) or 'none yet'}")
+    stored = [(config, entry) for config, entry in found if entry.success]
+    if not stored:
+        seeds = sorted({entry.seed for entry in store.episodes}, key=lambda other: abs(other - seed))[:2]
+        raise ValueError(
+            f"seed {seed} in {store.folder} ended as {found[0][1].outcome}, and only successes are kept: there is "
+            f"{' or '.join(map(str, seeds)) or 'none'}"
+        )
+    if len(stored) > 1:
+        raise ValueError(
+            f"{store.folder} has {len(stored)} episodes of seed {seed}: ask one of the stores it is made of"
+        )
+    return stored[0][0], episode_of(store, stored[0][1])
+
+
+def episode_of(store: EpisodeStore, entry: Entry) -> Episode:
+    """Read an episode back from a store; a DamageError if it is damaged."""
+    rows, problem = _rows_of(store, entry)
+    if problem:
+        raise DamageError(
+            f"seed {entry.seed} in {store.folder} is damaged ({problem}): inspect.repair=true leaves it out of a copy"
+        )
+    observations = observations_of(store.spec, rows, entry.instruction)
+    return replace(_without_rows(entry), observations=observations, actions=rows["action"], executed=rows["executed"])
+
+
+def _without_rows(entry: Entry) -> Episode:
+    """Return the episode of an index entry, without its rows."""
+    what = (entry.seed, entry.task, entry.instruction, entry.outcome, frozenset(entry.milestones), entry.draws)
+    return Episode(*what, observations=[], actions=np.empty((0, 0)), executed=np.empty((0, 0)))
+
+
+def entries_by_config(store: EpisodeStore) -> list[tuple[dict[str, Any], list[Entry]]]:
+    """Return the entries of a store by their config; a ValueError if the index of a derived store lost lines."""
+    if not store.derived:
+        return [(store.config, store.tried)]
+    ends = np.cumsum([0, *(part["entries"] for part in store.config["parts"])])
+    if ends[-1] != len(store.tried):
+        raise ValueError(f"the index of {store.folder} has lost lines: derive it again from its sources")
+    return [(part["config"], store.tried[ends[at] : ends[at + 1]]) for at, part in enumerate(store.config["parts"])]
+
+
+def derive_store(
+    stores: Sequence[EpisodeStore], folder: Path, where: Mapping[str, Any] | None = None, repair: bool = False
+) -> list[int]:
+    """Write a new store of the episodes in others of the same spec that match `where`, atomically.
+
+    Seeds are in order, config by config. Of the same seed and config one undamaged episode is kept. If all seeds
+    between the first and the last of a single config exist, the new store equals a collected one, and can grow.
+    Returns the seeds that are damaged in every store.
+
+    Args:
+        stores: sources of the episodes; with `repair` they may be damaged.
+        folder: of the new store; it must not exist.
+        where: conditions, see `vla.data.episode_filter`.
+        repair: turn a damaged episode into a failed seed instead of raising.
+
+    Raises:
+        ValueError: the folder exists, specs differ, nothing matches, or an episode is damaged.
+    """
+    if folder.exists():
+        raise ValueError(f"{folder} exists already and is left alone: choose another inspect.into")
+    for store in stores[1:]:
+        store.spec.require(stores[0].spec, f"the episode store {store.folder}", f"{stores[0].folder}")
+    chosen = _choose(stores, where or {})
+    episodes = sum(any(entry.success for _, entry in found) for seeds in chosen.values() for found in seeds.values())
+    if not episodes:
+        fitting = f" that fit inspect.where={dict(where)}" if where else ""
+        raise ValueError(f"{', '.join(str(store.folder) for store in stores)}: there are no episodes{fitting}")
+    draft = folder.with_name(f".{folder.name}.draft")
+    shutil.rmtree(draft, ignore_errors=True)  # left by a process that was killed
+    try:
+        store = EpisodeStore.create_or_open(draft, stores[0].spec, _config(chosen, stores, where))
+        with store.writing():
+            seeds = [(seed, found) for part in chosen.values() for seed, found in sorted(part.items())]
+            damaged = [seed for seed, found in track(seeds, "writing") if not _write(store, seed, found, repair)]
+        os.rename(draft, folder)
+    except BaseException as error:
+        shutil.rmtree(draft, ignore_errors=True)
+        if isinstance(error.__cause__, OSError):  # of a growing store, whose message does not apply here
+            raise ValueError(
+                f"{folder} cannot be written ({error.__cause__.strerror}), nothing of it is kept: make room there, or "
+                "choose another inspect.into"
+            ) from error
+        raise
+    return damaged
+
+
+Chosen = dict[str, dict[int, list[Found]]]  # config as JSON → seed → its copies
+
+
+def _choose(stores: Sequence[EpisodeStore], where: Mapping[str, Any]) -> Chosen:
+    matches = EpisodeFilter(where, [entry for store in stores for entry in store.tried])
+    chosen: Chosen = {}
+    for store in stores:
+        for config, entries in entries_by_config(store):
+            seeds = chosen.setdefault(json.dumps(config), {})
+            for entry in filter(matches, entries):
+                seeds.setdefault(entry.seed, []).append((store, entry))
+    return {config: seeds for config, seeds in chosen.items() if seeds}
+
+
+def _config(chosen: Chosen, stores: Sequence[EpisodeStore], where: Mapping[str, Any] | None) -> dict[str, Any]:
+    conditions = [condition for store in stores if store.derived for condition in store.config["where"]]
+    conditions += [dict(where)] if where else []
+    (config, seeds), *others = chosen.items()
+    exact = not any(store.lossy(field) for store in stores for field in store.fields)
+    if not others and not conditions and exact and max(seeds) - min(seeds) == len(seeds) - 1:
+        collected: dict[str, Any] = json.loads(config)
+        return collected
+    parts = [{"config": json.loads(config), "entries": len(seeds)} for config, seeds in chosen.items()]
+    return {"parts": parts, "where": conditions}
+
+
+def _write(store: EpisodeStore, seed: int, found: Sequence[Found], repair: bool) -> bool:
+    """Add a seed to a store from its first undamaged copy; returns whether there was one."""
+    known = found[0][1]
+    for source, entry in sorted(found, key=lambda place: not place[1].success):
+        if entry.outcome == LOST:
+            continue
+        known = entry
+        if not entry.success:
+            store.fail(_without_rows(entry))
+            return True
+        try:
+            store.append(episode_of(source, entry))
+            return True
+        except DamageError:
+            if not repair:
+                raise
+    store.fail(replace(_without_rows(known), outcome=DAMAGED))
+    return False
+
+
+def _rows_of(store: EpisodeStore, entry: Entry) -> tuple[dict[str, Array], str]:
+    """Return the rows of an episode and a description of their damage, or an empty text."""
+    try:
+        rows = store.read(entry) if entry.steps else {}
+    except ValueError:
+        rows = {}
+    if not rows:
+        return rows, "rows changed or lost"
+    if not all(np.isfinite(values).all() for values in rows.values() if values.dtype.kind == "f"):
+        return rows, "numbers that are not finite"
+    return rows, ""
+
+
+def _repeated_seeds(store: EpisodeStore) -> list[int]:
+    counts = [Counter(entry.seed for entry in entries) for _, entries in entries_by_config(store)]
+    return sorted({seed for part in counts for seed, count in part.items() if count > 1})

@@ -1,0 +1,154 @@
+"""Batches of training windows, copied from the rows of an episode store in one gather per field.
+
+Shapes: B batch, T history frames, k action chunk, D action components, S truth scalars.
+"""
+
+from __future__ import annotations
+
+from sys import getrefcount
+from typing import Any
+
+import numpy as np
+import torch
+
+from vla.data.episodes import EpisodeStore, Rows
+from vla.spec import Array, Spec
+
+Batch = dict[str, Any]
+
+# dtype of a field → dtype of its tensor: torch supports few operations on uint16.
+TYPES = {np.dtype(np.uint8): torch.uint8, np.dtype(np.uint16): torch.int32, np.dtype(np.float32): torch.float32}
+NUMPY = {torch.uint8: np.uint8, torch.int32: np.int32, torch.float32: np.float32}
+
+# An executed action counts as disturbed if it differs from the label by more than this share of the label, and of the
+# action range.
+SHARE_OF_LABEL, SHARE_OF_RANGE = 0.6, 0.05
+
+
+def disturbed(action: Array, executed: Array, spec: Spec) -> Array:
+    """Return (N,) bool: the executed action differs from the (N, D) label by more than proportional noise.
+
+    Later labels react to a disturbance that a policy cannot predict, so the loss masks them.
+    """
+    least = SHARE_OF_RANGE * (np.array(spec.high) - np.array(spec.low))
+    off = np.abs(executed - action) > np.maximum(SHARE_OF_LABEL * np.abs(action), least)
+    return np.any(off, axis=1)
+
+
+class BufferPool:
+    """Pool of arrays that are reused once no array, view or tensor refers to them.
+
+    Reuse saves the zeroing of new memory by the kernel, which takes longer than the copy itself. The pool grows to the
+    largest number of arrays in use at once.
+    """
+
+    def __init__(self) -> None:
+        self._arrays: dict[tuple[tuple[int, ...], type], list[Array]] = {}
+
+    def empty(self, shape: tuple[int, ...], dtype: type) -> Array:
+        """Return an array with arbitrary content."""
+        arrays = self._arrays.setdefault((shape, dtype), [])
+        for array in arrays:
+            # References of the list, of `array` and of the argument; another thread at this line adds a fourth.
+            if getrefcount(array) == 3:
+                return array
+        arrays.append(np.empty(shape, dtype))
+        return arrays[-1]
+
+
+class WindowBatcher:
+    """Callable that copies windows of an episode store into batches; a window is identified by its newest row.
+
+    Args:
+        store: source of the rows.
+        history: frames T in a window.
+        chunk: actions k that label a frame.
+        depth: include depth.
+        pin: allocate page-locked memory, from which copies to a GPU are asynchronous.
+
+    Raises:
+        ValueError: numeric rows of the store differ from their checksums.
+    """
+
+    def __init__(self, store: EpisodeStore, history: int, chunk: int, depth: bool = False, pin: bool = False) -> None:
+        self._pin, self._buffers = pin, BufferPool()
+        self._ages, self._aheads = np.arange(1 - history, 1), np.arange(chunk)
+        cameras = {"rgb": store.spec.cameras, **({"depth": store.spec.depth} if depth else {})}
+        self._images = {kind: {name: store.rows(f"{kind}_{name}") for name in of} for kind, of in cameras.items()}
+        # One array: the row look-up costs more than the copy of a few numbers.
+        names = ("state", *(("truth",) if store.spec.truth else ()))
+        numbers = {name: store.rows(name) for name in (*names, "action", "executed")}
+        store.verify(store.episodes, numbers)
+        self._numbers = np.concatenate([numbers[name][:] for name in names], axis=1)
+        self._truth_size = store.spec.truth_size
+        self._action = numbers["action"]
+        off = disturbed(self._action[:], numbers["executed"][:], store.spec)
+        self._disturbances = np.append(0, off.cumsum())  # before each row
+        self._store, self._entries = store, (entries := store.episodes)
+        self._verified = np.zeros(len(entries), bool)  # images only
+        self._instructions = [entry.instruction for entry in entries]
+        self._first = np.array([entry.start for entry in entries])
+        self._last = np.array([entry.end - 1 for entry in entries])
+
+    def __call__(self, windows: Array) -> Batch:
+        """Return the batch of `windows` (B,), row numbers.
+
+        A frame before the start of the episode is zero, absent, and has no valid label. A label is also invalid if a
+        step between its frame and itself was disturbed, or if it lies beyond the end of the episode, where it repeats
+        the last action. The valid labels of a frame therefore come first.
+
+        Raises:
+            ValueError: images of these episodes differ from their checksums, which are compared once per episode.
+        """
+        episode = self._first.searchsorted(windows, side="right") - 1  # (B,)
+        if not self._verified[episode].all():
+            self._verify(np.unique(episode[~self._verified[episode]]))
+        first, last = self._first[episode, None], self._last[episode, None]
+        frames = windows[:, None] + self._ages  # (B, T)
+        labels = frames[:, :, None] + self._aheads  # (B, T, k)
+        present = frames >= first
+        valid = (labels <= last[:, :, None]) & present[:, :, None]
+        labels = np.minimum(np.maximum(labels, first[:, :, None]), last[:, :, None])
+        frames = np.maximum(frames, first)
+        if len(self._aheads) > 1:  # no step lies between a frame and its first label
+            valid &= self._disturbances[labels] == self._disturbances[frames][:, :, None]
+        absent = None if present.all() else ~present
+        batch: Batch = {
+            kind: {camera: self._take(rows, frames, absent) for camera, rows in cameras.items()}
+            for kind, cameras in self._images.items()
+        }
+        numbers = self._take(self._numbers, frames, absent)
+        state = self._numbers.shape[1] - self._truth_size
+        batch["state"] = numbers[..., :state]
+        if self._truth_size:
+            batch["truth"] = numbers[..., state:]
+        batch["action"] = self._take(self._action, labels)
+        batch["present"] = self._own(present)
+        batch["valid"] = self._own(valid)
+        batch["instruction"] = [self._instructions[number] for number in episode.tolist()]
+        return batch
+
+    def _verify(self, episodes: Array) -> None:
+        entries = [self._entries[number] for number in episodes.tolist()]
+        images = {f"{kind}_{camera}": rows for kind, of in self._images.items() for camera, rows in of.items()}
+        self._store.verify(entries, images)
+        self._verified[episodes] = True
+
+    def _take(self, rows: Rows, index: Array, absent: Array | None = None) -> torch.Tensor:
+        values = self._empty((*index.shape, *rows.shape[1:]), TYPES[rows.dtype])
+        if values.dtype == rows.dtype:
+            rows.take(index, axis=0, out=values, mode="clip")  # "clip" writes into `out` without a buffer
+        else:
+            values[...] = rows.take(index, axis=0)
+        if absent is not None:
+            values[absent] = 0  # many times faster than in torch
+        return torch.from_numpy(values)
+
+    def _empty(self, shape: tuple[int, ...], dtype: torch.dtype) -> Array:
+        if self._pin:
+            return torch.empty(shape, dtype=dtype, pin_memory=True).numpy()
+        return self._buffers.empty(shape, NUMPY[dtype])
+
+    def _own(self, values: Array) -> torch.Tensor:
+        tensor = torch.from_numpy(values)
+        return tensor.pin_memory() if self._pin else tensor

@@ -1,0 +1,82 @@
+"""Requests to running nodes: an instruction, the resumption of a stopped agent, the next episode of a simulator."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+import rclpy
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState
+from std_msgs.msg import String
+from std_srvs.srv import Trigger
+
+TIMEOUT = 10.0  # of the discovery of a subscriber or service, and of a service call [s]
+SETTLED = 0.7  # discovery is complete after so long without a new subscriber [s]
+RESUME, CHANGE, RESET = "/vla_agent/resume", "/vla_agent/change_state", "/vla_simulator/reset"
+
+
+def say(node: Any, topic: str, instruction: str) -> None:
+    """Publish an instruction once all subscribers are discovered.
+
+    Raises:
+        ValueError: there is no subscriber.
+    """
+    publisher = node.create_publisher(String, topic, 1)
+    subscribers, since = 0, time.monotonic()
+    # Subscribers are discovered one by one, in any order: the simulator may come before the agent.
+    while time.monotonic() - since < (SETTLED if subscribers else TIMEOUT):
+        if publisher.get_subscription_count() != subscribers:
+            subscribers, since = publisher.get_subscription_count(), time.monotonic()
+        time.sleep(0.02)
+    if publisher.get_subscription_count() == 0:
+        raise ValueError(f"no subscriber on {topic}: is the agent running, and on the same network and domain?")
+    publisher.publish(String(data=instruction))
+    publisher.wait_for_all_acked()
+
+
+def resume(node: Any) -> None:
+    """Resume a stopped agent.
+
+    Raises:
+        ValueError: there is no agent, or it is not stopped.
+    """
+    answer = _call(node, Trigger, RESUME, Trigger.Request())
+    if not answer.success:
+        raise ValueError(answer.message)
+
+
+def next_episode(node: Any) -> str:
+    """Start the simulator's next episode and restart the agent, if there is one, which then waits for an instruction.
+
+    Returns the simulator's description of the episode.
+
+    Raises:
+        ValueError: there is no simulator, or a node does not respond.
+    """
+
+    def change(transition: int) -> bool:
+        request = ChangeState.Request(transition=Transition(id=transition))
+        return bool(_call(node, ChangeState, CHANGE, request).success)
+
+    reset = node.create_client(Trigger, RESET)
+    if not reset.wait_for_service(TIMEOUT):
+        raise ValueError(f"no service {RESET}: is the simulator running, and on the same network and domain?")
+    agent = node.create_client(ChangeState, CHANGE).wait_for_service(SETTLED)
+    # The reset moves the arm: an active agent would pull it back.
+    active = agent and change(Transition.TRANSITION_DEACTIVATE)
+    description = str(_call(node, Trigger, RESET, Trigger.Request()).message)
+    if active and not change(Transition.TRANSITION_ACTIVATE):
+        raise ValueError("the agent cannot be activated again, see its log")
+    return description
+
+
+def _call(node: Any, kind: Any, service: str, request: Any) -> Any:
+    client = node.create_client(kind, service)
+    if not client.wait_for_service(TIMEOUT):
+        raise ValueError(f"no service {service}: is the agent running, and on the same network and domain?")
+    answer = client.call_async(request)
+    rclpy.spin_until_future_complete(node, answer, timeout_sec=TIMEOUT)
+    if not answer.done():
+        raise ValueError(f"{service} does not respond")
+    return answer.result()

@@ -1,0 +1,148 @@
+"""Joint commands within the limits of a robot, for any goal: plain numpy, no ROS.
+
+Shapes: J joints. Positions [rad], speeds [rad/s], accelerations [rad/s²].
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated
+
+import numpy as np
+from annotated_types import Gt, Le, MinLen
+
+from vla.io.types import NonNegative, Positive, Text
+from vla.spec import Array
+
+PositiveShare = Annotated[float, Gt(0), Le(1)]
+
+REST = 1e-9  # lower speeds are rounding errors [rad/s]
+
+
+@dataclass(frozen=True)
+class Robot:
+    """Joint names and limits of an arm.
+
+    Attributes:
+        joints: J names, base to tip.
+        low, high: position limits [rad].
+        speed, acceleration: limits [rad/s], [rad/s²].
+        fingers: names of the finger joints.
+        finger_travel: position of a finger joint when open; 0 is closed [m].
+        margin: distance kept from the position limits [rad].
+        overshoot: largest overshoot of the last goal, which lets joints pass goals without stopping [rad].
+        speed_share, acceleration_share: usable share of those limits, above 0 and at most 1.
+
+    Raises:
+        ValueError: lists of different lengths, or a share out of range.
+    """
+
+    joints: Annotated[list[Text], MinLen(1)]
+    low: list[float]
+    high: list[float]
+    speed: list[Positive]
+    acceleration: list[Positive]
+    fingers: list[Text]
+    finger_travel: Positive
+    margin: NonNegative
+    overshoot: NonNegative
+    speed_share: PositiveShare
+    acceleration_share: PositiveShare
+
+    def __post_init__(self) -> None:
+        lengths = {len(values) for values in (self.joints, self.low, self.high, self.speed, self.acceleration)}
+        if len(lengths) != 1:
+            raise ValueError(
+                "deploy.robot needs one entry per joint in each of joints, low, high, speed and acceleration"
+            )
+        if not (0 < self.speed_share <= 1 and 0 < self.acceleration_share <= 1):
+            raise ValueError("deploy.robot.speed_share and acceleration_share must be above 0 and at most 1")
+
+    @property
+    def min_position(self) -> Array:
+        """(J,) smallest allowed positions [rad]."""
+        return np.array(self.low) + self.margin
+
+    @property
+    def max_position(self) -> Array:
+        """(J,) largest allowed positions [rad]."""
+        return np.array(self.high) - self.margin
+
+    @property
+    def max_speed(self) -> Array:
+        """(J,) largest allowed speeds [rad/s]."""
+        return np.array(self.speed) * self.speed_share
+
+    @property
+    def max_acceleration(self) -> Array:
+        """(J,) largest allowed accelerations [rad/s²]."""
+        return np.array(self.acceleration) * self.acceleration_share
+
+
+class JointLimiter:
+    """Moves a commanded position towards goals within the limits of position, speed and acceleration.
+
+    It integrates its own command, because the measured position lags behind: restarting from that at every goal would
+    make the arm oscillate and fall short.
+    """
+
+    def __init__(self, robot: Robot, period: float) -> None:
+        """Args: the arm and its limits; time between commands [s]."""
+        self.robot, self._period = robot, period
+        self.position = np.zeros(len(robot.joints))
+        self.velocity = np.zeros(len(robot.joints))
+
+    def start(self, measured: Array) -> None:
+        """Start from the measured position (J,), at rest.
+
+        Raises:
+            ValueError: the arm is outside its position limits.
+        """
+        out = (measured < self.robot.min_position) | (measured > self.robot.max_position)
+        if out.any():
+            joint = int(np.argmax(out))
+            raise ValueError(
+                f"{self.robot.joints[joint]} is at {measured[joint]:.3f} rad, outside "
+                f"{self.robot.min_position[joint]:.3f} to {self.robot.max_position[joint]:.3f}: move it inside first"
+            )
+        self.position, self.velocity = np.array(measured, dtype=float), np.zeros(len(measured))
+
+    def step(self, goal: Array, remaining: float = 0.0) -> Array:
+        """Return the next command (J,) towards `goal` (J,), which is due in `remaining` seconds."""
+        distance = np.clip(goal, self.robot.min_position, self.robot.max_position) - self.position
+        wanted = distance / max(remaining, self._period)
+        fastest = np.minimum(self._stoppable(np.abs(distance) + self.robot.overshoot), self.robot.max_speed)
+        # Scale all joints alike, so that the tool stays on its path.
+        share = np.min(fastest / np.maximum(np.abs(wanted), fastest))
+        return self._move(share * wanted)
+
+    def brake(self) -> Array:
+        """Return the next command (J,) of the fastest stop."""
+        return self._move(np.zeros_like(self.velocity))
+
+    @property
+    def resting(self) -> bool:
+        """True if the commanded velocity is zero."""
+        return not self.velocity.any()
+
+    def _move(self, velocity: Array) -> Array:
+        change = self.robot.max_acceleration * self._period
+        velocity = np.clip(velocity, -self.robot.max_speed, self.robot.max_speed)
+        # After the speed limit, which may have been lowered in motion: the acceleration limit has priority.
+        velocity = np.clip(velocity, self.velocity - change, self.velocity + change)
+        # Keep the braking distance within the position limits.
+        up = self._stoppable(self.robot.max_position - self.position)
+        down = self._stoppable(self.position - self.robot.min_position)
+        velocity = np.clip(velocity, -down, up)
+        self.velocity = np.where(np.abs(velocity) < REST, 0.0, velocity)
+        self.position = self.position + self.velocity * self._period
+        return self.position.copy()
+
+    def _stoppable(self, distance: Array) -> Array:
+        """(J,) largest speed from which constant deceleration stops within `distance` (J,), this step included."""
+        change = self.robot.max_acceleration * self._period
+        steps = np.maximum(distance, 0.0) / (
+            change * self._period
+        )  # in units of the speed change of one step times its period
+        whole = np.floor((np.sqrt(1 + 8 * steps) - 1) / 2)  # n steps cover n(n + 1)/2 of these
+        return change * (whole + (steps - whole * (whole + 1) / 2) / (whole + 1))

@@ -1,0 +1,355 @@
+"""The policy as a managed ROS 2 node: images, joint states and instructions in, joint commands out."""
+
+from __future__ import annotations
+
+import time
+import traceback
+from collections import deque
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import asdict, replace
+from functools import partial
+from typing import Any, get_args
+
+import numpy as np
+from builtin_interfaces.msg import Duration
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor, SetParametersResult
+from rclpy.clock import Clock, ClockType
+from rclpy.context import Context
+from rclpy.exceptions import ParameterException
+from rclpy.parameter import Parameter
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from sensor_msgs.msg import Image, JointState
+from std_msgs.msg import Float64MultiArray, String
+from std_srvs.srv import Trigger
+from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
+
+from vla.deploy import images, messages
+from vla.deploy.control_loop import ControlLoop, State
+from vla.deploy.joint_limiter import Robot
+from vla.deploy.lifecycle_node import GuardedLifecycleNode
+from vla.deploy.ros2 import PolicyDeployment
+from vla.policy import Policy
+from vla.spec import LONGEST_INSTRUCTION, Array, Observation
+
+LEVELS = {
+    State.WAITING: DiagnosticStatus.OK,
+    State.RUNNING: DiagnosticStatus.OK,
+    State.HOLDING: DiagnosticStatus.WARN,
+    State.STOPPED: DiagnosticStatus.WARN,
+    State.FAULT: DiagnosticStatus.ERROR,
+}
+MAX_MESSAGE = 300  # length of a log line or status message [characters]
+COMMANDS = {"joint_state": JointState, "trajectory": JointTrajectory, "forward": Float64MultiArray}
+
+
+class PolicyNode(GuardedLifecycleNode):
+    """Configuring warms the policy up, activating takes over the arm at its pose, deactivating brakes and holds."""
+
+    def __init__(self, policy: Policy, settings: PolicyDeployment, context: Context | None = None) -> None:
+        super().__init__("vla_agent", context=context)
+        self.policy, self.settings = policy, settings
+        self.loop: ControlLoop | None = None
+        self._steady = Clock(clock_type=ClockType.STEADY_TIME)  # runs even if simulated time is paused
+        self._timers: list[Any] = []
+        self._latencies: dict[str, deque[float]] = {}
+        self._stamps: dict[str, tuple[int, int]] = {}
+        self._sizes: dict[str, tuple[int, ...]] = {}  # camera → shape of its last image
+        self._inference: tuple[Future[Array], float] | None = None
+        self._last_tick: float | None = None
+        self._reported: tuple[State | None, str] = (None, "")
+        self._ignored = ""  # message about an instruction that is ignored after a stop or a fault
+        self._dropped = 0
+        try:
+            self._declare()
+        except ParameterException as error:  # in the arguments after --ros-args
+            raise ValueError(str(error)) from error
+
+    # Parameters.
+
+    def _declare(self) -> None:
+        for name, value in asdict(self.settings.robot).items():
+            share = name.endswith("_share")
+            limits = [FloatingPointRange(from_value=0.01, to_value=1.0)] if share else []
+            value = list(value) if isinstance(value, (list, tuple)) else value
+            self.declare_parameter(name, value, ParameterDescriptor(floating_point_range=limits))
+        self.declare_parameter("command", self.settings.command)
+        self.declare_parameter("image_reliability", self.settings.image_reliability)
+        self.declare_parameter("image_crop", self.settings.image_crop)
+        rate = FloatingPointRange(from_value=1.0, to_value=1000.0)
+        self.declare_parameter("command_hz", self.settings.command_hz, ParameterDescriptor(floating_point_range=[rate]))
+        self.add_on_set_parameters_callback(self._on_set_parameters)
+
+    def _on_set_parameters(self, parameters: list[Parameter]) -> SetParametersResult:
+        """Once configured, allow changes of the shares only; while active, only smaller ones."""
+        for parameter in parameters:
+            if self.loop is None or not self.has_parameter(parameter.name) or parameter.name == "use_sim_time":
+                continue
+            if not parameter.name.endswith("_share"):
+                return SetParametersResult(successful=False, reason=f"clean up before changing {parameter.name}")
+            if self._timers and parameter.value > self.get_parameter(parameter.name).value:
+                return SetParametersResult(successful=False, reason=f"deactivate before raising {parameter.name}")
+            limiter = self.loop.limiter
+            limiter.robot = replace(limiter.robot, **{parameter.name: parameter.value})
+        return SetParametersResult(successful=True)
+
+    # Lifecycle.
+
+    def configure(self) -> None:
+        """Check that policy, robot and topics match, warm the policy up, connect."""
+        spec, topics = self.policy.spec, self.settings.topics
+        unnamed = sorted(set(spec.cameras) - set(topics.images))
+        if unnamed:
+            missing = ", ".join(unnamed)
+            raise ValueError(f"no topic for the policy's cameras {missing}: set deploy.topics.images.{unnamed[0]}")
+        robot = Robot(**{name: self.get_parameter(name).value for name in asdict(self.settings.robot)})
+        self._command_type = self.get_parameter("command").value
+        if self._command_type not in COMMANDS:
+            raise ValueError(f"command is '{self._command_type}', expected one of {', '.join(COMMANDS)}")
+        self._crop = self.get_parameter("image_crop").value
+        if self._crop not in get_args(images.Crop):
+            raise ValueError(f"image_crop is '{self._crop}', expected one of {', '.join(get_args(images.Crop))}")
+        loop = ControlLoop(spec, robot, self.settings.safety, self.get_parameter("command_hz").value)
+        self._warm_up()
+        reliable = self.get_parameter("image_reliability").value == "reliable"
+        best_effort = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
+        image_qos = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE) if reliable else best_effort
+        for camera in spec.cameras:
+            self.add_subscription(Image, topics.images[camera], partial(self._on_image, camera), image_qos)
+        self.add_subscription(JointState, topics.joint_states, self._on_joint_state, best_effort)
+        self.add_subscription(String, topics.instruction, self._on_instruction, QoSProfile(depth=1))
+        self._commands = self.add_publisher(COMMANDS[self._command_type], topics.commands, while_active=True)
+        self._gripper = (
+            self.add_publisher(Float64MultiArray, topics.gripper, while_active=True) if topics.gripper else None
+        )
+        self._status = self.add_publisher(DiagnosticStatus, "~/status")
+        self._diagnostics = self.add_publisher(DiagnosticArray, "/diagnostics")
+        self._arm = self.add_publisher(String, "~/arm")
+        self._description = messages.fill_arm(String(), robot, spec.require_robot("deployment"))
+        self.add_service(Trigger, "~/stop", self._on_stop)
+        self.add_service(Trigger, "~/resume", self._on_resume)
+        self._pool = ThreadPoolExecutor(1, thread_name_prefix="policy")
+        self._latencies, self._stamps, self._sizes, self._dropped = {}, {}, {}, 0
+        self.loop = loop
+
+    def _warm_up(self) -> None:
+        """Run three inferences on noise: the first ones are slow."""
+        noise = self.policy.spec.random_observation(np.random.default_rng(0))
+        for _ in range(3):
+            self.policy.reset("", 0)
+            self.policy.plan(noise)
+        self.policy.reset("", 0)
+
+    def activate(self) -> None:
+        """Take over the arm at its measured pose."""
+        assert self.loop is not None
+        others = self.count_publishers(self._commands.topic_name) - 1
+        if others > 0:
+            raise ValueError(f"{others} other publisher(s) on {self._commands.topic_name}: stop them before activation")
+        self.loop.restart()
+        self._inference, self._last_tick = None, None
+        self._timers = [
+            self.create_timer(self.loop.tick, self.guard(self._tick), clock=self._steady),
+            self.create_timer(1.0, self.guard(self._report), clock=self._steady),
+        ]
+
+    def brake(self) -> None:
+        """Publish commands until the arm is at rest, then stop the timers."""
+        if not self._timers or self.loop is None:
+            return
+        self.loop.stop("deactivated", "activate the agent")
+        while True:
+            self._send()
+            if self.loop.limiter.resting:
+                break
+            time.sleep(self.loop.tick)
+        for timer in self._timers:
+            self.destroy_timer(timer)
+        self._timers = []
+        self._report()
+
+    def clean_up(self) -> None:
+        """Shut the inference thread down and drop the control loop."""
+        self._pool.shutdown(cancel_futures=True)
+        self.loop = None
+
+    def on_callback_error(self, reason: str) -> None:
+        """Brake and hold until deactivated."""
+        if self.loop is not None:
+            self.loop.fail(reason)
+
+    # Inputs.
+
+    def _on_image(self, camera: str, message: Image) -> None:
+        now = time.monotonic()
+        stamp = (message.header.stamp.sec, message.header.stamp.nanosec)
+        if not self._timers or self.loop is None:
+            return
+        if stamp != (0, 0) and stamp == self._stamps.get(camera):
+            return self._drop(f"two images of the camera {camera} have the same time stamp: is its clock frozen?")
+        self._stamps[camera] = stamp
+        try:
+            image = messages.image_from(message)
+        except ValueError as error:
+            return self._drop(f"camera {camera}: {error}")
+        if self._sizes.get(camera) != image.shape:
+            self._sizes[camera] = image.shape
+            if resizing := images.describe_resize(image, self.policy.spec.image_size, self._crop):
+                self.get_logger().info(f"camera {camera}: {resizing}")
+        age = self._age(stamp)
+        self._record("image age", age)
+        self.loop.on_image(camera, image, now - age)
+        return self._advance()
+
+    def _on_joint_state(self, message: JointState) -> None:
+        now = time.monotonic()
+        if not self._timers or self.loop is None:
+            return
+        try:
+            joints, velocities, opening = messages.joints_from(message, self.loop.robot)
+        except ValueError as error:
+            return self._drop(str(error))
+        self.loop.on_joint_state(joints, velocities, opening, now)
+
+    def _on_instruction(self, message: String) -> None:
+        if not self._timers or self.loop is None:
+            return
+        instruction, loop = message.data, self.loop
+        quoted = repr(messages.shorten(instruction))
+        if (length := len(instruction)) > LONGEST_INSTRUCTION:
+            return self._drop(f"an instruction of {length} characters, the limit is {LONGEST_INSTRUCTION}: {quoted}")
+        repeated = instruction.strip() == loop.instruction
+        if loop.on_instruction(instruction, time.monotonic()):
+            if not repeated:
+                self.get_logger().info(f"instruction: {quoted}")
+        elif instruction.strip():
+            self._report_ignored(f"instruction ignored while {loop.state}: {quoted}; {loop.reason}")
+
+    def _report_ignored(self, message: str) -> None:
+        if message != self._ignored:
+            self._ignored = message
+            self.get_logger().warning(messages.shorten(message, MAX_MESSAGE))
+            self._report()
+
+    def _on_stop(self, request: Any, response: Any) -> Any:
+        response.success = bool(self._timers)
+        if self.loop is not None:
+            self.loop.stop("stopped by request")
+            self._report()  # before an instruction is ignored, whose warning this would clear
+        return response
+
+    def _on_resume(self, request: Any, response: Any) -> Any:
+        response.success = bool(self._timers) and self.loop is not None and self.loop.resume(time.monotonic())
+        response.message = "" if response.success else "nothing to resume: the agent is not stopped"
+        return response
+
+    def _drop(self, reason: str) -> None:
+        self._dropped += 1
+        self.get_logger().warning(messages.shorten(reason, MAX_MESSAGE), throttle_duration_sec=1.0)
+
+    def _age(self, stamp: tuple[int, int]) -> float:
+        """Return the age [s] of a message by its stamp; 0 if the stamp cannot come from this clock."""
+        age = self.get_clock().now().nanoseconds * 1e-9 - (stamp[0] + stamp[1] * 1e-9)
+        return age if stamp != (0, 0) and 0 <= age < 10.0 else 0.0
+
+    # Commands.
+
+    def _tick(self) -> None:
+        now = time.monotonic()
+        if self._last_tick is not None:
+            self._record("tick", now - self._last_tick)
+        self._last_tick = now
+        self._advance()
+        self._send()
+
+    def _advance(self) -> None:
+        """Schedule a finished inference, and start the next one if it is due."""
+        assert self.loop is not None
+        if self._inference is not None and self._inference[0].done():
+            (future, started), self._inference = self._inference, None
+            try:
+                self.loop.set_plan(future.result(), time.monotonic())
+                self._record("inference", time.monotonic() - started)
+                self._record("image to command", time.monotonic() - self.loop.observed_at)
+            except Exception as error:
+                self.get_logger().error(f"the policy failed: {traceback.format_exc()}", throttle_duration_sec=1.0)
+                self.loop.reject_plan(f"the policy failed: {error}")
+        if self._inference is None:
+            observation = self.loop.next_observation(time.monotonic())
+            if observation is not None:
+                self._inference = (self._pool.submit(self._infer, observation, self.loop.resumed), time.monotonic())
+
+    def _infer(self, observation: Observation, reset: bool) -> Array:
+        if reset:
+            self.policy.reset(observation.instruction, 0)
+        size = self.policy.spec.image_size
+        rgb = {camera: images.resize(image, size, self._crop) for camera, image in observation.rgb.items()}
+        return self.policy.plan(replace(observation, rgb=rgb))[: self.policy.execute]
+
+    def _send(self) -> None:
+        assert self.loop is not None
+        now = time.monotonic()
+        command = self.loop.command(now)
+        if command is None:
+            return
+        robot = self.loop.robot
+        if self._command_type == "joint_state":
+            message = messages.fill_joint_state(JointState(), robot, command)
+            message.header.stamp = self.get_clock().now().to_msg()
+        elif self._command_type == "trajectory":
+            ahead = [command, *self.loop.horizon(now)]  # the next trajectory replaces all points after the first
+            message = messages.fill_trajectory(
+                JointTrajectory(), JointTrajectoryPoint, Duration, robot, ahead, self.loop.tick
+            )
+        else:
+            message = Float64MultiArray(data=command.position.tolist())
+        self._commands.publish(message)
+        if self._gripper is not None:
+            self._gripper.publish(Float64MultiArray(data=messages.finger_positions(robot, command)))
+        if (self.loop.state, self.loop.reason) != self._reported:
+            self._report()
+
+    def _record(self, name: str, seconds: float) -> None:
+        self._latencies.setdefault(name, deque(maxlen=500)).append(seconds)
+
+    def _report(self) -> None:
+        """Publish status and description of the arm, log changes of state, and check for conflicting publishers."""
+        loop = self.loop
+        assert loop is not None
+        if self._timers:
+            self._check_publishers()
+        if (loop.state, loop.reason) != self._reported:
+            self._reported, self._ignored = (loop.state, loop.reason), ""
+            line = f"{loop.state}: {messages.shorten(loop.reason, MAX_MESSAGE)}".removesuffix(": ")
+            # Two calls, because rclpy refuses to log with changing severity from one line.
+            if LEVELS[loop.state] == DiagnosticStatus.OK:
+                self.get_logger().info(line)
+            else:
+                self.get_logger().warning(line)
+        values = {
+            "state": loop.state.value,
+            "instruction": messages.shorten(loop.instruction),
+            "messages dropped": str(self._dropped),
+            "ticks skipped": str(loop.overruns),
+        }
+        for name, seconds in self._latencies.items():
+            middle, high = np.percentile(list(seconds), [50, 99]) * 1000
+            values[f"{name} p50 [ms]"], values[f"{name} p99 [ms]"] = f"{middle:.1f}", f"{high:.1f}"
+        pairs = [KeyValue(key=key, value=value) for key, value in values.items()]
+        text = messages.shorten(self._ignored or loop.reason or loop.state.value, MAX_MESSAGE)
+        status = DiagnosticStatus(level=LEVELS[loop.state], name=self.get_name(), message=text, values=pairs)
+        self._status.publish(status)
+        array = DiagnosticArray(status=[status])
+        array.header.stamp = self.get_clock().now().to_msg()
+        self._diagnostics.publish(array)
+        self._arm.publish(self._description)
+
+    def _check_publishers(self) -> None:
+        """Fault if another node commands the arm, hold if a camera topic has several publishers."""
+        assert self.loop is not None
+        if self.count_publishers(self._commands.topic_name) > 1:
+            self.loop.fail(f"another node commands the arm on {self._commands.topic_name}")
+        for camera in self.policy.spec.cameras:
+            topic = self.resolve_topic_name(self.settings.topics.images[camera])
+            if (count := self.count_publishers(topic)) > 1:
+                self.loop.hold(f"{count} publishers send images on {topic}")

@@ -1,0 +1,171 @@
+"""The simulated arm as a ROS 2 node with the topics of a real one."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections import deque
+from functools import partial
+from typing import Any
+
+from rclpy.clock import Clock, ClockType
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from rclpy.time import Time
+from rosgraph_msgs.msg import Clock as ClockMessage
+from sensor_msgs.msg import Image, JointState
+from std_msgs.msg import String
+from std_srvs.srv import Trigger
+
+from vla.deploy import messages
+from vla.deploy.joint_limiter import Robot
+from vla.deploy.ros2 import Timing, Topics
+from vla.spec import LONGEST_INSTRUCTION, Array, Drivable, Environment
+
+
+class SimulatorNode(Node):
+    """Plays episodes one after the other: `~/reset` starts the next, `~/episode` and the log give its status.
+
+    The time of an episode starts with the first instruction, as in evaluation.
+    """
+
+    def __init__(self, environment: Environment, robot: Robot, topics: Topics, timing: Timing, seed: int) -> None:
+        """Args: a `Drivable` environment; its arm; topics; rates; seed of the first episode.
+
+        Raises:
+            ValueError: the environment has no robot or is not `Drivable`.
+        """
+        model = environment.spec.require_robot("deploy=simulator")
+        if not isinstance(environment, Drivable):
+            raise ValueError(
+                f"deploy=simulator needs an environment that is Drivable, {type(environment).__name__} is not"
+            )
+        super().__init__("vla_simulator")
+        self._drivable, self._model = environment, model
+        self.environment, self.robot, self.timing, self.seed = environment, robot, timing, seed - 1
+        self._steady = Clock(clock_type=ClockType.STEADY_TIME)
+        qos = QoSProfile(depth=1)
+        self._images = {
+            camera: self.create_publisher(Image, topics.images[camera], qos) for camera in environment.spec.cameras
+        }
+        self._joints = self.create_publisher(JointState, topics.joint_states, qos)
+        latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+        self._episode = self.create_publisher(String, "~/episode", latched)
+        self._clock_publisher = self.create_publisher(ClockMessage, "/clock", qos) if timing.clock else None
+        self.create_subscription(JointState, topics.commands, self._on_command, qos)
+        self.create_subscription(String, topics.instruction, self._on_instruction, qos)
+        self.create_service(Trigger, "~/reset", self._on_reset)
+        self._delayed: deque[tuple[float, Any]] = (
+            deque()
+        )  # image publications delayed by the camera latency: when due, publish
+        self._elapsed = 0.0  # simulated time since the start [s]
+        self.reset()
+        self._period = 1 / timing.joints_hz
+        self.create_timer(self._period / timing.speed, self._tick, clock=self._steady)
+
+    def reset(self) -> None:
+        """Start the next episode."""
+        self.seed += 1
+        self.instruction = self.environment.reset(self.seed).instruction
+        self._commanded_at: float | None
+        self._target, self._commanded_at = self._hold_command(), None
+        self._running, self._ticks = False, 0
+        self._until_frame = 0.0
+        self.get_logger().info(self.description)
+        self._publish_episode()
+
+    @property
+    def description(self) -> str:
+        """Seed and instruction of the episode."""
+        return f'episode {self.seed}: "{self.instruction}"'
+
+    def _on_reset(self, request: Any, response: Any) -> Any:
+        self.reset()
+        response.success, response.message = True, self.description
+        return response
+
+    def _on_instruction(self, message: String) -> None:
+        valid = len(message.data) <= LONGEST_INSTRUCTION and message.data.strip()
+        if valid and not self._running and not self.environment.done:
+            self._running, self._ticks = True, 0
+
+    def _on_command(self, message: JointState) -> None:
+        try:
+            joints, opening = messages.command_from(message, self.robot)
+        except ValueError as error:
+            return self.get_logger().warning(messages.shorten(str(error), 300), throttle_duration_sec=1.0)
+        self._target = (joints, self._target[1] if opening is None else opening)
+        self._commanded_at = time.monotonic()
+
+    def _tick(self) -> None:
+        """Advance the simulation by one tick, then publish the measurements."""
+        timed_out = self._commanded_at is None or time.monotonic() - self._commanded_at > self.timing.command_timeout
+        if timed_out and self._commanded_at is not None:
+            self.get_logger().warning("no commands: the arm holds its pose", throttle_duration_sec=5.0)
+            self._target, self._commanded_at = self._hold_command(), None
+        self._drivable.drive(*self._target, self._period)
+        self._elapsed += self._period
+        self._ticks += 1
+        control_period = 1 / self.environment.spec.control_hz
+        if self._running and self._ticks % round(control_period / self._period) == 0:
+            self._drivable.judge()
+            if self.environment.done:
+                self._running = False
+                after = "in" if self.environment.outcome == "success" else "after"
+                self.get_logger().info(f"{self.environment.outcome} {after} {self._ticks * self._period:.1f} s")
+                self._publish_episode()
+        self._publish()
+
+    def _publish(self) -> None:
+        stamp = self._now()
+        if self._clock_publisher is not None:
+            self._clock_publisher.publish(ClockMessage(clock=stamp))
+        joints, velocities, opening = self._measured()
+        fingers = len(self.robot.fingers)
+        message = JointState(name=[*self.robot.joints, *self.robot.fingers])
+        message.position = [*joints.tolist(), *[opening / max(fingers, 1)] * fingers]
+        message.velocity = [*velocities.tolist(), *[0.0] * fingers] if len(velocities) else []
+        message.header.stamp = stamp
+        self._joints.publish(message)
+        self._until_frame -= self._period
+        if self._until_frame <= 1e-9:
+            self._until_frame += 1 / self.timing.camera_hz
+            due = time.monotonic() + self.timing.camera_latency
+            for camera, image in self._drivable.look().rgb.items():
+                frame = messages.fill_image(Image(), image, f"{camera}_camera_optical_frame")
+                frame.header.stamp = stamp
+                self._delayed.append((due, partial(self._images[camera].publish, frame)))
+        while self._delayed and self._delayed[0][0] <= time.monotonic():
+            self._delayed.popleft()[1]()
+
+    def _hold_command(self) -> tuple[Array, float]:
+        """Return the command that holds the measured pose: joints [rad] and opening 0 … 1."""
+        joints, _, opening = self._measured()
+        stroke = max(self.robot.finger_travel * len(self.robot.fingers), 1e-6)
+        return joints.astype(float), opening / stroke
+
+    def _measured(self) -> tuple[Array, Array, float]:
+        """Return joints [rad], their velocities [rad/s] and the gripper's opening [m]."""
+        spec, model = self.environment.spec, self._model
+        with self.environment.blind():
+            state = self._drivable.look().state
+        joints, velocities = (state[spec.indices(names)] for names in (model.joints, model.velocities))
+        return joints, velocities, float(state[spec.indices([model.gripper])[0]]) if model.gripper else 0.0
+
+    def _now(self) -> Any:
+        """Return the time stamp of a measurement taken now."""
+        if self.timing.clock:
+            return Time(nanoseconds=int(self._elapsed * 1e9)).to_msg()
+        return self.get_clock().now().to_msg()
+
+    def _publish_episode(self) -> None:
+        environment = self.environment
+        episode = {
+            "seed": self.seed,
+            "instruction": self.instruction,
+            "done": environment.done,
+            "outcome": environment.outcome,
+            "task": environment.task,
+            "milestones": sorted(environment.milestones),
+        }
+        self._episode.publish(String(data=json.dumps(episode)))

@@ -1,0 +1,75 @@
+"""Tasks as dm_env environments: `vla.envs.dm_env.load("tabletop", goal="pick_place")`."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import dm_env
+import numpy as np
+from dm_env import TimeStep, specs
+
+from vla.config.compose import compose_task
+from vla.config.experiment import make_environment
+from vla.spec import FIRST_SEED, Array, Environment, Observation
+
+
+class DmEnvironment(dm_env.Environment):
+    """Adapter of an `Environment` to dm_env.
+
+    An observation is a dictionary: one image per camera, (H, W, 3) uint8, the `state` (P,) float32 and the
+    `instruction`, an array of one string. The reward is 1 for the step that succeeds, otherwise 0. The discount is 0
+    after success and 1 if an episode ends at its time limit.
+    """
+
+    def __init__(self, environment: Environment, random_state: int | np.random.RandomState | None = None) -> None:
+        """Args: the environment to wrap; source of the episodes' seeds, which are below those of evaluation."""
+        self.environment = environment
+        if not isinstance(random_state, np.random.RandomState):
+            random_state = np.random.RandomState(random_state)
+        self.random_state = random_state
+        self._over = True
+
+    def reset(self, seed: int | None = None) -> TimeStep:
+        """Start the episode of `seed`, or of a random seed."""
+        episode = int(self.random_state.randint(FIRST_SEED)) if seed is None else seed
+        self._over = False
+        return dm_env.restart(_arrays(self.environment.reset(episode)))
+
+    def step(self, action: Array) -> TimeStep:
+        """Apply one (D,) action for one control period, or start a new episode after the last one ended."""
+        if self._over:
+            return self.reset()
+        observation = _arrays(self.environment.step(action))
+        success, self._over = self.environment.outcome == "success", self.environment.done
+        if success:
+            return dm_env.termination(1.0, observation)
+        return dm_env.truncation(0.0, observation) if self._over else dm_env.transition(0.0, observation)
+
+    def observation_spec(self) -> dict[str, specs.Array]:
+        """Return shapes and types of an observation."""
+        spec = self.environment.spec
+        return {
+            **{camera: specs.BoundedArray((*spec.image_size, 3), np.uint8, 0, 255, camera) for camera in spec.cameras},
+            "state": specs.Array((len(spec.state),), np.float32, "\t".join(spec.state)),
+            "instruction": specs.StringArray((), name="instruction"),
+        }
+
+    def action_spec(self) -> specs.BoundedArray:
+        """Return the bounds of an action."""
+        spec = self.environment.spec
+        low, high = np.array(spec.low, np.float32), np.array(spec.high, np.float32)
+        return specs.BoundedArray(low.shape, np.float32, low, high, "\t".join(spec.action))
+
+    def close(self) -> None:
+        """Close the environment."""
+        self.environment.close()
+
+
+def load(task: str, random_state: int | np.random.RandomState | None = None, **overrides: Any) -> DmEnvironment:
+    """Build a task of the config as a dm_env environment; see `vla.config.compose.compose_task`."""
+    return DmEnvironment(make_environment(compose_task(task, **overrides)), random_state)
+
+
+def _arrays(observation: Observation) -> dict[str, Array]:
+    instruction = np.array(observation.instruction, dtype=object)
+    return {**observation.rgb, "state": observation.state, "instruction": instruction}

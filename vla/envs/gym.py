@@ -1,0 +1,83 @@
+"""Tasks as gymnasium environments."""
+
+from __future__ import annotations
+
+from copy import deepcopy
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium.spaces import Box, Dict, Text
+
+from vla.config.compose import compose_task
+from vla.config.experiment import make_environment
+from vla.spec import FIRST_SEED, LONGEST_INSTRUCTION, Array, Environment, Observation
+
+UNBOUNDED = np.finfo(np.float32).max
+LATIN = "".join(filter(str.isprintable, map(chr, range(0x100))))  # characters of an instruction
+
+
+class GymEnvironment(gymnasium.Env[dict[str, Any], Array]):
+    """Adapter of an `Environment` to gymnasium.
+
+    An observation is a dictionary: one image per camera, (H, W, 3) uint8, the `state` (P,) float32 and the
+    `instruction`. The reward is 1 for the step that succeeds, otherwise 0. Success terminates an episode, its time
+    limit truncates it. `info` contains the current outcome and the draws of the episode.
+    """
+
+    metadata = {"render_modes": ["rgb_array"]}  # noqa: RUF012
+
+    def __init__(self, environment: Environment, render_mode: str | None = None) -> None:
+        """Args: the environment to wrap; with "rgb_array", `render` returns the images of all cameras side by side."""
+        self.environment, self.render_mode = environment, render_mode
+        spec = environment.spec
+        self.metadata = {**self.metadata, "render_fps": round(spec.control_hz)}
+        self.observation_space = Dict(
+            {
+                **{camera: Box(0, 255, (*spec.image_size, 3), np.uint8) for camera in spec.cameras},
+                "state": Box(-UNBOUNDED, UNBOUNDED, (len(spec.state),), np.float32),
+                "instruction": Text(LONGEST_INSTRUCTION, min_length=0, charset=LATIN),
+            }
+        )
+        self.action_space = Box(np.array(spec.low, np.float32), np.array(spec.high, np.float32), dtype=np.float32)
+        self._images: list[Array] = []
+        self._closed = False
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[dict[str, Any], dict[str, Any]]:
+        """Start the episode of `seed`; without a seed, draw one below those of evaluation."""
+        super().reset(seed=seed)
+        episode = int(self.np_random.integers(FIRST_SEED)) if seed is None else seed
+        return self._arrays(self.environment.reset(episode)), self._info()
+
+    def step(self, action: Array) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
+        """Apply one (D,) action for one control period."""
+        observation = self._arrays(self.environment.step(action))
+        success = self.environment.outcome == "success"
+        return observation, float(success), success, self.environment.done and not success, self._info()
+
+    def render(self) -> Array | None:
+        """Return the newest images side by side, (H, C·W, 3) uint8."""
+        return np.concatenate(self._images, axis=1) if self.render_mode == "rgb_array" else None
+
+    def close(self) -> None:
+        """Close the environment."""
+        if not self._closed:
+            self.environment.close()
+        self._closed = True
+
+    def _arrays(self, observation: Observation) -> dict[str, Any]:
+        self._images = list(observation.rgb.values())
+        return {**observation.rgb, "state": observation.state, "instruction": observation.instruction}
+
+    def _info(self) -> dict[str, Any]:
+        return {"outcome": self.environment.outcome, "draws": deepcopy(self.environment.draws)}
+
+
+class Task(GymEnvironment):
+    """A task of the config as a gymnasium environment."""
+
+    def __init__(self, task: str, render_mode: str | None = None, **overrides: Any) -> None:
+        """Args: see `vla.config.compose.compose_task` and `GymEnvironment`."""
+        super().__init__(make_environment(compose_task(task, **overrides)), render_mode)

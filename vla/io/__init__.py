@@ -1,0 +1,1 @@
+"""File input and output: constrained types, bounded documents, atomic writes."""

@@ -1,0 +1,112 @@
+"""Untrusted JSON and YAML files: bounded in size and depth, and validated against a type."""
+
+from __future__ import annotations
+
+import json
+from functools import cache
+from pathlib import Path
+from typing import Any, TypeVar, cast
+
+import yaml
+from pydantic import ConfigDict, PydanticUserError, TypeAdapter, ValidationError
+
+from vla.io.files import require_file
+
+T = TypeVar("T")
+
+MAX_BYTES = 64 << 20  # [bytes] of a file
+MAX_VALUES = 100_000  # values in a configuration
+MAX_DEPTH = 64  # nesting levels in YAML; pydantic's JSON parser stops at 200 by itself
+
+# `__pydantic_config__` of the dataclasses and typed dictionaries that describe a file.
+STRICT = ConfigDict(strict=True, extra="forbid", allow_inf_nan=False)
+
+
+def read_json(path: Path, kind: type[T], largest: int = MAX_BYTES) -> T:
+    """Read the JSON file at `path` as a `kind`: a dataclass, a typed dictionary or any annotation.
+
+    Raises:
+        ValueError: the file is larger than `largest` [bytes], nested too deep, not JSON, or not of that kind.
+        OSError: it cannot be read.
+    """
+    return parse_json(read_bounded(path, largest), kind, str(path))
+
+
+def read_yaml(path: Path, kind: type[T], largest: int = 1 << 20) -> T:
+    """Read the YAML file at `path` as a `kind`, see `read_json`. Aliases are refused: they expand without bound."""
+    return parse_yaml(read_bounded(path, largest), kind, str(path))
+
+
+def parse_json(text: str | bytes, kind: type[T], name: str) -> T:
+    """Parse JSON text, called `name` in errors, as a `kind`, see `read_json`."""
+    try:
+        validated: T = _adapter(cast(Any, kind)).validate_json(text, strict=True)
+    except ValidationError as error:
+        raise ValueError(f"{name} is damaged or of another kind: {problems(error)}") from error
+    return validated
+
+
+def parse_yaml(text: str | bytes, kind: type[T], name: str) -> T:
+    """Parse YAML text, called `name` in errors, as a `kind`, see `read_yaml`."""
+    depth = 0
+    try:
+        for event in yaml.parse(text, Loader=yaml.CSafeLoader):
+            depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
+            if depth > MAX_DEPTH or isinstance(event, yaml.AliasEvent):
+                raise ValueError(f"{name} is nested deeper than {MAX_DEPTH} levels, or has aliases")
+        plain = json.dumps(yaml.load(text, Loader=yaml.CSafeLoader))
+    except (yaml.YAMLError, UnicodeDecodeError, TypeError, RecursionError) as error:
+        raise ValueError(f"{name} is no plain YAML: {' '.join(str(error).split())[:200]}") from error
+    return parse_json(plain, kind, name)
+
+
+def require_resolved(value: Any, name: str) -> None:
+    """Require a configuration from a file, called `name`, to be plain data without references.
+
+    Raises:
+        ValueError: a value is no mapping, list, text, number or null; a text contains `${`, which would be resolved
+            later; or there are more than `MAX_VALUES` values or `MAX_DEPTH` levels.
+    """
+    pending, count = [(value, 0)], 0
+    while pending:
+        item, depth = pending.pop()
+        count += 1
+        if count > MAX_VALUES or depth > MAX_DEPTH:  # a pickle can refer to the same list many times, or to itself
+            raise ValueError(f"{name} holds more than {MAX_VALUES} values, or more than {MAX_DEPTH} levels of them")
+        if isinstance(item, str):
+            if "${" in item:
+                raise ValueError(f"{name} holds the reference {item[:200]!r}: only resolved values are read from files")
+        elif isinstance(item, (dict, list, tuple)):
+            parts = [*item, *item.values()] if isinstance(item, dict) else item
+            pending += [(part, depth + 1) for part in parts]
+        elif item is not None and not isinstance(item, (bool, int, float)):
+            raise ValueError(f"{name} holds a {type(item).__name__}, which is no plain data")
+
+
+def problems(error: ValidationError, most: int = 3) -> str:
+    """Format at most `most` validation errors, as `spec.cameras[0]: Input should be a valid string`."""
+    found = [f"{_dotted(each['loc'])}{each['msg']}" for each in error.errors(include_url=False, include_input=False)]
+    more = f"; and {len(found) - most} more" if len(found) > most else ""
+    return "; ".join(found[:most]) + more
+
+
+def _dotted(location: tuple[int | str, ...]) -> str:
+    path = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in location)
+    return f"{path.lstrip('.')[:100]}: " if path else ""
+
+
+def read_bounded(path: Path, largest: int = MAX_BYTES) -> bytes:
+    """Read a file of at most `largest` bytes, see `read_json`."""
+    require_file(path)
+    size = path.stat().st_size
+    if size > largest:
+        raise ValueError(f"{path} has {size} bytes, more than the {largest} that such a file can have")
+    return path.read_bytes()
+
+
+@cache
+def _adapter(kind: Any) -> TypeAdapter[Any]:
+    try:
+        return TypeAdapter(kind, config=ConfigDict(allow_inf_nan=False))
+    except PydanticUserError:  # a dataclass or typed dictionary has its own configuration
+        return TypeAdapter(kind)

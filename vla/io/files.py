@@ -1,0 +1,65 @@
+"""Atomic writes of files and folders, and errors that name the target."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from errno import EACCES, EDQUOT, EFBIG, EISDIR, ENOSPC, ENOTDIR, EPERM, EROFS
+from pathlib import Path
+
+UNWRITABLE = (EACCES, EDQUOT, EFBIG, EISDIR, ENOSPC, ENOTDIR, EPERM, EROFS)
+
+
+@contextmanager
+def atomic_path(target: Path) -> Iterator[Path]:
+    """Yield a draft path beside `target`, for a file or a folder; the draft replaces `target` at the end.
+
+    Several processes may write to one target at once. On failure the draft is removed and `target` stays as it was.
+
+    Raises:
+        OSError: the draft cannot be written; the message names `target`.
+    """
+    draft = target.with_name(f".{os.getpid()}.{target.name}")  # libraries choose the format by the suffix
+    try:
+        with writing(target):
+            yield draft
+            os.replace(draft, target)
+    finally:
+        if draft.is_dir():
+            shutil.rmtree(draft, ignore_errors=True)
+        else:
+            with suppress(OSError):  # where nothing can be written, nothing can be removed either
+                draft.unlink()
+
+
+def write_text(target: Path, text: str) -> None:
+    """Write a text file atomically, creating its folder; see `atomic_path`."""
+    with atomic_path(target) as draft:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        draft.write_text(text, encoding="utf-8")
+
+
+def require_file(path: Path) -> None:
+    """Refuse what is there without being a file: reading from a pipe or a device may never end.
+
+    Raises:
+        ValueError: it is a folder, a pipe or a device.
+    """
+    if path.exists() and not path.is_file():
+        raise ValueError(f"{path} is a folder, a pipe or a device, not a file")
+
+
+@contextmanager
+def writing(target: Path) -> Iterator[None]:
+    """Convert disk errors, which often name no file, into an OSError whose message names `target`."""
+    try:
+        yield
+    except OSError as error:
+        if error.errno not in UNWRITABLE:
+            raise
+        kept = ", the one before it is kept" if target.is_file() else ""
+        raise OSError(
+            f"{target} cannot be written ({error.strerror}){kept}: make room there, or choose another folder"
+        ) from error

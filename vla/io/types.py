@@ -1,0 +1,52 @@
+"""Constrained types for constructor arguments and records in files, validated by `vla.config.annotations`.
+
+Validation also requires every float to be finite.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from typing import Annotated, Any
+
+from annotated_types import Ge, Gt, Le, Lt, MinLen, Predicate
+
+
+def ascending(values: Sequence[float]) -> bool:
+    """in ascending order"""
+    return all(low <= high for low, high in itertools.pairwise(values))
+
+
+def unique(values: Sequence[Any]) -> bool:
+    """without repetitions"""
+    return len({repr(value) for value in values}) == len(values)
+
+
+Natural = Annotated[int, Ge(0), Le(2**31 - 1)]
+Count = Annotated[int, Ge(1), Le(2**31 - 1)]
+Seed = Annotated[int, Ge(0), Le(2**32 - 1)]  # range of NumPy and Lightning
+NonNegative = Annotated[float, Ge(0)]
+Positive = Annotated[float, Gt(0)]
+Share = Annotated[float, Ge(0), Le(1)]  # a probability, a fraction
+Rate = Annotated[float, Ge(0), Lt(1)]  # of dropout, of a moving average
+Range = Annotated[tuple[float, float], Predicate(ascending)]  # low, high
+NonNegativeRange = Annotated[tuple[NonNegative, NonNegative], Predicate(ascending)]
+PositiveRange = Annotated[tuple[Positive, Positive], Predicate(ascending)]
+CountRange = Annotated[tuple[Count, Count], Predicate(ascending)]
+Pixels = Annotated[int, Ge(8), Le(1024)]
+ImageSize = tuple[Pixels, Pixels]  # height, width
+Point = tuple[float, float, float]  # [m]
+# Network sizes, bounded by the memory of a machine: model configs are also read from checkpoints.
+Width = Annotated[int, Ge(1), Le(16384)]
+Layers = Annotated[int, Ge(1), Le(256)]
+Steps = Annotated[int, Ge(1), Le(1024)]  # of history, of a chunk of actions
+Bins = Annotated[int, Ge(2), Le(65536)]
+Widths = Annotated[list[Width], MinLen(1)]
+Kernels = Annotated[list[Annotated[int, Ge(1), Le(31)]], MinLen(1)]
+Shift = tuple[NonNegative, NonNegative]  # of images in augmentation, down and across [px]
+
+Text = Annotated[str, MinLen(1)]
+
+# `**inherited: Inherited` at the end of a constructor stands for the arguments of the base class.
+Inherited = Annotated[Any, "arguments of the base class"]
+Names = Annotated[tuple[Text, ...], MinLen(1), Predicate(unique)]

@@ -1,0 +1,41 @@
+"""`job=benchmark`: throughput and latency of every stage, next to a floor that is measured in the same run.
+
+The floor is the same measure for the part of the work that cannot be avoided. A ratio of 1 means that everything else
+is free. Each stage is a module of this package with a function `measures`.
+"""
+
+from __future__ import annotations
+
+import json
+from importlib import import_module
+
+from rich import print as show
+from rich.table import Table
+
+from vla.config.experiment import Experiment
+from vla.io.files import write_text
+from vla.jobs.benchmark.measure import Measure
+
+STAGES = ("collect", "loader", "train", "policy", "deploy")
+
+
+def run(experiment: Experiment) -> dict[str, Measure]:
+    """Measure the stages in `benchmark.names`, print a table and write `benchmark.json`; returns name → measure.
+
+    Raises:
+        ValueError: a name is no stage, or there are no names.
+    """
+    names = experiment["benchmark"]["names"]
+    if not names:
+        raise ValueError(f"benchmark.names is empty: the stages are {', '.join(STAGES)}")
+    if unknown := sorted(set(names) - set(STAGES)):
+        raise ValueError(f"benchmark.names has {unknown}, the stages are {sorted(STAGES)}")
+    measures: dict[str, Measure] = {}
+    for name in names:
+        measures |= import_module(f"vla.jobs.benchmark.{name}").measures(experiment)
+    write_text(experiment.output / "benchmark.json", json.dumps(measures, indent=2))
+    table = Table("stage", "value", "unit", "n", "floor", "ratio")
+    for name, measure in measures.items():
+        table.add_row(name, *map(str, measure.values()))
+    show(table)
+    return measures

@@ -1,0 +1,1 @@
+"""Scripts that measure other projects on the same work, for the interpreters of those projects."""

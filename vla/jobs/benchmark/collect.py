@@ -1,0 +1,103 @@
+"""Throughput of collection and its breakdown, and the throughput of robosuite."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from tempfile import TemporaryDirectory
+from typing import Protocol, runtime_checkable
+
+from vla.config.experiment import Experiment
+from vla.data.episodes import EpisodeStore
+from vla.jobs.benchmark.baselines.peer import DURATION, peer
+from vla.jobs.benchmark.measure import Measure, measure, timed
+from vla.parallel.pool import LocalCluster, WorkerFactory
+from vla.parallel.processes import cores
+from vla.rollouts.collect import DemonstrationWorker
+from vla.rollouts.rollout import replay, rollout
+from vla.spec import Episode
+
+
+@runtime_checkable
+class Floored(Protocol):
+    """A world that can run the unavoidable part of a control step by itself."""
+
+    def floor(self) -> dict[str, Callable[[], object]]:
+        """Return "physics" and "rendering" → a function that does this part of one control step."""
+        ...
+
+
+def measures(experiment: Experiment) -> dict[str, Measure]:
+    """Measure control steps per second.
+
+    - collect: rollouts of one process with all cameras; the floor is physics and rendering, for a `Floored` world.
+    - breakdown of the time of a step, including replay and storage; the floor is the whole step.
+    - all processes, including verification; the floor is that of one process times their number.
+    - robosuite on the same work as the floor, if `benchmark.robosuite` names a Python interpreter.
+    """
+    asked = experiment["benchmark"]
+    makers = experiment.make_environment(), experiment.make_expert()
+    environment = makers[0]()
+    expert = makers[1](environment)
+    rollout(environment, expert, 0)  # warm-up: compiles shaders
+    seeds = range(asked["episodes"])
+    episodes, full = timed(lambda: [rollout(environment, expert, seed) for seed in seeds])
+    steps = sum(len(episode.actions) for episode in episodes)
+    calls = environment.floor() if isinstance(environment, Floored) else {}
+    floor = {name: timed(partial(_repeat, call, steps))[1] for name, call in calls.items()}
+    with environment.blind():
+        _, blind = timed(lambda: [rollout(environment, expert, seed) for seed in seeds])
+        _, replaying = timed(lambda: [replay(environment, episode) for episode in episodes])
+    with TemporaryDirectory() as folder:
+        store = EpisodeStore.create_or_open(folder, environment.spec, {})
+        with store.writing():
+            _, storing = timed(partial(_keep, store, episodes))
+    environment.close()
+    physics, rendering = floor.get("physics", 0.0), floor.get("rendering", 0.0)
+    stages = {
+        **floor,
+        "expert, controller, judge": blind - physics,
+        "images into arrays": full - blind - rendering,
+        "replay": replaying,
+        "storing": storing,
+    }
+    least = steps / sum(floor.values()) if floor else None
+    found = {"collect": measure(steps / full, "control steps/s", steps, least)}
+    whole = 1000 * (full + replaying + storing) / steps
+    for name, seconds in stages.items():
+        found[f"collect: {name}"] = measure(1000 * seconds / steps, "ms/step", steps, whole)
+    work = partial(DemonstrationWorker, *makers)
+    alone, together = (_attempts(work, count, asked["episodes"]) for count in (1, cores()))
+    found[f"collect: {cores()} processes"] = measure(*together, cores() * alone[0])
+    if asked["robosuite"] is not None:
+        arguments = (*environment.spec.image_size, DURATION)
+        for count, (rate, unit, n) in ((1, alone), (cores(), together)):
+            rival = peer("robosuite", asked["robosuite"], "robosuite_lift.py", arguments, count)
+            if count == 1:  # robosuite verifies nothing: the same work is a rollout without verification
+                found["collect, against robosuite"] = measure(steps / full, unit, steps, rival)
+            found[f"collect: verified, against {count} of robosuite"] = measure(rate, unit, n, rival)
+    return found
+
+
+def _repeat(call: Callable[[], object], times: int) -> None:
+    for _ in range(times):
+        call()
+
+
+def _keep(store: EpisodeStore, episodes: list[Episode]) -> None:
+    for episode in episodes:
+        if episode.success:
+            store.append(episode)
+        else:
+            store.fail(episode)
+
+
+def _attempts(make: WorkerFactory, processes: int, episodes_each: int) -> tuple[float, str, int]:
+    """Return the rate of verified control steps of concurrent processes after a warm-up, its unit, and their number."""
+    with LocalCluster(processes).pool(make) as pool:
+        for attempt in [pool.submit(seed) for seed in range(2 * processes)]:
+            attempt.result()
+        seeds = range(processes * episodes_each)
+        episodes, seconds = timed(lambda: [attempt.result() for attempt in [pool.submit(seed) for seed in seeds]])
+    steps = sum(len(episode.actions) for episode in episodes)
+    return steps / seconds, "control steps/s", steps

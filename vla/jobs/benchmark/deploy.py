@@ -1,0 +1,37 @@
+"""Latencies of a deployed policy."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from vla.config.experiment import Experiment
+from vla.jobs.benchmark.measure import Measure, measure
+from vla.jobs.deploy import deployment
+
+
+def measures(experiment: Experiment) -> dict[str, Measure]:
+    """Measure the closed loop over ROS 2, with the nodes in processes of their own, in real time.
+
+    - image to command: median latency from the exposure of an image to the next command; the floor is inference alone.
+    - tick p99: 99th percentile of the period of the commands; the floor is the nominal period.
+    - watchdog: median delay from a frozen simulator to a held arm; the floor is the maximum age of a joint state.
+
+    Raises:
+        ValueError: no loop or no checkpoint is chosen.
+    """
+    if not experiment["deploy"] or experiment["deploy"]["_target_"] != "vla.deploy.loop.Loop":
+        raise ValueError("benchmark.names=[deploy] needs deploy=loop checkpoint=FILE")
+    loop = deployment(experiment)
+    with loop.running() as operator:
+        for _ in range(loop.episodes):
+            operator.play()
+        operator.begin_episode()
+        delays = [1000 * operator.watchdog_delay() for _ in range(experiment["benchmark"]["episodes"])]
+        figures = {key: float(value) for key, value in operator.status.items() if key.endswith("[ms]")}
+    agent = experiment["deploy"]["agent"]
+    image, inference = (figures[f"{name} p50 [ms]"] for name in ("image to command", "inference"))
+    return {
+        "deploy: image to command": measure(image, "ms", loop.episodes, inference),
+        "deploy: tick p99": measure(figures["tick p99 [ms]"], "ms", loop.episodes, 1000 / agent.command_hz),
+        "deploy: watchdog": measure(float(np.median(delays)), "ms", len(delays), 1000 * agent.safety.joints_age),
+    }

@@ -1,0 +1,91 @@
+"""`job=collect`: fill the episode store with verified demonstrations."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+
+from vla.config.build import build
+from vla.config.experiment import Experiment
+from vla.data.episodes import EpisodeStore
+from vla.data.formats.imported_demonstrations import ImportedDemonstrations
+from vla.rollouts.collect import collect
+from vla.spec import FIRST_SEED, Spec
+
+log = logging.getLogger(__name__)
+
+
+def run(experiment: Experiment) -> None:
+    """Fill the episode store."""
+    demonstrations(experiment)
+
+
+def demonstrations(experiment: Experiment) -> EpisodeStore:
+    """Return the episode store of an experiment, limited to `collect.episodes`; collect missing episodes.
+
+    Raises:
+        ValueError: the store has episodes of another experiment, or collection fails.
+    """
+    asked = experiment["collect"]
+    if asked["seed"] + asked["episodes"] > FIRST_SEED:
+        raise ValueError(f"collect.seed={asked['seed']}: seeds from {FIRST_SEED} on are reserved for evaluation")
+    store = complete_store(experiment)
+    if store is None:
+        store = _fill(experiment)
+    else:
+        log.info("%s: %d episodes, none of them new", store.folder, len(store.episodes))
+    return EpisodeStore(store.folder, asked["episodes"])
+
+
+def demonstration_spec(experiment: Experiment) -> Spec:
+    """Return the spec of the demonstrations; a complete store contains it, otherwise the simulator is built."""
+    store = complete_store(experiment)
+    return store.spec if store else _source(experiment)[0]
+
+
+def complete_store(experiment: Experiment) -> EpisodeStore | None:
+    """Return the episode store of an experiment if it has enough episodes.
+
+    Raises:
+        ValueError: the store was collected with another task, expert or first seed.
+    """
+    folder, asked = Path(experiment["collect"]["folder"]), experiment["collect"]
+    if not (folder / "store.json").exists():
+        return None
+    store = EpisodeStore(folder)
+    store.require(experiment.source, asked["seed"])
+    return store if len(store.episodes) >= asked["episodes"] else None
+
+
+def _source(experiment: Experiment) -> tuple[Spec, ImportedDemonstrations | None]:
+    """Return the spec of the demonstrations, and the recordings to import, or None for an acting expert."""
+    environment = experiment.make_environment()()
+    environment.close()
+    expert = build(experiment["expert"], "expert", spec=environment.spec)
+    return (expert.spec, expert) if isinstance(expert, ImportedDemonstrations) else (environment.spec, None)
+
+
+def _fill(experiment: Experiment) -> EpisodeStore:
+    asked, cluster = experiment["collect"], experiment.cluster()
+    spec, recorded = _source(experiment)
+    store = EpisodeStore.create_or_open(Path(asked["folder"]), spec, experiment.source)
+    if recorded is not None:
+        added = recorded.fill(store, asked["episodes"])
+        log.info("%s: %d recorded episodes, %d of them new", store.folder, len(store.episodes), added)
+        return store
+    makers = experiment.make_environment(), experiment.make_expert()
+    summary = collect(store, *makers, asked["episodes"], cluster, asked["seed"])
+    if len(summary.tasks) > 1:
+        for task, (solved, tried) in summary.tasks.items():
+            log.info("%s: %d episodes of %d seeds", task, solved, tried)
+    failures = ", ".join(f"{count} {cause}" for cause, count in summary.failures.items()) or "none"
+    log.info(
+        "%s: %d episodes, %d of them new in %.0f s; expert success %.1f %%, failures: %s",
+        store.folder,
+        summary.episodes,
+        summary.added,
+        summary.seconds,
+        100 * summary.success_rate,
+        failures,
+    )
+    return store

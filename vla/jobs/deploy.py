@@ -1,0 +1,37 @@
+"""`job=deploy`: run a trained policy on a robot or a simulator."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any
+
+from vla.config.build import build
+from vla.config.experiment import Experiment
+from vla.policy import Policy
+from vla.reports.evaluation import plot_report, write_report
+
+
+def run(experiment: Experiment) -> None:
+    """Run the deployment until done or interrupted; report a measured success rate like an evaluation."""
+    report = deployment(experiment).run()
+    if report is not None:
+        output = experiment.output
+        write_report(report, output / "report.json", experiment["checkpoint"], experiment.config)
+        plot_report(report, output / "report.png")
+        print(report)
+
+
+def deployment(experiment: Experiment) -> Any:
+    """Build the deployment of an experiment."""
+    return build(
+        experiment["deploy"],
+        "deploy",
+        policy=partial(_policy, experiment),
+        environment=experiment.make_environment(),
+        output=experiment.output,
+    )
+
+
+def _policy(experiment: Experiment) -> Policy:
+    """Build the trained policy; raise a ValueError if no checkpoint is given."""
+    return experiment.make_policy()()

@@ -1,0 +1,109 @@
+"""`job=evaluate`: the success rate of a policy on the same seeds under every condition; trains a policy if needed."""
+
+from __future__ import annotations
+
+import logging
+import time
+from contextlib import nullcontext
+from pathlib import Path
+
+from rich import print as show
+
+from vla.config.check import with_changes
+from vla.config.conditions import conditions
+from vla.config.experiment import Experiment
+from vla.io.files import writing
+from vla.jobs.train import train
+from vla.policy import latency
+from vla.reports.conditions import conditions_table, plot_conditions
+from vla.reports.evaluation import plot_report, write_report
+from vla.reports.html import PAGE, optional, write_page
+from vla.rollouts.evaluate import IN_DISTRIBUTION, Report, evaluate, keep_recordings
+from vla.runs.folder import CHECKPOINTS, run_of, save_config
+from vla.runs.resume import cached_success, training_lock
+
+log = logging.getLogger(__name__)
+
+
+def run(experiment: Experiment) -> float | None:
+    """Measure the success rate; return None in all but the first process of a training.
+
+    Raises:
+        ValueError: an episode ended in an error; the report is written and contains it.
+    """
+    output = experiment.output
+    checkpoint = experiment.checkpoint or train(experiment)
+    if checkpoint is None:
+        return None
+    own = checkpoint.resolve().parent == (output / CHECKPOINTS).resolve()
+    if own and (success := cached_success(output, experiment.config, checkpoint)) is not None:
+        return success
+    with training_lock(checkpoint.parent) if own else nullcontext():  # else resume=last would find it interrupted
+        return _evaluated(experiment, checkpoint)
+
+
+def _evaluated(experiment: Experiment, checkpoint: Path) -> float:
+    """Play the episodes, write the reports, and return the success rate; print it even if writing fails."""
+    started, output = time.monotonic(), experiment.output
+    reports = _play(experiment, checkpoint)
+    report = reports[IN_DISTRIBUTION]
+    try:
+        with writing(output / "report.json"):
+            _write(experiment, checkpoint, reports, started)
+    finally:
+        print(report)
+    errors = [error for each in reports.values() for error in each.errors]
+    if errors:
+        raise ValueError(f"{len(errors)} episodes ended in an error, see {output / 'report.json'}")
+    return report.success
+
+
+def _play(experiment: Experiment, checkpoint: Path) -> dict[str, Report]:
+    """Return condition → report on the same seeds; only the first, the training condition, is recorded."""
+    asked, task = experiment["evaluate"], experiment["task"]
+    seeds = range(asked["seed"], asked["seed"] + asked["episodes"])
+    cluster, needs = experiment.cluster(), [checkpoint.resolve()]
+    make_policy = experiment.make_policy(needs[0])
+    recordings = experiment.output.resolve() / "recordings"
+    recorder = experiment.make_recorder(recordings)
+    if recorder:
+        recordings.mkdir(exist_ok=True)
+        needs.append(recordings)
+    reports: dict[str, Report] = {}
+    for name, changes in {IN_DISTRIBUTION: {}, **conditions(asked)}.items():
+        if reports and with_changes(task, changes) == task:  # equal to the training condition
+            reports[name] = reports[IN_DISTRIBUTION]
+            continue
+        watching = None if reports else recorder
+        make_environment = experiment.make_environment(changes)
+        reports[name] = evaluate(make_environment, make_policy, watching, seeds, cluster, name, needs)
+    return reports
+
+
+def _write(experiment: Experiment, checkpoint: Path, reports: dict[str, Report], started: float) -> None:
+    """Write all results of an evaluation that started at `started` [s]."""
+    output, report = experiment.output, reports[IN_DISTRIBUTION]
+    others = {name: each for name, each in reports.items() if name != IN_DISTRIBUTION}
+    policy = experiment.make_policy(checkpoint)()
+    facts = {
+        **experiment["chosen"],
+        "parameters": sum(p.numel() for p in policy.model.parameters()),
+        "latency_ms": latency(policy),
+        "wall_time_s": run_of(checkpoint).wall_time(time.monotonic() - started),
+    }
+    save_config(output, experiment.config, experiment.changes)
+    if experiment["recorder"]:
+        recording, limit = output / "rollouts.rrd", experiment["evaluate"]["recordings"]
+        with optional(recording):
+            keep_recordings(report, output / "recordings", recording, limit)
+    plot_report(report, output / "report.png")
+    if others:
+        plot_conditions(reports, output / "suite.png")
+        show(conditions_table(reports))
+    # Last, because its existence marks the evaluation as finished.
+    write_report(report, output / "report.json", str(checkpoint), experiment.config, facts, others)
+    with optional(output / PAGE):
+        write_page(output)
+    log.info(
+        "wrote %s, report.json, report.png%s", output / PAGE, " and rollouts.rrd" if experiment["recorder"] else ""
+    )

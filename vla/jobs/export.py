@@ -1,0 +1,24 @@
+"""`job=export`: export the demonstrations to another format, or a trained policy to programs."""
+
+from __future__ import annotations
+
+import logging
+
+from vla.config.build import build
+from vla.config.experiment import Experiment
+from vla.jobs.collect import demonstrations
+
+log = logging.getLogger(__name__)
+
+
+def run(experiment: Experiment) -> None:
+    """Export demonstrations or a policy, depending on the exporter.
+
+    Raises:
+        ValueError: the exporter needs a policy, and no checkpoint is given.
+    """
+    exporter = build(experiment["export"], "export")
+    if hasattr(exporter, "export_policy"):
+        log.info("wrote %s", exporter.export_policy(experiment.make_policy()()))
+    else:
+        log.info("wrote %s", exporter.export(demonstrations(experiment), experiment.cluster()))

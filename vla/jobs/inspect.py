@@ -1,0 +1,97 @@
+"""`job=inspect`: verify and describe an episode store, merge stores into a new one, or replay one episode."""
+
+from __future__ import annotations
+
+import logging
+import os
+from pathlib import Path
+from typing import Any
+
+from rich import print as show
+
+from vla.config.build import require_no_paths
+from vla.config.experiment import Experiment, make_environment
+from vla.data.episodes import EpisodeStore
+from vla.data.index import listed
+from vla.data.verification import derive_store, find_episode, require_whole, verify_store
+from vla.reports.dataset_card import store_table, write_card
+from vla.rollouts.recorder import RerunRecorder, recording_name
+from vla.rollouts.rollout import replay
+from vla.tasks.gl import choose_backend
+
+log = logging.getLogger(__name__)
+
+
+def run(experiment: Experiment) -> None:
+    """Verify and describe a store, after merging or repairing if asked for, or replay one episode."""
+    asked = dict(experiment["inspect"])
+    seed = asked.pop("episode")
+    if seed is None:
+        inspect_store(**asked)
+    else:
+        replay_episode(experiment.output, Path(asked["folder"]), seed)
+
+
+def inspect_store(
+    folder: str, stores: list[str] | None, where: dict[str, Any] | None, repair: bool, into: str | None
+) -> None:
+    """Verify and describe the store in `folder`, or a new store made by merging, filtering or repair.
+
+    Args: see the node `inspect` of the config.
+
+    Raises:
+        ValueError: the store does not exist, cannot be made, or is damaged; its intact episodes are described first.
+    """
+    findings = verify_store(EpisodeStore(_chosen(folder, stores, where, repair, into), damaged=True))
+    show(store_table(findings))
+    if findings.whole:
+        log.info("wrote %s and card.png", write_card(findings))
+    require_whole(findings)
+
+
+def _chosen(
+    folder: str, stores: list[str] | None, where: dict[str, Any] | None, repair: bool, into: str | None
+) -> Path:
+    """Return the path of the store to inspect; make it if needed."""
+    if stores == []:
+        raise ValueError("inspect.stores=[] is empty: omit it, or give at least one folder")
+    if into is None and (stores or where):
+        raise ValueError("inspect.stores and inspect.where make a new store: give its folder, inspect.into=DIR")
+    if into is None and not repair:
+        return Path(folder)
+    sources = [EpisodeStore(source, damaged=repair) for source in stores or [folder]]
+    if into is None and not verify_store(sources[0]).damaged:
+        log.info("nothing in %s is damaged, so nothing is repaired", folder)
+        return Path(folder)
+    new = Path(f"{Path(folder)}-repaired" if into is None else into)
+    damaged = derive_store(sources, new, where, repair)
+    log.info("wrote %s; its sources are unchanged", new)
+    if damaged:
+        log.warning("%d damaged seeds now count as failed: %s", len(damaged), listed(damaged))
+    return new
+
+
+def replay_episode(output: Path, folder: Path, seed: int) -> None:
+    """Write `episode-SEED.rrd`: a stored episode in the 3-D scene of a replay of its actions.
+
+    Raises:
+        ValueError: there is no such episode, or its store does not contain its task.
+    """
+    store = EpisodeStore(folder, damaged=True)
+    config, episode = find_episode(store, seed)
+    if "task" not in config:
+        raise ValueError(f"{folder} does not contain the task of seed {seed}, so there is no scene to replay it in")
+    choose_backend()  # before the check imports MuJoCo, which reads MUJOCO_GL then
+    require_no_paths(config, ("task",), folder)
+    environment = make_environment(config["task"])
+    store.spec.require(environment.spec, f"the episode store {folder}", "its task as it is built now")
+    with environment.blind():
+        step = replay(environment, episode, RerunRecorder(output))
+    environment.close()
+    recording = output / f"episode-{seed}.rrd"
+    os.replace(output / f"{recording_name(seed, episode.outcome)}.rrd", recording)
+    if step is None:
+        log.info("the replay goes through the same states, bit for bit, and ends in %s", episode.outcome)
+    else:
+        log.warning("the replay differs from step %d on: the scene is the replay's, all else is from the store", step)
+    log.info("wrote %s", recording)

@@ -1,0 +1,34 @@
+"""`job=preview`: a contact sheet of randomised resets, a table of their draws, and a recording of the expert."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+from rich import print as show
+
+from vla.config.experiment import Experiment
+from vla.io.files import atomic_path, writing
+from vla.reports.evaluation import contact_sheet, draws_table
+from vla.rollouts.recorder import RerunRecorder, merge
+from vla.rollouts.rollout import rollout
+
+log = logging.getLogger(__name__)
+
+
+def run(experiment: Experiment) -> None:
+    """Roll out the expert on a few seeds; write contact sheet and recording, print the draws."""
+    output, asked = experiment.output, experiment["preview"]
+    environment = experiment.make_environment()()
+    expert = experiment.make_expert()(environment)
+    seeds = range(asked["seed"], asked["seed"] + asked["episodes"])
+    with writing(output / "preview.rrd"), TemporaryDirectory(prefix=".recordings-", dir=output) as folder:
+        recorder = RerunRecorder(folder)
+        episodes = [rollout(environment, expert, seed, recorder) for seed in seeds]
+        environment.close()
+        merge(sorted(Path(folder).glob("*.rrd")), output / "preview.rrd")
+    with atomic_path(output / "preview.png") as draft:
+        contact_sheet(list(seeds), [episode.observations[0] for episode in episodes]).save(draft)
+    show(draws_table(list(seeds), [episode.draws for episode in episodes]))
+    log.info("wrote %s and %s", output / "preview.png", output / "preview.rrd")

@@ -1,0 +1,33 @@
+"""The Hydra callback that tabulates a sweep after every cell."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from filelock import FileLock
+from hydra.core.utils import JobReturn, JobStatus
+from hydra.experimental.callback import Callback
+from hydra.types import RunMode
+from omegaconf import DictConfig
+
+from vla.runs.sweep import FAILURE
+
+
+class SweepTable(Callback):
+    """Writes `sweep.html`, `sweep.csv`, `sweep.md` and `sweep.png` after every cell."""
+
+    def on_job_start(self, config: DictConfig, **kwargs: Any) -> None:
+        """Remove an earlier error of the cell."""
+        (Path(config.hydra.runtime.output_dir) / FAILURE).unlink(missing_ok=True)
+
+    def on_job_end(self, config: DictConfig, job_return: JobReturn, **kwargs: Any) -> None:
+        """Write the table of all cells that have a report."""
+        if config.hydra.mode == RunMode.MULTIRUN:
+            if job_return.status == JobStatus.COMPLETED:  # from a concurrent sweep in this folder
+                (Path(config.hydra.runtime.output_dir) / FAILURE).unlink(missing_ok=True)
+            from vla.reports.sweep import tabulate  # imports matplotlib
+
+            folder = Path(config.hydra.sweep.dir)
+            with FileLock(folder / ".lock"):  # the last holder of the lock writes all cells
+                tabulate(folder)

@@ -1,0 +1,152 @@
+"""`job=train`: fill the episode store and train a model on it."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import partial
+from pathlib import Path
+
+import lightning
+from lightning import Trainer
+
+from vla.config.experiment import Experiment, training_policy
+from vla.data.episodes import EpisodeStore
+from vla.io.files import writing
+from vla.jobs.collect import demonstration_spec, demonstrations
+from vla.models.chunk_policy import ChunkModel
+from vla.models.learner import Learner
+from vla.models.model import Model
+from vla.models.tokenizers.tokenization_error import describe_tokenization_error, out_of_bounds
+from vla.reports.first_batch import FILE, SHOWN, draw_samples
+from vla.reports.html import PAGE, optional, write_page
+from vla.rollouts.collect import collection_time
+from vla.runs.folder import CHECKPOINTS, LAST, save_choice, save_config, save_training
+from vla.runs.resume import TrainingProgress, first_process, training_lock, training_progress
+from vla.training.closed_loop import ClosedLoop
+from vla.training.trainer import GracefulStop, explain_memory_errors, make_trainer, quiet_lightning, restore_metrics
+
+log = logging.getLogger(__name__)
+
+
+def run(experiment: Experiment) -> None:
+    """Train, or continue the training in the output folder."""
+    train(experiment)
+
+
+def train(experiment: Experiment) -> Path | None:
+    """Train, and return the checkpoint that validation selects; None in all but the first process.
+
+    An unfinished training in the output folder is resumed; a finished one is kept.
+
+    Raises:
+        ValueError: the output folder has another training, or this one cannot start.
+    """
+    state = training_progress(experiment.output, experiment.config)
+    if state.chosen is not None:
+        return state.chosen if first_process() else None
+    quiet_lightning()
+    output = experiment.output
+    checkpoints = output / CHECKPOINTS
+    graceful_stop = GracefulStop(checkpoints)
+    closed_loop = _closed_loop(experiment, checkpoints)
+    if _endless(experiment):
+        log.info("trainer.max_steps=-1: training runs until interrupted; Ctrl-C saves and stops")
+    with training_lock(checkpoints):
+        # Before collection, so that missing devices are reported early.
+        trainer = make_trainer(experiment.config, checkpoints, *([closed_loop] if closed_loop else []), graceful_stop)
+        if not trainer.is_global_zero:
+            logging.getLogger("vla").setLevel(logging.WARNING)  # only the first process logs
+        _fit(experiment, state, trainer, graceful_stop)
+    if not trainer.is_global_zero:
+        return None
+    chosen = closed_loop.selected_checkpoint(checkpoints / LAST) if closed_loop else checkpoints / LAST
+    save_choice(output, chosen.name)
+    return chosen
+
+
+def _fit(experiment: Experiment, state: TrainingProgress, trainer: Trainer, graceful_stop: GracefulStop) -> None:
+    """Collect missing demonstrations and train on them."""
+    output, origin = experiment.output, state.resume_from or experiment.pretrained
+    lightning.seed_everything(experiment["seed"], verbose=False)
+    with explain_memory_errors(experiment.config):
+        learner = experiment.learner(demonstration_spec(experiment), origin)
+    store = demonstrations(experiment)
+    if origin is None:
+        experiment.fit_tokenizer(learner.model.tokenizer, store)
+    data = experiment.data(store, learner.model.history, learner.model.chunk)
+    _log_tokenization_error(learner.model, store)
+    data.setup()
+    if data.batch_size > len(data.training_windows):
+        raise ValueError(
+            f"data.batch_size={data.batch_size} is more than the {len(data.training_windows)} windows of "
+            f"the episodes in {store.folder}: lower it, or collect more"
+        )
+    if not len(data.held_out_windows):
+        trainer.limit_val_batches = 0  # else callbacks wait for a validation that never runs
+    with optional(output / FILE):
+        draw_samples(data.make_batch(data.order(0)[:SHOWN]), store.spec, output / FILE)
+    if state.resume_from:
+        restore_metrics(trainer, state.resume_from)
+    collection_s = collection_time(store, experiment["collect"]["episodes"])
+    with writing(output), _reported(experiment, trainer, graceful_stop, learner, collection_s):
+        try:
+            with explain_memory_errors(experiment.config), graceful_stop.handling_signals():
+                trainer.fit(learner, datamodule=data, ckpt_path=state.resume_from, weights_only=True)
+        except SystemExit:  # on SIGTERM Lightning exits with status 0
+            if not graceful_stop.requested:
+                raise
+        if not graceful_stop.stopped:
+            trainer.save_checkpoint(output / CHECKPOINTS / LAST, weights_only=False)
+        if graceful_stop.requested and trainer.is_global_zero:
+            raise KeyboardInterrupt
+
+
+def _endless(experiment: Experiment) -> bool:
+    limits = [experiment["trainer"].get(name) for name in ("max_steps", "max_epochs", "max_time")]
+    return all(limit in (None, -1) for limit in limits)
+
+
+def _log_tokenization_error(model: Model, store: EpisodeStore) -> None:
+    """Log the tokenisation error and the share of actions beyond the tokenizer's bounds."""
+    chunks = store.statistics.chunks(model.chunk)
+    if not isinstance(model, ChunkModel):
+        error = describe_tokenization_error(model.tokenizer, chunks, store.spec)
+        log.info("%s: %s", type(model.tokenizer).__name__, error)
+    if outside := out_of_bounds(model.tokenizer, chunks):
+        log.warning("%.2g %% of the demonstrated actions exceed the bounds of the tokenizer", 100 * outside)
+
+
+def _closed_loop(experiment: Experiment, checkpoints: Path) -> ClosedLoop | None:
+    """Return the callback that plays episodes in every validation, or None without episodes."""
+    asked = experiment["validate"]
+    seeds = range(asked["seed"], asked["seed"] + asked["episodes"])
+    make_environment = experiment.make_environment(asked["changes"])
+    make_policy = partial(training_policy, experiment["policy"])
+    return ClosedLoop(make_environment, make_policy, seeds, checkpoints) if seeds else None
+
+
+@contextmanager
+def _reported(
+    experiment: Experiment, trainer: Trainer, graceful_stop: GracefulStop, learner: Learner, collection_s: float | None
+) -> Iterator[None]:
+    """Write the report page and the log summary however training ends, including the runs it resumed from."""
+    output = experiment.output
+    save_config(output, experiment.config, experiment.changes)
+    parameters = sum(parameter.numel() for parameter in learner.model.parameters())
+    start = f", starting from {experiment.pretrained}" if experiment.pretrained else ""
+    log.info("training %s with %.2f M parameters%s", type(learner.model).__name__, parameters / 1e6, start)
+    ended = "done"
+    try:
+        yield
+    except BaseException as error:
+        ended = "interrupted" if isinstance(error, KeyboardInterrupt) else str(error) or type(error).__name__
+        raise
+    finally:
+        seconds = graceful_stop.seconds
+        if trainer.is_global_zero:
+            with optional(output / PAGE):
+                save_training(output, parameters, trainer.global_step, seconds, ended, collection_s)
+                write_page(output)
+    log.info("trained %d steps in %.0f s: %s", trainer.global_step, seconds, output / CHECKPOINTS)

@@ -1,0 +1,25 @@
+"""The cache of graphs that PyTorch compiles, one per instruction set."""
+
+from __future__ import annotations
+
+import os
+from zlib import crc32
+
+import torch
+
+CACHE_VARIABLE = "TORCHINDUCTOR_CACHE_DIR"
+
+
+def set_compile_cache() -> None:
+    """Set PyTorch's cache folder of compiled graphs, unless it is set, to one per instruction set.
+
+    Graphs that were compiled for other instructions act otherwise in silence or stop the process, and PyTorch's key of
+    a graph lacks them. PyTorch's own folder, which it sets as soon as it compiles anything, counts as none.
+    """
+    from torch._inductor.runtime.cache_dir_utils import default_cache_dir  # heavy: only for who compiles
+
+    shared = default_cache_dir()
+    if os.environ.get(CACHE_VARIABLE, shared) == shared:
+        features = torch.cpu.get_capabilities() if hasattr(torch.cpu, "get_capabilities") else {}
+        kind = (torch.backends.cpu.get_cpu_capability(), os.environ.get("ONEDNN_MAX_CPU_ISA"), features)
+        os.environ[CACHE_VARIABLE] = f"{shared}_{crc32(repr(kind).encode()):08x}"

@@ -1,0 +1,97 @@
+"""Text encoders: the base class, and learned embeddings of n-grams.
+
+Shapes: B sentences, L tokens of the longest, such as its n-grams.
+"""
+
+from __future__ import annotations
+
+import re
+import zlib
+from abc import ABC, abstractmethod
+from functools import lru_cache
+from typing import Annotated
+
+import torch
+from annotated_types import Ge, Le
+from torch import Tensor, nn
+
+from vla.io.types import Count, Rate
+
+PADDING = 0
+CACHE_SIZE = 8192  # sentences; at most 70 MB
+INITIAL_STD = 0.1  # of embeddings; small, so that untrained n-grams have little effect
+
+
+class TextEncoder(nn.Module, ABC):
+    """Sentence → vector in two parts: `tokenize` in plain Python, and `forward`, which is compiled and trained.
+
+    Args:
+        width: length of the vector.
+    """
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.width = width
+
+    @abstractmethod
+    def tokenize(self, sentences: list[str]) -> Tensor:
+        """Return the input of `forward` for B sentences, (B, L)."""
+
+    @abstractmethod
+    def forward(self, tokens: Tensor) -> Tensor:
+        """Return (B, width) vectors for the (B, L) output of `tokenize`."""
+
+
+class NGrams(TextEncoder):
+    """Mean of learned embeddings of the hashed words and n-grams of a sentence; needs no download.
+
+    Unseen words share character n-grams with known ones. Trigrams of words distinguish "put the red block on the blue
+    block" from "put the blue block on the red block", which have the same bigrams.
+
+    Args:
+        vocabulary: number of embeddings; n-grams with the same hash share one.
+        words: longest n-gram of words.
+        characters: length of character n-grams, taken from every word with boundary marks.
+        forget: dropout rate of n-grams in training, which imitates unknown words.
+        width: length of the sentence vector.
+    """
+
+    def __init__(
+        self,
+        vocabulary: Annotated[int, Ge(2), Le(2**24)],
+        words: Count,
+        characters: Count,
+        forget: Rate,
+        *,
+        width: int,
+    ) -> None:
+        super().__init__(width)
+        self.vocabulary, self.words, self.characters, self.forget = vocabulary, words, characters, forget
+        self.embedding = nn.Embedding(vocabulary, width, padding_idx=PADDING)
+        with torch.no_grad():
+            self.embedding.weight.mul_(INITIAL_STD)
+        self.norm = nn.LayerNorm(width)
+
+    def tokenize(self, sentences: list[str]) -> Tensor:
+        """Return (B, L) int64 hashes of the n-grams of B lower-cased sentences, padded with 0."""
+        rows = [_hashes(sentence, self.vocabulary, self.words, self.characters) for sentence in sentences]
+        return nn.utils.rnn.pad_sequence(rows, batch_first=True, padding_value=PADDING)
+
+    def forward(self, tokens: Tensor) -> Tensor:
+        """Return (B, width) vectors for (B, L) tokens; 0 is ignored at any position."""
+        if self.training and self.forget:
+            tokens = tokens * (torch.rand(tokens.shape, device=tokens.device) >= self.forget)
+        count = (tokens != PADDING).sum(1, keepdim=True).clamp(min=1)
+        vector: Tensor = self.norm(self.embedding(tokens).sum(1) / count)
+        return vector
+
+
+@lru_cache(maxsize=CACHE_SIZE)
+def _hashes(sentence: str, vocabulary: int, words: int, characters: int) -> Tensor:
+    found = re.findall(r"\w+", sentence.lower())
+    grams = [" ".join(found[i : i + n]) for n in range(1, words + 1) for i in range(len(found) - n + 1)]
+    for word in found:
+        marked = f"<{word}>"
+        grams += [f"#{marked[i : i + characters]}" for i in range(len(marked) - characters + 1)]
+    # crc32, because hash() differs between processes.
+    return torch.tensor([1 + zlib.crc32(gram.encode()) % (vocabulary - 1) for gram in grams] or [PADDING])

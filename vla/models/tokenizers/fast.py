@@ -1,0 +1,167 @@
+"""FAST: a chunk of actions as a short token sequence, by cosine transform and byte-pair encoding (arXiv 2501.09747).
+
+Shapes: k actions of a chunk, D action components, L tokens of a sequence, K tokens of the vocabulary, … leading
+dimensions.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from tokenizers import Tokenizer
+from tokenizers.models import BPE
+from tokenizers.trainers import BpeTrainer
+from torch import Tensor
+
+from vla.io.types import Bins, Positive, Steps
+from vla.models.tokenizers.tokenizer import MIN_SPAN, ActionTokenizer, Statistics, data_bounds
+from vla.spec import Spec
+
+FIRST_CODE_POINT = 0x100  # of the smallest coefficient; below 0xD800 every code point is a character
+END = "<end>"
+QUANTILES = (0.01, 0.99)  # of the data, scaled to -1 and 1
+
+
+class Fast(ActionTokenizer):
+    """Byte-pair encoding of the rounded cosine transform of each component, low frequencies first.
+
+    Smooth motions have few non-zero coefficients, and byte-pair encoding merges frequent sequences, so the length
+    varies, up to k·D tokens and an end token. A generated sequence with too few coefficients is filled up with 0, one
+    with too many is cut.
+
+    The loss mask of a chunk is that of its first action.
+
+    Args:
+        bins: K: the end token, one token per coefficient value, and merged sequences.
+        scale: quantisation steps per unit of the scaled actions; a larger value is finer and needs more tokens.
+        chunk: k.
+        spec: gives the allowed range of actions.
+        statistics: the data; None if a checkpoint is loaded next.
+    """
+
+    end = 0
+    centre: Tensor  # (D,) of the scaled range, in the units of the action
+    spread: Tensor  # (D,) half of the scaled range, in the units of the action
+    basis: Tensor  # (k, k) orthonormal cosine transform of type II: frequency, time
+
+    def __init__(
+        self,
+        bins: Bins,
+        scale: Positive,
+        chunk: Steps,
+        *,
+        spec: Spec,
+        statistics: Statistics | None = None,
+    ) -> None:
+        low, high = data_bounds(spec, statistics)
+        super().__init__(spec, low, high, bins)
+        self.scale, self.chunk = scale, chunk
+        sample = np.stack([low, high])[:, None].repeat(chunk, 1) if statistics is None else statistics.chunks(chunk)
+        first, last = np.quantile(sample.astype(np.float64), QUANTILES, axis=(0, 1))
+        allowed = np.array(spec.high) - np.array(spec.low)
+        self.register_buffer("centre", torch.as_tensor((first + last) / 2, dtype=torch.float32))
+        self.register_buffer(
+            "spread", torch.as_tensor(np.maximum(last - first, MIN_SPAN * allowed) / 2, dtype=torch.float32)
+        )
+        self.register_buffer("basis", cosines(chunk), persistent=False)
+        self._least, self._most = 0, 0  # coefficients
+        self._bpe, self._pieces = Tokenizer(BPE()), [""]
+        if statistics is not None:
+            self._fit(torch.from_numpy(np.ascontiguousarray(sample, np.float32)))
+
+    def length(self, chunk: int) -> int:
+        """Return k·D + 1: one token per coefficient and the end token.
+
+        Raises:
+            ValueError: the tokenizer was fitted on chunks of another length.
+        """
+        if chunk != self.chunk:
+            raise ValueError(
+                f"the model predicts {chunk} actions, its tokenizer {self.chunk}: set tokenizer.chunk={chunk}"
+            )
+        return chunk * self.components + 1
+
+    @torch.compiler.disable
+    def tokenize(self, actions: Tensor) -> Tensor:
+        """Encode (…, k, D) float chunks, clipped to the bounds, as (…, L) int64 tokens, padded with the end token."""
+        texts = self._texts(self._round(actions).clamp(self._least, self._most))  # to the alphabet
+        encoded = [encoding.ids for encoding in self._bpe.encode_batch(texts, add_special_tokens=False)]
+        length = 1 + max(len(ids) for ids in encoded)
+        rows = [ids + [self.end] * (length - len(ids)) for ids in encoded]
+        return torch.tensor(rows, device=actions.device).view(*actions.shape[:-2], length)
+
+    @torch.compiler.disable
+    def detokenize(self, tokens: Tensor) -> Tensor:
+        """Decode (…, L) tokens up to the first end token, if any, as (…, k, D) float actions."""
+        count = self.chunk * self.components
+        rows = []
+        for ids in tokens.reshape(-1, tokens.shape[-1]).tolist():
+            ids = ids[: ids.index(self.end)] if self.end in ids else ids
+            text = "".join(self._pieces[token] for token in ids if token < len(self._pieces))[:count]
+            values = [ord(character) - FIRST_CODE_POINT + self._least for character in text]
+            rows.append(values + [0] * (count - len(values)))
+        coefficients = torch.tensor(rows, dtype=torch.float32, device=tokens.device)
+        scaled = _exact(self.basis.T, coefficients.view(-1, self.chunk, self.components)) / self.scale
+        return (scaled * self.spread + self.centre).view(*tokens.shape[:-1], self.chunk, self.components)
+
+    def loss_mask(self, tokens: Tensor, valid: Tensor) -> Tensor:
+        """Return the (…, L) bool loss mask: tokens up to the first end token of chunks whose first action is valid."""
+        ended = (tokens == self.end).cumsum(-1)
+        return ((ended == 0) | ((ended == 1) & (tokens == self.end))) & valid[..., :1]
+
+    def vocabulary_usage(self, tokens: Tensor) -> str:
+        """Describe the number of distinct tokens."""
+        return f"{len(tokens.unique())} of {self.bins} tokens used"
+
+    def get_extra_state(self) -> dict[str, Any]:
+        """Return the fitted values that are not tensors, for the checkpoint."""
+        return {"coefficients": [self._least, self._most], "bpe": self._bpe.to_str()}
+
+    def set_extra_state(self, state: dict[str, Any]) -> None:
+        """Restore the fitted values."""
+        self._least, self._most = state["coefficients"]
+        self._set_bpe(Tokenizer.from_str(state["bpe"]))
+
+    def _fit(self, chunks: Tensor) -> None:
+        coefficients = self._round(chunks)
+        self._least, self._most = int(coefficients.min()), int(coefficients.max())
+        alphabet = [chr(FIRST_CODE_POINT + number) for number in range(self._most - self._least + 1)]
+        if len(alphabet) >= self.bins:
+            raise ValueError(
+                f"the coefficients take {len(alphabet)} values, more than tokenizer.bins={self.bins} can tell apart: "
+                f"raise it, or lower tokenizer.scale={self.scale}"
+            )
+        bpe = Tokenizer(BPE())
+        trainer = BpeTrainer(vocab_size=self.bins, special_tokens=[END], initial_alphabet=alphabet, show_progress=False)
+        bpe.train_from_iterator(self._texts(coefficients), trainer)
+        self._set_bpe(bpe)
+
+    def _set_bpe(self, bpe: Tokenizer) -> None:
+        self._bpe = bpe
+        vocabulary = sorted(bpe.get_vocab().items(), key=lambda item: item[1])
+        self._pieces = ["" if number == self.end else piece for piece, number in vocabulary]
+
+    def _round(self, actions: Tensor) -> Tensor:
+        """Transform (…, k, D) actions to (…, k, D) rounded coefficients, by frequency and component."""
+        inside = torch.minimum(torch.maximum(actions, self.low), self.high)
+        return (_exact(self.basis, (inside - self.centre) / self.spread) * self.scale).round()
+
+    def _texts(self, coefficients: Tensor) -> list[str]:
+        """Convert (…, k, D) coefficients to one text of k·D characters per chunk."""
+        codes = (coefficients - self._least + FIRST_CODE_POINT).long().reshape(-1, self.chunk * self.components)
+        return ["".join(map(chr, row)) for row in codes.tolist()]
+
+
+def _exact(matrix: Tensor, values: Tensor) -> Tensor:
+    with torch.autocast(values.device.type, enabled=False):  # half precision would change coefficients
+        return matrix @ values
+
+
+def cosines(count: int) -> Tensor:
+    """Return the (count, count) orthonormal cosine transform of type II: rows are frequencies, columns times."""
+    index = torch.arange(count, dtype=torch.float64)
+    waves = torch.cos(torch.pi / count * (index + 0.5) * index[:, None]) * (2 / count) ** 0.5
+    waves[0] /= 2**0.5
+    return waves.float()

@@ -1,0 +1,285 @@
+"""Action tokenizers: a chunk of actions as a sequence of tokens from a vocabulary of K.
+
+Shapes: D action components, k actions of a chunk, L tokens of the longest sequence of a batch, K bins, … any leading
+dimensions.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+from abc import ABC, abstractmethod
+from typing import Protocol
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from vla.io.types import Bins, Count, NonNegative
+from vla.spec import Spec
+
+log = logging.getLogger(__name__)
+
+# Fixed bounds of RT-1: 1 m, a right angle, and a gripper command of one (arXiv 2212.06817).
+RT1_BOUNDS = {"m": 1.0, "rad": math.pi / 2, "1": 1.0}
+
+# Smallest range of the bins of a component, as a fraction of its allowed range.
+MIN_SPAN = 0.05
+
+
+class Statistics(Protocol):
+    """Statistics of a dataset that tokenizers are fitted on: bounds of its actions and a sample of its chunks."""
+
+    @property
+    def low(self) -> np.ndarray:
+        """Return the smallest action, (D,)."""
+        ...
+
+    @property
+    def high(self) -> np.ndarray:
+        """Return the largest action, (D,)."""
+        ...
+
+    def chunks(self, length: int) -> np.ndarray:
+        """Return (N, length, D) float32 chunks of consecutive actions."""
+        ...
+
+
+class ActionTokenizer(nn.Module, ABC):
+    """Base class of action tokenizers; bounds and other fitted values are saved in checkpoints.
+
+    Args:
+        spec: names the components.
+        low, high: (D,) bounds of the encoded actions, in the units of the action.
+        bins: K, the size of the vocabulary, at least 2.
+    """
+
+    low: Tensor  # (D,)
+    high: Tensor  # (D,)
+    end = -1  # end and padding token; -1 if all sequences have the same length
+
+    def __init__(self, spec: Spec, low: np.ndarray, high: np.ndarray, bins: Bins) -> None:
+        super().__init__()
+        ranges = zip(spec.action, spec.low, spec.high, strict=True)
+        empty = [name for name, least, largest in ranges if not (least < largest and math.isfinite(largest - least))]
+        if empty:
+            raise ValueError(f"the spec must give {', '.join(empty)} a range: a low and a higher high, both finite")
+        self.bins, self.components = bins, len(spec.action)
+        self.register_buffer("low", torch.as_tensor(low, dtype=torch.float32))
+        self.register_buffer("high", torch.as_tensor(high, dtype=torch.float32))
+
+    @abstractmethod
+    def length(self, chunk: int) -> int:
+        """Return the maximum number of tokens of a chunk of `chunk` actions."""
+
+    @abstractmethod
+    def tokenize(self, actions: Tensor) -> Tensor:
+        """Encode (…, k, D) float chunks, clipped to the bounds, as (…, L) int64 tokens."""
+
+    @abstractmethod
+    def detokenize(self, tokens: Tensor) -> Tensor:
+        """Decode any (…, L) tokens as (…, k, D) float actions."""
+
+    @abstractmethod
+    def loss_mask(self, tokens: Tensor, valid: Tensor) -> Tensor:
+        """Return the (…, L) bool loss mask of tokens, given the (…, k) bool mask of actions."""
+
+    @abstractmethod
+    def vocabulary_usage(self, tokens: Tensor) -> str:
+        """Describe how much of the vocabulary appears in (N, L) tokens, for the log."""
+
+    def token_losses(self, logits: Tensor, tokens: Tensor, actions: Tensor) -> Tensor:
+        """Return the (…, L) losses of (…, L, K) logits against the (…, L) tokens of (…, k, D) actions."""
+        return _hard_cross_entropy(logits, tokens)
+
+    def sampled(self, tokens: Tensor, actions: Tensor) -> Tensor:
+        """Sample (…, L) decoder inputs near the (…, L) tokens of (…, k, D) actions, by default the tokens themselves.
+
+        With such inputs instead of the labels, the decoder is trained on prefixes like its own (scheduled sampling).
+        """
+        return tokens
+
+    def actions(self, logits: Tensor, tokens: Tensor) -> Tensor:
+        """Decode (…, L, K) logits and the (…, L) tokens chosen from them as (…, k, D) actions."""
+        return self.detokenize(tokens)
+
+
+class PerComponent(ActionTokenizer):
+    """Tokenizers with one token per component of every action, in order, so that L is k·D."""
+
+    @abstractmethod
+    def encode(self, action: Tensor) -> Tensor:
+        """Encode (…, D) float actions, clipped to the bounds, as (…, D) int64 tokens."""
+
+    @abstractmethod
+    def decode(self, token: Tensor) -> Tensor:
+        """Decode (…, D) tokens as (…, D) float actions."""
+
+    def decode_logits(self, logits: Tensor) -> Tensor:
+        """Decode (…, D, K) logits as (…, D) float actions, by default those of the most likely tokens."""
+        return self.decode(logits.argmax(-1))
+
+    def cross_entropy(self, logits: Tensor, action: Tensor) -> Tensor:
+        """Return the (…, D) cross-entropy of (…, D, K) logits against (…, D) actions."""
+        return _hard_cross_entropy(logits, self.encode(action))
+
+    def loss(self, logits: Tensor, action: Tensor, valid: Tensor) -> Tensor:
+        """Return the mean cross-entropy of (…, D, K) logits and (…, D) actions where the (…) bool `valid` is true."""
+        losses = self.cross_entropy(logits.float(), action).mean(-1)  # (…)
+        return (losses * valid).sum() / valid.sum().clamp(min=1)
+
+    def length(self, chunk: int) -> int:
+        """Return k·D."""
+        return chunk * self.components
+
+    def tokenize(self, actions: Tensor) -> Tensor:
+        """Encode (…, k, D) float chunks as (…, k·D) int64 tokens."""
+        return self.encode(actions).flatten(-2)
+
+    def detokenize(self, tokens: Tensor) -> Tensor:
+        """Decode (…, k·D) tokens as (…, k, D) float actions."""
+        return self.decode(self._split(tokens, -1))
+
+    def loss_mask(self, tokens: Tensor, valid: Tensor) -> Tensor:
+        """Return the (…, k·D) bool loss mask: the tokens of valid actions."""
+        return valid.repeat_interleave(self.components, -1)
+
+    def token_losses(self, logits: Tensor, tokens: Tensor, actions: Tensor) -> Tensor:
+        """Return the (…, k·D) losses of (…, k·D, K) logits against (…, k, D) actions."""
+        return self.cross_entropy(self._split(logits, -2), actions).flatten(-2)
+
+    def actions(self, logits: Tensor, tokens: Tensor) -> Tensor:
+        """Decode (…, k·D, K) logits as (…, k, D) actions."""
+        return self.decode_logits(self._split(logits, -2))
+
+    def vocabulary_usage(self, tokens: Tensor) -> str:
+        """Describe the smallest and largest number of used bins over the components."""
+        counts = [len(of_one.unique()) for of_one in self._split(tokens, -1).unbind(-1)]
+        return f"{min(counts)} to {max(counts)} of {self.bins} bins used"
+
+    def _split(self, values: Tensor, dim: int) -> Tensor:
+        return values.unflatten(dim, (-1, self.components))
+
+
+class EvenBins(PerComponent):
+    """Uniform grid of K bins; the outermost are centred on the bounds."""
+
+    def decode(self, token: Tensor) -> Tensor:
+        """Decode (…, D) tokens, integer or fractional, as (…, D) float actions."""
+        return token.to(self.low.dtype) / (self.bins - 1) * (self.high - self.low) + self.low
+
+    def _position(self, action: Tensor) -> Tensor:
+        """Return the fractional token, 0 … K - 1, of (…, D) actions clipped to the bounds."""
+        inside = torch.minimum(torch.maximum(action, self.low), self.high)
+        return (inside - self.low) / (self.high - self.low) * (self.bins - 1)
+
+
+class Uniform(EvenBins):
+    """Uniform bins over the range of the data, with Gaussian targets around the correct bin.
+
+    An action is decoded as the expectation over the most likely window of bins. It is finer than a bin, and modes
+    further apart than the window are not averaged. Decoding the most likely bin instead would prefer a sharp peak of
+    little weight, such as standing still, over a broad mode of more weight.
+
+    Args:
+        bins: K.
+        margin: distance of the bounds from the data, as a fraction of its range.
+        smoothing: standard deviation of the Gaussian target [bins]; 0 gives one-hot targets.
+        reach: half the length of the decoding window [bins]; 0 decodes the most likely bin.
+        spec: gives the allowed range of actions.
+        statistics: bounds of the data; None if a checkpoint is loaded next, the allowed range until then.
+    """
+
+    def __init__(
+        self,
+        bins: Bins,
+        margin: NonNegative,
+        smoothing: NonNegative,
+        reach: Count,
+        *,
+        spec: Spec,
+        statistics: Statistics | None = None,
+    ) -> None:
+        super().__init__(spec, *data_bounds(spec, statistics, margin), bins)
+        self.smoothing, self.reach = smoothing, reach
+
+    def encode(self, action: Tensor) -> Tensor:
+        """Encode (…, D) float actions as the nearest tokens, (…, D) int64."""
+        return self._position(action).round().long()
+
+    def cross_entropy(self, logits: Tensor, action: Tensor) -> Tensor:
+        """Return the (…, D) cross-entropy against a Gaussian around the fractional token of the action."""
+        if self.smoothing == 0:
+            return _hard_cross_entropy(logits, self.encode(action))
+        distance = (self._bins(logits) - self._position(action).unsqueeze(-1)) / self.smoothing  # (…, D, K)
+        target = (-0.5 * distance.square()).softmax(-1)
+        return -(target * logits.log_softmax(-1)).sum(-1)
+
+    def sampled(self, tokens: Tensor, actions: Tensor) -> Tensor:
+        """Sample (…, k·D) tokens from the Gaussian target of each component."""
+        position = self._position(actions).flatten(-2)
+        return (position + self.smoothing * torch.randn_like(position)).round().clamp(0, self.bins - 1).long()
+
+    def decode_logits(self, logits: Tensor) -> Tensor:
+        """Decode (…, D, K) logits as the expectation over the most likely window of bins, (…, D)."""
+        probabilities = logits.float().softmax(-1)  # (…, D, K)
+        window = 2 * self.reach + 1
+        weight = F.avg_pool1d(probabilities.flatten(0, -2), window, stride=1, padding=self.reach).view_as(logits)
+        bins = self._bins(logits)
+        near = probabilities * ((bins - weight.argmax(-1, keepdim=True)).abs() <= self.reach)
+        return self.decode((near * bins).sum(-1) / near.sum(-1))
+
+    def _bins(self, logits: Tensor) -> Tensor:
+        return torch.arange(self.bins, device=logits.device, dtype=torch.float32)
+
+
+class RT1(EvenBins):
+    """The tokenizer of RT-1: fixed bounds per unit (1 m, π/2 rad, 1), rounding down, one-hot targets, most likely bin.
+
+    It exists for faithful reproduction: small motions use few bins, and rounding down biases every action.
+
+    Args:
+        bins: K.
+        spec: gives the units of the components.
+        statistics: unused, as in the signature of every tokenizer.
+    """
+
+    def __init__(self, bins: Bins, *, spec: Spec, statistics: Statistics | None = None) -> None:
+        unknown = sorted(set(spec.units) - set(RT1_BOUNDS))
+        if unknown:
+            raise ValueError(f"tokenizer=rt1 supports the units {sorted(RT1_BOUNDS)}, the spec has {unknown}")
+        bound = np.array([RT1_BOUNDS[unit] for unit in spec.units])
+        super().__init__(spec, -bound, bound, bins)
+
+    def encode(self, action: Tensor) -> Tensor:
+        """Encode (…, D) float actions, rounded down, as (…, D) int64 tokens."""
+        # The offset keeps a decoded token, which may have a rounding error, at its own index.
+        return (self._position(action) + 1e-3).floor().long()
+
+
+def data_bounds(spec: Spec, statistics: Statistics | None, margin: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
+    """Return (D,) bounds: the data extended by `margin` times its range, or without data the allowed range.
+
+    Raises:
+        ValueError: the statistics have another number of components.
+    """
+    allowed_low, allowed_high = np.array(spec.low), np.array(spec.high)
+    low = allowed_low if statistics is None else np.asarray(statistics.low, dtype=np.float64)
+    high = allowed_high if statistics is None else np.asarray(statistics.high, dtype=np.float64)
+    if low.shape != allowed_low.shape:
+        raise ValueError(
+            f"the statistics describe actions of {low.size} components, the spec has {len(spec.action)}: "
+            f"{', '.join(spec.action)}"
+        )
+    min_span = MIN_SPAN * (allowed_high - allowed_low)
+    constant = [name for name, narrow in zip(spec.action, high - low < min_span, strict=True) if narrow]
+    if constant:
+        log.info("%s hardly varies in the demonstrations: bins over %g of its range", ", ".join(constant), MIN_SPAN)
+    span = np.maximum(high - low, min_span)
+    half = (0.5 + margin) * span
+    return (low + high) / 2 - half, (low + high) / 2 + half
+
+
+def _hard_cross_entropy(logits: Tensor, token: Tensor) -> Tensor:
+    return F.cross_entropy(logits.flatten(0, -2), token.flatten(), reduction="none").view(token.shape)

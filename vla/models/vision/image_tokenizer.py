@@ -1,0 +1,204 @@
+"""Image encoders conditioned on the instruction, and layers from feature maps to tokens or keypoints.
+
+Shapes: N images, C channels, H by W pixels, h by w positions of a feature map, M tokens or keypoints.
+"""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from vla.io.types import Kernels, Widths
+
+POSITION_SCALE = 4.0  # of keypoint positions; large, because a hundredth of the image matters
+BRIGHTNESS_OFFSET = 0.1  # of a brightness up to 3; suppresses the chromaticity of darker colours
+INITIAL_CONTRAST = 2.0  # standard deviation of the scores of a keypoint; a few of 576 positions dominate
+MIN_SCORE_STD = 1e-3
+
+
+class FiLM(nn.Module):
+    """Scales and shifts every channel by a linear function of the text: (1 + gamma)·x + beta (arXiv 1709.07871).
+
+    Args:
+        text_width: length of the text vector.
+        channels: C.
+        identity: start with gamma = beta = 0, which leaves a pretrained network unchanged.
+    """
+
+    def __init__(self, text_width: int, channels: int, identity: bool) -> None:
+        super().__init__()
+        self.gamma, self.beta = nn.Linear(text_width, channels), nn.Linear(text_width, channels)
+        if identity:
+            for linear in (self.gamma, self.beta):
+                nn.init.zeros_(linear.weight)
+                nn.init.zeros_(linear.bias)
+
+    def forward(self, x: Tensor, text: Tensor) -> Tensor:
+        """Modulate (N, C, h, w) features by (N, text_width) text; same shape."""
+        gamma, beta = self.gamma(text)[:, :, None, None], self.beta(text)[:, :, None, None]
+        return x * (1 + gamma) + beta
+
+
+class ImageEncoder(nn.Module, ABC):
+    """Images and text → feature map.
+
+    Args:
+        channels: C of the feature map.
+    """
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.channels = channels
+
+    @abstractmethod
+    def forward(self, images: Tensor, text: Tensor) -> Tensor:
+        """Encode (N, 3, H, W) float images in 0 … 1 with (N, text_width) text as (N, channels, h, w)."""
+
+
+class FilmConv(ImageEncoder):
+    """A few convolutions, each followed by FiLM, for training on a CPU.
+
+    The activation is SiLU: without normalisation, ReLU left most of the few channels dead.
+
+    Args:
+        channels: output channels, one per convolution.
+        kernels: kernel sizes, one per convolution [px].
+        strides: strides, one per convolution.
+        chroma: add colours relative to their brightness as input, which depend less on light and shadows.
+        text_width: length of the text vector.
+    """
+
+    def __init__(self, channels: Widths, kernels: Kernels, strides: Kernels, chroma: bool, *, text_width: int) -> None:
+        if not len(channels) == len(kernels) == len(strides):
+            raise ValueError(
+                f"channels, kernels and strides need one entry per convolution, got {channels}, {kernels}, {strides}"
+            )
+        super().__init__(channels[-1])
+        inputs = [3, *channels[:-1]]
+        convs = [
+            nn.Conv2d(i, o, kernel, stride, kernel // 2)
+            for i, o, kernel, stride in zip(inputs, channels, kernels, strides, strict=True)
+        ]
+        self.chroma: nn.Conv2d | None = None
+        if chroma:
+            self.chroma = nn.Conv2d(3, channels[0], kernels[0], strides[0], kernels[0] // 2, bias=False)
+        for conv in (*convs, *([self.chroma] if self.chroma else [])):
+            # Without normalisation layers the variance must be preserved, or attention over positions starts uniform.
+            nn.init.kaiming_normal_(conv.weight, nonlinearity="relu")
+        self.convs = nn.ModuleList(convs)
+        self.films = nn.ModuleList(FiLM(text_width, c, identity=False) for c in channels)
+        self.to(memory_format=torch.channels_last)
+
+    def forward(self, images: Tensor, text: Tensor) -> Tensor:
+        """Encode (N, 3, H, W) float images in 0 … 1 with (N, text_width) text as (N, channels, h, w)."""
+        scale = 1.0 if self.chroma is None else math.sqrt(0.5)  # keeps the variance of the sum of both inputs
+        x = self.convs[0]((images - 0.5).mul_(4 * scale))  # about unit variance
+        if self.chroma is not None:
+            x = x + self.chroma(_chromaticity(images).mul_(6 * scale))
+        x = F.silu(self.films[0](x, text))
+        for conv, film in zip(self.convs[1:], self.films[1:], strict=True):
+            x = F.silu(film(conv(x), text))
+        return x
+
+
+def _chromaticity(images: Tensor) -> Tensor:
+    """Return the shares of red, green and blue in the brightness of each pixel, minus 1/3; grey is 0."""
+    brightness = images[:, 0] + images[:, 1] + images[:, 2] + BRIGHTNESS_OFFSET  # faster than .sum(1)
+    return (images / brightness.unsqueeze(1)).sub_(1 / 3)
+
+
+class TokenLearner(nn.Module):
+    """M tokens per image, each an attention-weighted mean of the features (TokenLearner 1.1, arXiv 2106.11297).
+
+    Args:
+        channels: C of the feature map.
+        tokens: M.
+    """
+
+    def __init__(self, channels: int, tokens: int) -> None:
+        super().__init__()
+        hidden = min(channels, 64)  # 64 as published
+        self.attention = nn.Sequential(
+            nn.LayerNorm(channels, eps=1e-6),
+            nn.Linear(channels, hidden),
+            nn.GELU(approximate="tanh"),
+            nn.Linear(hidden, tokens),
+        )
+
+    def forward(self, features: Tensor) -> Tensor:
+        """Map (N, C, h, w) features to (N, M, C) tokens."""
+        values = features.flatten(2).mT  # (N, h·w, C)
+        weights = self.attention(values).softmax(1).mT  # (N, M, h·w)
+        return weights @ values
+
+
+class Keypoints(nn.Module):
+    """M keypoints per image: the mean position under the softmax of a feature map (spatial softmax, arXiv 1504.00702).
+
+    Each also has the features averaged with the same weights, because a position does not contain orientation.
+
+    The scores are normalised over each image to a standard deviation that is learned per keypoint. Otherwise most
+    keypoints converge to uniform attention, which has no gradient.
+
+    Args:
+        channels: C of the feature map.
+        keypoints: M.
+    """
+
+    def __init__(self, channels: int, keypoints: int) -> None:
+        super().__init__()
+        self.width = 2 + channels
+        self.score = nn.Linear(channels, keypoints, bias=False)
+        self.contrast = nn.Parameter(torch.full((keypoints,), math.log(INITIAL_CONTRAST)))
+
+    def forward(self, features: Tensor) -> Tensor:
+        """Map (N, C, h, w) features to (N, M, 2 + C): positions x, y in ±POSITION_SCALE, and features."""
+        values = features.flatten(2)  # (N, C, h·w)
+        centred = values - values.mean(-1, keepdim=True)
+        # The covariance of the few channels gives the variance of the scores at a fraction of the cost. `bmm` per image
+        # avoids a copy before the softmax.
+        covariance = torch.bmm(centred, centred.mT) / values.shape[-1]
+        variance = (self.score.weight @ covariance * self.score.weight).sum(-1, keepdim=True)  # (N, M, 1)
+        query = self.score.weight * self.contrast.exp()[:, None] / variance.clamp(min=MIN_SCORE_STD**2).sqrt()
+        weights = torch.bmm(query, centred).softmax(-1)  # (N, M, h·w)
+        positions = (POSITION_SCALE * grid(features)).expand(len(values), -1, -1)
+        return torch.bmm(weights.float(), torch.cat([positions, values.mT.float()], -1))
+
+
+def grid(features: Tensor) -> Tensor:
+    """Return the positions x, y in -1 … 1 of (N, C, h, w) features, (h·w, 2) float32."""
+    height, width = features.shape[-2:]
+    y = torch.linspace(-1, 1, height, device=features.device)
+    x = torch.linspace(-1, 1, width, device=features.device)
+    return torch.stack([x.repeat(height), y.repeat_interleave(width)], -1)
+
+
+class RandomShift(nn.Module):
+    """Random shift augmentation: one offset for all images of a clip, padded with black; identity outside training.
+
+    Exclude it from compilation: every new offset would trigger a recompilation.
+
+    Args:
+        vertical, horizontal: largest shift either way [1/256 of the image height].
+    """
+
+    def __init__(self, vertical: float, horizontal: float) -> None:
+        super().__init__()
+        self.vertical, self.horizontal = vertical, horizontal
+
+    def forward(self, images: Tensor) -> Tensor:
+        """Shift (B, T, H, W, 3) images of B clips; same shape and type."""
+        if not self.training:
+            return images
+        clips, frames, height, width, _ = images.shape
+        up, left = round(self.vertical * height / 256), round(self.horizontal * height / 256)
+        padded = images.new_zeros(clips, frames, height + 2 * up, width + 2 * left, 3)
+        padded[:, :, up : up + height, left : left + width] = images
+        rows = torch.randint(2 * up + 1, (clips,)).tolist()
+        columns = torch.randint(2 * left + 1, (clips,)).tolist()
+        crops = zip(padded, rows, columns, strict=True)
+        return torch.stack([clip[:, row : row + height, column : column + width] for clip, row, column in crops])

@@ -1,0 +1,228 @@
+"""Image encoders with pretrained timm backbones.
+
+Shapes: N images, C channels, H by W pixels, h by w positions of a feature map.
+"""
+
+from __future__ import annotations
+
+import logging
+from difflib import get_close_matches
+from pathlib import Path
+from pickle import UnpicklingError
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from vla.io.types import Pixels, Width
+from vla.models.vision.hub import fetch
+from vla.models.vision.image_tokenizer import FiLM, ImageEncoder
+
+log = logging.getLogger(__name__)
+
+WEIGHTS = "model.safetensors"  # file name of timm's weights on the hub
+
+
+class Normalize(nn.Module):
+    """Input normalisation of a timm network.
+
+    Args:
+        backbone: the network.
+    """
+
+    mean: Tensor
+    std: Tensor
+
+    def __init__(self, backbone: Any) -> None:
+        super().__init__()
+        for name in ("mean", "std"):
+            self.register_buffer(name, torch.tensor(backbone.pretrained_cfg[name]).view(3, 1, 1), persistent=False)
+
+    def forward(self, images: Tensor) -> Tensor:
+        """Normalise (N, 3, H, W) images in 0 … 1 to about zero mean and unit variance."""
+        return (images - self.mean) / self.std
+
+
+class FilmEfficientNet(ImageEncoder):
+    """An EfficientNet with FiLM after every block and after its final projection, as in RT-1 (arXiv 2212.06817).
+
+    Every FiLM is initialised as the identity, so the initial features are those of the EfficientNet.
+
+    Args:
+        name: an EfficientNet of timm.
+        pretrained: true downloads timm's weights or fails; false initialises at random; "auto" downloads them or
+            initialises at random with a warning; another text is the path of a weights file (.safetensors or .pth).
+            Empty if a checkpoint is loaded next.
+        channels: C of the feature map.
+        text_width: length of the text vector.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        pretrained: bool | str,
+        channels: Width,
+        *,
+        text_width: int,
+    ) -> None:
+        super().__init__(channels)
+        net = load_backbone(name, pretrained, kind="efficientnet")
+        self.normalize = Normalize(net)
+        self.stem = nn.Sequential(net.conv_stem, net.bn1)
+        self.blocks = nn.ModuleList(block for stage in net.blocks for block in stage)
+        self.films = nn.ModuleList(FiLM(text_width, _output_channels(b), identity=True) for b in self.blocks)
+        self.top = nn.Sequential(net.conv_head, net.bn2)
+        self.projection = nn.Conv2d(net.conv_head.out_channels, channels, 1, bias=False)
+        self.last_film = FiLM(text_width, channels, identity=True)
+        self.to(memory_format=torch.channels_last)
+
+    def forward(self, images: Tensor, text: Tensor) -> Tensor:
+        """Encode (N, 3, H, W) float images in 0 … 1 with (N, text_width) text as (N, channels, h, w)."""
+        x = self.stem(self.normalize(images))
+        for block, film in zip(self.blocks, self.films, strict=True):
+            x = film(block(x), text)
+        features: Tensor = self.last_film(self.projection(self.top(x)), text)
+        return features
+
+
+class FilmBackbone(ImageEncoder):
+    """Projected last feature map of any timm network, such as DINO or SigLIP, with FiLM.
+
+    The feature map of a vision transformer is its normalised patch tokens. FiLM is initialised as the identity.
+
+    Args:
+        name: a timm network, with or without the tag of its weights.
+        pretrained: as in `FilmEfficientNet`.
+        frozen: train only projection and FiLM.
+        size: images are resized to this height and width [px]; null is the training resolution of the network.
+        channels: C of the feature map.
+        text_width: length of the text vector.
+
+    Raises:
+        ValueError: timm has no such network, the size is unsupported, or the weights are not available.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        pretrained: bool | str,
+        frozen: bool,
+        size: Pixels | None,
+        channels: Width,
+        *,
+        text_width: int,
+    ) -> None:
+        super().__init__(channels)
+        self.backbone = load_backbone(name, pretrained, size=size)
+        self.backbone.prune_intermediate_layers(1, prune_norm=False, prune_head=True)
+        last = self.backbone.feature_info[-1]
+        if size is not None and size % last["reduction"]:
+            raise ValueError(f"model.image.size={size} must be a multiple of {last['reduction']} px for {name}")
+        self.size = size or self.backbone.pretrained_cfg["input_size"][-1]
+        self.frozen = frozen
+        self.normalized = "hiera" not in name  # the only family without a normalisation of feature maps
+        self.backbone.requires_grad_(not frozen)
+        self.normalize = Normalize(self.backbone)
+        self.projection = nn.Conv2d(last.get("num_chs_norm", last["num_chs"]), channels, 1, bias=False)
+        self.film = FiLM(text_width, channels, identity=True)
+
+    def train(self, mode: bool = True) -> FilmBackbone:
+        """Set the training mode; a frozen backbone stays in evaluation mode."""
+        super().train(mode)
+        if self.frozen:
+            self.backbone.eval()
+        return self
+
+    def forward(self, images: Tensor, text: Tensor) -> Tensor:
+        """Encode (N, 3, H, W) float images in 0 … 1 with (N, text_width) text as (N, channels, h, w)."""
+        x = F.interpolate(images, (self.size, self.size), mode="bilinear")
+        (features,) = self.backbone.forward_intermediates(
+            self.normalize(x), indices=1, norm=self.normalized, output_fmt="NCHW", intermediates_only=True
+        )
+        modulated: Tensor = self.film(self.projection(features), text)
+        return modulated
+
+
+def load_backbone(name: str, pretrained: bool | str, kind: str = "", size: int | None = None) -> Any:
+    """Create a timm network without its classifier; `pretrained` as in `FilmEfficientNet`.
+
+    Args:
+        kind: required part of the name.
+        size: height and width of the images [px], for networks with a fixed input size.
+
+    Raises:
+        ValueError: timm has no such network, or the weights are not available.
+    """
+    import timm  # slow to import, not needed by every policy
+
+    pattern = f"*{kind}*"
+    known = {*timm.list_models(pattern), *timm.list_pretrained(pattern)}
+    if name not in known:
+        close = ", ".join(get_close_matches(name, known, 5, 0))
+        raise ValueError(f"timm has no {kind or 'network'} called '{name}', it has {close} and others")
+    config: Any = timm.get_pretrained_cfg(name)
+    options: dict[str, Any] = {"num_classes": 0, "img_size": size if config.fixed_input_size else None}
+    path = _weights_file(name, config.hf_hub_id, pretrained)
+    if path is None:
+        return timm.create_model(name, **options)
+    # Without a classifier in network and file, timm loads the weights strictly.
+    weights = _read(path, config.classifier)
+    overlay = {"state_dict": weights, "classifier": None, "num_classes": 0}
+    try:
+        net: Any = timm.create_model(name, pretrained=True, pretrained_cfg_overlay=overlay, **options)
+    except RuntimeError as error:
+        raise ValueError(f"{path} does not hold the weights of timm's {name}: {str(error).splitlines()[-1]}") from error
+    del net.pretrained_cfg["state_dict"]
+    log.info("%s: weights loaded from %s", name, path)
+    return net
+
+
+def _weights_file(name: str, repository: str | None, pretrained: bool | str) -> Path | None:
+    """Return the file of the initial weights, downloaded if necessary; None for random initialisation."""
+    if pretrained == "":
+        return None
+    if not pretrained:
+        log.info("%s is built without pretrained weights", name)
+        return None
+    if isinstance(pretrained, str) and pretrained != "auto":
+        path = Path(pretrained)
+        if not path.is_file():
+            raise ValueError(
+                f"model.image.pretrained is true, false, auto or a weights file, and there is no file {path}"
+            )
+        return path
+    try:
+        if repository is None:
+            raise OSError("timm names none")
+        return fetch(repository, WEIGHTS) / WEIGHTS
+    except OSError as error:
+        if pretrained is True:
+            raise ValueError(
+                f"the weights of {name} cannot be fetched ({error}): give model.image.pretrained the path of a weights "
+                "file, or false to start at random"
+            ) from error
+        log.warning("%s starts at RANDOM: its weights cannot be fetched (%s)", name, error)
+        return None
+
+
+def _read(path: Path, classifier: str | tuple[str, ...] | None) -> dict[str, Any]:
+    """Read weights without those of the classifier; of a pickle only tensors are read."""
+    from safetensors import SafetensorError
+    from safetensors.torch import load_file
+
+    try:
+        safe = path.suffix == ".safetensors"
+        content = load_file(path) if safe else torch.load(path, map_location="cpu", weights_only=True)
+    except (SafetensorError, UnpicklingError, RuntimeError, EOFError) as error:
+        raise ValueError(f"{path} cannot be read as weights, it is damaged or something else") from error
+    names = (classifier,) if isinstance(classifier, str) else classifier or ()
+    unwanted = tuple(f"{name}." for name in names)
+    weights = {key: value for key, value in content.items() if not key.startswith(unwanted)}
+    if not weights:
+        raise ValueError(f"{path} holds no weights")
+    return weights
+
+
+def _output_channels(block: nn.Module) -> int:
+    return [module for module in block.modules() if isinstance(module, nn.Conv2d)][-1].out_channels

@@ -1,0 +1,169 @@
+"""Worker processes of this machine: start, communication and end, and their cores and threads."""
+
+from __future__ import annotations
+
+import os
+import pickle
+import signal
+import sys
+import threading
+import traceback
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager
+from multiprocessing import get_context, parent_process
+from multiprocessing.connection import Connection
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from vla.parallel.pool import Worker
+
+PATIENCE = 5.0  # [s] for an idle process to free its resources
+
+# LP_NUM_THREADS is of Mesa's renderer, which counts only threads beside the calling one.
+THREAD_SETTINGS = {"OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "LP_NUM_THREADS": "0"}
+
+
+class ProcessEnded(Exception):
+    """Crash or kill of a worker process; the message is its exit status or signal."""
+
+
+class WorkerProcess:
+    """Spawned process that sends one answer when its worker exists, and then one per item."""
+
+    def __init__(self, make: bytes) -> None:
+        self._connection, there = get_context("spawn").Pipe()
+        # A daemon is ended with this process, even if its pool is never left.
+        self._process = get_context("spawn").Process(target=_serve, args=(there, make), daemon=True)
+        self._process.start()
+        there.close()  # so that the end of the process ends the connection
+
+    @property
+    def killed(self) -> bool:
+        """True if a signal ended the process."""
+        return (self._process.exitcode or 0) < 0
+
+    def ask(self, item: Any) -> Any:
+        """Return the result of an item; raises the error of the attempt, or `ProcessEnded` if the process ended."""
+        try:
+            self._connection.send(item)
+        except OSError as error:
+            raise ProcessEnded(self._how_it_ended()) from error
+        return self.answer()
+
+    def answer(self) -> Any:
+        """Receive the next answer; raises as `ask` does."""
+        try:
+            result, error, remote = self._connection.recv()
+        except (EOFError, OSError) as end:
+            raise ProcessEnded(self._how_it_ended()) from end
+        if error is not None:
+            raise error from _RemoteTraceback(remote)
+        return result
+
+    def _how_it_ended(self) -> str:
+        self._process.join()
+        code = self._process.exitcode or 0
+        if code >= 0:
+            return f"it ended with exit status {code}"
+        memory = ", perhaps because memory ran out" if code == -signal.SIGKILL else ""
+        return f"it was ended by signal {-code} ({signal.strsignal(-code)}{memory})"
+
+    def kill(self) -> None:
+        """Kill the process at once."""
+        self._process.kill()
+
+    def dismiss(self) -> None:
+        """Close the connection: the process ends as soon as it is idle."""
+        self._connection.close()
+
+    def join(self) -> None:
+        """Wait for the end of the process; kill it after `PATIENCE`."""
+        self._process.join(PATIENCE)
+        self._process.kill()
+        self._process.join()
+
+
+class _RemoteTraceback(Exception):
+    """Traceback of another process, as text."""
+
+    def __init__(self, text: str) -> None:
+        self._text = text
+
+    def __str__(self) -> str:
+        return f"\n{self._text}"
+
+
+def _serve(connection: Connection, make: bytes) -> None:
+    """Create a worker and process items until the connection is closed."""
+    leave_with_parent()
+    made: list[Worker] = []
+    # Unpickled here, not as an argument of the process, so that import errors reach the parent.
+    connection.send(_outcome(lambda: made.append(pickle.loads(make)())))
+    for worker in made:
+        with closing(worker):
+            while True:
+                try:
+                    item = connection.recv()
+                except EOFError:
+                    return
+                connection.send(_outcome(worker.attempt, item))
+
+
+def _outcome(function: Callable[..., Any], *arguments: Any) -> tuple[Any, Exception | None, str]:
+    """Call a function; returns its result, its error and the traceback of that."""
+    try:
+        return function(*arguments), None, ""
+    except Exception as error:  # of any kind: the parent raises it
+        return None, _portable(error), traceback.format_exc()
+
+
+def _portable(error: Exception) -> Exception:
+    """Return the error, or a RuntimeError with its text if it cannot be pickled."""
+    try:
+        pickle.loads(pickle.dumps(error))
+    except Exception:  # its constructor may fail in any way
+        return RuntimeError(f"{type(error).__name__}: {error}")
+    return error
+
+
+def cores() -> int:
+    """Return the number of cores available to this process."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def leave_with_parent() -> None:
+    """End this worker process as soon as its parent has ended in any way."""
+
+    def wait() -> None:
+        parent = parent_process()
+        assert parent is not None
+        parent.join()
+        os._exit(1)
+
+    threading.Thread(target=wait, daemon=True).start()
+
+
+def one_thread() -> None:
+    """Limit numerical libraries to one thread: sums must not depend on the number of workers on the machine."""
+    os.environ.update(THREAD_SETTINGS)  # read when a library is loaded
+    if torch := sys.modules.get("torch"):  # already loaded if this process trained the policy
+        torch.set_num_threads(1)
+
+
+@contextmanager
+def one_thread_each() -> Iterator[None]:
+    """Apply `one_thread` to this process and its children within the context."""
+    before = {name: os.environ.get(name) for name in THREAD_SETTINGS}
+    torch = sys.modules.get("torch")
+    threads = torch.get_num_threads() if torch else 0
+    one_thread()
+    try:
+        yield
+    finally:
+        if torch:
+            torch.set_num_threads(threads)
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value

@@ -1,0 +1,57 @@
+"""Table and plot of one policy under several conditions on the same seeds."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+from matplotlib.figure import Figure
+from rich.table import Table
+
+from vla.reports.style import BLUE, GREEN, GREY, RED, error_bars, save
+from vla.rollouts.evaluate import Report
+
+# Suffix of a condition's name → colour, and vertical offset within the row.
+LEVELS = {"": (GREEN, 0.0), "wide": (BLUE, -0.13), "hard": (RED, 0.13)}
+
+
+def conditions_table(reports: Mapping[str, Report]) -> Table:
+    """Tabulate success, its interval, and the p-value against the first condition, one row per condition."""
+    table = Table("condition", "success", "of", "%", "95 % CI", "p")
+    first = next(iter(reports.values()))
+    for name, report in reports.items():
+        low, high = report.interval
+        p = "" if report is first else f"{first.p_value(report):.2g}"
+        shares = f"{100 * report.success:.1f}", f"{100 * low:.1f}-{100 * high:.1f}"
+        table.add_row(name, str(report.successes), str(report.episodes), *shares, p)
+    return table
+
+
+def plot_conditions(reports: Mapping[str, Report], path: Path) -> None:
+    """Plot the success rate with its interval per condition, levels of one axis in one row, the first as a line."""
+    lines = list(dict.fromkeys(axis for axis, _ in map(_axis_and_level, reports)))
+    figure = Figure(figsize=(8, 1.4 + 0.32 * len(lines)), layout="constrained")
+    axes = figure.add_subplot()
+    axes.axvline(next(iter(reports.values())).success, color=GREY, linewidth=0.8, linestyle="--")
+    for level, (colour, below) in LEVELS.items():
+        chosen = {
+            axis: report for name, report in reports.items() for axis, at in [_axis_and_level(name)] if at == level
+        }
+        rates, reach = error_bars((report.success, *report.interval) for report in chosen.values())
+        rows = [len(lines) - 1 - lines.index(axis) - below for axis in chosen]
+        name = level or None
+        axes.errorbar(rates, rows, None, reach, "o", color=colour, ecolor=GREY, capsize=3, label=name, clip_on=False)
+    axes.set_yticks(range(len(lines)), [axis.replace("_", " ") for axis in reversed(lines)])
+    axes.set_xlim(0, 1)
+    axes.set_ylim(-0.6, len(lines) - 0.4)
+    if len(lines) < len(reports):
+        axes.legend(frameon=False, ncols=2, loc="lower right", bbox_to_anchor=(1, 1), borderaxespad=0)
+    axes.set_xlabel("success, 95 % CI")
+    axes.grid(axis="x", alpha=0.3)
+    save(figure, path)
+
+
+def _axis_and_level(name: str) -> tuple[str, str]:
+    """Split a condition's name such as light_hard into axis and level; the level is empty if there is none."""
+    axis, _, level = name.rpartition("_")
+    return (axis, level) if axis and level in LEVELS else (name, "")

@@ -1,0 +1,223 @@
+"""Output of an evaluation, report.json and report.png, and the contact sheet and draws table of a preview."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib import colormaps
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
+from PIL import Image, ImageDraw, ImageFont
+from rich.table import Table
+
+from vla.data.draws import flat, leaves
+from vla.io.files import write_text
+from vla.reports.factors import association, factors, groups, numeric
+from vla.reports.style import GREEN, GREY, RED, error_bars, save
+from vla.rollouts.evaluate import ERROR, Report, Result
+from vla.rollouts.statistics import wilson_interval
+from vla.spec import Array, Observation
+
+PANELS = 8  # maximum number of factors on the page
+TILE = 144  # minimum height of an image on a contact sheet [px]
+CAPTION = 18  # height of a text line on a contact sheet [px]
+
+
+def write_report(
+    report: Report,
+    path: Path,
+    checkpoint: str | None,
+    config: Mapping[str, Any],
+    facts: Mapping[str, Any] | None = None,
+    conditions: Mapping[str, Report] | None = None,
+) -> None:
+    """Write a report as JSON atomically.
+
+    Args:
+        report: of the first condition.
+        path: of the file.
+        checkpoint: the evaluated policy.
+        config: the resolved config.
+        facts: further entries, such as chosen options, parameters and latency.
+        conditions: condition → report on the same seeds.
+    """
+    content = {
+        **summary(report),
+        "seeds": [result.seed for result in report.results],
+        "checkpoint": checkpoint,
+        **(facts or {}),
+        "conditions": {
+            name: {**summary(other), "outcomes": [result.outcome for result in other.results]}
+            for name, other in (conditions or {}).items()
+        },
+        "config": config,
+        "per_episode": [asdict(result) for result in report.results],
+    }
+    write_text(path, json.dumps(content, indent=1, allow_nan=False, ensure_ascii=False) + "\n")
+
+
+def summary(report: Report) -> dict[str, Any]:
+    """Summarise a report for JSON: rate, interval, outcomes, milestones, and the same per task if there are several."""
+    low, high = report.interval
+    tasks = report.tasks if len(report.tasks) > 1 else {}
+    return {
+        "success": report.success,
+        "ci_low": low,
+        "ci_high": high,
+        "episodes": report.episodes,
+        "successes": report.successes,
+        "errors": len(report.errors),
+        "taxonomy": report.taxonomy,
+        "milestones": {name: _milestone(count, report.episodes) for name, count in report.milestones.items()},
+        "tasks": {task: summary(part) for task, part in tasks.items()},
+    }
+
+
+def _milestone(count: int, episodes: int) -> dict[str, Any]:
+    low, high = wilson_interval(count, episodes)
+    return {"rate": count / max(episodes, 1), "ci_low": low, "ci_high": high, "episodes": count}
+
+
+def plot_report(report: Report, path: Path) -> None:
+    """Plot outcomes, episode lengths, and success over the randomised factors with the strongest association."""
+    played = [result for result in report.results if result.outcome != ERROR]
+    shown = sorted(factors(played).items(), key=lambda factor: -association(factor[1], played))[:PANELS]
+    rows = 1 + -(-len(shown) // 4)
+    figure = Figure(figsize=(13, 3.1 * rows), layout=ConstrainedLayoutEngine(h_pad=0.12))
+    figure.suptitle(str(report).splitlines()[-1], fontsize=15, fontweight="bold")
+    grid = figure.add_gridspec(rows, 4)
+    _plot_outcomes(figure.add_subplot(grid[0, :2]), report)
+    _plot_lengths(figure.add_subplot(grid[0, 2:]), played)
+    for index, (name, values) in enumerate(shown):
+        axes = figure.add_subplot(grid[1 + index // 4, index % 4])
+        axes.set_title(name, fontsize=10)
+        plot = _plot_points if isinstance(values[0], tuple) else _plot_groups
+        plot(axes, values, played)
+    save(figure, path)
+
+
+def _plot_outcomes(axes: Axes, report: Report) -> None:
+    """Plot one bar per outcome, and the interval of the success rate."""
+    names, counts = list(report.taxonomy)[::-1], list(report.taxonomy.values())[::-1]
+    colours = [GREEN if name == "success" else GREY if name == ERROR else RED for name in names]
+    axes.barh([name.replace("_", " ") for name in names], counts, color=colours, height=0.7)
+    low, high = (bound * report.episodes for bound in report.interval)
+    for row, (name, count) in enumerate(zip(names, counts, strict=True)):
+        axes.annotate(
+            str(count), (high if name == "success" else count, row), (6, 0), textcoords="offset points", va="center"
+        )
+        if name == "success":
+            axes.plot([low, high], [row, row], color="black", linewidth=1.5, marker="|", markersize=10)
+    axes.set_xlim(0, 1.1 * len(report.results))
+    axes.locator_params(axis="x", integer=True)
+    axes.set_xlabel("episodes")
+    axes.set_title("outcomes", fontsize=10, loc="left")
+
+
+def _plot_lengths(axes: Axes, played: Sequence[Result]) -> None:
+    """Plot a histogram of the steps until success or failure."""
+    steps = [[result.steps for result in played if (result.outcome == "success") == good] for good in (True, False)]
+    edges = np.histogram_bin_edges(steps[0] + steps[1] or [0], bins=30)
+    axes.hist(steps, bins=list(edges), stacked=True, color=[GREEN, RED], label=["success", "failure"])
+    axes.legend(frameon=False, ncols=2, loc="lower right", bbox_to_anchor=(1, 1), borderaxespad=0)
+    axes.set_xlabel("steps")
+    axes.locator_params(axis="y", integer=True)
+    axes.set_ylabel("episodes")
+    axes.set_title("length of episodes", fontsize=10, loc="left")
+
+
+def _plot_points(axes: Axes, values: Sequence[tuple[float, float]], played: Sequence[Result]) -> None:
+    """Scatter successes and failures over a two-dimensional factor, failures on top."""
+    for good, colour, marker in ((True, GREEN, "o"), (False, RED, "X")):
+        points = [value for value, result in zip(values, played, strict=True) if (result.outcome == "success") == good]
+        across, along = np.array(points).reshape(-1, 2).T
+        axes.scatter(across, along, c=colour, marker=marker, s=22, alpha=0.75, linewidths=0)
+    axes.set_aspect("equal", adjustable="datalim")
+
+
+def _plot_groups(axes: Axes, values: Sequence[Any], played: Sequence[Result]) -> None:
+    """Plot the success rate with its interval per group of values; a group of numbers is placed at its mean."""
+    split = groups(values)
+    if numeric(values):
+        places = [float(np.mean([values[index] for index in group])) for group in split]
+        axes.locator_params(axis="x", nbins=4)  # long tick labels would overlap
+    else:
+        places = list(range(len(split)))
+        names = [str(values[group[0]]) for group in split]
+        tilt = 20 if max(map(len, names)) > 9 else 0
+        axes.set_xticks(places, names, fontsize=8, rotation=tilt, ha="right" if tilt else "center")
+        axes.set_xlim(-0.5, len(split) - 0.5)
+    won = [sum(played[index].outcome == "success" for index in group) for group in split]
+    counts = [(good, len(group)) for good, group in zip(won, split, strict=True)]
+    rates, reach = error_bars((good / count, *wilson_interval(good, count)) for good, count in counts)
+    axes.errorbar(places, rates, reach, fmt="o-", color=GREEN, ecolor=GREY, linewidth=0.7, capsize=3, clip_on=False)
+    axes.set_ylim(0, 1)
+    axes.set_ylabel("success")
+    axes.grid(axis="y", alpha=0.3)
+
+
+def contact_sheet(seeds: Sequence[int], observations: Sequence[Observation], columns: int = 2) -> Image.Image:
+    """Draw the first observations of several episodes on one image.
+
+    Each block has a caption with seed and instruction, the colour image of every camera, and its depth image, from near
+    (blue) to far (red) in one range for all blocks. Images are enlarged without interpolation.
+    """
+    turbo = colormaps["turbo"]
+    ranges = {name: _depth_range([each.depth[name] for each in observations]) for name in observations[0].depth}
+    blocks = []
+    for each in observations:
+        depth = [turbo(np.clip((each.depth[name] - low) / (high - low), 0, 1)) for name, (low, high) in ranges.items()]
+        tiles = [*each.rgb.values(), *((255 * shades[..., :3]).astype(np.uint8) for shades in depth)]
+        factor = max(1, -(-TILE // len(tiles[0])))
+        enlarged = [tile.repeat(factor, 0).repeat(factor, 1) for tile in tiles]
+        framed = [np.pad(tile, ((0, 4), (0, 4), (0, 0)), constant_values=255) for tile in enlarged]
+        blocks.append(np.concatenate(framed, axis=1))
+    height, width = blocks[0].shape[0] + CAPTION, blocks[0].shape[1] + CAPTION
+    rows = -(-len(blocks) // columns)
+    sheet = Image.new("RGB", (columns * width + CAPTION, rows * (height + CAPTION // 2) + 2 * CAPTION), "white")
+    draw, font = ImageDraw.Draw(sheet), ImageFont.load_default(13)
+    for index, (seed, each, block) in enumerate(zip(seeds, observations, blocks, strict=True)):
+        left, top = CAPTION + index % columns * width, CAPTION // 2 + index // columns * (height + CAPTION // 2)
+        draw.text((left, top), f"seed {seed}: {each.instruction}", fill="black", font=font)
+        sheet.paste(Image.fromarray(block), (left, top + CAPTION))
+    legend = [f"{name} depth {low / 1000:.2f}-{high / 1000:.2f} m" for name, (low, high) in ranges.items()]
+    names = ", ".join([f"{name} colour" for name in observations[0].rgb] + legend)
+    draw.text((CAPTION, sheet.height - CAPTION - 4), f"from left to right: {names}", fill="black", font=font)
+    return sheet
+
+
+def _depth_range(images: Sequence[Array]) -> tuple[float, float]:
+    """Return a near and a far percentile [mm] of the pixels with a return."""
+    depth = np.stack(images)
+    low, high = np.percentile(depth[depth > 0], (1, 90)) if depth.any() else (0.0, 1.0)
+    return float(low), float(max(high, low + 1.0))
+
+
+def draws_table(seeds: Sequence[int], draws: Sequence[Mapping[str, Any]]) -> Table:
+    """Tabulate the draws of several resets: range of numbers or set of words, and the values of the first reset."""
+    table = Table("draw", "range", f"seed {seeds[0]}", title=f"{len(draws)} resets")
+    first = flat(draws[0])
+    for name, span in spans(draws).items():
+        values = [f"{leaf:.3g}" if isinstance(leaf, float) else str(leaf) for leaf in leaves(first.get(name))]
+        table.add_row(name, span, " ".join(values))
+    return table
+
+
+def spans(draws: Sequence[Mapping[str, Any]]) -> dict[str, str]:
+    """Return dotted name → range of the numbers, or set of the words, drawn under that name."""
+    drawn: dict[str, list[Any]] = {}
+    for draw in draws:
+        for name, value in flat(draw).items():
+            drawn.setdefault(name, []).extend(leaves(value))
+    return {
+        name: f"{min(values):.4g} … {max(values):.4g}"
+        if values and all(isinstance(value, (int, float)) for value in values)
+        else ", ".join(sorted({str(value) for value in values}))
+        for name, values in drawn.items()
+    }

@@ -1,0 +1,301 @@
+"""Self-contained HTML pages of a run, of a comparison of runs, and of a sweep."""
+
+from __future__ import annotations
+
+import logging
+import os
+from base64 import b64encode
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from datetime import datetime
+from itertools import combinations
+from pathlib import Path
+from typing import Any
+from urllib.parse import quote
+
+import yaml
+from jinja2 import Environment, FileSystemLoader, StrictUndefined
+from markupsafe import Markup
+
+from vla.config.differences import ABSENT, at, differences
+from vla.io.files import write_text
+from vla.reports.style import BLUE, GREEN, GREY, RED, Interval
+from vla.reports.training_curves import colours, draw_run, draw_runs
+from vla.rollouts.evaluate import ERROR, IN_DISTRIBUTION, Report, Result
+from vla.runs.folder import Run, read_run, require_run
+
+log = logging.getLogger(__name__)
+
+PAGE, COMPARISON, SWEEP = "report.html", "comparison.html", "sweep.html"
+RECORDING, SAMPLES, PLOTS, SUITE = "rollouts.rrd", "samples.png", "report.png", "suite.png"
+FAILURES, SUCCESSES = 6, 3  # filmstrips on a run's page
+NAMED = 5  # maximum number of tasks in a title
+COMPARED = 3  # failures per run on a comparison
+
+
+@dataclass(frozen=True)
+class TableRow:
+    """A row of a table of results."""
+
+    words: Sequence[str]  # name of the run, or choices of a sweep's row
+    intervals: Mapping[str, Interval]  # by condition
+    costs: Sequence[str]
+    links: Mapping[str, str] = field(default_factory=dict)  # text → address
+    colour: str = ""  # of its curves
+
+
+@contextmanager
+def optional(path: Path) -> Iterator[None]:
+    """Reduce any error within to a warning, for work that only presents results which are already saved."""
+    try:
+        yield
+    except Exception as error:
+        log.warning("could not write %s, other results are saved: %s: %s", path, type(error).__name__, error)
+
+
+def write_page(folder: Path) -> Path:
+    """Write the page of a run from the files in its folder, and return its path; missing files are omitted.
+
+    Raises:
+        ValueError: a file is damaged.
+    """
+    run = read_run(folder)
+    pictures = {name: folder / name for name in (SAMPLES, PLOTS, SUITE) if (folder / name).is_file()}
+    return _write(
+        folder / PAGE,
+        "run.html",
+        title=_title(run),
+        run=run,
+        facts=_facts(run),
+        all_steps=at(run.config, "trainer.max_steps", None),
+        tables=_rate_tables(run),
+        curves=draw_run(run.metrics),
+        strips=_filmstrips(run, FAILURES, SUCCESSES),
+        pictures=pictures,
+    )
+
+
+def write_comparison(folders: Sequence[Path], target: Path) -> Path:
+    """Write a page that compares several runs into the folder `target`, and return its path.
+
+    Raises:
+        ValueError: no folder is given, a folder is no run, or a file in it is damaged.
+    """
+    if not folders:
+        raise ValueError("name the runs to compare, as in report.runs=[RUN,RUN]")
+    read = [require_run(folder) for folder in folders]
+    runs = dict(zip(_names(folders), read, strict=True))
+    lines = [
+        TableRow(
+            [name],
+            {condition: (report.success, *report.interval) for condition, report in run.reports.items()},
+            _costs(run),
+            _links(run.folder, target),
+            colour,
+        )
+        for (name, run), colour in zip(runs.items(), colours(len(runs)), strict=True)
+    ]
+    return _write(
+        target / COMPARISON,
+        "comparison.html",
+        title=f"{len(runs)} runs" if len(runs) > 1 else next(iter(runs)),
+        lines=lines,
+        heads=(["run"], ["model", "parameters [M]", "action [ms]", "steps", "time"], ""),
+        curves=draw_runs({name: run.metrics for name, run in runs.items()}),
+        pairs=_pairs(runs),
+        differences=_config_differences(runs),
+        strips={name: strips for name, run in runs.items() if (strips := _filmstrips(run, COMPARED, 0))},
+        links={name: _links(run.folder, target) for name, run in runs.items()},
+    )
+
+
+def write_sweep(folder: Path, choices: Sequence[str], lines: Sequence[TableRow], cells: Sequence[Path]) -> Path:
+    """Write the page of a sweep with its table, plot and training curves, and return its path.
+
+    Args:
+        folder: of the sweep.
+        choices: keys of the choices that distinguish the rows.
+        lines: rows of the table; their links are named by cells.
+        cells: folders of the cells.
+    """
+    runs = {cell.name: read_run(cell) for cell in cells}
+    captions = {cell: f"{cell}: {' '.join(line.words)}" for line in lines for cell in line.links}
+    overview = folder / "sweep.png"
+    return _write(
+        folder / SWEEP,
+        "sweep.html",
+        title=f"Sweep {folder.resolve().name}",
+        lines=lines,
+        heads=(choices, ["each seed [%]", "parameters [M]", "action [ms]"], "cells"),
+        curves=draw_runs({name: run.metrics for name, run in runs.items()}),
+        cells=dict(zip(map(captions.get, runs), colours(len(runs)), strict=True)),
+        pictures={overview.name: overview} if overview.is_file() else {},
+    )
+
+
+def _write(path: Path, template: str, **content: Any) -> Path:
+    environment = Environment(
+        loader=FileSystemLoader(Path(__file__).with_name("templates")),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters.update(percent=_percent, duration=_duration, brief=_brief, embedded=_embedded, svg=Markup)
+    colours: dict[str, Any] = {"green": GREEN, "red": RED, "blue": BLUE, "grey": GREY}
+    environment.globals.update(colours)
+    page = environment.get_template(template).render(written=f"{datetime.now():%Y-%m-%d %H:%M}", **content)
+    write_text(path, page)
+    return path
+
+
+def _title(run: Run) -> str:
+    tasks = ", ".join(run.tasks) if len(run.tasks) <= NAMED else f"{len(run.tasks)} tasks"
+    return " · ".join(part for part in (run.model, tasks.replace("_", " ")) if part) or run.folder.resolve().name
+
+
+def _facts(run: Run) -> dict[str, str]:
+    """Return the facts at the top of a run's page: name → text."""
+    training, report = run.training, run.report
+    facts = {}
+    if run.parameters is not None:
+        facts["parameters"] = f"{run.parameters / 1e6:.2f} M"
+    if report and report.latency_ms:
+        facts["time per action"] = f"{report.latency_ms:.1f} ms"
+    if training:
+        facts["training"] = f"{training.steps} steps in {_duration(training.seconds)}"
+    if report and report.wall_time_s:
+        facts["collection, training, evaluation"] = _duration(report.wall_time_s)
+    if run.metrics and (demonstrations := at(run.config, "collect.episodes")) != ABSENT:
+        facts["demonstrations"] = str(demonstrations)
+    if report and report.seeds:
+        facts["evaluated on"] = f"seeds {min(report.seeds)} to {max(report.seeds)}"
+    if report and report.checkpoint:
+        folder, checkpoint = (Path(os.path.realpath(path)) for path in (run.folder, report.checkpoint))
+        inside = checkpoint.is_relative_to(folder)
+        facts["checkpoint"] = str(checkpoint.relative_to(folder) if inside else report.checkpoint)
+    return facts
+
+
+def _rate_tables(run: Run) -> dict[str, dict[str, tuple[Interval, str, str]]]:
+    """Return table → name → (rate, count, p-value against the first condition) of a run's page."""
+    if run.report is None:
+        return {"condition": {}, "task": {}, "milestone": {}}
+    first = next(iter(run.reports.values()))
+    return {
+        "condition": {
+            name: (
+                (report.success, *report.interval),
+                f"{report.successes}/{report.episodes}",
+                "" if report is first else f"{first.p_value(report):.2g}",
+            )
+            for name, report in run.reports.items()
+        },
+        "task": {
+            name: ((part.success, part.ci_low, part.ci_high), f"{part.successes}/{part.episodes}", "")
+            for name, part in run.report.tasks.items()
+        },
+        "milestone": {
+            name: ((part.rate, part.ci_low, part.ci_high), f"{part.episodes}/{run.report.episodes}", "")
+            for name, part in run.report.milestones.items()
+        },
+    }
+
+
+def _costs(run: Run) -> list[str]:
+    logged = max((steps[-1] + 1 for steps, _ in run.metrics.values()), default=ABSENT)
+    return [
+        run.model or ABSENT,
+        ABSENT if run.parameters is None else f"{run.parameters / 1e6:.2f}",
+        f"{run.report.latency_ms:.1f}" if run.report and run.report.latency_ms else ABSENT,
+        str(run.training.steps if run.training else logged),
+        _duration(run.training.seconds) if run.training else ABSENT,
+    ]
+
+
+def _links(run: Path, page: Path) -> dict[str, str]:
+    """Return name → address, relative to the folder `page`, of a run's page and recording."""
+    return {
+        name: quote(os.path.relpath(run / name, page).replace(os.sep, "/"))
+        for name in (PAGE, RECORDING)
+        if (run / name).is_file()
+    }
+
+
+def _pairs(runs: Mapping[str, Run]) -> list[dict[str, Any]]:
+    """Compare every two runs on their common episodes, per condition: discordant pairs and the p-value."""
+    found = []
+    for one, other in combinations(runs, 2):
+        for condition in runs[one].reports:
+            first, second = (_by_seed(runs[name], condition) for name in (one, other))
+            # The same seed gives another episode under another goal or level of randomisation.
+            seeds = [seed for seed, (_, scene) in first.items() if seed in second and scene == second[seed][1]]
+            if seeds:
+                a, b = (Report(tuple(results[seed][0] for seed in seeds)) for results in (first, second))
+                won = [
+                    (x.outcome == "success", y.outcome == "success") for x, y in zip(a.results, b.results, strict=True)
+                ]
+                counts = {"first": won.count((True, False)), "second": won.count((False, True)), "seeds": len(seeds)}
+                found.append({"one": one, "other": other, "condition": condition, **counts, "p": a.p_value(b)})
+    return found
+
+
+def _by_seed(run: Run, condition: str) -> dict[int, tuple[Result, Any]]:
+    """Return seed → result under a condition, and what identifies its scene and instruction."""
+    results = [result for result in run.reports.get(condition, Report(())).results if result.outcome != ERROR]
+    if condition == IN_DISTRIBUTION:
+        return {result.seed: (result, (result.instruction, result.draws)) for result in results}
+    config = run.report.config if run.report else {}
+    scene = at(config, "task"), at(at(config, "evaluate.conditions"), condition)
+    return {result.seed: (result, scene) for result in results}
+
+
+def _config_differences(runs: Mapping[str, Run]) -> dict[str, list[Any]]:
+    """Return dotted key → its value in each run, for all keys that differ."""
+    first, *others = (run.config for run in runs.values())
+    keys = dict.fromkeys(key for other in others for key, _, _ in differences(first, other))
+    return {key: [at(run.config, key) for run in runs.values()] for key in keys}
+
+
+def _filmstrips(run: Run, failures: int, successes: int) -> list[Any]:
+    if not (run.folder / RECORDING).is_file():
+        return []
+    from vla.reports.filmstrips import read_filmstrips  # imports rerun
+
+    return read_filmstrips(run.folder / RECORDING, failures, successes)
+
+
+def _names(folders: Sequence[Path]) -> list[str]:
+    """Return the shortest path suffixes of equal length that distinguish the folders."""
+    paths = [folder.resolve().parts for folder in folders]
+    for length in range(1, max(map(len, paths)) + 1):
+        names = ["/".join(path[-length:]) for path in paths]
+        if len(set(names)) == len(names):
+            return names
+    raise ValueError("report.runs contains a folder twice")
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:.1f}"
+
+
+def _duration(seconds: float) -> str:
+    minutes, rest = divmod(round(seconds), 60)
+    if minutes >= 60:
+        return f"{minutes // 60} h {minutes % 60:02d} min"
+    return f"{minutes} min {rest:02d} s" if minutes else f"{rest} s"
+
+
+def _brief(value: Any) -> str:
+    """Format a config value on one line of YAML; empty if it is absent."""
+    if value == ABSENT:
+        return ""
+    text = yaml.safe_dump(value, default_flow_style=True, width=10**6, allow_unicode=True, sort_keys=False).strip()
+    return text.removesuffix("...").strip()
+
+
+def _embedded(content: Path | bytes) -> str:
+    """Encode a PNG file or a JPEG as a data URL."""
+    kind, content = ("png", content.read_bytes()) if isinstance(content, Path) else ("jpeg", content)
+    return f"data:image/{kind};base64,{b64encode(content).decode()}"

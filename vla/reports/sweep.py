@@ -1,0 +1,72 @@
+"""The table of a sweep, updated after every cell: CSV, Markdown, PNG and HTML."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+from urllib.parse import quote
+
+from vla.io.files import atomic_path, write_text
+from vla.reports.html import SWEEP, TableRow, optional, write_sweep
+from vla.reports.sweep_plot import plot
+from vla.runs.sweep import SweepRow, read_rows
+
+
+def tabulate(folder: Path) -> list[SweepRow]:
+    """Write the table of a sweep's folder and return its rows; without any report, write nothing."""
+    rows = read_rows(folder)
+    if rows:
+        with atomic_path(folder / "sweep.csv") as draft:
+            _write_csv(rows, draft)
+        write_text(folder / "sweep.md", markdown(rows))
+        plot(rows, folder / "sweep.png")
+        _write_page(rows, folder)
+    return rows
+
+
+def markdown(rows: list[SweepRow]) -> str:
+    """Format the table in Markdown: success per condition with its interval, then costs."""
+    conditions = list(dict.fromkeys(condition for row in rows for condition in row.played))
+    head = [*rows[0].choices, *(f"{name} [%]" for name in conditions), "each seed [%]", "parameters [M]", "action [ms]"]
+    lines = [head, ["---"] * len(head)]
+    for row in rows:
+        shares = []
+        for condition in conditions:
+            if condition not in row.played:
+                shares.append("-")
+                continue
+            rate, low, high = (100 * value for value in row.interval(condition))
+            shares.append(f"{rate:.1f} ({low:.1f}-{high:.1f})")
+        lines.append([*row.choices.values(), *shares, *_costs(row)])
+    return "".join(f"| {' | '.join(line)} |\n" for line in lines)
+
+
+def _costs(row: SweepRow) -> list[str]:
+    rates = ", ".join(f"{100 * rate:.1f}" for rate in row.rates)
+    return [rates, f"{row.parameters / 1e6:.2f}", f"{row.latency:.1f}"]
+
+
+def _write_page(rows: list[SweepRow], folder: Path) -> None:
+    lines = [
+        TableRow(
+            list(row.choices.values()),
+            {condition: row.interval(condition) for condition in row.played},
+            _costs(row),
+            {cell.name: f"{quote(cell.name)}/report.html" for cell in row.cells},
+        )
+        for row in rows
+    ]
+    with optional(folder / SWEEP):
+        write_sweep(folder, list(rows[0].choices), lines, [cell for row in rows for cell in row.cells])
+
+
+def _write_csv(rows: list[SweepRow], path: Path) -> None:
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        columns = ["condition", "success", "ci_low", "ci_high", "successes", "episodes", "cells"]
+        writer.writerow([*rows[0].choices, *columns, "parameters", "latency_ms"])
+        for row in rows:
+            for condition in row.played:
+                counts = [row.successes[condition], row.episodes[condition], len(row.rates)]
+                costs = [row.parameters, round(row.latency, 3)]
+                writer.writerow([*row.choices.values(), condition, *row.interval(condition), *counts, *costs])

@@ -1,0 +1,115 @@
+"""Training curves as SVG for embedding in a page, in the page's text colour."""
+
+from __future__ import annotations
+
+import io
+import re
+from collections.abc import Mapping
+from typing import Any
+
+import matplotlib
+import numpy as np
+from matplotlib.figure import Figure
+
+from vla.reports.style import BLUE, GREEN, GREY, RED
+from vla.runs.folder import Curve
+
+COLOURS = (GREEN, BLUE, RED, "#d9942b", "#8a5bb8", "#2f9fa3", "#b5628f", GREY)  # of runs, or of components
+SIZE = (3.4, 2.3)  # of a figure [inch]
+INK = "#010203"  # placeholder for the page's text colour
+DECADE = 10.0  # ratio of maximum to minimum above which a loss has a logarithmic axis
+
+Lines = list[tuple[str, bool, str, Curve]]  # label or "", logged in training (not validation), colour, curve
+
+
+def draw_run(metrics: Mapping[str, Curve]) -> dict[str, str]:
+    """Return title → SVG, one per family of metrics: training and validation of one metric, or errors of one unit."""
+    families: dict[str, Lines] = {}
+    components: dict[str, list[str]] = {}  # of a family
+    for name, curve in metrics.items():
+        family, component = _family(_bare(name))
+        known = components.setdefault(family, [])
+        if component not in known:
+            known.append(component)
+        training = not name.startswith("val/")
+        colour = GREY if training and not component else COLOURS[known.index(component) % len(COLOURS)]
+        families.setdefault(family, []).append((component, training, colour, curve))
+    return {title: _draw(title, lines) for title, lines in _ordered(families).items()}
+
+
+def draw_runs(runs: Mapping[str, Mapping[str, Curve]]) -> dict[str, str]:
+    """Return title → SVG, one per metric, with the curves of all runs."""
+    families: dict[str, Lines] = {}
+    for colour, metrics in zip(colours(len(runs)), runs.values(), strict=True):
+        for name, curve in metrics.items():
+            families.setdefault(_title(_bare(name)), []).append(("", not name.startswith("val/"), colour, curve))
+    return {title: _draw(title, lines) for title, lines in _ordered(families).items()}
+
+
+def colours(count: int) -> list[str]:
+    """Return `count` colours; they repeat after the eighth."""
+    return [COLOURS[number % len(COLOURS)] for number in range(count)]
+
+
+def _bare(name: str) -> str:
+    return name.removeprefix("train/").removeprefix("val/")
+
+
+def _title(name: str) -> str:
+    """Format a metric's name as a title, with the unit of an error in brackets."""
+    return re.sub(r"^(error_.+)_(mm|deg)$", r"\1 [\2]", name).replace("_", " ")
+
+
+def _family(name: str) -> tuple[str, str]:
+    """Return the panel of a metric and its component there, or an empty string."""
+    error = re.fullmatch(r"error_(.+)_(mm|deg)", name)
+    return (f"error [{error[2]}]", error[1]) if error else (_title(name), "")
+
+
+def _ordered(families: Mapping[str, Lines]) -> dict[str, Lines]:
+    """Sort validated metrics first, among them the loss first; otherwise keep the order of logging."""
+
+    def place(title: str) -> tuple[bool, bool]:
+        return all(training for _, training, _, _ in families[title]), title != "loss"
+
+    return {title: families[title] for title in sorted(families, key=place)}
+
+
+def _draw(title: str, lines: Lines) -> str:
+    """Draw an SVG without external references, not even XML namespaces."""
+    settings: Any = {"svg.fonttype": "none", "svg.hashsalt": title, "text.parse_math": False, "font.size": 9}
+    settings |= {f"{part}.color": INK for part in ("text", "xtick", "ytick")}
+    settings |= {"axes.edgecolor": INK, "axes.labelcolor": INK, "grid.color": INK, "axes.linewidth": 0.6}
+    with matplotlib.rc_context(settings):
+        figure = Figure(figsize=SIZE, layout="constrained")
+        axes = figure.add_subplot()
+        for label, training, colour, (steps, values) in lines:
+            few = "o" if len(steps) < 30 and not training else ""
+            look: dict[str, Any] = (
+                {"linewidth": 1.0, "alpha": 0.8} if training else {"linewidth": 1.7, "marker": few, "markersize": 3}
+            )
+            axes.plot(steps, values, color=colour, label=label, clip_on=title != "success", **look)
+        if title.endswith("loss") and _spans_decades(lines):
+            axes.set_yscale("log", subs=[2, 5])
+            axes.yaxis.set_major_formatter("{x:g}")
+            axes.yaxis.set_minor_formatter("{x:g}")
+        else:
+            axes.ticklabel_format(useOffset=False)
+        if title == "success":
+            axes.set_ylim(0, 1)
+        if any(label for label, _, _, _ in lines):
+            axes.legend(frameon=False, fontsize=8, ncols=3)
+        axes.grid(alpha=0.12)
+        axes.spines[["top", "right"]].set_visible(False)
+        axes.tick_params(width=0.6)
+        file = io.StringIO()
+        figure.savefig(file, format="svg", transparent=True, metadata={"Date": None})
+    svg = file.getvalue()
+    svg = re.sub(r"<metadata>.*?</metadata>", "", svg[svg.index("<svg") :], flags=re.DOTALL)
+    return re.sub(r' xmlns(:\w+)?="[^"]*"', "", svg).replace(INK, "currentColor")
+
+
+def _spans_decades(lines: Lines) -> bool:
+    values = np.concatenate([values for _, _, _, (_, values) in lines])
+    values = values[np.isfinite(values)]
+    return bool(len(values) and values.min() > 0 and values.max() > DECADE * values.min())

@@ -1,0 +1,1 @@
+"""Robot models, shared by the simulator and the robot: links, limits, inverse kinematics."""

@@ -1,0 +1,33 @@
+"""Forward kinematics of any serial arm in plain numpy, for views; `vla.models.kinematics` has that of networks."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from vla.spec import Array
+
+
+def frame_positions(chain: Sequence[Sequence[float]], joints: ArrayLike) -> Array:
+    """Return (J + 2, 3) positions [m] of the base, of every joint's frame and of the tool, in the base frame.
+
+    Args:
+        chain: as in `vla.spec.RobotModel`, (J + 1, 7).
+        joints: (J,) [rad].
+    """
+    rotation, position = np.eye(3), np.zeros(3)
+    positions = [position]
+    for frame, angle in zip(chain, [*np.asarray(joints), 0.0], strict=True):
+        position = position + rotation @ np.asarray(frame[:3])
+        rotation = rotation @ _rotation(frame[3:]) @ _rotation((np.cos(angle / 2), 0.0, 0.0, np.sin(angle / 2)))
+        positions.append(position)
+    return np.array(positions)
+
+
+def _rotation(quaternion: ArrayLike) -> Array:
+    """Convert a quaternion wxyz of any length to a (3, 3) rotation matrix."""
+    w, x, y, z = np.asarray(quaternion, float) / np.linalg.norm(quaternion)
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    return np.eye(3) + 2 * w * cross + 2 * cross @ cross

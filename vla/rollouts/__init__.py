@@ -1,0 +1,1 @@
+"""Rollouts: the agent-environment loop, collection, evaluation, statistics and recordings."""

@@ -1,0 +1,233 @@
+"""Evaluation of a policy on unseen seeds: success rate, failures and milestones.
+
+An episode is a function of its seed alone, so a report does not depend on the cluster or the number of workers.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import traceback
+from collections import Counter
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+from vla.parallel.pool import THIS_PROCESS, Cluster, Crashed
+from vla.rollouts.rollout import rollout
+from vla.rollouts.statistics import mcnemar, wilson_interval
+from vla.spec import FIRST_SEED, Agent, Environment, Episode, Recorder
+
+log = logging.getLogger(__name__)
+
+IN_DISTRIBUTION = "seen"  # name of the unchanged condition, which a policy is trained for
+ERROR = "error"  # outcome of an episode that was not completed
+
+EnvironmentFactory = Callable[[], Environment]
+AgentFactory = Callable[[Environment], Agent]
+RecorderFactory = Callable[[], Recorder]
+
+
+@dataclass(frozen=True)
+class Result:
+    """Result of one episode."""
+
+    seed: int
+    outcome: str  # "success", the name of a failure, or "error"
+    instruction: str = ""
+    steps: int = 0
+    draws: dict[str, Any] = field(default_factory=dict)  # randomisation axis → drawn values
+    task: str = ""
+    milestones: tuple[str, ...] = ()  # in alphabetical order
+    error: str = ""  # message, if the outcome is "error"
+
+
+@dataclass(frozen=True)
+class Report:
+    """Results of all episodes, in the order of their seeds.
+
+    Errors are of the program, not of the policy: they count neither as successes nor as failures.
+    """
+
+    results: tuple[Result, ...]
+
+    @property
+    def errors(self) -> list[Result]:
+        """Episodes that were not completed."""
+        return [result for result in self.results if result.outcome == ERROR]
+
+    @property
+    def episodes(self) -> int:
+        """Number of completed episodes."""
+        return len(self.results) - len(self.errors)
+
+    @property
+    def successes(self) -> int:
+        """Number of successes."""
+        return self.taxonomy.get("success", 0)
+
+    @property
+    def success(self) -> float:
+        """Share of successes among completed episodes, 0…1; 0 if there are none."""
+        return self.successes / self.episodes if self.episodes else 0.0
+
+    @property
+    def interval(self) -> tuple[float, float]:
+        """95 % confidence interval of `success`."""
+        return wilson_interval(self.successes, self.episodes)
+
+    @property
+    def milestones(self) -> dict[str, int]:
+        """Milestone → number of episodes in which it was reached, sorted by name."""
+        return dict(sorted(Counter(name for result in self.results for name in result.milestones).items()))
+
+    @property
+    def taxonomy(self) -> dict[str, int]:
+        """Outcome → number of episodes, the most frequent first."""
+        return dict(Counter(result.outcome for result in self.results).most_common())
+
+    @property
+    def tasks(self) -> dict[str, Report]:
+        """Task → report of its episodes, sorted by name; without errors of unknown task."""
+        names = sorted({result.task for result in self.results if result.task})
+        return {name: Report(tuple(result for result in self.results if result.task == name)) for name in names}
+
+    def p_value(self, other: Report) -> float:
+        """Return the two-sided exact p-value for equal success on the same seeds, over pairs without an error.
+
+        Raises:
+            ValueError: the reports have different seeds.
+        """
+        if [result.seed for result in self.results] != [result.seed for result in other.results]:
+            raise ValueError("only reports on the same seeds can be compared")
+        pairs = Counter(
+            (one.outcome == "success", two.outcome == "success")
+            for one, two in zip(self.results, other.results, strict=True)
+            if ERROR not in (one.outcome, two.outcome)
+        )
+        return mcnemar(pairs[True, False], pairs[False, True])
+
+    def __str__(self) -> str:
+        """Format failures, errors, milestones, several tasks and, last, the success rate with its interval."""
+        lines = [f"{outcome} {count}" for outcome, count in self.taxonomy.items() if outcome not in ("success", ERROR)]
+        if self.errors:
+            first = self.errors[0]
+            lines.append(f"errors {len(self.errors)}, the first at seed {first.seed}: {first.error}")
+        lines += [f"{name} {_rate(count, self.episodes)}" for name, count in self.milestones.items()]
+        if len(self.tasks) > 1:
+            lines += [f"{task} {_rate(report.successes, report.episodes)}" for task, report in self.tasks.items()]
+        return "\n".join([*lines, f"success {_rate(self.successes, self.episodes)}"])
+
+
+def _rate(count: int, episodes: int) -> str:
+    low, high = wilson_interval(count, episodes)
+    share = count / episodes if episodes else 0.0
+    return f"{count}/{episodes} ({100 * share:.1f} %, 95 % CI {100 * low:.1f}-{100 * high:.1f})"
+
+
+def evaluate(
+    make_environment: EnvironmentFactory,
+    make_agent: AgentFactory,
+    make_recorder: RecorderFactory | None,
+    seeds: Sequence[int],
+    cluster: Cluster = THIS_PROCESS,
+    name: str = "evaluating",
+    needs: Sequence[Path] = (),
+) -> Report:
+    """Play the episodes of the seeds; `name` is the label of the progress bar.
+
+    Every process of the `cluster` calls the factories once and accesses the paths `needs`. Errors of a factory end the
+    evaluation; errors of an episode, or a crash of its process, are reported in its result.
+
+    Raises:
+        ValueError: there are no seeds, seeds are in the range of collection, or the cluster raises one.
+    """
+    if not seeds or min(seeds) < FIRST_SEED:
+        raise ValueError(f"evaluation needs seeds from {FIRST_SEED} on, which no policy is trained on; got {seeds}")
+    make = partial(_RolloutWorker, make_environment, make_agent, make_recorder)
+    columns = (TextColumn(name), BarColumn(), MofNCompleteColumn(), TextColumn("{task.fields[note]}"))
+    results: dict[int, Result] = {}
+    with cluster.pool(make, needs) as pool, Progress(*columns, TimeRemainingColumn()) as bar:
+        task = bar.add_task("", total=len(seeds), note="")
+        seed_of = {pool.submit(seed): seed for seed in seeds}
+        for future in pool.as_completed(seed_of):
+            seed = seed_of[future]
+            try:
+                results[seed] = future.result()
+            except Crashed as crash:
+                results[seed] = Result(seed, ERROR, error=str(crash))
+            so_far = Report(tuple(results.values()))
+            errors = f", {len(so_far.errors)} errors" if so_far.errors else ""
+            bar.update(task, advance=1, note=f"success {100 * so_far.success:.0f} %{errors}")
+    return Report(tuple(results[seed] for seed in seeds))
+
+
+def keep_recordings(report: Report, folder: Path, target: Path, limit: int | None) -> int:
+    """Merge the recordings of an evaluation into one file, failures first, at most `limit`; returns their number.
+
+    The single files are removed, and their folder if it is empty.
+    """
+    from vla.rollouts.recorder import merge, recording_name  # imports the viewer's library
+
+    names = sorted(recording_name(result.seed, result.outcome) for result in report.results)
+    files = [file for name in names if (file := folder / f"{name}.rrd").exists()]
+    if files[:limit]:
+        merge(files[:limit], target)
+    for file in files:
+        file.unlink()
+    with suppress(OSError):
+        folder.rmdir()
+    return len(files[:limit])
+
+
+def play(environment: Environment, agent: Agent, seed: int, recorder: Recorder | None = None) -> Result:
+    """Play one episode; errors become results, so that one seed ends neither an evaluation nor a training."""
+    try:
+        episode = rollout(environment, agent, seed, recorder)
+    except Exception as problem:
+        where = traceback.extract_tb(problem.__traceback__)[-1]
+        what = f"{type(problem).__name__}: {problem} ({Path(where.filename).name}:{where.lineno})"
+        return Result(seed, ERROR, error=what)
+    # Draws may be arrays; plain values support comparison and JSON.
+    draws = json.loads(json.dumps(episode.draws, default=lambda value: value.tolist()))
+    steps, milestones = len(episode.observations), tuple(sorted(episode.milestones))
+    return Result(seed, episode.outcome, episode.instruction, steps, draws, episode.task, milestones)
+
+
+class _TolerantRecorder:
+    """Recorder that logs disk errors: a missing recording must not fail an episode."""
+
+    def __init__(self, recorder: Recorder) -> None:
+        self._recorder = recorder
+        self.start, self.step = recorder.start, recorder.step
+
+    def end(self, episode: Episode) -> None:
+        """Write the recording, or log a warning."""
+        try:
+            self._recorder.end(episode)
+        except OSError as error:
+            log.warning("seed %d has no recording: %s", episode.seed, error)
+
+
+class _RolloutWorker:
+    """Worker with one environment, agent and recorder."""
+
+    def __init__(
+        self, make_environment: EnvironmentFactory, make_agent: AgentFactory, make_recorder: RecorderFactory | None
+    ) -> None:
+        self._environment = make_environment()
+        self._agent = make_agent(self._environment)
+        self._recorder = None if make_recorder is None else _TolerantRecorder(make_recorder())
+
+    def attempt(self, seed: int) -> Result:
+        """Play one episode."""
+        return play(self._environment, self._agent, seed, self._recorder)
+
+    def close(self) -> None:
+        """Close the environment."""
+        self._environment.close()

@@ -1,0 +1,281 @@
+"""Recordings of episodes for the Rerun viewer: scene, cameras, curves, token probabilities, instruction and draws."""
+
+from __future__ import annotations
+
+import io
+import os
+import subprocess
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import rerun as rr
+import rerun.blueprint as rrb
+import rerun_cli
+from PIL import Image
+
+from vla.io.files import atomic_path
+from vla.io.types import Point
+from vla.spec import Array, Drawable, Environment, Episode, Observation, Shape, Spec
+
+# N steps, S series of a plot, D action components, K bins, V vertices, F faces
+
+VIEWER = str(Path(rerun_cli.__file__).with_name("rerun"))  # the binary: killing its wrapper script would orphan it
+CURVES = np.array([0xE5574CFF, 0x5ABE64FF, 0x508CF0FF, 0xF0AA3CFF, 0xB46EE6FF, 0x3CC8C8FF, 0xDCDCDCFF], np.uint32)
+HEAT = np.array([(10, 8, 24), (70, 18, 95), (160, 45, 95), (235, 105, 55), (252, 190, 75), (252, 253, 200)])
+TOKENS = (210, 256)  # height and width of the image of token probabilities [px]
+
+
+def recording_name(seed: int, outcome: str) -> str:
+    """Return the file name of an episode; in alphabetical order failures come first, and seeds ascend."""
+    return f"success-{seed:08d}" if outcome == "success" else f"failure-{seed:08d}-{outcome}"
+
+
+class RerunRecorder:
+    """Recorder of one .rrd file per episode, with the timelines "step" and "time" [s].
+
+    It contains the scene if the environment is `Drawable`.
+    """
+
+    def __init__(self, folder: str | os.PathLike[str]) -> None:
+        """Create the folder of the recordings; files are named by `recording_name`."""
+        self._folder = Path(folder)
+        self._folder.mkdir(parents=True, exist_ok=True)
+
+    def start(self, name: str, environment: Environment) -> None:
+        """Begin an episode; an unfinished one is discarded."""
+        self._spec = environment.spec
+        self._world = environment if isinstance(environment, Drawable) else None
+        self._shapes = self._world.shapes() if self._world else []
+        self._steps, self._poses = 0, list[dict[str, Array]]()
+        self._probabilities: dict[int, Array] = {}
+
+    def step(self, observation: Observation, action: Array, info: Mapping[str, Any]) -> None:
+        """Buffer what is not in `Episode`; writing whole columns in `end` is much faster than single steps."""
+        if "probabilities" in info:
+            self._probabilities[self._steps] = np.array(info["probabilities"], dtype=np.float32)
+        self._steps += 1
+        self._pose()
+
+    def end(self, episode: Episode) -> None:
+        """Write the file of the episode atomically; an OSError if it cannot be written."""
+        self._pose()
+        name, spec = recording_name(episode.seed, episode.outcome), self._spec
+        # Random part: the viewer merges recordings of the same id, and policies share seeds.
+        stream = rr.RecordingStream("vla", recording_id=f"{name}-{os.urandom(3).hex()}")
+        content = rr.binary_stream(stream)  # Rerun's own file sink can block for ever on a full disk
+        viewpoint = self._world.viewpoint if self._world else None
+        stream.send_blueprint(_blueprint(spec, bool(self._probabilities), viewpoint), make_active=False)
+        writer = _Writer(stream, spec)
+        writer.facts(episode)
+        if self._poses:
+            draw_shapes(stream, self._shapes)
+            writer.poses(self._poses)
+        writer.cameras(episode.observations)
+        writer.curves(episode)
+        if self._probabilities:
+            writer.tokens(np.array([*self._probabilities]), np.stack([*self._probabilities.values()]))
+        with atomic_path(self._folder / f"{name}.rrd") as draft:
+            draft.write_bytes(content.read() or b"")
+        stream.disconnect()
+
+    def _pose(self) -> None:
+        if self._world is not None:
+            poses = self._world.poses()
+            self._poses.append({body: np.array(pose, dtype=np.float32) for body, pose in poses.items()})
+
+
+class _Writer:
+    """Writer of the parts of one episode into a recording."""
+
+    def __init__(self, stream: rr.RecordingStream, spec: Spec) -> None:
+        self._stream, self._spec = stream, spec
+
+    def facts(self, episode: Episode) -> None:
+        """Write name, properties, instruction and draws."""
+        steps = len(episode.observations)
+        self._stream.send_recording_name(f"{episode.outcome}: {episode.instruction}")
+        self._stream.send_property("episode", rr.AnyValues(outcome=episode.outcome, seed=episode.seed, steps=steps))
+        end = f"{'✔' if episode.success else '✘'} **{episode.outcome}** after {steps} steps, seed {episode.seed}"
+        draws = "\n".join(f"- **{axis}** {draw}" for axis, draw in episode.draws.items())
+        self._static("instruction", rr.TextDocument(f"### {episode.instruction}\n\n{end}", media_type="text/markdown"))
+        self._static("draws", rr.TextDocument(draws, media_type="text/markdown"))
+
+    def poses(self, poses: Sequence[Mapping[str, Array]]) -> None:
+        """Write body poses at the steps where they change: for many bodies, never."""
+        for body in poses[0]:
+            track = np.stack([pose[body] for pose in poses])  # (N + 1, 7)
+            moved = np.flatnonzero(np.append(True, (track[1:] != track[:-1]).any(axis=1)))
+            columns = rr.Transform3D.columns(translation=track[moved, :3], quaternion=_xyzw(track[moved, 3:]))
+            self._columns(_path("world", body), moved, columns)
+
+    def cameras(self, observations: Sequence[Observation]) -> None:
+        """Write colour as JPEG, depth as lossless 16-bit PNG [mm]."""
+        steps = np.arange(len(observations))
+        for camera in observations[0].rgb:
+            blobs = [encoded(seen.rgb[camera], "JPEG", quality=90) for seen in observations]
+            columns = rr.EncodedImage.columns(blob=blobs, media_type=["image/jpeg"] * len(blobs))
+            self._columns(_path("camera", camera, "rgb"), steps, columns)
+        for camera in observations[0].depth:
+            path, some = _path("camera", camera, "depth"), np.stack([seen.depth[camera] for seen in observations[::8]])
+            shades = np.percentile(some[some > 0], (1, 90)) if some.any() else (0.0, 1.0)
+            self._static(path, rr.EncodedDepthImage.from_fields(meter=1000.0, depth_range=shades, colormap="turbo"))
+            blobs = [encoded(seen.depth[camera], "PNG", compress_level=1) for seen in observations]
+            columns = rr.EncodedDepthImage.columns(blob=blobs, media_type=["image/png"] * len(blobs))
+            self._columns(path, steps, columns)
+
+    def curves(self, episode: Episode) -> None:
+        """Write state and executed action by unit, and the clean action if it differs."""
+        spec, state = self._spec, np.stack([seen.state for seen in episode.observations])
+        for unit, which in _by_unit(spec.state_units).items():
+            self._series(_path("state", unit), state[:, which], [spec.state[index] for index in which])
+        for unit, which in _by_unit(spec.units).items():
+            names = [spec.action[index] for index in which]
+            self._series(_path("action", unit, "executed"), episode.executed[:, which], names)
+            if not np.array_equal(episode.actions, episode.executed):
+                names = [f"{name}, clean" for name in names]
+                self._series(_path("action", unit, "clean"), episode.actions[:, which], names, width=0.75)
+
+    def tokens(self, steps: Array, probabilities: Array) -> None:
+        """Write one image per step: a row per action component, with its lowest bin on the left.
+
+        Args: steps (N,) and their probabilities (N, D, K); each row is scaled by its maximum.
+        """
+        components, bins = probabilities.shape[1:]
+        row = TOKENS[0] // components  # [px]
+        pixel_row, pixel_bin = np.arange(row * components) // row, np.arange(TOKENS[1]) * bins // TOKENS[1]
+        # The square root makes small probabilities visible.
+        strength = np.sqrt(probabilities / probabilities.max(axis=2, keepdims=True))
+        levels = np.round(strength * 255).astype(np.uint8)[:, pixel_row][:, :, pixel_bin]
+        levels[:, ::row] = 0  # a line between rows
+        shades = np.linspace(0, 255, len(HEAT))
+        palette = np.stack([np.interp(np.arange(256), shades, channel) for channel in HEAT.T], axis=1).astype(np.uint8)
+        blobs = [encoded(picture, "PNG", palette=palette, compress_level=1) for picture in levels]
+        self._columns("tokens", steps, rr.EncodedImage.columns(blob=blobs, media_type=["image/png"] * len(blobs)))
+        beside = [(-32.0, (index + 0.5) * row) for index in range(components)]
+        self._static("tokens/names", rr.Points2D(beside, labels=self._spec.action, radii=0.0, show_labels=True))
+
+    def _series(self, path: str, values: Array, names: Sequence[str], width: float = 1.75) -> None:
+        """Write a plot; values (N, S), S names, width of the curves [px]."""
+        count = len(names)
+        self._static(path, rr.SeriesLines(names=names, colors=np.resize(CURVES, count), widths=[width] * count))
+        columns = rr.Scalars.columns(scalars=values.reshape(-1)).partition([count] * len(values))
+        self._columns(path, np.arange(len(values)), columns)
+
+    def _static(self, path: str, *what: Any) -> None:
+        self._stream.log(path, *what, static=True)
+
+    def _columns(self, path: str, steps: Array, columns: Iterable[Any]) -> None:
+        seconds = rr.TimeColumn("time", duration=steps / self._spec.control_hz)
+        self._stream.send_columns(path, [rr.TimeColumn("step", sequence=steps), seconds], columns)
+
+
+def draw_shapes(stream: rr.RecordingStream, shapes: Iterable[Shape]) -> None:
+    """Log the geometry of every body, in its own frame."""
+    stream.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+    for shape in shapes:
+        place = rr.Transform3D(translation=shape.position, quaternion=_xyzw(shape.quaternion))
+        stream.log(_path("world", shape.body, shape.name), place, _solid(shape), static=True)
+
+
+def draw_poses(stream: rr.RecordingStream, poses: Mapping[str, Array]) -> None:
+    """Log the current poses of the bodies of `draw_shapes`."""
+    for body, pose in poses.items():
+        place = rr.Transform3D(translation=pose[:3], quaternion=_xyzw(pose[3:]))
+        stream.log(_path("world", body), place)
+
+
+def _by_unit(units: Sequence[str]) -> dict[str, list[int]]:
+    """Return unit → indices of its components."""
+    return {unit: [index for index, other in enumerate(units) if other == unit] for unit in dict.fromkeys(units)}
+
+
+def _path(*parts: str) -> str:
+    """Return an entity path; a slash within a name would create a level."""
+    return "/".join(part.replace("/", ".") for part in parts)
+
+
+def _xyzw(wxyz: Array) -> Any:
+    return np.asarray(wxyz)[..., [1, 2, 3, 0]]
+
+
+def encoded(pixels: Array, kind: str, palette: Array | None = None, **options: int) -> bytes:
+    """Encode an image file of `kind`, "PNG" or "JPEG", with Pillow's `options`."""
+    image, buffer = Image.fromarray(pixels), io.BytesIO()
+    if palette is not None:
+        image.putpalette(palette.tobytes())
+    image.save(buffer, kind, **options)
+    return buffer.getvalue()
+
+
+def _solid(shape: Shape) -> Any:
+    colour, (radius, half_length) = np.round(np.asarray(shape.rgba) * 255).astype(np.uint8), shape.size[:2]
+    if shape.kind == "mesh":
+        vertices, faces = np.asarray(shape.vertices), np.asarray(shape.faces)
+        normals = _normals(vertices, faces)
+        return rr.Mesh3D(
+            vertex_positions=vertices, triangle_indices=faces, vertex_normals=normals, albedo_factor=colour
+        )
+    if shape.kind == "box":
+        return rr.Boxes3D(half_sizes=[shape.size], colors=[colour], fill_mode="solid")
+    if shape.kind == "sphere":
+        return rr.Ellipsoids3D(radii=[radius], colors=[colour], fill_mode="solid")
+    size: dict[str, Any] = {"lengths": [2 * half_length], "radii": [radius], "colors": [colour], "fill_mode": "solid"}
+    if shape.kind == "cylinder":
+        return rr.Cylinders3D(**size)
+    return rr.Capsules3D(translations=[[0, 0, -half_length]], **size)  # Rerun's capsule begins at the origin
+
+
+def _normals(vertices: Array, faces: Array) -> Array:
+    """Return (V, 3) unit normals: the area-weighted mean of the normals of adjacent faces."""
+    first, second, third = (vertices[faces[:, corner]] for corner in range(3))  # (F, 3) each
+    normals = np.zeros(vertices.shape)
+    np.add.at(normals, faces.reshape(-1), np.cross(second - first, third - first).repeat(3, axis=0))
+    return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+
+
+def _blueprint(spec: Spec, tokens: bool, viewpoint: tuple[Point, Point] | None) -> rrb.Blueprint:
+    """Lay out the scene, if there is one, on the left, texts and cameras on the right, curves and tokens below."""
+    texts = [rrb.TextDocumentView(origin=f"/{name}", name=name) for name in ("instruction", "draws")]
+    images = [(name, kind) for kind, names in (("rgb", spec.cameras), ("depth", spec.depth)) for name in names]
+    views = [rrb.Spatial2DView(origin=_path("camera", name, kind), name=f"{name} {kind}") for name, kind in images]
+    states = _curves("state", spec.state_units)
+    plots: list[Any] = _curves("action", spec.units)
+    if tokens:
+        bounds = rrb.VisualBounds2D(x_range=(-64, TOKENS[1] + 4), y_range=(-4, TOKENS[0] + 4))
+        plots.append(rrb.Spatial2DView(origin="/tokens", name="token probabilities", visual_bounds=bounds))
+    above: Any = rrb.Vertical(
+        rrb.Horizontal(*texts), rrb.Grid(*views, grid_columns=len(spec.cameras)), row_shares=[1, 3]
+    )
+    if viewpoint is not None:
+        controls = rrb.EyeControls3D(position=viewpoint[0], look_target=viewpoint[1], eye_up=(0, 0, 1))
+        scene = rrb.Spatial3DView(origin="/world", name="scene", eye_controls=controls, line_grid=False)
+        above = rrb.Horizontal(scene, above, column_shares=[5, 4])
+    return rrb.Blueprint(
+        rrb.Vertical(above, rrb.Horizontal(rrb.Tabs(*states), *plots), row_shares=[5, 3]),
+        rrb.TimePanel(state="collapsed", timeline="step", fps=spec.control_hz),
+        rrb.BlueprintPanel(state="collapsed"),
+        rrb.SelectionPanel(state="collapsed"),
+    )
+
+
+def _curves(what: str, units: Sequence[str]) -> list[rrb.TimeSeriesView]:
+    """Return one view per unit."""
+    return [rrb.TimeSeriesView(origin=_path(what, unit), name=f"{what} [{unit}]") for unit in _by_unit(units)]
+
+
+def merge(files: Sequence[Path], target: Path) -> None:
+    """Merge recordings into one file, in which the viewer lists them by name.
+
+    Raises:
+        ValueError: there are no files, or one of them is no recording.
+    """
+    if not files:
+        raise ValueError(f"no recordings to merge into {target}")
+    with atomic_path(target) as draft:
+        command = [VIEWER, "rrd", "merge", *map(str, files), "-o", str(draft)]
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        if done.returncode:
+            reason = done.stderr[-500:].strip()
+            raise ValueError(f"rerun could not merge {len(files)} recordings into {target}: {reason}")

@@ -1,0 +1,71 @@
+"""The agent-environment loop, and the replay of its episodes."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from vla.spec import Agent, Environment, Episode, Recorder
+
+
+def rollout(environment: Environment, agent: Agent, seed: int, recorder: Recorder | None = None) -> Episode:
+    """Run the episode of `seed` to its end.
+
+    The label for imitation is `agent.info["clean"]` if present, else the executed action.
+
+    Raises:
+        ValueError: the agent returned an action of the wrong shape, or one that is not finite.
+    """
+    observation = environment.reset(seed)
+    agent.reset(observation.instruction, seed)
+    if recorder is not None:
+        recorder.start(f"seed {seed}", environment)
+    observations, clean, executed = [], [], []
+    components = len(environment.spec.action)
+    while not environment.done:
+        action = np.asarray(agent.act(observation), dtype=np.float32)
+        if action.shape != (components,) or not np.isfinite(action).all():
+            raise ValueError(f"{type(agent).__name__} must return {components} finite numbers, got {action}")
+        observations.append(observation)
+        clean.append(agent.info.get("clean", action))
+        executed.append(action)
+        if recorder is not None:
+            recorder.step(observation, action, agent.info)
+        observation = environment.step(action)
+    episode = Episode(
+        seed=seed,
+        task=environment.task,
+        instruction=observations[0].instruction,
+        outcome=environment.outcome,
+        milestones=environment.milestones,
+        draws=environment.draws,
+        observations=observations,
+        actions=np.asarray(clean, dtype=np.float32),
+        executed=np.asarray(executed, dtype=np.float32),
+    )
+    if recorder is not None:
+        recorder.end(episode)
+    return episode
+
+
+def replay(environment: Environment, episode: Episode, recorder: Recorder | None = None) -> int | None:
+    """Execute the actions of an episode again from its seed; records this world with the observations of the episode.
+
+    Returns the first step whose state differs in any bit, N if only the end of the episode differs, or None.
+    """
+    observation = environment.reset(episode.seed)
+    if recorder is not None:
+        recorder.start(f"seed {episode.seed}", environment)
+    same = []
+    for recorded, action in zip(episode.observations, episode.executed, strict=True):
+        if environment.done:
+            break
+        same.append(np.array_equal(observation.state, recorded.state))
+        if recorder is not None:
+            recorder.step(recorded, action, {})
+        observation = environment.step(action)
+    if recorder is not None:
+        recorder.end(episode)
+    if not all(same):
+        return same.index(False)
+    ended = len(same) == len(episode.executed) and environment.done and environment.outcome == episode.outcome
+    return None if ended else len(same)

@@ -1,0 +1,72 @@
+"""Confidence intervals of success rates, and tests of their differences."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from math import sqrt
+
+import numpy as np
+
+NORMAL_QUANTILE = 1.959964  # of 0.975: an interval of 95 %
+
+
+def wilson_interval(successes: float, trials: float) -> tuple[float, float]:
+    """Return the 95 % confidence interval of a proportion; (0, 1) without trials.
+
+    Wilson's score interval: E. B. Wilson, "Probable inference, the law of succession, and statistical inference",
+    Journal of the American Statistical Association 22 (1927).
+    """
+    if trials == 0:
+        return 0.0, 1.0
+    share, spread = successes / trials, NORMAL_QUANTILE**2 / trials
+    centre = (share + spread / 2) / (1 + spread)
+    half_width = sqrt(spread * (share * (1 - share) + spread / 4)) / (1 + spread)
+    # Without successes, or failures, the exact bound is 0, or 1; avoid rounding errors.
+    low = centre - half_width if successes else 0.0
+    return low, centre + half_width if successes < trials else 1.0
+
+
+def mcnemar(lost: int, won: int) -> float:
+    """Return the two-sided exact p-value for equal success rates, given the numbers of discordant pairs.
+
+    Under the null hypothesis both kinds of pairs are equally likely (Q. McNemar, "Note on the sampling error of
+    the difference between correlated proportions or percentages", Psychometrika 12, 1947).
+    """
+    if lost == won:
+        return 1.0
+    from scipy.stats import binomtest  # the import takes a second
+
+    return float(binomtest(lost, lost + won).pvalue)
+
+
+def pooled_interval(trainings: Sequence[Mapping[int, bool]]) -> tuple[float, float]:
+    """Return the 95 % confidence interval of success over several trainings, each scene seed → success.
+
+    Episodes are correlated within a training and within a scene, so the effective sample size is smaller than their
+    number. It is the one whose binomial variance equals the variance of the mean, estimated with trainings, with
+    scenes, and with both as clusters (A. C. Cameron, J. B. Gelbach, D. L. Miller, "Robust inference with multiway
+    clustering", Journal of Business & Economic Statistics 29, 2011); the largest of the three estimates is used, as
+    there are few trainings. If all succeed or all fail, it is the number of scenes. The interval is Wilson's.
+
+    Two or three trainings estimate the variance between trainings poorly: where it exceeds the variance between scenes,
+    the coverage is about 80 % instead of 95 %.
+    """
+    success = np.array([won for training in trainings for won in training.values()], float)
+    if not len(success):
+        return wilson_interval(0, 0)
+    independent, rate = float(len(success)), float(success.mean())
+    if len(trainings) > 1:
+        scene = np.array([seed for training in trainings for seed in training])
+        training = np.repeat(np.arange(len(trainings)), [len(training) for training in trainings])
+        apart = success - rate
+        between, within = _squares(apart, training) * len(trainings) / (len(trainings) - 1), _squares(apart, scene)
+        squares = max(between, within, between + within - float(apart @ apart))
+        alike = len(np.unique(scene)) if rate in (0, 1) else len(success) ** 2 * rate * (1 - rate) / max(squares, 1e-9)
+        independent = min(independent, alike)
+    return wilson_interval(rate * independent, independent)
+
+
+def _squares(values: np.ndarray, groups: np.ndarray) -> float:
+    """Σ_g (Σ_{i∈g} x_i)²."""
+    _, place = np.unique(groups, return_inverse=True)
+    return float(np.square(np.bincount(place, values)).sum())

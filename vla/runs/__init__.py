@@ -1,0 +1,1 @@
+"""Run folders on disk: what they hold, and which run to resume."""

@@ -1,0 +1,98 @@
+"""Schemas of the JSON and YAML files in a run's folder, validated on reading."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated, Any
+
+from pydantic import ConfigDict, StringConstraints
+
+from vla.io.documents import STRICT
+from vla.io.types import Count, Natural, NonNegative, Positive, Share
+from vla.rollouts.evaluate import Result
+
+Node = dict[str, Any]
+CheckpointName = Annotated[str, StringConstraints(pattern=r"^\w[\w.-]*\.ckpt$")]  # in the run's own folder
+
+
+@dataclass(frozen=True)
+class Change:
+    """An entry of changes.yaml: a key whose value differs from the default."""
+
+    __pydantic_config__ = STRICT
+
+    key: str
+    here: Any
+    default: Any
+
+
+@dataclass(frozen=True)
+class Training:
+    """training.json: size of the model and result of its training."""
+
+    __pydantic_config__ = STRICT
+
+    parameters: Natural
+    steps: Natural
+    seconds: NonNegative
+    ended: str  # "done", "interrupted", or an error
+    collection_s: NonNegative | None = None  # duration of the collection, if known
+    checkpoint: CheckpointName | None = None  # selected for evaluation
+
+
+@dataclass(frozen=True)
+class Milestone:
+    """Rate of a milestone, regardless of the outcome."""
+
+    __pydantic_config__ = STRICT
+
+    rate: Share
+    ci_low: Share
+    ci_high: Share
+    episodes: Natural  # that reached it
+
+
+@dataclass(frozen=True)
+class Summary:
+    """Success statistics, written by `vla.reports.evaluation.summary`."""
+
+    __pydantic_config__ = ConfigDict(strict=True, extra="ignore", allow_inf_nan=False)
+
+    success: Share
+    ci_low: Share
+    ci_high: Share
+    episodes: Natural
+    successes: Natural
+    errors: Natural
+    taxonomy: dict[str, Natural]
+    milestones: dict[str, Milestone]
+    tasks: dict[str, Summary]
+
+
+@dataclass(frozen=True)
+class Condition(Summary):
+    """Success statistics under another condition, on the same seeds."""
+
+    outcomes: list[str]
+
+
+@dataclass(frozen=True)
+class ReportFile(Summary):
+    """report.json, written by `vla.reports.evaluation.write_report`, without the names of chosen options."""
+
+    seeds: list[int]
+    checkpoint: str | None
+    conditions: dict[str, Condition]
+    config: Node
+    per_episode: list[Result]
+    parameters: Count | None = None
+    latency_ms: Positive | None = None
+    wall_time_s: NonNegative | None = None
+
+    def __post_init__(self) -> None:
+        """Require the same episodes in every part."""
+        if [result.seed for result in self.per_episode] != self.seeds:
+            raise ValueError("per_episode has other episodes than seeds")
+        for name, condition in self.conditions.items():
+            if len(condition.outcomes) != len(self.seeds):
+                raise ValueError(f"conditions.{name} has {len(condition.outcomes)} outcomes of {len(self.seeds)} seeds")

@@ -1,0 +1,161 @@
+"""Progress of a run's training, the run to resume, and the lock of a folder in training."""
+
+from __future__ import annotations
+
+import logging
+import os
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from filelock import FileLock, Timeout
+
+from vla.config.differences import differences
+from vla.policy import read_header
+from vla.runs.folder import CHECKPOINTS, LAST, REPORT, read_run, run_of
+
+log = logging.getLogger(__name__)
+
+FOUND = "VLA_LAST"  # environment variable that passes the run found by resume=last to other processes
+LOCK = ".training"  # held by the process that trains into a folder of checkpoints
+
+# Keys that identify a training. Its length, location and speed may change.
+IDENTITY = (
+    *("task", "expert", "collect.episodes", "collect.seed", "collect.folder", "data"),
+    *("tokenizer", "model", "learner", "validate", "seed", "pretrained"),
+    *(f"trainer.{name}" for name in ("val_check_interval", "accumulate_grad_batches", "gradient_clip_val")),
+    *(f"trainer.{name}" for name in ("precision", "devices", "num_nodes")),
+)
+
+LENGTHS = ("max_steps", "max_epochs", "max_time")
+
+
+@dataclass(frozen=True)
+class TrainingProgress:
+    """Progress of a run's training; both fields are None before its first save."""
+
+    resume_from: Path | None = None  # checkpoint of an unfinished training
+    chosen: Path | None = None  # checkpoint selected by a finished training
+
+
+def training_progress(folder: Path, config: Mapping[str, Any]) -> TrainingProgress:
+    """Return the progress of the training that `config` describes in a run's folder.
+
+    Raises:
+        ValueError: the folder holds another training, or one that `config` cannot continue.
+    """
+    last = folder / CHECKPOINTS / LAST
+    if not last.exists():
+        return TrainingProgress()
+    saved = read_header(last)
+    changed = [key for key, _, _ in differences(_identity(saved.config), _identity(config))]
+    if changed:
+        raise ValueError(
+            f"{folder} holds a training that differs in {', '.join(changed[:3])}{', …' if changed[3:] else ''}: choose "
+            f"another output=DIR (hydra.sweep.dir=DIR of a sweep), continue it unchanged with resume={folder}, or "
+            f"start a new one from its weights with pretrained={last}"
+        )
+    trainer, before = config["trainer"], saved.config.get("trainer", {})
+    longer = (
+        any(trainer.get(name) != before.get(name) for name in LENGTHS) and not 0 <= trainer["max_steps"] <= saved.steps
+    )
+    chosen = run_of(last).chosen if saved.finished else None  # None if the process was killed before the selection
+    if chosen is not None and not longer:
+        log.info("training is already finished: %s", last.with_name(chosen))
+        return TrainingProgress(chosen=last.with_name(chosen))
+    if isinstance(trainer.get("strategy"), dict) and not isinstance(before.get("strategy"), dict):
+        # A sharded optimiser orders its parameters differently.
+        raise ValueError(f"trainer=fsdp cannot continue {last}, which was trained without it: use trainer=ddp")
+    log.info("resuming from %s", last)
+    return TrainingProgress(resume_from=last)
+
+
+def cached_success(folder: Path, config: Mapping[str, Any], checkpoint: Path) -> float | None:
+    """Return the success rate of a run's report if it is of the same checkpoint and the same evaluation."""
+    report = read_run(folder).report
+    if report is None or report.checkpoint != str(checkpoint):
+        return None
+    if (folder / REPORT).stat().st_mtime < checkpoint.stat().st_mtime:  # the training continued afterwards
+        return None
+    if any(part.errors for part in (report, *report.conditions.values())):
+        return None
+    if differences(report.config, config):
+        return None
+    log.info("evaluation is already finished: %s", folder / REPORT)
+    return report.success
+
+
+def interrupted_run(runs: Path) -> Path:
+    """Return the newest unfinished run in a folder, found once per command.
+
+    The first process passes the result to the processes that a trainer starts, because it locks that run.
+
+    Raises:
+        ValueError: there is no unfinished run.
+    """
+    if os.environ.get("LOCAL_RANK", "0") == "0" or FOUND not in os.environ:
+        os.environ[FOUND] = str(_newest_interrupted(runs))
+    return Path(os.environ[FOUND])
+
+
+def _newest_interrupted(runs: Path) -> Path:
+    files = sorted(runs.glob(f"*/{CHECKPOINTS}/{LAST}"), key=lambda path: path.stat().st_mtime, reverse=True)
+    for last in files:
+        if _locked(last.parent):
+            continue
+        run, saved = last.parent.parent, read_header(last)
+        unreported = saved.config.get("job") == "evaluate" and not (run / REPORT).exists()
+        unchosen = run_of(last).chosen is None  # killed between the last save and the selection
+        if not saved.finished or unchosen or unreported:
+            return run
+    raise ValueError(f"resume=last: none of the {len(files)} trainings in {runs} was interrupted; resume=DIR names one")
+
+
+@contextmanager
+def training_lock(checkpoints: Path) -> Iterator[None]:
+    """Lock a folder of checkpoints against other trainings; only the first process of a training takes the lock.
+
+    Raises:
+        ValueError: another training holds the lock.
+    """
+    if not first_process():
+        yield
+        return
+    checkpoints.mkdir(parents=True, exist_ok=True)
+    lock = FileLock(checkpoints / LOCK, blocking=False)
+    try:
+        lock.acquire()
+    except Timeout as error:
+        raise ValueError(
+            f"another process is training into {checkpoints}: wait for it, or choose another output=DIR"
+        ) from error
+    try:
+        yield
+    finally:
+        lock.release()
+
+
+def _locked(checkpoints: Path) -> bool:
+    try:
+        with FileLock(checkpoints / LOCK, blocking=False):
+            return False
+    except Timeout:
+        return True
+
+
+def first_process() -> bool:
+    """Return whether this is the first process of a training."""
+    from lightning.pytorch.utilities import rank_zero_only
+
+    return bool(rank_zero_only.rank == 0)  # type: ignore[attr-defined]
+
+
+def _identity(config: Mapping[str, Any]) -> dict[str, Any]:
+    """Return key → value of the keys that identify a training; None for absent keys."""
+    values: dict[str, Any] = {}
+    for key in IDENTITY:
+        group, _, name = key.partition(".")
+        values[key] = config.get(group, {}).get(name) if name else config.get(group)
+    return values

@@ -1,1 +1,0 @@
-"""What the robot is asked to do, one goal per file."""

@@ -1,0 +1,134 @@
+"""Perturbation of experts, so that demonstrations cover the states that a learner will drift into."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Annotated, Any
+
+import numpy as np
+from annotated_types import Ge, Le, MinLen
+
+from vla.io.types import CountRange, Names, PositiveRange, Share, Text
+from vla.spec import Agent, Array, Observation, Spec
+
+Corner = Annotated[tuple[float, ...], MinLen(2)]  # x, y and, in most worlds, z [m]
+
+MISS, MISS_STEPS = 0.03, 3  # offset [m] and duration [steps] of a missed grasp
+MAX_TURN = 0.2  # of the gripper per step of an excursion [rad]
+
+
+@dataclass
+class Perturbation:
+    """Excursions, missed grasps and action noise.
+
+    An excursion moves the tool at full speed towards a random point for a few steps, with the gripper, if there is one,
+    open or closed at random. Only a gripper misses grasps.
+
+    Raises:
+        ValueError: `low`, `high` and `move` differ in length.
+    """
+
+    low: Corner  # lower corner of the box of excursion targets, in the frame of the actions [m]
+    high: Corner  # upper corner [m]
+    tool: Text  # key, in the simulator's truth, of the last commanded tool position [m]
+    move: Names  # action components that translate the tool along x, y and z [m], as many as the corners have
+    turn: Text | None  # action component that turns the gripper [rad]
+    gripper: Text | None  # action component that closes the gripper at its lower bound and opens it at its upper one
+    start: Share  # probability that an episode begins with an excursion
+    start_steps: CountRange  # length of the first excursion [steps]
+    rate: Share  # probability per step of a further excursion
+    steps: CountRange  # length of a further excursion [steps]
+    noise: Annotated[float, Ge(0), Le(2)]  # standard deviation of the noise on every motion, relative to the motion
+    closed: Share  # probability that an excursion closes the gripper
+    unturned: Share  # probability that an episode executes no turns, so that blocks are also grasped by their edges
+    missed: Share  # probability of a missed grasp: the gripper closes a few centimetres beside the block
+    # Range of the speed of an episode, relative to the expert's. Slow episodes contain more states of the last
+    # centimetres, where imprecise policies stall.
+    pace: PositiveRange
+
+    def __post_init__(self) -> None:
+        """Require corners with a coordinate per component of `move`."""
+        low, high, move = len(self.low), len(self.high), len(self.move)
+        if not low == high == move:
+            raise ValueError(f"expert.perturb has {low} numbers in low, {high} in high, {move} in move")
+
+    def reset(self, spec: Spec, seed: int) -> None:
+        """Draw the pace of an episode and its first excursion.
+
+        Raises:
+            ValueError: the actions lack a named component.
+        """
+        groups = self.move, (self.turn,) if self.turn else (), (self.gripper,) if self.gripper else ()
+        if unknown := [name for group in groups for name in group if name not in spec.action]:
+            raise ValueError(f"expert.perturb names {', '.join(unknown)}; actions have {', '.join(spec.action)}")
+        self._move, self._turn, self._grip = ([spec.action.index(name) for name in group] for group in groups)
+        self._motions = [index for index in range(len(spec.action)) if index not in self._grip]
+        self._shut, self._wide = (np.array(bounds)[self._grip] for bounds in (spec.low, spec.high))
+        self._random = np.random.default_rng([seed, 0x5EED])
+        self._pace = np.random.default_rng([seed, 0xACE]).uniform(*self.pace)
+        self._left, self._open = 0, True
+        self._turns = self._random.uniform() >= self.unturned
+        if self._random.uniform() < self.start:
+            self._begin(self.start_steps)
+
+    def _begin(self, steps: Sequence[int]) -> None:
+        self._left = int(self._random.integers(steps[0], steps[1] + 1))
+        self._point = self._random.uniform(self.low, self.high)
+        self._angle = self._random.uniform(-MAX_TURN, MAX_TURN)
+        self._gripper = self._wide if self._random.uniform() >= self.closed else self._shut
+
+    def __call__(self, clean: Array, truth: dict[str, Array]) -> Array:
+        """Return the (D,) action to execute instead of `clean`, not yet clipped to the bounds of the spec."""
+        tool, opens = truth[self.tool], bool((clean[self._grip] >= (self._shut + self._wide) / 2).all())
+        grasps, self._open = self._open and not opens, opens
+        if self._left == 0 and self._random.uniform() < self.rate:
+            self._begin(self.steps)
+        elif self._left == 0 and grasps and self._random.uniform() < self.missed:
+            angle = self._random.uniform(-np.pi, np.pi)
+            self._left, self._angle, self._gripper = MISS_STEPS, 0.0, self._shut
+            self._point = tool + MISS * np.array([np.cos(angle), np.sin(angle), 0.0])[: len(tool)]
+        action = clean.astype(float)
+        if self._left > 0:
+            self._left -= 1
+            action[self._move] = self._point - tool
+            action[self._turn], action[self._grip] = self._angle, self._gripper
+            return action
+        action[self._motions] *= self._pace * (1 + self.noise * self._random.standard_normal(len(self._motions)))
+        action[self._turn] *= self._turns
+        return action
+
+
+class Perturbed:
+    """An expert with perturbed actions; `info["clean"]` is the expert's own action, the label to imitate."""
+
+    def __init__(self, spec: Spec, expert: Callable[..., Agent], perturb: Perturbation | None) -> None:
+        """Args:
+        spec: the environment's spec.
+        expert: factory of the expert, called with `spec`.
+        perturb: None disables perturbation.
+        """
+        self._spec, self._expert, self._perturb = spec, expert(spec=spec), perturb
+        self.info: dict[str, Any] = {}
+
+    def reset(self, instruction: str, seed: int) -> None:
+        """Start an episode; `seed` seeds the expert and the perturbation."""
+        self.info = {}
+        self._expert.reset(instruction, seed)
+        if self._perturb is not None:
+            self._perturb.reset(self._spec, seed)
+
+    def act(self, observation: Observation) -> Array:
+        """Return the (D,) float32 action to execute.
+
+        Raises:
+            ValueError: there is a perturbation, and the observation lacks the simulator's truth.
+        """
+        clean = self._expert.act(observation)
+        self.info = {**self._expert.info, "clean": clean}
+        if self._perturb is None:
+            return clean
+        if observation.truth is None:
+            raise ValueError("expert.perturb needs the simulator's truth, which this observation lacks")
+        executed = self._perturb(clean, observation.truth)
+        return np.clip(executed, self._spec.low, self._spec.high).astype(np.float32)

@@ -1,0 +1,1 @@
+"""Pictures of any MuJoCo model: a fast renderer, and MuJoCo's own as the reference."""

@@ -1,0 +1,91 @@
+"""What is drawn of a model: geoms and sites as one table of elements."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+
+from vla.spec import Array
+from vla.tasks.rendering.renderer import View
+
+OPAQUE = 0.995  # smallest alpha of an opaque element in MuJoCo
+DEFAULT_RGBA = (0.5, 0.5, 0.5, 1.0)  # of a geom that shows its material's colour
+RGB_ROLE = int(mujoco.mjtTextureRole.mjTEXROLE_RGB)
+
+
+@dataclass(frozen=True)
+class Elements:
+    """Appearance of all geoms, then all sites of a model; rows (E, …)."""
+
+    kind: Array  # (E,) mjtGeom
+    mesh: Array  # (E,) id of the mesh, or -1
+    size: Array  # (E, 3) along x, y and z [m]
+    rgba: Array  # (E, 4)
+    material: Array  # (E,) id, or -1
+    texture: Array  # (E,) id, or -1
+    light: Array  # (E, 3) emission, specular, shininess
+    seen: Array  # (E,) bool
+
+    @property
+    def opaque(self) -> Array:
+        """Which elements (E,) are drawn without blending."""
+        return self.seen & (self.rgba[:, 3] >= OPAQUE)
+
+
+def elements_of(model: mujoco.MjModel, view: View) -> Elements:
+    """Read the elements' present appearance from a model."""
+    both = lambda name: np.concatenate([getattr(model, f"geom_{name}"), getattr(model, f"site_{name}")])  # noqa: E731
+    kind, material, rgba = both("type"), both("matid"), both("rgba")
+    mesh = np.concatenate([model.geom_dataid, np.full(model.nsite, -1, np.int32)])
+    light, texture = np.tile(np.array([0.0, 0.5, 0.5], np.float32), (len(kind), 1)), np.full(len(kind), -1, np.int32)
+    with_material = np.flatnonzero(material >= 0)
+    if len(with_material):
+        chosen = material[with_material]
+        plain = (rgba[with_material] == np.array(DEFAULT_RGBA, np.float32)).all(axis=1)
+        rgba[with_material[plain]] = model.mat_rgba[chosen[plain]]
+        names = ("mat_emission", "mat_specular", "mat_shininess")
+        light[with_material] = np.stack([getattr(model, name)[chosen] for name in names], axis=1)
+        texture[with_material] = model.mat_texid[chosen, RGB_ROLE]
+    groups = np.clip(both("group"), 0, mujoco.mjNGROUP - 1)
+    shown = np.concatenate(
+        [
+            np.isin(groups[: model.ngeom], list(view.geom_groups)),
+            np.isin(groups[model.ngeom :], list(view.site_groups)),
+        ]
+    )
+    return Elements(kind, mesh, _sizes(kind, both("size")), rgba, material, texture, light, shown & (rgba[:, 3] > 0))
+
+
+def _sizes(kind: Array, size: Array) -> Array:
+    """Return (E, 3) half sizes along x, y and z [m] of MuJoCo's sizes, which start with the radius of round shapes."""
+    sizes = size.astype(np.float32)
+    round_ = np.isin(kind, (mujoco.mjtGeom.mjGEOM_CAPSULE, mujoco.mjtGeom.mjGEOM_CYLINDER))
+    sizes[round_] = sizes[round_][:, [0, 0, 1]]
+    ball = kind == mujoco.mjtGeom.mjGEOM_SPHERE
+    sizes[ball] = sizes[ball][:, [0, 0, 0]]
+    return sizes
+
+
+def unsupported(model: mujoco.MjModel, view: View) -> list[str]:
+    """Name what MuJoCo's renderer would draw of a model and the fast one does not."""
+    elements = elements_of(model, view)
+    infinite = (elements.kind == mujoco.mjtGeom.mjGEOM_PLANE) & (elements.size[:, :2] <= 0).any(axis=1)
+    sky = (model.tex_type == mujoco.mjtTexture.mjTEXTURE_SKYBOX).any()
+    odd = (mujoco.mjtLightType.mjLIGHT_POINT, mujoco.mjtLightType.mjLIGHT_IMAGE)
+    counts = {
+        "height fields": int((elements.seen & (elements.kind == mujoco.mjtGeom.mjGEOM_HFIELD)).sum()),
+        "skins": model.nskin,
+        "flexible bodies": model.nflex,
+        "spatial tendons": int((model.wrap_type != mujoco.mjtWrap.mjWRAP_JOINT).any()),
+        "reflections": int(
+            model.nmat
+            and (model.mat_reflectance[elements.material[elements.seen & (elements.material >= 0)]] > 0).any()
+        ),
+        "haze at the horizon": int(sky and (elements.seen & infinite).any()),
+        "lights of the types point and image": int(np.isin(model.light_type, odd).sum()),
+        "textures of one or two channels": int((model.tex_nchannel < 3).sum()),
+        "slider-cranks": int((model.actuator_trntype == mujoco.mjtTrn.mjTRN_SLIDERCRANK).sum()),
+    }
+    return [name for name, count in counts.items() if count]

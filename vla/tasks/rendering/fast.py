@@ -1,0 +1,449 @@
+"""A renderer that draws the scene once: few draw calls on one framebuffer for all cameras.
+
+All geometry is in one buffer, and each vertex names its element. Poses and appearance are textures with a row per
+element. A frame uploads the poses, draws one shadow map per lamp for all cameras, then each camera's picture with one
+call per texture, and reads all of them back at once.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Collection, Iterable
+from dataclasses import dataclass
+from typing import Annotated, Any, Literal
+
+import moderngl
+import mujoco
+import numpy as np
+from annotated_types import Ge, Le
+
+from vla.spec import Array
+from vla.tasks.rendering import lights, shaders, shapes
+from vla.tasks.rendering.decimate import decimate
+from vla.tasks.rendering.elements import Elements, elements_of, unsupported
+from vla.tasks.rendering.geometry import VERTEX, Geometry
+from vla.tasks.rendering.renderer import Renderer, View
+from vla.tasks.rendering.textures import Textures
+
+log = logging.getLogger(__name__)
+BEHIND = 0.3  # factor on the alpha of a plane seen from behind, as in MuJoCo
+SLOPE, UNITS = 1.5, 4.0  # offset of shadow maps against surfaces that shade themselves, as in MuJoCo
+GAP = 300  # indices out of view that are drawn rather than skipped by another call
+ALIGNMENT = 256  # of a camera's block in its buffer [bytes], enough for every machine
+CORNERS = np.array([[-1, -1, 1, 1], [-1, 1, -1, 1], [1, 1, 1, 1], [1, 1, 1, 1]], float)  # of what a camera sees
+UPSIDE_DOWN = np.diag([1.0, -1.0, 1.0, 1.0])  # the first row of the framebuffer becomes the top of the picture
+BACKEND: Any = {"backend": "egl"}
+STATE = moderngl.DEPTH_TEST | moderngl.CULL_FACE
+
+
+@dataclass(frozen=True)
+class Run:
+    """Triangles that one call draws."""
+
+    texture: int  # id, or -1
+    start: int  # of the indices
+    count: int  # of the indices
+
+
+class Fast:
+    """The choice of the fast renderer."""
+
+    def __init__(
+        self,
+        samples: Literal[0, 2, 4],
+        soft: Annotated[int, Ge(0), Le(4)],
+        light: Literal["auto", "vertex", "pixel"],
+        faces: Annotated[int, Ge(100)] | None,
+    ) -> None:
+        """Args:
+        samples: per pixel, for smooth edges; 0 is fastest.
+        soft: texels around the nearest one over which the edges of shadows are averaged.
+        light: whether light is computed at vertices, as in MuJoCo, or pixels; auto: pixels for spot lights only.
+        faces: most faces of a mesh, heavier ones are decimated for pictures; None keeps all.
+        """
+        self.samples, self.soft, self.light, self.faces = samples, soft, light, faces
+
+    def open(self, model: mujoco.MjModel, view: View) -> Renderer:
+        """Make a renderer of `model`, with a GL context in this thread.
+
+        Raises:
+            RuntimeError: this machine has no EGL. Nothing else draws in its place, because a store names its renderer.
+        """
+        try:
+            gl = moderngl.create_standalone_context(**BACKEND)
+        except Exception as error:  # moderngl raises plain exceptions
+            raise RuntimeError(
+                f"the fast renderer needs EGL, which this machine lacks ({error}): install the packages libegl1 and "
+                "libgl1-mesa-dri, or choose task/renderer=mujoco"
+            ) from error
+        return FastRenderer(gl, model, view, self)
+
+
+class FastRenderer:
+    """Pictures of one model by OpenGL 3.3."""
+
+    def __init__(self, gl: moderngl.Context, model: mujoco.MjModel, view: View, settings: Fast) -> None:
+        """Args: the context, which the renderer owns; the model; what to draw of it; settings."""
+        self._gl: Any = gl  # its type annotations are too narrow
+        self._model, self._view, self._settings = model, view, settings
+        missing = unsupported(model, view)
+        if missing:
+            log.warning(f"the fast renderer leaves out {', '.join(missing)}; task/renderer=mujoco draws them")
+        self._near, self._far = lights.clip_range(model)
+        sky = np.flatnonzero(model.tex_type == mujoco.mjtTexture.mjTEXTURE_SKYBOX)
+        self._sky = int(sky[0]) if len(sky) else -1
+        self._geometry = Geometry(model, self._mesh)
+        with gl:
+            self._make_targets()
+            self._make_tables()
+            self._textures = Textures(gl, model)
+            self._blocks: list[Any] = []
+            self._buffers: list[Any] = []
+            self._make_programs()
+            gl.depth_func = "<="
+        self.update()
+
+    def _mesh(self, mesh: int) -> shapes.Shape:
+        vertices, faces = shapes.mesh_triangles(self._model, mesh)
+        if self._settings.faces is not None and len(faces) > self._settings.faces:
+            return shapes.decimated(*decimate(vertices, faces, self._settings.faces))
+        return shapes.mesh(self._model, mesh)
+
+    def _make_targets(self) -> None:
+        """Make the framebuffer, the cameras' pictures one above the other, and the shadow maps."""
+        gl, view = self._gl, self._view
+        size = view.width, view.height * len(view.cameras)
+        self._target = gl.framebuffer(gl.renderbuffer(size, 4), gl.depth_renderbuffer(size))
+        self._drawn = self._target
+        samples = min(self._settings.samples, gl.max_samples)
+        if samples:
+            colour, depth = gl.renderbuffer(size, 4, samples=samples), gl.depth_renderbuffer(size, samples=samples)
+            self._drawn = gl.framebuffer(colour, depth)
+        model = self._model
+        edge = int(model.vis.quality.shadowsize)
+        self._lights = lights.drawn(model)
+        self._lamps = [int(light) for light in self._lights if model.light_castshadow[light] and edge]
+        self._shadows = []
+        for _ in self._lamps:
+            depth = gl.depth_texture((edge, edge))
+            depth.compare_func = "<="
+            depth.repeat_x = depth.repeat_y = False
+            depth.filter = (moderngl.LINEAR,) * 2 if self._settings.soft else (moderngl.NEAREST,) * 2
+            self._shadows.append(gl.framebuffer(depth_attachment=depth))
+
+    def _make_tables(self) -> None:
+        model, gl = self._model, self._gl
+        count = model.ngeom + model.nsite + 1  # the last one is the sky
+        self._poses = np.zeros((count, shaders.POSE, 4), np.float32)
+        self._poses[-1] = np.eye(3, 4)
+        self._table = np.zeros((count, shaders.TEXELS, 4), np.float32)
+        self._pose_texture = gl.texture((shaders.POSE, count), 4, dtype="f4")
+        self._table_texture = gl.texture((shaders.TEXELS, count), 4, dtype="f4")
+        for texture in (self._pose_texture, self._table_texture):
+            texture.filter = moderngl.NEAREST, moderngl.NEAREST
+
+    def _make_programs(self) -> None:
+        gl, settings = self._gl, self._settings
+        spot = self._model.light_type == lights.SPOT
+        pixel = settings.light == "pixel" or (settings.light == "auto" and bool(spot[self._lights].any()))
+        spots = [bool(spot[lamp]) for lamp in self._lamps]
+        numbers = [1 + list(self._lights).index(lamp) for lamp in self._lamps]
+        kinds: tuple[shaders.Texture, ...] = ("none", "2d", "cube")
+        self._programs = {
+            kind: gl.program(**shaders.scene_program(1 + len(self._lights), numbers, spots, kind, pixel, settings.soft))
+            for kind in kinds
+        }
+        self._shadow_program = gl.program(**shaders.shadow_program())
+        units = {"poses": self._pose_texture, "table": self._table_texture}
+        units |= {f"shadow{number}": shadow.depth_attachment for number, shadow in enumerate(self._shadows)}
+        for unit, (name, texture) in enumerate(units.items()):
+            texture.use(unit)
+            for program in (*self._programs.values(), self._shadow_program):
+                if name in program:
+                    program[name] = unit
+        self._skin = len(units)  # the unit of the texture of what is being drawn
+        for program in self._programs.values():
+            if "skin" in program:
+                program["skin"] = self._skin
+        floats = shaders.CAMERA + 16 * len(self._lamps) + 4 * lights.ROWS * (1 + len(self._lights))
+        rows = -(-4 * floats // ALIGNMENT) * ALIGNMENT // 4
+        self._cameras = np.zeros((len(self._view.cameras), rows), np.float32)
+        self._camera_buffer = gl.buffer(reserve=self._cameras.nbytes)
+
+    def update(self, textures: Collection[int] = ()) -> None:
+        """Upload what has changed in the model; `textures` are the ids of those whose pixels have."""
+        with self._gl:
+            self._textures.upload(set(textures))
+            elements = self._elements = elements_of(self._model, self._view)
+            self._planes = np.flatnonzero(elements.seen & (elements.kind == mujoco.mjtGeom.mjGEOM_PLANE))
+            self._geometry.update(elements, self._sky >= 0)
+            self._upload_vertices()
+            self._plan_draws()
+            self._shining = lights.rows(self._model)
+            self._shadow_places: dict[int, bytes] = {}
+            self._shadow_projections: dict[int, Array] = {}
+            self._lenses = [UPSIDE_DOWN @ self._projection(camera) for camera in self._view.cameras]
+            bounds = np.append(self._model.geom_rbound, np.linalg.norm(elements.size[self._model.ngeom :], axis=1))
+            bounds[self._planes] = np.inf
+            self._floors = self._planes[elements.opaque[self._planes]]
+            self._bounds = np.append(bounds, np.inf).astype(np.float32)  # radius of each element [m]
+            table = self._new_table(elements)
+            if not np.array_equal(table, self._table):
+                self._table = table
+                self._table_texture.write(table)
+
+    def _upload_vertices(self) -> None:
+        """Write blocks that have changed into the buffers, or all of them where their layout has changed."""
+        old, new = self._blocks, self._geometry.blocks
+        starts = np.cumsum([0, *(len(block.vertices) for block in new)])
+        if [block.layout for block in old] == [block.layout for block in new]:
+            for before, block, start in zip(old, new, starts, strict=False):
+                if before is not block:
+                    self._vertices.write(block.vertices, offset=int(start) * VERTEX * 4)
+        elif new:
+            indices = [block.triangles + start for block, start in zip(new, starts, strict=False)]
+            self._replace_buffers(
+                np.concatenate([block.vertices for block in new]), np.concatenate(indices, dtype=np.int32)
+            )
+        self._blocks = list(new)
+
+    def _replace_buffers(self, vertices: Array, indices: Array) -> None:
+        gl = self._gl
+        for old in self._buffers:
+            old.release()
+        self._vertices, triangles = gl.buffer(vertices), gl.buffer(indices)
+        names = "in_position", "in_normal", "in_coordinate", "in_element"
+        self._scene = {}
+        for kind, program in self._programs.items():
+            taken = [name if name in program else None for name in names]
+            form = " ".join(f"{n}f" if name else f"{4 * n}x" for n, name in zip((3, 3, 3, 1), taken, strict=True))
+            content = [(self._vertices, form, *(name for name in taken if name))]
+            self._scene[kind] = gl.vertex_array(program, content, triangles)
+        only = [(self._vertices, "3f 24x 1f", "in_position", "in_element")]
+        self._casting = gl.vertex_array(self._shadow_program, only, triangles)
+        self._buffers = [*self._scene.values(), self._casting, self._vertices, triangles]
+
+    def _plan_draws(self) -> None:
+        """Note where each element's triangles are."""
+        ends = np.cumsum([0, *(3 * len(block.triangles) for block in self._blocks)])
+        self._single = {
+            block.element: Run(self._texture_of(block.element), int(start), 3 * len(block.triangles))
+            for block, start in zip(self._blocks, ends, strict=False)
+        }
+        order = [block.element for block in self._blocks]
+        self._opaque, self._transparent = np.array(order[: self._geometry.solid], int), order[self._geometry.solid :]
+        sky = len(self._elements.kind)
+        self._casting_runs = self._merged([element for element in order if element != sky], by_texture=False)
+        self._seen_runs: dict[bytes, list[Run]] = {}  # which of the opaque elements are in view → how to draw them
+
+    def _merged(self, elements: Iterable[int], by_texture: bool = True) -> list[Run]:
+        """Join neighbouring triangles, with the same texture where it matters, into runs that one call draws."""
+        runs: list[Run] = []
+        for element in elements:
+            run = self._single[int(element)]
+            last = runs[-1] if runs else None
+            if (
+                last
+                and (last.texture == run.texture or not by_texture)
+                and 0 <= run.start - last.start - last.count <= GAP
+            ):
+                run = Run(run.texture, last.start, run.start + run.count - last.start)
+                runs.pop()
+            runs.append(run)
+        return runs
+
+    def _texture_of(self, element: int) -> int:
+        texture = self._sky if element == len(self._elements.kind) else int(self._elements.texture[element])
+        return texture if texture in self._textures.placed else -1
+
+    def _kind(self, texture: int) -> shaders.Texture:
+        return "none" if texture < 0 else "cube" if self._textures.is_cube(texture) else "2d"
+
+    def _draw_run(self, run: Run) -> None:
+        if run.texture >= 0:
+            self._textures.placed[run.texture].use(self._skin)
+        self._scene[self._kind(run.texture)].render(moderngl.TRIANGLES, vertices=run.count, first=run.start)
+
+    def _new_table(self, elements: Elements) -> Array:
+        """Return (E + 1, TEXELS, 4) float32, the appearance of all elements and the sky."""
+        table = np.zeros_like(self._table)
+        table[:-1, 0], table[:-1, 1, :3] = elements.rgba, elements.light
+        table[:-1, 1, 2] *= 128  # shininess, the exponent
+        for plane in self._planes:
+            table[plane, 2, :2] = elements.size[plane, :2] <= 0  # an infinite plane moves along with the camera
+            if elements.texture[plane] >= 0:
+                repeat = self._model.mat_texrepeat[elements.material[plane]]
+                table[plane, 3, :2] = [0.5, -0.5] * np.where(repeat > 0, repeat, 1.0)
+        table[-1, 0, 3], table[-1, 1, 0], table[-1, 2, :3] = 1, -1, 1  # the sky: not lit, always around the camera
+        return table
+
+    def render(self, data: mujoco.MjData) -> tuple[Array, Array]:
+        """Draw colours (cameras, H, W, 3) uint8 and depth (cameras, H, W) float32 [m]."""
+        with self._gl:
+            self._upload_poses(data)
+            self._upload_cameras(data, self._cast_shadows(data))
+            self._drawn.use()
+            self._gl.enable_only(STATE)
+            self._gl.front_face = "cw"  # in pictures that are upside down
+            self._drawn.clear(depth=1.0)
+            for number, (camera, visible) in enumerate(zip(self._view.cameras, self._in_view(), strict=True)):
+                self._draw(number, visible, data.cam_xpos[camera])
+            return self._read()
+
+    def _upload_poses(self, data: mujoco.MjData) -> None:
+        geoms, sites = self._model.ngeom, self._model.nsite
+        poses = self._poses
+        poses[:geoms, :, :3], poses[:geoms, :, 3] = data.geom_xmat.reshape(-1, 3, 3), data.geom_xpos
+        if self._view.site_groups:
+            poses[geoms : geoms + sites, :, :3] = data.site_xmat.reshape(-1, 3, 3)
+            poses[geoms : geoms + sites, :, 3] = data.site_xpos
+        self._pose_texture.write(poses)
+
+    def _cast_shadows(self, data: mujoco.MjData) -> Array:
+        """Draw the depth of the scene from every lamp with shadows; return projections into the maps, by columns."""
+        if not self._lamps:
+            return np.empty(0)
+        gl, edge = self._gl, self._shadows[0].size[0]
+        gl.enable_only(moderngl.DEPTH_TEST)  # all faces cast shadows
+        gl.polygon_offset = SLOPE + 2.0 * self._settings.soft, UNITS  # averages reach across texels
+        inner = 0.5 * (edge - 2) / edge
+        onto_texture = np.array([[inner, 0, 0, 0.5], [0, inner, 0, 0.5], [0, 0, 0.5, 0.5], [0, 0, 0, 1]])
+        projections = []
+        for lamp, shadow in zip(self._lamps, self._shadows, strict=True):
+            projection = self._shadow_projection(data, lamp)
+            projections.append((onto_texture @ projection).T.ravel())
+            shadow.use()
+            shadow.viewport = 0, 0, edge, edge
+            shadow.clear(depth=1.0)
+            shadow.viewport = 1, 1, edge - 2, edge - 2  # without the rim, shadows at the edge would never end
+            self._shadow_program["projection"].write(projection.T.astype(np.float32).tobytes())
+            self._shadow_program["lamp"].write(np.float32(data.light_xpos[lamp]).tobytes())
+            for run in self._casting_runs:
+                self._casting.render(moderngl.TRIANGLES, vertices=run.count, first=run.start)
+        gl.polygon_offset = 0.0, 0.0
+        return np.concatenate(projections)
+
+    def _shadow_projection(self, data: mujoco.MjData, lamp: int) -> Array:
+        """Return a lamp's projection (4, 4) into its shadow map, computed again only where the lamp has moved."""
+        place = data.light_xpos[lamp].tobytes() + data.light_xdir[lamp].tobytes()
+        if self._shadow_places.get(lamp) != place:
+            self._shadow_places[lamp] = place
+            self._shadow_projections[lamp] = lights.shadow_projection(self._model, data, lamp)
+        return self._shadow_projections[lamp]
+
+    def _upload_cameras(self, data: mujoco.MjData, shadows: Array) -> None:
+        """Write every camera's block: its projection and position, shadow projections and lights."""
+        shining = self._shining
+        shining[1:, 3, :3], shining[1:, 4, :3] = data.light_xpos[self._lights], data.light_xdir[self._lights]
+        start = shaders.CAMERA + shadows.size
+        for block, camera, lens in zip(self._cameras, self._view.cameras, self._lenses, strict=True):
+            axes, eye = data.cam_xmat[camera].reshape(3, 3).T, data.cam_xpos[camera]
+            shining[0, 4, :3] = -axes[2]  # the headlight
+            block[:16], block[16:19] = (lens @ lights.inverse_pose(eye, axes)).T.ravel(), eye
+            block[shaders.CAMERA : start], block[start : start + shining.size] = shadows, shining.ravel()
+        self._camera_buffer.write(self._cameras)
+
+    def _in_view(self) -> Array:
+        """Return (cameras, E + 1) bool: whether the element's bounding sphere meets the pyramid that a camera sees."""
+        views = self._cameras[:, :16].reshape(-1, 4, 4).transpose(0, 2, 1)
+        sides = views[:, 3:] + np.concatenate([views[:, :2], -views[:, :2]], axis=1)  # (cameras, 4, 4) planes
+        sides /= np.linalg.norm(sides[:, :, :3], axis=2, keepdims=True)
+        distance = sides[:, :, :3] @ self._poses[:, :, 3].T + sides[:, :, 3:]
+        visible = (distance >= -self._bounds).all(axis=1)
+        for number, view in enumerate(views):
+            visible[number, -1] = not self._plane_fills(view, self._cameras[number, 16:19])
+        return visible
+
+    def _plane_fills(self, view: Array, eye: Array) -> bool:
+        """Return whether all corners of a camera's picture show an opaque plane, which then hides the sky."""
+        far = np.linalg.inv(view) @ CORNERS  # of the picture, on the far clipping plane
+        rays = (far[:3] / far[3]).T - eye
+        for plane in self._floors:
+            turn, size = self._poses[plane, :, :3], self._elements.size[plane]
+            start, ways = (eye - self._poses[plane, :, 3]) @ turn, rays @ turn
+            if start[2] > 0 and (ways[:, 2] < -start[2]).all():  # met before the far clipping plane
+                met = np.abs(start[:2] - ways[:, :2] * start[2] / ways[:, 2:])
+                if ((met <= size[:2]) | (size[:2] <= 0)).all():
+                    return True
+        return False
+
+    def _draw(self, number: int, visible: Array, eye: Array) -> None:
+        """Draw a camera's picture: what is opaque and the sky, then what is transparent."""
+        view, size = self._view, self._cameras[number].nbytes
+        self._camera_buffer.bind_to_uniform_block(0, offset=number * size, size=size)
+        self._gl.viewport = 0, number * view.height, view.width, view.height
+        opaque = visible[self._opaque]
+        runs = self._seen_runs.get(opaque.tobytes())
+        if runs is None:
+            runs = self._seen_runs[opaque.tobytes()] = self._merged(self._opaque[opaque])
+        for run in runs:
+            self._draw_run(run)
+        self._draw_transparent(eye)
+
+    def _draw_transparent(self, eye: Array) -> None:
+        """Blend transparent elements and planes seen from behind, as MuJoCo does: from near to far, and back again."""
+        poses = self._poses
+        behind = [plane for plane in self._planes if (eye - poses[plane, :, 3]) @ poses[plane, :, 2] < 0]
+        if not self._transparent and not behind:
+            return
+        distance = {
+            element: float(np.linalg.norm(poses[element, :, 3] - eye) - self._bounds[element])
+            for element in {*self._transparent, *behind}
+        }
+        distance |= {int(plane): np.inf for plane in self._planes if plane in distance}
+        order = sorted(distance, key=lambda element: (distance[element], element))
+        gl = self._gl
+        gl.enable(moderngl.BLEND)
+        gl.blend_func = moderngl.SRC_ALPHA, moderngl.ONE_MINUS_SRC_ALPHA
+        self._drawn.depth_mask = False
+        self._leave_out_shadows(True)
+        for element in [*order, *order[::-1]]:
+            run, alpha = self._single[element], float(self._elements.rgba[element, 3])
+            self._programs[self._kind(run.texture)]["alpha"] = alpha * (BEHIND if element in behind else 1.0)
+            if element in behind:
+                gl.disable(moderngl.CULL_FACE)
+            self._draw_run(run)
+            gl.enable(moderngl.CULL_FACE)
+        self._leave_out_shadows(False)
+        self._drawn.depth_mask = True
+        gl.disable(moderngl.BLEND)
+
+    def _leave_out_shadows(self, value: bool) -> None:
+        for program in self._programs.values():
+            if "unshadowed" in program:
+                program["unshadowed"] = float(value)
+
+    def _projection(self, camera: int) -> Array:
+        """Return a camera's projection (4, 4)."""
+        model, near, far = self._model, self._near, self._far
+        aspect, fovy = self._view.width / self._view.height, float(model.cam_fovy[camera])
+        if model.cam_projection[camera] == mujoco.mjtProjection.mjPROJ_ORTHOGRAPHIC:
+            return lights.box(aspect * fovy / 2, fovy / 2, near, far)
+        if model.cam_sensorsize[camera, 1]:
+            focal, centre = model.cam_intrinsic[camera, :2], model.cam_intrinsic[camera, 2:]
+            half = model.cam_sensorsize[camera] / 2
+            low, high = near / focal * (half - centre), near / focal * (half + centre)
+            return lights.frustum(-low[0], high[0], -high[1], low[1], near, far)
+        half = near * np.tan(np.radians(fovy / 2))
+        return lights.frustum(-aspect * half, aspect * half, -half, half, near, far)
+
+    def _read(self) -> tuple[Array, Array]:
+        view = self._view
+        shape = len(view.cameras), view.height, view.width
+        rgb, depth = np.empty((*shape, 3), np.uint8), np.empty(shape, np.float32)
+        if self._drawn is not self._target:
+            self._gl.copy_framebuffer(self._target, self._drawn)
+        self._target.read_into(rgb, components=3, alignment=1)
+        self._target.read_into(depth, attachment=-1, components=1, dtype="f4", alignment=1)
+        return rgb, self._metres(depth)
+
+    def _metres(self, reading: Array) -> Array:
+        """Convert readings of the depth buffer, 0 at the near plane and 1 at the far one, to depth [m]."""
+        near, far = self._near, self._far
+        depth = near * far / (far - reading * (far - near))
+        depth *= reading < 1
+        return depth
+
+    def close(self) -> None:
+        """Free the GL context and all that is in it."""
+        self._gl.release()

@@ -1,0 +1,136 @@
+"""All geometry of a model in one buffer of vertices and one of indices."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from vla.spec import Array
+from vla.tasks.rendering import shapes
+from vla.tasks.rendering.elements import Elements
+from vla.tasks.rendering.shapes import Shape
+
+VERTEX = 10  # floats of a vertex: position, normal, texture coordinates or direction, element
+HORIZON = 1.05  # half the extent of an infinite plane over the distance of the far clipping plane, as in MuJoCo
+SKY_DISTANCE = 0.7  # of the sky over the distance of the far clipping plane, as in MuJoCo
+Kind = mujoco.mjtGeom
+
+
+@dataclass(frozen=True)
+class Block:
+    """One element's part of the buffers."""
+
+    element: int
+    key: tuple[Any, ...]  # what its vertices depend on
+    vertices: Array  # (V, VERTEX) float32
+    triangles: Array  # (T, 3) int32, from 0
+
+    @property
+    def layout(self) -> tuple[int, ...]:
+        """What its place in the buffers and its triangles depend on."""
+        return (self.element, *self.key[:2], len(self.vertices), len(self.triangles))
+
+
+class Geometry:
+    """Vertices of the elements drawn: opaque ones by texture, planes after the others, the sky, transparent ones."""
+
+    def __init__(self, model: mujoco.MjModel, mesh: Callable[[int], Shape]) -> None:
+        """Args: the model; a function from a mesh's id to its shape."""
+        self._model, self._mesh = model, mesh
+        self._far = float(model.vis.map.zfar * model.stat.extent)
+        quality = model.vis.quality
+        self._slices, self._stacks = int(quality.numslices), int(quality.numstacks)
+        self._sphere, self._box = shapes.sphere(self._slices, self._stacks // 2 * 2), shapes.box()
+        self._cylinder = shapes.cylinder(self._slices)
+        self._reach = (
+            np.append(model.geom_rbound, model.site_size.max(axis=1)) if model.nsite else model.geom_rbound.copy()
+        )
+        self._known: dict[int, Block] = {}  # element → its present block
+        self.blocks: list[Block] = []
+
+    def update(self, elements: Elements, sky: bool) -> None:
+        """Make the blocks of the elements' present shapes; equal ones stay the same objects."""
+        opaque = np.flatnonzero(elements.opaque)
+        planes = elements.kind == Kind.mjGEOM_PLANE
+        # Large things are mostly behind small ones, and what is hidden when it is drawn costs little.
+        order = opaque[np.lexsort((opaque, self._reach[opaque], elements.texture[opaque], planes[opaque]))]
+        blocks = [self._block(elements, int(element)) for element in np.flatnonzero(elements.seen & ~elements.opaque)]
+        solid = [self._block(elements, int(element)) for element in order]
+        if sky:
+            solid.append(self._sky(len(elements.kind)))
+        solid = [block for block in solid if len(block.triangles)]
+        self.solid = len(solid)
+        self.blocks = [*solid, *(block for block in blocks if len(block.triangles))]
+
+    def _block(self, elements: Elements, element: int) -> Block:
+        material, texture = int(elements.material[element]), int(elements.texture[element])
+        mapping = (
+            (*self._model.mat_texrepeat[material], int(self._model.mat_texuniform[material])) if texture >= 0 else ()
+        )
+        kind, mesh = int(elements.kind[element]), int(elements.mesh[element])
+        key = (kind, mesh, elements.size[element].tobytes(), texture, *mapping)
+        known = self._known.get(element)
+        if known is None or known.key != key:
+            shape = self._shape(kind, mesh, elements.size[element].astype(float))
+            coordinates = self._coordinates(shape, kind, mesh, elements.size[element], texture, mapping)
+            known = self._known[element] = _packed(element, key, shape, coordinates)
+        return known
+
+    def _shape(self, kind: int, mesh: int, size: Array) -> Shape:
+        if kind in (Kind.mjGEOM_SPHERE, Kind.mjGEOM_ELLIPSOID):
+            return self._sphere.scaled(size)
+        if kind == Kind.mjGEOM_BOX:
+            return self._box.scaled(size)
+        if kind == Kind.mjGEOM_CYLINDER:
+            return self._cylinder.scaled(size)
+        if kind == Kind.mjGEOM_CAPSULE:
+            return shapes.capsule(self._slices, self._stacks, size[0], size[2])
+        if kind == Kind.mjGEOM_PLANE:
+            return shapes.plane(*(half if half > 0 else HORIZON * self._far for half in size[:2]))
+        if kind in (Kind.mjGEOM_MESH, Kind.mjGEOM_SDF) and mesh >= 0:
+            return self._mesh(mesh)
+        nothing = np.empty((0, 3))
+        return Shape(nothing, nothing, nothing[:, :2], nothing, np.empty((0, 3), np.int32))
+
+    def _coordinates(
+        self, shape: Shape, kind: int, mesh: int, size: Array, texture: int, mapping: tuple[float, ...]
+    ) -> Array:
+        """Return texture coordinates (V, 3): two for a plane picture, a direction for a cube."""
+        if texture < 0:
+            return np.zeros((len(shape.position), 3))
+        if self._model.tex_type[texture] != mujoco.mjtTexture.mjTEXTURE_2D:
+            return shape.raw * (size if mapping[2] else 1.0)
+        repeat = np.array([each if each > 0 else 1.0 for each in mapping[:2]])
+        extent = np.where(size[:2] > 0, size[:2], 1.0)
+        if kind == Kind.mjGEOM_PLANE and (size[:2] <= 0).any():
+            flat = np.where(size[:2] > 0, shape.texcoord, shape.position[:, :2] * [0.5, -0.5])
+            flat = flat * repeat * (extent if mapping[2] else 1.0) - 0.5
+        elif mesh < 0 or self._model.mesh_texcoordadr[mesh] >= 0:
+            flat = shape.texcoord * repeat * (extent if mapping[2] else 1.0)
+        else:  # projected along z
+            flat = shape.position[:, :2] * [0.5, -0.5] * repeat / (1.0 if mapping[2] else extent) - 0.5
+        return np.concatenate([flat, np.zeros((len(flat), 1))], axis=1)
+
+    def _sky(self, element: int) -> Block:
+        """Return the cylinder around the camera that shows the sky, seen from inside."""
+        if element not in self._known:
+            shape = shapes.cylinder(self._slices)
+            inside = Shape(
+                shape.position * SKY_DISTANCE * self._far,
+                shape.normal,
+                shape.texcoord,
+                shape.raw,
+                shape.triangles[:, ::-1],
+            )
+            self._known[element] = _packed(element, (), inside, shape.raw[:, [0, 2, 1]] * [1, 1, -1])
+        return self._known[element]
+
+
+def _packed(element: int, key: tuple[Any, ...], shape: Shape, coordinates: Array) -> Block:
+    number = np.full((len(shape.position), 1), element)
+    vertices = np.concatenate([shape.position, shape.normal, coordinates, number], axis=1, dtype=np.float32)
+    return Block(element, key, vertices, np.ascontiguousarray(shape.triangles, np.int32))

@@ -1,0 +1,96 @@
+"""MuJoCo's own renderer, one pass per camera."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+
+import mujoco
+import numpy as np
+
+from vla.spec import Array
+from vla.tasks.rendering.renderer import View
+
+
+class Reference:
+    """The choice of MuJoCo's own renderer; the model's `visual` element has its settings."""
+
+    def open(self, model: mujoco.MjModel, view: View) -> ReferenceRenderer:
+        """Make a renderer of `model`, with a GL context in this thread."""
+        return ReferenceRenderer(model, view)
+
+
+class ReferenceRenderer:
+    """MuJoCo's classic renderer without reflections."""
+
+    def __init__(self, model: mujoco.MjModel, view: View) -> None:
+        """Args: the model; what to draw of it."""
+        self._model, self._view = model, view
+        # The off-screen buffer is allocated with the context, so its size must be set first.
+        model.vis.global_.offwidth, model.vis.global_.offheight = view.width, view.height
+        self._gl = mujoco.GLContext(view.width, view.height)
+        self._gl.make_current()
+        self._context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100)
+        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self._context)
+        self._context.readDepthMap = mujoco.mjtDepthMap.mjDEPTH_ZEROFAR
+        self._scene = mujoco.MjvScene(model, maxgeom=model.ngeom + model.nsite + 50)
+        self._scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = False
+        self._option = mujoco.MjvOption()
+        self._option.geomgroup[:] = [group in view.geom_groups for group in range(mujoco.mjNGROUP)]
+        self._option.sitegroup[:] = [group in view.site_groups for group in range(mujoco.mjNGROUP)]
+        self._camera = mujoco.MjvCamera()
+        self._camera.type = mujoco.mjtCamera.mjCAMERA_FIXED
+        self._rect = mujoco.MjrRect(0, 0, view.width, view.height)
+
+    def update(self, textures: Collection[int] = ()) -> None:
+        """Upload changed textures; MuJoCo reads everything else at each frame."""
+        if textures:
+            self._gl.make_current()
+        for texture in sorted(textures):
+            mujoco.mjr_uploadTexture(self._model, self._context, texture)
+
+    def render(self, data: mujoco.MjData) -> tuple[Array, Array]:
+        """Draw colours (cameras, H, W, 3) uint8 and depth (cameras, H, W) float32 [m]."""
+        self._gl.make_current()
+        view = self._view
+        rgb = np.empty((len(view.cameras), view.height, view.width, 3), np.uint8)
+        depth = np.empty((len(view.cameras), view.height, view.width), np.float32)
+        for number, camera in enumerate(view.cameras):
+            self._draw(data, camera)
+            # OpenGL's lowest row is the first one.
+            mujoco.mjr_readPixels(rgb[number], depth[number], self._rect, self._context)
+        return rgb[:, ::-1], self._metres(depth[:, ::-1])
+
+    def segment(self, data: mujoco.MjData, camera: int) -> Array:
+        """Return (H, W) int32, the id of the geom in each pixel of a camera's picture, -1 where there is none."""
+        self._gl.make_current()
+        flags = [int(mujoco.mjtRndFlag.mjRND_SEGMENT), int(mujoco.mjtRndFlag.mjRND_IDCOLOR)]
+        self._scene.flags[flags] = True
+        self._draw(data, camera)
+        self._scene.flags[flags] = False
+        rgb = np.empty((self._view.height, self._view.width, 3), np.uint8)
+        mujoco.mjr_readPixels(rgb, None, self._rect, self._context)
+        ids = np.full(self._scene.ngeom + 1, -1, np.int32)
+        for geom in self._scene.geoms[: self._scene.ngeom]:
+            if geom.objtype == mujoco.mjtObj.mjOBJ_GEOM:
+                ids[geom.segid + 1] = geom.objid
+        return ids[rgb[::-1].astype(np.int32) @ np.array([1, 256, 65536])]
+
+    def _draw(self, data: mujoco.MjData, camera: int) -> None:
+        self._camera.fixedcamid = camera
+        mujoco.mjv_updateScene(
+            self._model, data, self._option, None, self._camera, mujoco.mjtCatBit.mjCAT_ALL.value, self._scene
+        )
+        mujoco.mjr_render(self._rect, self._scene, self._context)
+
+    def _metres(self, reading: Array) -> Array:
+        """Convert a reverse-z buffer, 1 at the near plane and 0 at the far one, to depth [m]."""
+        near = float(self._model.vis.map.znear * self._model.stat.extent)
+        far = float(self._model.vis.map.zfar * self._model.stat.extent)
+        depth = near * far / (near + reading * (far - near))
+        depth *= reading > 0
+        return depth
+
+    def close(self) -> None:
+        """Free the GL context; otherwise a traceback is printed when Python exits."""
+        self._context.free()
+        self._gl.free()

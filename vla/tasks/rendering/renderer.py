@@ -1,0 +1,55 @@
+"""The protocol of off-screen renderers."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import mujoco
+
+from vla.spec import Array
+
+
+@dataclass(frozen=True)
+class View:
+    """What to draw of a model, and how large."""
+
+    cameras: Sequence[int]  # ids in the model, in the order of the pictures
+    height: int  # of every picture [px]
+    width: int  # of every picture [px]
+    geom_groups: Collection[int] = (0, 1, 2)
+    site_groups: Collection[int] = ()
+
+
+class Renderer(Protocol):
+    """Off-screen renderer of one model; its GL context is bound to the thread that created it."""
+
+    def update(self, textures: Collection[int] = ()) -> None:
+        """Take over changes of the model since the last call: call it after every change, such as at resets.
+
+        Args:
+            textures: ids of textures whose pixels have changed; all other changes are found by comparison.
+        """
+        ...
+
+    def render(self, data: mujoco.MjData) -> tuple[Array, Array]:
+        """Draw every camera's picture of a state.
+
+        Returns:
+            Colours (cameras, height, width, 3) uint8, and depth along the optical axis (cameras, height, width)
+            float32 [m], 0 where nothing is.
+        """
+        ...
+
+    def close(self) -> None:
+        """Free the GL context."""
+        ...
+
+
+class Rendering(Protocol):
+    """A choice of renderer with its settings, before there is a model."""
+
+    def open(self, model: mujoco.MjModel, view: View) -> Renderer:
+        """Make a renderer of `model`, with a GL context in this thread."""
+        ...

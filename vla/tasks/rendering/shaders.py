@@ -1,0 +1,188 @@
+"""GLSL programs of the fast renderer, for one model's number of lights."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Literal
+
+from vla.tasks.rendering.lights import ROWS
+
+POSE = 3  # texels of an element's pose: rows of a 3 x 4 matrix
+TEXELS = 4  # of an element's appearance: colour, light, what it follows, rate of texture coordinates there
+CAMERA = 24  # floats of a camera's block before shadow projections and lights: projection, eye, and a spare
+Texture = Literal["none", "2d", "cube"]
+
+PLACE = """
+uniform sampler2D poses;
+uniform sampler2D table;
+in vec3 in_position;
+in vec3 in_normal;
+in vec3 in_coordinate;
+in float in_element;
+
+// The place of a vertex in the world; the sky and infinite planes move along with the eye, by `shift` in their frame.
+vec3 place(int element, vec3 eye, out mat3 turn, out vec3 shift) {
+    vec4 x = texelFetch(poses, ivec2(0, element), 0);
+    vec4 y = texelFetch(poses, ivec2(1, element), 0);
+    vec4 z = texelFetch(poses, ivec2(2, element), 0);
+    turn = mat3(x.x, y.x, z.x, x.y, y.y, z.y, x.z, y.z, z.z);
+    vec3 origin = vec3(x.w, y.w, z.w);
+    shift = ((eye - origin) * turn) * texelFetch(table, ivec2(2, element), 0).xyz;
+    return turn * (in_position + shift) + origin;
+}
+"""
+
+SHADOW_VERTEX = f"""#version 330
+{PLACE}
+uniform mat4 projection;
+uniform vec3 lamp;
+void main() {{
+    mat3 turn;
+    vec3 shift;
+    gl_Position = projection * vec4(place(int(in_element), lamp, turn, shift), 1.0);
+}}"""
+
+SHADOW_FRAGMENT = """#version 330
+void main() {}"""
+
+# OpenGL's fixed-function lighting with a local viewer, as MuJoCo's classic renderer uses it.
+LIGHT = """
+vec3 shine(int number, vec3 place, vec3 normal, vec3 colour, vec3 material) {
+    int first = number * ROWS;
+    vec3 towards = -lights[first + 4].xyz;
+    float strength = 1.0;
+    if (lights[first + 3].w > 0.5) {
+        vec3 offset = lights[first + 3].xyz - place;
+        float far = length(offset);
+        towards = offset / far;
+        vec4 fading = lights[first + 5];
+        float inside = dot(-towards, lights[first + 4].xyz);
+        strength = inside < lights[first + 4].w ? 0.0 : pow(max(inside, 0.0), fading.w);
+        strength /= fading.x + fading.y * far + fading.z * far * far;
+    }
+    float facing = dot(normal, towards);
+    vec3 sum = (lights[first].rgb + max(facing, 0.0) * lights[first + 1].rgb) * colour;
+    float glance = pow(max(dot(normal, normalize(towards + normalize(eye.xyz - place))), 0.0), material.z);
+    return strength * (sum + (facing > 0.0 ? glance * material.y : 0.0) * lights[first + 2].rgb);
+}
+"""
+
+
+def shadow_program() -> dict[str, str]:
+    """Return the sources of the shaders of shadow maps."""
+    return {"vertex_shader": SHADOW_VERTEX, "fragment_shader": SHADOW_FRAGMENT}
+
+
+def scene_program(
+    lights: int, lamps: Sequence[int], spots: Sequence[bool], texture: Texture, pixel: bool, soft: int
+) -> dict[str, str]:
+    """Return the sources of the shaders of pictures.
+
+    Args:
+        lights: number of lights, the headlight first.
+        lamps: numbers of the lights with a shadow map.
+        spots: whether each of these is a spot light.
+        texture: kind of texture.
+        pixel: whether to compute light per pixel instead of per vertex.
+        soft: texels around the nearest one over which shadows are averaged.
+    """
+    count = len(lamps)
+    shared = f"""#version 330
+layout(std140) uniform Camera {{
+    mat4 projection;
+    vec4 eye;
+    vec4 spare;
+    {f"mat4 shadow_projection[{count}];" if count else ""}
+    vec4 lights[{lights * ROWS}];
+}};
+{LIGHT.replace("ROWS", str(ROWS))}"""
+    passed = {"none": [], "2d": ["vec2 coordinate"], "cube": ["vec3 coordinate"]}[texture]
+    passed += [f"vec{4 if spot else 3} shadow_at{number}" for number, spot in enumerate(spots)]
+    passed += ["vec3 position", "vec3 normal", "vec3 colour", "vec3 material"] if pixel else []
+    passed += [] if pixel else ["vec3 base", *(f"vec3 lit{number}" for number in range(count))]
+    shaded = _shaded(lights, lamps)
+    return {
+        "vertex_shader": shared + _vertex(passed, shaded, spots, texture, pixel),
+        "fragment_shader": shared + _fragment(passed, shaded, count, texture, pixel, soft),
+    }
+
+
+def _declared(way: str, names: Sequence[str]) -> str:
+    return "\n".join(f"{way} {name};" for name in names)
+
+
+def _shaded(lights: int, lamps: Sequence[int]) -> str:
+    """Return statements that set `base` and every `lit`, clamped as OpenGL clamps a vertex's colour."""
+    shine = "shine({}, position, normal, colour, material)".format
+    sky = "material.x < 0.0"  # is not lit
+    sums = " + ".join(["material.x * colour", *(shine(number) for number in range(lights) if number not in lamps)])
+    lines = [f"base = {sky} ? vec3(1.0) : clamp({sums}, 0.0, 1.0);"]
+    for index, number in enumerate(lamps):
+        lines.append(f"lit{index} = {sky} ? vec3(0.0) : clamp({shine(number)}, 0.0, 1.0);")
+    return "\n    ".join(lines)
+
+
+def _vertex(passed: Sequence[str], shaded: str, spots: Sequence[bool], texture: Texture, pixel: bool) -> str:
+    lookups = [
+        f"shadow_at{number} = (shadow_projection[{number}] * vec4(position, 1.0)).{'xyzw' if spot else 'xyz'};"
+        for number, spot in enumerate(spots)
+    ]
+    moved = "in_coordinate + shift * texelFetch(table, ivec2(3, element), 0).xyz"
+    coordinate = {"none": "", "2d": f"coordinate = ({moved}).xy;", "cube": f"coordinate = {moved};"}[texture]
+    return f"""
+{PLACE}
+{_declared("out", passed)}
+void main() {{
+    int element = int(in_element);
+    mat3 turn;
+    vec3 shift;
+    {"" if pixel else "vec3 position, normal, colour, material;"}
+    position = place(element, eye.xyz, turn, shift);
+    normal = turn * in_normal;
+    colour = texelFetch(table, ivec2(0, element), 0).rgb;
+    material = texelFetch(table, ivec2(1, element), 0).xyz;
+    {coordinate}
+    {"" if pixel else shaded}
+    {" ".join(lookups)}
+    gl_Position = projection * vec4(position, 1.0);
+}}"""
+
+
+def _fragment(passed: Sequence[str], shaded: str, count: int, texture: Texture, pixel: bool, soft: int) -> str:
+    samplers = [f"sampler2DShadow shadow{number}" for number in range(count)]
+    samplers += {"none": [], "2d": ["sampler2D skin"], "cube": ["samplerCube skin"]}[texture]
+    texel = {"none": "vec4(1.0)", "2d": "texture(skin, coordinate)", "cube": "texture(skin, coordinate)"}[texture]
+    names = ", ".join(["base", *(f"lit{number}" for number in range(count))])
+    local = f"vec3 {names};\n    {shaded.replace('normal,', 'normalize(normal),')}" if pixel else ""
+    sums = [
+        f"sum += lit{number} * max(unshadowed, shown(shadow{number}, shadow_at{number}));" for number in range(count)
+    ]
+    return f"""
+uniform float unshadowed;
+uniform float alpha;
+{_declared("uniform", samplers)}
+{_declared("in", passed)}
+out vec4 picture;
+{_taps(soft)}
+void main() {{
+    {local}
+    vec3 sum = base;
+    {" ".join(sums)}
+    picture = vec4(sum, alpha) * {texel};
+}}"""
+
+
+def _taps(soft: int) -> str:
+    """Return functions that look up which share of a place's surroundings a lamp shines on."""
+    taps = [(x, y) for x in range(-soft, soft + 1) for y in range(-soft, soft + 1)]
+    functions = []
+    for kind, look, scale in (("vec3", "texture", "1.0"), ("vec4", "textureProj", "at.w")):
+        sums = [
+            f"{look}(map, at + {kind}({x}.0 * texel.x, {y}.0 * texel.y, 0.0{', 0.0' if kind == 'vec4' else ''}))"
+            for x, y in taps
+        ]
+        body = f"vec2 texel = {scale} / vec2(textureSize(map, 0));\n    return ({' + '.join(sums)}) / {len(taps)}.0;"
+        functions.append(
+            f"float shown(sampler2DShadow map, {kind} at) {{\n    {body if soft else f'return {look}(map, at);'}\n}}"
+        )
+    return "\n".join(functions)

@@ -1,0 +1,171 @@
+"""Triangles of MuJoCo's shapes, tessellated and textured as MuJoCo does."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+
+from vla.spec import Array
+
+SMOOTH = 0.8  # smallest cosine between a mesh's normal at a vertex and that of a face that is shaded smoothly
+
+
+@dataclass(frozen=True)
+class Shape:
+    """Triangles with normals and texture coordinates."""
+
+    position: Array  # (V, 3) [m]
+    normal: Array  # (V, 3), of length 1
+    texcoord: Array  # (V, 2), 0…1 over the shape
+    raw: Array  # (V, 3) position before scaling, the direction in a cube texture
+    triangles: Array  # (T, 3) int32, indices of vertices, counterclockwise from outside
+
+    def scaled(self, size: Array) -> Shape:
+        """Return the shape stretched by `size` (3,)."""
+        normal = self.normal / size
+        normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+        return Shape(self.position * size, normal, self.texcoord, self.raw, self.triangles)
+
+
+def join(*shapes: Shape) -> Shape:
+    """Return one shape of several."""
+    starts = np.cumsum([0, *(len(shape.position) for shape in shapes)])
+    return Shape(
+        np.concatenate([shape.position for shape in shapes]),
+        np.concatenate([shape.normal for shape in shapes]),
+        np.concatenate([shape.texcoord for shape in shapes]),
+        np.concatenate([shape.raw for shape in shapes]),
+        np.concatenate([shape.triangles + start for shape, start in zip(shapes, starts, strict=False)]),
+    )
+
+
+def _patch(rows: int, columns: int) -> tuple[Array, Array, Array]:
+    """Return row and column numbers of a grid's vertices, and its triangles, of `rows` times `columns` cells."""
+    row, column = (axis.ravel() for axis in np.mgrid[: rows + 1, : columns + 1])
+    corner = (np.arange(rows)[:, None] * (columns + 1) + np.arange(columns)).ravel()
+    right, above = corner + 1, corner + columns + 1
+    triangles = np.concatenate([np.stack([corner, right, above + 1], 1), np.stack([corner, above + 1, above], 1)])
+    return row, column, triangles.astype(np.int32)
+
+
+def sphere(slices: int, stacks: int, low: float = -1.0, high: float = 1.0) -> Shape:
+    """Return the unit sphere between two elevations [quarter turns], with `stacks` rows."""
+    row, column, triangles = _patch(stacks, slices)
+    elevation, azimuth = np.pi / 2 * (low + (high - low) * row / stacks), 2 * np.pi * column / slices
+    ring = np.where(np.isclose(np.abs(elevation), np.pi / 2), 0.0, np.cos(elevation))
+    position = np.stack([np.cos(azimuth) * ring, np.sin(azimuth) * ring, np.sin(elevation)], 1)
+    u = np.where(ring == 0, column + 0.5, column) / slices
+    first, second, third = (position[triangles[:, corner]] for corner in range(3))
+    flat = np.linalg.norm(np.cross(second - first, third - first), axis=1) < 1e-9  # at the poles
+    return Shape(position, position, np.stack([u, 1 - row / stacks], 1), position, triangles[~flat])
+
+
+def tube(slices: int) -> Shape:
+    """Return an open cylinder of radius 1 from z = -1 to 1."""
+    row, column, triangles = _patch(1, slices)
+    azimuth = 2 * np.pi * column / slices
+    position = np.stack([np.cos(azimuth), np.sin(azimuth), 2.0 * row - 1], 1)
+    texcoord = np.stack([column / slices, 1.0 - row], 1)
+    return Shape(position, position * [1, 1, 0], texcoord, position, triangles)
+
+
+def disk(slices: int, side: int) -> Shape:
+    """Return a disk of radius 1 at z = side, -1 or 1, that looks away from the origin."""
+    azimuth = 2 * np.pi * np.arange(slices) / slices
+    rim = np.stack([np.cos(azimuth), np.sin(azimuth), np.full(slices, float(side))], 1)
+    position = np.concatenate([[[0.0, 0.0, side]], rim])
+    here = np.arange(slices)
+    triangles = np.stack([np.zeros(slices, int), 1 + here, 1 + (here + 1) % slices], 1)[:, ::side]
+    normal = np.tile([0.0, 0.0, side], (slices + 1, 1))
+    return Shape(position, normal, 0.5 + 0.5 * position[:, :2], position, triangles.astype(np.int32))
+
+
+def cylinder(slices: int) -> Shape:
+    """Return a closed cylinder of radius 1 from z = -1 to 1."""
+    return join(disk(slices, -1), tube(slices), disk(slices, 1))
+
+
+def capsule(slices: int, stacks: int, radius: float, half_length: float) -> Shape:
+    """Return a capsule along z [m]."""
+    parts = [tube(slices).scaled(np.array([radius, radius, half_length]))]
+    for side in (-1, 1):
+        cap = sphere(slices, stacks // 2, *sorted((0.0, float(side))))
+        # Texture coordinates run from one pole to the equator and again from there.
+        position = cap.position * radius + [0, 0, side * half_length]
+        parts.append(Shape(position, cap.normal, cap.texcoord, cap.raw + np.array([0, 0, side]), cap.triangles))
+    return join(*parts)
+
+
+def box() -> Shape:
+    """Return the cube from -1 to 1."""
+    faces = []
+    across = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]], float)
+    for axis, (first, second), straight in ((2, (0, 1), 1), (0, (1, 2), 1), (1, (0, 2), -1)):
+        for side in (-1, 1):
+            position, normal = np.full((4, 3), float(side)), np.zeros((4, 3))
+            position[:, first], position[:, second], normal[:, axis] = across[:, 0], across[:, 1], side
+            triangles = np.array([[0, 1, 2], [0, 2, 3]], np.int32)[:, :: side * straight]
+            faces.append(Shape(position, normal, 0.5 + across * [0.5, -0.5], position, triangles))
+    return join(*faces)
+
+
+def plane(half_x: float, half_y: float) -> Shape:
+    """Return a rectangle in z = 0 that looks along z [m]."""
+    across = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]], float)
+    position = np.concatenate([across * [half_x, half_y], np.zeros((4, 1))], 1)
+    normal = np.tile([0.0, 0.0, 1.0], (4, 1))
+    triangles = np.array([[0, 1, 2], [0, 2, 3]], np.int32)
+    return Shape(position, normal, 0.5 + across * [0.5, -0.5], position, triangles)
+
+
+def mesh_triangles(model: mujoco.MjModel, mesh: int) -> tuple[Array, Array]:
+    """Return a mesh's vertices (V, 3) [m] and faces (F, 3)."""
+    vertex, face = model.mesh_vertadr[mesh], model.mesh_faceadr[mesh]
+    vertices = model.mesh_vert[vertex : vertex + model.mesh_vertnum[mesh]]
+    return vertices, model.mesh_face[face : face + model.mesh_facenum[mesh]]
+
+
+def mesh(model: mujoco.MjModel, number: int) -> Shape:
+    """Return the triangles of a model's mesh, with its own normals where they are near those of the faces."""
+    vertices, faces = mesh_triangles(model, number)
+    start, stop = model.mesh_faceadr[number], model.mesh_faceadr[number] + model.mesh_facenum[number]
+    corners = vertices[faces]  # (F, 3 corners, 3)
+    normals = model.mesh_normal[model.mesh_normaladr[number] + model.mesh_facenormal[start:stop]]
+    if model.mesh_texcoordadr[number] >= 0:
+        texcoord = model.mesh_texcoord[model.mesh_texcoordadr[number] + model.mesh_facetexcoord[start:stop]]
+    else:
+        normals = _sharpened(corners, normals)
+        texcoord = np.zeros((*corners.shape[:2], 2), np.float32)
+    return _shared(corners, normals, texcoord)
+
+
+def decimated(vertices: Array, faces: Array) -> Shape:
+    """Return a shape of triangles (V, 3) and (F, 3), with normals averaged where faces meet at a flat angle."""
+    corners = vertices[faces]
+    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    smooth = np.zeros_like(vertices)
+    for corner in range(3):
+        np.add.at(smooth, faces[:, corner], across)
+    smooth /= np.maximum(np.linalg.norm(smooth, axis=1, keepdims=True), 1e-20)
+    return _shared(corners, _sharpened(corners, smooth[faces]), np.zeros((*corners.shape[:2], 2), np.float32))
+
+
+def _sharpened(corners: Array, normals: Array) -> Array:
+    """Return normals (F, 3, 3) with the face's own one where the given one is far from it."""
+    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    across /= np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-20)
+    near = np.einsum("fci,fi->fc", normals, across) >= SMOOTH
+    return np.where(near[:, :, None], normals, across[:, None])
+
+
+def _shared(corners: Array, normals: Array, texcoord: Array) -> Shape:
+    """Return a shape whose triangles share equal vertices, of arrays (F, 3 corners, …)."""
+    rows = np.concatenate([corners, normals, texcoord], axis=2).reshape(-1, 8).astype(np.float32)
+    rows = np.ascontiguousarray(rows + 0.0)  # no negative zeros
+    _, first, inverse = np.unique(
+        rows.view(np.dtype((np.void, rows.itemsize * 8))), return_index=True, return_inverse=True
+    )
+    kept = rows[first]
+    return Shape(kept[:, :3], kept[:, 3:6], kept[:, 6:], kept[:, :3], inverse.reshape(-1, 3).astype(np.int32))

@@ -1,0 +1,1 @@
+"""The Franka tabletop: scene, randomisation, goals and scripted expert."""

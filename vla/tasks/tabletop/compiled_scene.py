@@ -1,0 +1,225 @@
+"""The compiled tabletop: indices into the model, and changes to it without recompilation."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import mujoco
+import numpy as np
+from dm_control import mjcf
+
+from vla.robots.panda import HOME, MAX_OPENING
+from vla.spec import Array, Shape
+from vla.tasks.tabletop.scene import BLOCK_DENSITY, BLOCK_HALF_SIZE, COLOURS, PAD_THICKNESS, PADS, Scene
+
+AWAY = (-1.5, 0.0, -3.0)  # position of blocks and pads that are absent [m]
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Standard deviations of the sensor noise."""
+
+    image: float = 0.0  # of a colour channel, 0…255
+    joints: float = 0.0  # [rad]
+    gripper: float = 0.0  # [m]
+
+
+class CompiledScene:
+    """Indices of a scene's elements in its compiled model, and the nominal model for resets."""
+
+    # Model fields that randomisation may change; everything else stays as compiled.
+    RANDOMISABLE = (
+        "geom_type",
+        "geom_matid",
+        "geom_contype",
+        "geom_conaffinity",
+        "geom_rgba",
+        "geom_size",
+        "geom_friction",
+        "geom_rbound",
+        "geom_aabb",
+        "body_mass",
+        "body_inertia",
+        "body_gravcomp",
+        "actuator_gainprm",
+        "actuator_biasprm",
+        "light_pos",
+        "light_dir",
+        "light_diffuse",
+        "cam_pos",
+        "cam_quat",
+        "cam_fovy",
+        "bvh_aabb",
+    )
+
+    def __init__(self, scene: Scene, physics: mjcf.Physics) -> None:
+        """Args: the scene and its compiled physics."""
+        self.model: mujoco.MjModel = physics.model.ptr
+        self.data: mujoco.MjData = physics.data.ptr
+        bind = physics.bind
+        self.joints = np.array([bind(joint).qposadr for joint in scene.panda.joints]).ravel()
+        self.velocities = np.array([bind(joint).dofadr for joint in scene.panda.joints]).ravel()
+        self.fingers = np.array([bind(finger).qposadr for finger in scene.panda.fingers]).ravel()
+        self.pads = [int(bind(pad).element_id) for pad in scene.panda.pads]
+        self.tcp = int(bind(scene.panda.tcp).element_id)
+        self.block_geoms = np.array([bind(block.geom).element_id for block in scene.blocks], dtype=int)
+        self.block_bodies = self.model.geom_bodyid[self.block_geoms]
+        free = self.model.body_jntadr[self.block_bodies]
+        self.block_positions = self.model.jnt_qposadr[free]  # address of x y z, quaternion wxyz
+        self.block_velocities = self.model.jnt_dofadr[free]
+        self.zones = [int(self.model.body(f"{name}_pad").mocapid[0]) for name in PADS]
+        self.cameras = {"front": self.model.camera("front").id, "wrist": self.model.camera("panda/wrist").id}
+        self.arm_actuators = np.arange(len(self.joints))  # the finger actuator follows them
+        self.robot_geoms = np.flatnonzero(
+            [model_body.startswith("panda/") for model_body in map(self._body_of, range(self.model.ngeom))]
+        )
+        self._materials = {name: int(self.model.geom_matid[self.model.geom(name).id]) for name in ("table", "floor")}
+        self.model.geom_matid[:] = -1  # plain surfaces render faster without a material
+        self._nominal = {name: getattr(self.model, name).copy() for name in self.RANDOMISABLE}
+        self._scratch = mujoco.MjData(self.model)
+        self.stale_textures: set[int] = set()  # ids of textures that a renderer has not uploaded yet
+
+    def restore(self) -> None:
+        """Undo every randomisation: nominal model, three blocks in a row, arm at home."""
+        for name, value in self._nominal.items():
+            getattr(self.model, name)[:] = value
+        count = len(self.block_geoms)
+        self.extents = np.full((count, 3), BLOCK_HALF_SIZE)  # half sizes of the blocks, upright [m]
+        self.density = np.full(count, BLOCK_DENSITY)  # of each block [kg/m³]
+        self.present = min(count, 3)  # blocks on the table, the first ones
+        self.latency = 0.0  # from a command to the motors [s]
+        self.noise = Noise()
+        self.held_out: float = 0.0  # probability of a held-out instruction in an evaluation
+        self.skip = 0  # number of blocks skipped in the order of naming
+        self.paint_blocks(list(COLOURS)[:count], np.array(list(COLOURS.values()))[:count])
+        for pad in range(len(PADS)):
+            self.place_pad(pad, 0.4, 0.15 * pad)
+        for index in range(count):
+            self.place_block(index, 0.52, 0.12 * (index - (self.present - 1) / 2), 0.0)
+        self.place_arm(HOME, MAX_OPENING)
+
+    def _body_of(self, geom: int) -> str:
+        return str(self.model.body(self.model.geom_bodyid[geom]).name)
+
+    def paint_blocks(self, names: list[str], rgb: Array) -> None:
+        """Set each block's colour (count, 3) and its name in instructions."""
+        self.block_names = names
+        self.model.geom_rgba[self.block_geoms, :3] = rgb
+
+    def paint_texture(self, name: str, picture: Array) -> None:
+        """Set the texture (TEXTURE, TEXTURE, 3) uint8 of the table or the floor."""
+        texture = self.model.texture(name).id
+        start = self.model.tex_adr[texture]
+        self.model.tex_data[start : start + picture.size] = picture.ravel()
+        self.model.geom_matid[self.model.geom(name).id] = self._materials[name]
+        self.stale_textures.add(texture)
+
+    def set_block(self, index: int, half_size: Array, round: bool = False) -> None:
+        """Make block `index` a box of half sizes (3,) [m], or a cylinder, and update its mass, inertia and bounds."""
+        x, y, z = self.extents[index] = half_size
+        volume = 2 * np.pi * x**2 * z if round else 8 * x * y * z
+        mass = self.density[index] * volume
+        model, geom, body = self.model, self.block_geoms[index], self.block_bodies[index]
+        kind = mujoco.mjtGeom.mjGEOM_CYLINDER if round else mujoco.mjtGeom.mjGEOM_BOX
+        model.geom_type[geom] = int(kind)
+        model.geom_size[geom] = (x, z, 0.0) if round else half_size
+        model.geom_rbound[geom] = np.hypot(x, z) if round else np.linalg.norm(half_size)
+        model.geom_aabb[geom, 3:] = half_size
+        start, count = model.body_bvhadr[body], model.body_bvhnum[body]
+        model.bvh_aabb[start : start + count, 3:] = half_size
+        model.body_mass[body] = mass
+        if round:  # solid cylinder
+            model.body_inertia[body] = mass * np.array([x**2 / 4 + z**2 / 3, x**2 / 4 + z**2 / 3, x**2 / 2])
+        else:
+            model.body_inertia[body] = mass / 3 * (np.sum(self.extents[index] ** 2) - self.extents[index] ** 2)
+
+    def scale_density(self, factors: Array) -> None:
+        """Multiply each block's density by a factor, (count,); later changes of size or shape keep it."""
+        self.density *= factors
+        self.model.body_mass[self.block_bodies] *= factors
+        self.model.body_inertia[self.block_bodies] *= factors[:, None]
+
+    def finish(self, pads: int) -> None:
+        """Make model and state consistent after all changes, with `pads` pads on the table."""
+        for index in range(len(self.block_geoms)):
+            if index >= self.present:
+                self._take_away(index)
+        for pad in range(pads, len(PADS)):
+            self.data.mocap_pos[self.zones[pad]] = AWAY
+        mujoco.mj_setConst(self.model, self._scratch)  # without it, physics explodes after a change of mass
+        here = self.block_positions[: self.present]
+        self.data.qpos[here + 2] = self.extents[: self.present, 2]
+
+    def _take_away(self, index: int) -> None:
+        """Move a block out of sight and contact."""
+        geom = self.block_geoms[index]
+        self.model.geom_contype[geom] = self.model.geom_conaffinity[geom] = 0
+        self.model.body_gravcomp[self.block_bodies[index]] = 1.0
+        start = self.block_positions[index]
+        self.data.qpos[start : start + 7] = (*AWAY, 1, 0, 0, 0)
+
+    def place_pad(self, pad: int, x: float, y: float) -> None:
+        """Put pad `pad` on the table at (x, y) [m]."""
+        self.data.mocap_pos[self.zones[pad]] = (x, y, PAD_THICKNESS)
+
+    def place_arm(self, joints: Array, opening: float) -> None:
+        """Set the arm to `joints` (7,) [rad] and the gripper to `opening` between the fingertips [m]."""
+        self.data.qpos[self.joints] = joints
+        self.data.qpos[self.fingers] = opening / 2
+
+    def turn_camera(self, camera: int, rotation: Array) -> None:
+        """Turn camera `camera` by the rotation vector `rotation` (3,) [rad] in its own frame."""
+        turn, turned = np.empty(4), np.empty(4)
+        angle = float(np.linalg.norm(rotation))
+        mujoco.mju_axisAngle2Quat(turn, rotation / angle if angle > 0 else np.array([1.0, 0, 0]), angle)
+        mujoco.mju_mulQuat(turned, self.model.cam_quat[camera], turn)
+        self.model.cam_quat[camera] = turned
+
+    def place_block(self, index: int, x: float, y: float, yaw: float) -> None:
+        """Put block `index` on the table at (x, y) [m], turned by `yaw` [rad]."""
+        start = self.block_positions[index]
+        self.data.qpos[start : start + 7] = (x, y, self.extents[index, 2], np.cos(yaw / 2), 0, 0, np.sin(yaw / 2))
+
+    def block_centres(self) -> Array:
+        """Return the centres (present, 3) of the blocks on the table [m]."""
+        return self.data.geom_xpos[self.block_geoms[: self.present]].copy()
+
+    def touching(self) -> set[tuple[int, int]]:
+        """Return (fingertip index, block index) of every contact between a fingertip and a block."""
+        pairs = set()
+        block_of = {int(geom): index for index, geom in enumerate(self.block_geoms)}
+        for first, second in self.data.contact.geom[: self.data.ncon].tolist():
+            for pad, other in ((first, second), (second, first)):
+                if pad in self.pads and other in block_of:
+                    pairs.add((self.pads.index(pad), block_of[other]))
+        return pairs
+
+    def shapes(self) -> list[Shape]:
+        """Return the visible shapes."""
+        model, shapes = self.model, []
+        kinds: dict[int, Literal["mesh", "box", "cylinder"]] = {
+            int(mujoco.mjtGeom.mjGEOM_MESH): "mesh",
+            int(mujoco.mjtGeom.mjGEOM_BOX): "box",
+            int(mujoco.mjtGeom.mjGEOM_CYLINDER): "cylinder",
+        }
+        for geom in np.flatnonzero(model.geom_group == 2):
+            kind = kinds.get(int(model.geom_type[geom]))
+            if kind is None:
+                continue
+            vertices = faces = None
+            if kind == "mesh":
+                mesh = model.geom_dataid[geom]
+                vertex, face = model.mesh_vertadr[mesh], model.mesh_faceadr[mesh]
+                vertices = model.mesh_vert[vertex : vertex + model.mesh_vertnum[mesh]].copy()
+                faces = model.mesh_face[face : face + model.mesh_facenum[mesh]].copy()
+            name = model.geom(geom).name or f"geom{geom}"
+            body = model.body(model.geom_bodyid[geom]).name
+            place = (model.geom_pos[geom].copy(), model.geom_quat[geom].copy(), model.geom_size[geom].copy())
+            shapes.append(Shape(body, name, kind, *place, model.geom_rgba[geom].copy(), vertices, faces))
+        return shapes
+
+    def poses(self) -> dict[str, Array]:
+        """Return body name → (7,) position [m] and quaternion wxyz in the world frame."""
+        pose = np.concatenate([self.data.xpos, self.data.xquat], axis=1)
+        return {self.model.body(body).name: pose[body] for body in range(self.model.nbody)}

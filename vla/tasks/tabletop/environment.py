@@ -1,0 +1,208 @@
+"""The Franka tabletop as a `vla.spec.Environment`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from typing import Any, Literal
+
+import dm_env
+import mujoco
+import numpy as np
+
+from vla.io.types import Count, ImageSize, Names, Point, Positive
+from vla.robots.panda import CHAIN, FINGER_TRAVEL
+from vla.spec import Array, Observation, RobotModel, Shape, Spec
+from vla.tasks.rendering.renderer import Renderer, Rendering, View
+from vla.tasks.tabletop.goals.goal import Goal
+from vla.tasks.tabletop.goals.mixed import Mixed
+from vla.tasks.tabletop.randomize.randomizer import Randomizer
+from vla.tasks.tabletop.scene import COLOURS, Scene
+from vla.tasks.tabletop.task import CONTROL_HZ, FastEnvironment, TabletopTask
+
+TRANSLATION = 0.04  # largest translation per step [m]
+ROTATION = 0.25  # largest rotation per step [rad]
+VISIBLE = 2  # group of the geoms in pictures
+MILLIMETRES = 1000.0  # of a metre
+JOINTS = tuple(f"panda_joint{index}" for index in range(1, 8))
+ARM = RobotModel(
+    joints=JOINTS,
+    frame="panda_link0",
+    velocities=tuple(f"{joint}_velocity" for joint in JOINTS),
+    gripper="gripper",
+    chain=CHAIN,
+)
+
+
+class Tabletop:
+    """`TabletopTask` as an `Environment` with camera observations, also `Drawable` and `Drivable`."""
+
+    viewpoint: tuple[Point, Point] = ((1.2, -0.7, 0.75), (0.38, 0.0, 0.2))
+
+    def __init__(
+        self,
+        goal: Goal | Mixed,
+        randomize: Mapping[str, Randomizer | None],
+        renderer: Rendering,
+        blocks: Count,
+        image_size: ImageSize,
+        cameras: Names,
+        time_limit: Positive,
+        meshes: Literal["light", "full"],
+        shadows: bool,
+    ) -> None:
+        """Build and compile the scene.
+
+        Args:
+            goal: goal, or mixture of goals.
+            randomize: axis name → randomizer, or None to disable the axis.
+            renderer: renderer of the images.
+            blocks: maximum number of blocks on the table; the axis `distractors` draws the number.
+            image_size: height and width of every camera's images [px].
+            cameras: "front", "wrist" or both.
+            time_limit: maximum length of an episode per block to be moved [s].
+            meshes: robot meshes with few faces ("light") or all of them ("full", much slower on a CPU).
+            shadows: whether the lamp casts shadows.
+
+        Raises:
+            ValueError: an unknown camera, or more blocks than colours.
+        """
+        most = len(COLOURS) - goal.absent
+        if not goal.blocks <= blocks <= most:
+            raise ValueError(f"task.blocks must be from {goal.blocks} to {most}, one colour each, got {blocks}")
+        low = np.array([-TRANSLATION] * 3 + [-ROTATION] * 3 + [0.0])
+        high = np.array([TRANSLATION] * 3 + [ROTATION] * 3 + [1.0])
+        self.spec = Spec(
+            cameras=tuple(cameras),
+            image_size=(image_size[0], image_size[1]),
+            state=ARM.components,
+            state_units=("rad",) * 7 + ("rad/s",) * 7 + ("m",),
+            action=("dx", "dy", "dz", "rx", "ry", "rz", "gripper"),
+            units=("m", "m", "m", "rad", "rad", "rad", "1"),
+            low=tuple(low.tolist()),
+            high=tuple(high.tolist()),
+            control_hz=CONTROL_HZ,
+            depth=tuple(cameras),
+            truth=(("tcp", 3), ("block", 3), ("destination", 3), ("faces", 2)),
+            robot=ARM,
+        )
+        task = TabletopTask(
+            goal, randomize, Scene(blocks=blocks, meshes=meshes, shadows=shadows), low, high, time_limit
+        )
+        self.dm_env = FastEnvironment(task)
+        self._task = task
+        unknown = sorted(set(cameras) - set(task.compiled.cameras))
+        if unknown or not cameras:
+            raise ValueError(f"unknown cameras {unknown}; task.cameras may list {sorted(task.compiled.cameras)}")
+        self.done, self.outcome, self.task = True, "timeout", ""
+        self.milestones: frozenset[str] = frozenset()
+        self.draws: dict[str, Any] = {}
+        self._choice = renderer
+        self._rendering: Renderer | None = None
+        self._blind = False
+        self._changed = True
+
+    def reset(self, seed: int) -> Observation:
+        """Start the episode of `seed`."""
+        self._task.seed = seed
+        self.dm_env.reset()
+        self._changed = True  # in the model, for the renderer
+        # Separate streams, so that a replay without images has the same joint noise.
+        self._joint_noise, self._image_noise = self._task.streams(seed, "joint noise"), np.random.default_rng([seed, 1])
+        self.task, self.draws = self._task.goal.name, self._task.draws
+        self._update_outcome(done=False)
+        return self.look()
+
+    def step(self, action: Array) -> Observation:
+        """Apply one (7,) action, clipped to the spec's bounds, for one control period."""
+        if self.done:
+            raise ValueError("the episode is over; call reset(seed) before step(action)")
+        timestep: dm_env.TimeStep = self.dm_env.step(action)
+        self._update_outcome(timestep.last())
+        return self.look()
+
+    def drive(self, joints: Array, opening: float, seconds: float) -> None:
+        """Move towards joint targets (7,) [rad] and a gripper opening 0…1 for `seconds`; call `judge` once per control
+        period."""
+        physics = self.dm_env.physics
+        substeps = round(seconds / physics.timestep())
+        self._task.follow(physics, np.append(joints, opening * FINGER_TRAVEL), substeps)
+
+    def judge(self) -> None:
+        """Update the outcome after one control period of driving; this may end the episode."""
+        self._task.after_step(self.dm_env.physics, self.dm_env.random_state)
+        self._update_outcome(self._task.over)
+
+    def _update_outcome(self, done: bool) -> None:
+        classifier = self._task.classifier
+        self.done, self.outcome, self.milestones = done, classifier.outcome, classifier.milestones
+
+    def _state(self) -> Array:
+        """Measure (15,) float32: joint positions [rad], their velocities [rad/s] and the gripper's opening [m]."""
+        compiled, noise = self._task.compiled, self._task.compiled.noise
+        joints, velocities = compiled.data.qpos[compiled.joints], compiled.data.qvel[compiled.velocities]
+        opening = float(compiled.data.qpos[compiled.fingers].sum())
+        if noise.joints or noise.gripper:
+            joints = joints + noise.joints * self._joint_noise.randn(len(joints))
+            opening = max(0.0, opening + noise.gripper * float(self._joint_noise.randn()))
+        return np.array([*joints, *velocities, opening], np.float32)
+
+    def shapes(self) -> list[Shape]:
+        """Return the visible shapes of the current episode."""
+        return self._task.compiled.shapes()
+
+    def poses(self) -> dict[str, Array]:
+        """Return body name → (7,) position [m] and quaternion wxyz in the world frame."""
+        return self._task.compiled.poses()
+
+    def floor(self) -> dict[str, Callable[[], object]]:
+        """Return name → minimal work of a control step, as calls for the benchmark to time."""
+        compiled = self._task.compiled
+        return {
+            "physics": lambda: mujoco.mj_step(compiled.model, compiled.data, self._task.substeps),
+            "rendering": lambda: self.renderer.render(compiled.data),
+        }
+
+    @contextmanager
+    def blind(self) -> Iterator[None]:
+        """Disable images in observations within this context, which makes steps several times faster."""
+        self._blind = True
+        try:
+            yield
+        finally:
+            self._blind = False
+
+    def close(self) -> None:
+        """Free physics and GL."""
+        if self._rendering is not None:
+            self._rendering.close()
+            self._rendering = None
+        self.dm_env.close()
+
+    @property
+    def renderer(self) -> Renderer:
+        """The renderer, created on first use, because blind environments need no GL."""
+        if self._rendering is None:
+            compiled, (height, width) = self._task.compiled, self.spec.image_size
+            cameras = [compiled.cameras[name] for name in self.spec.cameras]
+            self._rendering = self._choice.open(compiled.model, View(cameras, height, width, geom_groups=(VISIBLE,)))
+        return self._rendering
+
+    def look(self) -> Observation:
+        """Return the current observation."""
+        compiled = self._task.compiled
+        if self._blind:
+            return Observation({}, self._state(), self._task.instruction, {}, self._task.truth())
+        if self._changed:
+            self.renderer.update(compiled.stale_textures)
+            compiled.stale_textures.clear()
+            self._changed = False
+        pictures, metres = self.renderer.render(compiled.data)
+        rgb = dict(zip(self.spec.cameras, pictures, strict=True))
+        millimetres = np.rint(metres * np.float32(MILLIMETRES)).astype(np.uint16)
+        if compiled.noise.image:
+            for name, picture in rgb.items():
+                grain = self._image_noise.standard_normal(picture.shape, dtype=np.float32)
+                rgb[name] = np.clip(picture + compiled.noise.image * grain, 0, 255).astype(np.uint8)
+        depth = dict(zip(self.spec.cameras, millimetres, strict=True))
+        return Observation(rgb, self._state(), self._task.instruction, depth, self._task.truth())

@@ -1,0 +1,156 @@
+"""The scripted expert: a memoryless closed-loop controller on the simulator's truth.
+
+Its action depends only on the current state, so every action is a valid label for its state. Policies therefore learn
+to recover from any state that a perturbation leads to.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from vla.robots.panda import DOWN, MAX_OPENING, rotation_z, vector_from_rotation
+from vla.spec import Array, Observation, Spec
+from vla.tasks.tabletop.goals.goal import SKILLS, Skill
+
+HOVER = 0.08  # height above the block at which an approach starts [m]
+CARRY = 0.07  # height of a carried block above its destination [m]
+FUNNEL = 2.5  # height gained per metre of horizontal distance, so that approaches come from above
+# The loosest values that work: a policy with an error of a centimetre must not stall.
+GRASP_XY, GRASP_Z = 0.012, 0.012  # position tolerances at which the gripper closes [m]
+PLACE_Z = 0.012  # height tolerance at which the gripper opens [m]
+FINGERTIP = 0.012  # half the width of the closed fingertips [m]
+LOW = 0.012  # lowest tool height at which a fingertip clears the table [m]
+LANE = 0.010  # lateral tolerance of the fingertips in a push [m]
+PUSH_AT = 1.1  # contact height of a push relative to half the block's height, so that the block does not tip
+PUSH = 0.015  # largest motion of a push per step [m]
+MAX_YAW = 0.9  # largest yaw from neutral for a grasp of the nearest faces [rad]
+CLEARANCE = 0.012  # total gap between the open fingers and a block [m]
+
+
+class Waypoint:
+    """Waypoint controller that reaches, grasps, carries, pushes and releases, and recovers from any failure."""
+
+    def __init__(self, spec: Spec) -> None:
+        """Args: the environment's spec.
+
+        Raises:
+            ValueError: there is no robot, or it has no gripper.
+        """
+        self._low, self._high = np.array(spec.low), np.array(spec.high)
+        robot = spec.require_robot("the scripted expert")
+        if robot.gripper is None:
+            raise ValueError("the scripted expert needs a robot with a gripper")
+        self._gripper = spec.state.index(robot.gripper)
+        self.info: dict[str, Any] = {}
+
+    def reset(self, instruction: str, seed: int) -> None:
+        """Do nothing: the expert has no state."""
+
+    def act(self, observation: Observation) -> Array:
+        """Return the (7,) action for this state.
+
+        Raises:
+            ValueError: the observation lacks the simulator's truth.
+        """
+        if observation.truth is None:
+            raise ValueError("the scripted expert needs the simulator's truth, which this observation lacks")
+        action = self._decide(observation.truth, float(observation.state[self._gripper]))
+        return np.clip(action, self._low, self._high).astype(np.float32)
+
+    def _decide(self, truth: dict[str, Array], opening: float) -> Array:
+        """Return the (7,) unclipped action for this state."""
+        skill = SKILLS[int(truth["skill"][0])]
+        if skill == "stay":
+            return self._action(truth, np.zeros(3), 0.0, 1.0)
+        if skill == "push":
+            return self._push(truth)
+        if truth["grasped"][0]:
+            return self._carry(truth, skill)
+        if skill == "place" and _placed(truth):
+            free = opening > 2 * truth["half_size"][0] + CLEARANCE / 2
+            return self._action(truth, np.array([0.0, 0.0, HOVER if free else 0.0]), 0.0, 1.0)
+        return self._reach(truth, opening)
+
+    def _reach(self, truth: dict[str, Array], opening: float) -> Array:
+        tool, block, width = truth["commanded"][:3, 3], truth["block"], 2 * truth["half_size"][0]
+        offset = block - tool
+        yaw = _yaw_to_faces(truth)
+        away = float(np.hypot(offset[0], offset[1]))
+        between = away < GRASP_XY + 0.004 and abs(offset[2]) < GRASP_Z + 0.004
+        closing = between and width - 0.006 < opening < MAX_OPENING - 0.004
+        aligned = away < GRASP_XY and abs(offset[2]) < GRASP_Z
+        if closing or (aligned and opening > width - 0.006):
+            return self._action(truth, offset, yaw, 0.0)
+        # Descend only straight above the block with open fingers; otherwise stay above it.
+        height = min(FUNNEL * max(away - GRASP_XY / 2, 0.0), HOVER)
+        if opening < width + CLEARANCE:
+            height = max(height, 0.045) if not between else HOVER
+        offset[2] += height
+        return self._action(truth, _rising_first(offset), yaw, 1.0)
+
+    def _carry(self, truth: dict[str, Array], skill: Skill) -> Array:
+        offset, tolerance = truth["destination"] - truth["block"], truth["tolerance"][0]
+        away = float(np.hypot(offset[0], offset[1]))
+        if skill == "hold":
+            return self._action(truth, offset, 0.0, 0.0)
+        height = min(FUNNEL * max(away - tolerance / 2, 0.0), CARRY)
+        opens = away < tolerance and abs(offset[2]) < PLACE_Z
+        offset[2] += height
+        return self._action(truth, _rising_first(offset), 0.0, 1.0 if opens else 0.0)
+
+    def _push(self, truth: dict[str, Array]) -> Array:
+        """Move behind the block, opposite its destination, and push it with closed fingers."""
+        tool, block, (half, _, half_height) = truth["commanded"][:3, 3], truth["block"], truth["half_size"]
+        way = (truth["destination"] - block)[:2]
+        distance = float(np.hypot(*way))
+        ahead = way / max(distance, 1e-6)
+        aside = np.array([-ahead[1], ahead[0]])
+        along, across = (tool - block)[:2] @ ahead, (tool - block)[:2] @ aside
+        near = np.hypot(along, across) < half + FINGERTIP
+        if near and tool[2] < block[2] + half_height + FINGERTIP and tool[2] > LOW + half_height:
+            return self._action(
+                truth, np.array([0.0, 0.0, HOVER]), 0.0, 1.0
+            )  # the fingers enclose the block: release it and rise
+        height = max(LOW, min(PUSH_AT * half, 0.9 * half_height))
+        behind = np.sqrt(2) * half + FINGERTIP + 0.006  # for any yaw of the block
+        if tool[2] < height + 0.012 and -behind - 0.03 < along < -half and abs(across) < LANE:
+            offset = np.append(min(distance, PUSH) * ahead - across * aside, height - tool[2])
+            return self._action(truth, offset, 0.0, 0.0)
+        offset = np.append(block[:2] - (behind + 0.004) * ahead, height) - tool
+        away = float(np.hypot(offset[0], offset[1]))
+        offset[2] += min(FUNNEL * max(away - LANE / 2, 0.0), HOVER)
+        return self._action(truth, _rising_first(offset), 0.0, 0.0)
+
+    def _action(self, truth: dict[str, Array], offset: Array, yaw: float, gripper: float) -> Array:
+        """Return the action that moves by `offset`, scaled uniformly to the bounds of a step, and turns by `yaw`."""
+        rotation = truth["commanded"][:3, :3]
+        upright = rotation_z(np.arctan2(rotation[1, 0], rotation[0, 0]) + yaw) @ DOWN
+        scale = max(1.0, float(np.max(np.abs(offset) / self._high[:3])))
+        return np.concatenate([offset / scale, vector_from_rotation(upright @ rotation.T), [gripper]])
+
+
+def _rising_first(offset: Array) -> Array:
+    """Reduce horizontal motion while the tool has to rise, so that it does not hit other blocks."""
+    if offset[2] > 0.01:
+        offset[:2] *= 0.02 / (0.02 + offset[2])
+    return offset
+
+
+def _placed(truth: dict[str, Array]) -> bool:
+    """Return whether the block is close enough to its destination."""
+    offset = truth["destination"] - truth["block"]
+    return bool(np.hypot(offset[0], offset[1]) < 1.5 * truth["tolerance"][0] and abs(offset[2]) < PLACE_Z)
+
+
+def _yaw_to_faces(truth: dict[str, Array]) -> float:
+    """Return the turn [rad] that aligns the fingers with the block's nearest faces, close to the arm's neutral yaw.
+
+    The nearest faces, because a cube is symmetric under quarter turns: a farther choice would be ambiguous.
+    """
+    rotation, (cosine, sine) = truth["commanded"][:3, :3], truth["faces"]
+    yaw = np.arctan2(rotation[1, 0], rotation[0, 0])
+    back = np.clip(yaw, -MAX_YAW, MAX_YAW) - yaw  # turn back into the range of allowed yaws
+    quarter = np.pi / 2
+    return float(back + (np.arctan2(sine, cosine) / 4 - back + quarter / 2) % quarter - quarter / 2)

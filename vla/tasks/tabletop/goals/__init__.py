@@ -1,0 +1,1 @@
+"""Goals of the tabletop, one per file."""

@@ -1,0 +1,108 @@
+"""The base class of goals: named objects, language and subgoals."""
+
+from __future__ import annotations
+
+import re
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from vla.spec import Array
+from vla.tasks.language import Grammar
+
+AT_REST = 0.02  # speed below which a block is at rest [m/s]
+
+Skill = Literal["place", "hold", "push", "stay"]
+SKILLS: tuple[Skill, ...] = ("place", "hold", "push", "stay")
+
+
+@dataclass(frozen=True)
+class WorldState:
+    """True state of the world after a step; B blocks on the table, Z pads."""
+
+    positions: Array  # (B, 3) centres of the blocks [m]
+    starts: Array  # (B, 3) centres at the start of the episode [m]
+    extents: Array  # (B, 3) half sizes, upright [m]
+    speeds: Array  # (B,) of the centres [m/s]
+    lifts: Array  # (B,) largest height above the start so far [m]
+    held: Array  # (B,) both fingertips touch the block
+    touched: Array  # (B,) at least one fingertip touches the block
+    pads: Array  # (Z, 3) centres [m]
+    tool: Array  # (3,) point between the fingertips [m]
+    arm_speed: float = 0.0  # of the fastest joint [rad/s]
+
+    def away(self, block: int, place: Array) -> float:
+        """Return the horizontal distance between a block's centre and a place [m]."""
+        return float(np.hypot(*(self.positions[block] - place)[:2]))
+
+    def resting(self, block: int) -> bool:
+        """Return whether a block rests on the table, untouched by the gripper."""
+        low = self.positions[block, 2] < 1.5 * self.extents[block].max()
+        return bool(low and self.speeds[block] < AT_REST and not self.touched[block])
+
+    def on_table(self, block: int, place: Array) -> Array:
+        """Return the centre (3,) [m] of a block that stands on the table at `place`."""
+        return np.array([place[0], place[1], self.extents[block, 2]])
+
+
+@dataclass(frozen=True)
+class Referents:
+    """Indices of the blocks and pads that the instruction names, in that order."""
+
+    blocks: tuple[int, ...]
+    pads: tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class Subgoal:
+    """One skill to apply to one block."""
+
+    block: int
+    destination: Array  # (3,) of its centre [m]
+    skill: Skill  # "place" releases the block there, "hold" keeps it there, "push" moves it there, "stay" leaves it
+    done: bool
+    tolerance: float = 0.02  # horizontal distance from the destination at which to release the block [m]
+
+
+class Goal(ABC):
+    """One kind of task.
+
+    Attributes:
+        named: number of blocks that the instruction names.
+        moves: number of these to be moved.
+        blocks: minimum number of blocks on the table.
+        absent: minimum number of colours that no block has.
+        pads: number of pads on the table.
+        language: grammar of the instructions; the slots {block} and {other} are the colours of the named blocks,
+            {absent} a colour that no block has, {pad} and {rest} the colours of the pads.
+        hold_steps: consecutive control steps for which all subgoals must be done.
+    """
+
+    named, moves, blocks, absent, pads = 1, 1, 2, 0, 1
+
+    def __init__(self, language: Grammar, hold_steps: int) -> None:
+        known = ["block", "other"][: self.named] + ["pad", "rest"][: self.pads] + ["absent"] * bool(self.absent)
+        if unknown := sorted(language.slots - set(known)):
+            raise ValueError(f"task.goal.language has the slots {unknown}, but {type(self).__name__} fills {known}")
+        self.language, self.hold_steps = language, hold_steps
+
+    @property
+    def name(self) -> str:
+        """Name of the task in reports, such as "pick_place"."""
+        return re.sub(r"(?<!^)(?=[A-Z])", "_", type(self).__name__).lower()
+
+    def draw(self, random_state: np.random.RandomState) -> Goal:
+        """Draw the goal of an episode."""
+        return self
+
+    @abstractmethod
+    def subgoals(self, state: WorldState, referents: Referents) -> Sequence[Subgoal]:
+        """Return the subgoals in order; the goal is reached while all are done."""
+
+
+def placed(state: WorldState, block: int, pad: int, radius: float) -> bool:
+    """Return whether a block rests on a pad, released."""
+    return state.away(block, state.pads[pad]) < radius and state.resting(block)

@@ -1,0 +1,26 @@
+"""The goal of pushing a block onto a pad."""
+
+from __future__ import annotations
+
+from vla.io.types import Count, Positive
+from vla.tasks.language import Grammar
+from vla.tasks.tabletop.goals.goal import AT_REST, Goal, Referents, Subgoal, WorldState
+
+
+class Push(Goal):
+    """Push the named block onto the named pad without lifting it."""
+
+    pads = 2
+
+    def __init__(self, language: Grammar, radius: Positive, highest: Positive = 0.02, hold_steps: Count = 3) -> None:
+        """Args: grammar; maximum distance between the centres of block and pad [m]; maximum height above the table
+        during the episode [m]; consecutive steps at rest."""
+        super().__init__(language, hold_steps)
+        self.radius, self.highest = radius, highest
+
+    def subgoals(self, state: WorldState, referents: Referents) -> list[Subgoal]:
+        """Push the block onto the pad's centre."""
+        (block,), (pad, _) = referents.blocks, referents.pads
+        there = state.away(block, state.pads[pad]) < self.radius and state.speeds[block] < AT_REST
+        done = bool(there and state.lifts[block] < self.highest)
+        return [Subgoal(block, state.on_table(block, state.pads[pad]), "push", done)]

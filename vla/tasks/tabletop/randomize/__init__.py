@@ -1,0 +1,1 @@
+"""Domain randomisation: one class per axis, each with its own random stream."""

@@ -1,0 +1,177 @@
+"""Randomizers of blocks and pads: number, colour, size, shape, mass, friction and placement."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from math import dist
+from typing import Annotated, Any
+
+import numpy as np
+from annotated_types import Ge, Le, MinLen, Predicate
+
+from vla.io.types import CountRange, NonNegative, PositiveRange, Share, ascending, unique
+from vla.tasks.tabletop.compiled_scene import CompiledScene
+from vla.tasks.tabletop.randomize.randomizer import Angles, Places, rounded
+from vla.tasks.tabletop.scene import COLOURS, PAD_RADIUS, PADS
+
+SHAPES = {"cube": 1.0, "cylinder": 1.0, "tall": 1.25, "flat": 0.75}  # name → height over width
+HalfSize = Annotated[float, Ge(0.005), Le(0.04)]  # within the gripper's opening [m]
+HalfSizes = Annotated[tuple[HalfSize, HalfSize], Predicate(ascending)]
+ColourNames = Annotated[Sequence[str], MinLen(1), Predicate(unique)]
+ROOM = 0.034  # radius reserved for a block: half the diagonal of the largest one of the default sizes [m]
+
+
+@dataclass(frozen=True)
+class Distractors:
+    """Number of blocks besides the first named one."""
+
+    count: CountRange  # minimum and maximum number
+
+    def __call__(self, scene: CompiledScene, random_state: np.random.RandomState) -> dict[str, Any]:
+        """Draw the number; other axes draw for every block, so their draws do not depend on it."""
+        low, high = self.count
+        if high >= len(scene.block_geoms):
+            raise ValueError(f"{high} distractors need task.blocks={high + 1}, it is {len(scene.block_geoms)}")
+        count = int(random_state.randint(low, high + 1))
+        scene.present = count + 1
+        return {"count": count}
+
+
+@dataclass(frozen=True)
+class Colours:
+    """Colour of each block: distinct names from a list, each with a random tint."""
+
+    names: ColourNames  # to draw from without replacement
+    jitter: Share  # maximum change of each channel, 0…1
+
+    def __post_init__(self) -> None:
+        """Raise a ValueError if a colour is unknown."""
+        if unknown := sorted(set(self.names) - set(COLOURS)):
+            raise ValueError(f"unknown colours {unknown}, expected some of {sorted(COLOURS)}")
+
+    def __call__(self, scene: CompiledScene, random_state: np.random.RandomState) -> dict[str, Any]:
+        """Draw names and tints."""
+        count = len(scene.block_geoms)
+        if count > len(self.names):
+            raise ValueError(f"{count} blocks need as many colours, but the colour axis has {list(self.names)}")
+        names = [self.names[index] for index in random_state.permutation(len(self.names))[:count]]
+        tint = random_state.uniform(-self.jitter, self.jitter, (count, 3))
+        rgb = np.clip([COLOURS[name] for name in names] + tint, 0, 1)
+        scene.paint_blocks(names, rgb)
+        return {"names": names, "rgb": rounded(rgb)}
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """Size of each block."""
+
+    half_size: HalfSizes  # range of half the edge length [m]
+
+    def __call__(self, scene: CompiledScene, random_state: np.random.RandomState) -> dict[str, Any]:
+        """Draw each block's size; its mass follows from its density."""
+        sizes = random_state.uniform(*self.half_size, len(scene.block_geoms))
+        for index, half_size in enumerate(sizes):
+            scene.set_block(index, np.full(3, half_size))
+        return {"half_size": rounded(sizes)}
+
+
+@dataclass(frozen=True)
+class Shapes:
+    """Shape of each block, applied after the size."""
+
+    names: Annotated[Sequence[str], MinLen(1)]  # to draw from
+
+    def __post_init__(self) -> None:
+        """Raise a ValueError if a shape is unknown."""
+        if unknown := sorted(set(self.names) - set(SHAPES)):
+            raise ValueError(f"unknown shapes {unknown}, expected some of {sorted(SHAPES)}")
+
+    def __call__(self, scene: CompiledScene, random_state: np.random.RandomState) -> dict[str, Any]:
+        """Draw a shape per block."""
+        names = [str(name) for name in random_state.choice(self.names, len(scene.block_geoms))]
+        for index, name in enumerate(names):
+            scene.set_block(index, scene.extents[index] * (1, 1, SHAPES[name]), round=name == "cylinder")
+        return {"names": names}
+
+
+@dataclass(frozen=True)
+class Masses:
+    """Mass of each block, independent of its size."""
+
+    factor: PositiveRange  # range of the factor on the density
+
+    def __call__(self, scene: CompiledScene, random_state: np.random.RandomState) -> dict[str, Any]:
+        """Draw a factor per block."""
+        factors = random_state.uniform(*self.factor, len(scene.block_geoms))
+        scene.scale_density(factors)
+        return {"factor": rounded(factors)}
+
+
+@dataclass(frozen=True)
+class Friction:
+    """Sliding friction of blocks and table."""
+
+    sliding: PositiveRange  # range of the sliding coefficient
+
+    def __call__(self, scene: CompiledScene, random_state: np.random.RandomState) -> dict[str, Any]:
+        """Draw a coefficient per block; MuJoCo uses the larger one of a contact, so the table gets the minimum."""
+        sliding = random_state.uniform(*self.sliding, len(scene.block_geoms))
+        scene.model.geom_friction[scene.block_geoms, 0] = sliding
+        scene.model.geom_friction[scene.model.geom("table").id, 0] = sliding.min()
+        return {"sliding": rounded(sliding)}
+
+
+@dataclass(frozen=True)
+class Placement:
+    """Placement of pads and blocks: uniform in a rectangle, without overlap."""
+
+    x: Places  # range of the centres [m]
+    y: Places
+    yaw: Angles  # range of the blocks' yaw [rad]
+    clearance: NonNegative = 0.03  # minimum gap between outlines [m]
+
+    def __call__(self, scene: CompiledScene, random_state: np.random.RandomState) -> dict[str, Any]:
+        """Draw a place for every pad and block in turn, also for those that will be absent.
+
+        Raises:
+            ValueError: the rectangle is too small.
+        """
+        count = len(scene.block_geoms)
+        # Equal room for every block, so that this draw is independent of sizes, shapes and distractors.
+        radii = [PAD_RADIUS, *[ROOM] * count, *[PAD_RADIUS] * (len(PADS) - 1)]
+        for _ in range(200):
+            centres = self._scattered(radii, random_state)
+            if len(centres) == len(radii):
+                break
+        else:
+            raise ValueError(
+                f"no room for {len(PADS)} pads and {count} blocks {self.clearance} m apart in x {self.x}, y {self.y}; "
+                "widen task.randomize.placement or lower its clearance"
+            )
+        yaws = random_state.uniform(*self.yaw, count)
+        pads, blocks = [centres[0], *centres[count + 1 :]], centres[1 : count + 1]
+        for pad, (x, y) in enumerate(pads):
+            scene.place_pad(pad, x, y)
+        for index, (x, y) in enumerate(blocks):
+            scene.place_block(index, x, y, yaws[index])
+        return {
+            "pad": rounded(np.array(pads[0])),
+            "pads": rounded(np.array(pads)),
+            "blocks": rounded(np.array(blocks)),
+            "yaw": rounded(yaws),
+        }
+
+    def _scattered(self, radii: Sequence[float], random_state: np.random.RandomState) -> list[tuple[float, float]]:
+        """Sample centres x, y of disjoint discs by rejection; fewer than `radii` if a disc finds no room."""
+        centres: list[tuple[float, float]] = []
+        for radius in radii:
+            for _ in range(100):
+                centre = random_state.uniform(*self.x), random_state.uniform(*self.y)
+                apart = (dist(centre, other) - near for other, near in zip(centres, radii, strict=False))
+                if all(gap > radius + self.clearance for gap in apart):
+                    centres.append(centre)
+                    break
+            else:
+                return centres
+        return centres

@@ -1,0 +1,121 @@
+"""Randomizers of the surroundings: light, cameras, table and background."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from annotated_types import Ge, Le
+
+from vla.io.types import NonNegativeRange, Share
+from vla.spec import Array
+from vla.tasks.tabletop.compiled_scene import CompiledScene
+from vla.tasks.tabletop.randomize.randomizer import Angle, Length, Shares, rounded
+from vla.tasks.tabletop.scene import LAMP_DISTANCE, SHADOWED, TEXTURE
+
+PATTERNS = ("checks", "stripes", "patches")
+
+
+@dataclass(frozen=True)
+class Light:
+    """Brightness, colour and direction of the lamp."""
+
+    brightness: NonNegativeRange | None  # range of brightness 0…1, or None for the nominal one
+    tint: Share  # maximum change of each channel
+    tilt: Angle  # maximum tilt [rad]
+
+    def __call__(self, scene: CompiledScene, random_state: np.random.RandomState) -> dict[str, Any]:
+        """Draw the properties of the directional lamp."""
+        nominal = scene.model.light_diffuse[0]
+        brightness = nominal if self.brightness is None else random_state.uniform(*self.brightness)
+        diffuse = brightness + random_state.uniform(-self.tint, self.tint, 3)
+        direction = scene.model.light_dir[0] + np.append(np.tan(random_state.uniform(-self.tilt, self.tilt, 2)), 0.0)
+        scene.model.light_diffuse[0] = diffuse
+        scene.model.light_dir[0] = direction / np.linalg.norm(direction)
+        scene.model.light_pos[0] = np.array(SHADOWED) - LAMP_DISTANCE * scene.model.light_dir[0]
+        return {"diffuse": rounded(diffuse), "direction": rounded(scene.model.light_dir[0])}
+
+
+@dataclass(frozen=True)
+class Cameras:
+    """Position, orientation and field of view of each camera."""
+
+    position: Length  # maximum shift along each axis [m]
+    rotation: Angle  # maximum rotation about each axis [rad]
+    fovy: Annotated[float, Ge(0), Le(30)]  # maximum change of the field of view [degrees]
+    wrist: Share = 0.25  # share of all three for the wrist camera, which is mounted rigidly
+
+    def __call__(self, scene: CompiledScene, random_state: np.random.RandomState) -> dict[str, Any]:
+        """Draw a mounting error per camera."""
+        draws = {}
+        for name, camera in scene.cameras.items():
+            share = self.wrist if name == "wrist" else 1.0
+            shift, turn = random_state.uniform(-share, share, 3), random_state.uniform(-share, share, 3)
+            zoom = random_state.uniform(-share, share)
+            scene.model.cam_pos[camera] += self.position * shift
+            scene.model.cam_fovy[camera] += self.fovy * zoom
+            scene.turn_camera(camera, self.rotation * turn)
+            draws[name] = {
+                "position": rounded(self.position * shift),
+                "rotation": rounded(self.rotation * turn),
+                "fovy": round(self.fovy * zoom, 3),
+            }
+        return draws
+
+
+@dataclass(frozen=True)
+class Table:
+    """Colour of the table."""
+
+    brightness: Shares  # range of brightness, 0…1
+    tint: Share  # maximum change of each channel
+
+    def __call__(self, scene: CompiledScene, random_state: np.random.RandomState) -> dict[str, Any]:
+        """Draw a colour."""
+        rgb = random_state.uniform(*self.brightness) + random_state.uniform(-self.tint, self.tint, 3)
+        scene.model.geom_rgba[scene.model.geom("table").id, :3] = rgb
+        return {"rgb": rounded(rgb)}
+
+
+@dataclass(frozen=True)
+class Texture:
+    """Random texture on table or floor: checks, stripes or patches in two shades."""
+
+    surface: Literal["table", "floor"]
+    contrast: Shares  # range of the contrast of the second shade, 0…1
+
+    def __call__(self, scene: CompiledScene, random_state: np.random.RandomState) -> dict[str, Any]:
+        """Draw a pattern."""
+        kind = PATTERNS[random_state.randint(len(PATTERNS))]
+        shade = 1 - random_state.uniform(*self.contrast) * random_state.uniform(0, 1, 3)
+        where = _pattern(kind, random_state)[:, :, None]  # (H, W, 1) 0…1
+        picture = 255 * (1 - where + where * shade)
+        scene.paint_texture(self.surface, picture.astype(np.uint8))
+        return {"kind": kind, "shade": rounded(shade)}
+
+
+def _pattern(kind: str, random_state: np.random.RandomState) -> Array:
+    """Draw (TEXTURE, TEXTURE) 0…1, the weight of the second shade."""
+    across, along = np.meshgrid(np.arange(TEXTURE), np.arange(TEXTURE))
+    if kind == "patches":
+        coarse = random_state.uniform(0, 1, (8, 8))
+        return np.kron(coarse, np.ones((TEXTURE // 8, TEXTURE // 8)))
+    width = int(random_state.choice([4, 8, 16]))
+    if kind == "stripes":
+        return ((across // width) % 2).astype(float)
+    return ((across // width + along // width) % 2).astype(float)
+
+
+@dataclass(frozen=True)
+class Background:
+    """Colour of the floor around the table."""
+
+    brightness: Shares  # range of brightness, 0…1
+    tint: Share  # maximum change of each channel
+
+    def __call__(self, scene: CompiledScene, random_state: np.random.RandomState) -> dict[str, Any]:
+        """Draw a colour."""
+        rgb = random_state.uniform(*self.brightness) + random_state.uniform(-self.tint, self.tint, 3)
+        scene.model.geom_rgba[scene.model.geom("floor").id, :3] = np.clip(rgb, 0, 1)
+        return {"rgb": rounded(rgb)}

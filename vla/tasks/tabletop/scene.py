@@ -1,0 +1,198 @@
+"""The tabletop scene: table, lights, cameras, pads, blocks and robot."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from dm_control import composer, mjcf
+
+from vla.spec import Array
+from vla.tasks.tabletop.panda import Panda
+
+COLOURS: dict[str, tuple[float, float, float]] = {
+    "red": (0.85, 0.10, 0.10),
+    "green": (0.10, 0.65, 0.20),
+    "blue": (0.12, 0.25, 0.85),
+    "yellow": (0.95, 0.80, 0.10),
+    "purple": (0.50, 0.15, 0.65),
+    "orange": (0.95, 0.45, 0.08),
+}
+BLOCK_HALF_SIZE = 0.02  # nominal [m]
+BLOCK_DENSITY = 600.0  # of hardwood [kg/m³]
+PADS: dict[str, tuple[float, float, float]] = {"black": (0.12, 0.12, 0.14), "white": (0.93, 0.93, 0.90)}
+PAD_RADIUS = 0.05  # [m]
+PAD_THICKNESS = 0.001  # half [m]; pads do not collide
+TABLE_HALF_SIZE = (0.6, 0.8, 0.03)  # [m]
+TABLE_CENTRE = (0.4, 0.0)  # [m]
+LAMP_DIRECTION = np.array([-0.1, 0.25, -1.0]) / np.linalg.norm([-0.1, 0.25, -1.0])
+LAMP_DISTANCE = 2.0  # from the centre of the shadow region [m]
+SHADOWED = (0.42, 0.0, 0.1)  # centre of the shadow region [m]
+SHADOW_REACH = 0.6  # radius of the shadow region [m]
+TEXTURE = 64  # edge of the table's and the floor's texture [px]
+BLOCK_CONTACT = {"contype": 1, "conaffinity": 3}
+
+
+@dataclass(frozen=True)
+class CameraPose:
+    """A camera that looks from `position` at `target`, with a vertical field of view."""
+
+    position: tuple[float, float, float]  # [m]
+    target: tuple[float, float, float]  # [m]
+    fovy: float  # [degrees]
+
+
+FRONT = CameraPose(position=(1.02, 0.0, 0.52), target=(0.5, 0.0, 0.05), fovy=45.0)  # in the base frame
+WRIST = CameraPose(position=(0.085, 0.0, 0.035), target=(0.02, 0.0, 0.12), fovy=75.0)  # in the hand's frame
+WRIST_UP = (1.0, 0.0, 0.0)
+
+
+def look_at(position: Sequence[float] | Array, target: Sequence[float] | Array, up: Sequence[float] | Array) -> Array:
+    """Return the rotation (3, 3) of a camera at `position` that looks at `target` along its negative z axis, y up."""
+    back = np.asarray(position, dtype=float) - np.asarray(target, dtype=float)
+    back /= np.linalg.norm(back)
+    right = np.cross(up, back)
+    right /= np.linalg.norm(right)
+    return np.stack([right, np.cross(back, right), back], axis=1)
+
+
+class Block(composer.Entity):
+    """A coloured block, a cube before randomisation."""
+
+    def _build(self, name: str) -> None:
+        self._root = mjcf.RootElement(model=name)
+        self._root.compiler.angle = "radian"
+        self.geom = self._root.worldbody.add(
+            "geom",
+            name="cube",
+            type="box",
+            size=(BLOCK_HALF_SIZE,) * 3,
+            density=BLOCK_DENSITY,
+            condim=4,
+            friction=(1.0, 0.01, 0.0002),
+            group=2,
+            **BLOCK_CONTACT,
+        )
+
+    @property
+    def mjcf_model(self) -> mjcf.RootElement:
+        """The model's root element."""
+        return self._root
+
+
+class Scene(composer.Entity):
+    """The complete scene; `CompiledScene` indexes its compiled model."""
+
+    def _build(self, blocks: int = 4, meshes: Literal["light", "full"] = "light", shadows: bool = True) -> None:
+        """Args: number of blocks; robot meshes, "light" or "full"; whether the lamp casts shadows."""
+        self._root = mjcf.RootElement(model="tabletop")
+        self._root.compiler.angle = "radian"
+        self._set_physics()
+        self._set_quality()
+        self._add_table()
+        self._add_lights(shadows)
+        self.panda = Panda(meshes=meshes)
+        self.attach(self.panda)
+        self._add_cameras()
+        self.blocks = [Block(name=f"block{index}") for index in range(blocks)]
+        for block in self.blocks:
+            frame = self.attach(block)
+            frame.add("freejoint")
+
+    @property
+    def mjcf_model(self) -> mjcf.RootElement:
+        """The model's root element."""
+        return self._root
+
+    def _set_physics(self) -> None:
+        option = self._root.option
+        option.timestep, option.integrator = 0.004, "implicitfast"
+        option.cone, option.impratio = "elliptic", 10  # prevent slip of held blocks
+
+    def _set_quality(self) -> None:
+        visual = self._root.visual
+        # On a CPU, MuJoCo's default multisampling and shadow map take thirty times as long, and its default
+        # tessellation of boxes and cylinders half as much again.
+        visual.quality.shadowsize, visual.quality.offsamples = 192, 0
+        visual.quality.numslices, visual.quality.numstacks, visual.quality.numquads = 24, 2, 1
+        visual.map.znear, visual.map.zfar = 0.01, 10.0
+        visual.headlight.ambient, visual.headlight.diffuse = (0.42,) * 3, (0.2,) * 3
+        visual.headlight.specular = (0.0,) * 3
+        visual.map.shadowclip = SHADOW_REACH  # [m], as the extent is 1
+        self._root.statistic.extent, self._root.statistic.center = 1.0, (0.4, 0, 0.2)
+        self._root.asset.add(
+            "texture",
+            type="skybox",
+            builtin="gradient",
+            rgb1=(0.78, 0.83, 0.88),
+            rgb2=(0.55, 0.60, 0.66),
+            width=64,
+            height=384,
+        )
+
+    def _add_table(self) -> None:
+        world = self._root.worldbody
+        world.add(
+            "geom",
+            name="table",
+            type="box",
+            size=TABLE_HALF_SIZE,
+            pos=(*TABLE_CENTRE, -TABLE_HALF_SIZE[2]),
+            rgba=(0.72, 0.66, 0.58, 1),
+            friction=(1.0, 0.01, 0.0002),
+            group=2,
+            material=self._add_material("table", repeat=(3, 4)),
+        )
+        world.add(
+            "geom",
+            name="floor",
+            type="plane",
+            size=(3, 3, 0.1),
+            pos=(0, 0, -0.75),
+            rgba=(0.45, 0.46, 0.48, 1),
+            group=2,
+            material=self._add_material("floor", repeat=(6, 6)),
+        )
+        for name, rgb in PADS.items():
+            pad = world.add("body", name=f"{name}_pad", mocap=True, pos=(0.5, 0, PAD_THICKNESS))
+            pad.add(
+                "geom",
+                name=f"{name}_pad",
+                type="cylinder",
+                size=(PAD_RADIUS, PAD_THICKNESS),
+                rgba=(*rgb, 1),
+                contype=0,
+                conaffinity=0,
+                group=2,
+            )
+
+    def _add_material(self, name: str, repeat: tuple[int, int]) -> mjcf.Element:
+        """Add a material with its own texture, white before randomisation."""
+        texture = self._root.asset.add(
+            "texture", name=name, type="2d", builtin="flat", rgb1=(1, 1, 1), width=TEXTURE, height=TEXTURE
+        )
+        return self._root.asset.add("material", name=name, texture=texture, texrepeat=repeat, specular=0.0)
+
+    def _add_lights(self, shadows: bool) -> None:
+        self._root.worldbody.add(
+            "light",
+            name="lamp",
+            pos=np.array(SHADOWED) - LAMP_DISTANCE * LAMP_DIRECTION,
+            dir=LAMP_DIRECTION,
+            directional=True,
+            castshadow=shadows,
+            diffuse=(0.55,) * 3,
+            specular=(0.15,) * 3,
+        )
+
+    def _add_cameras(self) -> None:
+        front = look_at(FRONT.position, FRONT.target, (0, 0, 1))
+        self._root.worldbody.add(
+            "camera", name="front", pos=FRONT.position, xyaxes=(*front[:, 0], *front[:, 1]), fovy=FRONT.fovy
+        )
+        wrist = look_at(WRIST.position, WRIST.target, WRIST_UP)
+        self.panda.hand.add(
+            "camera", name="wrist", pos=WRIST.position, xyaxes=(*wrist[:, 0], *wrist[:, 1]), fovy=WRIST.fovy
+        )

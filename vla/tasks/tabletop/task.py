@@ -1,0 +1,265 @@
+"""The dm_control task: episodes sampled from a seed, stepped by actions, with a classified outcome."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Mapping
+from typing import Any
+
+import mujoco
+import numpy as np
+from dm_control import composer, mjcf
+from dm_env import specs
+
+from vla.robots.panda import FINGER_SPEED, FINGER_TRAVEL, CartesianController
+from vla.spec import FIRST_SEED, Array
+from vla.tasks.language import HeldOut
+from vla.tasks.streams import Streams
+from vla.tasks.tabletop.compiled_scene import CompiledScene
+from vla.tasks.tabletop.goals.goal import SKILLS, Goal, Referents, WorldState
+from vla.tasks.tabletop.goals.mixed import Mixed
+from vla.tasks.tabletop.outcome import OutcomeClassifier
+from vla.tasks.tabletop.panda import DAMPING_RATIO
+from vla.tasks.tabletop.randomize.randomizer import Randomizer
+from vla.tasks.tabletop.scene import COLOURS, PADS, Scene
+
+CONTROL_HZ = 10.0
+WORKSPACE = ((0.25, -0.40, 0.008), (0.75, 0.40, 0.50))  # corners of the box that bounds the tool point [m]
+FINGER_STEP = FINGER_SPEED / CONTROL_HZ  # largest motion of a finger per control period [m]
+
+
+class FastEnvironment(composer.Environment):
+    """Composer's environment with all substeps in one loop: its hooks per substep take longer than MuJoCo itself."""
+
+    def __init__(self, task: TabletopTask) -> None:
+        # Every reset writes into the compiled model instead of compiling again.
+        super().__init__(task, recompile_mjcf_every_episode=False)
+
+    def _substep(self, action: Array) -> None:
+        self._task.advance(self._physics, self._task.substeps)
+
+
+class TabletopTask(composer.Task):
+    """Manipulation of blocks on a table by instruction."""
+
+    def __init__(
+        self,
+        goal: Goal | Mixed,
+        randomize: Mapping[str, Randomizer | None],
+        scene: Scene,
+        low: Array,
+        high: Array,
+        time_limit: float,
+    ) -> None:
+        """Args:
+        goal: goal, or mixture of goals.
+        randomize: axis name → randomizer, or None to disable the axis.
+        scene: the world.
+        low: lower bounds (7,) of an action.
+        high: upper bounds (7,) of an action.
+        time_limit: length of an episode per block to be moved [s].
+        """
+        self.goals, self.randomize, self.scene = goal, randomize, scene
+        self._time_limit = time_limit
+        self._low, self._high = low, high
+        self.control_timestep = 1 / CONTROL_HZ
+        self.substeps = round(self.control_timestep / self.physics_timestep)
+        self.controller = CartesianController(self.control_timestep, *WORKSPACE)
+        self.seed: int | None = None  # of the next episode; None: drawn from composer's random state
+        self.draws: dict[str, Any] = {}
+        self.instruction = ""
+        self.streams = Streams()
+
+    @property
+    def root_entity(self) -> Scene:
+        """The scene."""
+        return self.scene
+
+    @property
+    def physics_steps_per_control_step(self) -> int:
+        """One for composer; `FastEnvironment` runs the real substeps."""
+        return 1
+
+    def after_compile(self, physics: mjcf.Physics, random_state: np.random.RandomState) -> None:
+        """Index the scene's elements in the compiled model."""
+        self.compiled = CompiledScene(self.scene, physics)
+
+    def initialize_episode(self, physics: mjcf.Physics, random_state: np.random.RandomState) -> None:
+        """Randomise the compiled model in place, then draw goal and instruction."""
+        seed = int(random_state.randint(FIRST_SEED)) if self.seed is None else self.seed
+        self.seed = None
+        self.compiled.restore()
+        axes = {name: axis for name, axis in self.randomize.items() if axis is not None}
+        draws = {name: axis(self.compiled, self.streams(seed, name)) for name, axis in axes.items()}
+        self.goal = self.goals.draw(self.streams(seed, "goal"))
+        self.compiled.present = max(self.compiled.present, self.goal.blocks)
+        self.compiled.finish(self.goal.pads)
+        physics.forward()
+        held_out = self._held_out(seed)
+        self.referents = self._choose(held_out, self.streams(seed, "named"))
+        self.instruction = self.goal.language.say(self._slots(seed), held_out, self.streams(seed, "language"))
+        language = {"instruction": self.instruction, "held_out": held_out or "none"}
+        self.draws = {"named": self._named(), **draws, "language": language}
+        data = self.compiled.data
+        self.controller.reset(data.qpos[self.compiled.joints])
+        self._command = np.append(self.controller.joints, data.qpos[self.compiled.fingers].mean())
+        data.ctrl[:] = self._command
+        self._late: deque[Array] = deque()  # commands delayed by the latency
+        self._delay = round(self.compiled.latency / physics.timestep())
+        self._cached: tuple[float, WorldState] | None = None  # simulation time [s] and state
+        self._starts, self._lifts = self.compiled.block_centres(), np.zeros(self.compiled.present)
+        self.classifier = OutcomeClassifier(self.goal.hold_steps)
+        self._periods, self._most_periods = 0, round(self._time_limit * self.goal.moves * CONTROL_HZ)
+
+    def _held_out(self, seed: int) -> HeldOut | None:
+        """Draw which part of the instruction is held out; None in training and in the rest of an evaluation."""
+        if seed < FIRST_SEED:
+            return None
+        random_state = self.streams(seed, "novelty")  # the name seeds the stream
+        if random_state.uniform() >= self.compiled.held_out:
+            return None
+        present = set(self.compiled.block_names[: self.compiled.present])
+        possible = present & set(self.goal.language.held_out_colours)
+        kinds = [kind for kind in self.goal.language.held_out_kinds if kind != "combinations" or possible]
+        return kinds[random_state.randint(len(kinds))]
+
+    def _choose(self, held_out: HeldOut | None, random_state: np.random.RandomState) -> Referents:
+        """Draw the named blocks and pads; the first block has a colour that the instruction may name."""
+        colours = self.goal.language.held_out_colours
+        order = [int(index) for index in random_state.permutation(self.compiled.present)]
+        # The sort is stable: without held-out colours it changes nothing.
+        order.sort(key=lambda index: (self.compiled.block_names[index] in colours) != (held_out == "combinations"))
+        order = order[self.compiled.skip :] + order[: self.compiled.skip]
+        pads = [int(index) for index in random_state.permutation(self.goal.pads)]
+        return Referents(tuple(order[: self.goal.named]), tuple(pads))
+
+    def _slots(self, seed: int) -> dict[str, str]:
+        """Return the words that fill the goal's slots of an instruction."""
+        blocks = zip(("block", "other"), self.referents.blocks, strict=False)
+        pads = zip(("pad", "rest"), self.referents.pads, strict=False)
+        slots = {slot: self.compiled.block_names[index] for slot, index in blocks}
+        if self.goal.absent:
+            missing = [name for name in COLOURS if name not in self.compiled.block_names[: self.compiled.present]]
+            slots["absent"] = missing[self.streams(seed, "absent").randint(len(missing))]
+        return slots | {slot: list(PADS)[index] for slot, index in pads}
+
+    def _named(self) -> dict[str, Any]:
+        """Return the draws of the first named block, for reports on what success depends on."""
+        index = self.referents.blocks[0]
+        x, y, _ = self.compiled.block_centres()[index]
+        rotation = self.compiled.data.geom_xmat[self.compiled.block_geoms[index]].reshape(3, 3)
+        return {
+            "goal": type(self.goal).__name__,
+            "index": index,
+            "position": [round(float(x), 5), round(float(y), 5)],
+            "colour": self.compiled.block_names[index],
+            "yaw": round(float(np.arctan2(rotation[1, 0], rotation[0, 0])), 5),
+            "half_size": round(float(self.compiled.extents[index, 0]), 5),
+        }
+
+    def before_step(self, physics: mjcf.Physics, action: Array, random_state: np.random.RandomState) -> None:
+        """Convert the action to joint targets, interpolated linearly over the control period."""
+        action = np.clip(action, self._low, self._high)
+        grip = self._command[7]
+        goal = np.append(self.controller.step(action[:6]), action[6] * FINGER_TRAVEL)
+        goal[7] = grip + np.clip(goal[7] - grip, -FINGER_STEP, FINGER_STEP)
+        self._increment = (goal - self._command) / self.substeps
+
+    def follow(self, physics: mjcf.Physics, goal: Array, substeps: int) -> None:
+        """Step physics while interpolating the targets of joints [rad] and fingers [m] linearly to `goal` (8,)."""
+        furthest = FINGER_SPEED * substeps * physics.timestep()
+        finger = self._command[7] + np.clip(goal[7] - self._command[7], -furthest, furthest)
+        self._increment = (np.append(goal[:7], finger) - self._command) / substeps
+        self.advance(physics, substeps)
+
+    def advance(self, physics: mjcf.Physics, substeps: int) -> None:
+        """Step physics while interpolating the targets; a lead compensates the servo's damping, so the arm does not
+        lag."""
+        commands = self._command + np.arange(1, substeps + 1)[:, None] * self._increment
+        targets = commands.copy()
+        targets[:, :7] += DAMPING_RATIO / physics.timestep() * self._increment[:7]
+        self._command = commands[-1]
+        model, data = physics.model.ptr, physics.data.ptr
+        with physics.check_invalid_state():
+            for target in targets:
+                self._late.append(target)
+                if len(self._late) > self._delay:
+                    data.ctrl[:] = self._late.popleft()
+                mujoco.mj_step2(model, data)
+                mujoco.mj_step1(model, data)
+
+    def after_step(self, physics: mjcf.Physics, random_state: np.random.RandomState) -> None:
+        """Update the outcome after a control period."""
+        self._periods += 1
+        self._lifts = np.maximum(self._lifts, (self.compiled.block_centres() - self._starts)[:, 2])
+        state = self.world_state()
+        self.classifier.update(state, self.goal.subgoals(state, self.referents), self.referents.blocks)
+
+    def world_state(self) -> WorldState:
+        """Return the current true state."""
+        now = float(self.compiled.data.time)
+        if self._cached is None or self._cached[0] != now:
+            self._cached = now, self._measure()
+        return self._cached[1]
+
+    def _measure(self) -> WorldState:
+        compiled, present = self.compiled, self.compiled.present
+        fingers: list[set[int]] = [set() for _ in range(present)]
+        for finger, block in compiled.touching():
+            fingers[block].add(finger)
+        velocities = compiled.data.qvel[compiled.block_velocities[:present, None] + np.arange(3)]  # (B, 3)
+        return WorldState(
+            positions=compiled.block_centres(),
+            starts=self._starts,
+            extents=compiled.extents[:present],
+            speeds=np.linalg.norm(velocities, axis=1),
+            lifts=self._lifts,
+            held=np.array([len(touching) == 2 for touching in fingers]),
+            touched=np.array([bool(touching) for touching in fingers]),
+            pads=compiled.data.mocap_pos[compiled.zones[: self.goal.pads]].copy(),
+            tool=compiled.data.site_xpos[compiled.tcp].copy(),
+            arm_speed=float(np.abs(compiled.data.qvel[compiled.velocities]).max()),
+        )
+
+    def truth(self) -> dict[str, Array]:
+        """Return the privileged state for experts, by name, of the current subgoal and its block; lengths in [m].
+
+        faces: cosine and sine of four times the yaw from the fingers to the block's faces, because a cube is symmetric
+        under quarter turns.
+        """
+        compiled, state = self.compiled, self.world_state()
+        subgoals = self.goal.subgoals(state, self.referents)
+        now = next((subgoal for subgoal in subgoals if not subgoal.done), subgoals[-1])
+        block = compiled.data.geom_xmat[compiled.block_geoms[now.block]].reshape(3, 3)
+        edge = block[:, int(np.argmin(np.abs(block[2])))]  # the most horizontal edge, for any face up
+        gripper = self.controller.pose[:, 0]
+        quarters = 4 * (np.arctan2(edge[1], edge[0]) - np.arctan2(gripper[1], gripper[0]))
+        return {
+            "tcp": state.tool,
+            "block": state.positions[now.block],
+            "destination": now.destination,
+            "commanded": self.controller.pose.copy(),  # (4, 4)
+            "commanded_position": self.controller.pose[:3, 3].copy(),
+            "faces": np.array([np.cos(quarters), np.sin(quarters)]),
+            "half_size": state.extents[now.block],  # (3,)
+            "grasped": np.array([float(state.held[now.block])]),
+            "skill": np.array([float(SKILLS.index(now.skill))]),
+            "tolerance": np.array([now.tolerance]),
+        }
+
+    def get_reward(self, physics: mjcf.Physics) -> float:
+        """Return 1 after the goal was reached and held."""
+        return float(self.classifier.success)
+
+    @property
+    def over(self) -> bool:
+        """Whether the goal was reached and held, or the time limit is reached."""
+        return self.classifier.success or self._periods >= self._most_periods
+
+    def should_terminate_episode(self, physics: mjcf.Physics) -> bool:
+        """Return `over`."""
+        return self.over
+
+    def action_spec(self, physics: mjcf.Physics) -> specs.BoundedArray:
+        """Return the bounds of the seven components."""
+        return specs.BoundedArray((7,), np.float32, self._low, self._high, name="dx\tdy\tdz\trx\try\trz\tgripper")

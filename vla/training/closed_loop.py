@@ -1,0 +1,100 @@
+"""Closed-loop validation: success rate on fixed seeds during training, which selects the best checkpoint."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from lightning import Callback, LightningModule, Trainer
+
+from vla.models.learner import Learner
+from vla.models.model import Model
+from vla.rollouts.evaluate import play
+from vla.rollouts.statistics import wilson_interval
+from vla.spec import Agent, Environment
+
+log = logging.getLogger(__name__)
+
+BEST = "best.ckpt"
+
+
+class ClosedLoop(Callback):
+    """Plays episodes with the EMA weights in every validation, and logs `val/success`, 0…1.
+
+    The processes of a training split the episodes. The weights with the highest success rate are saved as `best.ckpt`;
+    ties go to the newest. With sharded weights nothing is played, because all processes would have to act in step.
+
+    Args:
+        make_environment: factory of the environment, called once per process.
+        make_policy: factory of a policy from the model in training.
+        seeds: of the episodes, the same in every validation.
+        checkpoints: folder of `best.ckpt`.
+    """
+
+    def __init__(
+        self,
+        make_environment: Callable[[], Environment],
+        make_policy: Callable[[Model], Agent],
+        seeds: Sequence[int],
+        checkpoints: Path,
+    ) -> None:
+        self._make_environment, self._make_policy, self._seeds = make_environment, make_policy, seeds
+        self._path = checkpoints / BEST
+        self._environment: Environment | None = None
+        self.success, self.best = 0.0, -1.0
+
+    def on_validation_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Play the episodes; later callbacks restore the weights in training."""
+        assert isinstance(pl_module, Learner)
+        if pl_module.device_mesh is not None:
+            return
+        if self._environment is None:
+            self._environment = self._make_environment()
+        policy = self._make_policy(pl_module.model)
+        mine = self._seeds[trainer.global_rank :: trainer.world_size]
+        with torch.compiler.set_stance("force_eager"):  # a window has another shape than was compiled
+            results = [play(self._environment, policy, seed) for seed in mine]
+        for result in results:
+            if result.error:
+                log.warning("validation: seed %d could not be played: %s", result.seed, result.error)
+        successes = sum(result.outcome == "success" for result in results)
+        share = torch.tensor(successes / len(self._seeds), device=pl_module.device)
+        pl_module.log("val/success", share, sync_dist=True, reduce_fx="sum")
+
+    def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Save `best.ckpt` if the success rate is at least the best so far."""
+        self.success = float(trainer.callback_metrics.get("val/success", -1.0))
+        if self.success >= max(self.best, 0.0):
+            self.best = self.success
+            trainer.save_checkpoint(self._path, weights_only=False)
+
+    def teardown(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
+        """Close the environment."""
+        if self._environment is not None:
+            self._environment.close()
+            self._environment = None
+
+    def selected_checkpoint(self, last: Path) -> Path:
+        """Return `best.ckpt` if the last success rate is below the 95 % confidence interval of the best, else `last`.
+
+        Smaller differences between a few episodes are chance, and longer training is better.
+        """
+        low, _ = wilson_interval(round(max(self.best, 0.0) * len(self._seeds)), len(self._seeds))
+        if self.success >= low or not self._path.exists():
+            return last
+        log.info("success in validation fell from %.0f to %.0f %%: %s", 100 * self.best, 100 * self.success, self._path)
+        return self._path
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return the state to save in a checkpoint."""
+        return {"success": self.success, "best": self.best, "seeds": list(self._seeds)}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Restore the state."""
+        self.success = state_dict["success"]
+        # The best is void in another folder or with other episodes.
+        if self._path.exists() and state_dict.get("seeds") == list(self._seeds):
+            self.best = state_dict["best"]

@@ -1,0 +1,127 @@
+"""Throughput metrics and the progress bar of training."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+import torch
+from lightning import Callback, LightningModule, Trainer
+from lightning.pytorch.callbacks import RichProgressBar
+
+from vla.models.flops import matmul_flops, peak_flops, training_flops
+from vla.models.learner import Learner
+
+PEAK_SECONDS = 0.1  # duration of the measurement of an unknown peak
+
+
+class Throughput(Callback):
+    """Logs throughput between two log steps, without validation.
+
+    - `pace/samples_per_s`: samples per second of all processes.
+    - `pace/waiting`: share of the time in which this process waited for data, from `waited` [s] of the data loader.
+    - `pace/mfu`: model FLOPs utilisation (arXiv 2204.02311). Without a data sheet the peak is the best rate measured so
+      far, of matrix products or of the training itself.
+    - `pace/memory_gb`: peak memory, on GPUs.
+
+    Lightning's `ThroughputMonitor` synchronises the GPU in every step and does not measure data loading.
+    """
+
+    def __init__(self) -> None:
+        self._flops = self._peak = 0.0  # per step of this process; of its device [FLOP/s]
+        self._batches, self._began, self._paused, self._waited = 0, 0.0, 0.0, 0.0
+
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Start the measurement."""
+        self._restart(trainer)
+
+    def on_validation_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Pause the measurement."""
+        self._paused = time.perf_counter()
+
+    def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Resume the measurement."""
+        self._began += time.perf_counter() - self._paused
+
+    def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, batch: Any, batch_idx: int) -> None:
+        """Count the FLOPs of the first batch; all batches have the same size."""
+        assert isinstance(pl_module, Learner)
+        if not self._flops and pl_module.device_mesh is None:
+            device = pl_module.device
+            self._flops = training_flops(pl_module.model, batch)
+            self._peak = peak_flops(device, trainer.precision) or matmul_flops(device, trainer.precision, PEAK_SECONDS)
+            self._restart(trainer)
+
+    def on_train_batch_end(
+        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
+    ) -> None:
+        """Log every `log_every_n_steps` batches."""
+        self._batches += 1
+        every = trainer.log_every_n_steps  # type: ignore[attr-defined]
+        if not every or (batch_idx + 1) % every:
+            return
+        seconds = time.perf_counter() - self._began
+        samples = self._batches * trainer.world_size * len(batch["action"])
+        pace = {
+            "pace/samples_per_s": samples / seconds,
+            "pace/waiting": (_waited(trainer) - self._waited) / seconds,
+        }
+        if self._flops:  # unknown for sharded weights, which cannot be copied
+            rate = self._flops * self._batches / seconds
+            self._peak = max(self._peak, rate)
+            pace["pace/mfu"] = rate / self._peak
+        if pl_module.device.type == "cuda":
+            pace["pace/memory_gb"] = torch.cuda.max_memory_allocated(pl_module.device) / 1e9
+        pl_module.log_dict(pace)
+        self._restart(trainer)
+
+    def _restart(self, trainer: Trainer) -> None:
+        self._batches, self._began, self._waited = 0, time.perf_counter(), _waited(trainer)
+
+
+def _waited(trainer: Trainer) -> float:
+    """Return the time spent waiting for batches [s]; 0 for data loaders that do not measure it."""
+    return float(getattr(trainer.train_dataloader, "waited", 0.0))
+
+
+class TrainingProgressBar(RichProgressBar):
+    """Progress bar over training steps.
+
+    Lightning's own bar labels training without epochs "Epoch 0/-2", and restarts at 0 after resuming.
+    """
+
+    READ_EVERY = 10  # steps; each read synchronises the GPU
+
+    def __init__(self) -> None:
+        super().__init__(refresh_rate=4)  # a second: painting takes milliseconds, in a thread that the model waits for
+        self._loss = float("nan")
+
+    def on_train_batch_end(
+        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
+    ) -> None:
+        """Advance the bar; read the loss every `READ_EVERY` batches."""
+        if batch_idx % self.READ_EVERY == 0:
+            self._loss = outputs["loss"].item()
+        super().on_train_batch_end(trainer, pl_module, outputs, batch, batch_idx)
+
+    @property
+    def total_train_batches(self) -> int | float:
+        """Return the batches of the whole training; infinity if only its time is limited."""
+        trainer = self.trainer
+        return trainer.max_steps * trainer.accumulate_grad_batches if trainer.max_steps > 0 else float("inf")
+
+    def get_metrics(
+        self, trainer: Trainer, pl_module: LightningModule
+    ) -> dict[str, int | str | float | dict[str, float]]:
+        """Return the columns beside the bar: loss, samples per second, share of waiting for data, success."""
+        logged = trainer.callback_metrics
+        shown: dict[str, int | str | float | dict[str, float]] = {"loss": f"{self._loss:.3f}"}
+        if "pace/samples_per_s" in logged:
+            shown["samples/s"] = f"{logged['pace/samples_per_s']:.0f}"
+            shown["waiting"] = f"{logged['pace/waiting']:.0%}"
+        if "val/success" in logged:
+            shown["success"] = f"{logged['val/success']:.0%}"
+        return shown
+
+    def _get_train_description(self, current_epoch: int) -> str:
+        return "training".ljust(len(self.validation_description))  # equal lengths avoid flicker
