@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import asyncio
 import re
 import threading
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
+from contextlib import AbstractContextManager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -51,27 +50,9 @@ def settings(policy: Policy, **changes: Any) -> PolicyServer:
     return PolicyServer(**{**values, **changes})
 
 
-@contextmanager
-def serving(policy: Policy, **changes: Any) -> Iterator[str]:
+def serving(policy: Policy, **changes: Any) -> AbstractContextManager[str]:
     """A server in a thread of its own, by its URL."""
-    ready, url = threading.Event(), []
-    loop, stop = asyncio.new_event_loop(), asyncio.Event()
-
-    async def serve() -> None:
-        async with Service(settings(policy, **changes), policy).listening() as here:
-            url.append(here)
-            ready.set()
-            await stop.wait()
-
-    thread = threading.Thread(target=loop.run_until_complete, args=[serve()])
-    thread.start()
-    try:
-        assert ready.wait(20)
-        yield url[0]
-    finally:
-        loop.call_soon_threadsafe(stop.set)
-        thread.join(20)
-        loop.close()
+    return Service(settings(policy, **changes), policy).in_thread()
 
 
 def client(url: str, **options: Any) -> ClientConnection:
@@ -290,6 +271,8 @@ def test_beyond_this_machine_nobody_listens_without_a_key(tmp_path: Path) -> Non
     assert settings(policy, host="0.0.0.0", api_key="open").host == "0.0.0.0"
     with pytest.raises(ValueError, match=r"needs both deploy\.certificate and deploy\.private_key"):
         settings(policy, certificate=str(tmp_path / "certificate.pem"))
+    with serving(policy) as url, pytest.raises(OSError, match="in use"), serving(policy, port=int(url[-5:])):
+        pass
     with pytest.raises(ValueError, match=r"set deploy\.keys\.images\.eye=KEY"):
         settings(policy, keys=replace(KEYS, images={})).run()
 

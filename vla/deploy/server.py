@@ -13,12 +13,13 @@ from __future__ import annotations
 import asyncio
 import hmac
 import logging
+import queue
 import signal
 import ssl
 import time
-from collections.abc import AsyncIterator, Callable, Mapping, Sequence
+from collections.abc import AsyncIterator, Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor
-from contextlib import asynccontextmanager, suppress
+from contextlib import asynccontextmanager, contextmanager, suppress
 from dataclasses import dataclass
 from http import HTTPStatus
 from ipaddress import ip_address
@@ -176,6 +177,26 @@ class Service:
                 host = f"[{settings.host}]" if ":" in settings.host else settings.host
                 yield f"{'wss' if context else 'ws'}://{host}:{port}"
             inference.cancel()
+
+    @contextmanager
+    def in_thread(self) -> Iterator[str]:
+        """Serve in a thread of its own within the context, which is entered with the URL."""
+        with asyncio.Runner() as runner, ThreadPoolExecutor(1, "server") as thread:
+            loop, url, stop = runner.get_loop(), queue.Queue[str](), asyncio.Event()
+
+            async def serve() -> None:
+                async with self.listening() as here:
+                    url.put(here)
+                    await stop.wait()
+
+            served = thread.submit(runner.run, serve())
+            served.add_done_callback(lambda _: url.put(""))  # it could not start
+            try:
+                if here := url.get():
+                    yield here
+            finally:
+                loop.call_soon_threadsafe(stop.set)
+                served.result()
 
     async def serve(self) -> None:
         """Serve until SIGINT or SIGTERM."""

@@ -8,6 +8,7 @@ from __future__ import annotations
 import time
 from collections import deque
 from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -72,6 +73,7 @@ class RemotePolicy:
         self.info: dict[str, Any] = {}
         self._chunk: deque[Array] = deque()
         self._low, self._high = np.array(self.spec.low, np.float32), np.array(self.spec.high, np.float32)
+        self._open = ExitStack()
         self._connection, self.metadata = self._connected()
         horizon, history = self.metadata.get("execute"), self.metadata.get("history")
         # A policy with a history wants to see every frame.
@@ -92,16 +94,21 @@ class RemotePolicy:
         """
         if not self._chunk:
             began = time.perf_counter()
-            answer = self._ask(self._message(observation))
+            answer = self.ask(observation)
             self.info = {"answer_ms": 1000 * (time.perf_counter() - began)}
             self._chunk.extend(self._translated(answer.get("actions"))[: self._execute])
         return self._chunk.popleft()
 
+    def ask(self, observation: Observation) -> dict[str, Any]:
+        """Return the server's answer to an observation. Raises as `act` does."""
+        return self._ask(self.message(observation))
+
     def close(self) -> None:
         """Close the connection."""
-        self._connection.close()
+        self._open.close()
 
-    def _message(self, observation: Observation) -> dict[str, Any]:
+    def message(self, observation: Observation) -> dict[str, Any]:
+        """Return the observation with the server's keys."""
         state = {
             key: observation.state if names is None else observation.state[self.spec.indices(names)]
             for key, names in self.state.items()
@@ -132,10 +139,11 @@ class RemotePolicy:
                 "agent=remote needs websockets: install this package with its extra server, as in "
                 "pip install -e '.[server]'"
             ) from error
+        times = {"open_timeout": self.timeout, "close_timeout": self.timeout}
         headers = {"Authorization": f"Api-Key {self.api_key}"} if self.api_key else None
         try:
-            connection = connect(
-                self.url, compression=None, max_size=2**26, additional_headers=headers, open_timeout=self.timeout
+            connection = self._open.enter_context(
+                connect(self.url, compression=None, max_size=2**26, additional_headers=headers, **times)
             )
             metadata = self._received(connection)
         except InvalidStatus as error:
