@@ -6,6 +6,7 @@ import ast
 import subprocess
 import sys
 from collections.abc import Iterator
+from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
 import pytest
@@ -84,6 +85,35 @@ def imports_at_once(path: Path) -> Iterator[str]:
         typing_only = isinstance(statement, ast.If) and "TYPE_CHECKING" in ast.unparse(statement.test)
         if not typing_only and not isinstance(statement, (ast.FunctionDef, ast.ClassDef)):
             yield from imports(statement)
+
+
+def references(module: str, source: str) -> set[str]:
+    """Modules that `module` imports anywhere, for type checkers included, or names in a string to import them later."""
+    tree = ast.parse(source)
+    named = set(imports(tree))
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Constant) and isinstance(node.value, str) and node.value.startswith("vla."):
+            package, _, name = node.value.rpartition(".")
+            in_package = {each for each in MODULES if package != "vla" and each.rpartition(".")[0] == package}
+            named |= {node.value, package} if name else in_package  # the name of a module or class, or its start
+    return {name for name in named if name in MODULES and name != module}
+
+
+def require_no_circle(sources: dict[str, str]) -> None:
+    TopologicalSorter({module: references(module, source) for module, source in sources.items()}).prepare()
+
+
+def test_no_imports_go_in_a_circle() -> None:
+    sources = {module: path.read_text(encoding="utf-8") for module, path in MODULES.items()}
+    require_no_circle(sources)
+    for lazy in (
+        "def later() -> None:\n    from vla.models.bc import BC",
+        "if TYPE_CHECKING:\n    from vla.models.bc import BC",
+        "import_module('vla.models.bc')",
+        "import_module(f'vla.models.{name}')",
+    ):
+        with pytest.raises(CycleError):
+            require_no_circle({**sources, "vla.io.types": f"{sources['vla.io.types']}\n{lazy}\n"})
 
 
 @pytest.mark.parametrize("module", [module for module in MODULES if module != "vla"])

@@ -20,8 +20,8 @@ from typing import TYPE_CHECKING, Any
 from uuid import uuid4
 
 from vla.io.types import Positive
-from vla.parallel.pool import Crashed, Pool, Worker, WorkerFactory, WorkersLost
-from vla.parallel.processes import one_thread
+from vla.parallel.pool import Crashed, Pool, WorkersLost
+from vla.parallel.processes import Worker, WorkerFactory, one_thread
 
 if TYPE_CHECKING:
     import distributed

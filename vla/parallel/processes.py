@@ -12,15 +12,27 @@ from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
 from multiprocessing import get_context, parent_process
 from multiprocessing.connection import Connection
-from typing import TYPE_CHECKING, Any
-
-if TYPE_CHECKING:
-    from vla.parallel.pool import Worker
+from typing import Any, Protocol
 
 PATIENCE = 5.0  # [s] for an idle process to free its resources
 
 # LP_NUM_THREADS is of Mesa's renderer, which counts only threads beside the calling one.
 THREAD_SETTINGS = {"OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "LP_NUM_THREADS": "0"}
+
+
+class Worker(Protocol):
+    """Sequential processor of items."""
+
+    def attempt(self, item: Any, /) -> Any:
+        """Return the result of one item."""
+        ...
+
+    def close(self) -> None:
+        """Free the resources of the worker."""
+        ...
+
+
+WorkerFactory = Callable[[], Worker]
 
 
 class ProcessEnded(Exception):
