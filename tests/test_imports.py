@@ -19,7 +19,7 @@ MODULES = {
 
 # Parts import those of the rows above and nothing of their own row but themselves, lazy imports counted.
 LAYERS = (
-    ("vla.io", "vla.tasks.gl"),
+    ("vla.io",),
     ("vla.spec", "vla.parallel"),
     ("vla.robots",),
     ("vla.models", "vla.data", "vla.tasks"),
@@ -131,6 +131,17 @@ def test_the_entry_dispatches_with_few_modules() -> None:
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, timeout=60)
     modules = [name for name in done.stdout.split() if MODULES.get(name, ROOT / "__init__.py").name != "__init__.py"]
     assert "vla.config.check" in modules and len(modules) <= 25, sorted(modules)
+
+
+def test_only_worlds_of_mujoco_choose_its_backend_and_before_they_import_it() -> None:
+    worlds = {
+        module.rpartition(".")[0]
+        for module, path in MODULES.items()
+        if within(module, ("vla.tasks",)) and not within(module, ("vla.tasks.rendering",))
+        if {name.partition(".")[0] for name in imports(ast.parse(path.read_text(encoding="utf-8")))} & {"mujoco"}
+    }
+    choosing = {m for m in MODULES if "vla.tasks.gl" in references(m, MODULES[m].read_text(encoding="utf-8"))}
+    assert worlds <= choosing and all(within(module, ("vla.tasks",)) for module in choosing)
 
 
 def test_the_simulator_needs_no_torch() -> None:
