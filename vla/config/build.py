@@ -48,6 +48,7 @@ GROUPS = {
     "trainer": Group(("lightning.Trainer",), ("callbacks", "logger")),
     "logger": Group(("lightning.pytorch.loggers.Logger",), ("save_dir",), optional=True, several=True),
     "policy": Group(("vla.policy.Policy",), ("model", "spec")),
+    "agent": Group(("vla.spec.Agent",), ("spec",), optional=True),
     "recorder": Group(("vla.spec.Recorder",), ("folder",), optional=True),
     "export": Group(("vla.spec.Exporter", "vla.spec.PolicyExporter")),
     "deploy": Group(("vla.spec.Deployment",), ("policy", "environment", "output")),

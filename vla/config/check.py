@@ -30,13 +30,15 @@ class Job:
 
 
 TRAINING = ("task", "expert", "cluster", "data", "tokenizer", "model", "learner", "trainer", "logger")
+PLAYING = ("task", "cluster", "agent", "recorder")  # of an agent that is not a checkpoint
 EVALUATION = ("task", "cluster", "tokenizer", "model", "policy", "recorder")  # of a checkpoint, without training
+AGENTS = ("evaluate", "deploy")  # jobs in which another agent than a checkpoint can act
 JOBS = {
     "preview": Job(("task", "expert"), {"episodes": Count, "seed": Seed}),
     "collect": Job(("task", "expert", "cluster"), {"episodes": Count, "seed": Seed, "folder": Text}),
     "train": Job(TRAINING),
     "evaluate": Job(
-        (*TRAINING, "policy", "recorder"),
+        (*TRAINING, "policy", "agent", "recorder"),
         {
             "episodes": Count,
             "seed": UnseenSeed,
@@ -46,7 +48,7 @@ JOBS = {
         },
     ),
     "export": Job(("task", "expert", "cluster", "tokenizer", "model", "policy", "export")),
-    "deploy": Job(("tokenizer", "model", "policy", "deploy")),
+    "deploy": Job(("tokenizer", "model", "policy", "agent", "deploy")),
     "benchmark": Job(
         (*TRAINING, "policy"),
         {
@@ -104,7 +106,13 @@ def check(cfg: DictConfig) -> None:
         _check_plain(name, node, annotation)
     _require_apart(cfg)
     job = JOBS[cfg.job]
-    groups = EVALUATION if cfg.job == "evaluate" and cfg.checkpoint is not None else job.groups
+    groups = job.groups
+    if cfg.job == "evaluate" and (cfg.agent is not None or cfg.checkpoint is not None):
+        groups = EVALUATION if cfg.agent is None else PLAYING
+    if cfg.agent is not None and cfg.job not in AGENTS:
+        raise ValueError(f"job={cfg.job} takes no agent: agent=OPTION goes with job={' and '.join(AGENTS)}")
+    if cfg.agent is not None and cfg.checkpoint is not None:
+        raise ValueError("agent=OPTION and checkpoint=FILE are two policies: omit one of them")
     for name in groups:
         group = GROUPS[name]
         if cfg.get(name) is not None:
