@@ -15,12 +15,11 @@ import pytest
 import torch
 import toy
 from command_line import here
-from composing import CONF, composed
+from composing import CONF, check, composed
 from hostile import HANDLER, command, hostile, node
 
 from vla.config.adopt import adopt, finetune, resume
 from vla.config.annotations import LIBRARY, OWN, locate
-from vla.config.check import check
 from vla.config.experiment import make_policy, plain
 from vla.policy import read_checkpoint
 

@@ -6,9 +6,12 @@ from functools import partial
 from typing import Any
 
 from vla.config.build import build
+from vla.config.check import Job
 from vla.config.experiment import Experiment
 from vla.policy import Policy
 from vla.reports.evaluation import plot_report, write_report
+
+JOB = Job(("tokenizer", "model", "policy", "agent", "deploy"), adopts=True)
 
 
 def run(experiment: Experiment) -> None:

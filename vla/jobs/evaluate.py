@@ -10,7 +10,7 @@ from typing import Any
 
 from rich import print as show
 
-from vla.config.check import with_changes
+from vla.config.check import Job, with_changes
 from vla.config.conditions import conditions
 from vla.config.experiment import Experiment
 from vla.io.files import writing
@@ -24,6 +24,13 @@ from vla.runs.folder import CHECKPOINTS, run_of, save_config
 from vla.runs.resume import cached_success, training_lock
 
 log = logging.getLogger(__name__)
+
+JOB = Job(
+    ("task", "cluster", "agent", "recorder"),
+    adopts=True,
+    without_agent=("tokenizer", "model", "policy"),
+    without_checkpoint=("expert", "data", "learner", "trainer", "logger"),
+)
 
 
 def run(experiment: Experiment) -> float | None:

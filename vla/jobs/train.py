@@ -11,6 +11,7 @@ from pathlib import Path
 import lightning
 from lightning import Trainer
 
+from vla.config.check import TRAINING, Job
 from vla.config.experiment import Experiment, training_policy
 from vla.data.episodes import EpisodeStore
 from vla.io.files import writing
@@ -28,6 +29,8 @@ from vla.training.closed_loop import ClosedLoop
 from vla.training.trainer import GracefulStop, explain_memory_errors, make_trainer, quiet_lightning, restore_metrics
 
 log = logging.getLogger(__name__)
+
+JOB = Job(TRAINING)
 
 
 def run(experiment: Experiment) -> None:
