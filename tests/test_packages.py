@@ -21,7 +21,8 @@ import toy
 from clusters import PLACES, address_in, dask
 from collecting import content
 from command_line import vla
-from composing import composed
+from composing import CONF, check, composed
+from hydra.errors import ConfigCompositionException
 
 from vla import jobs
 from vla.config import packages
@@ -109,6 +110,26 @@ def test_a_job_with_a_group_of_its_own_is_two_options_and_a_module(home: Path, i
         assert words in vla(home, *asked, wrong, ok=False).stderr
     with pytest.raises(ValueError, match=r"job names mypackage\.survey, which is not trusted: add trust=\[mypackage\]"):
         jobs.find("mypackage.survey")
+
+
+# Options that name a part of the tabletop: they are for this world only.
+OF_THE_TABLETOP = {
+    *("ablation", "few", "learning_curve", "multitask", "recipe", "standard"),
+    *("generalisation", "language", "levels", "paper", "suite", "tabletop", "no_excursions", "no_noise"),
+}
+
+
+@pytest.mark.parametrize("group", ["experiment", "evaluate", "validate", "variant"])
+def test_options_go_with_any_world_or_are_refused_for_it(
+    group: str, importable: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(packages.TRUSTED, "mypackage")
+    options = {path.stem for path in (CONF / group).glob("*.yaml")}
+    for option in sorted(options - OF_THE_TABLETOP):
+        check(composed("task=mine", "expert=mine", f"{group}={option}"))
+    for option in sorted(options & OF_THE_TABLETOP):
+        with pytest.raises((ValueError, ConfigCompositionException), match="randomize|perturb|task/goal"):
+            check(composed("task=mine", "expert=mine", f"{group}={option}"))
 
 
 @pytest.mark.parametrize("name", ["nothing", "os.path", "vla.io.files", "sweep", ""])

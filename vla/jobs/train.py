@@ -25,8 +25,9 @@ from vla.reports.html import PAGE, optional, write_page
 from vla.rollouts.collect import collection_time
 from vla.runs.folder import CHECKPOINTS, LAST, save_choice, save_config, save_training
 from vla.runs.resume import LENGTHS, TrainingProgress, first_process, training_lock, training_progress
+from vla.training.checkpoints import GracefulStop
 from vla.training.closed_loop import ClosedLoop
-from vla.training.trainer import GracefulStop, explain_memory_errors, make_trainer, quiet_lightning, restore_metrics
+from vla.training.trainer import explain_memory_errors, make_trainer, quiet_lightning, restore_metrics
 
 log = logging.getLogger(__name__)
 
