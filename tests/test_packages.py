@@ -128,7 +128,7 @@ def test_options_go_with_any_world_or_are_refused_for_it(
     for option in sorted(options - OF_THE_TABLETOP):
         check(composed("task=mine", "expert=mine", f"{group}={option}"))
     for option in sorted(options & OF_THE_TABLETOP):
-        with pytest.raises((ValueError, ConfigCompositionException), match="randomize|perturb|task/goal"):
+        with pytest.raises((ValueError, ConfigCompositionException), match=r"randomize|perturb|task/goal"):
             check(composed("task=mine", "expert=mine", f"{group}={option}"))
 
 

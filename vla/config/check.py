@@ -81,7 +81,7 @@ def check(cfg: DictConfig, job: Job) -> None:
         _check_plain(name, node, annotation)
     _require_apart(cfg)
     if cfg.agent is not None and "agent" not in groups:
-        raise ValueError(f"job={cfg.job} takes no agent: omit agent=OPTION, which goes with job=evaluate and deploy")
+        raise ValueError(f"job={cfg.job} takes no agent: agent=OPTION goes with job=evaluate and deploy")
     if cfg.agent is not None and cfg.checkpoint is not None:
         raise ValueError("agent=OPTION and checkpoint=FILE are two policies: omit one of them")
     for name, group in groups.items():
