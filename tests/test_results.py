@@ -13,7 +13,7 @@ from finished_runs import CONFIG, a_run
 
 from vla.reports.html import write_comparison
 from vla.runs.files import Change, Training
-from vla.runs.folder import read_run, run_of, save_choice, save_training
+from vla.runs.folder import chosen_checkpoint, read_run, save_choice, save_training, wall_time
 
 BOMB = "a: &a [x, x]\nb: &b [*a, *a]\nc: [*b, *b]\n"
 
@@ -27,9 +27,10 @@ def test_what_was_written_is_read(tmp_path: Path) -> None:
     folder = a_run(tmp_path / "run", "sd")
     save_training(folder, 12, 40, 3.04, "done", 2.0)
     save_choice(folder, "best.ckpt")
-    run = run_of(folder / "checkpoints/best.ckpt")
+    run = read_run(folder)
     assert run.training == Training(12, 40, 3.0, "done", 2.0, "best.ckpt")
-    assert (run.chosen, run.model, run.tasks, run.wall_time(1.0)) == ("best.ckpt", "BC", [], 6.0)
+    assert (chosen_checkpoint(folder), run.model, run.tasks) == ("best.ckpt", "BC", [])
+    assert wall_time(folder / "checkpoints/best.ckpt", 1.0) == 6.0
     assert run.changes == [Change("model.width", 16, 32)] and run.config["task"] == CONFIG["task"]
     assert run.report is not None and run.report.successes == 1
     assert [result.outcome for result in run.reports["seen"].results] == ["success", "dropped"]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import ctypes
 import logging
 import os
@@ -15,7 +14,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -28,9 +27,11 @@ from lightning.pytorch.strategies import ParallelStrategy
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 
 from vla.config.build import build
+from vla.io.documents import parse_plain
 from vla.io.files import atomic_path
+from vla.io.types import NonNegative
 from vla.parallel.processes import cores
-from vla.runs.folder import LAST
+from vla.runs.folder import LAST, METRICS, metric_rows
 from vla.training.ema import EMA
 from vla.training.throughput import Throughput, TrainingProgressBar
 
@@ -52,7 +53,7 @@ class GracefulStop(Checkpoint):
 
     def __init__(self, checkpoints: Path) -> None:
         self._path, self._previous_seconds, self._began = checkpoints / LAST, 0.0, time.monotonic()
-        self.requested = self.stopped = self._signalled = self._step_complete = False
+        self.requested = self.stopped = self.started = self._signalled = self._step_complete = False
 
     @property
     def seconds(self) -> float:
@@ -77,7 +78,8 @@ class GracefulStop(Checkpoint):
         return {number: signal.signal(number, self._on_signal) for number in (signal.SIGINT, signal.SIGTERM)}
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Replace Lightning's own handlers, which can deadlock several processes."""
+        """Replace Lightning's own handlers, which can deadlock several processes; all state is restored by now."""
+        self.started = True
         if signal.getsignal(signal.SIGINT) == self._on_signal:
             self._install_handlers()
 
@@ -115,8 +117,27 @@ class GracefulStop(Checkpoint):
         checkpoint["finished"], checkpoint["seconds"] = trainer.state.finished, self.seconds
 
     def on_load_checkpoint(self, trainer: Trainer, pl_module: LightningModule, checkpoint: dict[str, Any]) -> None:
-        """Restore the training time."""
-        self._previous_seconds = checkpoint.get("seconds", 0.0)
+        """Restore the training time; a ValueError if it is no duration."""
+        self._previous_seconds = parse_plain(
+            checkpoint.get("seconds", 0.0), cast(type[float], NonNegative), "the training time"
+        )
+
+    @contextmanager
+    def explaining_restore(self, checkpoint: Path | None) -> Iterator[None]:
+        """Convert errors before the training starts from `checkpoint` into a sentence that names the file.
+
+        Raises:
+            ValueError: the state of the training in the file is damaged.
+        """
+        try:
+            yield
+        except (OSError, MisconfigurationException):
+            raise
+        except Exception as error:
+            if self.started or checkpoint is None:
+                raise
+            what = str(error) if isinstance(error, ValueError) else f"{type(error).__name__}: {error}"
+            raise ValueError(f"{checkpoint} cannot be resumed: {what[:1000]}") from error
 
 
 class PeriodicCheckpoint(Checkpoint):
@@ -260,14 +281,17 @@ def explain_memory_errors(config: Mapping[str, Any]) -> Iterator[None]:
 
 
 def restore_metrics(trainer: Trainer, checkpoint: Path) -> None:
-    """Start the metrics file of a resumed training with the rows up to its checkpoint."""
-    source = checkpoint.parent.parent / "metrics.csv"
+    """Start the metrics file of a resumed training with the rows up to its checkpoint, unless they are damaged."""
+    source = checkpoint.parent.parent / METRICS
     writers = [logger for logger in trainer.loggers if isinstance(logger, CSVLogger)]
     if not writers or not source.exists() or not trainer.is_global_zero:
         return
     steps = torch.load(checkpoint, map_location="cpu", weights_only=True, mmap=True)["global_step"]
-    with source.open(newline="", encoding="utf-8") as file:
-        rows = [{name: value for name, value in row.items() if value} for row in csv.DictReader(file)]
+    try:
+        rows = metric_rows(source)
+    except (OSError, ValueError) as error:  # they only inform
+        log.warning("the training curves begin anew: %s", error)
+        return
     # Lightning starts with an empty file.
     writers[0].experiment.metrics = [row for row in rows if int(row["step"]) < steps]
     writers[0].save()
