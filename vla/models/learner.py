@@ -187,9 +187,11 @@ class Learner(LightningModule):
         """Keep only the weights of the model: metrics would take over whatever stands under their names.
 
         Raises:
-            ValueError: the progress of the training holds other things than counts.
+            ValueError: the progress of the training holds other things than counts, or its optimiser has no state.
         """
         _require_counts(checkpoint["loops"])
+        if not checkpoint["optimizer_states"] or not checkpoint["lr_schedulers"]:
+            raise ValueError("it holds no state of the optimiser")
         for name in {"state_dict", "current_model_state"} & checkpoint.keys():
             weights = checkpoint[name].items()
             checkpoint[name] = {key: value for key, value in weights if key.startswith("model.")}

@@ -134,14 +134,16 @@ class Fast(ActionTokenizer):
             kind = cast(type[tuple[int, int]], Coefficients)
             self._least, self._most = parse_plain(state["coefficients"], kind, "coefficients")
             bpe = Tokenizer.from_str(state["bpe"])
-            longest = max(map(len, bpe.get_vocab()), default=0)
+            words = bpe.get_vocab()
         except Exception as error:  # tokenizers raises a plain Exception for invalid text
             raise ValueError(f"the tokenizer in the checkpoint cannot be read: {str(error)[:200]}") from error
         plain = (bpe.normalizer, bpe.pre_tokenizer, bpe.post_processor, bpe.padding, bpe.truncation)
-        largest = max(self.chunk * self.components, len(END))
-        if any(plain) or bpe.get_vocab_size() > self.bins or longest > largest:
+        longest = max(self.chunk * self.components, len(END))
+        numbered = sorted(words.values()) == list(range(len(words)))
+        if any(plain) or not numbered or len(words) > self.bins or max(map(len, words), default=0) > longest:
             raise ValueError(
-                f"the tokenizer in the checkpoint is another than of {self.bins} tokens of up to {largest} characters"
+                f"the tokenizer in the checkpoint has more than {self.bins} words of up to {longest} characters, or "
+                "more parts than byte pairs"
             )
         self._set_bpe(bpe)
 
