@@ -19,11 +19,16 @@ def test_a_damaged_file_of_the_cache_is_made_anew(tmp_path: Path, monkeypatch: p
     whole = path.read_bytes()
     damages = {"empty": b"", "half": whole[: len(whole) // 2], "text": b"[1]"}
     damages["flipped"] = bytes([*whole[:400], whole[400] ^ 1, *whole[401:]])
-    for kind in ({"vertices": vertices}, {"vertices": vertices, "faces": faces + len(vertices)}):
-        np.savez(tmp_path / "other.npz", **kind)
-        damages[str(sorted(kind))] = (tmp_path / "other.npz").read_bytes()
-    np.savez(tmp_path / "other.npz", vertices=vertices * np.nan, faces=faces)
-    damages["NaN"] = (tmp_path / "other.npz").read_bytes()
+    for other in (
+        (vertices, faces + len(vertices)),
+        (vertices * np.nan, faces),
+        (vertices[:, :2], faces),
+        (faces, faces),
+    ):
+        np.savez(tmp_path / "other.npz", vertices=other[0], faces=other[1])
+        damages[str(len(damages))] = (tmp_path / "other.npz").read_bytes()
+    np.savez(tmp_path / "other.npz", vertices=vertices)
+    damages["no faces"] = (tmp_path / "other.npz").read_bytes()
     for damage in damages.values():
         path.write_bytes(damage)
         again = decimate(grid, np.array(corners), 50)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from typing import Any
 
 import pytest
 import torch
@@ -105,7 +106,7 @@ def test_unknown_words_hardly_change_what_training_made_of_the_known_ones() -> N
 @pytest.mark.parametrize("name", ["words", "characters"])
 def test_n_grams_are_short(name: str) -> None:
     """Over the lengths up to 2^31, which a checkpoint could ask for, a single sentence took minutes."""
-    node = OmegaConf.to_container(OmegaConf.load(CONF / "model/text/ngrams.yaml"))
+    node: Any = OmegaConf.to_container(OmegaConf.load(CONF / "model/text/ngrams.yaml"))
     with pytest.raises(ValueError, match=rf"text\.{name} must be int, at least 1, at most \d\d, got"):
         check_node("text", {**node, name: 2**31 - 1}, object)
 

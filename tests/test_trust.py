@@ -180,7 +180,7 @@ def test_a_path_in_somebody_elses_checkpoint_is_refused(tmp_path: Path) -> None:
 
 
 def test_folders_loggers_and_devices_are_never_those_of_a_checkpoint(tmp_path: Path) -> None:
-    theirs = {
+    theirs: dict[str, Any] = {
         **plain(composed("expert=lerobot", "expert.folder=/theirs", "collect.episodes=7", "trainer.max_steps=9")),
         **{"output": "/theirs", "pretrained": "/theirs", "resume": "/theirs", "checkpoint": "/theirs"},
         "logger": {"csv": {"_target_": "lightning.pytorch.loggers.CSVLogger", "name": "/theirs"}},
