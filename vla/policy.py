@@ -119,7 +119,7 @@ def _header(path: Path, content: dict[str, Any]) -> Header:
             f"{path} is no checkpoint of this project: its configuration lacks {', '.join(REQUIRED_NODES)}"
         )
     finished = content.get("finished") is True
-    return Header(path, config, Spec.from_dict(spec), finished, steps if isinstance(steps, int) else 0)
+    return Header(path, config, Spec.from_dict(spec, f"{path}: spec"), finished, steps if isinstance(steps, int) else 0)
 
 
 def _load(path: Path, weights: bool) -> dict[str, Any]:

@@ -96,9 +96,10 @@ def resume(cfg: DictConfig, run: Path, overrides: Sequence[str]) -> DictConfig:
     resumed = _on_top(cfg, {str(name): saved[name] for name in cfg if name in saved and name not in OF_A_RUN}, parsed)
     named = {_path(override) for override in parsed}
     if "trainer" in named:  # another option changes the speed of training, not its length
-        for name in LENGTHS:
-            if name in saved["trainer"] and f"trainer.{name}" not in named:
-                OmegaConf.update(resumed, f"trainer.{name}", saved["trainer"][name], force_add=True)
+        lengths = {name: value for name, value in saved.get("trainer", {}).items() if name in LENGTHS}
+        for name, value in lengths.items():
+            if f"trainer.{name}" not in named:
+                OmegaConf.update(resumed, f"trainer.{name}", value, force_add=True)
     resumed.output, resumed.resume = str(run), str(run)
     if "job" not in named:
         resumed.job = saved.get("job", cfg.job)
