@@ -22,7 +22,8 @@ from vla.data.episodes import EpisodeStore
 from vla.data.index import DAMAGED
 from vla.io.documents import read_json
 from vla.io.files import write_text
-from vla.parallel.pool import Cluster, Future, Pool, WorkerFactory, WorkersLost
+from vla.parallel.pool import Cluster, Future, Pool, WorkersLost
+from vla.parallel.processes import WorkerFactory
 from vla.rollouts.rollout import replay, rollout
 from vla.spec import FIRST_SEED, Agent, Environment, Episode
 

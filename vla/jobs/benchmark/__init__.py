@@ -16,7 +16,7 @@ from vla.config.experiment import Experiment
 from vla.io.files import write_text
 from vla.jobs.benchmark.measure import Measure
 
-STAGES = ("collect", "loader", "train", "policy", "deploy")
+STAGES = ("collect", "loader", "train", "policy", "deploy", "serve")
 
 
 def run(experiment: Experiment) -> dict[str, Measure]:
