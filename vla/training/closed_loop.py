@@ -23,8 +23,8 @@ log = logging.getLogger(__name__)
 
 BEST = "best.ckpt"
 
-
-Rate = Annotated[float, Ge(-1), Le(1)]  # of success, -1 before the first validation
+# Of success, -1 before the first validation; the sum of the shares of several processes is rounded.
+Rate = Annotated[float, Ge(-1), Le(1.001)]
 
 
 @dataclass(frozen=True)
