@@ -294,6 +294,28 @@ def test_a_checkpoint_keeps_its_tokenizer_and_model(override: str, checkpoint: P
         adopt(config(job="evaluate", checkpoint=str(checkpoint)), [override])
 
 
+@pytest.mark.parametrize("partial", [True, "false", 1, None, [False]])
+def test_a_factory_is_refused_where_an_object_belongs(partial: Any) -> None:
+    """As a group it passed the check, without all of its arguments, and ended in a traceback when it was built."""
+    assert problem(**{"task._partial_": partial}).startswith("task._partial_ must be omitted here")
+    assert problem(**{"expert": {**WAYPOINT, "_partial_": partial}}).startswith("expert._partial_ must be omitted")
+    axis = problem(**{"task.randomize.mass": {**MASSES, "_partial_": partial}})
+    assert axis.startswith("task.randomize must be " if partial is True else "task.randomize.mass._partial_ must be ")
+
+
+def test_an_object_is_refused_where_a_factory_belongs() -> None:
+    for wrong in (False, "true"):
+        assert "expert.expert" in problem(**{"expert": {**PERTURBED, "expert": {**WAYPOINT, "_partial_": wrong}}})
+
+
+def test_a_factory_has_all_arguments_but_its_callers() -> None:
+    cfg = composed("job=train")
+    OmegaConf.set_struct(cfg, False)
+    del cfg.model.text.vocabulary
+    with pytest.raises(ValueError, match=r"model\.text\.vocabulary is missing: NGrams needs it"):
+        check(cfg)
+
+
 def test_a_report_says_what_the_training_of_its_checkpoint_was(checkpoint: Path) -> None:
     cfg = config(job="evaluate", checkpoint=str(checkpoint))
     assert adopt(cfg, []).collect.episodes == 50

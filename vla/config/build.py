@@ -61,6 +61,8 @@ GROUPS = {
     )
 }
 
+RUNTIME = {name for group in GROUPS.values() for name in group.runtime}
+
 # Narrower than Lightning's annotations: with other values its trainer fails late, or silently trains nothing.
 NARROWER: dict[str, dict[str, Any]] = {
     "lightning.Trainer": {
@@ -115,12 +117,18 @@ def makes(group: Group) -> Any:
 def check_node(key: str, node: Any, expected: Any, runtime: Sequence[str] = ()) -> None:
     """Check a plain node at `key` against the signature of its class, without the `runtime` arguments.
 
+    A factory, a node with `_partial_: true`, lacks the arguments that its caller gives: keyword-only ones, and those
+    that programs give to a group. It belongs within another node only.
+
     Raises:
         ValueError: the class is no `expected`, or a key is unknown, missing or ill-typed; with its dotted name and the
             allowed values.
     """
     if not is_node(node):
         raise ValueError(f"{key} must be a node with a _target_, got {_short(node)}")
+    partial = node.get("_partial_", False)
+    if not isinstance(partial, bool) or (partial and expected is not object):
+        raise ValueError(f"{key}._partial_ must be {'true or false' if expected is object else 'omitted here'}")
     target = locate(f"{key}._target_", node["_target_"])
     if not fits(target, expected):
         raise ValueError(f"{key}._target_ must name a class of kind {describe(expected)}, got {node['_target_']}")
@@ -134,8 +142,9 @@ def check_node(key: str, node: Any, expected: Any, runtime: Sequence[str] = ()) 
         if not several or str(name).startswith("_"):
             require_known(key, name, known, target.__name__)
         check_value(f"{key}.{name}", value, hints.get(name, Any))
-    for name in () if node.get("_partial_") else known:
-        if name not in node and parameters[name].default is inspect.Parameter.empty:
+    for name in known:
+        by_caller = partial and (name in RUNTIME or parameters[name].kind is inspect.Parameter.KEYWORD_ONLY)
+        if name not in node and not by_caller and parameters[name].default is inspect.Parameter.empty:
             raise ValueError(f"{key}.{name} is missing: {target.__name__} needs it")
 
 
@@ -158,6 +167,19 @@ def require_no_paths(config: Mapping[str, Any], names: Collection[str], source: 
     require_trust(config, names, source)
     for key in (key for name in names for key in _paths_in(config.get(name), name)):
         raise ValueError(f"{source} names a path in {key}: paths are taken from your own runs and commands only")
+
+
+def without_paths(config: Mapping[str, Any], name: str) -> Any:
+    """Return the node `name` of a config out of a file without the files and folders that it names, for reports.
+
+    Of a class that may not be built only the name is returned.
+    """
+    node = config[name]
+    try:
+        require_no_paths(config, [name], name)
+    except ValueError:
+        return {"_target_": node["_target_"]} if is_node(node) else None
+    return node
 
 
 def _paths_in(node: Any, key: str) -> Iterator[str]:

@@ -154,9 +154,13 @@ class Experiment:
         return Path(self["pretrained"]) if self["pretrained"] else None
 
     def fitted_learner(self, store: EpisodeStore) -> Learner:
-        """Build the learner of a new training, with a tokenizer from `pretrained` or fitted to the store's actions."""
-        learner = self.learner(store.spec, self.pretrained)
-        if self.pretrained is None:
+        """Build the learner of a new training, of the weights of `pretrained` or `checkpoint` if one is given.
+
+        Without, its tokenizer is fitted to the store's actions.
+        """
+        origin = self.pretrained or self.checkpoint
+        learner = self.learner(store.spec, origin)
+        if origin is None:
             self.fit_tokenizer(learner.model.tokenizer, store)
         return learner
 

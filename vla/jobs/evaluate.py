@@ -20,7 +20,7 @@ from vla.reports.conditions import conditions_table, plot_conditions
 from vla.reports.evaluation import plot_report, write_report
 from vla.reports.html import PAGE, optional, write_page
 from vla.rollouts.evaluate import IN_DISTRIBUTION, Report, evaluate, keep_recordings
-from vla.runs.folder import CHECKPOINTS, run_of, save_config
+from vla.runs.folder import CHECKPOINTS, save_config, wall_time
 from vla.runs.resume import cached_success, training_lock
 
 log = logging.getLogger(__name__)
@@ -128,5 +128,5 @@ def _facts(experiment: Experiment, checkpoint: Path | None, seconds: float) -> d
         **experiment["chosen"],
         "parameters": sum(p.numel() for p in policy.model.parameters()),
         "latency_ms": latency(policy),
-        "wall_time_s": run_of(checkpoint).wall_time(seconds),
+        "wall_time_s": wall_time(checkpoint, seconds),
     }

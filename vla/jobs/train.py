@@ -96,7 +96,11 @@ def _fit(experiment: Experiment, state: TrainingProgress, trainer: Trainer, grac
     collection_s = collection_time(store, experiment["collect"]["episodes"])
     with writing(output), _reported(experiment, trainer, graceful_stop, learner, collection_s):
         try:
-            with explain_memory_errors(experiment.config), graceful_stop.handling_signals():
+            with (
+                explain_memory_errors(experiment.config),
+                graceful_stop.explaining_restore(state.resume_from),
+                graceful_stop.handling_signals(),
+            ):
                 trainer.fit(learner, datamodule=data, ckpt_path=state.resume_from, weights_only=True)
         except SystemExit:  # on SIGTERM Lightning exits with status 0
             if not graceful_stop.requested:

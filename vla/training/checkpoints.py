@@ -11,14 +11,17 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
-from typing import Any
+from typing import Any, cast
 
 import torch
 from lightning import LightningModule, Trainer
 from lightning.pytorch.callbacks import Checkpoint
 from lightning.pytorch.plugins import TorchCheckpointIO
+from lightning.pytorch.utilities.exceptions import MisconfigurationException
 
+from vla.io.documents import parse_plain
 from vla.io.files import atomic_path
+from vla.io.types import NonNegative
 from vla.runs.folder import LAST
 
 log = logging.getLogger(__name__)
@@ -35,7 +38,7 @@ class GracefulStop(Checkpoint):
 
     def __init__(self, checkpoints: Path) -> None:
         self._path, self._previous_seconds, self._began = checkpoints / LAST, 0.0, time.monotonic()
-        self.requested = self.stopped = self._signalled = self._step_complete = False
+        self.requested = self.stopped = self.started = self._signalled = self._step_complete = False
 
     @property
     def seconds(self) -> float:
@@ -60,7 +63,8 @@ class GracefulStop(Checkpoint):
         return {number: signal.signal(number, self._on_signal) for number in (signal.SIGINT, signal.SIGTERM)}
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Replace Lightning's own handlers, which can deadlock several processes."""
+        """Replace Lightning's own handlers, which can deadlock several processes; all state is restored by now."""
+        self.started = True
         if signal.getsignal(signal.SIGINT) == self._on_signal:
             self._install_handlers()
 
@@ -98,8 +102,27 @@ class GracefulStop(Checkpoint):
         checkpoint["finished"], checkpoint["seconds"] = trainer.state.finished, self.seconds
 
     def on_load_checkpoint(self, trainer: Trainer, pl_module: LightningModule, checkpoint: dict[str, Any]) -> None:
-        """Restore the training time."""
-        self._previous_seconds = checkpoint.get("seconds", 0.0)
+        """Restore the training time; a ValueError if it is no duration."""
+        self._previous_seconds = parse_plain(
+            checkpoint.get("seconds", 0.0), cast(type[float], NonNegative), "the training time"
+        )
+
+    @contextmanager
+    def explaining_restore(self, checkpoint: Path | None) -> Iterator[None]:
+        """Convert errors before the training starts from `checkpoint` into a sentence that names the file.
+
+        Raises:
+            ValueError: the state of the training in the file is damaged.
+        """
+        try:
+            yield
+        except (OSError, MisconfigurationException):
+            raise
+        except Exception as error:
+            if self.started or checkpoint is None:
+                raise
+            what = str(error) if isinstance(error, ValueError) else f"{type(error).__name__}: {error}"
+            raise ValueError(f"{checkpoint} cannot be resumed: {what[:1000]}") from error
 
 
 class PeriodicCheckpoint(Checkpoint):

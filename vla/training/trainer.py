@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import ctypes
 import logging
 import platform
@@ -22,6 +21,7 @@ from lightning.pytorch.utilities.exceptions import MisconfigurationException
 
 from vla.config.build import build
 from vla.parallel.processes import cores
+from vla.runs.folder import METRICS, metric_rows
 from vla.training.checkpoints import AtomicCheckpointIO, PeriodicCheckpoint
 from vla.training.ema import EMA
 from vla.training.throughput import Throughput, TrainingProgressBar
@@ -124,14 +124,17 @@ def explain_memory_errors(config: Mapping[str, Any]) -> Iterator[None]:
 
 
 def restore_metrics(trainer: Trainer, checkpoint: Path) -> None:
-    """Start the metrics file of a resumed training with the rows up to its checkpoint."""
-    source = checkpoint.parent.parent / "metrics.csv"
+    """Start the metrics file of a resumed training with the rows up to its checkpoint, unless they are damaged."""
+    source = checkpoint.parent.parent / METRICS
     writers = [logger for logger in trainer.loggers if isinstance(logger, CSVLogger)]
     if not writers or not source.exists() or not trainer.is_global_zero:
         return
     steps = torch.load(checkpoint, map_location="cpu", weights_only=True, mmap=True)["global_step"]
-    with source.open(newline="", encoding="utf-8") as file:
-        rows = [{name: value for name, value in row.items() if value} for row in csv.DictReader(file)]
+    try:
+        rows = metric_rows(source)
+    except (OSError, ValueError) as error:  # they only inform
+        log.warning("the training curves begin anew: %s", error)
+        return
     # Lightning starts with an empty file.
     writers[0].experiment.metrics = [row for row in rows if int(row["step"]) < steps]
     writers[0].save()
