@@ -36,6 +36,4 @@ class Buffers:
 
 def _alike(one: Part, other: Part) -> bool:
     """Return whether two parts differ in nothing but what their vertices contain."""
-    return one is other or (
-        len(one.vertices) == len(other.vertices) and np.array_equal(one.triangles, other.triangles)
-    )
+    return one is other or (len(one.vertices) == len(other.vertices) and np.array_equal(one.triangles, other.triangles))

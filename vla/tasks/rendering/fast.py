@@ -20,6 +20,7 @@ from annotated_types import Ge, Le
 from vla.spec import Array
 from vla.tasks.rendering import lights, shaders, shapes
 from vla.tasks.rendering.buffers import Buffers
+from vla.tasks.rendering.cameras import Cameras
 from vla.tasks.rendering.decimate import decimate
 from vla.tasks.rendering.elements import Elements, elements_of, unsupported
 from vla.tasks.rendering.geometry import Geometry
@@ -30,8 +31,8 @@ log = logging.getLogger(__name__)
 BEHIND = 0.3  # factor on the alpha of a plane seen from behind, as in MuJoCo
 SLOPE, UNITS = 1.5, 4.0  # offset of shadow maps against surfaces that shade themselves, as in MuJoCo
 ALIGNMENT = 256  # of a camera's block in its buffer [bytes], enough for every machine
-UPSIDE_DOWN = np.diag([1.0, -1.0, 1.0, 1.0])  # the first row of the framebuffer becomes the top of the picture
 BACKEND: Any = {"backend": "egl"}
+RIM = 2  # texels of a shadow map, both sides together, that stay empty: shadows at its edge would never end
 STATE = moderngl.DEPTH_TEST | moderngl.CULL_FACE
 
 
@@ -85,6 +86,7 @@ class FastRenderer:
         """Args: the context, which the renderer owns; the model; what to draw of it; settings."""
         self._gl: Any = gl  # its type annotations are too narrow
         self._model, self._view, self._settings = model, view, settings
+        self._cameras = Cameras(model, view)
         missing = unsupported(model, view)
         if missing:
             log.warning(f"the fast renderer leaves out {', '.join(missing)}; task/renderer=mujoco draws them")
@@ -165,8 +167,8 @@ class FastRenderer:
                 program["skin"] = self._skin
         floats = shaders.CAMERA + 16 * len(self._lamps) + 4 * lights.ROWS * (1 + len(self._lights))
         rows = -(-4 * floats // ALIGNMENT) * ALIGNMENT // 4
-        self._cameras = np.zeros((len(self._view.cameras), rows), np.float32)
-        self._camera_buffer = gl.buffer(reserve=self._cameras.nbytes)
+        self._blocks = np.zeros((len(self._cameras.ids), rows), np.float32)
+        self._camera_buffer = gl.buffer(reserve=self._blocks.nbytes)
 
     def _make_buffers(self) -> None:
         gl = self._gl
@@ -179,7 +181,7 @@ class FastRenderer:
             content = [(self._seen.vertices, form, *(name for name in taken if name))]
             self._scene[kind] = gl.vertex_array(program, content, self._seen.indices)
         content = [(self._casting.vertices, "3f 1f", "in_position", "in_element")]
-        self._casters = gl.vertex_array(self._shadow_program, content, self._casting.indices)
+        self._caster = gl.vertex_array(self._shadow_program, content, self._casting.indices)
 
     def update(self, textures: Collection[int] = ()) -> None:
         """Upload what has changed in the model; `textures` are the ids of those whose pixels have."""
@@ -189,10 +191,9 @@ class FastRenderer:
             self._planes = np.flatnonzero(elements.seen & (elements.kind == mujoco.mjtGeom.mjGEOM_PLANE))
             self._geometry.update(elements, self._sky >= 0)
             self._place_blocks()
-            self._shining = lights.rows(self._model)
-            self._shadow_places: dict[int, bytes] = {}
-            self._shadow_projections: dict[int, Array] = {}
-            self._lenses = np.stack([UPSIDE_DOWN @ self._projection(camera) for camera in self._view.cameras])
+            self._cameras.update()
+            self._light_places: bytes | None = None
+            self._floors = [int(plane) for plane in self._planes if elements.opaque[plane]] if self._sky >= 0 else []
             sites = np.linalg.norm(elements.size[self._model.ngeom :], axis=1)
             self._bounds = np.append(self._model.geom_rbound, sites)  # radius of each element [m]
             table = self._new_table(elements)
@@ -205,20 +206,18 @@ class FastRenderer:
         blocks, sky = self._geometry.blocks, len(self._elements.kind)
         self._seen.update([block.seen for block in blocks])
         ends = np.cumsum([0, *(block.seen.triangles.size for block in blocks)])
-        runs = [
-            Run(self._texture_of(block.element), int(start), block.seen.triangles.size)
+        self._runs = {
+            block.element: Run(self._texture_of(block.element), int(start), block.seen.triangles.size)
             for block, start in zip(blocks, ends, strict=False)
-        ]
-        self._opaque = _merged(runs[: self._geometry.solid])
-        self._transparent = {
-            block.element: run
-            for block, run in zip(blocks, runs, strict=True)
-            if block.element in self._planes or block in blocks[self._geometry.solid :]
         }
+        order = list(self._runs)
+        solid, self._transparent = order[: self._geometry.solid], order[self._geometry.solid :]
+        self._opaque = _merged([self._runs[element] for element in solid if element != sky])
         casting = sorted((block for block in blocks if block.element != sky), key=lambda block: not block.closed)
         self._casting.update([block.casting for block in casting])
-        self._closed_casters = sum(block.casting.triangles.size for block in casting if block.closed)
-        self._open_casters = sum(block.casting.triangles.size for block in casting) - self._closed_casters
+        self._casters = [
+            sum(block.casting.triangles.size for block in casting if block.closed is kind) for kind in (True, False)
+        ]
 
     def _texture_of(self, element: int) -> int:
         texture = self._sky if element == len(self._elements.kind) else int(self._elements.texture[element])
@@ -249,13 +248,14 @@ class FastRenderer:
         """Draw colours (cameras, H, W, 3) uint8 and depth (cameras, H, W) float32 [m]."""
         with self._gl:
             self._upload_poses(data)
-            self._upload_cameras(data, self._cast_shadows(data))
+            self._upload_cameras(data)
+            self._cast_shadows(data)
             self._drawn.use()
             self._gl.enable_only(STATE)
             self._gl.front_face = "cw"  # in pictures that are upside down
             self._drawn.clear(depth=1.0)
-            for number, camera in enumerate(self._view.cameras):
-                self._draw(number, data.cam_xpos[camera])
+            for number, (sky, behind) in enumerate(zip(self._sky_seen(), self._behind(), strict=True)):
+                self._draw(number, sky, behind)
             return self._read()
 
     def _upload_poses(self, data: mujoco.MjData) -> None:
@@ -267,73 +267,83 @@ class FastRenderer:
             poses[geoms : geoms + sites, :, 3] = data.site_xpos
         self._pose_texture.write(poses)
 
-    def _cast_shadows(self, data: mujoco.MjData) -> Array:
-        """Draw the depth of the scene from every lamp with shadows; return projections into the maps, by columns."""
-        if not self._lamps:
-            return np.empty(0)
-        gl, edge = self._gl, self._shadows[0].size[0]
+    def _place_lights(self, data: mujoco.MjData) -> None:
+        """Note the shadow maps' projections and write the lights into the cameras' blocks, where a light has moved."""
+        places = data.light_xpos.tobytes() + data.light_xdir.tobytes()
+        if places == self._light_places:
+            return
+        self._light_places = places
+        table = lights.rows(self._model)
+        table[1:, 3, :3], table[1:, 4, :3] = data.light_xpos[self._lights], data.light_xdir[self._lights]
+        inner = 0.5 * (1 - RIM / max(1, self._model.vis.quality.shadowsize))
+        onto_texture = np.array([[inner, 0, 0, 0.5], [0, inner, 0, 0.5], [0, 0, 0.5, 0.5], [0, 0, 0, 1]])
+        self._projections = [lights.shadow_projection(self._model, data, lamp) for lamp in self._lamps]
+        columns = [(onto_texture @ projection).T.ravel() for projection in self._projections]
+        content = np.concatenate([*columns, table.ravel()])
+        self._blocks[:, shaders.CAMERA : shaders.CAMERA + content.size] = content
+
+    def _upload_cameras(self, data: mujoco.MjData) -> None:
+        """Write every camera's block: its projection and position, shadow projections and lights."""
+        self._place_lights(data)
+        blocks, cameras = self._blocks, self._cameras
+        blocks[:, :16] = cameras.place(data).swapaxes(1, 2).reshape(-1, 16)
+        blocks[:, 16:19] = cameras.eyes
+        head = shaders.CAMERA + 16 * len(self._lamps) + 16
+        blocks[:, head : head + 3] = -cameras.axes[:, :, 2]  # the direction of the headlight
+        self._camera_buffer.write(blocks)
+
+    def _cast_shadows(self, data: mujoco.MjData) -> None:
+        """Draw the depth of the scene from every lamp with shadows."""
+        gl = self._gl
         gl.front_face = "ccw"
         gl.polygon_offset = SLOPE + 2.0 * self._settings.soft, UNITS  # averages reach across texels
-        inner = 0.5 * (edge - 2) / edge
-        onto_texture = np.array([[inner, 0, 0, 0.5], [0, inner, 0, 0.5], [0, 0, 0.5, 0.5], [0, 0, 0, 1]])
-        projections = []
-        for lamp, shadow in zip(self._lamps, self._shadows, strict=True):
-            projection = self._shadow_projection(data, lamp)
-            projections.append((onto_texture @ projection).T.ravel())
+        closed, still_open = self._casters
+        for lamp, projection, shadow in zip(self._lamps, self._projections, self._shadows, strict=True):
+            edge = shadow.size[0]
             shadow.use()
             shadow.viewport = 0, 0, edge, edge
             shadow.clear(depth=1.0)
-            shadow.viewport = 1, 1, edge - 2, edge - 2  # without the rim, shadows at the edge would never end
+            shadow.viewport = RIM // 2, RIM // 2, edge - RIM, edge - RIM
             self._shadow_program["projection"].write(projection.T.astype(np.float32).tobytes())
             self._shadow_program["lamp"].write(np.float32(data.light_xpos[lamp]).tobytes())
-            if self._closed_casters:  # their front faces are nearer to any lamp outside
+            if closed:  # their front faces are nearer to a lamp outside than the others
                 gl.enable_only(STATE)
-                self._casters.render(moderngl.TRIANGLES, vertices=self._closed_casters)
-            if self._open_casters:
+                self._caster.render(moderngl.TRIANGLES, vertices=closed)
+            if still_open:
                 gl.enable_only(moderngl.DEPTH_TEST)
-                self._casters.render(moderngl.TRIANGLES, vertices=self._open_casters, first=self._closed_casters)
+                self._caster.render(moderngl.TRIANGLES, vertices=still_open, first=closed)
         gl.polygon_offset = 0.0, 0.0
-        return np.concatenate(projections)
 
-    def _shadow_projection(self, data: mujoco.MjData, lamp: int) -> Array:
-        """Return a lamp's projection (4, 4) into its shadow map, computed again only where the lamp has moved."""
-        place = data.light_xpos[lamp].tobytes() + data.light_xdir[lamp].tobytes()
-        if self._shadow_places.get(lamp) != place:
-            self._shadow_places[lamp] = place
-            self._shadow_projections[lamp] = lights.shadow_projection(self._model, data, lamp)
-        return self._shadow_projections[lamp]
+    def _sky_seen(self) -> list[bool]:
+        """Return whether a camera may see the sky beside the planes."""
+        seen = [self._sky >= 0] * len(self._cameras.ids)
+        for plane in self._floors:
+            filled = self._cameras.filled(self._poses[plane], self._elements.size[plane, :2])
+            seen = [sky and not full for sky, full in zip(seen, filled, strict=True)]
+        return seen
 
-    def _upload_cameras(self, data: mujoco.MjData, shadows: Array) -> None:
-        """Write every camera's block: its projection and position, shadow projections and lights."""
-        cameras, blocks, shining = list(self._view.cameras), self._cameras, self._shining
-        axes, eyes = data.cam_xmat[cameras].reshape(-1, 3, 3), data.cam_xpos[cameras]
-        shining[1:, 3, :3], shining[1:, 4, :3] = data.light_xpos[self._lights], data.light_xdir[self._lights]
-        start = shaders.CAMERA + shadows.size
-        projections = self._lenses @ lights.inverse_pose(eyes, axes.swapaxes(1, 2))
-        blocks[:, :16], blocks[:, 16:19] = projections.swapaxes(1, 2).reshape(-1, 16), eyes
-        blocks[:, shaders.CAMERA : start], blocks[:, start : start + shining.size] = shadows, shining.ravel()
-        blocks[:, start + 16 : start + 19] = -axes[:, :, 2]  # the direction of the headlight
-        self._camera_buffer.write(blocks)
+    def _behind(self) -> list[list[int]]:
+        """Return the planes that a camera sees from behind."""
+        behind = self._cameras.behind(self._poses[self._planes])
+        return [self._planes[planes].tolist() for planes in behind]
 
-    def _draw(self, number: int, eye: Array) -> None:
-        """Draw a camera's picture: what is opaque and the sky, then what is transparent."""
-        view, size = self._view, self._cameras[number].nbytes
+    def _draw(self, number: int, sky: bool, behind: list[int]) -> None:
+        """Draw a camera's picture: what is opaque and the sky, then what is transparent and planes from behind."""
+        view, size = self._view, self._blocks[number].nbytes
         self._camera_buffer.bind_to_uniform_block(0, offset=number * size, size=size)
         self._gl.viewport = 0, number * view.height, view.width, view.height
         for run in self._opaque:
             self._draw_run(run)
-        self._draw_transparent(eye)
+        if sky:
+            self._draw_run(self._runs[len(self._elements.kind)])
+        if self._transparent or behind:
+            self._draw_transparent(self._cameras.eyes[number], behind)
 
-    def _draw_transparent(self, eye: Array) -> None:
+    def _draw_transparent(self, eye: Array, behind: list[int]) -> None:
         """Blend transparent elements and planes seen from behind, as MuJoCo does: from near to far, and back again."""
-        poses = self._poses
-        behind = [plane for plane in self._planes if (eye - poses[plane, :, 3]) @ poses[plane, :, 2] < 0]
-        opaque = self._elements.opaque
-        blended = [element for element in self._transparent if element in behind or not opaque[element]]
-        if not blended:
-            return
         distance = {
-            element: float(np.linalg.norm(poses[element, :, 3] - eye) - self._bounds[element]) for element in blended
+            element: float(np.linalg.norm(self._poses[element, :, 3] - eye) - self._bounds[element])
+            for element in {*self._transparent, *behind}
         }
         distance |= {int(plane): np.inf for plane in self._planes if plane in distance}
         order = sorted(distance, key=lambda element: (distance[element], element))
@@ -343,7 +353,7 @@ class FastRenderer:
         self._drawn.depth_mask = False
         self._leave_out_shadows(True)
         for element in [*order, *order[::-1]]:
-            run, alpha = self._transparent[element], float(self._elements.rgba[element, 3])
+            run, alpha = self._runs[element], float(self._elements.rgba[element, 3])
             self._programs[self._kind(run.texture)]["alpha"] = alpha * (BEHIND if element in behind else 1.0)
             if element in behind:
                 gl.disable(moderngl.CULL_FACE)
@@ -358,20 +368,6 @@ class FastRenderer:
             if "unshadowed" in program:
                 program["unshadowed"] = float(value)
 
-    def _projection(self, camera: int) -> Array:
-        """Return a camera's projection (4, 4)."""
-        model, near, far = self._model, self._near, self._far
-        aspect, fovy = self._view.width / self._view.height, float(model.cam_fovy[camera])
-        if model.cam_projection[camera] == mujoco.mjtProjection.mjPROJ_ORTHOGRAPHIC:
-            return lights.box(aspect * fovy / 2, fovy / 2, near, far)
-        if model.cam_sensorsize[camera, 1]:
-            focal, centre = model.cam_intrinsic[camera, :2], model.cam_intrinsic[camera, 2:]
-            half = model.cam_sensorsize[camera] / 2
-            low, high = near / focal * (half - centre), near / focal * (half + centre)
-            return lights.frustum(-low[0], high[0], -high[1], low[1], near, far)
-        half = near * np.tan(np.radians(fovy / 2))
-        return lights.frustum(-aspect * half, aspect * half, -half, half, near, far)
-
     def _read(self) -> tuple[Array, Array]:
         view = self._view
         shape = len(view.cameras), view.height, view.width
@@ -385,11 +381,12 @@ class FastRenderer:
     def _metres(self, reading: Array) -> Array:
         """Convert readings of the depth buffer, 0 at the near plane and 1 at the far one, to depth [m], in place."""
         near, far = self._near, self._far
-        nothing = reading >= 1
+        nothing = reading >= 1 if reading.max() >= 1 else None
         depth = np.multiply(reading, near - far, out=reading)
         depth += far
         np.divide(near * far, depth, out=depth)
-        np.copyto(depth, 0.0, where=nothing)
+        if nothing is not None:
+            np.copyto(depth, 0.0, where=nothing)
         return depth
 
     def close(self) -> None:

@@ -114,7 +114,9 @@ def _declared(way: str, names: Sequence[str]) -> str:
 def _shaded(lights: int, lamps: Sequence[int]) -> str:
     """Return statements that set `base` and every `lit`, clamped as OpenGL clamps a vertex's colour."""
     shine = "shine({}, position, normal, colour, material)".format
-    sums = " + ".join(["vec3(material.w) + material.x * colour", *(shine(number) for number in range(lights) if number not in lamps)])
+    sums = " + ".join(
+        ["vec3(material.w) + material.x * colour", *(shine(number) for number in range(lights) if number not in lamps)]
+    )
     lines = [f"base = clamp({sums}, 0.0, 1.0);"]
     for index, number in enumerate(lamps):
         lines.append(f"lit{index} = clamp({shine(number)}, 0.0, 1.0);")
