@@ -18,7 +18,11 @@ from conftest import CONF, make_tabletop
 from gallery import gallery
 from hydra import compose, initialize_config_dir
 
+from vla.config.compose import compose as compose_config
+from vla.config.experiment import plain
+from vla.config.renderer import with_usable_renderer
 from vla.spec import Array
+from vla.tasks import gl
 from vla.tasks.rendering import shapes
 from vla.tasks.rendering.fast import Fast, FastRenderer
 from vla.tasks.rendering.reference import Reference, ReferenceRenderer
@@ -253,6 +257,28 @@ def test_without_egl_the_error_names_the_other_renderer(monkeypatch: pytest.Monk
     model, _ = gallery("spot")
     with pytest.raises(RuntimeError, match=r"lacks \(libEGL.so not found\): .*, or choose task/renderer=mujoco"):
         fast().open(model, View((0,), 8, 8))
+
+
+def test_without_egl_mujocos_renderer_is_chosen_and_named(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setenv(gl.EGL, "False")
+    config = compose_config("output=here")
+    usable = with_usable_renderer(config, ["output=here"])
+    assert "this machine has no EGL, which the fast renderer needs" in caplog.text
+    assert (
+        plain(usable.task)["renderer"] == plain(compose_config("task/renderer=mujoco", "output=here").task)["renderer"]
+    )
+    assert usable.collect.folder == collected_with("mujoco")[0] != collected_with("fast")[0]
+    assert with_usable_renderer(config, ["task/renderer=fast"]) is config  # and fails, in a sentence
+    monkeypatch.setenv(gl.EGL, "True")
+    assert with_usable_renderer(config, []) is config
+
+
+def test_a_machine_without_gl_is_told_from_others(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv(gl.EGL, raising=False)
+    monkeypatch.setattr(gl, "EGL_PROBE", "raise SystemExit(1)")
+    assert not gl.has_egl()
 
 
 def test_heavy_meshes_are_decimated_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

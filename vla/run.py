@@ -27,6 +27,7 @@ from vla.config.check import JOBS, check
 from vla.config.compose import CONF
 from vla.config.experiment import Experiment
 from vla.config.packages import offer_options, option_folders, trust
+from vla.config.renderer import with_usable_renderer
 from vla.deploy import ros
 from vla.parallel.fast_exit import fast_exit
 from vla.runs.sweep import failures, save_failure
@@ -143,7 +144,10 @@ def _do(cfg: DictConfig) -> float | None:
         choose_backend(required=cfg.job != "deploy")
     composed: Any = OmegaConf.to_container(cfg, resolve=False)
     trust(composed.get("trust"), targets(composed))  # before anything is read from a file
-    cfg = _adopted(cfg, HydraConfig.get().overrides.task)
+    overrides = HydraConfig.get().overrides.task
+    cfg = _adopted(cfg, overrides)
+    if "task" in _groups(cfg):
+        cfg = with_usable_renderer(cfg, overrides)
     _require_sweepable(cfg)  # with the trainer that a run brings
     check(cfg)
     return jobs.run(Experiment.of(cfg, compose("config")))

@@ -1,4 +1,4 @@
-"""The choice of MuJoCo's GL backend, made before MuJoCo is imported, because it reads MUJOCO_GL then."""
+"""The choice of MuJoCo's GL backend, which it reads from MUJOCO_GL when it is imported; whether the fast renderer works."""
 
 from __future__ import annotations
 
@@ -10,6 +10,8 @@ from pathlib import Path
 
 TRIED = "VLA_GL_WORKS"  # the backend that worked in a probe, inherited by child processes
 PROBE = "import mujoco; mujoco.GLContext(8, 8).make_current()"
+EGL = "VLA_EGL_WORKS"  # whether the fast renderer has what it needs, found by a probe, inherited by child processes
+EGL_PROBE = "import moderngl; moderngl.create_standalone_context(backend='egl')"
 
 
 def choose_backend(required: bool = True) -> None:
@@ -45,3 +47,11 @@ def choose_backend(required: bool = True) -> None:
         f"this machine cannot render with MUJOCO_GL={' or '.join(candidates)}: install the packages libegl1 and "
         "libgl1-mesa-dri, or libosmesa6, or set MUJOCO_GL to egl, osmesa or glfw"
     )
+
+
+def has_egl() -> bool:
+    """Return whether the fast renderer can draw on this machine."""
+    if EGL not in os.environ:
+        probe = subprocess.run([sys.executable, "-c", EGL_PROBE], capture_output=True)
+        os.environ[EGL] = str(probe.returncode == 0)
+    return os.environ[EGL] == "True"

@@ -73,8 +73,8 @@ class Fast:
             gl = moderngl.create_standalone_context(**BACKEND)
         except Exception as error:  # moderngl raises plain exceptions
             raise RuntimeError(
-                f"the fast renderer needs EGL, which this machine lacks ({error}): install the packages libegl1 and "
-                "libgl1-mesa-dri, or choose task/renderer=mujoco"
+                f"the fast renderer needs EGL, which this machine lacks ({error}): install the packages libegl1, "
+                "libgl1 and libgl1-mesa-dri, or choose task/renderer=mujoco"
             ) from error
         return FastRenderer(gl, model, view, self)
 

@@ -1,0 +1,33 @@
+"""The renderer of a machine that cannot use the one of the config."""
+
+from __future__ import annotations
+
+import copy
+import logging
+from collections.abc import Sequence
+
+from omegaconf import DictConfig, OmegaConf
+
+from vla.config.compose import CONF
+from vla.tasks.gl import has_egl
+
+log = logging.getLogger(__name__)
+FAST = "vla.tasks.rendering.fast.Fast"
+
+
+def with_usable_renderer(cfg: DictConfig, overrides: Sequence[str]) -> DictConfig:
+    """Return `cfg` with MuJoCo's own renderer in place of the fast one on a machine without EGL, and log a warning.
+
+    What follows, such as the folder of the demonstrations, names the renderer that draws. A renderer that the command
+    line names stays, and so does that of a resumed run: its demonstrations have been drawn.
+    """
+    asked = cfg.resume is not None or any(override.startswith("task/renderer=") for override in overrides)
+    if asked or OmegaConf.select(cfg, "task.renderer._target_") != FAST or has_egl():
+        return cfg
+    log.warning(
+        "this machine has no EGL, which the fast renderer needs: MuJoCo's own draws instead, task/renderer=mujoco. The "
+        "packages libegl1, libgl1 and libgl1-mesa-dri bring EGL"
+    )
+    usable = copy.deepcopy(cfg)
+    usable.task.renderer = OmegaConf.load(CONF / "task/renderer/mujoco.yaml")
+    return usable
