@@ -27,7 +27,6 @@ from vla.config.check import JOBS, check
 from vla.config.compose import CONF
 from vla.config.experiment import Experiment
 from vla.config.packages import offer_options, option_folders, trust
-from vla.config.renderer import with_usable_renderer
 from vla.deploy import ros
 from vla.parallel.fast_exit import fast_exit
 from vla.runs.sweep import failures, save_failure
@@ -147,6 +146,8 @@ def _do(cfg: DictConfig) -> float | None:
     overrides = HydraConfig.get().overrides.task
     cfg = _adopted(cfg, overrides)
     if "task" in _groups(cfg):
+        from vla.config.renderer import with_usable_renderer  # not every job draws
+
         cfg = with_usable_renderer(cfg, overrides)
     _require_sweepable(cfg)  # with the trainer that a run brings
     check(cfg)

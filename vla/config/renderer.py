@@ -1,18 +1,27 @@
-"""The renderer of a machine that cannot use the one of the config."""
+"""The renderers of the config, and which of them a machine can use."""
 
 from __future__ import annotations
 
 import copy
 import logging
 from collections.abc import Sequence
+from typing import cast
 
 from omegaconf import DictConfig, OmegaConf
 
 from vla.config.compose import CONF
+from vla.config.experiment import Node, plain
 from vla.tasks.gl import has_egl
 
 log = logging.getLogger(__name__)
 FAST = "vla.tasks.rendering.fast.Fast"
+
+
+def renderers() -> dict[str, Node]:
+    """Return option of `task/renderer` → its node, of those that work on this machine."""
+    files = sorted((CONF / "task/renderer").glob("*.yaml"))
+    nodes = {file.stem: plain(cast(DictConfig, OmegaConf.load(file))) for file in files}
+    return {name: node for name, node in nodes.items() if node["_target_"] != FAST or has_egl()}
 
 
 def with_usable_renderer(cfg: DictConfig, overrides: Sequence[str]) -> DictConfig:
@@ -29,5 +38,5 @@ def with_usable_renderer(cfg: DictConfig, overrides: Sequence[str]) -> DictConfi
         "packages libegl1, libgl1 and libgl1-mesa-dri bring EGL"
     )
     usable = copy.deepcopy(cfg)
-    usable.task.renderer = OmegaConf.load(CONF / "task/renderer/mujoco.yaml")
+    usable.task.renderer = renderers()["mujoco"]
     return usable

@@ -1,4 +1,4 @@
-"""The choice of MuJoCo's GL backend, which it reads from MUJOCO_GL when it is imported; whether the fast renderer works."""
+"""The choice of MuJoCo's GL backend, which it reads from MUJOCO_GL when imported; whether the fast renderer works."""
 
 from __future__ import annotations
 
