@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 from filelock import FileLock
 
-from vla.parallel.processes import THREAD_SETTINGS
+from vla.parallel.processes import THREAD_SETTINGS, without_triton
 from vla.tasks.gl import choose_backend, has_egl
 
 if TYPE_CHECKING:
@@ -30,6 +30,7 @@ for name, threads in THREAD_SETTINGS.items():
     os.environ.setdefault(name, threads)
 choose_backend()
 has_egl()  # once, for the programs that tests start
+without_triton()
 
 # What a shell runs in the background ignores interrupts, and so would the programs that tests start and interrupt.
 signal.signal(signal.SIGINT, signal.default_int_handler)

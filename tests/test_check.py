@@ -57,6 +57,11 @@ def test_a_right_config_passes() -> None:
     check(config(**{"task.time_limit": 10, "task.image_size": [64, 128], "expert.perturb": None}))
 
 
+def test_fields_that_a_dataclass_inherits_from_another_module_are_checked() -> None:
+    with pytest.raises(ValueError, match="one of joint_state, trajectory, forward, got 'fly'"):
+        check(composed("job=deploy", "deploy=ros2", "deploy.command=fly"))
+
+
 def test_an_unknown_key_is_named_with_what_was_probably_meant() -> None:
     assert problem(**{"task.bloks": 2}).startswith("task.bloks is unknown, did you mean blocks? Tabletop takes goal,")
     assert problem(**{"task.goal.hight": 0.2}).startswith("task.goal.hight is unknown, did you mean height?")

@@ -6,6 +6,7 @@ import ast
 import subprocess
 import sys
 from collections.abc import Iterator
+from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
 import pytest
@@ -18,7 +19,7 @@ MODULES = {
 
 # Parts import those of the rows above and nothing of their own row but themselves, lazy imports counted.
 LAYERS = (
-    ("vla.io", "vla.tasks.gl"),
+    ("vla.io",),
     ("vla.spec", "vla.parallel"),
     ("vla.robots",),
     ("vla.models", "vla.data", "vla.tasks"),
@@ -86,6 +87,35 @@ def imports_at_once(path: Path) -> Iterator[str]:
             yield from imports(statement)
 
 
+def references(module: str, source: str) -> set[str]:
+    """Modules that `module` imports anywhere, for type checkers included, or names in a string to import them later."""
+    tree = ast.parse(source)
+    named = set(imports(tree))
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Constant) and isinstance(node.value, str) and node.value.startswith("vla."):
+            package, _, name = node.value.rpartition(".")
+            in_package = {each for each in MODULES if package != "vla" and each.rpartition(".")[0] == package}
+            named |= {node.value, package} if name else in_package  # the name of a module or class, or its start
+    return {name for name in named if name in MODULES and name != module}
+
+
+def require_no_circle(sources: dict[str, str]) -> None:
+    TopologicalSorter({module: references(module, source) for module, source in sources.items()}).prepare()
+
+
+def test_no_imports_go_in_a_circle() -> None:
+    sources = {module: path.read_text(encoding="utf-8") for module, path in MODULES.items()}
+    require_no_circle(sources)
+    for lazy in (
+        "def later() -> None:\n    from vla.models.bc import BC",
+        "if TYPE_CHECKING:\n    from vla.models.bc import BC",
+        "import_module('vla.models.bc')",
+        "import_module(f'vla.models.{name}')",
+    ):
+        with pytest.raises(CycleError):
+            require_no_circle({**sources, "vla.io.types": f"{sources['vla.io.types']}\n{lazy}\n"})
+
+
 @pytest.mark.parametrize("module", [module for module in MODULES if module != "vla"])
 def test_parts_import_only_what_they_may(module: str) -> None:
     names = set(imports(ast.parse(MODULES[module].read_text(encoding="utf-8"))))
@@ -101,6 +131,17 @@ def test_the_entry_dispatches_with_few_modules() -> None:
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, timeout=60)
     modules = [name for name in done.stdout.split() if MODULES.get(name, ROOT / "__init__.py").name != "__init__.py"]
     assert "vla.config.check" in modules and len(modules) <= 25, sorted(modules)
+
+
+def test_only_worlds_of_mujoco_choose_its_backend_and_before_they_import_it() -> None:
+    worlds = {
+        module.rpartition(".")[0]
+        for module, path in MODULES.items()
+        if within(module, ("vla.tasks",)) and not within(module, ("vla.tasks.rendering",))
+        if {name.partition(".")[0] for name in imports(ast.parse(path.read_text(encoding="utf-8")))} & {"mujoco"}
+    }
+    choosing = {m for m in MODULES if "vla.tasks.gl" in references(m, MODULES[m].read_text(encoding="utf-8"))}
+    assert worlds <= choosing and all(within(module, ("vla.tasks",)) for module in choosing)
 
 
 def test_the_simulator_needs_no_torch() -> None:

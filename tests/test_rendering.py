@@ -20,7 +20,7 @@ from hydra import compose, initialize_config_dir
 
 from vla.config.compose import compose as compose_config
 from vla.config.experiment import plain
-from vla.config.renderer import with_usable_renderer
+from vla.config.substitutes import options, with_substitutes
 from vla.spec import Array
 from vla.tasks import gl
 from vla.tasks.rendering import shapes
@@ -264,15 +264,16 @@ def test_without_egl_mujocos_renderer_is_chosen_and_named(
 ) -> None:
     monkeypatch.setenv(gl.EGL, "False")
     config = compose_config("output=here")
-    usable = with_usable_renderer(config, ["output=here"])
-    assert "this machine has no EGL, which the fast renderer needs" in caplog.text
+    usable = with_substitutes(config, ["output=here"])
+    assert "the fast renderer needs EGL, which this machine lacks" in caplog.text
+    assert "task/renderer=mujoco instead" in caplog.text and set(options("task/renderer")) == {"mujoco"}
     assert (
         plain(usable.task)["renderer"] == plain(compose_config("task/renderer=mujoco", "output=here").task)["renderer"]
     )
     assert usable.collect.folder == collected_with("mujoco")[0] != collected_with("fast")[0]
-    assert with_usable_renderer(config, ["task/renderer=fast"]) is config  # and fails, in a sentence
+    assert with_substitutes(config, ["task/renderer=fast"]) is config  # and fails, in a sentence
     monkeypatch.setenv(gl.EGL, "True")
-    assert with_usable_renderer(config, []) is config
+    assert with_substitutes(config, []) is config
 
 
 def test_a_machine_without_gl_is_told_from_others(monkeypatch: pytest.MonkeyPatch) -> None:

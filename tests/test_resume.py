@@ -19,6 +19,8 @@ from vla.rollouts.evaluate import Report, Result
 from vla.runs.folder import save_choice, save_training
 from vla.runs.resume import FOUND, TrainingProgress, cached_success, interrupted_run, training_progress
 
+OF_TRAINER = ("trainer.max_steps=9", "trainer.precision=bf16")
+
 
 def leave(run: Path, config: dict[str, Any], finished: bool, chosen: str = "") -> None:
     """What a training of `max_steps` leaves; one that was killed at its end may have chosen nothing."""
@@ -50,13 +52,18 @@ def test_the_newest_run_that_did_not_end_is_found(tmp_path: Path) -> None:
 
 
 def test_a_run_is_resumed_with_its_config_in_its_folder(tmp_path: Path) -> None:
-    leave(tmp_path / "one", plain(composed("job=train", "model.width=17", "collect.episodes=3")), finished=False)
+    leave(
+        tmp_path / "one",
+        plain(composed("job=train", "model.width=17", "collect.episodes=3", *OF_TRAINER)),
+        finished=False,
+    )
     now = composed(f"output={tmp_path}/now", "trainer=cpu", "trainer.gradient_clip_val=2", "evaluate.episodes=7")
     said = ["trainer=cpu", "trainer.gradient_clip_val=2", "evaluate.episodes=7"]
     resumed = resume(now, tmp_path / "one", said)
     assert (resumed.job, resumed.output) == ("train", str(tmp_path / "one"))
     assert (resumed.model.width, resumed.collect.episodes, resumed.evaluate.episodes) == (17, 3, 7)
     assert (resumed.trainer.accelerator, resumed.trainer.gradient_clip_val) == ("cpu", 2)
+    assert (resumed.trainer.max_steps, resumed.trainer.precision) == (9, "bf16")  # of the run, not of trainer=cpu
     with pytest.raises(ValueError, match="omit checkpoint="):
         resume(composed(f"output={tmp_path}/now", "checkpoint=x.ckpt"), tmp_path / "one", [])
     with pytest.raises(ValueError, match="nothing was trained in that folder"):

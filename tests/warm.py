@@ -22,6 +22,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from vla.parallel.fast_exit import fast_exit
+from vla.parallel.processes import without_triton
 from vla.tasks.gl import choose_backend
 
 PATIENCE = 450  # [s]
@@ -121,6 +122,7 @@ def _codes(processes: list[int]) -> list[int]:
 def main() -> None:
     """Load the libraries; then, for every line of standard input, fork and tell the processes, then how they ended."""
     choose_backend()
+    without_triton()
     import lightning
     import matplotlib.figure
     import pyarrow

@@ -26,7 +26,8 @@ from vla.deploy import messages
 from vla.deploy.control_loop import State
 from vla.deploy.policy_node import PolicyNode
 from vla.deploy.ros import Network
-from vla.deploy.ros2 import PolicyDeployment, Topics
+from vla.deploy.ros2 import PolicyDeployment
+from vla.deploy.settings import Topics
 from vla.robots.panda import HOME
 from vla.spec import Array, Observation
 

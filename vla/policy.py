@@ -6,6 +6,8 @@ from __future__ import annotations
 
 import time
 from collections import deque
+from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass, replace
 from pathlib import Path
 from pickle import UnpicklingError
@@ -206,6 +208,7 @@ class Policy:
         self.model, self.spec = model.eval().to(self.device), spec
         self.execute = model.execute  # number of actions of a chunk to execute
         self.info: dict[str, Any] = {}
+        self.compiled = compile
         self._bf16 = precision == "bf16"
         self._encode, self._predict_chunk = self.model.encode, self.model.predict
         self._padding_sentences = [LONG_SENTENCE] if compile else []
@@ -256,20 +259,38 @@ class Policy:
         self._observe(observation)
         return self._predict()[0]
 
+    def session(self) -> Policy:
+        """Return another agent with the same model and a history of its own."""
+        other = copy(self)
+        other._frames, other._chunk = deque(maxlen=self.model.history), deque()
+        other.reset("", 0)
+        return other
+
     def _observe(self, observation: Observation) -> None:
-        if observation.instruction != self._instruction:
-            self.reset(observation.instruction, 0)
+        self._follow(observation.instruction)
         self._frames.append(self._encoded(self.frame(observation)))
 
-    @torch.inference_mode()
+    def _follow(self, instruction: str) -> None:
+        if instruction != self._instruction:
+            self.reset(instruction, 0)
+
     def _predict(self) -> tuple[Array, Array | None]:
         """Return clipped actions, (k, D), and token probabilities, (k, D, K), if the model has them."""
+        actions, probabilities = self._predicted(self._inputs())
+        return actions[0], None if probabilities is None else probabilities[0]
+
+    def _inputs(self) -> Batch:
+        """Return the input of one prediction, with the next noise if the model needs any."""
         noise = self.model.sample_noise(self._random)
-        inputs = self.window() if noise is None else {**self.window(), "noise": noise.to(self.device)}
+        return self.window() if noise is None else {**self.window(), "noise": noise.to(self.device)}
+
+    @torch.inference_mode()
+    def _predicted(self, inputs: Batch) -> tuple[Array, Array | None]:
+        """Return clipped actions, (B, k, D), and token probabilities, (B, k, D, K), if the model has them."""
         with self._autocast():
             actions, probabilities = self._predict_chunk(inputs)
-        array = None if probabilities is None else probabilities[0].float().cpu().numpy()
-        return np.clip(actions[0].float().cpu().numpy(), self._low, self._high), array
+        array = None if probabilities is None else probabilities.float().cpu().numpy()
+        return np.clip(actions.float().cpu().numpy(), self._low, self._high), array
 
     def _autocast(self) -> torch.autocast:
         return torch.autocast(self.device.type, torch.bfloat16, enabled=self._bf16)
@@ -303,7 +324,7 @@ class Policy:
 
     @torch.inference_mode()
     def _encoded(self, frame: Batch) -> dict[str, Tensor]:
-        """Return the part of a frame to cache, (1, 1, …): its tokens if the model encodes frames, else all of it."""
+        """Return the part of B frames to cache, (B, 1, …): their tokens if the model encodes frames, else all of it."""
         with self._autocast():
             tokens = self._encode(frame)
         if tokens is None:
@@ -313,6 +334,41 @@ class Policy:
 
     def _tensor(self, values: Array) -> Tensor:
         return torch.from_numpy(values.copy())[None, None].to(self.device)
+
+
+def plan_together(policies: Sequence[Policy], observations: Sequence[Observation]) -> list[Array]:
+    """Call `plan` of several sessions of one policy, each with its observation, in one pass through the model.
+
+    Actions differ from those of `plan` by rounding, because products of other sizes are summed in another order.
+    Instructions whose tokens have different lengths take one pass per length.
+
+    Raises:
+        ValueError: an observation does not match the spec.
+    """
+    frames = []
+    for policy, observation in zip(policies, observations, strict=True):
+        policy._follow(observation.instruction)
+        frames.append(policy.frame(observation))
+    plans: dict[int, Array] = {}
+    for length in {frame["text"].shape for frame in frames}:
+        group = [index for index, frame in enumerate(frames) if frame["text"].shape == length]
+        first = policies[group[0]]
+        encoded = first._encoded(_joined([frames[index] for index in group]))
+        for row, index in enumerate(group):
+            policies[index]._frames.append({name: values[row : row + 1] for name, values in encoded.items()})
+        actions, _ = first._predicted(_joined([policies[index]._inputs() for index in group]))
+        plans.update(zip(group, actions, strict=True))
+    return [plans[index] for index in range(len(policies))]
+
+
+def _joined(batches: Sequence[Batch]) -> Batch:
+    """Concatenate batches, which may hold mappings of tensors."""
+    return {
+        name: _joined([batch[name] for batch in batches])
+        if isinstance(value, dict)
+        else torch.cat([batch[name] for batch in batches])
+        for name, value in batches[0].items()
+    }
 
 
 def latency(policy: Policy) -> float:

@@ -29,8 +29,8 @@ from vla.config.experiment import Experiment
 from vla.config.packages import offer_options, option_folders, trust
 from vla.deploy import ros
 from vla.parallel.fast_exit import fast_exit
+from vla.parallel.processes import without_triton
 from vla.runs.sweep import failures, save_failure
-from vla.tasks.gl import choose_backend
 
 PACKAGE = Path(__file__).resolve().parent
 SWEEP = "in the sweep "  # prefix of a note on a cell's error
@@ -138,19 +138,17 @@ def _remove_unused() -> None:
 
 def _do(cfg: DictConfig) -> float | None:
     _require_swept()
-    if cfg.checkpoint is not None or "task" in _groups(cfg):
-        # Before the check imports MuJoCo, which reads MUJOCO_GL then; a policy on a robot does not render.
-        choose_backend(required=cfg.job != "deploy")
+    without_triton()
     composed: Any = OmegaConf.to_container(cfg, resolve=False)
     trust(composed.get("trust"), targets(composed))  # before anything is read from a file
     overrides = HydraConfig.get().overrides.task
     cfg = _adopted(cfg, overrides)
-    if "task" in _groups(cfg):
-        from vla.config.renderer import with_usable_renderer  # not every job draws
-
-        cfg = with_usable_renderer(cfg, overrides)
     _require_sweepable(cfg)  # with the trainer that a run brings
     check(cfg)
+    if "task" in _groups(cfg):
+        from vla.config.substitutes import with_substitutes  # not every job has a task
+
+        cfg = with_substitutes(cfg, overrides)
     return jobs.run(Experiment.of(cfg, compose("config")))
 
 

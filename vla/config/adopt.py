@@ -16,6 +16,7 @@ from hydra.core.override_parser.types import Override
 from omegaconf import DictConfig, OmegaConf, open_dict
 
 from vla.config.build import require_no_paths, require_trust
+from vla.config.differences import at, differences
 from vla.policy import read_header
 
 ADOPTING = ("evaluate", "export", "deploy", "benchmark")  # jobs that take a checkpoint
@@ -25,8 +26,14 @@ OF_MODEL = ("tokenizer", "model", "data")  # the batch size depends on the model
 REPORTED = ("expert", "collect", "data", "learner", "trainer", "validate", "seed", "pretrained")
 CHOSEN = {"experiment": "experiment", "model": "model"}  # name in `chosen` → group
 PRESETS = ("experiment", "variant", "shift")  # groups and keys that change other groups
-OF_A_RUN = ("job", "output", "resume", "trust")  # keys that are not taken from a resumed run
-LENGTHS = ("max_steps", "max_epochs", "val_check_interval", "accumulate_grad_batches", "gradient_clip_val")
+OF_THIS_COMMAND = ("output", "resume", "trust")  # keys that are not taken from a resumed run
+MACHINES = ("accelerator", "devices", "num_nodes", "strategy")  # keys of the trainer that its options change in one
+IDENTITY = (  # keys that nothing changes in one, because they make another training
+    *("task", "expert", "collect.episodes", "collect.seed", "collect.folder", "data"),
+    *("tokenizer", "model", "learner", "validate", "seed", "pretrained"),
+    *(f"trainer.{name}" for name in ("val_check_interval", "accumulate_grad_batches", "gradient_clip_val")),
+    *(f"trainer.{name}" for name in ("precision", "devices", "num_nodes")),
+)
 
 
 def adopt(cfg: DictConfig, overrides: Sequence[str]) -> DictConfig:
@@ -73,6 +80,9 @@ def finetune(cfg: DictConfig, overrides: Sequence[str]) -> DictConfig:
 def resume(cfg: DictConfig, run: Path, overrides: Sequence[str]) -> DictConfig:
     """Return the config of `run`, to continue it in its folder.
 
+    A resumed run has its saved config and, on top, what the command line names: of an option of `trainer` only
+    `MACHINES`, and nothing of `IDENTITY`, which `require_identity` refuses when training starts.
+
     Raises:
         ValueError: the folder has no training, is not one of the user's own runs, or `cfg` names another policy.
     """
@@ -89,17 +99,27 @@ def resume(cfg: DictConfig, run: Path, overrides: Sequence[str]) -> DictConfig:
         )
     saved, parsed = read_header(last).config, _parsed(overrides)
     _require_own_parts(parsed, PRESETS)
-    require_trust(saved, [name for name in saved if name not in OF_A_RUN], last)
-    resumed = _on_top(cfg, {str(name): saved[name] for name in cfg if name in saved and name not in OF_A_RUN}, parsed)
-    named = {_path(override) for override in parsed}
-    if "trainer" in named:  # another option changes the speed of training, not its length
-        for name in LENGTHS:
-            if name in saved["trainer"] and f"trainer.{name}" not in named:
-                OmegaConf.update(resumed, f"trainer.{name}", saved["trainer"][name], force_add=True)
+    taken = {str(name): saved[name] for name in cfg if name in saved and name not in OF_THIS_COMMAND}
+    require_trust(taken, taken, last)
+    if any(_path(override) == "trainer" for override in parsed):
+        kept = {name: value for name, value in saved["trainer"].items() if name not in MACHINES}
+        taken["trainer"] = kept | {name: cfg.trainer[name] for name in MACHINES if name in cfg.trainer}
+        parsed = [override for override in parsed if _path(override) != "trainer"]
+    resumed = _on_top(cfg, taken, parsed)
     resumed.output, resumed.resume = str(run), str(run)
-    if "job" not in named:
-        resumed.job = saved.get("job", cfg.job)
     return resumed
+
+
+def require_identity(saved: Mapping[str, Any], config: Mapping[str, Any], folder: Path) -> None:
+    """Raise a ValueError unless `config` describes the training in a run's `folder`, which has the config `saved`."""
+    before, now = ({key: at(each, key, None) for key in IDENTITY} for each in (saved, config))
+    changed = [key for key, _, _ in differences(before, now)]
+    if changed:
+        raise ValueError(
+            f"{folder} holds a training that differs in {', '.join(changed[:3])}{', …' if changed[3:] else ''}: choose "
+            f"another output=DIR (hydra.sweep.dir=DIR of a sweep), continue it unchanged with resume={folder}, or "
+            f"start a new one from its weights with pretrained={folder / 'checkpoints/last.ckpt'}"
+        )
 
 
 def _require_own_parts(parsed: Sequence[Override], groups: Sequence[str]) -> None:

@@ -7,6 +7,8 @@ arguments, types and allowed values. A node is checked against that signature be
 from __future__ import annotations
 
 import inspect
+import sys
+from collections import ChainMap
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from difflib import get_close_matches
@@ -202,23 +204,26 @@ def arguments(target: type) -> dict[str, inspect.Parameter]:
     `**inherited: Inherited` is replaced by the arguments of the next base class with a constructor.
     """
     found: dict[str, inspect.Parameter] = {}
-    for init in (vars(base)["__init__"] for base in target.__mro__[:-1] if "__init__" in vars(base)):
-        own = _parameters(init)
+    for base in (base for base in target.__mro__[:-1] if "__init__" in vars(base)):
+        own = _parameters(base)
         found = {**own, **found}
         if all(each.annotation is not Inherited for each in own.values()):
             break
     return {name: each for name, each in found.items() if each.annotation is not Inherited}
 
 
-def _parameters(init: Any) -> dict[str, inspect.Parameter]:
-    """Return the arguments of a constructor without `self`."""
-    scope = inspect.unwrap(init).__globals__
+def _parameters(target: type) -> dict[str, inspect.Parameter]:
+    """Return the arguments of a class's own constructor without `self`."""
+    init: Any = vars(target)["__init__"]
+    # The constructor of a dataclass also has the annotations of its base classes, of other modules.
+    bases = (vars(sys.modules[base.__module__]) for base in target.__mro__[:-1])
+    scope = ChainMap(inspect.unwrap(init).__globals__, *bases)
     found = {}
     for name, each in list(inspect.signature(init).parameters.items())[1:]:
         annotation = each.annotation
         if isinstance(annotation, str):
             try:
-                annotation = eval(annotation, scope)
+                annotation = eval(annotation, {}, scope)
             except NameError:  # imported for type checking only
                 annotation = Any
         found[name] = each.replace(annotation=annotation)

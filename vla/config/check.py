@@ -50,7 +50,7 @@ JOBS = {
     "benchmark": Job(
         (*TRAINING, "policy"),
         {
-            "names": Annotated[list[Literal["collect", "loader", "train", "policy", "deploy"]], MinLen(1)],
+            "names": Annotated[list[Literal["collect", "loader", "train", "policy", "deploy", "serve"]], MinLen(1)],
             "episodes": Count,
             "batches": Count,
             "steps": Count,

@@ -18,7 +18,7 @@ from vla.config.build import build
 from vla.config.check import with_changes
 from vla.config.differences import differences
 from vla.config.packages import trusted, with_trust
-from vla.tasks.gl import choose_backend
+from vla.parallel.processes import without_triton
 
 if TYPE_CHECKING:
     from vla.data.datamodule import WindowDataModule
@@ -176,8 +176,8 @@ def plain(node: DictConfig) -> Node:
 
 
 def make_environment(task: Node) -> Environment:
-    """Build the environment of a task node, with a GL backend that works on this machine."""
-    choose_backend()
+    """Build the environment of a task node."""
+    without_triton()
     environment: Environment = build(task, "task")
     return environment
 

@@ -19,7 +19,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
-from vla.deploy.ros2 import PolicyDeployment
+from vla.deploy.settings import PolicySettings
 from vla.rollouts.evaluate import Result
 
 # Time-outs.
@@ -31,7 +31,7 @@ EPISODE = 60.0  # of an episode [s]
 class DemoOperator:
     """Starts episodes, sends the instructions and monitors both nodes."""
 
-    def __init__(self, settings: PolicyDeployment, stopped: Event, agent: BaseProcess, simulator: BaseProcess) -> None:
+    def __init__(self, settings: PolicySettings, stopped: Event, agent: BaseProcess, simulator: BaseProcess) -> None:
         """Args: the agent's settings; an event that is set on interruption; the nodes' processes.
 
         Raises:

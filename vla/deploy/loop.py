@@ -15,9 +15,9 @@ from vla.deploy.ros import plain_errors, ros
 from vla.deploy.ros2 import PolicyDeployment, SimulatorDeployment
 from vla.deploy.topic_listener import TopicListener
 from vla.io.types import Count
+from vla.parallel.processes import without_triton
 from vla.rollouts.evaluate import Report, Result
 from vla.spec import Shell
-from vla.tasks.gl import choose_backend
 
 if TYPE_CHECKING:
     from vla.deploy.demo_operator import DemoOperator
@@ -99,6 +99,6 @@ class Loop:
 
 def _run(node: PolicyDeployment | SimulatorDeployment) -> None:
     """Run a node in its own process; user errors exit with one sentence."""
-    choose_backend(required=False)  # also blocks libraries that conflict with MuJoCo's renderer
+    without_triton()
     with plain_errors():
         node.run()

@@ -17,7 +17,7 @@ from vla.data.episodes import EpisodeStore
 from vla.data.formats.files import FolderExporter
 from vla.data.index import Entry
 from vla.deploy.joint_limiter import Robot
-from vla.deploy.ros2 import Topics
+from vla.deploy.settings import Topics
 from vla.io.types import Text
 from vla.parallel.pool import THIS_PROCESS, Cluster
 from vla.spec import Array, Spec

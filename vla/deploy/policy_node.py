@@ -28,7 +28,7 @@ from vla.deploy import images, messages
 from vla.deploy.control_loop import ControlLoop, State
 from vla.deploy.joint_limiter import Robot
 from vla.deploy.lifecycle_node import GuardedLifecycleNode
-from vla.deploy.ros2 import PolicyDeployment
+from vla.deploy.settings import PolicySettings
 from vla.policy import Policy
 from vla.spec import LONGEST_INSTRUCTION, Array, Observation
 
@@ -46,7 +46,7 @@ COMMANDS = {"joint_state": JointState, "trajectory": JointTrajectory, "forward":
 class PolicyNode(GuardedLifecycleNode):
     """Configuring warms the policy up, activating takes over the arm at its pose, deactivating brakes and holds."""
 
-    def __init__(self, policy: Policy, settings: PolicyDeployment, context: Context | None = None) -> None:
+    def __init__(self, policy: Policy, settings: PolicySettings, context: Context | None = None) -> None:
         super().__init__("vla_agent", context=context)
         self.policy, self.settings = policy, settings
         self.loop: ControlLoop | None = None

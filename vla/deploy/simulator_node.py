@@ -19,7 +19,7 @@ from std_srvs.srv import Trigger
 
 from vla.deploy import messages
 from vla.deploy.joint_limiter import Robot
-from vla.deploy.ros2 import Timing, Topics
+from vla.deploy.settings import Timing, Topics
 from vla.spec import LONGEST_INSTRUCTION, Array, Drivable, Environment
 
 

@@ -17,7 +17,6 @@ from vla.data.verification import derive_store, find_episode, require_whole, ver
 from vla.reports.dataset_card import store_table, write_card
 from vla.rollouts.recorder import RerunRecorder, recording_name
 from vla.rollouts.rollout import replay
-from vla.tasks.gl import choose_backend
 
 log = logging.getLogger(__name__)
 
@@ -81,7 +80,6 @@ def replay_episode(output: Path, folder: Path, seed: int) -> None:
     config, episode = find_episode(store, seed)
     if "task" not in config:
         raise ValueError(f"{folder} does not contain the task of seed {seed}, so there is no scene to replay it in")
-    choose_backend()  # before the check imports MuJoCo, which reads MUJOCO_GL then
     require_no_paths(config, ("task",), folder)
     environment = make_environment(config["task"])
     store.spec.require(environment.spec, f"the episode store {folder}", "its task as it is built now")

@@ -23,7 +23,7 @@ from vla.reports.first_batch import FILE, SHOWN, draw_samples
 from vla.reports.html import PAGE, optional, write_page
 from vla.rollouts.collect import collection_time
 from vla.runs.folder import CHECKPOINTS, LAST, save_choice, save_config, save_training
-from vla.runs.resume import TrainingProgress, first_process, training_lock, training_progress
+from vla.runs.resume import LENGTHS, TrainingProgress, first_process, training_lock, training_progress
 from vla.training.closed_loop import ClosedLoop
 from vla.training.trainer import GracefulStop, explain_memory_errors, make_trainer, quiet_lightning, restore_metrics
 
@@ -104,8 +104,7 @@ def _fit(experiment: Experiment, state: TrainingProgress, trainer: Trainer, grac
 
 
 def _endless(experiment: Experiment) -> bool:
-    limits = [experiment["trainer"].get(name) for name in ("max_steps", "max_epochs", "max_time")]
-    return all(limit in (None, -1) for limit in limits)
+    return all(experiment["trainer"].get(name) in (None, -1) for name in LENGTHS)
 
 
 def _log_tokenization_error(model: Model, store: EpisodeStore) -> None:

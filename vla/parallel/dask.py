@@ -6,12 +6,13 @@ import asyncio
 import logging
 import re
 import struct
+import sys
 import threading
 from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import CancelledError
 from contextlib import contextmanager
 from functools import partial
-from importlib.metadata import PackageNotFoundError, version
+from importlib.metadata import distributions, packages_distributions, version
 from importlib.util import find_spec
 from pathlib import Path
 from queue import Empty, SimpleQueue
@@ -20,8 +21,8 @@ from typing import TYPE_CHECKING, Any
 from uuid import uuid4
 
 from vla.io.types import Positive
-from vla.parallel.pool import Crashed, Pool, Worker, WorkerFactory, WorkersLost
-from vla.parallel.processes import one_thread
+from vla.parallel.pool import Crashed, Pool, WorkersLost
+from vla.parallel.processes import Worker, WorkerFactory, one_thread
 
 if TYPE_CHECKING:
     import distributed
@@ -29,7 +30,6 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 CONNECT = 5.0  # timeout of the connection to the scheduler [s]
-LIBRARIES = ("numpy", "mujoco", "dm-control", "torch")  # their versions must agree for bit-exact episodes
 
 
 class DaskCluster:
@@ -173,25 +173,42 @@ def _attempt(pool: str, make: WorkerFactory, item: Any) -> Any:
 
 
 def _make_checked(make: WorkerFactory, versions: dict[str, str], needs: Sequence[Path]) -> Worker:
-    """Create a worker on another machine with the same library versions.
+    """Create a worker on another machine, which loads libraries of the same `versions`: bit-exact results need them.
 
     Raises:
-        ValueError: that machine has other versions, or lacks a path in `needs`.
+        ValueError: that machine loads another version, or lacks a path in `needs`.
     """
-    if _versions() != versions:
-        raise ValueError(f"{gethostname()} has {_versions()}, not {versions}: install the same versions everywhere")
     for path in needs:
         if not path.exists():
             raise ValueError(f"{gethostname()} has no {path}: workers need it on a file system that all machines share")
     one_thread()
-    return make()
+    try:
+        return make()
+    finally:
+        loaded = {
+            _normal(name)
+            for package, names in packages_distributions().items()
+            if package in sys.modules
+            for name in names
+        }
+        for name in sorted(loaded & {*versions}):
+            if version(name) != versions[name]:
+                raise ValueError(
+                    f"{gethostname()} has {name} {version(name)}, not {versions[name]}: install the same versions "
+                    "everywhere"
+                )
 
 
 def _versions() -> dict[str, str]:
-    versions = {}
-    for name in LIBRARIES:
-        try:
-            versions[name] = version(name)
-        except PackageNotFoundError:
-            versions[name] = "none"
-    return versions
+    """Return name → version of the installed dependencies of vla and of packages made for it."""
+    installed = {_normal(each.name): each for each in distributions()}
+    needed = {
+        name: [_normal(re.split(r"[^\w.-]", text)[0]) for text in each.requires or ()]
+        for name, each in installed.items()
+    }
+    ours = [names for name, names in needed.items() if name == "vla" or "vla" in names]
+    return {name: installed[name].version for names in ours for name in names if name in installed}
+
+
+def _normal(name: str) -> str:
+    return re.sub(r"[-_.]+", "-", name).lower()

@@ -10,7 +10,7 @@ import logging
 import pickle
 import signal
 import threading
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from concurrent import futures
 from contextlib import AbstractContextManager, closing, contextmanager
 from multiprocessing import resource_tracker
@@ -18,24 +18,9 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from vla.io.types import Count
-from vla.parallel.processes import ProcessEnded, WorkerProcess, cores, one_thread_each
+from vla.parallel.processes import ProcessEnded, Worker, WorkerFactory, WorkerProcess, cores, one_thread_each
 
 log = logging.getLogger(__name__)
-
-
-class Worker(Protocol):
-    """Sequential processor of items."""
-
-    def attempt(self, item: Any, /) -> Any:
-        """Return the result of one item."""
-        ...
-
-    def close(self) -> None:
-        """Free the resources of the worker."""
-        ...
-
-
-WorkerFactory = Callable[[], Worker]
 
 
 class WorkersLost(ValueError):

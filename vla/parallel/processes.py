@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import pickle
 import signal
@@ -12,15 +13,28 @@ from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
 from multiprocessing import get_context, parent_process
 from multiprocessing.connection import Connection
-from typing import TYPE_CHECKING, Any
-
-if TYPE_CHECKING:
-    from vla.parallel.pool import Worker
+from pathlib import Path
+from typing import Any, Protocol
 
 PATIENCE = 5.0  # [s] for an idle process to free its resources
 
 # LP_NUM_THREADS is of Mesa's renderer, which counts only threads beside the calling one.
 THREAD_SETTINGS = {"OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "LP_NUM_THREADS": "0"}
+
+
+class Worker(Protocol):
+    """Sequential processor of items."""
+
+    def attempt(self, item: Any, /) -> Any:
+        """Return the result of one item."""
+        ...
+
+    def close(self) -> None:
+        """Free the resources of the worker."""
+        ...
+
+
+WorkerFactory = Callable[[], Worker]
 
 
 class ProcessEnded(Exception):
@@ -148,6 +162,17 @@ def one_thread() -> None:
     os.environ.update(THREAD_SETTINGS)  # read when a library is loaded
     if torch := sys.modules.get("torch"):  # already loaded if this process trained the policy
         torch.set_num_threads(1)
+
+
+def without_triton() -> None:
+    """Block the import of Triton where PyTorch cannot use it, on machines without an NVIDIA GPU.
+
+    Triton and Mesa's software renderer each contain an LLVM, and processes that load both crash. Call this before
+    Lightning is imported, which imports Triton.
+    """
+    if not Path("/dev/nvidiactl").exists():
+        sys.modules.setdefault("triton", None)  # type: ignore[arg-type]
+        logging.getLogger("torch.utils.flop_counter").setLevel(logging.ERROR)  # warns without Triton
 
 
 @contextmanager

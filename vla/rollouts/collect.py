@@ -19,7 +19,8 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from vla.data.episodes import EpisodeStore
 from vla.data.index import DAMAGED
 from vla.io.files import atomic_path
-from vla.parallel.pool import Cluster, Future, Pool, WorkerFactory, WorkersLost
+from vla.parallel.pool import Cluster, Future, Pool, WorkersLost
+from vla.parallel.processes import WorkerFactory
 from vla.rollouts.rollout import replay, rollout
 from vla.spec import FIRST_SEED, Agent, Environment, Episode
 

@@ -12,6 +12,7 @@ from typing import Any
 
 from filelock import FileLock, Timeout
 
+from vla.config.adopt import require_identity
 from vla.config.differences import differences
 from vla.policy import read_header
 from vla.runs.folder import CHECKPOINTS, LAST, REPORT, read_run, run_of
@@ -21,15 +22,7 @@ log = logging.getLogger(__name__)
 FOUND = "VLA_LAST"  # environment variable that passes the run found by resume=last to other processes
 LOCK = ".training"  # held by the process that trains into a folder of checkpoints
 
-# Keys that identify a training. Its length, location and speed may change.
-IDENTITY = (
-    *("task", "expert", "collect.episodes", "collect.seed", "collect.folder", "data"),
-    *("tokenizer", "model", "learner", "validate", "seed", "pretrained"),
-    *(f"trainer.{name}" for name in ("val_check_interval", "accumulate_grad_batches", "gradient_clip_val")),
-    *(f"trainer.{name}" for name in ("precision", "devices", "num_nodes")),
-)
-
-LENGTHS = ("max_steps", "max_epochs", "max_time")
+LENGTHS = ("max_steps", "max_epochs", "max_time")  # of the trainer
 
 
 @dataclass(frozen=True)
@@ -50,13 +43,7 @@ def training_progress(folder: Path, config: Mapping[str, Any]) -> TrainingProgre
     if not last.exists():
         return TrainingProgress()
     saved = read_header(last)
-    changed = [key for key, _, _ in differences(_identity(saved.config), _identity(config))]
-    if changed:
-        raise ValueError(
-            f"{folder} holds a training that differs in {', '.join(changed[:3])}{', …' if changed[3:] else ''}: choose "
-            f"another output=DIR (hydra.sweep.dir=DIR of a sweep), continue it unchanged with resume={folder}, or "
-            f"start a new one from its weights with pretrained={last}"
-        )
+    require_identity(saved.config, config, folder)
     trainer, before = config["trainer"], saved.config.get("trainer", {})
     longer = (
         any(trainer.get(name) != before.get(name) for name in LENGTHS) and not 0 <= trainer["max_steps"] <= saved.steps
@@ -150,12 +137,3 @@ def first_process() -> bool:
     from lightning.pytorch.utilities import rank_zero_only
 
     return bool(rank_zero_only.rank == 0)  # type: ignore[attr-defined]
-
-
-def _identity(config: Mapping[str, Any]) -> dict[str, Any]:
-    """Return key → value of the keys that identify a training; None for absent keys."""
-    values: dict[str, Any] = {}
-    for key in IDENTITY:
-        group, _, name = key.partition(".")
-        values[key] = config.get(group, {}).get(name) if name else config.get(group)
-    return values

@@ -46,13 +46,17 @@ class ClosedLoop(Callback):
         self._environment: Environment | None = None
         self.success, self.best = 0.0, -1.0
 
+    def on_fit_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Build the environment before training, in case this machine cannot."""
+        assert isinstance(pl_module, Learner)
+        if pl_module.device_mesh is None and trainer.enable_validation:
+            self._environment = self._make_environment()
+
     def on_validation_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Play the episodes; later callbacks restore the weights in training."""
         assert isinstance(pl_module, Learner)
-        if pl_module.device_mesh is not None:
-            return
         if self._environment is None:
-            self._environment = self._make_environment()
+            return
         policy = self._make_policy(pl_module.model)
         mine = self._seeds[trainer.global_rank :: trainer.world_size]
         with torch.compiler.set_stance("force_eager"):  # a window has another shape than was compiled

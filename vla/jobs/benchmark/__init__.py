@@ -19,7 +19,7 @@ from vla.jobs.benchmark.machine import Others, machine, spoilt
 from vla.jobs.benchmark.measure import Measure
 
 log = logging.getLogger(__name__)
-STAGES = ("collect", "loader", "train", "policy", "deploy")
+STAGES = ("collect", "loader", "train", "policy", "deploy", "serve")
 
 
 def run(experiment: Experiment) -> dict[str, Measure]:

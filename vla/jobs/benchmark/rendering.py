@@ -7,7 +7,7 @@ from collections.abc import Callable
 from functools import partial
 
 from vla.config.experiment import Experiment
-from vla.config.renderer import renderers
+from vla.config.substitutes import options
 from vla.jobs.benchmark.measure import Floored, Measure, measure, timed
 
 FRAMES = 10  # of a renderer before it is the next one's turn
@@ -18,10 +18,10 @@ def renderings(experiment: Experiment) -> dict[str, Measure]:
 
     The floor is the fastest one. Nothing is measured of a world that is not `Floored` or has no such renderer.
     """
-    own, options = experiment["task"].get("renderer"), renderers()
-    if own is None or own["_target_"] not in [node["_target_"] for node in options.values()]:
+    own, choice = experiment["task"].get("renderer"), options("task/renderer")
+    if own is None or own["_target_"] not in [node["_target_"] for node in choice.values()]:
         return {}
-    nodes = {name: own if node["_target_"] == own["_target_"] else node for name, node in options.items()}
+    nodes = {name: own if node["_target_"] == own["_target_"] else node for name, node in choice.items()}
     worlds = {name: experiment.make_environment({"renderer": node})() for name, node in nodes.items()}
     seconds: defaultdict[str, float] = defaultdict(float)
     rounds = experiment["benchmark"]["episodes"]

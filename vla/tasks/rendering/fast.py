@@ -18,6 +18,7 @@ import numpy as np
 from annotated_types import Ge, Le
 
 from vla.spec import Array
+from vla.tasks.gl import has_egl
 from vla.tasks.rendering import lights, shaders, shapes
 from vla.tasks.rendering.buffers import Buffers
 from vla.tasks.rendering.cameras import Cameras
@@ -33,6 +34,7 @@ SLOPE, UNITS = 1.5, 4.0  # offset of shadow maps against surfaces that shade the
 ALIGNMENT = 256  # of a camera's block in its buffer [bytes], enough for every machine
 BACKEND: Any = {"backend": "egl"}
 RIM = 2  # texels of a shadow map, both sides together, that stay empty: shadows at its edge would never end
+PACKAGES = "libegl1, libgl1 and libgl1-mesa-dri"
 STATE = moderngl.DEPTH_TEST | moderngl.CULL_FACE
 
 
@@ -63,6 +65,13 @@ class Fast:
         """
         self.samples, self.soft, self.light, self.faces = samples, soft, light, faces
 
+    @staticmethod
+    def substitute() -> tuple[str, str] | None:
+        """Return why this machine cannot use the renderer, and the option to use instead; None where it can."""
+        if has_egl():
+            return None
+        return f"the fast renderer needs EGL, which this machine lacks (packages {PACKAGES})", "mujoco"
+
     def open(self, model: mujoco.MjModel, view: View) -> Renderer:
         """Make a renderer of `model`, with a GL context in this thread.
 
@@ -73,8 +82,8 @@ class Fast:
             gl = moderngl.create_standalone_context(**BACKEND)
         except Exception as error:  # moderngl raises plain exceptions
             raise RuntimeError(
-                f"the fast renderer needs EGL, which this machine lacks ({error}): install the packages libegl1, "
-                "libgl1 and libgl1-mesa-dri, or choose task/renderer=mujoco"
+                f"the fast renderer needs EGL, which this machine lacks ({error}): install the packages "
+                f"{PACKAGES}, or choose task/renderer=mujoco"
             ) from error
         return FastRenderer(gl, model, view, self)
 

@@ -13,6 +13,7 @@ import numpy as np
 from vla.io.types import Count, ImageSize, Names, Point, Positive
 from vla.robots.panda import CHAIN, FINGER_TRAVEL
 from vla.spec import Array, Observation, RobotModel, Shape, Spec
+from vla.tasks.gl import require_backend
 from vla.tasks.rendering.renderer import Renderer, Rendering, View
 from vla.tasks.tabletop.goals.goal import Goal
 from vla.tasks.tabletop.goals.mixed import Mixed
@@ -66,7 +67,9 @@ class Tabletop:
 
         Raises:
             ValueError: an unknown camera, or more blocks than colours.
+            RuntimeError: this machine cannot render.
         """
+        require_backend()
         most = len(COLOURS) - goal.absent
         if not goal.blocks <= blocks <= most:
             raise ValueError(f"task.blocks must be from {goal.blocks} to {most}, one colour each, got {blocks}")

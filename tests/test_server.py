@@ -1,0 +1,305 @@
+"""A policy behind openpi's protocol, for well-behaved clients and for others."""
+
+from __future__ import annotations
+
+import re
+import threading
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+from urllib.error import HTTPError
+from urllib.request import urlopen
+
+import msgpack
+import numpy as np
+import pytest
+from fake_batch import as_policy, make_bc, make_rt1
+from toy import SPEC, ToyEnvironment
+from websockets.exceptions import ConnectionClosed, InvalidStatus
+from websockets.sync.client import ClientConnection, connect
+
+from vla.deploy.server import Keys, PolicyServer, Service
+from vla.io.array_messages import LARGEST_MAP, LONGEST_LIST, pack, unpack
+from vla.policy import Policy, plan_together
+from vla.rollouts.evaluate import play
+from vla.rollouts.remote import Component, RemotePolicy
+from vla.rollouts.rollout import rollout
+from vla.spec import FIRST_SEED, LONGEST_INSTRUCTION, Observation
+
+KEYS = Keys({"eye": "observation/image"}, ["observation/state"], "prompt")
+
+
+def settings(policy: Policy, **changes: Any) -> PolicyServer:
+    values: dict[str, Any] = {
+        "host": "127.0.0.1",
+        "port": 0,
+        "keys": KEYS,
+        "image_crop": "centre",
+        "batch": 8,
+        "connections": 4,
+        "largest_message": 1_000_000,
+        "api_key": None,
+        "certificate": None,
+        "private_key": None,
+        "policy": lambda: policy,
+        "environment": ToyEnvironment,
+        "output": Path(),
+    }
+    return PolicyServer(**{**values, **changes})
+
+
+def serving(policy: Policy, **changes: Any) -> AbstractContextManager[str]:
+    """A server in a thread of its own, by its URL."""
+    return Service(settings(policy, **changes), policy).in_thread()
+
+
+def client(url: str, **options: Any) -> ClientConnection:
+    return connect(url, compression=None, max_size=None, **options)
+
+
+def received(connection: ClientConnection) -> Any:
+    data = connection.recv()
+    assert isinstance(data, bytes), data
+    return unpack(data)
+
+
+def message(observation: Observation) -> dict[str, Any]:
+    return {
+        "observation/image": observation.rgb["eye"],
+        "observation/state": observation.state,
+        "prompt": observation.instruction,
+    }
+
+
+def observations(count: int, seed: int = 0) -> list[Observation]:
+    random = np.random.default_rng(seed)
+    return [SPEC.random_observation(random) for _ in range(count)]
+
+
+def remote(url: str, **changes: Any) -> RemotePolicy:
+    values: dict[str, Any] = {
+        "url": url,
+        "images": {"observation/image": "eye"},
+        "image_size": None,
+        "state": {"observation/state": None},
+        "prompt": "prompt",
+        "actions": None,
+        "execute": None,
+        "timeout": 10.0,
+        "api_key": None,
+        "spec": SPEC,
+    }
+    return RemotePolicy(**{**values, **changes})
+
+
+@pytest.mark.parametrize("make", [make_bc, make_rt1], ids=["one frame", "a history"])
+def test_a_client_gets_the_chunks_of_the_policy_bit_for_bit(make: Callable[[], Any]) -> None:
+    policy = as_policy(make())
+    seen = observations(4)
+    expected = policy.session()
+    with serving(policy) as url, client(url) as connection:
+        described = received(connection)
+        for observation in seen:
+            connection.send(pack(message(observation)))
+            answer = received(connection)
+            np.testing.assert_array_equal(answer["actions"], expected.plan(observation))
+    assert answer["actions"].dtype == np.float32 and answer["server_timing"].keys() == {"infer_ms", "prev_total_ms"}
+    assert described["images"] == {"observation/image": [16, 16, 3]} and described["prompt"] == "prompt"
+    assert described["action"]["names"] == list(SPEC.action) and described["history"] == policy.model.history
+    np.testing.assert_array_equal(described["action"]["high"], np.array(SPEC.high, np.float32))
+
+
+def test_an_agent_in_another_process_plays_like_the_policy_here() -> None:
+    policy = as_policy(make_bc(chunk=3))
+    expected = rollout(ToyEnvironment(), policy.session(), FIRST_SEED)
+    with serving(policy) as url:
+        agent = remote(url)
+        episodes = [rollout(ToyEnvironment(), agent, FIRST_SEED) for _ in range(2)]
+        agent.close()
+    for episode in episodes:
+        np.testing.assert_array_equal(episode.executed, expected.executed)
+
+
+def test_clients_have_histories_of_their_own_and_share_passes() -> None:
+    policy = as_policy(make_rt1())
+    streams = [observations(5, seed) for seed in range(3)]
+    alone = [[session.plan(each) for each in stream] for stream in streams for session in [policy.session()]]
+    together = [policy.session() for _ in streams]
+    for step, group in enumerate(zip(*streams, strict=True)):
+        planned = plan_together(together, group)
+        for number, actions in enumerate(planned):
+            np.testing.assert_allclose(actions, alone[number][step], atol=1e-5)
+    with serving(policy) as url:
+        results: dict[int, list[Any]] = {}
+
+        def talk(number: int) -> None:
+            with client(url) as connection:
+                connection.recv()
+                results[number] = []
+                for observation in streams[number]:
+                    connection.send(pack(message(observation)))
+                    results[number].append(received(connection)["actions"])
+
+        threads = [threading.Thread(target=talk, args=[number]) for number in range(3)]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join(20)
+    for number in range(3):
+        np.testing.assert_allclose(results[number], alone[number], atol=1e-5)
+
+
+def test_sentences_of_different_lengths_wait_together() -> None:
+    policy = as_policy(make_bc())
+    seen = [
+        replace(each, instruction=text) for each, text in zip(observations(3), ("go", "lift it now", "go"), strict=True)
+    ]
+    expected = [policy.session().plan(each) for each in seen]
+    planned = plan_together([policy.session() for _ in seen], seen)
+    np.testing.assert_allclose(planned, expected, atol=1e-5)
+
+
+def test_a_reset_begins_another_episode() -> None:
+    policy = as_policy(make_rt1())
+    seen = observations(3)
+    expected = policy.session().plan(seen[2])
+    with serving(policy) as url, client(url) as connection:
+        connection.recv()
+        for observation in seen[:2]:
+            connection.send(pack(message(observation)))
+            connection.recv()
+        connection.send(pack({"reset": True, "seed": 3, "prompt": "do what is to be done"}))
+        assert received(connection) == {"reset": True}
+        connection.send(pack(message(seen[2])))
+        np.testing.assert_array_equal(received(connection)["actions"], expected)
+
+
+def test_images_of_other_sizes_kinds_and_places_are_taken() -> None:
+    observation = observations(1)[0]
+    image = observation.rgb["eye"]
+    plain = KEYS.observation(message(observation), SPEC, "centre")
+    np.testing.assert_array_equal(plain.rgb["eye"], image)
+    nested = {
+        "observation": {"image": image.transpose(2, 0, 1) / np.float32(255), "state": list(map(float, plain.state))}
+    }
+    other = KEYS.observation({**nested, "prompt": "go"}, SPEC, "centre")
+    np.testing.assert_array_equal(other.rgb["eye"], image)
+    np.testing.assert_array_equal(other.state, plain.state)
+    large = {**message(observation), "observation/image": image.repeat(4, 0).repeat(6, 1)}
+    assert KEYS.observation(large, SPEC, "centre").rgb["eye"].shape == (16, 16, 3)
+    parts = Keys(KEYS.images, ["east", "north"], "prompt")
+    split = {"observation/image": image, "east": np.float32(1), "north": [2.0], "prompt": "go"}
+    np.testing.assert_array_equal(parts.observation(split, SPEC, "none").state, [1, 2])
+
+
+WHOLE = message(observations(1)[0])
+WRONG: dict[str, tuple[Any, str]] = {
+    "text": ("hello", "is a binary message in msgpack, not text"),
+    "noise": (b"\xc1\x00", "is no message in msgpack with arrays of numbers"),
+    "half": (pack(WHOLE)[:100], "is no message in msgpack"),
+    "list": (pack([1, 2]), "an observation is a map, not list"),
+    "empty": (pack({}), "lacks observation/image, observation/state, prompt: it has nothing"),
+    "keys": (pack({"image": 1, "prompt": "go"}), "lacks observation/image, observation/state: it has image, prompt"),
+    "image": (pack({**WHOLE, "observation/image": np.zeros((4, 4), np.uint8)}), r"is an image \(H, W, 3\).*\(4, 4\)"),
+    "range": (pack({**WHOLE, "observation/image": np.full((4, 4, 3), 255.0)}), "send uint8, or floats from 0 to 1"),
+    "state": (pack({**WHOLE, "observation/state": np.zeros(3)}), "hold 3 numbers, the policy needs 2: east, north"),
+    "finite": (pack({**WHOLE, "observation/state": [np.nan, 0.0]}), "holds a number that is not finite"),
+    "words": (pack({**WHOLE, "observation/state": "far"}), "observation/state is no vector of numbers"),
+    "prompt": (pack({**WHOLE, "prompt": "a" * (LONGEST_INSTRUCTION + 1)}), "of at most 1000 characters"),
+    "seed": (pack({"reset": True, "seed": -1}), "seed is -1, expected an integer"),
+    "objects": (
+        msgpack.packb({b"__ndarray__": True, b"dtype": "|O", b"data": b"cos\nsystem\n", b"shape": [1]}),
+        r"has the type \|O, expected one of",
+    ),
+    "short": (
+        msgpack.packb({b"__ndarray__": True, b"dtype": "<f8", b"data": b"", b"shape": [10**9, 10**9]}),
+        "has too many or too few bytes",
+    ),
+    "deep": (b"\x91" * 100_000 + b"\x01", "is no message in msgpack"),
+    "lists": (msgpack.packb([[0] * 1000] * (LONGEST_LIST // 1000)), "hold more than 10000 items"),
+    "maps": (msgpack.packb([{}] * (LARGEST_MAP + 1)), "more than 1000 maps"),
+}
+
+
+def test_who_sends_nonsense_is_told_why_and_disturbs_nobody() -> None:
+    policy = as_policy(make_bc())
+    expected = policy.session().plan(observations(1)[0])
+    with serving(policy) as url, client(url) as good:
+        good.recv()
+        for data, sentence in WRONG.values():
+            with client(url) as bad:
+                bad.recv()
+                bad.send(data)
+                said = bad.recv()
+                assert isinstance(said, str) and re.search(sentence, said), said
+                with pytest.raises(ConnectionClosed):
+                    bad.recv()
+        with client(url) as large:
+            large.recv()
+            large.send(pack({"observation/image": np.zeros(2_000_000, np.uint8)}))
+            with pytest.raises(ConnectionClosed, match="1009"):
+                large.recv()
+        good.send(pack(WHOLE))
+        np.testing.assert_array_equal(received(good)["actions"], expected)
+
+
+def test_only_so_many_come_in_and_only_with_the_key() -> None:
+    policy = as_policy(make_bc())
+    key = {"additional_headers": {"Authorization": "Api-Key open"}}
+    with serving(policy, api_key="open", connections=1) as url:
+        http = url.replace("ws://", "http://")
+        assert urlopen(f"{http}/healthz").read() == b"OK\n"
+        with pytest.raises(HTTPError, match="401"):
+            urlopen(http)
+        with pytest.raises(InvalidStatus, match="401"):
+            client(url)
+        with pytest.raises(ValueError, match="failed: send the API key as Authorization: Api-Key"):
+            remote(url)
+        with client(url, **key) as connection:
+            connection.recv()
+            with pytest.raises(ValueError, match="failed: 1 clients are connected"):
+                remote(url, api_key="open")
+        remote(url, api_key="open").close()
+
+
+def test_beyond_this_machine_nobody_listens_without_a_key(tmp_path: Path) -> None:
+    policy = as_policy(make_bc())
+    with pytest.raises(ValueError, match=r"deploy\.host=0\.0\.0\.0 lets other machines use the policy: set"):
+        settings(policy, host="0.0.0.0")
+    assert settings(policy, host="0.0.0.0", api_key="open").host == "0.0.0.0"
+    with pytest.raises(ValueError, match=r"needs both deploy\.certificate and deploy\.private_key"):
+        settings(policy, certificate=str(tmp_path / "certificate.pem"))
+    with serving(policy) as url, pytest.raises(OSError, match="in use"), serving(policy, port=int(url[-5:])):
+        pass
+    with pytest.raises(ValueError, match=r"set deploy\.keys\.images\.eye=KEY"):
+        settings(policy, keys=replace(KEYS, images={})).run()
+
+
+def test_somebody_elses_actions_become_ours() -> None:
+    policy = as_policy(make_bc())
+    swapped = {"x": Component(1), "y": Component(0, scale=-1.0), "gripper": Component(2, offset=2.0)}
+    observation = observations(1)[0]
+    x, y, _ = policy.session().plan(observation)[0]
+    with serving(policy) as url:
+        agent = remote(url, actions=swapped)
+        agent.reset(observation.instruction, 0)
+        np.testing.assert_allclose(agent.act(observation), [y, -x, 1.0])
+        with pytest.raises(ValueError, match=r"agent\.actions must map x, y, gripper, got x"):
+            remote(url, actions={"x": Component(0)})
+        with pytest.raises(ValueError, match=r"agent\.images names back, the cameras are eye"):
+            remote(url, images={"observation/image": "back"})
+        with pytest.raises(ValueError, match="failed: its actions have 3 components"):
+            remote(url, actions={**swapped, "x": Component(3)}).act(observation)
+
+
+def test_a_server_that_goes_away_fails_the_episode_and_says_so() -> None:
+    policy = as_policy(make_bc())
+    with serving(policy) as url:
+        agent = remote(url)
+        assert play(ToyEnvironment(), agent, FIRST_SEED).outcome in ("success", "timeout")
+    failed = play(ToyEnvironment(), agent, FIRST_SEED)
+    assert failed.outcome == "error" and f"the policy server at {url} failed: it closed the connection" in failed.error
+    with pytest.raises(ValueError, match=f"nobody serves a policy at {url} .*: start it"):
+        remote(url)

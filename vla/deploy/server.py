@@ -1,0 +1,379 @@
+"""A policy server that speaks openpi's protocol, for any client that does.
+
+Over a WebSocket without compression the server first sends its metadata, then one map with `actions` (k, D) for every
+observation of the client, all in the encoding of `vla.io.array_messages`. An error is sent as text and closes the
+connection. `GET /healthz` answers OK (openpi, src/openpi/serving/websocket_policy_server.py).
+
+Beyond that protocol, the metadata describe actions, state and images, and the message {"reset": True, "prompt": …,
+"seed": …} starts an episode: it clears the history of the connection and seeds the noise of the model.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import hmac
+import logging
+import queue
+import signal
+import ssl
+import time
+from collections.abc import AsyncIterator, Callable, Iterator, Mapping, Sequence
+from concurrent.futures import Executor, ThreadPoolExecutor
+from contextlib import asynccontextmanager, contextmanager, suppress
+from dataclasses import dataclass
+from http import HTTPStatus
+from ipaddress import ip_address
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import numpy as np
+from annotated_types import Ge, Le, MinLen
+
+from vla.deploy.images import Crop, resize
+from vla.io.array_messages import pack, unpack
+from vla.io.types import Count, Text
+from vla.spec import LONGEST_INSTRUCTION, Array, Environment, Observation, Spec
+
+if TYPE_CHECKING:
+    from websockets.asyncio.server import ServerConnection
+    from websockets.http11 import Request, Response
+
+    from vla.policy import Policy
+
+LARGEST_IMAGE = 4096  # pixels in a row or column
+INVALID, INTERNAL = 1007, 1011  # WebSocket close codes: invalid data, error in the server
+
+log = logging.getLogger(__name__)
+
+Port = Annotated[int, Ge(0), Le(65535)]  # 0: any free one
+
+
+@dataclass(frozen=True)
+class Keys:
+    """Keys of a client's observation; a key that is absent is also looked up as a path of nested maps."""
+
+    images: dict[str, Text]  # camera → image
+    state: Annotated[list[Text], MinLen(1)]  # vectors to concatenate
+    prompt: Text  # instruction
+
+    def observation(self, message: Any, spec: Spec, crop: Crop) -> Observation:
+        """Convert a client's observation; images are resized, and all components are checked.
+
+        Raises:
+            ValueError: it does not match the spec; all missing keys are named at once.
+        """
+        if not isinstance(message, Mapping):
+            raise ValueError(f"an observation is a map, not {type(message).__name__}")
+        wanted = [*(self.images[camera] for camera in spec.cameras), *self.state, self.prompt]
+        found = {key: _find(message, key) for key in wanted}
+        if missing := [key for key, value in found.items() if value is None]:
+            present = ", ".join(str(key)[:50] for key in list(message)[:20])
+            raise ValueError(f"the observation lacks {', '.join(missing)}: it has {present or 'nothing'}")
+        rgb = {
+            camera: resize(_image(self.images[camera], found[self.images[camera]]), spec.image_size, crop)
+            for camera in spec.cameras
+        }
+        state = np.concatenate([_vector(key, found[key]) for key in self.state])
+        if len(state) != len(spec.state):
+            raise ValueError(
+                f"{' and '.join(self.state)} hold {len(state)} numbers, the policy needs {len(spec.state)}: "
+                f"{', '.join(spec.state)}"
+            )
+        return Observation(rgb, state, _prompt(self.prompt, found[self.prompt]))
+
+
+@dataclass(kw_only=True)
+class PolicyServer:
+    """The policy behind openpi's protocol.
+
+    Attributes:
+        host, port: address to listen at.
+        keys: where an observation has its images, state and instruction.
+        image_crop: for images with another aspect ratio than in training: crop the centre, or distort the whole.
+        batch: largest number of clients that one pass through the model serves; a compiled policy serves one.
+        connections: largest number of clients at a time.
+        largest_message: of a client [bytes].
+        api_key: what clients must send; needed to listen beyond this machine.
+        certificate, private_key: PEM files for TLS.
+        policy, environment: factories of the policy and of the task's environment.
+        output: folder of results, unused.
+
+    Raises:
+        ValueError: other machines could connect without a key, or one of the two files for TLS is missing.
+    """
+
+    host: Text
+    port: Port
+    keys: Keys
+    image_crop: Crop
+    batch: Count
+    connections: Count
+    largest_message: Count
+    api_key: Text | None
+    certificate: str | None
+    private_key: str | None
+    policy: Callable[[], Policy]
+    environment: Callable[[], Environment]
+    output: Path
+
+    def __post_init__(self) -> None:
+        if self.api_key is None and not _is_loopback(self.host):
+            raise ValueError(
+                f"deploy.host={self.host} lets other machines use the policy: set the environment variable "
+                "VLA_API_KEY, which clients must then know, or deploy.host=127.0.0.1"
+            )
+        if (self.certificate is None) != (self.private_key is None):
+            raise ValueError("TLS needs both deploy.certificate and deploy.private_key")
+        for name in ("certificate", "private_key"):
+            file = getattr(self, name)
+            if file is not None and not Path(file).is_file():
+                raise ValueError(f"deploy.{name}={file}: there is no such file")
+
+    def run(self) -> None:
+        """Serve until interrupted.
+
+        Raises:
+            ValueError: websockets is not installed, there is no policy, or its cameras have no keys.
+            OSError: the address cannot be used.
+        """
+        try:
+            import websockets  # noqa: F401
+        except ImportError as error:
+            raise ValueError(
+                "deploy=server needs websockets: install this package with its extra server, as in "
+                "pip install -e '.[server]'"
+            ) from error
+        policy = self.policy()
+        if keyless := [camera for camera in policy.spec.cameras if camera not in self.keys.images]:
+            raise ValueError(f"the policy sees {', '.join(keyless)}: set deploy.keys.images.{keyless[0]}=KEY")
+        asyncio.run(Service(self, policy).serve())
+
+
+class Service:
+    """A running server: all connections share the model, and inference runs in one thread beside the event loop."""
+
+    def __init__(self, settings: PolicyServer, policy: Policy) -> None:
+        self._settings, self._policy = settings, policy
+        self._metadata = pack(metadata(policy, settings.keys))
+        self._waiting: asyncio.Queue[tuple[Policy, Observation, asyncio.Future[Array]]] = asyncio.Queue()
+        self._connected = 0
+
+    @asynccontextmanager
+    async def listening(self) -> AsyncIterator[str]:
+        """Serve within the context, which is entered with the URL once the first client can be answered."""
+        from websockets.asyncio.server import serve
+
+        settings, context = self._settings, None
+        if settings.certificate is not None:
+            context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+            context.load_cert_chain(settings.certificate, settings.private_key)
+        limits = {"compression": None, "max_size": settings.largest_message, "max_queue": 1}
+        request = {"process_request": self._answer_request, "ssl": context}
+        with ThreadPoolExecutor(1, "inference") as thread:
+            await asyncio.get_running_loop().run_in_executor(thread, self._warm_up)
+            async with serve(self._talk, settings.host, settings.port, **limits, **request) as server:
+                inference = asyncio.create_task(self._infer(thread))
+                port = server.sockets[0].getsockname()[1]
+                host = f"[{settings.host}]" if ":" in settings.host else settings.host
+                yield f"{'wss' if context else 'ws'}://{host}:{port}"
+            inference.cancel()
+
+    @contextmanager
+    def in_thread(self) -> Iterator[str]:
+        """Serve in a thread of its own within the context, which is entered with the URL."""
+        with asyncio.Runner() as runner, ThreadPoolExecutor(1, "server") as thread:
+            loop, url, stop = runner.get_loop(), queue.Queue[str](), asyncio.Event()
+
+            async def serve() -> None:
+                async with self.listening() as here:
+                    url.put(here)
+                    await stop.wait()
+
+            served = thread.submit(runner.run, serve())
+            served.add_done_callback(lambda _: url.put(""))  # it could not start
+            try:
+                if here := url.get():
+                    yield here
+            finally:
+                loop.call_soon_threadsafe(stop.set)
+                served.result()
+
+    async def serve(self) -> None:
+        """Serve until SIGINT or SIGTERM."""
+        stop, loop = asyncio.Event(), asyncio.get_running_loop()
+        for number in (signal.SIGINT, signal.SIGTERM):
+            loop.add_signal_handler(number, stop.set)
+        async with self.listening() as url:
+            log.info("serving the policy at %s", url)
+            await stop.wait()
+
+    def _warm_up(self) -> None:
+        # The first pass through a compiled model takes up to a minute.
+        self._policy.session().plan(self._policy.spec.random_observation(np.random.default_rng(0)))
+
+    def _answer_request(self, connection: ServerConnection, request: Request) -> Response | None:
+        """Answer a request for health, and refuse strangers and crowds before they can send anything."""
+        if request.path == "/healthz":
+            return connection.respond(HTTPStatus.OK, "OK\n")
+        key = self._settings.api_key
+        given = request.headers.get("Authorization", "")
+        if key is not None and not hmac.compare_digest(given.encode(), f"Api-Key {key}".encode()):
+            return connection.respond(HTTPStatus.UNAUTHORIZED, "send the API key as Authorization: Api-Key …\n")
+        if self._connected >= self._settings.connections:
+            return connection.respond(HTTPStatus.SERVICE_UNAVAILABLE, f"{self._connected} clients are connected\n")
+        return None
+
+    async def _talk(self, connection: ServerConnection) -> None:
+        """Serve one client until it leaves or sends something invalid."""
+        from websockets.exceptions import ConnectionClosed
+
+        session, last = self._policy.session(), 0.0
+        self._connected += 1
+        try:
+            await connection.send(self._metadata)
+            async for data in connection:
+                began = time.perf_counter()
+                answer = await self._answer(session, data)
+                timing = answer.get("server_timing")
+                if timing and last:
+                    timing["prev_total_ms"] = last
+                await connection.send(pack(answer))
+                last = 1000 * (time.perf_counter() - began)
+        except ConnectionClosed:
+            pass
+        except ValueError as error:
+            await self._refuse(connection, str(error), INVALID)
+        except Exception:
+            log.exception("a client's observation caused an error")
+            await self._refuse(connection, "the server failed, see its log", INTERNAL)
+        finally:
+            self._connected -= 1
+
+    async def _refuse(self, connection: ServerConnection, sentence: str, code: int) -> None:
+        from websockets.exceptions import ConnectionClosed
+
+        log.warning("refused a client at %s: %s", connection.remote_address[0], sentence[:500])
+        with suppress(ConnectionClosed):
+            await connection.send(sentence)
+            await connection.close(code, sentence.encode()[:120].decode(errors="ignore"))
+
+    async def _answer(self, session: Policy, data: str | bytes) -> dict[str, Any]:
+        if isinstance(data, str):
+            raise ValueError("an observation is a binary message in msgpack, not text")
+        message = unpack(data)
+        if isinstance(message, Mapping) and message.get("reset"):
+            seed = message.get("seed", 0)
+            if type(seed) is not int or not 0 <= seed < 2**32:
+                raise ValueError(f"seed is {str(seed)[:50]}, expected an integer from 0 to 2**32 - 1")
+            session.reset(_prompt("prompt", message.get("prompt", "")), seed)
+            return {"reset": True}
+        observation = self._settings.keys.observation(message, session.spec, self._settings.image_crop)
+        began = time.perf_counter()
+        result: asyncio.Future[Array] = asyncio.get_running_loop().create_future()
+        self._waiting.put_nowait((session, observation, result))
+        actions = await result
+        return {"actions": actions, "server_timing": {"infer_ms": 1000 * (time.perf_counter() - began)}}
+
+    async def _infer(self, thread: Executor) -> None:
+        """Plan for the clients that wait, for those that wait at the same time in one pass."""
+        loop = asyncio.get_running_loop()
+        largest = 1 if self._policy.compiled else self._settings.batch
+        while True:
+            group = [await self._waiting.get()]
+            while len(group) < largest and not self._waiting.empty():
+                group.append(self._waiting.get_nowait())
+            sessions, observations, results = zip(*group, strict=True)
+            try:
+                plans = await loop.run_in_executor(thread, _plan, sessions, observations)
+            except Exception as error:
+                for result in results:
+                    result.set_exception(error)
+            else:
+                for result, actions in zip(results, plans, strict=True):
+                    result.set_result(actions)
+
+
+def metadata(policy: Policy, keys: Keys) -> dict[str, Any]:
+    """Describe the policy to a client: layouts, units and bounds, and how to use its chunks.
+
+    `horizon` is the length of a chunk, of which a client executes the first `execute` actions; a policy with a
+    `history` of several frames wants to see every frame, so that the client sends an observation at every step.
+    """
+    spec, size = policy.spec, [*policy.spec.image_size, 3]
+    return {
+        "server": "vla",
+        "policy": type(policy.model).__name__,
+        "images": {keys.images[camera]: size for camera in spec.cameras},
+        "state": {"keys": keys.state, "names": list(spec.state), "units": list(spec.state_units)},
+        "prompt": keys.prompt,
+        "action": {
+            "names": list(spec.action),
+            "units": list(spec.units),
+            "low": np.array(spec.low, np.float32),
+            "high": np.array(spec.high, np.float32),
+        },
+        "control_hz": spec.control_hz,
+        "horizon": policy.model.chunk,
+        "execute": policy.execute,
+        "history": policy.model.history,
+        "reset": True,
+    }
+
+
+def _plan(sessions: Sequence[Policy], observations: Sequence[Observation]) -> list[Array]:
+    if len(sessions) == 1:
+        return [sessions[0].plan(observations[0])]
+    from vla.policy import plan_together
+
+    return plan_together(sessions, observations)
+
+
+def _is_loopback(host: str) -> bool:
+    if host == "localhost":
+        return True
+    try:
+        return ip_address(host).is_loopback
+    except ValueError:  # a name
+        return False
+
+
+def _find(message: Mapping[Any, Any], key: str) -> Any:
+    """Look up a key, or a path of nested maps such as observation/image."""
+    if key in message:
+        return message[key]
+    value: Any = message
+    for part in key.split("/"):
+        value = value.get(part) if isinstance(value, Mapping) else None
+    return value
+
+
+def _image(key: str, value: Any) -> Array:
+    """Return an image as (H, W, 3) uint8."""
+    if not isinstance(value, np.ndarray) or value.ndim != 3 or 3 not in (value.shape[0], value.shape[2]):
+        shape = getattr(value, "shape", type(value).__name__)
+        raise ValueError(f"{key} is an image (H, W, 3) or (3, H, W), not {shape}")
+    image = value if value.shape[2] == 3 else value.transpose(1, 2, 0)
+    if not 1 <= min(image.shape[:2]) <= max(image.shape[:2]) <= LARGEST_IMAGE:
+        raise ValueError(f"{key} has {image.shape[1]} by {image.shape[0]} pixels, at most {LARGEST_IMAGE} each")
+    if image.dtype == np.uint8:
+        return np.ascontiguousarray(image)
+    if image.dtype.kind != "f" or not (np.min(image) >= 0 and np.max(image) <= 1):  # NaN fails both
+        raise ValueError(f"{key} is {image.dtype}: send uint8, or floats from 0 to 1")
+    return np.ascontiguousarray(np.round(255 * image).astype(np.uint8))
+
+
+def _vector(key: str, value: Any) -> Array:
+    """Return numbers as (N,) float32."""
+    try:
+        vector = np.asarray(value, np.float32).reshape(-1)
+    except (ValueError, TypeError) as error:
+        raise ValueError(f"{key} is no vector of numbers") from error
+    if not np.isfinite(vector).all():
+        raise ValueError(f"{key} holds a number that is not finite")
+    return vector
+
+
+def _prompt(key: str, value: Any) -> str:
+    if not isinstance(value, str) or len(value) > LONGEST_INSTRUCTION:
+        raise ValueError(f"{key} is an instruction of at most {LONGEST_INSTRUCTION} characters")
+    return value

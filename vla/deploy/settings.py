@@ -1,0 +1,70 @@
+"""Settings of the nodes: topics, rates and limits. No module of ROS is imported here."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import asdict, dataclass
+from typing import Literal
+
+from vla.deploy.control_loop import Safety
+from vla.deploy.images import Crop
+from vla.deploy.joint_limiter import Robot
+from vla.io.types import NonNegative, Positive
+
+NAME = re.compile(r"(~/|/)?[A-Za-z_]\w*(/[A-Za-z_]\w*)*", re.ASCII)  # of a topic
+
+
+@dataclass(frozen=True)
+class Topics:
+    """Names of the topics, before remapping.
+
+    Raises:
+        ValueError: a name is not valid in ROS.
+    """
+
+    images: dict[str, str]  # camera → topic of sensor_msgs/Image
+    joint_states: str  # sensor_msgs/JointState
+    instruction: str  # std_msgs/String
+    commands: str
+    gripper: str | None  # Float64MultiArray of finger positions, for commands without fingers
+
+    def __post_init__(self) -> None:
+        named = {**asdict(self), **{f"images.{camera}": topic for camera, topic in self.images.items()}}
+        for key, topic in named.items():
+            if isinstance(topic, str) and not NAME.fullmatch(topic):
+                raise ValueError(f"topics.{key} is {topic!r}, expected letters, digits and _ between slashes")
+
+
+@dataclass(frozen=True)
+class Timing:
+    """Rates and latencies of the simulator."""
+
+    joints_hz: Positive  # rate of joint states and of command execution
+    camera_hz: Positive
+    camera_latency: NonNegative  # from exposure to publication [s]
+    command_timeout: Positive  # the arm holds after so long without a command [s]
+    clock: bool  # publish /clock, and use it for time stamps
+    speed: Positive  # ratio of simulated to real time
+
+
+@dataclass(kw_only=True)
+class PolicySettings:
+    """Settings of the policy node.
+
+    Attributes:
+        robot: the arm and its limits.
+        topics: names of the topics.
+        safety: time-outs and limits.
+        command: JointState with positions, JointTrajectory that ends at rest, or Float64MultiArray of positions.
+        command_hz: commands per second.
+        image_reliability: QoS of the images; "reliable" helps with large images on a lossy network.
+        image_crop: for images with another aspect ratio than in training: crop the centre, or distort the whole.
+    """
+
+    robot: Robot
+    topics: Topics
+    safety: Safety
+    command: Literal["joint_state", "trajectory", "forward"]
+    command_hz: Positive
+    image_reliability: Literal["best_effort", "reliable"]
+    image_crop: Crop

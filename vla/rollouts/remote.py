@@ -1,0 +1,189 @@
+"""A policy that somebody else serves, as an agent: a client of openpi's protocol.
+
+`vla.io.array_messages` describes the encoding, `vla.deploy.server` the protocol.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Annotated, Any
+
+import numpy as np
+from annotated_types import Len
+from PIL import Image, ImageOps
+
+from vla.io.array_messages import pack, unpack
+from vla.io.types import Count, Natural, Pixels, Positive, Text
+from vla.spec import Array, Observation, Spec
+
+if TYPE_CHECKING:
+    from websockets.sync.client import ClientConnection
+
+
+@dataclass(frozen=True)
+class Component:
+    """A component of our action, computed from the server's: `scale` * value at `index` + `offset`, then clipped."""
+
+    index: Natural
+    scale: float = 1.0
+    offset: float = 0.0
+
+
+@dataclass(kw_only=True)
+class RemotePolicy:
+    """A policy behind a WebSocket, which acts like one in this process.
+
+    Attributes:
+        url: of the server, as in ws://127.0.0.1:8000.
+        images: key of the server's observation → our camera.
+        image_size: height and width to resize images to [px]; null: as they are.
+        state: key of the server's observation → our state components; null: all of them.
+        prompt: key of the instruction.
+        actions: our action component → how to compute it; null: the server's actions are ours.
+        execute: actions of each chunk to execute; null: as many as the server says, or all.
+        timeout: longest time to wait for an answer [s].
+        api_key: sent as Authorization: Api-Key …
+        spec: of the environment.
+
+    Raises:
+        ValueError: the mapping does not fit the spec, or nobody answers at the URL.
+    """
+
+    url: Text
+    images: dict[str, Text]
+    image_size: Annotated[list[Pixels], Len(2, 2)] | None
+    state: dict[str, list[Text] | None]
+    prompt: Text
+    actions: dict[str, Component] | None
+    execute: Count | None
+    timeout: Positive
+    api_key: Text | None
+    spec: Spec
+
+    def __post_init__(self) -> None:
+        _require_known("agent.images", self.images.values(), self.spec.cameras, "cameras")
+        names = [name for names in self.state.values() for name in names or ()]
+        _require_known("agent.state", names, self.spec.state, "state components")
+        if self.actions is not None and sorted(self.actions) != sorted(self.spec.action):
+            raise ValueError(f"agent.actions must map {', '.join(self.spec.action)}, got {', '.join(self.actions)}")
+        self.info: dict[str, Any] = {}
+        self._chunk: deque[Array] = deque()
+        self._low, self._high = np.array(self.spec.low, np.float32), np.array(self.spec.high, np.float32)
+        self._open = ExitStack()
+        self._connection, self.metadata = self._connected()
+        horizon, history = self.metadata.get("execute"), self.metadata.get("history")
+        # A policy with a history wants to see every frame.
+        told = 1 if isinstance(history, int) and history > 1 else horizon
+        self._execute = self.execute or (told if isinstance(told, int) and told >= 1 else None)
+
+    def reset(self, instruction: str, seed: int) -> None:
+        """Start an episode: drop the rest of the chunk, and tell a server that has episodes."""
+        self._chunk.clear()
+        if self.metadata.get("reset") is True:
+            self._ask({"reset": True, "prompt": instruction, "seed": seed})
+
+    def act(self, observation: Observation) -> Array:
+        """Return the next action, (D,) float32, clipped to the spec; `info` has the time of the last answer.
+
+        Raises:
+            ValueError: the server refuses the observation, fails, is too slow, or answers with something else.
+        """
+        if not self._chunk:
+            began = time.perf_counter()
+            answer = self.ask(observation)
+            self.info = {"answer_ms": 1000 * (time.perf_counter() - began)}
+            self._chunk.extend(self._translated(answer.get("actions"))[: self._execute])
+        return self._chunk.popleft()
+
+    def ask(self, observation: Observation) -> dict[str, Any]:
+        """Return the server's answer to an observation. Raises as `act` does."""
+        return self._ask(self.message(observation))
+
+    def close(self) -> None:
+        """Close the connection."""
+        self._open.close()
+
+    def message(self, observation: Observation) -> dict[str, Any]:
+        """Return the observation with the server's keys."""
+        state = {
+            key: observation.state if names is None else observation.state[self.spec.indices(names)]
+            for key, names in self.state.items()
+        }
+        images = {key: _resized(observation.rgb[camera], self.image_size) for key, camera in self.images.items()}
+        return {**images, **state, self.prompt: observation.instruction}
+
+    def _translated(self, actions: Any) -> Array:
+        """Convert the server's chunk to ours, (k, D)."""
+        if not isinstance(actions, np.ndarray) or actions.ndim != 2 or 0 in actions.shape:
+            shape = getattr(actions, "shape", type(actions).__name__)
+            raise self._error(f"actions are a chunk (k, D), not {shape}")
+        wanted = self.actions or {name: Component(index) for index, name in enumerate(self.spec.action)}
+        if actions.shape[1] <= max(each.index for each in wanted.values()):
+            raise self._error(f"its actions have {actions.shape[1]} components: set agent.actions")
+        columns = [wanted[name] for name in self.spec.action]
+        mine = np.stack([each.scale * actions[:, each.index] + each.offset for each in columns], 1)
+        if not np.isfinite(mine).all():
+            raise self._error("an action is not finite")
+        return np.clip(mine.astype(np.float32), self._low, self._high)
+
+    def _connected(self) -> tuple[ClientConnection, dict[str, Any]]:
+        try:
+            from websockets.exceptions import InvalidStatus, WebSocketException
+            from websockets.sync.client import connect
+        except ImportError as error:
+            raise ValueError(
+                "agent=remote needs websockets: install this package with its extra server, as in "
+                "pip install -e '.[server]'"
+            ) from error
+        times = {"open_timeout": self.timeout, "close_timeout": self.timeout}
+        headers = {"Authorization": f"Api-Key {self.api_key}"} if self.api_key else None
+        try:
+            connection = self._open.enter_context(
+                connect(self.url, compression=None, max_size=2**26, additional_headers=headers, **times)
+            )
+            metadata = self._received(connection)
+        except InvalidStatus as error:
+            said = bytes(error.response.body or b"").decode(errors="replace").strip()[:200]
+            raise self._error(said or f"HTTP status {error.response.status_code}") from error
+        except (OSError, WebSocketException) as error:
+            raise ValueError(f"nobody serves a policy at {self.url} ({error}): start it, or set agent.url") from error
+        return connection, metadata
+
+    def _ask(self, message: Mapping[str, Any]) -> dict[str, Any]:
+        from websockets.exceptions import ConnectionClosed
+
+        try:
+            self._connection.send(pack(message))
+            return self._received(self._connection)
+        except ConnectionClosed as error:
+            raise self._error("it closed the connection") from error
+        except TimeoutError as error:
+            raise self._error(f"no answer within {self.timeout:g} s") from error
+
+    def _received(self, connection: ClientConnection) -> dict[str, Any]:
+        data = connection.recv(timeout=self.timeout)
+        if isinstance(data, str):
+            raise self._error(data.strip().splitlines()[-1][:500] if data.strip() else "an empty error")
+        answer = unpack(data)
+        if not isinstance(answer, dict):
+            raise self._error(f"an answer is a map, not {type(answer).__name__}")
+        return answer
+
+    def _error(self, what: str) -> ValueError:
+        return ValueError(f"the policy server at {self.url} failed: {what}")
+
+
+def _resized(image: Array, size: Sequence[int] | None) -> Array:
+    """Resize an (H, W, 3) image to `size` (height, width), with black borders where its aspect ratio differs."""
+    if size is None or image.shape[:2] == tuple(size):
+        return image
+    return np.array(ImageOps.pad(Image.fromarray(image), (size[1], size[0]), Image.Resampling.BILINEAR))
+
+
+def _require_known(key: str, names: Any, known: Sequence[str], what: str) -> None:
+    if unknown := [str(name) for name in names if name not in known]:
+        raise ValueError(f"{key} names {', '.join(unknown)}, the {what} are {', '.join(known)}")
