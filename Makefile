@@ -8,7 +8,7 @@ PYTHON ?= $(firstword $(foreach name,python3 python3.12 python3.11,$(shell $(nam
 VERSION = $(shell $(PYTHON) -c 'import sys; print("python%d.%d" % sys.version_info[:2])')
 
 # Rendering without a display needs these, on Linux.
-GL := libegl1 libgl1-mesa-dri libosmesa6
+GL := libegl1 libgl1 libgl1-mesa-dri libosmesa6
 ROOT := $(shell test "$$(id -u)" = 0 || echo sudo -n) env DEBIAN_FRONTEND=noninteractive
 APT = ($(ROOT) apt-get -qq update && $(ROOT) apt-get -qq install --no-install-recommends -y $(1)) > /dev/null
 

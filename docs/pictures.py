@@ -14,9 +14,11 @@ import tempfile
 import time
 from pathlib import Path
 
+import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 from rerun.experimental import ViewerClient
 
+from vla.config.compose import compose_task
 from vla.config.experiment import make_environment, make_policy
 from vla.policy import read_header
 from vla.rollouts.recorder import VIEWER
@@ -26,6 +28,7 @@ DOCS = Path(__file__).parent
 HEIGHT = 1800  # of the page, as far as it is shown [px]
 STEP = 12  # at which the rollout is shown: about to grasp
 FILM_SIZE, FILM_EPISODES, FILM_PAUSE = 320, 5, 8  # of the moving picture: pixels, episodes, frames after each
+SCENES, SCENE_SIZE = 3, 200  # of the picture of both renderers: scenes, edge of an image [px]
 
 
 def vla(*arguments: str) -> None:
@@ -100,9 +103,23 @@ def captioned(images: list[Array], text: str) -> Image.Image:
     return frame
 
 
+def renderers(picture: Path) -> None:
+    """Save scenes as both renderers draw them, a row for each, above their names; both cameras, without noise."""
+    rows: list[list[Array]] = [[] for _ in range(SCENES)]
+    for name in ("fast", "mujoco"):
+        options = {"randomize": "wide", "randomize.sensor": None, "image_size": (SCENE_SIZE, SCENE_SIZE)}
+        environment = make_environment(compose_task("tabletop", renderer=name, **options))
+        for seed, row in enumerate(rows, FIRST_SEED):
+            row += environment.reset(seed).rgb.values()
+        environment.close()
+    sheet = np.concatenate([np.concatenate(row, axis=1) for row in rows])
+    captioned([sheet], "task/renderer=fast" + 40 * " " + "task/renderer=mujoco").save(picture, quality=85, method=6)
+
+
 def main(run: Path) -> None:
     """Previews, one rollout in the viewer, the card of a small store, the report of `run` and its page."""
     film(run, DOCS / "rollouts.webp")
+    renderers(DOCS / "renderers.webp")
     with tempfile.TemporaryDirectory() as folder:
         vla("job=preview", "preview.episodes=6", f"output={folder}")
         shutil.copy(Path(folder) / "preview.png", DOCS / "preview.png")

@@ -16,7 +16,7 @@ import pytest
 from filelock import FileLock
 
 from vla.parallel.processes import THREAD_SETTINGS, without_triton
-from vla.tasks.gl import choose_backend
+from vla.tasks.gl import choose_backend, has_egl
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -29,6 +29,7 @@ CONF = Path(__file__).parents[1] / "conf"
 for name, threads in THREAD_SETTINGS.items():
     os.environ.setdefault(name, threads)
 choose_backend()
+has_egl()  # once, for the programs that tests start
 without_triton()
 
 # What a shell runs in the background ignores interrupts, and so would the programs that tests start and interrupt.

@@ -9,14 +9,41 @@ import torch
 
 from vla.config.experiment import Experiment
 from vla.jobs.benchmark import run
+from vla.jobs.benchmark.machine import Others, machine, spoilt
 from vla.jobs.benchmark.measure import measure
 from vla.jobs.benchmark.memory import peak, reset_peak
 from vla.jobs.benchmark.train import measures
+from vla.parallel.processes import cores
 
 
 def test_a_measure_stands_beside_its_floor() -> None:
     expected = {"value": 3.0, "unit": "ms", "n": 5, "floor": 2.0, "ratio": 1.5}
     assert measure(3.0, "ms", 5, 2.0) == expected
+
+
+def test_the_machine_is_named() -> None:
+    here = machine()
+    assert here["processor"] and here["cores"] == cores()
+    told = Path("/proc/cpuinfo").read_text().split()
+    assert set(here["instructions"]) <= set(told) and ("avx2" in here["instructions"]) == ("avx2" in told)
+
+
+def test_the_time_of_other_programs_is_told_from_ones_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of 4 s that the cores were busy, this process and its children took 3; the clock went on by 2 s."""
+    readings = iter([(100.0, 10.0, 50.0), (104.0, 13.0, 52.0), None, (104.0, 13.0, 52.0)])
+    monkeypatch.setattr(Others, "_now", lambda _: next(readings))
+    assert Others().cores() == pytest.approx(0.5)
+    assert Others().cores() is None
+
+
+def test_the_clock_of_other_programs_runs() -> None:
+    one, two = Others()._now(), Others()._now()
+    assert one and two and all(late >= early > 0 for early, late in zip(one, two, strict=True))
+
+
+@pytest.mark.parametrize(("others", "result"), [(None, False), (0.0, False), (1e3, True)])
+def test_busy_machines_spoil_figures(others: float | None, result: bool) -> None:
+    assert spoilt(others) is result
 
 
 def test_a_peak_of_memory_is_remembered_until_it_is_forgotten() -> None:

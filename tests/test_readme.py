@@ -108,12 +108,13 @@ def require_floors(measures: dict[str, dict[str, Any]]) -> None:
     watched = ("", ": data-wait", ": MFU", ": memory", ": loss")
     assert set(measures) == {
         *("collect", *(f"collect: {stage}" for stage in stages), f"collect: {cores()} processes"),
+        *("collect: rendering, fast", "collect: rendering, mujoco"),
         *("loader", "loader: 1 frame", "loader: 6 frames"),
         *(f"train: {precision}{what}" for precision in precisions for what in watched),
         *("train: loader alone", "policy", "policy: every frame anew"),
     }
     for name, measure in measures.items():
-        assert set(measure) == {"value", "unit", "n", "floor", "ratio"} and measure["n"] > 0, name
+        assert set(measure) == {"value", "unit", "n", "floor", "ratio", "others"} and measure["n"] > 0, name
         assert all(math.isfinite(measure[key]) for key in ("value", "floor", "ratio")) and measure["floor"] > 0, name
     for precision in precisions:
         assert measures[f"train: {precision}"]["n"] == 2 * 8
@@ -123,7 +124,9 @@ def require_floors(measures: dict[str, dict[str, Any]]) -> None:
 def test_the_benchmark_measures_every_stage_against_its_floor(folder: Path) -> None:
     few = ("benchmark.episodes=1", "benchmark.batches=2", "benchmark.steps=2", "benchmark.rounds=1")
     run(folder, "job=benchmark", *SMALL, *few, "benchmark.compile=[false]", "output=speed")
-    require_floors(json.loads((folder / "speed/benchmark.json").read_text()))
+    written = json.loads((folder / "speed/benchmark.json").read_text())
+    require_floors(written["measures"])
+    assert written["machine"]["processor"] and written["machine"]["cores"] == cores()
 
 
 def test_an_ablation_ends_in_a_table(folder: Path) -> None:

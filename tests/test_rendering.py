@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 import subprocess
 import sys
@@ -17,7 +18,12 @@ from conftest import CONF, make_tabletop
 from gallery import gallery
 from hydra import compose, initialize_config_dir
 
+from vla.config.compose import compose as compose_config
+from vla.config.experiment import plain
+from vla.config.substitutes import options, with_substitutes
 from vla.spec import Array
+from vla.tasks import gl
+from vla.tasks.rendering import shapes
 from vla.tasks.rendering.fast import Fast, FastRenderer
 from vla.tasks.rendering.reference import Reference, ReferenceRenderer
 from vla.tasks.rendering.renderer import Renderer, View
@@ -150,6 +156,43 @@ def test_every_shape_texture_light_and_camera(lights: str, floor: str) -> None:
         assert np.median(np.abs(picture.astype(int) - other)) <= 1
 
 
+@pytest.mark.parametrize(
+    ("shape", "closed"),
+    [
+        (shapes.box().scaled(np.array([0.1, 0.2, 0.3])), True),
+        (shapes.sphere(28, 16), True),
+        (shapes.cylinder(24), True),
+        (shapes.capsule(24, 16, 0.1, 0.2), True),
+        (shapes.tube(24), False),
+        (shapes.plane(1, 1), False),
+        (shapes.sphere(28, 8, 0.0, 1.0), False),
+        (dataclasses.replace(shapes.box(), triangles=shapes.box().triangles[:, ::-1]), False),  # inside out
+    ],
+)
+def test_shapes_that_enclose_a_volume_are_told_from_others(shape: shapes.Shape, closed: bool) -> None:
+    assert shapes.closed(*shape.outline()) == closed
+
+
+def test_open_shapes_cast_shadows_with_both_sides() -> None:
+    text = """<mujoco><asset><mesh name="lid" inertia="shell" vertex="-1 -1 0 1 -1 0 1 1 0 -1 1 0 0 0 .1" face="FACES"/>
+      </asset><worldbody><light pos="0 0 3" dir="0 0 -1" type="directional"/><geom type="plane" size="3 3 .1"/>
+      <geom type="mesh" mesh="lid" pos="0 0 1"/><camera pos="0 -3 .9" xyaxes="1 0 0 0 .3 1"/></worldbody></mujoco>"""
+    for faces in ("0 1 4 1 2 4 2 3 4 3 0 4", "0 4 1 1 4 2 2 4 3 3 4 0"):
+        model = mujoco.MjModel.from_xml_string(text.replace("FACES", faces))
+        data = mujoco.MjData(model)
+        mujoco.mj_forward(model, data)
+        pictures = []
+        for choice in (fast(), Reference()):
+            renderer = choice.open(model, View((0,), SIZE, SIZE))
+            pictures.append(renderer.render(data)[0])
+            renderer.close()
+        below = [picture[0, SIZE // 2, SIZE // 2].astype(int) for picture in pictures]
+        beside = [picture[0, -1, 0].astype(int) for picture in pictures]
+        assert (below[0] < 0.7 * beside[0]).all()
+        np.testing.assert_allclose(below[0], below[1], atol=2)
+        np.testing.assert_allclose(beside[0], beside[1], atol=2)
+
+
 def test_edges_are_smooth_where_asked() -> None:
     model, data = gallery("directional")
     colours, views = {}, View((0,), SIZE, SIZE)
@@ -216,6 +259,29 @@ def test_without_egl_the_error_names_the_other_renderer(monkeypatch: pytest.Monk
         fast().open(model, View((0,), 8, 8))
 
 
+def test_without_egl_mujocos_renderer_is_chosen_and_named(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setenv(gl.EGL, "False")
+    config = compose_config("output=here")
+    usable = with_substitutes(config, ["output=here"])
+    assert "the fast renderer needs EGL, which this machine lacks" in caplog.text
+    assert "task/renderer=mujoco instead" in caplog.text and set(options("task/renderer")) == {"mujoco"}
+    assert (
+        plain(usable.task)["renderer"] == plain(compose_config("task/renderer=mujoco", "output=here").task)["renderer"]
+    )
+    assert usable.collect.folder == collected_with("mujoco")[0] != collected_with("fast")[0]
+    assert with_substitutes(config, ["task/renderer=fast"]) is config  # and fails, in a sentence
+    monkeypatch.setenv(gl.EGL, "True")
+    assert with_substitutes(config, []) is config
+
+
+def test_a_machine_without_gl_is_told_from_others(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv(gl.EGL, raising=False)
+    monkeypatch.setattr(gl, "EGL_PROBE", "raise SystemExit(1)")
+    assert not gl.has_egl()
+
+
 def test_heavy_meshes_are_decimated_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     azimuth, height = np.meshgrid(np.linspace(0, 2 * np.pi, 60, endpoint=False), np.linspace(-0.99, 0.99, 40))
@@ -233,7 +299,7 @@ def test_heavy_meshes_are_decimated_once(tmp_path: Path, monkeypatch: pytest.Mon
         renderer = fast(faces=most).open(model, View((0,), SIZE, SIZE))
         assert isinstance(renderer, FastRenderer)
         depths.append(renderer.render(data)[1])
-        faces.append(sum(len(block.triangles) for block in renderer._geometry.blocks))
+        faces.append(sum(len(block.seen.triangles) for block in renderer._geometry.blocks))
         renderer.close()
     assert faces[0] > 4000 and faces[1] == faces[2] <= 520
     assert len(list((tmp_path / "vla" / "meshes").iterdir())) == 1

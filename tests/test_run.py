@@ -11,6 +11,7 @@ import signal
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -23,6 +24,8 @@ from rerun.chunk import RrdReader
 
 from vla.data.episodes import EpisodeStore
 from vla.policy import read_checkpoint
+from vla.tasks.rendering.fast import Fast
+from vla.tasks.rendering.reference import Reference
 
 
 def wait_for(condition: Callable[[], bool]) -> None:
@@ -78,6 +81,28 @@ def test_a_checkpoint_brings_its_task_and_model_and_takes_harder_scenes(home: Pa
     assert report["model"] == "bc" and report["wall_time_s"] > 0
     refused = here(home, *arguments, "model=rt1_tiny", ok=False)
     assert refused.stderr.count("\n") == 1 and "model=rt1_tiny" in refused.stderr
+
+
+def test_a_policy_sees_the_pictures_of_its_training_and_those_of_the_other_renderer(
+    home: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    opened: list[str] = []
+    for kind in (Fast, Reference):
+
+        def noted(self: Any, model: Any, view: Any, name: str = kind.__name__, really: Any = kind.open) -> Any:
+            opened.append(name)
+            return really(self, model, view)
+
+        monkeypatch.setattr(kind, "open", noted)
+    arguments = ("checkpoint=run/checkpoints/last.ckpt", "evaluate=renderer", "evaluate.episodes=2", "output=renderers")
+    done = here(home, *arguments, "cluster.workers=1", "task.time_limit=1.0")
+    report = json.loads((home / "renderers/report.json").read_text())
+    assert opened == ["Fast", "Reference"]
+    conditions = report["conditions"]
+    assert conditions.keys() == {"renderer_fast", "renderer_mujoco"}
+    assert conditions["renderer_fast"]["outcomes"] == [result["outcome"] for result in report["per_episode"]]
+    assert conditions["renderer_mujoco"]["episodes"] == 2
+    assert "renderer_mujoco" in done.stdout
 
 
 def test_the_same_command_in_the_same_folder_does_nothing_twice(home: Path) -> None:

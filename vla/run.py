@@ -135,11 +135,16 @@ def _do(cfg: DictConfig) -> float | None:
     _require_swept()
     without_triton()
     composed: Any = OmegaConf.to_container(cfg, resolve=False)
+    overrides = HydraConfig.get().overrides.task
     trust(composed.get("trust"), [composed["job"], *targets(composed)])  # before anything is read from a file
-    cfg = _adopted(cfg, HydraConfig.get().overrides.task)
+    cfg = _adopted(cfg, overrides)
     job = jobs.find(cfg.job).JOB
     _require_sweepable(cfg, job)  # with the trainer that a run brings
     check(cfg, job)
+    if "task" in job.needs(cfg):
+        from vla.config.substitutes import with_substitutes  # not every job has a task
+
+        cfg = with_substitutes(cfg, overrides)
     return jobs.run(Experiment.of(cfg, compose("config")))
 
 

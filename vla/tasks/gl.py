@@ -10,6 +10,8 @@ TRIED = "VLA_GL_WORKS"  # the backend that worked in a probe, inherited by child
 FAILED = "VLA_GL_FAILS"  # those that did not
 NONE = "disabled"
 PROBE = "import mujoco; mujoco.GLContext(8, 8).make_current()"
+EGL = "VLA_EGL_WORKS"  # whether the fast renderer has what it needs, found by a probe, inherited by child processes
+EGL_PROBE = "import moderngl; moderngl.create_standalone_context(backend='egl')"
 
 
 def choose_backend() -> None:
@@ -43,3 +45,11 @@ def _works(backend: str) -> bool:
     # A failing GL backend can abort the process, so probe it in a subprocess.
     environment = {**os.environ, "MUJOCO_GL": backend}
     return subprocess.run([sys.executable, "-c", PROBE], env=environment, capture_output=True).returncode == 0
+
+
+def has_egl() -> bool:
+    """Return whether the fast renderer can draw on this machine."""
+    if EGL not in os.environ:
+        probe = subprocess.run([sys.executable, "-c", EGL_PROBE], capture_output=True)
+        os.environ[EGL] = str(probe.returncode == 0)
+    return os.environ[EGL] == "True"

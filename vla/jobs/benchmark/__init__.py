@@ -7,6 +7,7 @@ is free. Each stage is a module of this package with a function `measures`.
 from __future__ import annotations
 
 import json
+import logging
 from importlib import import_module
 from typing import Annotated, Literal
 
@@ -18,7 +19,10 @@ from vla.config.check import TRAINING, Job
 from vla.config.experiment import Experiment
 from vla.io.files import write_text
 from vla.io.types import Count
+from vla.jobs.benchmark.machine import Others, machine, spoilt
 from vla.jobs.benchmark.measure import Measure
+
+log = logging.getLogger(__name__)
 
 JOB = Job(
     (*TRAINING, "policy"),
@@ -38,13 +42,32 @@ JOB = Job(
 
 
 def run(experiment: Experiment) -> dict[str, Measure]:
-    """Measure the stages in `benchmark.names`, print a table and write `benchmark.json`; returns name → measure."""
+    """Measure the stages in `benchmark.names`, print a table and write `benchmark.json`; returns name → measure.
+
+    Both name the processor, and how many of its cores other programs used during a stage.
+    """
+    here = machine()
+    show(f"{here['processor']}, {here['cores']} cores, {' '.join(here['instructions'])}")
     measures: dict[str, Measure] = {}
+    busy: dict[str, float] = {}
     for name in experiment["benchmark"]["names"]:
-        measures |= import_module(f"vla.jobs.benchmark.{name}").measures(experiment)
-    write_text(experiment.output / "benchmark.json", json.dumps(measures, indent=2))
-    table = Table("stage", "value", "unit", "n", "floor", "ratio")
-    for name, measure in measures.items():
-        table.add_row(name, *map(str, measure.values()))
+        others = Others()
+        found = import_module(f"vla.jobs.benchmark.{name}").measures(experiment)
+        used = others.cores()
+        measures |= {key: {**each, "others": None if used is None else round(used, 2)} for key, each in found.items()}
+        if used is not None and spoilt(used):
+            busy[name] = used
+    write_text(
+        experiment.output / "benchmark.json", json.dumps({"machine": here, "measures": measures}, indent=2) + "\n"
+    )
+    table = Table("stage", "value", "unit", "n", "floor", "ratio", "others [cores]")
+    for name, each in measures.items():
+        table.add_row(name, *map(str, each.values()))
     show(table)
+    for name, used in busy.items():
+        log.warning(
+            "%s is slower here than on an idle machine, and its ratios are less exact: other programs used %.1f cores "
+            "meanwhile",
+            *(name, used),
+        )
     return measures

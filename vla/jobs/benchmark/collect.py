@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import partial
 from tempfile import TemporaryDirectory
-from typing import Protocol, runtime_checkable
 
 from vla.config.experiment import Experiment
 from vla.data.episodes import EpisodeStore
 from vla.jobs.benchmark.baselines.peer import DURATION, peer
-from vla.jobs.benchmark.measure import Measure, measure, timed
+from vla.jobs.benchmark.measure import Floored, Measure, measure, timed
+from vla.jobs.benchmark.rendering import renderings
 from vla.parallel.pool import LocalCluster
 from vla.parallel.processes import WorkerFactory, cores
 from vla.rollouts.collect import DemonstrationWorker
@@ -18,20 +18,12 @@ from vla.rollouts.rollout import replay, rollout
 from vla.spec import Episode
 
 
-@runtime_checkable
-class Floored(Protocol):
-    """A world that can run the unavoidable part of a control step by itself."""
-
-    def floor(self) -> dict[str, Callable[[], object]]:
-        """Return "physics" and "rendering" → a function that does this part of one control step."""
-        ...
-
-
 def measures(experiment: Experiment) -> dict[str, Measure]:
     """Measure control steps per second.
 
     - collect: rollouts of one process with all cameras; the floor is physics and rendering, for a `Floored` world.
     - breakdown of the time of a step, including replay and storage; the floor is the whole step.
+    - the images of a step by each renderer; the floor is the fastest.
     - all processes, including verification; the floor is that of one process times their number.
     - robosuite on the same work as the floor, if `benchmark.robosuite` names a Python interpreter.
     """
@@ -66,6 +58,7 @@ def measures(experiment: Experiment) -> dict[str, Measure]:
     whole = 1000 * (full + replaying + storing) / steps
     for name, seconds in stages.items():
         found[f"collect: {name}"] = measure(1000 * seconds / steps, "ms/step", steps, whole)
+    found |= renderings(experiment)
     work = partial(DemonstrationWorker, *makers)
     alone, together = (_attempts(work, count, asked["episodes"]) for count in (1, cores()))
     found[f"collect: {cores()} processes"] = measure(*together, cores() * alone[0])

@@ -4,9 +4,18 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 Measure = dict[str, Any]  # value, unit, n, floor, ratio, in this order
+
+
+@runtime_checkable
+class Floored(Protocol):
+    """A world that can run the unavoidable part of a control step by itself."""
+
+    def floor(self) -> dict[str, Callable[[], object]]:
+        """Return "physics" and "rendering" → a function that does this part of one control step."""
+        ...
 
 
 def measure(value: float, unit: str, n: int, floor: float | None) -> Measure:

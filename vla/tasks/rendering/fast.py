@@ -8,7 +8,7 @@ call per texture, and reads all of them back at once.
 from __future__ import annotations
 
 import logging
-from collections.abc import Collection, Iterable
+from collections.abc import Collection
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
@@ -18,21 +18,23 @@ import numpy as np
 from annotated_types import Ge, Le
 
 from vla.spec import Array
+from vla.tasks.gl import has_egl
 from vla.tasks.rendering import lights, shaders, shapes
+from vla.tasks.rendering.buffers import Buffers
+from vla.tasks.rendering.cameras import Cameras
 from vla.tasks.rendering.decimate import decimate
 from vla.tasks.rendering.elements import Elements, elements_of, unsupported
-from vla.tasks.rendering.geometry import VERTEX, Geometry
+from vla.tasks.rendering.geometry import Geometry
 from vla.tasks.rendering.renderer import Renderer, View
 from vla.tasks.rendering.textures import Textures
 
 log = logging.getLogger(__name__)
 BEHIND = 0.3  # factor on the alpha of a plane seen from behind, as in MuJoCo
 SLOPE, UNITS = 1.5, 4.0  # offset of shadow maps against surfaces that shade themselves, as in MuJoCo
-GAP = 300  # indices out of view that are drawn rather than skipped by another call
 ALIGNMENT = 256  # of a camera's block in its buffer [bytes], enough for every machine
-CORNERS = np.array([[-1, -1, 1, 1], [-1, 1, -1, 1], [1, 1, 1, 1], [1, 1, 1, 1]], float)  # of what a camera sees
-UPSIDE_DOWN = np.diag([1.0, -1.0, 1.0, 1.0])  # the first row of the framebuffer becomes the top of the picture
 BACKEND: Any = {"backend": "egl"}
+RIM = 2  # texels of a shadow map, both sides together, that stay empty: shadows at its edge would never end
+PACKAGES = "libegl1, libgl1 and libgl1-mesa-dri"
 STATE = moderngl.DEPTH_TEST | moderngl.CULL_FACE
 
 
@@ -63,6 +65,13 @@ class Fast:
         """
         self.samples, self.soft, self.light, self.faces = samples, soft, light, faces
 
+    @staticmethod
+    def substitute() -> tuple[str, str] | None:
+        """Return why this machine cannot use the renderer, and the option to use instead; None where it can."""
+        if has_egl():
+            return None
+        return f"the fast renderer needs EGL, which this machine lacks (packages {PACKAGES})", "mujoco"
+
     def open(self, model: mujoco.MjModel, view: View) -> Renderer:
         """Make a renderer of `model`, with a GL context in this thread.
 
@@ -73,8 +82,8 @@ class Fast:
             gl = moderngl.create_standalone_context(**BACKEND)
         except Exception as error:  # moderngl raises plain exceptions
             raise RuntimeError(
-                f"the fast renderer needs EGL, which this machine lacks ({error}): install the packages libegl1 and "
-                "libgl1-mesa-dri, or choose task/renderer=mujoco"
+                f"the fast renderer needs EGL, which this machine lacks ({error}): install the packages "
+                f"{PACKAGES}, or choose task/renderer=mujoco"
             ) from error
         return FastRenderer(gl, model, view, self)
 
@@ -86,6 +95,7 @@ class FastRenderer:
         """Args: the context, which the renderer owns; the model; what to draw of it; settings."""
         self._gl: Any = gl  # its type annotations are too narrow
         self._model, self._view, self._settings = model, view, settings
+        self._cameras = Cameras(model, view)
         missing = unsupported(model, view)
         if missing:
             log.warning(f"the fast renderer leaves out {', '.join(missing)}; task/renderer=mujoco draws them")
@@ -97,9 +107,8 @@ class FastRenderer:
             self._make_targets()
             self._make_tables()
             self._textures = Textures(gl, model)
-            self._blocks: list[Any] = []
-            self._buffers: list[Any] = []
             self._make_programs()
+            self._make_buffers()
             gl.depth_func = "<="
         self.update()
 
@@ -167,8 +176,21 @@ class FastRenderer:
                 program["skin"] = self._skin
         floats = shaders.CAMERA + 16 * len(self._lamps) + 4 * lights.ROWS * (1 + len(self._lights))
         rows = -(-4 * floats // ALIGNMENT) * ALIGNMENT // 4
-        self._cameras = np.zeros((len(self._view.cameras), rows), np.float32)
-        self._camera_buffer = gl.buffer(reserve=self._cameras.nbytes)
+        self._blocks = np.zeros((len(self._cameras.ids), rows), np.float32)
+        self._camera_buffer = gl.buffer(reserve=self._blocks.nbytes)
+
+    def _make_buffers(self) -> None:
+        gl = self._gl
+        self._seen, self._casting = Buffers(gl), Buffers(gl)
+        names = "in_position", "in_normal", "in_coordinate", "in_element"
+        self._scene = {}
+        for kind, program in self._programs.items():
+            taken = [name if name in program else None for name in names]
+            form = " ".join(f"{n}f" if name else f"{4 * n}x" for n, name in zip((3, 3, 3, 1), taken, strict=True))
+            content = [(self._seen.vertices, form, *(name for name in taken if name))]
+            self._scene[kind] = gl.vertex_array(program, content, self._seen.indices)
+        content = [(self._casting.vertices, "3f 1f", "in_position", "in_element")]
+        self._caster = gl.vertex_array(self._shadow_program, content, self._casting.indices)
 
     def update(self, textures: Collection[int] = ()) -> None:
         """Upload what has changed in the model; `textures` are the ids of those whose pixels have."""
@@ -177,80 +199,34 @@ class FastRenderer:
             elements = self._elements = elements_of(self._model, self._view)
             self._planes = np.flatnonzero(elements.seen & (elements.kind == mujoco.mjtGeom.mjGEOM_PLANE))
             self._geometry.update(elements, self._sky >= 0)
-            self._upload_vertices()
-            self._plan_draws()
-            self._shining = lights.rows(self._model)
-            self._shadow_places: dict[int, bytes] = {}
-            self._shadow_projections: dict[int, Array] = {}
-            self._lenses = [UPSIDE_DOWN @ self._projection(camera) for camera in self._view.cameras]
-            bounds = np.append(self._model.geom_rbound, np.linalg.norm(elements.size[self._model.ngeom :], axis=1))
-            bounds[self._planes] = np.inf
-            self._floors = self._planes[elements.opaque[self._planes]]
-            self._bounds = np.append(bounds, np.inf).astype(np.float32)  # radius of each element [m]
+            self._place_blocks()
+            self._cameras.update()
+            self._light_places: bytes | None = None
+            self._floors = [int(plane) for plane in self._planes if elements.opaque[plane]] if self._sky >= 0 else []
+            sites = np.linalg.norm(elements.size[self._model.ngeom :], axis=1)
+            self._bounds = np.append(self._model.geom_rbound, sites)  # radius of each element [m]
             table = self._new_table(elements)
             if not np.array_equal(table, self._table):
                 self._table = table
                 self._table_texture.write(table)
 
-    def _upload_vertices(self) -> None:
-        """Write blocks that have changed into the buffers, or all of them where their layout has changed."""
-        old, new = self._blocks, self._geometry.blocks
-        starts = np.cumsum([0, *(len(block.vertices) for block in new)])
-        if [block.layout for block in old] == [block.layout for block in new]:
-            for before, block, start in zip(old, new, starts, strict=False):
-                if before is not block:
-                    self._vertices.write(block.vertices, offset=int(start) * VERTEX * 4)
-        elif new:
-            indices = [block.triangles + start for block, start in zip(new, starts, strict=False)]
-            self._replace_buffers(
-                np.concatenate([block.vertices for block in new]), np.concatenate(indices, dtype=np.int32)
-            )
-        self._blocks = list(new)
-
-    def _replace_buffers(self, vertices: Array, indices: Array) -> None:
-        gl = self._gl
-        for old in self._buffers:
-            old.release()
-        self._vertices, triangles = gl.buffer(vertices), gl.buffer(indices)
-        names = "in_position", "in_normal", "in_coordinate", "in_element"
-        self._scene = {}
-        for kind, program in self._programs.items():
-            taken = [name if name in program else None for name in names]
-            form = " ".join(f"{n}f" if name else f"{4 * n}x" for n, name in zip((3, 3, 3, 1), taken, strict=True))
-            content = [(self._vertices, form, *(name for name in taken if name))]
-            self._scene[kind] = gl.vertex_array(program, content, triangles)
-        only = [(self._vertices, "3f 24x 1f", "in_position", "in_element")]
-        self._casting = gl.vertex_array(self._shadow_program, only, triangles)
-        self._buffers = [*self._scene.values(), self._casting, self._vertices, triangles]
-
-    def _plan_draws(self) -> None:
-        """Note where each element's triangles are."""
-        ends = np.cumsum([0, *(3 * len(block.triangles) for block in self._blocks)])
-        self._single = {
-            block.element: Run(self._texture_of(block.element), int(start), 3 * len(block.triangles))
-            for block, start in zip(self._blocks, ends, strict=False)
+    def _place_blocks(self) -> None:
+        """Upload the elements' triangles, and note where they are."""
+        blocks, sky = self._geometry.blocks, len(self._elements.kind)
+        self._seen.update([block.seen for block in blocks])
+        ends = np.cumsum([0, *(block.seen.triangles.size for block in blocks)])
+        self._runs = {
+            block.element: Run(self._texture_of(block.element), int(start), block.seen.triangles.size)
+            for block, start in zip(blocks, ends, strict=False)
         }
-        order = [block.element for block in self._blocks]
-        self._opaque, self._transparent = np.array(order[: self._geometry.solid], int), order[self._geometry.solid :]
-        sky = len(self._elements.kind)
-        self._casting_runs = self._merged([element for element in order if element != sky], by_texture=False)
-        self._seen_runs: dict[bytes, list[Run]] = {}  # which of the opaque elements are in view → how to draw them
-
-    def _merged(self, elements: Iterable[int], by_texture: bool = True) -> list[Run]:
-        """Join neighbouring triangles, with the same texture where it matters, into runs that one call draws."""
-        runs: list[Run] = []
-        for element in elements:
-            run = self._single[int(element)]
-            last = runs[-1] if runs else None
-            if (
-                last
-                and (last.texture == run.texture or not by_texture)
-                and 0 <= run.start - last.start - last.count <= GAP
-            ):
-                run = Run(run.texture, last.start, run.start + run.count - last.start)
-                runs.pop()
-            runs.append(run)
-        return runs
+        order = list(self._runs)
+        solid, self._transparent = order[: self._geometry.solid], order[self._geometry.solid :]
+        self._opaque = _merged([self._runs[element] for element in solid if element != sky])
+        casting = sorted((block for block in blocks if block.element != sky), key=lambda block: not block.closed)
+        self._casting.update([block.casting for block in casting])
+        self._casters = [
+            sum(block.casting.triangles.size for block in casting if block.closed is kind) for kind in (True, False)
+        ]
 
     def _texture_of(self, element: int) -> int:
         texture = self._sky if element == len(self._elements.kind) else int(self._elements.texture[element])
@@ -274,20 +250,21 @@ class FastRenderer:
             if elements.texture[plane] >= 0:
                 repeat = self._model.mat_texrepeat[elements.material[plane]]
                 table[plane, 3, :2] = [0.5, -0.5] * np.where(repeat > 0, repeat, 1.0)
-        table[-1, 0, 3], table[-1, 1, 0], table[-1, 2, :3] = 1, -1, 1  # the sky: not lit, always around the camera
+        table[-1, 0, 3], table[-1, 1, 3], table[-1, 2, :3] = 1, 1, 1  # the sky: not lit, always around the camera
         return table
 
     def render(self, data: mujoco.MjData) -> tuple[Array, Array]:
         """Draw colours (cameras, H, W, 3) uint8 and depth (cameras, H, W) float32 [m]."""
         with self._gl:
             self._upload_poses(data)
-            self._upload_cameras(data, self._cast_shadows(data))
+            self._upload_cameras(data)
+            self._cast_shadows(data)
             self._drawn.use()
             self._gl.enable_only(STATE)
             self._gl.front_face = "cw"  # in pictures that are upside down
             self._drawn.clear(depth=1.0)
-            for number, (camera, visible) in enumerate(zip(self._view.cameras, self._in_view(), strict=True)):
-                self._draw(number, visible, data.cam_xpos[camera])
+            for number, (sky, behind) in enumerate(zip(self._sky_seen(), self._behind(), strict=True)):
+                self._draw(number, sky, behind)
             return self._read()
 
     def _upload_poses(self, data: mujoco.MjData) -> None:
@@ -299,95 +276,82 @@ class FastRenderer:
             poses[geoms : geoms + sites, :, 3] = data.site_xpos
         self._pose_texture.write(poses)
 
-    def _cast_shadows(self, data: mujoco.MjData) -> Array:
-        """Draw the depth of the scene from every lamp with shadows; return projections into the maps, by columns."""
-        if not self._lamps:
-            return np.empty(0)
-        gl, edge = self._gl, self._shadows[0].size[0]
-        gl.enable_only(moderngl.DEPTH_TEST)  # all faces cast shadows
-        gl.polygon_offset = SLOPE + 2.0 * self._settings.soft, UNITS  # averages reach across texels
-        inner = 0.5 * (edge - 2) / edge
+    def _place_lights(self, data: mujoco.MjData) -> None:
+        """Note the shadow maps' projections and write the lights into the cameras' blocks, where a light has moved."""
+        places = data.light_xpos.tobytes() + data.light_xdir.tobytes()
+        if places == self._light_places:
+            return
+        self._light_places = places
+        table = lights.rows(self._model)
+        table[1:, 3, :3], table[1:, 4, :3] = data.light_xpos[self._lights], data.light_xdir[self._lights]
+        inner = 0.5 * (1 - RIM / max(1, self._model.vis.quality.shadowsize))
         onto_texture = np.array([[inner, 0, 0, 0.5], [0, inner, 0, 0.5], [0, 0, 0.5, 0.5], [0, 0, 0, 1]])
-        projections = []
-        for lamp, shadow in zip(self._lamps, self._shadows, strict=True):
-            projection = self._shadow_projection(data, lamp)
-            projections.append((onto_texture @ projection).T.ravel())
+        self._projections = [lights.shadow_projection(self._model, data, lamp) for lamp in self._lamps]
+        columns = [(onto_texture @ projection).T.ravel() for projection in self._projections]
+        content = np.concatenate([*columns, table.ravel()])
+        self._blocks[:, shaders.CAMERA : shaders.CAMERA + content.size] = content
+
+    def _upload_cameras(self, data: mujoco.MjData) -> None:
+        """Write every camera's block: its projection and position, shadow projections and lights."""
+        self._place_lights(data)
+        blocks, cameras = self._blocks, self._cameras
+        blocks[:, :16] = cameras.place(data).swapaxes(1, 2).reshape(-1, 16)
+        blocks[:, 16:19] = cameras.eyes
+        head = shaders.CAMERA + 16 * len(self._lamps) + 16
+        blocks[:, head : head + 3] = -cameras.axes[:, :, 2]  # the direction of the headlight
+        self._camera_buffer.write(blocks)
+
+    def _cast_shadows(self, data: mujoco.MjData) -> None:
+        """Draw the depth of the scene from every lamp with shadows."""
+        gl = self._gl
+        gl.front_face = "ccw"
+        gl.polygon_offset = SLOPE + 2.0 * self._settings.soft, UNITS  # averages reach across texels
+        closed, still_open = self._casters
+        for lamp, projection, shadow in zip(self._lamps, self._projections, self._shadows, strict=True):
+            edge = shadow.size[0]
             shadow.use()
             shadow.viewport = 0, 0, edge, edge
             shadow.clear(depth=1.0)
-            shadow.viewport = 1, 1, edge - 2, edge - 2  # without the rim, shadows at the edge would never end
+            shadow.viewport = RIM // 2, RIM // 2, edge - RIM, edge - RIM
             self._shadow_program["projection"].write(projection.T.astype(np.float32).tobytes())
             self._shadow_program["lamp"].write(np.float32(data.light_xpos[lamp]).tobytes())
-            for run in self._casting_runs:
-                self._casting.render(moderngl.TRIANGLES, vertices=run.count, first=run.start)
+            if closed:  # their front faces are nearer to a lamp outside than the others
+                gl.enable_only(STATE)
+                self._caster.render(moderngl.TRIANGLES, vertices=closed)
+            if still_open:
+                gl.enable_only(moderngl.DEPTH_TEST)
+                self._caster.render(moderngl.TRIANGLES, vertices=still_open, first=closed)
         gl.polygon_offset = 0.0, 0.0
-        return np.concatenate(projections)
 
-    def _shadow_projection(self, data: mujoco.MjData, lamp: int) -> Array:
-        """Return a lamp's projection (4, 4) into its shadow map, computed again only where the lamp has moved."""
-        place = data.light_xpos[lamp].tobytes() + data.light_xdir[lamp].tobytes()
-        if self._shadow_places.get(lamp) != place:
-            self._shadow_places[lamp] = place
-            self._shadow_projections[lamp] = lights.shadow_projection(self._model, data, lamp)
-        return self._shadow_projections[lamp]
-
-    def _upload_cameras(self, data: mujoco.MjData, shadows: Array) -> None:
-        """Write every camera's block: its projection and position, shadow projections and lights."""
-        shining = self._shining
-        shining[1:, 3, :3], shining[1:, 4, :3] = data.light_xpos[self._lights], data.light_xdir[self._lights]
-        start = shaders.CAMERA + shadows.size
-        for block, camera, lens in zip(self._cameras, self._view.cameras, self._lenses, strict=True):
-            axes, eye = data.cam_xmat[camera].reshape(3, 3).T, data.cam_xpos[camera]
-            shining[0, 4, :3] = -axes[2]  # the headlight
-            block[:16], block[16:19] = (lens @ lights.inverse_pose(eye, axes)).T.ravel(), eye
-            block[shaders.CAMERA : start], block[start : start + shining.size] = shadows, shining.ravel()
-        self._camera_buffer.write(self._cameras)
-
-    def _in_view(self) -> Array:
-        """Return (cameras, E + 1) bool: whether the element's bounding sphere meets the pyramid that a camera sees."""
-        views = self._cameras[:, :16].reshape(-1, 4, 4).transpose(0, 2, 1)
-        sides = views[:, 3:] + np.concatenate([views[:, :2], -views[:, :2]], axis=1)  # (cameras, 4, 4) planes
-        sides /= np.linalg.norm(sides[:, :, :3], axis=2, keepdims=True)
-        distance = sides[:, :, :3] @ self._poses[:, :, 3].T + sides[:, :, 3:]
-        visible = (distance >= -self._bounds).all(axis=1)
-        for number, view in enumerate(views):
-            visible[number, -1] = not self._plane_fills(view, self._cameras[number, 16:19])
-        return visible
-
-    def _plane_fills(self, view: Array, eye: Array) -> bool:
-        """Return whether all corners of a camera's picture show an opaque plane, which then hides the sky."""
-        far = np.linalg.inv(view) @ CORNERS  # of the picture, on the far clipping plane
-        rays = (far[:3] / far[3]).T - eye
+    def _sky_seen(self) -> list[bool]:
+        """Return whether a camera may see the sky beside the planes."""
+        seen = [self._sky >= 0] * len(self._cameras.ids)
         for plane in self._floors:
-            turn, size = self._poses[plane, :, :3], self._elements.size[plane]
-            start, ways = (eye - self._poses[plane, :, 3]) @ turn, rays @ turn
-            if start[2] > 0 and (ways[:, 2] < -start[2]).all():  # met before the far clipping plane
-                met = np.abs(start[:2] - ways[:, :2] * start[2] / ways[:, 2:])
-                if ((met <= size[:2]) | (size[:2] <= 0)).all():
-                    return True
-        return False
+            filled = self._cameras.filled(self._poses[plane], self._elements.size[plane, :2])
+            seen = [sky and not full for sky, full in zip(seen, filled, strict=True)]
+        return seen
 
-    def _draw(self, number: int, visible: Array, eye: Array) -> None:
-        """Draw a camera's picture: what is opaque and the sky, then what is transparent."""
-        view, size = self._view, self._cameras[number].nbytes
+    def _behind(self) -> list[list[int]]:
+        """Return the planes that a camera sees from behind."""
+        behind = self._cameras.behind(self._poses[self._planes])
+        return [self._planes[planes].tolist() for planes in behind]
+
+    def _draw(self, number: int, sky: bool, behind: list[int]) -> None:
+        """Draw a camera's picture: what is opaque and the sky, then what is transparent and planes from behind."""
+        view, size = self._view, self._blocks[number].nbytes
         self._camera_buffer.bind_to_uniform_block(0, offset=number * size, size=size)
         self._gl.viewport = 0, number * view.height, view.width, view.height
-        opaque = visible[self._opaque]
-        runs = self._seen_runs.get(opaque.tobytes())
-        if runs is None:
-            runs = self._seen_runs[opaque.tobytes()] = self._merged(self._opaque[opaque])
-        for run in runs:
+        for run in self._opaque:
             self._draw_run(run)
-        self._draw_transparent(eye)
+        if sky:
+            self._draw_run(self._runs[len(self._elements.kind)])
+        if self._transparent or behind:
+            self._draw_transparent(self._cameras.eyes[number], behind)
 
-    def _draw_transparent(self, eye: Array) -> None:
+    def _draw_transparent(self, eye: Array, behind: list[int]) -> None:
         """Blend transparent elements and planes seen from behind, as MuJoCo does: from near to far, and back again."""
-        poses = self._poses
-        behind = [plane for plane in self._planes if (eye - poses[plane, :, 3]) @ poses[plane, :, 2] < 0]
-        if not self._transparent and not behind:
-            return
         distance = {
-            element: float(np.linalg.norm(poses[element, :, 3] - eye) - self._bounds[element])
+            element: float(np.linalg.norm(self._poses[element, :, 3] - eye) - self._bounds[element])
             for element in {*self._transparent, *behind}
         }
         distance |= {int(plane): np.inf for plane in self._planes if plane in distance}
@@ -398,7 +362,7 @@ class FastRenderer:
         self._drawn.depth_mask = False
         self._leave_out_shadows(True)
         for element in [*order, *order[::-1]]:
-            run, alpha = self._single[element], float(self._elements.rgba[element, 3])
+            run, alpha = self._runs[element], float(self._elements.rgba[element, 3])
             self._programs[self._kind(run.texture)]["alpha"] = alpha * (BEHIND if element in behind else 1.0)
             if element in behind:
                 gl.disable(moderngl.CULL_FACE)
@@ -413,20 +377,6 @@ class FastRenderer:
             if "unshadowed" in program:
                 program["unshadowed"] = float(value)
 
-    def _projection(self, camera: int) -> Array:
-        """Return a camera's projection (4, 4)."""
-        model, near, far = self._model, self._near, self._far
-        aspect, fovy = self._view.width / self._view.height, float(model.cam_fovy[camera])
-        if model.cam_projection[camera] == mujoco.mjtProjection.mjPROJ_ORTHOGRAPHIC:
-            return lights.box(aspect * fovy / 2, fovy / 2, near, far)
-        if model.cam_sensorsize[camera, 1]:
-            focal, centre = model.cam_intrinsic[camera, :2], model.cam_intrinsic[camera, 2:]
-            half = model.cam_sensorsize[camera] / 2
-            low, high = near / focal * (half - centre), near / focal * (half + centre)
-            return lights.frustum(-low[0], high[0], -high[1], low[1], near, far)
-        half = near * np.tan(np.radians(fovy / 2))
-        return lights.frustum(-aspect * half, aspect * half, -half, half, near, far)
-
     def _read(self) -> tuple[Array, Array]:
         view = self._view
         shape = len(view.cameras), view.height, view.width
@@ -438,12 +388,27 @@ class FastRenderer:
         return rgb, self._metres(depth)
 
     def _metres(self, reading: Array) -> Array:
-        """Convert readings of the depth buffer, 0 at the near plane and 1 at the far one, to depth [m]."""
+        """Convert readings of the depth buffer, 0 at the near plane and 1 at the far one, to depth [m], in place."""
         near, far = self._near, self._far
-        depth = near * far / (far - reading * (far - near))
-        depth *= reading < 1
+        nothing = reading >= 1 if reading.max() >= 1 else None
+        depth = np.multiply(reading, near - far, out=reading)
+        depth += far
+        np.divide(near * far, depth, out=depth)
+        if nothing is not None:
+            np.copyto(depth, 0.0, where=nothing)
         return depth
 
     def close(self) -> None:
         """Free the GL context and all that is in it."""
         self._gl.release()
+
+
+def _merged(runs: Collection[Run]) -> list[Run]:
+    """Join neighbouring runs with the same texture."""
+    merged: list[Run] = []
+    for run in runs:
+        if merged and merged[-1].texture == run.texture:
+            last = merged.pop()
+            run = Run(run.texture, last.start, last.count + run.count)
+        merged.append(run)
+    return merged

@@ -14,25 +14,28 @@ from vla.tasks.rendering import shapes
 from vla.tasks.rendering.elements import Elements
 from vla.tasks.rendering.shapes import Shape
 
-VERTEX = 10  # floats of a vertex: position, normal, texture coordinates or direction, element
 HORIZON = 1.05  # half the extent of an infinite plane over the distance of the far clipping plane, as in MuJoCo
 SKY_DISTANCE = 0.7  # of the sky over the distance of the far clipping plane, as in MuJoCo
 Kind = mujoco.mjtGeom
 
 
 @dataclass(frozen=True)
+class Part:
+    """One element's part of a buffer."""
+
+    vertices: Array  # (V, floats of a vertex) float32
+    triangles: Array  # (T, 3) int32, from 0
+
+
+@dataclass(frozen=True)
 class Block:
-    """One element's part of the buffers."""
+    """One element's triangles."""
 
     element: int
     key: tuple[Any, ...]  # what its vertices depend on
-    vertices: Array  # (V, VERTEX) float32
-    triangles: Array  # (T, 3) int32, from 0
-
-    @property
-    def layout(self) -> tuple[int, ...]:
-        """What its place in the buffers and its triangles depend on."""
-        return (self.element, *self.key[:2], len(self.vertices), len(self.triangles))
+    seen: Part  # with vertices of position, normal, texture coordinates or direction, element: 10 floats
+    casting: Part  # with vertices of position and element, 4 floats, shared by all triangles at the same place
+    closed: bool  # whether the triangles enclose a volume
 
 
 class Geometry:
@@ -62,9 +65,9 @@ class Geometry:
         solid = [self._block(elements, int(element)) for element in order]
         if sky:
             solid.append(self._sky(len(elements.kind)))
-        solid = [block for block in solid if len(block.triangles)]
+        solid = [block for block in solid if len(block.seen.triangles)]
         self.solid = len(solid)
-        self.blocks = [*solid, *(block for block in blocks if len(block.triangles))]
+        self.blocks = [*solid, *(block for block in blocks if len(block.seen.triangles))]
 
     def _block(self, elements: Elements, element: int) -> Block:
         material, texture = int(elements.material[element]), int(elements.texture[element])
@@ -133,4 +136,7 @@ class Geometry:
 def _packed(element: int, key: tuple[Any, ...], shape: Shape, coordinates: Array) -> Block:
     number = np.full((len(shape.position), 1), element)
     vertices = np.concatenate([shape.position, shape.normal, coordinates, number], axis=1, dtype=np.float32)
-    return Block(element, key, vertices, np.ascontiguousarray(shape.triangles, np.int32))
+    position, triangles = shape.outline()
+    outline = np.concatenate([position, number[: len(position)]], axis=1, dtype=np.float32)
+    seen = Part(vertices, np.ascontiguousarray(shape.triangles, np.int32))
+    return Block(element, key, seen, Part(outline, triangles), shapes.closed(position, triangles))

@@ -59,9 +59,10 @@ def box(half_width: float, half_height: float, near: float, far: float) -> Array
 
 
 def inverse_pose(position: Array, axes: Array) -> Array:
-    """Return the transformation (4, 4) into the frame at `position` with `axes` (3, 3), one per row."""
-    view = np.eye(4)
-    view[:3, :3], view[:3, 3] = axes, -axes @ position
+    """Return transformations (…, 4, 4) into frames at `position` (…, 3) with `axes` (…, 3, 3), one per row."""
+    view = np.zeros((*position.shape[:-1], 4, 4))
+    view[..., :3, :3], view[..., 3, 3] = axes, 1
+    view[..., :3, 3] = -(axes @ position[..., None])[..., 0]
     return view
 
 

@@ -47,7 +47,7 @@ void main() {}"""
 
 # OpenGL's fixed-function lighting with a local viewer, as MuJoCo's classic renderer uses it.
 LIGHT = """
-vec3 shine(int number, vec3 place, vec3 normal, vec3 colour, vec3 material) {
+vec3 shine(int number, vec3 place, vec3 normal, vec3 colour, vec4 material) {
     int first = number * ROWS;
     vec3 towards = -lights[first + 4].xyz;
     float strength = 1.0;
@@ -98,7 +98,7 @@ layout(std140) uniform Camera {{
 {LIGHT.replace("ROWS", str(ROWS))}"""
     passed = {"none": [], "2d": ["vec2 coordinate"], "cube": ["vec3 coordinate"]}[texture]
     passed += [f"vec{4 if spot else 3} shadow_at{number}" for number, spot in enumerate(spots)]
-    passed += ["vec3 position", "vec3 normal", "vec3 colour", "vec3 material"] if pixel else []
+    passed += ["vec3 position", "vec3 normal", "vec3 colour", "vec4 material"] if pixel else []
     passed += [] if pixel else ["vec3 base", *(f"vec3 lit{number}" for number in range(count))]
     shaded = _shaded(lights, lamps)
     return {
@@ -114,11 +114,12 @@ def _declared(way: str, names: Sequence[str]) -> str:
 def _shaded(lights: int, lamps: Sequence[int]) -> str:
     """Return statements that set `base` and every `lit`, clamped as OpenGL clamps a vertex's colour."""
     shine = "shine({}, position, normal, colour, material)".format
-    sky = "material.x < 0.0"  # is not lit
-    sums = " + ".join(["material.x * colour", *(shine(number) for number in range(lights) if number not in lamps)])
-    lines = [f"base = {sky} ? vec3(1.0) : clamp({sums}, 0.0, 1.0);"]
+    sums = " + ".join(
+        ["vec3(material.w) + material.x * colour", *(shine(number) for number in range(lights) if number not in lamps)]
+    )
+    lines = [f"base = clamp({sums}, 0.0, 1.0);"]
     for index, number in enumerate(lamps):
-        lines.append(f"lit{index} = {sky} ? vec3(0.0) : clamp({shine(number)}, 0.0, 1.0);")
+        lines.append(f"lit{index} = clamp({shine(number)}, 0.0, 1.0);")
     return "\n    ".join(lines)
 
 
@@ -136,11 +137,11 @@ void main() {{
     int element = int(in_element);
     mat3 turn;
     vec3 shift;
-    {"" if pixel else "vec3 position, normal, colour, material;"}
+    {"" if pixel else "vec3 position, normal, colour; vec4 material;"}
     position = place(element, eye.xyz, turn, shift);
     normal = turn * in_normal;
     colour = texelFetch(table, ivec2(0, element), 0).rgb;
-    material = texelFetch(table, ivec2(1, element), 0).xyz;
+    material = texelFetch(table, ivec2(1, element), 0);
     {coordinate}
     {"" if pixel else shaded}
     {" ".join(lookups)}

@@ -10,6 +10,7 @@ import numpy as np
 from vla.spec import Array
 
 SMOOTH = 0.8  # smallest cosine between a mesh's normal at a vertex and that of a face that is shaded smoothly
+WELD = 1e-6  # largest distance between vertices at the same place, over the shape's size
 
 
 @dataclass(frozen=True)
@@ -27,6 +28,28 @@ class Shape:
         normal = self.normal / size
         normal /= np.linalg.norm(normal, axis=1, keepdims=True)
         return Shape(self.position * size, normal, self.texcoord, self.raw, self.triangles)
+
+    def outline(self) -> tuple[Array, Array]:
+        """Return positions (W, 3) float32 without repetition, and the triangles (T, 3) int32 between them."""
+        steps = np.rint(self.position / (WELD * max(np.abs(self.position).max(initial=0.0), 1e-9)))
+        _, first, inverse = np.unique(steps, axis=0, return_index=True, return_inverse=True)
+        triangles = inverse.reshape(-1)[self.triangles].astype(np.int32)
+        one, two, three = triangles.T
+        return self.position[first].astype(np.float32), triangles[(one != two) & (two != three) & (three != one)]
+
+
+def closed(position: Array, triangles: Array) -> bool:
+    """Return whether triangles (T, 3) between positions (W, 3) enclose a volume, and look away from it.
+
+    Every edge must be as often in one direction as in the other.
+    """
+    if not len(triangles):
+        return False
+    edges = triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2).astype(np.int64)
+    there, back = (np.sort(edges[:, first] * len(position) + edges[:, 1 - first]) for first in (0, 1))
+    corners = position[triangles] - position[triangles[0, 0]]
+    volume = np.einsum("ti,ti->", corners[:, 0], np.cross(corners[:, 1], corners[:, 2]))
+    return bool(volume > 0 and (there == back).all())
 
 
 def join(*shapes: Shape) -> Shape:

@@ -1,0 +1,50 @@
+"""Parts of a task that this machine cannot use, and what takes their place."""
+
+from __future__ import annotations
+
+import copy
+import logging
+from collections.abc import Sequence
+from typing import Any, cast
+
+from omegaconf import DictConfig, OmegaConf
+
+from vla.config.annotations import locate
+from vla.config.compose import CONF
+from vla.config.experiment import Node, plain
+
+log = logging.getLogger(__name__)
+
+
+def with_substitutes(cfg: DictConfig, overrides: Sequence[str]) -> DictConfig:
+    """Return `cfg` with the substitute of every part of the task that cannot be used here, and log a warning.
+
+    What follows, such as the folder of the demonstrations, names the substitute. An option that the command line names
+    stays, and so do those of a resumed run, whose demonstrations exist.
+    """
+    if cfg.resume is not None or cfg.task is None:
+        return cfg
+    for name, node in cfg.task.items():
+        asked = any(override.startswith(f"task/{name}=") for override in overrides)
+        if asked or (found := substitute(f"task.{name!s}", node)) is None:
+            continue
+        reason, option = found
+        log.warning("%s: task/%s=%s instead", reason, name, option)
+        cfg = copy.deepcopy(cfg)
+        cfg.task[name] = options(f"task/{name!s}")[option]
+    return cfg
+
+
+def options(group: str) -> dict[str, Node]:
+    """Return the options of a group that are classes which this machine can use, with their nodes."""
+    files = sorted((CONF / group).glob("*.yaml"))
+    nodes = {file.stem: plain(cast(DictConfig, OmegaConf.load(file))) for file in files}
+    return {name: node for name, node in nodes.items() if substitute(f"{group}={name}", node) is None}
+
+
+def substitute(key: str, node: Any) -> tuple[str, str] | None:
+    """Return why a node's class cannot be used here, and the option that its `substitute` names; None if it can be."""
+    if not isinstance(node, DictConfig | dict) or "_target_" not in node:
+        return None
+    found: tuple[str, str] | None = getattr(locate(f"{key}._target_", node["_target_"]), "substitute", lambda: None)()
+    return found

@@ -1,0 +1,54 @@
+"""The machine that a benchmark measures, and what else runs on it."""
+
+from __future__ import annotations
+
+import os
+import platform
+import time
+from pathlib import Path
+from typing import Any
+
+from vla.parallel.processes import cores
+
+# Vector instructions that kernels and compilers choose by, from old to new: of x86, then of ARM.
+INSTRUCTIONS = ("sse4_2", "avx", "avx2", "avx512f", "avx512_bf16", "amx_bf16", "asimd", "sve", "bf16")
+BUSY = 0.05  # share of all cores that spoils a figure when other programs use it
+TICKS = os.sysconf("SC_CLK_TCK") if hasattr(os, "sysconf") else 100  # of /proc/stat [1/s]
+
+
+def machine() -> dict[str, Any]:
+    """Return the processor's name, its vector instructions and the number of cores that this process may use."""
+    told: dict[str, str] = {}
+    if (file := Path("/proc/cpuinfo")).exists():
+        pairs = (line.partition(":") for line in file.read_text(encoding="utf-8").splitlines())
+        told = {key.strip(): value.strip() for key, _, value in pairs}
+    name = told.get("model name") or platform.processor() or platform.machine()
+    flags = (told.get("flags") or told.get("Features") or "").split()
+    return {"processor": name, "instructions": [each for each in INSTRUCTIONS if each in flags], "cores": cores()}
+
+
+class Others:
+    """Clock of the processor time that other programs use, whose child processes have ended."""
+
+    def __init__(self) -> None:
+        self._start = self._now()
+
+    def cores(self) -> float | None:
+        """Return how many cores other programs have used on average since the start; None where nothing tells."""
+        if self._start is None or (now := self._now()) is None:
+            return None
+        (busy, own, clock), (busy_before, own_before, before) = now, self._start
+        return max(0.0, (busy - busy_before) - (own - own_before)) / max(clock - before, 1e-9)
+
+    def _now(self) -> tuple[float, float, float] | None:
+        """Return the busy time of all cores, that of this process and its children, and the time [s]."""
+        file = Path("/proc/stat")
+        if not file.exists():
+            return None
+        user, nice, system, _, _, irq, softirq, steal = map(int, file.read_text(encoding="utf-8").split()[1:9])
+        return (user + nice + system + irq + softirq + steal) / TICKS, sum(os.times()[:4]), time.monotonic()
+
+
+def spoilt(others: float | None) -> bool:
+    """Return whether other programs used so many cores that figures are worse than the machine."""
+    return others is not None and others > BUSY * (os.cpu_count() or 1)

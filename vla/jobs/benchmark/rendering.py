@@ -1,0 +1,42 @@
+"""The renderers of a task beside each other."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Callable
+from functools import partial
+
+from vla.config.experiment import Experiment
+from vla.config.substitutes import options
+from vla.jobs.benchmark.measure import Floored, Measure, measure, timed
+
+FRAMES = 10  # of a renderer before it is the next one's turn
+
+
+def renderings(experiment: Experiment) -> dict[str, Measure]:
+    """Measure the time of a step's images by every renderer, in turns and on the same scenes.
+
+    The floor is the fastest one. Nothing is measured of a world that is not `Floored` or has no such renderer.
+    """
+    own, choice = experiment["task"].get("renderer"), options("task/renderer")
+    if own is None or own["_target_"] not in [node["_target_"] for node in choice.values()]:
+        return {}
+    nodes = {name: own if node["_target_"] == own["_target_"] else node for name, node in choice.items()}
+    worlds = {name: experiment.make_environment({"renderer": node})() for name, node in nodes.items()}
+    seconds: defaultdict[str, float] = defaultdict(float)
+    rounds = experiment["benchmark"]["episodes"]
+    for seed in range(rounds):
+        for name, world in worlds.items():
+            if isinstance(world, Floored):
+                world.reset(seed)
+                seconds[name] += timed(partial(_draw, world.floor()["rendering"]))[1]
+    for world in worlds.values():
+        world.close()
+    steps = FRAMES * rounds
+    times = {f"collect: rendering, {name}": 1000 * total / steps for name, total in seconds.items()}
+    return {name: measure(each, "ms/step", steps, min(times.values())) for name, each in times.items()}
+
+
+def _draw(draw: Callable[[], object]) -> None:
+    for _ in range(FRAMES):
+        draw()

@@ -1,0 +1,74 @@
+"""Cameras of a model: their projections, and which planes they see."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+
+from vla.spec import Array
+from vla.tasks.rendering import lights
+from vla.tasks.rendering.renderer import View
+
+UPSIDE_DOWN = np.diag([1.0, -1.0, 1.0, 1.0])  # the first row of the framebuffer becomes the top of the picture
+CORNERS = np.array([[-1, -1, 1, 1], [-1, 1, -1, 1], [1, 1, 1, 1], [1, 1, 1, 1]], float)  # of a picture, far away
+
+
+class Cameras:
+    """The cameras of a view in the present state."""
+
+    def __init__(self, model: mujoco.MjModel, view: View) -> None:
+        """Args: the model; what to draw of it."""
+        self._model, self._view, self.ids = model, view, list(view.cameras)
+        self._near, self._far = lights.clip_range(model)
+
+    def update(self) -> None:
+        """Take over the model's present lenses."""
+        self._lenses = np.stack([UPSIDE_DOWN @ self._lens(camera) for camera in self.ids])
+        far = np.linalg.inv(self._lenses) @ CORNERS
+        self._corners = far[:, :3] / far[:, 3:]  # (cameras, 3, 4), in the cameras' frames [m]
+        self._corners[self._lenses[:, 3, 3] != 0] = np.nan  # without perspective, nothing runs from eye to corner
+
+    def place(self, data: mujoco.MjData) -> Array:
+        """Move the cameras to where they are in a state; return projections of the world (cameras, 4, 4)."""
+        self.eyes, self.axes = data.cam_xpos[self.ids], data.cam_xmat[self.ids].reshape(-1, 3, 3)
+        return self._lenses @ lights.inverse_pose(self.eyes, self.axes.swapaxes(1, 2))
+
+    def behind(self, planes: Array) -> Array:
+        """Return (cameras, P) bool: which planes of poses (P, 3, 4) the cameras see from behind."""
+        return ((self.eyes[:, None] - planes[:, :, 3]) * planes[:, :, 2]).sum(axis=2) < 0
+
+    def filled(self, plane: Array, half: Array) -> list[bool]:
+        """Return whether all corners of a camera's picture show the front of a plane, which then hides the sky.
+
+        Args:
+            plane: pose (3, 4).
+            half: half the extent (2,) [m], 0 for infinity.
+        """
+        turn = plane[:, :3]
+        starts, ways = (self.eyes - plane[:, 3]) @ turn, turn.T @ self.axes @ self._corners
+        rays = ways.swapaxes(1, 2).tolist()  # faster than arrays for so few numbers
+        return [
+            all(self._meets(start, ray, half) for ray in four)
+            for start, four in zip(starts.tolist(), rays, strict=True)
+        ]
+
+    def _meets(self, start: list[float], ray: list[float], half: Array) -> bool:
+        """Return whether a ray from the eye to the far clipping plane meets the rectangle in z = 0 of its frame."""
+        if not (start[2] > 0 and self._near * -ray[2] < self._far * start[2] < self._far * -ray[2]):
+            return False
+        share = -start[2] / ray[2]
+        return all(size <= 0 or abs(at + share * way) <= size for at, way, size in zip(start, ray, half, strict=False))
+
+    def _lens(self, camera: int) -> Array:
+        """Return a camera's projection (4, 4)."""
+        model, near, far = self._model, self._near, self._far
+        aspect, fovy = self._view.width / self._view.height, float(model.cam_fovy[camera])
+        if model.cam_projection[camera] == mujoco.mjtProjection.mjPROJ_ORTHOGRAPHIC:
+            return lights.box(aspect * fovy / 2, fovy / 2, near, far)
+        if model.cam_sensorsize[camera, 1]:
+            focal, centre = model.cam_intrinsic[camera, :2], model.cam_intrinsic[camera, 2:]
+            half = model.cam_sensorsize[camera] / 2
+            low, high = near / focal * (half - centre), near / focal * (half + centre)
+            return lights.frustum(-low[0], high[0], -high[1], low[1], near, far)
+        half = near * np.tan(np.radians(fovy / 2))
+        return lights.frustum(-aspect * half, aspect * half, -half, half, near, far)
