@@ -126,7 +126,7 @@ def test_a_model_changes_nothing_but_itself() -> None:
 
 def test_options_are_named_as_the_command_line_names_them() -> None:
     chosen = composed("experiment=few", "model=act").chosen
-    assert chosen == {"experiment": "few", "model": "act"}
+    assert chosen == {"experiment": "few", "model": "act", "agent": "checkpoint"}
 
 
 def test_a_file_says_whether_it_comes_before_or_after_what_it_is_composed_of() -> None:
