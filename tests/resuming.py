@@ -14,7 +14,8 @@ from reading import windows
 
 from vla.models.learner import Learner
 from vla.models.model import Model
-from vla.training.trainer import GracefulStop, make_trainer, restore_metrics
+from vla.training.checkpoints import GracefulStop
+from vla.training.trainer import make_trainer, restore_metrics
 
 STEPS, STOP = 11, 6
 VALIDATED = 4  # every so many steps
@@ -70,7 +71,8 @@ def train(
         restore_metrics(made, checkpoint)
     learner = Learner(model=model, spec=toy.SPEC, config={}, **defaults_of("learner/default", warmup_steps=3, lr=0.001))
     data = windows(store, history=model.history, chunk=model.chunk)
-    made.fit(learner, datamodule=data, ckpt_path=checkpoint, weights_only=True)
+    with graceful_stop.explaining_restore(checkpoint):
+        made.fit(learner, datamodule=data, ckpt_path=checkpoint, weights_only=True)
     path = output / "checkpoints/last.ckpt"
     if not graceful_stop.requested:
         made.save_checkpoint(path)

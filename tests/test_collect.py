@@ -116,6 +116,20 @@ def test_how_long_it_took_is_added_up_and_shared_out_among_the_episodes(tmp_path
     assert collection_time(store, 8) is None
 
 
+def test_a_damaged_duration_is_unknown_and_costs_no_collection(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    gather(tmp_path, episodes=2)
+    file, store = tmp_path / COLLECTION_TIME, EpisodeStore(tmp_path)
+    for damage in ("", "soon", "nan", "1e400", "1e300", "-1", "[1]", "1" * 10**6):
+        file.write_text(damage)
+        assert collection_time(store, 2) is None
+        assert f"the duration of the collection is unknown: {file}" in caplog.text
+        caplog.clear()
+    assert gather(tmp_path, episodes=4).episodes == 4
+    assert collection_time(EpisodeStore(tmp_path), 4) is None and file.read_text() == damage
+
+
 def test_killed_ten_times_at_random_it_loses_and_doubles_nothing(tmp_path: Path) -> None:
     folder, whole = tmp_path / "episodes", tmp_path / "whole"
     random = np.random.default_rng(0)

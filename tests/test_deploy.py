@@ -32,6 +32,7 @@ from std_msgs.msg import String
 
 from vla.deploy import messages
 from vla.deploy.bag import POLICY_INPUTS
+from vla.deploy.demo_operator import DemoOperator, SimulatedEpisode
 from vla.deploy.images import resize
 from vla.deploy.ros import NETWORKS, Network, split_arguments
 from vla.rollouts.recorder import VIEWER
@@ -351,3 +352,33 @@ def test_a_ros_installation_finds_the_node() -> None:
     compile((prefix / "share/vla/launch/agent.launch.py").read_text(), "agent.launch.py", "exec")
     done = subprocess.run([prefix / "lib/vla/agent", "--help"], capture_output=True, text=True)
     assert done.returncode == 0 and "deploy" in done.stdout
+
+
+EPISODE = {"seed": 1, "instruction": "lift it", "done": False, "outcome": "timeout", "task": "", "milestones": ["near"]}
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        "",
+        "{",
+        "[" * 10**5,
+        "[]",
+        *(json.dumps({**EPISODE, name: value}) for name, value in {"seed": -1, "done": "no", "milestones": 3}.items()),
+        json.dumps({**EPISODE, "instruction": "a" * 1001}),
+        json.dumps({**EPISODE, "outcome": None}),
+        json.dumps({**EPISODE, "seed": float("nan")}),
+        json.dumps({**EPISODE, "more": 1}),
+        "{}",
+    ],
+    ids=lambda text: text[:40],
+)
+def test_the_operator_drops_messages_that_no_simulator_sends(wrong: str, caplog: pytest.LogCaptureFixture) -> None:
+    operator = DemoOperator.__new__(DemoOperator)
+    operator._on_episode(String(data=json.dumps(EPISODE)))
+    known = operator._episode
+    assert known == SimulatedEpisode(1, "lift it", False, "timeout", "", ("near",))
+    operator._on_episode(String(data=wrong))
+    assert operator._episode == known
+    dropped = "dropped a message: /vla_simulator/episode is damaged or of another kind"
+    assert dropped in caplog.text

@@ -134,3 +134,21 @@ def test_a_spec_comes_back_as_it_was() -> None:
     assert Spec.from_dict(ARM_SPEC.to_dict()) == ARM_SPEC
     with pytest.raises(ValueError, match=r"^x\.ckpt is damaged or of another kind: .*set"):
         Spec.from_dict({**ARM_SPEC.to_dict(), "cameras": {1}}, "x.ckpt")
+
+
+def test_a_description_is_read_only_up_to_a_size_and_a_depth(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = add(tmp_path, EPISODES[:1]).folder / "store.json"
+    header = json.loads(path.read_text())
+    nested: Any = {}
+    for _ in range(100):
+        nested = {"a": nested}
+    path.write_text(json.dumps({**header, "config": nested}))
+    with pytest.raises(ValueError, match=r"store\.json holds more than \d+ values, or more than \d+ levels"):
+        EpisodeStore(tmp_path)
+    path.write_text(json.dumps(header).replace('"config": {', '"config": {"a": ' + "[" * 10**5, 1))
+    with pytest.raises(ValueError, match=r"store\.json is damaged or of another kind: .*recursion limit"):
+        EpisodeStore(tmp_path)
+    with path.open("w") as file:
+        file.truncate(10**12)  # without contents on the disk
+    with pytest.raises(ValueError, match=r"store\.json has 1000000000000 bytes, more than the \d+"):
+        EpisodeStore(tmp_path)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import json
 import sys
 from collections.abc import Callable
 from functools import partial
@@ -149,6 +150,73 @@ def test_pickled_weights_are_not_read(folder: Path, tmp_path: Path) -> None:
     torch.save(weights, tmp_path / "pytorch_model.bin")
     with pytest.raises(ValueError, match=r"has no model.safetensors.*run code.*save_pretrained"):
         HuggingFace(str(tmp_path), width=8)
+
+
+def saved(folder: Path, **configuration: Any) -> dict[str, Any]:
+    """The state of an encoder as a checkpoint holds it, with another configuration."""
+    state = HuggingFace(str(folder), width=8).get_extra_state()
+    return {**state, "config": json.dumps({**json.loads(state["config"]), **configuration})}
+
+
+@pytest.mark.parametrize("kind", ["gpt2", "mamba", "vit", "clip_vision_model", "timm_wrapper", 3, None, "bert" * 999])
+def test_of_a_checkpoint_or_folder_only_known_kinds_of_text_encoders_are_built(
+    kind: Any, folder: Path, tmp_path: Path
+) -> None:
+    refused = r"cannot be read.*: .{1,100} is none of the text encoders albert, bert, "
+    with pytest.raises(ValueError, match=refused):
+        HuggingFace("", width=8).set_extra_state(saved(folder, model_type=kind))
+    broken = write_encoder(tmp_path)
+    (broken / "config.json").write_text(json.dumps({"model_type": kind}))
+    with pytest.raises(ValueError, match=refused):
+        HuggingFace(str(broken), width=8)
+
+
+def test_a_configuration_cannot_make_transformers_fetch_or_run_code(folder: Path, tmp_path: Path) -> None:
+    names = ("attn_implementation", "_attn_implementation", "experts_implementation")
+    acting = {**dict.fromkeys(names, "somebody/kernel"), "auto_map": {"AutoModel": "own.Model"}}
+    encoder, expected = HuggingFace("", width=8), HuggingFace(str(folder), width=8)
+    encoder.set_extra_state(saved(folder, **acting))
+    assert torch.equal(encoder.tokenize(SENTENCES), expected.tokenize(SENTENCES))
+    config = write_encoder(tmp_path) / "config.json"
+    config.write_text(json.dumps({**json.loads(config.read_text()), **acting}))
+    assert torch.equal(HuggingFace(str(tmp_path), width=8).tokenize(SENTENCES), expected.tokenize(SENTENCES))
+    tower = write_encoder(tmp_path / "clip", TOWERS["clip"]())
+    values = json.loads((tower / "config.json").read_text())
+    values["text_config"] |= acting
+    (tower / "config.json").write_text(json.dumps(values))
+    HuggingFace(str(tower), width=8)
+
+
+def test_an_encoder_has_no_more_layers_than_weights(folder: Path) -> None:
+    with pytest.raises(ValueError, match=r"num_hidden_layers is 1000000, with \d+ weights"):
+        HuggingFace("", width=8).set_extra_state(saved(folder, num_hidden_layers=10**6))
+
+
+@pytest.mark.parametrize(
+    ("part", "content", "says"),
+    [
+        ("padding", {"strategy": {"Fixed": 10**12}}, "pads texts to more than 65536 tokens"),
+        ("padding", {"pad_to_multiple_of": 10**9}, "pads texts to more than 65536 tokens"),
+        (
+            "normalizer",
+            {
+                "type": "Sequence",
+                "normalizers": [{"type": "Replace", "pattern": {"String": "a"}, "content": "aa"}] * 60,
+            },
+            "more than 4 replacements",
+        ),
+        ("normalizer", {"type": "Prepend", "prepend": "a" * 9}, "of over 8 characters"),
+    ],
+)
+def test_a_tokenizer_that_makes_texts_grow_without_bound_is_refused(
+    part: str, content: dict[str, Any], says: str, folder: Path
+) -> None:
+    state = saved(folder)
+    padding = {"direction": "Right", "pad_to_multiple_of": None, "pad_id": 0, "pad_type_id": 0, "pad_token": "[PAD]"}
+    content = {"strategy": "BatchLongest", **padding, **content} if part == "padding" else content
+    state["tokenizer"] = json.dumps({**json.loads(state["tokenizer"]), part: content})
+    with pytest.raises(ValueError, match=says):
+        HuggingFace("", width=8).set_extra_state(state)
 
 
 def test_what_is_missing_or_damaged_is_named(folder: Path, tmp_path: Path) -> None:

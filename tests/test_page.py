@@ -139,7 +139,8 @@ def test_what_is_missing_is_left_out(tmp_path: Path) -> None:
     (tmp_path / "metrics.csv").write_text(CURVES)
     save_training(tmp_path, 1, 39, 3.0, "interrupted")
     told = text(write_page(tmp_path))
-    assert "Training was interrupted after 39 steps" in told and "Rollouts" not in told
+    assert f"Training was interrupted after 39 steps; resume={tmp_path} continues it." in told
+    assert "Rollouts" not in told
 
 
 def test_axes_of_success_end_at_one_and_small_numbers_keep_their_digits(tmp_path: Path) -> None:

@@ -13,7 +13,7 @@ from finished_runs import CONFIG, a_run
 
 from vla.reports.html import write_comparison
 from vla.runs.files import Change, Training
-from vla.runs.folder import read_run, run_of, save_choice, save_training
+from vla.runs.folder import chosen_checkpoint, read_run, save_choice, save_training, wall_time
 
 BOMB = "a: &a [x, x]\nb: &b [*a, *a]\nc: [*b, *b]\n"
 
@@ -27,9 +27,10 @@ def test_what_was_written_is_read(tmp_path: Path) -> None:
     folder = a_run(tmp_path / "run", "sd")
     save_training(folder, 12, 40, 3.04, "done", 2.0)
     save_choice(folder, "best.ckpt")
-    run = run_of(folder / "checkpoints/best.ckpt")
+    run = read_run(folder)
     assert run.training == Training(12, 40, 3.0, "done", 2.0, "best.ckpt")
-    assert (run.chosen, run.model, run.tasks, run.wall_time(1.0)) == ("best.ckpt", "BC", [], 6.0)
+    assert (chosen_checkpoint(folder), run.model, run.tasks) == ("best.ckpt", "BC", [])
+    assert wall_time(folder / "checkpoints/best.ckpt", 1.0) == 6.0
     assert run.changes == [Change("model.width", 16, 32)] and run.config["task"] == CONFIG["task"]
     assert run.report is not None and run.report.successes == 1
     assert [result.outcome for result in run.reports["seen"].results] == ["success", "dropped"]
@@ -62,6 +63,10 @@ def test_what_was_written_is_read(tmp_path: Path) -> None:
         ("metrics.csv", "step,train/loss\n9,1\nten,2\n", r"metrics\.csv is damaged in line 3: .*'ten'"),
         ("metrics.csv", "step,train/loss\n9,low\n", r"line 2: could not convert"),
         ("metrics.csv", "step,train/loss\n9,1,2\n", r"line 2: .*longer"),
+        ("metrics.csv", "step,train/loss\n" + "9" * 30 + ",1\n", r"line 2: step is no count, but 9{30}"),
+        ("metrics.csv", "step,train/loss\n-1,1\n", r"line 2: step is no count, but -1"),
+        ("metrics.csv", "step,train/loss\n,1\n", r"line 2: step is no count"),
+        ("metrics.csv", "step,step\n1,1\n", r"line 1: there is no column step, or a column twice"),
         ("metrics.csv", "step,train/loss\n9," + "1" * 10**6, r"line 2: field larger"),
     ],
     ids=count(),
@@ -96,3 +101,25 @@ def test_a_row_that_a_killed_process_left_half_is_skipped(tmp_path: Path) -> Non
     assert (steps.tolist(), values.tolist()) == ([9], [2.5])
     (tmp_path / "metrics.csv").write_text("")
     assert read_run(tmp_path).metrics == {}
+
+
+def test_points_that_are_no_number_are_not_drawn(tmp_path: Path) -> None:
+    curves = "step,train/loss,val/loss\n9,2.5,nan\n19,inf,\n29,-1e400,nan\n39,1.5,\n"
+    run = read_run(a_run(tmp_path / "run", curves=curves))
+    assert {name: (at.tolist(), of.tolist()) for name, (at, of) in run.metrics.items()} == {
+        "train/loss": ([9, 39], [2.5, 1.5])
+    }
+    assert "<svg" in write_comparison([run.folder], tmp_path).read_text()
+
+
+def test_a_damaged_description_of_the_training_costs_no_evaluation(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    folder = a_run(tmp_path / "run")
+    save_training(folder, 12, 40, 3.0, "done", 2.0)
+    for name in ("metrics.csv", "report.json", "config.yaml"):
+        (folder / name).write_text("[1]")
+    assert wall_time(folder / "checkpoints/last.ckpt", 1.0) == 6.0
+    (folder / "training.json").write_text('{"seconds": NaN}')
+    assert wall_time(folder / "checkpoints/last.ckpt", 1.0) is None
+    assert f"the wall time is unknown: {folder / 'training.json'} is damaged" in caplog.text

@@ -79,6 +79,8 @@ def test_a_run_continues_in_its_folder(tmp_path: Path, finished: bool, chosen: s
     leave(tmp_path, config, finished, chosen)
     last = tmp_path / "checkpoints/last.ckpt"
     expected = TrainingProgress(chosen=last.with_name(chosen)) if chosen else TrainingProgress(resume_from=last)
+    for name in ("metrics.csv", "report.json", "config.yaml"):
+        (tmp_path / name).write_text("[1]")  # damaged, and not needed
     assert training_progress(tmp_path, plain(composed("cluster.workers=1"))) == expected
     assert training_progress(tmp_path, plain(composed("trainer.max_steps=1"))) == expected
     assert training_progress(tmp_path, plain(composed("trainer.max_steps=99999"))) == TrainingProgress(resume_from=last)

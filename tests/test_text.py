@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from typing import Any
 
 import pytest
 import torch
@@ -13,7 +14,9 @@ from defaults import defaults_of
 from hydra.utils import instantiate
 from omegaconf import OmegaConf
 
+from vla.config.build import check_node
 from vla.models.text.ngrams import NGrams
+from vla.models.text.tensor_cache import TensorCache
 
 SENTENCES = ["Lift the red block", "put the small green block onto the blue pad", ""]
 
@@ -98,3 +101,31 @@ def test_unknown_words_hardly_change_what_training_made_of_the_known_ones() -> N
         encoder.embedding.weight[known] *= 10  # as training does
         one, other = encoder(known[None]), encoder(new[None])
     assert torch.cosine_similarity(one, other).item() > 0.8
+
+
+@pytest.mark.parametrize("name", ["words", "characters"])
+def test_n_grams_are_short(name: str) -> None:
+    """Over the lengths up to 2^31, which a checkpoint could ask for, a single sentence took minutes."""
+    node: Any = OmegaConf.to_container(OmegaConf.load(CONF / "model/text/ngrams.yaml"))
+    with pytest.raises(ValueError, match=rf"text\.{name} must be int, at least 1, at most \d\d, got"):
+        check_node("text", {**node, name: 2**31 - 1}, object)
+
+
+def test_a_cache_holds_what_was_used_last_within_its_bytes() -> None:
+    cache, made = TensorCache(20_000), list[str]()
+
+    def get(text: str, length: int) -> torch.Tensor:
+        return cache.get(text, lambda: made.append(text) or torch.zeros(length), length)
+
+    for text in ("a", "b", "a", "c", "a"):
+        assert get(text, 1000).shape == (1000,)
+    assert made == ["a", "b", "c"]
+    for number in range(100):
+        get(str(number), 1000)
+        get("a", 1000)
+        assert 0 < cache.size <= 20_000
+    assert made.count("a") == 1
+    get("huge", 10_000)
+    get("x" * 10_000, 1)
+    assert cache.size <= 20_000
+    assert get("a", 1).shape == (1,)

@@ -24,8 +24,9 @@ from small_training import fit, make_learner
 from vla.models.diffusion import Diffusion
 from vla.models.learner import Learner
 from vla.models.model import Model
+from vla.training.checkpoints import GracefulStop
 from vla.training.closed_loop import ClosedLoop
-from vla.training.trainer import GracefulStop, explain_memory_errors, make_trainer
+from vla.training.trainer import explain_memory_errors, make_trainer
 
 MODELS: dict[str, Callable[[], Model]] = {
     "bc": lambda: make_bc(shift=(64, 64)),
@@ -89,7 +90,7 @@ def test_what_ends_at_a_step_that_is_validated_does_not_lose_the_validation(
 
     train(fresh(), folder, tmp_path / "whole")
     if killed:
-        monkeypatch.setattr("vla.training.trainer.SAVE_EVERY", VALIDATED)
+        monkeypatch.setattr("vla.training.checkpoints.SAVE_EVERY", VALIDATED)
         with pytest.raises(RuntimeError, match="killed"):
             train(fresh(), folder, tmp_path / "half", killer=DieAt(VALIDATED + 1))
     else:
@@ -181,3 +182,66 @@ def test_an_episode_that_cannot_be_played_in_validation_costs_no_training(
     train(make_bc(), folder, tmp_path / "run", killer=closed_loop)
     assert closed_loop.success == pytest.approx(0.5)  # seed 3 fails in this world
     assert "validation: seed 1 could not be played: RuntimeError: the simulation diverged" in caplog.text
+
+
+def test_damaged_training_curves_cost_no_training(
+    folder: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    train(make_bc(), folder, tmp_path, stop=2, max_steps=3)
+    last = tmp_path / "checkpoints/last.ckpt"
+    for damage in ("", "epoch,val/loss\n1,2\n", "step,val/loss\nlast,2\n", "step,val/loss\n" + "9" * 30 + ",2\n", "\0"):
+        (tmp_path / "metrics.csv").write_text(damage)
+        assert train(make_bc(), folder, tmp_path / "rest", checkpoint=last, max_steps=3)["global_step"] == 3
+    assert f"the training curves begin anew: {tmp_path / 'metrics.csv'} is damaged in line 2" in caplog.text
+
+
+LOOP = "epoch_loop.batch_progress"
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        *(("loops", value) for value in (None, {}, {"fit_loop": None}, [1])),
+        ("loops", {"fit_loop": {LOOP: {"total": {"ready": -1}}}}),
+        ("loops", {"fit_loop": {LOOP: {"total": {"ready": "x"}}}}),
+        *(("callbacks", {"ClosedLoop": value}) for value in ({"success": "x"}, {"success": 0.5, "best": 2.0})),
+        ("callbacks", {"ClosedLoop": {"success": float("nan"), "best": 0.5, "seeds": [1]}}),
+        *(("seconds", value) for value in ("x", None, -1.0, float("nan"))),
+        *(("optimizer_states", value) for value in (None, [], [3], [{"state": {}, "param_groups": []}])),
+        *(("lr_schedulers", value) for value in (None, [], [3])),
+        ("WindowDataModule", {"windows": "others"}),
+        ("WindowDataModule", None),
+        ("state_dict", {"model.x": 3}),
+        ("current_model_state", {"model.x": 3}),
+    ],
+    ids=lambda value: str(value)[:40],
+)
+def test_a_damaged_state_of_a_training_is_refused_by_name(
+    key: str, value: Any, interrupted: dict[str, Any], folder: Path, tmp_path: Path
+) -> None:
+    last = tmp_path / "checkpoints/last.ckpt"
+    last.parent.mkdir()
+    torch.save({**interrupted, key: value}, last)
+    played = ClosedLoop(toy.make_environment, lambda model: toy.ToyExpert(), range(1), last.parent)
+    with pytest.raises(ValueError, match=r"^\S+/last\.ckpt cannot be resumed: .+"):
+        train(make_bc(), folder, tmp_path, checkpoint=last, killer=played)
+
+
+@pytest.fixture(scope="module")
+def interrupted(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+    """The checkpoint of a training that was interrupted."""
+    return train(make_bc(), folder, tmp_path_factory.mktemp("interrupted"), stop=2)
+
+
+def test_a_checkpoint_does_not_say_what_was_measured(interrupted: dict[str, Any], folder: Path, tmp_path: Path) -> None:
+    """A metric takes over what lies under its name in a checkpoint, though it saves nothing there."""
+    attack = {
+        f"errors.{index}.{part}": torch.tensor(float("nan")) for index in range(3) for part in ("mean_value", "weight")
+    }
+    weights = {name: {**interrupted[name], **attack} for name in ("state_dict", "current_model_state")}
+    last = tmp_path / "checkpoints/last.ckpt"
+    last.parent.mkdir()
+    torch.save({**interrupted, **weights}, last)
+    train(make_bc(), folder, tmp_path, checkpoint=last, max_steps=VALIDATED)
+    errors = [row["val/error_x_mm"] for row in logged(tmp_path) if row["val/error_x_mm"]]
+    assert errors and all(0 <= float(error) < 1000 for error in errors)

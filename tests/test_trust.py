@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import re
 import shutil
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -15,13 +15,16 @@ import pytest
 import torch
 import toy
 from command_line import here
-from composing import CONF, composed
+from composing import CONF, check, composed
 from hostile import HANDLER, command, hostile, node
+from omegaconf import DictConfig
+from tiny_encoder import write_encoder
+from toy_episodes import EPISODES, add
 
+from vla import jobs
 from vla.config.adopt import adopt, finetune, resume
 from vla.config.annotations import LIBRARY, OWN, locate
-from vla.config.check import check
-from vla.config.experiment import make_policy, plain
+from vla.config.experiment import Experiment, make_policy, plain
 from vla.policy import read_checkpoint
 
 # Everything under these could be named once, and some of it acts when it is built.
@@ -54,16 +57,33 @@ def test_the_library_classes_that_may_be_built_are_those_of_the_options() -> Non
 
 
 ATTACKS = list(hostile(Path()))
+REFUSED = r"_target_ must name a class|holds the reference '.*only resolved values are read from files"
+
+
+def put(config: dict[str, Any], key: str, value: Any) -> None:
+    """Set what stands at a key with dots."""
+    *parents, name = key.split(".")
+    for parent in parents:
+        config = config[parent]
+    config[name] = value
+
+
+def run_job(cfg: DictConfig) -> None:
+    """Check and run a job as the command line does."""
+    check(cfg)
+    jobs.run(Experiment.of(cfg))
+
+
+@pytest.fixture(scope="module")
+def toy_store(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of a store with one episode."""
+    return add(tmp_path_factory.mktemp("stores") / "store", EPISODES[:1]).folder
 
 
 def checkpoint(path: Path, key: str, value: Any) -> Path:
     """A checkpoint whose configuration is the default one but for a key."""
     config = plain(composed("expert=clean", "trainer=cpu"))
-    *parents, name = key.split(".")
-    holder = config
-    for parent in parents:
-        holder = holder[parent]
-    holder[name] = value
+    put(config, key, value)
     path.parent.mkdir(parents=True, exist_ok=True)
     torch.save({"config": config, "spec": toy.SPEC.to_dict(), "state_dict": {}}, path)
     return path
@@ -75,24 +95,42 @@ def test_nothing_that_a_checkpoint_names_is_run(tmp_path: Path, attack: str, mon
     mark = tmp_path / "mark"
     path = checkpoint(tmp_path / "runs/theirs/checkpoints/last.ckpt", *hostile(mark)[attack])
     output = f"output={tmp_path}/runs/mine"  # beside it, as if it were an own run
-    evaluated = composed(output, f"checkpoint={path}")
-    started = composed(output, f"pretrained={path}")
-    resumed = composed(f"output={path.parent.parent}")
-    adopted = {
-        "evaluate": lambda: check(adopt(evaluated, [])),
-        "resume": lambda: check(resume(resumed, path.parent.parent, [])),
-        "pretrained": lambda: check(finetune(started, [])),
-        "policy": lambda: make_policy(plain(evaluated.policy), path),
+
+    def adopted(*options: str) -> Callable[[], None]:
+        return lambda: run_job(adopt(composed(output, f"checkpoint={path}", *options), []))
+
+    ways: dict[str, Callable[[], Any]] = {
+        "evaluate": adopted(),
+        "export": adopted("job=export", "export=program", f"export.folder={tmp_path}/new"),
+        "deploy": adopted("job=deploy", "deploy=ros2"),
+        "benchmark": adopted("job=benchmark"),
+        "resume": lambda: run_job(resume(composed(f"output={path.parent.parent}"), path.parent.parent, [])),
+        "pretrained": lambda: run_job(finetune(composed(output, f"pretrained={path}"), [])),
+        "policy": lambda: make_policy(plain(composed().policy), path),  # as evaluate, export and deploy build it
     }
-    untouched = {"a command as a plugin": {"evaluate", "pretrained", "policy"}}
+    untouched = {"a command as a plugin": {*ways} - {"resume"}}
     for part in ("task.goal", "an axis"):
         untouched[f"a command as {part}"] = {"pretrained", "policy"}
-    for way, do in adopted.items():
+    for way, do in ways.items():
         if way in untouched.get(attack, set()):
             continue  # what is wrong there is nothing that this way reads
-        with pytest.raises(ValueError):
+        with pytest.raises(ValueError, match=REFUSED):
             do()
-        assert not mark.exists()
+        assert not mark.exists(), way
+
+
+@pytest.mark.parametrize("attack", ATTACKS)
+def test_nothing_that_a_store_names_is_run(tmp_path: Path, attack: str, toy_store: Path) -> None:
+    mark = tmp_path / "mark"
+    key, value = hostile(mark)[attack]
+    config = {"task": plain(composed("expert=clean", "trainer=cpu"))["task"], "expert": {}}
+    put(config, key if key.startswith("task.") else "task.goal", value)
+    shutil.copytree(toy_store, tmp_path / "store")
+    header = json.loads((tmp_path / "store/store.json").read_text())
+    (tmp_path / "store/store.json").write_text(json.dumps({**header, "config": config}))
+    with pytest.raises(ValueError, match=REFUSED):
+        run_job(composed("job=inspect", f"inspect.folder={tmp_path}/store", "inspect.episode=0", f"output={tmp_path}"))
+    assert not mark.exists()
 
 
 WAYS = {
@@ -138,6 +176,50 @@ def test_a_path_in_somebody_elses_checkpoint_is_refused(tmp_path: Path) -> None:
     torch.save({"config": config, "spec": toy.SPEC.to_dict(), "state_dict": {}}, path)
     with pytest.raises(ValueError, match=r"last\.ckpt names a path in task\.goal\.folder"):
         adopt(composed(f"checkpoint={path}"), [])
+
+
+def test_folders_loggers_and_devices_are_never_those_of_a_checkpoint(tmp_path: Path) -> None:
+    theirs: dict[str, Any] = {
+        **plain(composed("expert=lerobot", "expert.folder=/theirs", "collect.episodes=7", "trainer.max_steps=9")),
+        **{"output": "/theirs", "pretrained": "/theirs", "resume": "/theirs", "checkpoint": "/theirs"},
+        "logger": {"csv": {"_target_": "lightning.pytorch.loggers.CSVLogger", "name": "/theirs"}},
+    }
+    theirs["collect"] |= {"folder": "/theirs"}
+    theirs["inspect"] |= {"folder": "/theirs", "into": "/theirs"}
+    theirs["export"] |= {"folder": "/theirs"}
+    theirs["trainer"] |= {"default_root_dir": "/theirs", "accelerator": "theirs", "devices": 99, "profiler": "theirs"}
+    path = tmp_path / "last.ckpt"
+    torch.save({"config": theirs, "spec": toy.SPEC.to_dict(), "state_dict": {}}, path)
+    own = (f"output={tmp_path}/mine",)
+    for adopted in (
+        *(adopt(composed(*own, f"checkpoint={path}", f"job={job}"), []) for job in ("evaluate", "export", "benchmark")),
+        finetune(composed(*own, f"pretrained={path}"), []),
+    ):
+        assert "theirs" not in repr(plain(adopted))
+        assert plain(adopted)["trainer"].get("devices") != 99
+    reported = plain(adopt(composed(*own, f"checkpoint={path}"), []))
+    assert (reported["collect"]["episodes"], reported["trainer"]["max_steps"]) == (7, 9)
+    assert reported["expert"] == {"_target_": theirs["expert"]["_target_"]}
+
+
+@pytest.mark.parametrize("job", ["evaluate", "benchmark"])
+def test_no_checkpoint_asks_for_a_download(job: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fetch(*_: str) -> Path:
+        raise AssertionError("a download")
+
+    store = add(tmp_path / "store", EPISODES[:1])
+    own = (f"output={tmp_path}/mine", "model/text=huggingface")
+    encoder = write_encoder(tmp_path / "encoder")
+    trained = Experiment.of(composed(*own, f"model.text.name={encoder}")).fitted_learner(store)
+    state = {f"model.{name}": value for name, value in trained.model.state_dict().items()}
+    config = plain(composed(*own, "model.text.name=somebody/encoder", "expert=clean"))
+    path = tmp_path / "last.ckpt"
+    torch.save({"config": config, "spec": store.spec.to_dict(), "state_dict": state}, path)
+    monkeypatch.setattr("vla.models.text.huggingface.fetch", fetch)
+    asked = Experiment.of(adopt(composed(f"output={tmp_path}/mine", f"checkpoint={path}", f"job={job}"), []))
+    model = asked.make_policy()().model if job == "evaluate" else asked.fitted_learner(store).model
+    sentence = ["lift the red block"]
+    assert torch.equal(model.text.tokenize(sentence), trained.model.text.tokenize(sentence))
 
 
 def test_a_model_that_its_checkpoint_cannot_hold_is_refused_before_it_is_made(tmp_path: Path) -> None:

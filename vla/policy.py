@@ -11,6 +11,7 @@ from copy import copy
 from dataclasses import dataclass, replace
 from pathlib import Path
 from pickle import UnpicklingError
+from pickletools import genops
 from typing import Any, Literal
 from zipfile import ZIP_STORED, BadZipFile, ZipFile, ZipInfo
 
@@ -27,6 +28,12 @@ from vla.spec import LONGEST_INSTRUCTION, Array, Observation, Spec
 REQUIRED_NODES = ("task", "tokenizer", "model")  # of the config in a checkpoint
 OPTIONAL_NODES = ("chosen", "expert", "collect", "data", "learner", "trainer", "validate")
 TRUTH_MODULES = ("truth_head", "truth_scale")  # modules of a model used in training only
+# What the pickle in a checkpoint may name.
+KNOWN = (
+    *("collections OrderedDict", "torch._utils _rebuild_tensor_v2", "torch._utils _rebuild_parameter"),
+    *(f"torch {kind}Storage" for kind in ("Float", "Double", "Half", "BFloat16", "Bool", "Byte")),
+    *(f"torch {kind}Storage" for kind in ("Char", "Short", "Int", "Long")),
+)
 LONG_SENTENCE = " ".join(["sentence"] * 24)  # shorter instructions are padded to it for a constant shape
 
 
@@ -48,14 +55,15 @@ class Checkpoint(Header):
     state: dict[str, Tensor]  # of the model
 
     def restore(self, model: torch.nn.Module) -> None:
-        """Load the weights into `model`.
+        """Load the weights into `model`; parts that it only makes now, such as a text encoder, fit in the file too.
 
         Raises:
             ValueError: they belong to another model.
         """
         try:
-            model.load_state_dict(self.state)
-        except (RuntimeError, TypeError, AttributeError) as error:  # the latter two for values that are not tensors
+            with TensorBudget(self.path):
+                model.load_state_dict(self.state)
+        except Exception as error:  # whatever modules raise for a state that is not theirs
             first = str(error).strip().splitlines()[-1].strip()[:200]
             raise ValueError(f"{self.path} does not fit the model of its own configuration: {first}") from error
 
@@ -113,7 +121,7 @@ def _header(path: Path, content: dict[str, Any]) -> Header:
             f"{path} is no checkpoint of this project: its configuration lacks {', '.join(REQUIRED_NODES)}"
         )
     finished = content.get("finished") is True
-    return Header(path, config, Spec.from_dict(spec), finished, steps if isinstance(steps, int) else 0)
+    return Header(path, config, Spec.from_dict(spec, f"{path}: spec"), finished, steps if isinstance(steps, int) else 0)
 
 
 def _load(path: Path, weights: bool) -> dict[str, Any]:
@@ -131,10 +139,49 @@ def _load(path: Path, weights: bool) -> dict[str, Any]:
             for entry in entries:
                 if weights or entry.filename.endswith("/data.pkl"):
                     _verify(archive, entry)  # torch does not verify checksums
+                if entry.filename.endswith("/data.pkl"):
+                    _require_known(archive.read(entry))
         content = torch.load(path, map_location="cpu", weights_only=True, mmap=not weights)
-    except (RuntimeError, UnpicklingError, EOFError, LookupError, TypeError, AttributeError, BadZipFile) as error:
+        _require_stored(content, path.stat().st_size)
+    except OSError:
+        raise
+    except Exception as error:  # a pickle can raise nearly anything
         raise ValueError(f"{path} cannot be read as a checkpoint, it is damaged or something else") from error
     return content if isinstance(content, dict) else {}
+
+
+def _require_known(pickled: bytes) -> None:
+    """Require a pickle to call nothing but what makes the tensors of a checkpoint.
+
+    PyTorch by itself also lets a pickle call `bytearray(10**10)`, for example.
+
+    Raises:
+        UnpicklingError: it names something else.
+    """
+    for opcode, name, _ in genops(pickled):
+        if opcode.name == "GLOBAL" and name not in KNOWN:
+            raise UnpicklingError(f"it names {name}")
+
+
+def _require_stored(content: Any, size: int) -> None:
+    """Require the tensors to lie in a file of `size` [bytes]: strides of 0 describe any number of elements.
+
+    Raises:
+        UnpicklingError: a tensor is larger than its storage, or all storages together are larger than the file.
+    """
+    pending, seen, stored = [content], set[int](), dict[int, int]()
+    while pending:
+        value = pending.pop()
+        if isinstance(value, Tensor):
+            storage = value.untyped_storage()
+            stored[storage.data_ptr()] = storage.nbytes()
+            if value.nbytes > storage.nbytes():
+                raise UnpicklingError("a tensor is larger than its storage")
+        elif isinstance(value, (dict, list, tuple)) and id(value) not in seen:
+            seen.add(id(value))  # a pickle can refer to the same list many times, or to itself
+            pending += [*value, *value.values()] if isinstance(value, dict) else value
+    if sum(stored.values()) > size:
+        raise UnpicklingError("its tensors are larger than the file")
 
 
 def _verify(archive: ZipFile, entry: ZipInfo) -> None:
@@ -147,31 +194,34 @@ def _verify(archive: ZipFile, entry: ZipInfo) -> None:
 class TensorBudget(TorchFunctionMode):
     """Context that limits the total size of created tensors to what the weights in a checkpoint could fill.
 
-    A config that requires more is refused at the first tensor above the limit, before memory is written.
+    A config that requires more is refused at the first tensor above the limit, before it is allocated.
     """
 
-    FACTORIES = (torch.empty, torch.zeros, torch.ones, torch.full, torch.rand, torch.randn)
+    FACTORIES: tuple[Any, ...] = (
+        *(torch.empty, torch.zeros, torch.ones, torch.full, torch.rand, torch.randn, torch.randint, torch.randperm),
+        *(torch.arange, torch.linspace, torch.eye),
+    )
 
     def __init__(self, checkpoint: Path) -> None:
         super().__init__()
         self._path, self._remaining = checkpoint, 2 * checkpoint.stat().st_size + 2**26
 
     def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
-        """Call `func` and subtract the size of its result from the budget.
+        """Call `func` after subtracting the size of its result from the budget.
 
         Raises:
             ValueError: the budget is exceeded.
         """
-        try:
-            result = func(*args, **(kwargs or {}))
-            self._remaining -= result.nbytes if func in self.FACTORIES else 0
-        except RuntimeError as error:
-            if func not in self.FACTORIES:
-                raise
-            raise self._error() from error
-        if self._remaining < 0:
-            raise self._error()
-        return result
+        kwargs = kwargs or {}
+        if func in self.FACTORIES:
+            described = {name: value for name, value in kwargs.items() if name not in ("generator", "out")}
+            try:
+                self._remaining -= func(*args, **(described | {"device": "meta", "pin_memory": False})).nbytes
+            except RuntimeError as error:  # a size beyond any address
+                raise self._error() from error
+            if self._remaining < 0:
+                raise self._error()
+        return func(*args, **kwargs)
 
     def _error(self) -> ValueError:
         return ValueError(f"{self._path} describes a model that is larger than the file, which does not hold it")

@@ -5,7 +5,6 @@ Tasks, data, models and deployment exchange only the types below: they import th
 
 from __future__ import annotations
 
-import json
 import math
 import re
 from collections.abc import Iterable, Iterator, Mapping
@@ -16,7 +15,7 @@ from typing import Annotated, Any, Literal, Protocol, runtime_checkable
 import numpy as np
 from annotated_types import Ge, Le, MaxLen, MinLen, Predicate
 
-from vla.io.documents import STRICT, parse_json
+from vla.io.documents import STRICT, parse_plain
 from vla.io.types import Count, Point, Positive, unique
 
 Array = np.ndarray
@@ -133,11 +132,7 @@ class Spec:
         Raises:
             ValueError: `values` are no spec; the message calls them `name`.
         """
-        try:
-            text = json.dumps(values)
-        except (TypeError, ValueError, RecursionError) as error:
-            raise ValueError(f"{name} is damaged or of another kind: {str(error)[:200]}") from error
-        spec = parse_json(text, cls, name)
+        spec = parse_plain(values, cls, name)
         if problem := next(_contradictions(spec), None):
             raise ValueError(f"{name} is damaged or of another kind: {problem}")
         return spec

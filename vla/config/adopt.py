@@ -9,23 +9,24 @@ from __future__ import annotations
 import copy
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
 from omegaconf import DictConfig, OmegaConf, open_dict
 
-from vla.config.build import require_no_paths, require_trust
+from vla.config.build import require_no_paths, require_trust, without_paths
 from vla.config.differences import at, differences
 from vla.policy import read_header
 
-ADOPTING = ("evaluate", "export", "deploy", "benchmark")  # jobs that take a checkpoint
 OF_POLICY = ("task", "tokenizer", "model")
 OF_MODEL = ("tokenizer", "model", "data")  # the batch size depends on the model
-# Nodes of the training that a report on its policy includes.
-REPORTED = ("expert", "collect", "data", "learner", "trainer", "validate", "seed", "pretrained")
+# What a report on a policy includes of its training: nodes, which nothing builds then, and values of other nodes.
+REPORTED = ("expert", "data", "learner", "validate", "seed")
 CHOSEN = {"experiment": "experiment", "model": "model"}  # name in `chosen` → group
 PRESETS = ("experiment", "variant", "shift")  # groups and keys that change other groups
+LENGTHS = ("max_steps", "max_epochs", "val_check_interval", "accumulate_grad_batches", "gradient_clip_val")
+REPORTED_VALUES = {"collect": ("episodes", "seed"), "trainer": (*LENGTHS, "precision")}
 OF_THIS_COMMAND = ("output", "resume", "trust")  # keys that are not taken from a resumed run
 MACHINES = ("accelerator", "devices", "num_nodes", "strategy")  # keys of the trainer that its options change in one
 IDENTITY = (  # keys that nothing changes in one, because they make another training
@@ -37,24 +38,21 @@ IDENTITY = (  # keys that nothing changes in one, because they make another trai
 
 
 def adopt(cfg: DictConfig, overrides: Sequence[str]) -> DictConfig:
-    """Return `cfg` with task, tokenizer and model of `cfg.checkpoint`, and for an evaluation also its training nodes.
+    """Return `cfg` with task, tokenizer and model of `cfg.checkpoint`; for an evaluation also with what it reports.
+
+    Neither has files, folders or devices of the checkpoint's author.
 
     Raises:
-        ValueError: the job takes no checkpoint, the file does not exist, or an override contradicts its weights.
+        ValueError: the file does not exist, or an override contradicts its weights.
     """
-    if cfg.job not in ADOPTING:
-        raise ValueError(
-            f"job={cfg.job} takes no checkpoint: resume=RUN continues a run, pretrained={cfg.checkpoint} starts a new "
-            "training from its weights"
-        )
     parsed = _parsed(overrides)
     _require_own_parts(parsed, ("tokenizer", "model", *PRESETS))
     saved = read_header(cfg.checkpoint).config
     require_no_paths(saved, OF_POLICY, cfg.checkpoint)
     named, kept = {override.key_or_group for override in parsed}, saved.get("chosen", {})
     chosen = {name: cfg.chosen[name] if group in named else kept.get(name) for name, group in CHOSEN.items()}
-    names = [*OF_POLICY, *(name for name in REPORTED if cfg.job == "evaluate" and name in saved)]
-    return _on_top(cfg, {**{name: saved[name] for name in names}, "chosen": chosen}, parsed)
+    reported = _reported(cfg, saved) if cfg.job == "evaluate" else {}
+    return _on_top(cfg, {**{name: saved[name] for name in OF_POLICY}, **reported, "chosen": chosen}, parsed)
 
 
 def finetune(cfg: DictConfig, overrides: Sequence[str]) -> DictConfig:
@@ -102,12 +100,22 @@ def resume(cfg: DictConfig, run: Path, overrides: Sequence[str]) -> DictConfig:
     taken = {str(name): saved[name] for name in cfg if name in saved and name not in OF_THIS_COMMAND}
     require_trust(taken, taken, last)
     if any(_path(override) == "trainer" for override in parsed):
-        kept = {name: value for name, value in saved["trainer"].items() if name not in MACHINES}
+        kept = {name: value for name, value in saved.get("trainer", {}).items() if name not in MACHINES}
         taken["trainer"] = kept | {name: cfg.trainer[name] for name in MACHINES if name in cfg.trainer}
         parsed = [override for override in parsed if _path(override) != "trainer"]
     resumed = _on_top(cfg, taken, parsed)
     resumed.output, resumed.resume = str(run), str(run)
     return resumed
+
+
+def _reported(cfg: DictConfig, saved: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the nodes of `cfg` that describe a training, as they were in that of a checkpoint, without its paths."""
+    nodes = {name: without_paths(saved, name) for name in REPORTED if name in saved}
+    for name, keys in REPORTED_VALUES.items():
+        values = {key: value for key, value in saved.get(name, {}).items() if key in keys}
+        own = cast("dict[str, Any] | None", OmegaConf.to_container(cfg[name]))
+        nodes[name] = {**(own or {}), **values}
+    return nodes
 
 
 def require_identity(saved: Mapping[str, Any], config: Mapping[str, Any], folder: Path) -> None:

@@ -31,27 +31,37 @@ HYDRA_KEYS = ("_target_", "_partial_")
 class Group:
     """The kind of objects that a config group describes."""
 
+    name: str
     makes: tuple[str, ...]  # alternative base classes or protocols
     runtime: tuple[str, ...] = ()  # constructor arguments from the program, never from YAML
     optional: bool = False  # jobs run without it
     several: bool = False  # an option is a mapping of name → node
 
 
+# A job may declare further groups of its own.
 GROUPS = {
-    "task": Group(("vla.spec.Environment",)),
-    "expert": Group(("vla.spec.Agent", "vla.data.formats.imported_demonstrations.ImportedDemonstrations"), ("spec",)),
-    "cluster": Group(("vla.parallel.pool.Cluster",)),
-    "data": Group(("vla.data.datamodule.WindowDataModule",), ("folder", "spec", "history", "chunk", "episodes")),
-    "tokenizer": Group(("vla.models.tokenizers.tokenizer.ActionTokenizer",), ("spec", "statistics")),
-    "model": Group(("vla.models.model.Model",), ("spec", "tokenizer")),
-    "learner": Group(("vla.models.learner.Learner",), ("model", "spec", "config")),
-    "trainer": Group(("lightning.Trainer",), ("callbacks", "logger")),
-    "logger": Group(("lightning.pytorch.loggers.Logger",), ("save_dir",), optional=True, several=True),
-    "policy": Group(("vla.policy.Policy",), ("model", "spec")),
-    "recorder": Group(("vla.spec.Recorder",), ("folder",), optional=True),
-    "export": Group(("vla.spec.Exporter", "vla.spec.PolicyExporter")),
-    "deploy": Group(("vla.spec.Deployment",), ("policy", "environment", "output")),
+    group.name: group
+    for group in (
+        Group("task", ("vla.spec.Environment",)),
+        Group(
+            "expert", ("vla.spec.Agent", "vla.data.formats.imported_demonstrations.ImportedDemonstrations"), ("spec",)
+        ),
+        Group("cluster", ("vla.parallel.pool.Cluster",)),
+        Group("data", ("vla.data.datamodule.WindowDataModule",), ("folder", "spec", "history", "chunk", "episodes")),
+        Group("tokenizer", ("vla.models.tokenizers.tokenizer.ActionTokenizer",), ("spec", "statistics")),
+        Group("model", ("vla.models.model.Model",), ("spec", "tokenizer")),
+        Group("learner", ("vla.models.learner.Learner",), ("model", "spec", "config")),
+        Group("trainer", ("lightning.Trainer",), ("callbacks", "logger")),
+        Group("logger", ("lightning.pytorch.loggers.Logger",), ("save_dir",), optional=True, several=True),
+        Group("policy", ("vla.policy.Policy",), ("model", "spec")),
+        Group("agent", ("vla.spec.Agent",), ("spec",), optional=True),
+        Group("recorder", ("vla.spec.Recorder",), ("folder",), optional=True),
+        Group("export", ("vla.spec.Exporter", "vla.spec.PolicyExporter")),
+        Group("deploy", ("vla.spec.Deployment",), ("policy", "environment", "output")),
+    )
 }
+
+RUNTIME = {name for group in GROUPS.values() for name in group.runtime}
 
 # Narrower than Lightning's annotations: with other values its trainer fails late, or silently trains nothing.
 NARROWER: dict[str, dict[str, Any]] = {
@@ -71,7 +81,7 @@ NARROWER: dict[str, dict[str, Any]] = {
 }
 
 
-def build(node: Mapping[str, Any], group: str, **runtime: Any) -> Any:
+def build(node: Mapping[str, Any], group: str | Group, **runtime: Any) -> Any:
     """Build the object that a plain `node` of a group such as "model" describes.
 
     Nested nodes are built first; those with `_partial_: true` become factories. Unresolved references such as `${seed}`
@@ -79,14 +89,15 @@ def build(node: Mapping[str, Any], group: str, **runtime: Any) -> Any:
 
     Args:
         node: class in `_target_`, and its arguments.
-        group: config group, which determines the base class.
+        group: config group, or its name in `GROUPS`, which determines the base class.
         runtime: arguments from the program.
 
     Raises:
         ValueError: a class that is not allowed or of another kind, wrong arguments, or an error of the constructor.
     """
-    require_resolved(node, group)
-    check_node(group, node, makes(group), tuple(runtime))
+    group = GROUPS[group] if isinstance(group, str) else group
+    require_resolved(node, group.name)
+    check_node(group.name, node, makes(group), tuple(runtime))
     try:
         factory = instantiate(dict(node), _convert_="all", _partial_=True)
     except InstantiationException as error:
@@ -97,16 +108,17 @@ def build(node: Mapping[str, Any], group: str, **runtime: Any) -> Any:
 
 
 @cache
-def makes(group: str) -> Any:
+def makes(group: Group) -> Any:
     """Return the class, protocol or union of the objects that a group describes."""
-    classes = [
-        getattr(import_module(module), name) for module, _, name in (p.rpartition(".") for p in GROUPS[group].makes)
-    ]
+    classes = [getattr(import_module(module), name) for module, _, name in (p.rpartition(".") for p in group.makes)]
     return classes[0] if len(classes) == 1 else classes[0] | classes[1]
 
 
 def check_node(key: str, node: Any, expected: Any, runtime: Sequence[str] = ()) -> None:
     """Check a plain node at `key` against the signature of its class, without the `runtime` arguments.
+
+    A factory, a node with `_partial_: true`, lacks the arguments that its caller gives: keyword-only ones, and those
+    that programs give to a group. It belongs within another node only.
 
     Raises:
         ValueError: the class is no `expected`, or a key is unknown, missing or ill-typed; with its dotted name and the
@@ -114,6 +126,9 @@ def check_node(key: str, node: Any, expected: Any, runtime: Sequence[str] = ()) 
     """
     if not is_node(node):
         raise ValueError(f"{key} must be a node with a _target_, got {_short(node)}")
+    partial = node.get("_partial_", False)
+    if not isinstance(partial, bool) or (partial and expected is not object):
+        raise ValueError(f"{key}._partial_ must be {'true or false' if expected is object else 'omitted here'}")
     target = locate(f"{key}._target_", node["_target_"])
     if not fits(target, expected):
         raise ValueError(f"{key}._target_ must name a class of kind {describe(expected)}, got {node['_target_']}")
@@ -127,8 +142,9 @@ def check_node(key: str, node: Any, expected: Any, runtime: Sequence[str] = ()) 
         if not several or str(name).startswith("_"):
             require_known(key, name, known, target.__name__)
         check_value(f"{key}.{name}", value, hints.get(name, Any))
-    for name in () if node.get("_partial_") else known:
-        if name not in node and parameters[name].default is inspect.Parameter.empty:
+    for name in known:
+        by_caller = partial and (name in RUNTIME or parameters[name].kind is inspect.Parameter.KEYWORD_ONLY)
+        if name not in node and not by_caller and parameters[name].default is inspect.Parameter.empty:
             raise ValueError(f"{key}.{name} is missing: {target.__name__} needs it")
 
 
@@ -151,6 +167,19 @@ def require_no_paths(config: Mapping[str, Any], names: Collection[str], source: 
     require_trust(config, names, source)
     for key in (key for name in names for key in _paths_in(config.get(name), name)):
         raise ValueError(f"{source} names a path in {key}: paths are taken from your own runs and commands only")
+
+
+def without_paths(config: Mapping[str, Any], name: str) -> Any:
+    """Return the node `name` of a config out of a file without the files and folders that it names, for reports.
+
+    Of a class that may not be built only the name is returned.
+    """
+    node = config[name]
+    try:
+        require_no_paths(config, [name], name)
+    except ValueError:
+        return {"_target_": node["_target_"]} if is_node(node) else None
+    return node
 
 
 def _paths_in(node: Any, key: str) -> Iterator[str]:

@@ -158,7 +158,7 @@ class WindowDataModule(LightningDataModule):
         if state["windows"] != self._digest:
             raise ValueError(
                 f"the resumed training was started with other demonstrations than those in {self._folder}: "
-                "set collect.folder=DIR to their folder, or start a new training without checkpoint="
+                "set collect.folder=DIR to their folder, or start a new training without resume="
             )
 
     def train_dataloader(self) -> Prefetcher:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -11,12 +10,13 @@ import numpy as np
 from annotated_types import Ge, Le
 
 from vla.data.index import REMEDY, Plain, dumps
-from vla.io.documents import STRICT, parse_json, require_resolved
+from vla.io.documents import STRICT, parse_json, parse_plain, read_bounded, require_resolved
 from vla.io.files import write_text
 from vla.spec import Spec
 
 FORMAT = 3
 NAME = "store.json"
+LARGEST = 16 << 20  # [bytes]; a derived store of a thousand others has 5 MB
 
 Codec = Literal["jpeg", "zlib"]
 
@@ -103,7 +103,7 @@ def read_header(folder: Path) -> tuple[Header, Spec]:
     if not path.exists():
         raise ValueError(f"there is no episode store in {folder} (no {NAME}): collect one first, with job=collect")
     try:
-        content = path.read_bytes()
+        content = read_bounded(path, LARGEST)
         found = parse_json(content, dict[str, Any], str(path)).get("format")
         if found == FORMAT:
             return _parsed(content, path)
@@ -116,7 +116,7 @@ def _parsed(content: bytes, path: Path) -> tuple[Header, Spec]:
     header = parse_json(content, Header, str(path))
     spec = Spec.from_dict(header.spec, f"{path}: spec")
     if "parts" in header.config:
-        parse_json(json.dumps(header.config), Derived, f"{path}: config")
+        parse_plain(header.config, Derived, f"{path}: config")
     require_resolved(header.config, str(path))
     if header.fields != _layouts(spec) or (header.packed and set(header.packed) != set(images_of(spec))):
         raise ValueError(f"{path} is damaged or of another kind: its fields are not those of its spec")

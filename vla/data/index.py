@@ -12,8 +12,7 @@ from typing import Annotated, Any
 import numpy as np
 from annotated_types import Ge, Le, MaxLen, Predicate
 
-from vla.io.documents import STRICT, parse_json
-from vla.io.files import require_file
+from vla.io.documents import STRICT, parse_json, read_bounded
 from vla.io.types import Seed
 from vla.spec import LONGEST_INSTRUCTION, Name
 
@@ -22,6 +21,7 @@ SALVAGE = f"keep what is whole with job=inspect inspect.repair=true, {REMEDY}"
 DAMAGED = "damaged"  # outcome of a seed whose episode a repair could not save
 LOST = "lost"  # outcome of a seed whose index line is unreadable
 CHECK = b', "check": '  # precedes the CRC-32 of the line without it, at the end of every line
+LARGEST = 4 << 30  # [bytes], millions of seeds
 LISTED = 8  # largest number of numbers in a message
 
 
@@ -147,8 +147,7 @@ def read_index(path: Path, any_seed: bool, damaged: bool) -> tuple[list[Entry], 
 
 def _lines(path: Path) -> list[bytes]:
     """Return every complete line, without its line end."""
-    require_file(path)
-    *lines, rest = path.read_bytes().split(b"\n") if path.exists() else [b""]
+    *lines, rest = read_bounded(path, LARGEST).split(b"\n") if path.exists() else [b""]
     # A process killed within a line leaves a shorter one: here only the line end is damaged.
     whole = _sealed(rest[:-1].rpartition(CHECK)[0] + b"}") == rest[:-1]
     return [*lines, rest] if whole else lines

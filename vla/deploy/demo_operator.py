@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-import json
+import logging
 import os
 import signal
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 from multiprocessing.process import BaseProcess
 from threading import Event
-from typing import Any
+from typing import Annotated, Any
 
 import rclpy
+from annotated_types import MaxLen
 from diagnostic_msgs.msg import DiagnosticStatus
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
@@ -20,12 +22,34 @@ from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
 from vla.deploy.settings import PolicySettings
+from vla.io.documents import STRICT, parse_json
+from vla.io.types import Seed
 from vla.rollouts.evaluate import Result
+from vla.spec import LONGEST_INSTRUCTION, Name
+
+log = logging.getLogger(__name__)
 
 # Time-outs.
 START = 60.0  # of the start of both nodes [s]
 ANSWER = 10.0  # of a service call [s]
 EPISODE = 60.0  # of an episode [s]
+
+
+LONGEST = 100_000  # characters of a message about an episode
+
+
+@dataclass(frozen=True)
+class SimulatedEpisode:
+    """Message of the simulator about its episode."""
+
+    __pydantic_config__ = STRICT
+
+    seed: Seed
+    instruction: Annotated[str, MaxLen(LONGEST_INSTRUCTION)]
+    done: bool
+    outcome: Name
+    task: Annotated[str, MaxLen(100)]
+    milestones: Annotated[tuple[Name, ...], MaxLen(100)]
 
 
 class DemoOperator:
@@ -45,7 +69,7 @@ class DemoOperator:
         latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         self.node.create_subscription(String, "/vla_simulator/episode", self._on_episode, latched)
         self.node.create_subscription(DiagnosticStatus, "/vla_agent/status", self._on_status, 10)
-        self._episode: dict[str, Any] = {}
+        self._episode: SimulatedEpisode | None = None
         self.status: dict[str, str] = {}  # of the last status message of the agent
         self.wait(lambda: self._change.service_is_ready() and self._reset.service_is_ready(), START, "the nodes")
         self.wait(lambda: self._instruction.get_subscription_count() >= 2, START, "both nodes to subscribe")
@@ -54,11 +78,12 @@ class DemoOperator:
         """Play one episode."""
         self.begin_episode()
         started = time.monotonic()
-        self.wait(lambda: bool(self._episode["done"]) or self.stopped.is_set(), EPISODE, "the end of an episode")
+        self.wait(lambda: not self._playing() or self.stopped.is_set(), EPISODE, "the end of an episode")
         seconds = round(10 * (time.monotonic() - started))
         episode = self._episode
-        details = {"task": episode["task"], "milestones": tuple(episode["milestones"])}
-        return Result(episode["seed"], episode["outcome"], episode["instruction"], seconds, **details)
+        assert episode is not None
+        details = {"task": episode.task, "milestones": episode.milestones}
+        return Result(episode.seed, episode.outcome, episode.instruction, seconds, **details)
 
     def begin_episode(self) -> None:
         """Deactivate the agent, reset the simulator, activate the agent and send the instruction."""
@@ -68,12 +93,16 @@ class DemoOperator:
             self._call(self._change, request, "change its state")
 
         change(Transition.TRANSITION_DEACTIVATE)
-        if self._episode.get("done"):
-            self._episode = {}
+        if self._episode is not None and self._episode.done:
+            self._episode = None
             self._call(self._reset, Trigger.Request(), "begin an episode")
-        self.wait(lambda: bool(self._episode) and not self._episode["done"], ANSWER, "an episode")
+        self.wait(self._playing, ANSWER, "an episode")
         change(Transition.TRANSITION_ACTIVATE)
-        self._instruction.publish(String(data=self._episode["instruction"]))
+        assert self._episode is not None
+        self._instruction.publish(String(data=self._episode.instruction))
+
+    def _playing(self) -> bool:
+        return self._episode is not None and not self._episode.done
 
     def watchdog_delay(self) -> float:
         """Suspend the simulator until the agent holds the arm; returns the delay [s]."""
@@ -91,7 +120,10 @@ class DemoOperator:
         self.status = {pair.key: pair.value for pair in status.values}
 
     def _on_episode(self, message: Any) -> None:
-        self._episode = json.loads(message.data)
+        try:
+            self._episode = parse_json(message.data[:LONGEST], SimulatedEpisode, "/vla_simulator/episode")
+        except ValueError as error:  # anybody on the network can send one
+            log.warning("dropped a message: %s", error)
 
     def _call(self, client: Any, request: Any, what: str) -> None:
         answer = client.call_async(request)

@@ -46,6 +46,15 @@ def parse_json(text: str | bytes, kind: type[T], name: str) -> T:
     return validated
 
 
+def parse_plain(value: Any, kind: type[T], name: str) -> T:
+    """Validate a plain value, called `name` in errors, such as a part of a checkpoint, as a `kind`, see `read_json`."""
+    try:
+        text = json.dumps(value)
+    except (TypeError, ValueError, RecursionError) as error:
+        raise ValueError(f"{name} is damaged or of another kind: {str(error)[:200]}") from error
+    return parse_json(text, kind, name)
+
+
 def parse_yaml(text: str | bytes, kind: type[T], name: str) -> T:
     """Parse YAML text, called `name` in errors, as a `kind`, see `read_yaml`."""
     depth = 0

@@ -13,12 +13,15 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import Annotated, cast
 
+from annotated_types import Ge, Le
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from vla.data.episodes import EpisodeStore
 from vla.data.index import DAMAGED
-from vla.io.files import atomic_path
+from vla.io.documents import read_json
+from vla.io.files import write_text
 from vla.parallel.pool import Cluster, Future, Pool, WorkersLost
 from vla.parallel.processes import WorkerFactory
 from vla.rollouts.rollout import replay, rollout
@@ -27,6 +30,7 @@ from vla.spec import FIRST_SEED, Agent, Environment, Episode
 log = logging.getLogger(__name__)
 
 COLLECTION_TIME = "seconds.txt"  # file in a store: total duration of its collection [s]
+Seconds = Annotated[float, Ge(0), Le(1e9)]
 PATIENCE = 50  # consecutive failures at a task before collection is given up
 LOOK_AHEAD = 4  # pending episodes per worker: a long one must not block the others
 NOT_REPEATABLE = "not_repeatable"  # outcome of a success that the replay of its actions does not reproduce
@@ -95,22 +99,30 @@ def collect(
 
 
 def collection_time(store: EpisodeStore, episodes: int) -> float | None:
-    """Return the time that it took to collect `episodes` of a store [s]; None if they were not collected.
+    """Return the time that it took to collect `episodes` of a store [s]; None if it is unknown.
 
     The time of killed processes is not included.
     """
-    file = store.folder / COLLECTION_TIME
-    if not file.exists():
+    seconds = _saved_time(store.folder / COLLECTION_TIME)
+    return seconds and seconds * episodes / len(EpisodeStore(store.folder).episodes)
+
+
+def _saved_time(file: Path) -> float | None:
+    """Return the duration in a file [s]; None, with a warning, for a damaged file: it only informs."""
+    try:
+        return read_json(file, cast(type[float], Seconds), largest=100) if file.exists() else None
+    except (OSError, ValueError) as error:
+        log.warning("the duration of the collection is unknown: %s", error)
         return None
-    return float(file.read_text(encoding="utf-8")) * episodes / len(EpisodeStore(store.folder).episodes)
 
 
 def _save_collection_time(folder: Path, seconds: float) -> None:
-    """Add to the saved time; ignored on a full disk, which the store reports."""
+    """Add to the saved time, unless that is unknown; ignored on a full disk, which the store reports."""
     file = folder / COLLECTION_TIME
-    with suppress(OSError), atomic_path(file) as draft:
-        before = float(file.read_text(encoding="utf-8")) if file.exists() else 0.0
-        draft.write_text(f"{before + seconds:.1f}\n", encoding="utf-8")
+    before = _saved_time(file) if file.exists() else 0.0
+    if before is not None:
+        with suppress(OSError):
+            write_text(file, f"{before + seconds:.1f}\n")
 
 
 def _require_first_seed(store: EpisodeStore, seed: int) -> None:

@@ -5,9 +5,11 @@ from __future__ import annotations
 import csv
 import io
 import json
+import logging
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property, partial
+from math import isfinite
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -20,6 +22,8 @@ from vla.io.files import write_text
 from vla.rollouts.evaluate import IN_DISTRIBUTION, Report, Result
 from vla.runs.files import Change, Node, ReportFile, Training
 from vla.spec import Array
+
+log = logging.getLogger(__name__)
 
 T = TypeVar("T")
 Curve = tuple[Array, Array]  # steps (N,) and values (N,)
@@ -56,17 +60,6 @@ class Run:
         known = self.training or self.report
         return known.parameters if known else None
 
-    @property
-    def chosen(self) -> str | None:
-        """File name of the checkpoint selected for evaluation, or None if none is selected yet."""
-        return self.training.checkpoint if self.training else None
-
-    def wall_time(self, evaluation: float) -> float | None:
-        """Return the wall time of collection, training and the given evaluation [s], or None if unknown."""
-        if self.training is None or self.training.collection_s is None:
-            return None
-        return round(self.training.collection_s + self.training.seconds + evaluation, 1)
-
     @cached_property
     def reports(self) -> dict[str, Report]:
         """Condition → report, the training condition first; reports of the others have only seeds and outcomes."""
@@ -85,21 +78,48 @@ def read_run(folder: Path) -> Run:
     Raises:
         ValueError: a file is damaged.
     """
-    report = _read(folder / REPORT, partial(read_json, kind=ReportFile), None)
+    report = read_report(folder)
     config = _read(folder / CONFIG, partial(read_yaml, kind=Node), report.config if report else {})
     changes = _read(folder / CHANGES, partial(read_yaml, kind=list[Change]), None)
-    training = _read(folder / TRAINING, partial(read_json, kind=Training), None)
     metrics: dict[str, Curve] = _read(folder / METRICS, _curves, {})
-    return Run(folder, config, changes, training, metrics, report)
+    return Run(folder, config, changes, read_training(folder), metrics, report)
 
 
-def run_of(checkpoint: str | Path) -> Run:
-    """Read the run that wrote a checkpoint.
+def read_report(folder: Path) -> ReportFile | None:
+    """Read the report of a run's folder, or return None; a ValueError if the file is damaged."""
+    return _read(folder / REPORT, partial(read_json, kind=ReportFile), None)
+
+
+def read_training(folder: Path) -> Training | None:
+    """Read the result of a run's training, or return None; a ValueError if the file is damaged."""
+    return _read(folder / TRAINING, partial(read_json, kind=Training), None)
+
+
+def chosen_checkpoint(folder: Path) -> str | None:
+    """Return the file name of the checkpoint selected for evaluation in a run's folder, or None if there is none yet.
 
     Raises:
-        ValueError: a file is damaged.
+        ValueError: the file that says so is damaged.
     """
-    return read_run(Path(checkpoint).resolve().parent.parent)
+    training = read_training(folder)
+    return training.checkpoint if training else None
+
+
+def wall_time(checkpoint: Path, evaluation: float) -> float | None:
+    """Return the wall time of collection, training and evaluation of a checkpoint [s], or None if unknown.
+
+    Args:
+        checkpoint: in the folder of the run that trained it.
+        evaluation: duration of the evaluation [s].
+    """
+    try:
+        training = read_training(checkpoint.resolve().parent.parent)
+    except (OSError, ValueError) as error:  # it only informs
+        log.warning("the wall time is unknown: %s", error)
+        return None
+    if training is None or training.collection_s is None:
+        return None
+    return round(training.collection_s + training.seconds + evaluation, 1)
 
 
 def require_run(folder: Path) -> Run:
@@ -157,17 +177,34 @@ def _read(path: Path, read: Callable[[Path], T], otherwise: T) -> T:
 def _curves(path: Path) -> dict[str, Curve]:
     """Read the columns of metrics.csv; a step logged again after an interruption has its later value."""
     points: dict[str, dict[int, float]] = {}
+    for row in metric_rows(path):
+        for name, value in row.items():
+            if name not in ("step", "epoch") and isfinite(float(value)):
+                points.setdefault(name, {})[int(row["step"])] = float(value)
+    return {name: (np.array(sorted(at)), np.array([at[step] for step in sorted(at)])) for name, at in points.items()}
+
+
+def metric_rows(path: Path) -> list[dict[str, str]]:
+    """Read metrics.csv as rows of column → number, as text, without empty cells; each has a `step`.
+
+    Raises:
+        ValueError: the file is too large, has no steps or holds something else than numbers.
+    """
     rows = csv.reader(io.StringIO(read_bounded(path).decode("utf-8", "replace"), newline=""))
+    found = []
     try:
         names = next(rows, ["step"])
-        if "step" not in names:
-            raise ValueError("there is no column step")
+        if "step" not in names or len(set(names)) < len(names):
+            raise ValueError("there is no column step, or a column twice")
         for row in rows:
             if len(row) < len(names):  # truncated by a killed process
                 continue
-            for name, value in zip(names, row, strict=True):
-                if value and name not in ("step", "epoch"):
-                    points.setdefault(name, {})[int(row[names.index("step")])] = float(value)
+            numbers = {name: value for name, value in zip(names, row, strict=True) if value}
+            for value in numbers.values():
+                float(value)
+            if not 0 <= int(numbers.get("step", -1)) < 2**31:
+                raise ValueError(f"step is no count, but {numbers.get('step')}")
+            found.append(numbers)
     except (ValueError, csv.Error) as error:
-        raise ValueError(f"{path} is damaged in line {rows.line_num}: {error}") from error
-    return {name: (np.array(sorted(at)), np.array([at[step] for step in sorted(at)])) for name, at in points.items()}
+        raise ValueError(f"{path} is damaged in line {rows.line_num}: {str(error)[:200]}") from error
+    return found

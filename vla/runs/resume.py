@@ -15,7 +15,7 @@ from filelock import FileLock, Timeout
 from vla.config.adopt import require_identity
 from vla.config.differences import differences
 from vla.policy import read_header
-from vla.runs.folder import CHECKPOINTS, LAST, REPORT, read_run, run_of
+from vla.runs.folder import CHECKPOINTS, LAST, REPORT, chosen_checkpoint, read_report
 
 log = logging.getLogger(__name__)
 
@@ -48,7 +48,9 @@ def training_progress(folder: Path, config: Mapping[str, Any]) -> TrainingProgre
     longer = (
         any(trainer.get(name) != before.get(name) for name in LENGTHS) and not 0 <= trainer["max_steps"] <= saved.steps
     )
-    chosen = run_of(last).chosen if saved.finished else None  # None if the process was killed before the selection
+    chosen = (
+        chosen_checkpoint(folder) if saved.finished else None
+    )  # None if the process was killed before the selection
     if chosen is not None and not longer:
         log.info("training is already finished: %s", last.with_name(chosen))
         return TrainingProgress(chosen=last.with_name(chosen))
@@ -61,7 +63,7 @@ def training_progress(folder: Path, config: Mapping[str, Any]) -> TrainingProgre
 
 def cached_success(folder: Path, config: Mapping[str, Any], checkpoint: Path) -> float | None:
     """Return the success rate of a run's report if it is of the same checkpoint and the same evaluation."""
-    report = read_run(folder).report
+    report = read_report(folder)
     if report is None or report.checkpoint != str(checkpoint):
         return None
     if (folder / REPORT).stat().st_mtime < checkpoint.stat().st_mtime:  # the training continued afterwards
@@ -94,7 +96,7 @@ def _newest_interrupted(runs: Path) -> Path:
             continue
         run, saved = last.parent.parent, read_header(last)
         unreported = saved.config.get("job") == "evaluate" and not (run / REPORT).exists()
-        unchosen = run_of(last).chosen is None  # killed between the last save and the selection
+        unchosen = chosen_checkpoint(run) is None  # killed between the last save and the selection
         if not saved.finished or unchosen or unreported:
             return run
     raise ValueError(f"resume=last: none of the {len(files)} trainings in {runs} was interrupted; resume=DIR names one")

@@ -8,7 +8,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from vla.io.documents import read_yaml
+from vla.io.documents import read_bounded, read_yaml
+from vla.io.files import write_text
 from vla.rollouts.evaluate import ERROR
 from vla.rollouts.statistics import pooled_interval
 from vla.runs.folder import REPORT, read_run
@@ -58,7 +59,7 @@ class SweepRow:
 
 def save_failure(cell: Path, reason: str) -> None:
     """Save why a cell failed; the list of failures quotes the first line."""
-    (cell / FAILURE).write_text(f"{reason}\n", encoding="utf-8")
+    write_text(cell / FAILURE, f"{reason}\n")
 
 
 def failures(folder: Path) -> str:
@@ -68,7 +69,7 @@ def failures(folder: Path) -> str:
     lines = []
     for cell in cells(folder, FAILURE):
         choices = "".join(f" {key}={choices_of[cell][key]}" for key in varied if key in choices_of[cell])
-        reason = (cell / FAILURE).read_text(encoding="utf-8").partition("\n")[0]
+        reason = read_bounded(cell / FAILURE).decode("utf-8", "replace").partition("\n")[0]
         lines.append(f"\n  {cell.name}{choices}: {reason}")
     return f"{len(lines)} of {len(choices_of)} cells failed, see {FAILURE} of each in {folder}{''.join(lines)}"
 

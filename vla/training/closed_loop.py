@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import torch
+from annotated_types import Ge, Le
 from lightning import Callback, LightningModule, Trainer
 
+from vla.io.documents import STRICT, parse_plain
 from vla.models.learner import Learner
 from vla.models.model import Model
 from vla.rollouts.evaluate import play
@@ -19,6 +22,20 @@ from vla.spec import Agent, Environment
 log = logging.getLogger(__name__)
 
 BEST = "best.ckpt"
+
+# Of success, -1 before the first validation; the sum of the shares of several processes is rounded.
+Rate = Annotated[float, Ge(-1), Le(1.001)]
+
+
+@dataclass(frozen=True)
+class State:
+    """State of `ClosedLoop` in a checkpoint."""
+
+    __pydantic_config__ = STRICT
+
+    success: Rate
+    best: Rate
+    seeds: list[int] | None = None
 
 
 class ClosedLoop(Callback):
@@ -97,8 +114,9 @@ class ClosedLoop(Callback):
         return {"success": self.success, "best": self.best, "seeds": list(self._seeds)}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Restore the state."""
-        self.success = state_dict["success"]
+        """Restore the state; a ValueError if it is of another kind."""
+        state = parse_plain(state_dict, State, "the state of the validation")
+        self.success = state.success
         # The best is void in another folder or with other episodes.
-        if self._path.exists() and state_dict.get("seeds") == list(self._seeds):
-            self.best = state_dict["best"]
+        if self._path.exists() and state.seeds == list(self._seeds):
+            self.best = state.best

@@ -9,37 +9,48 @@ from __future__ import annotations
 import json
 import logging
 from importlib import import_module
+from typing import Annotated, Literal
 
+from annotated_types import MinLen
 from rich import print as show
 from rich.table import Table
 
+from vla.config.check import TRAINING, Job
 from vla.config.experiment import Experiment
 from vla.io.files import write_text
+from vla.io.types import Count
 from vla.jobs.benchmark.machine import Others, machine, spoilt
 from vla.jobs.benchmark.measure import Measure
 
 log = logging.getLogger(__name__)
-STAGES = ("collect", "loader", "train", "policy", "deploy", "serve")
+
+JOB = Job(
+    (*TRAINING, "policy"),
+    {
+        "names": Annotated[list[Literal["collect", "loader", "train", "policy", "deploy", "serve"]], MinLen(1)],
+        "episodes": Count,
+        "batches": Count,
+        "steps": Count,
+        "rounds": Count,
+        "precisions": list[Literal["fp32", "bf16"]] | None,
+        "compile": list[bool],
+        "robosuite": str | None,
+        "lerobot": str | None,
+    },
+    adopts=True,
+)
 
 
 def run(experiment: Experiment) -> dict[str, Measure]:
     """Measure the stages in `benchmark.names`, print a table and write `benchmark.json`; returns name → measure.
 
     Both name the processor, and how many of its cores other programs used during a stage.
-
-    Raises:
-        ValueError: a name is no stage, or there are no names.
     """
-    names = experiment["benchmark"]["names"]
-    if not names:
-        raise ValueError(f"benchmark.names is empty: the stages are {', '.join(STAGES)}")
-    if unknown := sorted(set(names) - set(STAGES)):
-        raise ValueError(f"benchmark.names has {unknown}, the stages are {sorted(STAGES)}")
     here = machine()
     show(f"{here['processor']}, {here['cores']} cores, {' '.join(here['instructions'])}")
     measures: dict[str, Measure] = {}
     busy: dict[str, float] = {}
-    for name in names:
+    for name in experiment["benchmark"]["names"]:
         others = Others()
         found = import_module(f"vla.jobs.benchmark.{name}").measures(experiment)
         used = others.cores()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from vla.config.experiment import Experiment
+from vla.io.documents import parse_json
 from vla.jobs.benchmark.measure import Measure, measure
 from vla.jobs.deploy import deployment
 
@@ -27,11 +28,13 @@ def measures(experiment: Experiment) -> dict[str, Measure]:
             operator.play()
         operator.begin_episode()
         delays = [1000 * operator.watchdog_delay() for _ in range(experiment["benchmark"]["episodes"])]
-        figures = {key: float(value) for key, value in operator.status.items() if key.endswith("[ms]")}
+        keys = ("image to command p50 [ms]", "inference p50 [ms]", "tick p99 [ms]")
+        image, inference, tick = (
+            parse_json(operator.status.get(key, ""), float, f"{key} of /vla_agent/status") for key in keys
+        )
     agent = experiment["deploy"]["agent"]
-    image, inference = (figures[f"{name} p50 [ms]"] for name in ("image to command", "inference"))
     return {
         "deploy: image to command": measure(image, "ms", loop.episodes, inference),
-        "deploy: tick p99": measure(figures["tick p99 [ms]"], "ms", loop.episodes, 1000 / agent.command_hz),
+        "deploy: tick p99": measure(tick, "ms", loop.episodes, 1000 / agent.command_hz),
         "deploy: watchdog": measure(float(np.median(delays)), "ms", len(delays), 1000 * agent.safety.joints_age),
     }

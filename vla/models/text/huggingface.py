@@ -6,21 +6,42 @@ Shapes: B sentences, L tokens of one of them, E width of the encoder.
 from __future__ import annotations
 
 import logging
-from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
-from vla.io.documents import parse_json
+from vla.io.documents import parse_json, read_bounded
 from vla.models.text.ngrams import TextEncoder
+from vla.models.text.tensor_cache import TensorCache
 from vla.models.vision.hub import fetch
 
 log = logging.getLogger(__name__)
 
 FILES = ("config.json", "tokenizer.json", "tokenizer_config.json", "model*.safetensors", "model.safetensors.index.json")
-CACHE_SIZE = 8192  # sentences; at most 40 MB
+CACHE_BYTES = 64 << 20  # of sentence vectors; 16 000 sentences of 1024 components
+LONGEST = 1 << 16  # tokens of a padded text
+INSERTIONS, INSERTED = 4, 8  # replacements of a normalizer, and characters of one: a text grows by 8^4 at most
+
+# The encoders that may be built: model type → text-only class in transformers. A configuration also comes out of a
+# checkpoint, and transformers has hundreds of other classes.
+ENCODERS = {
+    "albert": "AlbertModel",
+    "bert": "BertModel",
+    "camembert": "CamembertModel",
+    "deberta": "DebertaModel",
+    "deberta-v2": "DebertaV2Model",
+    "distilbert": "DistilBertModel",
+    "electra": "ElectraModel",
+    "modernbert": "ModernBertModel",
+    "mpnet": "MPNetModel",
+    "mt5": "MT5EncoderModel",
+    "roberta": "RobertaModel",
+    "t5": "T5EncoderModel",
+    "umt5": "UMT5EncoderModel",
+    "xlm-roberta": "XLMRobertaModel",
+}
 
 # Text towers of image-text models with a trained sentence vector: class and output.
 TOWERS = {
@@ -43,7 +64,7 @@ class SentenceEncoder:
 
     def __init__(self, network: Any, tokenizer: Any) -> None:
         self.network, self.tokenizer = network.eval().requires_grad_(False), tokenizer
-        self.embed = lru_cache(maxsize=CACHE_SIZE)(self._embed)
+        self._vectors = TensorCache(CACHE_BYTES)
 
     def __deepcopy__(self, memo: Any) -> SentenceEncoder:
         return self
@@ -56,7 +77,7 @@ class SentenceEncoder:
             ValueError: a file is missing or damaged, or the weights are not safetensors.
         """
         from safetensors import SafetensorError
-        from transformers import AutoConfig, PreTrainedTokenizerFast
+        from transformers import PreTrainedTokenizerFast
 
         for needed in ("config.json", "tokenizer.json", "model*.safetensors"):
             if not any(folder.glob(needed)):
@@ -65,11 +86,10 @@ class SentenceEncoder:
                     "run code, and are not read): write it there with save_pretrained of transformers"
                 )
         try:
-            # By default transformers asks at the terminal whether to run code from the folder.
-            config = AutoConfig.from_pretrained(folder, trust_remote_code=False)
+            config = _configuration(read_bounded(folder / "config.json", 1 << 20))
             network, report = _network_class(config).from_pretrained(
                 folder,
-                config=getattr(config, "text_config", config),
+                config=config,
                 use_safetensors=True,
                 dtype=torch.float32,
                 output_loading_info=True,
@@ -89,14 +109,14 @@ class SentenceEncoder:
         Raises:
             ValueError: it is invalid.
         """
-        from tokenizers import Tokenizer
-        from transformers import AutoConfig
-
         try:
-            config = AutoConfig.for_model(**parse_json(state["config"], dict[str, Any], "its configuration"))
+            weights, config = state["weights"], _configuration(state["config"])
+            layers = [name for name, value in vars(config).items() if _exceeds(name, value, len(weights))]
+            if layers:
+                raise ValueError(f"{layers[0]} is {getattr(config, layers[0])}, with {len(weights)} weights")
             network = _network_class(config)(config)
-            network.load_state_dict(state["weights"])
-            return cls(network, Tokenizer.from_str(state["tokenizer"]))
+            network.load_state_dict(weights)
+            return cls(network, _saved_tokenizer(state["tokenizer"]))
         except Exception as error:  # tokenizers raises a plain Exception for invalid text
             raise ValueError(f"the encoder in the checkpoint cannot be read: {str(error)[:200]}") from error
 
@@ -108,9 +128,12 @@ class SentenceEncoder:
             "weights": self.network.state_dict(),
         }
 
+    def embed(self, sentence: str) -> Tensor:
+        """Return the sentence vector of a text tower, or else the mean over all tokens, (E,) float32."""
+        return self._vectors.get(sentence, lambda: self._embed(sentence))
+
     @torch.no_grad()
     def _embed(self, sentence: str) -> Tensor:
-        """Return the sentence vector of a text tower, or else the mean over all tokens, (E,) float32."""
         ids = torch.tensor([self.tokenizer.encode(sentence).ids or [0]])  # (1, L), also for an empty sentence
         output = self.network(input_ids=ids)
         family = _family(self.network.config)
@@ -205,20 +228,68 @@ def _family(config: Any) -> str:
     return str(config.model_type).removesuffix("_text_model")
 
 
-def _network_class(config: Any) -> Any:
-    """Return the text-only class of a model family in transformers.
+def _configuration(text: str | bytes) -> Any:
+    """Return the configuration of a text encoder from JSON, the text tower's of an image-text model.
+
+    Names that the kind of encoder does not have by default are ignored. Some would act: transformers downloads and runs
+    the code that `attn_implementation` names.
 
     Raises:
-        ValueError: there is none.
+        ValueError: it is no configuration of one of `ENCODERS` or `TOWERS`.
     """
+    from transformers import AutoConfig
+
+    values = parse_json(text, dict[str, Any], "its configuration")
+    kind = values.pop("model_type", None)
+    if not isinstance(kind, str) or kind.removesuffix("_text_model") not in (*ENCODERS, *TOWERS):
+        raise ValueError(f"{str(kind)[:100]} is none of the text encoders {', '.join((*ENCODERS, *TOWERS))}")
+    known = AutoConfig.for_model(kind).to_dict()
+    config = AutoConfig.for_model(kind, **{name: value for name, value in values.items() if name in known})
+    tower = getattr(config, "text_config", None)
+    return config if tower is None else _configuration(tower.to_json_string(use_diff=False))
+
+
+def _exceeds(name: str, value: Any, weights: int) -> bool:
+    """Return whether a configuration's value is a number of layers above the number of weights."""
+    return "layers" in name and isinstance(value, int) and value > weights
+
+
+def _network_class(config: Any) -> Any:
+    """Return the text-only class of a configuration in transformers."""
     import transformers
 
-    if _family(config) in TOWERS:
-        return getattr(transformers, TOWERS[_family(config)][0])
-    for classes in (transformers.MODEL_FOR_TEXT_ENCODING_MAPPING, transformers.MODEL_MAPPING):
-        if type(config) in classes:
-            return classes[type(config)]
-    raise ValueError(f"transformers has no text encoder called {config.model_type}")
+    family = _family(config)
+    return getattr(transformers, TOWERS[family][0] if family in TOWERS else ENCODERS[family])
+
+
+def _saved_tokenizer(text: str) -> Any:
+    """Restore a tokenizer from its JSON.
+
+    Raises:
+        ValueError: it pads or grows a text without bound.
+        Exception: it is invalid.
+    """
+    from tokenizers import Tokenizer
+
+    normalizer = parse_json(text, dict[str, Any], "its tokenizer").get("normalizer")
+    insertions = [each for each in _nodes(normalizer) if each.get("type") in ("Replace", "Prepend")]
+    inserted = [str(each.get("content") or each.get("prepend") or "") for each in insertions]
+    if len(inserted) > INSERTIONS or any(len(each) > INSERTED for each in inserted):
+        raise ValueError(
+            f"its tokenizer has more than {INSERTIONS} replacements, or ones of over {INSERTED} characters"
+        )
+    tokenizer = Tokenizer.from_str(text)
+    padding = tokenizer.padding or {}
+    if max(padding.get("length") or 0, padding.get("pad_to_multiple_of") or 0) > LONGEST:
+        raise ValueError(f"its tokenizer pads texts to more than {LONGEST} tokens")
+    return tokenizer
+
+
+def _nodes(value: Any) -> list[dict[str, Any]]:
+    """Return all mappings in a plain value."""
+    own = [value] if isinstance(value, dict) else []
+    parts = value.values() if isinstance(value, dict) else value if isinstance(value, list) else ()
+    return own + [node for part in parts for node in _nodes(part)]
 
 
 def _standalone_tokenizer(tokenizer: Any, config: Any) -> Any:

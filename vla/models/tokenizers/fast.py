@@ -6,22 +6,27 @@ dimensions.
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Annotated, Any, cast
 
 import numpy as np
 import torch
+from annotated_types import Ge, Le, Predicate
 from tokenizers import Tokenizer
 from tokenizers.models import BPE
 from tokenizers.trainers import BpeTrainer
 from torch import Tensor
 
-from vla.io.types import Bins, Positive, Steps
+from vla.io.documents import parse_plain
+from vla.io.types import Bins, Positive, Steps, ascending
 from vla.models.tokenizers.tokenizer import MIN_SPAN, ActionTokenizer, Statistics, data_bounds
 from vla.spec import Spec
 
 FIRST_CODE_POINT = 0x100  # of the smallest coefficient; below 0xD800 every code point is a character
 END = "<end>"
 QUANTILES = (0.01, 0.99)  # of the data, scaled to -1 and 1
+
+Coefficient = Annotated[int, Ge(-(2**20)), Le(2**20)]
+Coefficients = Annotated[tuple[Coefficient, Coefficient], Predicate(ascending)]  # smallest and largest
 
 
 class Fast(ActionTokenizer):
@@ -120,9 +125,27 @@ class Fast(ActionTokenizer):
         return {"coefficients": [self._least, self._most], "bpe": self._bpe.to_str()}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
-        """Restore the fitted values."""
-        self._least, self._most = state["coefficients"]
-        self._set_bpe(Tokenizer.from_str(state["bpe"]))
+        """Restore the fitted values.
+
+        Raises:
+            ValueError: they are not those of a fitted tokenizer of this configuration.
+        """
+        try:
+            kind = cast(type[tuple[int, int]], Coefficients)
+            self._least, self._most = parse_plain(state["coefficients"], kind, "coefficients")
+            bpe = Tokenizer.from_str(state["bpe"])
+            words = bpe.get_vocab()
+        except Exception as error:  # tokenizers raises a plain Exception for invalid text
+            raise ValueError(f"the tokenizer in the checkpoint cannot be read: {str(error)[:200]}") from error
+        plain = (bpe.normalizer, bpe.pre_tokenizer, bpe.post_processor, bpe.padding, bpe.truncation)
+        longest = max(self.chunk * self.components, len(END))
+        numbered = sorted(words.values()) == list(range(len(words)))
+        if any(plain) or not numbered or len(words) > self.bins or max(map(len, words), default=0) > longest:
+            raise ValueError(
+                f"the tokenizer in the checkpoint has more than {self.bins} words of up to {longest} characters, or "
+                "more parts than byte pairs"
+            )
+        self._set_bpe(bpe)
 
     def _fit(self, chunks: Tensor) -> None:
         coefficients = self._round(chunks)

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import hashlib
 import os
-import tempfile
+import zlib
+from contextlib import suppress
 from pathlib import Path
+from zipfile import BadZipFile
 
 import numpy as np
 
+from vla.io.files import atomic_path
 from vla.spec import Array
 
 METHOD = "fast-simplification 0.2"  # part of the content's name: another method gives other faces
@@ -20,11 +23,9 @@ def decimate(vertices: Array, faces: Array, most: int) -> tuple[Array, Array]:
     content.update(np.ascontiguousarray(vertices, np.float32).tobytes())
     content.update(np.ascontiguousarray(faces, np.int32).tobytes())
     path = cache_folder() / f"{content.hexdigest()[:32]}.npz"
-    try:
-        with np.load(path) as kept:
-            return kept["vertices"], kept["faces"]
-    except (OSError, ValueError, KeyError):
-        pass  # not there yet, or cut off
+    kept = _kept(path)
+    if kept is not None:
+        return kept
     from fast_simplification import simplify
 
     fewer = simplify(
@@ -40,12 +41,21 @@ def cache_folder() -> Path:
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "vla" / "meshes"
 
 
-def _keep(path: Path, vertices: Array, faces: Array) -> None:
-    """Write the file at once, as other processes may read it; without room for it, do without."""
+def _kept(path: Path) -> tuple[Array, Array] | None:
+    """Return vertices and faces in a file, or None if it is not there, cut off or of another kind."""
     try:
+        with np.load(path) as kept:
+            vertices, faces = kept["vertices"], kept["faces"]
+    except (OSError, ValueError, KeyError, EOFError, BadZipFile, zlib.error):
+        return None
+    right = (vertices.dtype, faces.dtype) == (np.float32, np.int32) and vertices.shape[1:] == faces.shape[1:] == (3,)
+    indexed = right and (not faces.size or 0 <= faces.min() <= faces.max() < len(vertices))
+    return (vertices, faces) if indexed and np.isfinite(vertices).all() else None
+
+
+def _keep(path: Path, vertices: Array, faces: Array) -> None:
+    """Write the file atomically, as other processes may read it; without room for it, do without."""
+    with suppress(OSError):
         path.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.NamedTemporaryFile(dir=path.parent, suffix=".npz", delete=False) as file:
-            np.savez(file, vertices=vertices, faces=faces)
-        os.replace(file.name, path)
-    except OSError:
-        return
+        with atomic_path(path) as draft:
+            np.savez(draft, vertices=vertices, faces=faces)
