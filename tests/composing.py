@@ -8,6 +8,8 @@ from functools import cache
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import DictConfig, OmegaConf
 
+from vla import jobs
+from vla.config import check as checking
 from vla.config.compose import CONF as CONF
 from vla.config.compose import compose
 
@@ -22,6 +24,11 @@ def composed(*overrides: str) -> DictConfig:
     for override in OverridesParser.create().parse_overrides(values):
         OmegaConf.update(config, override.key_or_group, override.value(), merge=True)
     return config
+
+
+def check(config: DictConfig) -> None:
+    """Check a configuration as the command line does, for its job."""
+    checking.check(config, jobs.find(config.job).JOB)
 
 
 def _is_value(override: str) -> bool:

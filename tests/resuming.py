@@ -14,7 +14,8 @@ from reading import windows
 
 from vla.models.learner import Learner
 from vla.models.model import Model
-from vla.training.trainer import GracefulStop, make_trainer, restore_metrics
+from vla.training.checkpoints import GracefulStop
+from vla.training.trainer import make_trainer, restore_metrics
 
 STEPS, STOP = 11, 6
 VALIDATED = 4  # every so many steps

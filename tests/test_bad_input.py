@@ -9,10 +9,9 @@ from pathlib import Path
 
 import pytest
 from command_line import SMALL, here, vla
-from composing import composed
+from composing import check, composed
 
 from vla.config.build import build
-from vla.config.check import check
 from vla.config.experiment import plain
 from vla.tasks.gl import TRIED
 
@@ -80,7 +79,12 @@ NONSENSE = {
         *("trainer.gradient_clip_val=-1", "trainer.limit_val_batches=-1", "trainer.precision=17"),
     ),
     "evaluate": ("evaluate.episodes=0", "evaluate.seed=3", "policy.precision=16"),
-    "benchmark": ("benchmark.names=[]", "benchmark.rounds=0"),
+    "benchmark": (
+        "benchmark.names=[]",
+        "benchmark.names=[training]",
+        "benchmark.precisions=[fp16]",
+        "benchmark.rounds=0",
+    ),
     "inspect": ("inspect.stores=[]", "inspect.folder="),
     "export": ("export.folder=",),
     "report": ("report.runs=['']",),
@@ -109,6 +113,11 @@ def test_a_grid_whose_cells_want_several_processes_is_refused(tmp_path: Path, la
     several = ("trainer=ddp", "trainer.accelerator=cpu", "trainer.devices=2", "seed=0")
     done = vla(tmp_path, "-m", f"hydra/launcher={launcher}", *several, ok=False)
     assert "trainer.devices=1" in done.stderr and "submitit_slurm" in done.stderr and "Traceback" not in done.stderr
+
+
+def test_a_job_that_takes_no_checkpoint_says_which_word_does(tmp_path: Path) -> None:
+    done = vla(tmp_path, "job=train", "checkpoint=x.ckpt", ok=False)
+    assert "job=train takes no checkpoint: resume=RUN continues a run, pretrained=x.ckpt starts" in done.stderr
 
 
 def test_an_experiment_that_is_a_grid_is_refused_as_a_single_run(tmp_path: Path) -> None:

@@ -18,7 +18,8 @@ from together import PAIRS, composed, train, untrained
 
 from vla.config.experiment import make_policy
 from vla.models.learner import Learner
-from vla.training.trainer import LAST, make_trainer
+from vla.runs.folder import LAST
+from vla.training.trainer import make_trainer
 
 TORCHRUN = {"TORCHELASTIC_RUN_ID": "1", "RANK": "0", "LOCAL_RANK": "0", "WORLD_SIZE": "2"}  # what it sets
 

@@ -16,7 +16,7 @@ from toy import SPEC
 
 from vla.models.model import Model
 from vla.policy import read_checkpoint
-from vla.training.trainer import AtomicCheckpointIO
+from vla.training.checkpoints import AtomicCheckpointIO
 
 
 def test_training_lowers_the_loss_and_validation_reports_errors_in_readable_units() -> None:

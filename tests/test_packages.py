@@ -10,17 +10,21 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Iterator
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 import toy
 from clusters import PLACES, address_in, dask
 from collecting import content
 from command_line import vla
-from composing import composed
+from composing import CONF, check, composed
+from hydra.errors import ConfigCompositionException
 
+from vla import jobs
 from vla.config import packages
 from vla.config.adopt import adopt, finetune, resume
 from vla.config.annotations import locate
@@ -76,7 +80,7 @@ def importable(installed: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Non
 def test_the_page_shows_what_the_package_holds() -> None:
     sources = "\n".join(path.read_text(encoding="utf-8") for path in EXAMPLE.rglob("*") if path.is_file())
     blocks = re.findall(r"^```(?:toml|yaml|python)\n(.*?)^```", PAGE, re.MULTILINE | re.DOTALL)
-    assert len(blocks) == 5
+    assert len(blocks) == 7
     for block in blocks:
         assert block in sources
 
@@ -87,6 +91,51 @@ def test_installing_it_adds_its_options(home: Path) -> None:
     for group in ("task", "expert", "model", "tokenizer", "recorder", "deploy", "experiment"):
         assert re.search(rf"^\W*{group}: .*\bmine\b", listed, re.MULTILINE), group
     assert f"_target_: {MODEL}" in vla(home, "model=mine", "--cfg", "job").stdout
+
+
+def test_a_job_with_a_group_of_its_own_is_two_options_and_a_module(home: Path, importable: None) -> None:
+    listed = vla(home, "--help").stdout
+    assert "\n  survey      Measure the start of some episodes.\n" in listed and "\nmetric: distance\n" in listed
+    asked = ("job=survey", "task=mine", "survey.episodes=3")
+    world = import_module("mypackage.world").Square(16, 30)
+    starts = [world.reset(seed) for seed in range(3)]
+    away = [np.linalg.norm(start.truth["target"] - start.state) for start in starts]
+    assert vla(home, *asked, "output=surveyed").stdout == f"mean {1000 * np.mean(away):.3f}\n"
+    for wrong, words in (
+        ("metric.unit=0", "metric.unit must be float, more than 0, got 0"),
+        ("survey.episodes=0", "survey.episodes must be int, at least 1, got 0"),
+        ("+survey.length=3", "survey.length is unknown: survey takes episodes, seed"),
+        ("~metric", "job=mypackage.survey needs metric=OPTION"),
+    ):
+        assert words in vla(home, *asked, wrong, ok=False).stderr
+    with pytest.raises(ValueError, match=r"job names mypackage\.survey, which is not trusted: add trust=\[mypackage\]"):
+        jobs.find("mypackage.survey")
+
+
+# Options that name a part of the tabletop: they are for this world only.
+OF_THE_TABLETOP = {
+    *("ablation", "few", "learning_curve", "multitask", "recipe", "standard"),
+    *("generalisation", "language", "levels", "paper", "suite", "tabletop", "no_excursions", "no_noise"),
+}
+
+
+@pytest.mark.parametrize("group", ["experiment", "evaluate", "validate", "variant"])
+def test_options_go_with_any_world_or_are_refused_for_it(
+    group: str, importable: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(packages.TRUSTED, "mypackage")
+    options = {path.stem for path in (CONF / group).glob("*.yaml")}
+    for option in sorted(options - OF_THE_TABLETOP):
+        check(composed("task=mine", "expert=mine", f"{group}={option}"))
+    for option in sorted(options & OF_THE_TABLETOP):
+        with pytest.raises((ValueError, ConfigCompositionException), match=r"randomize|perturb|task/goal"):
+            check(composed("task=mine", "expert=mine", f"{group}={option}"))
+
+
+@pytest.mark.parametrize("name", ["nothing", "os.path", "vla.io.files", "sweep", ""])
+def test_what_is_no_job_is_none(name: str) -> None:
+    with pytest.raises(ValueError, match=f"there is no job={name}; --help lists the jobs"):
+        jobs.find(name)
 
 
 def test_its_parts_do_the_main_job(home: Path) -> None:

@@ -16,12 +16,11 @@ import pytest
 import torch
 from command_line import SMALL, here
 from command_line import vla as vla_process
-from composing import CONF, composed
+from composing import CONF, check, composed
 from documented import README, ROOT, commands
 from omegaconf import OmegaConf
 
 from vla import jobs
-from vla.config.check import check
 from vla.deploy import ros
 from vla.jobs.bfloat16 import has_bfloat16
 from vla.parallel.processes import cores

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import threading
 from collections.abc import Callable
@@ -15,11 +16,14 @@ from urllib.request import urlopen
 import msgpack
 import numpy as np
 import pytest
+from command_line import SMALL, here
+from composing import composed
 from fake_batch import as_policy, make_bc, make_rt1
 from toy import SPEC, ToyEnvironment
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 
+from vla.config.experiment import Experiment
 from vla.deploy.server import Keys, PolicyServer, Service
 from vla.io.array_messages import LARGEST_MAP, LONGEST_LIST, pack, unpack
 from vla.policy import Policy, plan_together
@@ -303,3 +307,23 @@ def test_a_server_that_goes_away_fails_the_episode_and_says_so() -> None:
     assert failed.outcome == "error" and f"the policy server at {url} failed: it closed the connection" in failed.error
     with pytest.raises(ValueError, match=f"nobody serves a policy at {url} .*: start it"):
         remote(url)
+
+
+def test_whoever_acts_is_evaluated_by_the_same_job(tmp_path: Path) -> None:
+    common = (*SMALL, "evaluate.episodes=1", "task.time_limit=1", "recorder=none")
+    environment = Experiment.of(composed(*common)).make_environment()()
+    policy = as_policy(make_bc(spec=environment.spec), spec=environment.spec)
+    expected = play(environment, policy.session(), FIRST_SEED)
+    environment.close()
+    keys = Keys({"front": "observation/image", "wrist": "observation/wrist_image"}, ["observation/state"], "prompt")
+    with serving(policy, keys=keys) as url:
+        here(tmp_path, "agent=remote", f"agent.url={url}", *common, "output=remote")
+    report = json.loads((tmp_path / "remote/report.json").read_text())
+    (played,) = report["per_episode"]
+    assert (played["outcome"], played["steps"], played["draws"]) == (expected.outcome, 10, expected.draws)
+    assert (report["model"], report["checkpoint"], report["errors"]) == ("remote", None, 0)
+    here(tmp_path, "agent=expert", *common, "task.time_limit=10", "output=expert")
+    report = json.loads((tmp_path / "expert/report.json").read_text())
+    assert (report["model"], report["successes"]) == ("expert", 1)
+    refused = here(tmp_path, "agent=expert", "job=train", ok=False).stderr
+    assert refused == "error: job=train takes no agent: agent=OPTION goes with job=evaluate and deploy\n"

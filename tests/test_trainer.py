@@ -24,8 +24,9 @@ from small_training import fit, make_learner
 from vla.models.diffusion import Diffusion
 from vla.models.learner import Learner
 from vla.models.model import Model
+from vla.training.checkpoints import GracefulStop
 from vla.training.closed_loop import ClosedLoop
-from vla.training.trainer import GracefulStop, explain_memory_errors, make_trainer
+from vla.training.trainer import explain_memory_errors, make_trainer
 
 MODELS: dict[str, Callable[[], Model]] = {
     "bc": lambda: make_bc(shift=(64, 64)),
@@ -89,7 +90,7 @@ def test_what_ends_at_a_step_that_is_validated_does_not_lose_the_validation(
 
     train(fresh(), folder, tmp_path / "whole")
     if killed:
-        monkeypatch.setattr("vla.training.trainer.SAVE_EVERY", VALIDATED)
+        monkeypatch.setattr("vla.training.checkpoints.SAVE_EVERY", VALIDATED)
         with pytest.raises(RuntimeError, match="killed"):
             train(fresh(), folder, tmp_path / "half", killer=DieAt(VALIDATED + 1))
     else:

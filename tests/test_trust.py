@@ -15,7 +15,7 @@ import pytest
 import torch
 import toy
 from command_line import here
-from composing import CONF, composed
+from composing import CONF, check, composed
 from hostile import HANDLER, command, hostile, node
 from omegaconf import DictConfig
 from tiny_encoder import write_encoder
@@ -24,7 +24,6 @@ from toy_episodes import EPISODES, add
 from vla import jobs
 from vla.config.adopt import adopt, finetune, resume
 from vla.config.annotations import LIBRARY, OWN, locate
-from vla.config.check import check
 from vla.config.experiment import Experiment, make_policy, plain
 from vla.policy import read_checkpoint
 
@@ -186,7 +185,7 @@ def test_folders_loggers_and_devices_are_never_those_of_a_checkpoint(tmp_path: P
         "logger": {"csv": {"_target_": "lightning.pytorch.loggers.CSVLogger", "name": "/theirs"}},
     }
     theirs["collect"] |= {"folder": "/theirs"}
-    theirs["inspect"] |= {"folder": "/theirs", "into": "/theirs"}
+    theirs["inspect"] = {"folder": "/theirs", "into": "/theirs"}
     theirs["export"] |= {"folder": "/theirs"}
     theirs["trainer"] |= {"default_root_dir": "/theirs", "accelerator": "theirs", "devices": 99, "profiler": "theirs"}
     path = tmp_path / "last.ckpt"

@@ -23,7 +23,7 @@ from yaml import YAMLError
 from vla import jobs
 from vla.config.annotations import targets
 from vla.config.build import suggestion
-from vla.config.check import JOBS, check
+from vla.config.check import Job, check
 from vla.config.compose import CONF
 from vla.config.experiment import Experiment
 from vla.config.packages import offer_options, option_folders, trust
@@ -92,12 +92,12 @@ def _meant_for_user(error: Exception) -> bool:
     return ours and statement.startswith("raise")
 
 
-def _require_sweepable(cfg: DictConfig) -> None:
+def _require_sweepable(cfg: DictConfig, job: Job) -> None:
     """Refuse -m with several devices: processes that a trainer starts repeat the command line, here the whole sweep."""
     choices = HydraConfig.get().runtime.choices
     if HydraConfig.get().mode != RunMode.MULTIRUN or choices["hydra/launcher"] == "submitit_slurm":
         return
-    if "trainer" in _groups(cfg) and cfg.trainer is not None and _devices(cfg.trainer) > 1:
+    if "trainer" in job.needs(cfg) and cfg.trainer is not None and _devices(cfg.trainer) > 1:
         raise ValueError(
             "-m cannot train on several devices in this launcher: add trainer.devices=1, "
             "or hydra/launcher=submitit_slurm, which starts every process of a cell itself"
@@ -109,11 +109,6 @@ def _require_swept() -> None:
     choices = HydraConfig.get().runtime.choices
     if HydraConfig.get().mode == RunMode.RUN and HydraConfig.get().sweeper.params:
         raise ValueError(f"experiment={choices['experiment']} is a grid of runs: add -m")
-
-
-def _groups(cfg: DictConfig) -> tuple[str, ...]:
-    """Return the groups that the job needs; none for an unknown job, which `check` refuses."""
-    return JOBS[cfg.job].groups if cfg.job in JOBS else ()
 
 
 def _devices(trainer: DictConfig) -> int:
@@ -140,10 +135,11 @@ def _do(cfg: DictConfig) -> float | None:
     _require_swept()
     without_triton()
     composed: Any = OmegaConf.to_container(cfg, resolve=False)
-    trust(composed.get("trust"), targets(composed))  # before anything is read from a file
+    trust(composed.get("trust"), [composed["job"], *targets(composed)])  # before anything is read from a file
     cfg = _adopted(cfg, HydraConfig.get().overrides.task)
-    _require_sweepable(cfg)  # with the trainer that a run brings
-    check(cfg)
+    job = jobs.find(cfg.job).JOB
+    _require_sweepable(cfg, job)  # with the trainer that a run brings
+    check(cfg, job)
     return jobs.run(Experiment.of(cfg, compose("config")))
 
 
@@ -165,7 +161,14 @@ def _adopted(cfg: DictConfig, overrides: list[str]) -> DictConfig:
         _remove_unused()
         run = interrupted_run(Path(cfg.output).parent) if cfg.resume == "last" else Path(cfg.resume)
         return resume(cfg, run, overrides)
-    return finetune(cfg, overrides) if cfg.pretrained is not None else adopt(cfg, overrides)
+    if cfg.pretrained is not None:
+        return finetune(cfg, overrides)
+    if not jobs.find(cfg.job).JOB.adopts:
+        raise ValueError(
+            f"job={cfg.job} takes no checkpoint: resume=RUN continues a run, pretrained={cfg.checkpoint} starts a new "
+            "training from its weights"
+        )
+    return adopt(cfg, overrides)
 
 
 def _fail(error: Exception) -> NoReturn:
@@ -202,15 +205,23 @@ def _compose(cfg: DictConfig) -> float | None:
 
 def _menu() -> str:
     """Return the text of --help; Hydra's own search through its config sources takes most of a second."""
-    groups: dict[str, list[str]] = {}
+    groups: dict[str, dict[str, Path]] = {}
     for folder in (CONF, *(folder for _, folder in option_folders())):
         for file in folder.rglob("*.yaml"):
             group = file.parent.relative_to(folder)
             if group.parts[:1] not in ((), ("hydra",)):
-                groups.setdefault(group.as_posix(), []).append(file.stem)
-    lines = [f"{group}: {', '.join(sorted({*options}))}\n" for group, options in sorted(groups.items())]
+                groups.setdefault(group.as_posix(), {}).setdefault(file.stem, file)
+    jobs = [f"  {name:11} {_description(file)}\n" for name, file in sorted(groups.pop("job").items())]
+    lines = [f"{group}: {', '.join(sorted(options))}\n" for group, options in sorted(groups.items())]
+    title = "\nGroups and their options, +GROUP=OPTION where it is not chosen by default\n"
     template = OmegaConf.select(OmegaConf.load(CONF / "config.yaml"), "hydra.help.template")
-    return Template(template).substitute(APP_CONFIG_GROUPS="".join(lines))
+    return Template(template).substitute(APP_CONFIG_GROUPS="".join(["Jobs\n", *jobs, title, *lines]))
+
+
+def _description(file: Path) -> str:
+    """Return the first comment of an option that says more than its package."""
+    lines = (line.removeprefix("# ") for line in file.read_text(encoding="utf-8").splitlines() if line.startswith("# "))
+    return next((line for line in lines if not line.startswith("@")), "")
 
 
 def main() -> None:

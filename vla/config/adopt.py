@@ -19,7 +19,6 @@ from vla.config.build import require_no_paths, require_trust, without_paths
 from vla.config.differences import at, differences
 from vla.policy import read_header
 
-ADOPTING = ("evaluate", "export", "deploy", "benchmark")  # jobs that take a checkpoint
 OF_POLICY = ("task", "tokenizer", "model")
 OF_MODEL = ("tokenizer", "model", "data")  # the batch size depends on the model
 # What a report on a policy includes of its training: nodes, which nothing builds then, and values of other nodes.
@@ -44,13 +43,8 @@ def adopt(cfg: DictConfig, overrides: Sequence[str]) -> DictConfig:
     Neither has files, folders or devices of the checkpoint's author.
 
     Raises:
-        ValueError: the job takes no checkpoint, the file does not exist, or an override contradicts its weights.
+        ValueError: the file does not exist, or an override contradicts its weights.
     """
-    if cfg.job not in ADOPTING:
-        raise ValueError(
-            f"job={cfg.job} takes no checkpoint: resume=RUN continues a run, pretrained={cfg.checkpoint} starts a new "
-            "training from its weights"
-        )
     parsed = _parsed(overrides)
     _require_own_parts(parsed, ("tokenizer", "model", *PRESETS))
     saved = read_header(cfg.checkpoint).config

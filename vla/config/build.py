@@ -31,26 +31,34 @@ HYDRA_KEYS = ("_target_", "_partial_")
 class Group:
     """The kind of objects that a config group describes."""
 
+    name: str
     makes: tuple[str, ...]  # alternative base classes or protocols
     runtime: tuple[str, ...] = ()  # constructor arguments from the program, never from YAML
     optional: bool = False  # jobs run without it
     several: bool = False  # an option is a mapping of name → node
 
 
+# A job may declare further groups of its own.
 GROUPS = {
-    "task": Group(("vla.spec.Environment",)),
-    "expert": Group(("vla.spec.Agent", "vla.data.formats.imported_demonstrations.ImportedDemonstrations"), ("spec",)),
-    "cluster": Group(("vla.parallel.pool.Cluster",)),
-    "data": Group(("vla.data.datamodule.WindowDataModule",), ("folder", "spec", "history", "chunk", "episodes")),
-    "tokenizer": Group(("vla.models.tokenizers.tokenizer.ActionTokenizer",), ("spec", "statistics")),
-    "model": Group(("vla.models.model.Model",), ("spec", "tokenizer")),
-    "learner": Group(("vla.models.learner.Learner",), ("model", "spec", "config")),
-    "trainer": Group(("lightning.Trainer",), ("callbacks", "logger")),
-    "logger": Group(("lightning.pytorch.loggers.Logger",), ("save_dir",), optional=True, several=True),
-    "policy": Group(("vla.policy.Policy",), ("model", "spec")),
-    "recorder": Group(("vla.spec.Recorder",), ("folder",), optional=True),
-    "export": Group(("vla.spec.Exporter", "vla.spec.PolicyExporter")),
-    "deploy": Group(("vla.spec.Deployment",), ("policy", "environment", "output")),
+    group.name: group
+    for group in (
+        Group("task", ("vla.spec.Environment",)),
+        Group(
+            "expert", ("vla.spec.Agent", "vla.data.formats.imported_demonstrations.ImportedDemonstrations"), ("spec",)
+        ),
+        Group("cluster", ("vla.parallel.pool.Cluster",)),
+        Group("data", ("vla.data.datamodule.WindowDataModule",), ("folder", "spec", "history", "chunk", "episodes")),
+        Group("tokenizer", ("vla.models.tokenizers.tokenizer.ActionTokenizer",), ("spec", "statistics")),
+        Group("model", ("vla.models.model.Model",), ("spec", "tokenizer")),
+        Group("learner", ("vla.models.learner.Learner",), ("model", "spec", "config")),
+        Group("trainer", ("lightning.Trainer",), ("callbacks", "logger")),
+        Group("logger", ("lightning.pytorch.loggers.Logger",), ("save_dir",), optional=True, several=True),
+        Group("policy", ("vla.policy.Policy",), ("model", "spec")),
+        Group("agent", ("vla.spec.Agent",), ("spec",), optional=True),
+        Group("recorder", ("vla.spec.Recorder",), ("folder",), optional=True),
+        Group("export", ("vla.spec.Exporter", "vla.spec.PolicyExporter")),
+        Group("deploy", ("vla.spec.Deployment",), ("policy", "environment", "output")),
+    )
 }
 
 RUNTIME = {name for group in GROUPS.values() for name in group.runtime}
@@ -73,7 +81,7 @@ NARROWER: dict[str, dict[str, Any]] = {
 }
 
 
-def build(node: Mapping[str, Any], group: str, **runtime: Any) -> Any:
+def build(node: Mapping[str, Any], group: str | Group, **runtime: Any) -> Any:
     """Build the object that a plain `node` of a group such as "model" describes.
 
     Nested nodes are built first; those with `_partial_: true` become factories. Unresolved references such as `${seed}`
@@ -81,14 +89,15 @@ def build(node: Mapping[str, Any], group: str, **runtime: Any) -> Any:
 
     Args:
         node: class in `_target_`, and its arguments.
-        group: config group, which determines the base class.
+        group: config group, or its name in `GROUPS`, which determines the base class.
         runtime: arguments from the program.
 
     Raises:
         ValueError: a class that is not allowed or of another kind, wrong arguments, or an error of the constructor.
     """
-    require_resolved(node, group)
-    check_node(group, node, makes(group), tuple(runtime))
+    group = GROUPS[group] if isinstance(group, str) else group
+    require_resolved(node, group.name)
+    check_node(group.name, node, makes(group), tuple(runtime))
     try:
         factory = instantiate(dict(node), _convert_="all", _partial_=True)
     except InstantiationException as error:
@@ -99,11 +108,9 @@ def build(node: Mapping[str, Any], group: str, **runtime: Any) -> Any:
 
 
 @cache
-def makes(group: str) -> Any:
+def makes(group: Group) -> Any:
     """Return the class, protocol or union of the objects that a group describes."""
-    classes = [
-        getattr(import_module(module), name) for module, _, name in (p.rpartition(".") for p in GROUPS[group].makes)
-    ]
+    classes = [getattr(import_module(module), name) for module, _, name in (p.rpartition(".") for p in group.makes)]
     return classes[0] if len(classes) == 1 else classes[0] | classes[1]
 
 

@@ -5,15 +5,15 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Annotated, Any, Literal, cast
+from dataclasses import dataclass, field
+from typing import Annotated, Any, cast
 
-from annotated_types import Ge, MinLen
+from annotated_types import Ge
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
 from vla.config.annotations import fits, locate
-from vla.config.build import GROUPS, arguments, check_node, check_value, makes, require_known
+from vla.config.build import GROUPS, Group, arguments, check_node, check_value, makes, require_known
 from vla.config.conditions import conditions
 from vla.io.types import Count, Natural, Seed, Shift, Text
 from vla.spec import FIRST_SEED
@@ -23,61 +23,28 @@ UnseenSeed = Annotated[Seed, Ge(FIRST_SEED)]
 
 @dataclass(frozen=True)
 class Job:
-    """Requirements of a job; its module in `vla.jobs` has the same name."""
+    """Requirements of a job, which its module declares as `JOB`."""
 
-    groups: tuple[str, ...]  # config groups that it builds from; only these are checked and imported
-    options: dict[str, Any] | None = None  # name → type, in the config node of the same name
+    groups: tuple[str | Group, ...]  # that it builds from; only these are checked and imported; names in `GROUPS`
+    options: Mapping[str, Any] = field(default_factory=dict)  # name → type, in the config node of the job's name
+    adopts: bool = False  # takes checkpoint=FILE
+    without_agent: tuple[str, ...] = ()  # further groups, unless an agent acts
+    without_checkpoint: tuple[str, ...] = ()  # further groups, unless an agent or a checkpoint acts
+
+    def needs(self, config: Any) -> dict[str, Group]:
+        """Return name → group of everything that it builds from with a plain or composed config."""
+        further = () if config["agent"] is not None else self.without_agent
+        if config["agent"] is config["checkpoint"] is None:
+            further += self.without_checkpoint
+        groups = (GROUPS[name] if isinstance(name, str) else name for name in (*self.groups, *further))
+        return {group.name: group for group in groups}
 
 
 TRAINING = ("task", "expert", "cluster", "data", "tokenizer", "model", "learner", "trainer", "logger")
-EVALUATION = ("task", "cluster", "tokenizer", "model", "policy", "recorder")  # of a checkpoint, without training
-JOBS = {
-    "preview": Job(("task", "expert"), {"episodes": Count, "seed": Seed}),
-    "collect": Job(("task", "expert", "cluster"), {"episodes": Count, "seed": Seed, "folder": Text}),
-    "train": Job(TRAINING),
-    "evaluate": Job(
-        (*TRAINING, "policy", "recorder"),
-        {
-            "episodes": Count,
-            "seed": UnseenSeed,
-            "recordings": Natural | None,
-            "conditions": dict[str, dict[str, object]],
-            "one_by_one": dict[str, dict[str, dict[str, object]]],
-        },
-    ),
-    "export": Job(("task", "expert", "cluster", "tokenizer", "model", "policy", "export")),
-    "deploy": Job(("tokenizer", "model", "policy", "deploy")),
-    "benchmark": Job(
-        (*TRAINING, "policy"),
-        {
-            "names": Annotated[list[Literal["collect", "loader", "train", "policy", "deploy", "serve"]], MinLen(1)],
-            "episodes": Count,
-            "batches": Count,
-            "steps": Count,
-            "rounds": Count,
-            "precisions": list[Literal["fp32", "bf16"]] | None,
-            "compile": list[bool],
-            "robosuite": str | None,
-            "lerobot": str | None,
-        },
-    ),
-    "inspect": Job(
-        (),
-        {
-            "folder": Text,
-            "stores": Annotated[list[Text], MinLen(1)] | None,
-            "where": dict[str, Any] | None,
-            "repair": bool,
-            "into": Text | None,
-            "episode": Natural | None,
-        },
-    ),
-    "report": Job((), {"runs": list[Text]}),
-}
 
 # Nodes without a class.
 PLAIN: dict[str, Any] = {
-    "job": Literal[tuple(JOBS)],  # type: ignore[invalid-literal]
+    "job": Text,
     "seed": Seed,
     "shift": Shift,
     "checkpoint": Text | None,
@@ -86,33 +53,44 @@ PLAIN: dict[str, Any] = {
     "trust": list[str],
     "output": Text,
     "chosen": dict[str, str | None],
+    "collect": {"episodes": Count, "seed": Seed, "folder": Text},
     "validate": {"episodes": Natural, "seed": UnseenSeed, "changes": dict[str, object]},
-    **{name: job.options for name, job in JOBS.items() if job.options},
+    "evaluate": {
+        "episodes": Count,
+        "seed": UnseenSeed,
+        "recordings": Natural | None,
+        "conditions": dict[str, dict[str, object]],
+        "one_by_one": dict[str, dict[str, dict[str, object]]],
+    },
 }
 
 
-def check(cfg: DictConfig) -> None:
-    """Check every node that the job of `cfg` will build against the signature of its class.
+def check(cfg: DictConfig, job: Job) -> None:
+    """Check every node that the `job` of `cfg` will build against the signature of its class.
 
     Raises:
         ValueError: an unknown, missing or ill-typed key, with its dotted name and the allowed values.
     """
+    groups, plain = job.needs(cfg), dict(PLAIN)
+    if job.options:
+        plain[cfg.job.rpartition(".")[2]] = job.options
     for name in cfg:
-        require_known("", str(name), (*PLAIN, *GROUPS), "the config")
-    for name, annotation in PLAIN.items():
+        require_known("", str(name), (*plain, *GROUPS, *groups), "the config")
+    for name, annotation in plain.items():
         node = OmegaConf.to_container(cfg[name], resolve=True) if OmegaConf.is_config(cfg[name]) else cfg[name]
         _check_plain(name, node, annotation)
     _require_apart(cfg)
-    job = JOBS[cfg.job]
-    groups = EVALUATION if cfg.job == "evaluate" and cfg.checkpoint is not None else job.groups
-    for name in groups:
-        group = GROUPS[name]
+    if cfg.agent is not None and "agent" not in groups:
+        raise ValueError(f"job={cfg.job} takes no agent: agent=OPTION goes with job=evaluate and deploy")
+    if cfg.agent is not None and cfg.checkpoint is not None:
+        raise ValueError("agent=OPTION and checkpoint=FILE are two policies: omit one of them")
+    for name, group in groups.items():
         if cfg.get(name) is not None:
             node = OmegaConf.to_container(cfg[name], resolve=True, throw_on_missing=True)
             assert isinstance(node, dict)
             nodes = {f"{name}.{each!s}": part for each, part in node.items()} if group.several else {name: node}
             for key, each in nodes.items():
-                check_node(key, each, makes(name), group.runtime)
+                check_node(key, each, makes(group), group.runtime)
         elif not group.optional:
             raise ValueError(f"job={cfg.job} needs {name}=OPTION; --help lists the options")
     if "model" in groups:
@@ -132,7 +110,7 @@ def _check_changes(cfg: DictConfig, training: bool) -> None:
     if training and validate["changes"]:
         changed["validate.changes"] = validate["changes"]
     for name, changes in changed.items():
-        check_node(f"task ({name})", with_changes(task, changes), makes("task"))
+        check_node(f"task ({name})", with_changes(task, changes), makes(GROUPS["task"]))
 
 
 def with_changes(node: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
@@ -191,7 +169,7 @@ def _canonical(value: Any) -> Any:
 
 
 def _check_plain(key: str, value: Any, annotation: Any) -> None:
-    if not isinstance(annotation, dict):
+    if not isinstance(annotation, Mapping):
         return check_value(key, value, annotation)
     if not isinstance(value, dict):
         raise ValueError(f"{key} must hold {', '.join(annotation)}, got {value!r}")

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 # Keys that do not change the result of a run.
-NOT_COMPARED = ("output", "cluster", "job", "resume", "trust", "preview", "inspect", "export", "benchmark", "report")
+NOT_COMPARED = ("output", "cluster", "job", "resume", "trust", "export")
 ABSENT = "-"  # value of a key that one of two configs lacks
 
 
@@ -22,13 +22,14 @@ def at(config: Any, key: str, absent: Any = ABSENT) -> Any:
 def differences(one: Any, other: Any, key: str = "") -> list[tuple[str, Any, Any]]:
     """Return dotted key and both values of every difference between two plain configs, except `NOT_COMPARED`.
 
-    A node that only one of them has is one entry, with `ABSENT` for the other.
+    A node that only one of them has is one entry, with `ABSENT` for the other; at the top level it is a job's own, and
+    not compared.
     """
     if not (isinstance(one, Mapping) and isinstance(other, Mapping)):
         return [] if one == other else [(key, one, other)]
     found = []
     for name in dict.fromkeys((*one, *other)):
-        if key or name not in NOT_COMPARED:
+        if key or (name in one and name in other and name not in NOT_COMPARED):
             values = one.get(name, ABSENT), other.get(name, ABSENT)
             found += differences(*values, f"{key}.{name}" if key else str(name))
     return found

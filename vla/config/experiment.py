@@ -101,6 +101,12 @@ class Experiment:
             raise ValueError("this needs a trained policy: checkpoint=FILE")
         return partial(with_trust, trusted(), make_policy, self["policy"], checkpoint)
 
+    def make_agent(self) -> Callable[[Environment], Agent] | None:
+        """Return the factory of the agent that acts in place of a checkpoint, or None."""
+        if not self["agent"]:
+            return None
+        return partial(with_trust, trusted(), make_agent, self["agent"])
+
     def make_recorder(self, folder: Path) -> Callable[[], Recorder] | None:
         """Return the factory of the recorder that writes into a folder, or None without a recorder."""
         if not self["recorder"]:
@@ -198,6 +204,12 @@ def make_expert(expert: Node, environment: Environment) -> Agent:
     if isinstance(agent, ImportedDemonstrations):
         raise ValueError("recorded demonstrations cannot act: this job needs another expert, such as expert=waypoint")
     return agent
+
+
+def make_agent(agent: Node, environment: Environment) -> Agent:
+    """Build an agent for an environment."""
+    made: Agent = build(agent, "agent", spec=environment.spec)
+    return made
 
 
 def make_policy(policy: Node, checkpoint: Path, environment: Environment | None = None) -> Policy:

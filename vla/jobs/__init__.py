@@ -1,4 +1,4 @@
-"""Jobs, `job=…`: one module each, with a function `run`.
+"""Jobs, `job=…`: an option that names a module each, with its requirements, `JOB`, and a function `run`.
 
 `collect`, `train` and `evaluate` are stages of a pipeline: each first runs the earlier stages whose product is missing.
 """
@@ -6,16 +6,38 @@
 from __future__ import annotations
 
 from importlib import import_module
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
+from vla.config.annotations import require_trusted
+from vla.config.packages import is_trusted
 from vla.jobs.bfloat16 import warn_of_bfloat16
 
 if TYPE_CHECKING:
     from vla.config.experiment import Experiment
 
 
+def find(name: str) -> Any:
+    """Import the module of a job: `vla.jobs.NAME`, or of a trusted package if `name` has dots.
+
+    Raises:
+        ValueError: there is no such job, or its package is not trusted.
+    """
+    module = name if "." in name else f"vla.jobs.{name}"
+    require_trusted("job", module)
+    try:
+        found = import_module(module) if module.startswith("vla.") or is_trusted(module) else None
+    except ModuleNotFoundError as error:
+        if not f"{module}.".startswith(f"{error.name}."):  # of another import
+            raise
+        found = None
+    if not hasattr(found, "JOB"):
+        raise ValueError(f"there is no job={name}; --help lists the jobs")
+    return found
+
+
 def run(experiment: Experiment) -> float | None:
     """Run the job of an experiment; evaluation returns the success rate, which sweeps maximise."""
-    warn_of_bfloat16(experiment.config)
-    result: float | None = import_module(f"vla.jobs.{experiment['job']}").run(experiment)
+    job = find(experiment["job"])
+    warn_of_bfloat16(experiment.config, job.JOB.needs(experiment.config))
+    result: float | None = job.run(experiment)
     return result

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
+from collections.abc import Container, Mapping
 from typing import Any
-
-from vla.config.check import JOBS
 
 log = logging.getLogger(__name__)
 
@@ -24,10 +22,10 @@ def has_bfloat16() -> bool:
     return torch.backends.mkldnn.is_available() and bool(torch.ops.mkldnn._is_mkldnn_bf16_supported())
 
 
-def warn_of_bfloat16(config: Mapping[str, Any]) -> None:
-    """Log a warning for every config group of the job that selects bfloat16 on a CPU where it is slow."""
+def warn_of_bfloat16(config: Mapping[str, Any], groups: Container[str]) -> None:
+    """Log a warning for every one of the config `groups` that selects bfloat16 on a CPU where it is slow."""
     for group, device in DEVICE_KEYS.items():
-        node = config[group] if group in JOBS[config["job"]].groups else None
+        node = config[group] if group in groups else None
         if node is None or node.get("precision") != "bf16":
             continue
         if computes_on_cpu(node.get(device)) and not has_bfloat16():

@@ -6,6 +6,7 @@ import logging
 from pathlib import Path
 
 from vla.config.build import build
+from vla.config.check import Job
 from vla.config.experiment import Experiment
 from vla.data.episodes import EpisodeStore
 from vla.data.formats.imported_demonstrations import ImportedDemonstrations
@@ -13,6 +14,8 @@ from vla.rollouts.collect import collect
 from vla.spec import FIRST_SEED, Spec
 
 log = logging.getLogger(__name__)
+
+JOB = Job(("task", "expert", "cluster"))
 
 
 def run(experiment: Experiment) -> None:

@@ -6,9 +6,12 @@ from functools import partial
 from typing import Any
 
 from vla.config.build import build
+from vla.config.check import Job
 from vla.config.experiment import Experiment
 from vla.policy import Policy
 from vla.reports.evaluation import plot_report, write_report
+
+JOB = Job(("tokenizer", "model", "policy", "agent", "deploy"), adopts=True)
 
 
 def run(experiment: Experiment) -> None:
@@ -33,5 +36,15 @@ def deployment(experiment: Experiment) -> Any:
 
 
 def _policy(experiment: Experiment) -> Policy:
-    """Build the trained policy; raise a ValueError if no checkpoint is given."""
-    return experiment.make_policy()()
+    """Build the trained policy, or the agent in its place; raise a ValueError if there is neither."""
+    make_agent = experiment.make_agent()
+    if make_agent is None:
+        return experiment.make_policy()()
+    environment = experiment.make_environment()()
+    try:
+        agent: Any = make_agent(environment)
+    finally:
+        environment.close()
+    if not hasattr(agent, "plan"):
+        raise ValueError(f"{type(agent).__name__} sees the simulator's truth, which a robot does not have")
+    return agent

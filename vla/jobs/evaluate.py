@@ -6,10 +6,11 @@ import logging
 import time
 from contextlib import nullcontext
 from pathlib import Path
+from typing import Any
 
 from rich import print as show
 
-from vla.config.check import with_changes
+from vla.config.check import Job, with_changes
 from vla.config.conditions import conditions
 from vla.config.experiment import Experiment
 from vla.io.files import writing
@@ -24,6 +25,13 @@ from vla.runs.resume import cached_success, training_lock
 
 log = logging.getLogger(__name__)
 
+JOB = Job(
+    ("task", "cluster", "agent", "recorder"),
+    adopts=True,
+    without_agent=("tokenizer", "model", "policy"),
+    without_checkpoint=("expert", "data", "learner", "trainer", "logger"),
+)
+
 
 def run(experiment: Experiment) -> float | None:
     """Measure the success rate; return None in all but the first process of a training.
@@ -32,6 +40,8 @@ def run(experiment: Experiment) -> float | None:
         ValueError: an episode ended in an error; the report is written and contains it.
     """
     output = experiment.output
+    if experiment["agent"]:
+        return _evaluated(experiment, None)
     checkpoint = experiment.checkpoint or train(experiment)
     if checkpoint is None:
         return None
@@ -42,7 +52,7 @@ def run(experiment: Experiment) -> float | None:
         return _evaluated(experiment, checkpoint)
 
 
-def _evaluated(experiment: Experiment, checkpoint: Path) -> float:
+def _evaluated(experiment: Experiment, checkpoint: Path | None) -> float:
     """Play the episodes, write the reports, and return the success rate; print it even if writing fails."""
     started, output = time.monotonic(), experiment.output
     reports = _play(experiment, checkpoint)
@@ -58,12 +68,15 @@ def _evaluated(experiment: Experiment, checkpoint: Path) -> float:
     return report.success
 
 
-def _play(experiment: Experiment, checkpoint: Path) -> dict[str, Report]:
-    """Return condition → report on the same seeds; only the first, the training condition, is recorded."""
+def _play(experiment: Experiment, checkpoint: Path | None) -> dict[str, Report]:
+    """Return condition → report on the same seeds; only the first, the training condition, is recorded.
+
+    Without a checkpoint the agent of the config acts.
+    """
     asked, task = experiment["evaluate"], experiment["task"]
     seeds = range(asked["seed"], asked["seed"] + asked["episodes"])
-    cluster, needs = experiment.cluster(), [checkpoint.resolve()]
-    make_policy = experiment.make_policy(needs[0])
+    cluster, needs = experiment.cluster(), [checkpoint.resolve()] if checkpoint else []
+    make_agent = experiment.make_agent() or experiment.make_policy(needs[0])
     recordings = experiment.output.resolve() / "recordings"
     recorder = experiment.make_recorder(recordings)
     if recorder:
@@ -76,21 +89,15 @@ def _play(experiment: Experiment, checkpoint: Path) -> dict[str, Report]:
             continue
         watching = None if reports else recorder
         make_environment = experiment.make_environment(changes)
-        reports[name] = evaluate(make_environment, make_policy, watching, seeds, cluster, name, needs)
+        reports[name] = evaluate(make_environment, make_agent, watching, seeds, cluster, name, needs)
     return reports
 
 
-def _write(experiment: Experiment, checkpoint: Path, reports: dict[str, Report], started: float) -> None:
+def _write(experiment: Experiment, checkpoint: Path | None, reports: dict[str, Report], started: float) -> None:
     """Write all results of an evaluation that started at `started` [s]."""
     output, report = experiment.output, reports[IN_DISTRIBUTION]
     others = {name: each for name, each in reports.items() if name != IN_DISTRIBUTION}
-    policy = experiment.make_policy(checkpoint)()
-    facts = {
-        **experiment["chosen"],
-        "parameters": sum(p.numel() for p in policy.model.parameters()),
-        "latency_ms": latency(policy),
-        "wall_time_s": wall_time(checkpoint, time.monotonic() - started),
-    }
+    facts = _facts(experiment, checkpoint, time.monotonic() - started)
     save_config(output, experiment.config, experiment.changes)
     if experiment["recorder"]:
         recording, limit = output / "rollouts.rrd", experiment["evaluate"]["recordings"]
@@ -101,9 +108,25 @@ def _write(experiment: Experiment, checkpoint: Path, reports: dict[str, Report],
         plot_conditions(reports, output / "suite.png")
         show(conditions_table(reports))
     # Last, because its existence marks the evaluation as finished.
-    write_report(report, output / "report.json", str(checkpoint), experiment.config, facts, others)
+    write_report(
+        report, output / "report.json", str(checkpoint) if checkpoint else None, experiment.config, facts, others
+    )
     with optional(output / PAGE):
         write_page(output)
     log.info(
         "wrote %s, report.json, report.png%s", output / PAGE, " and rollouts.rrd" if experiment["recorder"] else ""
     )
+
+
+def _facts(experiment: Experiment, checkpoint: Path | None, seconds: float) -> dict[str, Any]:
+    """Return what a report says of the agent, given the duration of its evaluation [s]."""
+    if checkpoint is None:
+        chosen = experiment["chosen"]
+        return {**chosen, "model": chosen["agent"], "wall_time_s": seconds}
+    policy = experiment.make_policy(checkpoint)()
+    return {
+        **experiment["chosen"],
+        "parameters": sum(p.numel() for p in policy.model.parameters()),
+        "latency_ms": latency(policy),
+        "wall_time_s": wall_time(checkpoint, seconds),
+    }

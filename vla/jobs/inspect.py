@@ -5,20 +5,35 @@ from __future__ import annotations
 import logging
 import os
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
+from annotated_types import MinLen
 from rich import print as show
 
 from vla.config.build import require_no_paths
+from vla.config.check import Job
 from vla.config.experiment import Experiment, make_environment
 from vla.data.episodes import EpisodeStore
 from vla.data.index import listed
 from vla.data.verification import derive_store, find_episode, require_whole, verify_store
+from vla.io.types import Natural, Text
 from vla.reports.dataset_card import store_table, write_card
 from vla.rollouts.recorder import RerunRecorder, recording_name
 from vla.rollouts.rollout import replay
 
 log = logging.getLogger(__name__)
+
+JOB = Job(
+    (),
+    {
+        "folder": Text,
+        "stores": Annotated[list[Text], MinLen(1)] | None,
+        "where": dict[str, Any] | None,
+        "repair": bool,
+        "into": Text | None,
+        "episode": Natural | None,
+    },
+)
 
 
 def run(experiment: Experiment) -> None:

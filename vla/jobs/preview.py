@@ -8,13 +8,17 @@ from tempfile import TemporaryDirectory
 
 from rich import print as show
 
+from vla.config.check import Job
 from vla.config.experiment import Experiment
 from vla.io.files import atomic_path, writing
+from vla.io.types import Count, Seed
 from vla.reports.evaluation import contact_sheet, draws_table
 from vla.rollouts.recorder import RerunRecorder, merge
 from vla.rollouts.rollout import rollout
 
 log = logging.getLogger(__name__)
+
+JOB = Job(("task", "expert"), {"episodes": Count, "seed": Seed})
 
 
 def run(experiment: Experiment) -> None:

@@ -5,10 +5,14 @@ from __future__ import annotations
 import logging
 from pathlib import Path
 
+from vla.config.check import Job
 from vla.config.experiment import Experiment
+from vla.io.types import Text
 from vla.reports.html import write_comparison
 
 log = logging.getLogger(__name__)
+
+JOB = Job((), {"runs": list[Text]})
 
 
 def run(experiment: Experiment) -> None:

@@ -11,6 +11,7 @@ from pathlib import Path
 import lightning
 from lightning import Trainer
 
+from vla.config.check import TRAINING, Job
 from vla.config.experiment import Experiment, training_policy
 from vla.data.episodes import EpisodeStore
 from vla.io.files import writing
@@ -24,10 +25,13 @@ from vla.reports.html import PAGE, optional, write_page
 from vla.rollouts.collect import collection_time
 from vla.runs.folder import CHECKPOINTS, LAST, save_choice, save_config, save_training
 from vla.runs.resume import LENGTHS, TrainingProgress, first_process, training_lock, training_progress
+from vla.training.checkpoints import GracefulStop
 from vla.training.closed_loop import ClosedLoop
-from vla.training.trainer import GracefulStop, explain_memory_errors, make_trainer, quiet_lightning, restore_metrics
+from vla.training.trainer import explain_memory_errors, make_trainer, quiet_lightning, restore_metrics
 
 log = logging.getLogger(__name__)
+
+JOB = Job(TRAINING)
 
 
 def run(experiment: Experiment) -> None:

@@ -126,13 +126,8 @@ def _plot_curves(axes: Axes, lines: dict[str, list[SweepRow]], condition: str) -
         rates, reach = error_bars(row.interval(condition) for row in played)
         counts = [_demonstrations(row) for row in played]
         axes.errorbar(counts, rates, reach, fmt="o-", capsize=3, label=name, clip_on=False)
-    axes.set_xscale("log")
+    _label_rates(axes, condition, "demonstrations")
     axes.set_xticks(sorted({_demonstrations(row) for line in lines.values() for row in line}))
-    axes.xaxis.set_major_formatter("{x:g}")
-    axes.xaxis.set_minor_formatter("")
-    axes.set_ylim(0, 1)
-    axes.set_xlabel("demonstrations")
-    axes.set_title(condition.replace("_", " "), fontsize=10)
     if len(lines) > 1:
         axes.legend(frameon=False)
 
@@ -177,13 +172,18 @@ def _plot_costs(axes: Axes, rows: list[SweepRow], condition: str) -> None:
     best = pareto(rows, condition)
     rates = [row.interval(condition)[0] for row in best]
     axes.plot([row.latency for row in best], rates, color="#8a8f98", linewidth=0.8, zorder=0)
-    axes.set_xscale("log")
+    _label_rates(axes, condition, "time per action [ms]")
     axes.set_xlim(0.7 * min(row.latency for row in rows), 1.4 * max(row.latency for row in rows))
     axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+
+
+def _label_rates(axes: Axes, condition: str, label: str) -> None:
+    """Prepare axes for success rates under a condition, 0…1, over a logarithmic axis."""
+    axes.set_xscale("log")
     axes.xaxis.set_major_formatter("{x:g}")
     axes.xaxis.set_minor_formatter("")
     axes.set_ylim(0, 1)
-    axes.set_xlabel("time per action [ms]")
+    axes.set_xlabel(label)
     axes.set_title(condition.replace("_", " "), fontsize=10)
 
 

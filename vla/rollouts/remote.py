@@ -75,10 +75,10 @@ class RemotePolicy:
         self._low, self._high = np.array(self.spec.low, np.float32), np.array(self.spec.high, np.float32)
         self._open = ExitStack()
         self._connection, self.metadata = self._connected()
-        horizon, history = self.metadata.get("execute"), self.metadata.get("history")
+        told, history = (self.metadata.get(name) for name in ("execute", "history"))
+        told = told if isinstance(told, int) and told >= 1 else None
         # A policy with a history wants to see every frame.
-        told = 1 if isinstance(history, int) and history > 1 else horizon
-        self._execute = self.execute or (told if isinstance(told, int) and told >= 1 else None)
+        self._wanted = self.execute or (1 if isinstance(history, int) and history > 1 else told)
 
     def reset(self, instruction: str, seed: int) -> None:
         """Start an episode: drop the rest of the chunk, and tell a server that has episodes."""
@@ -93,11 +93,17 @@ class RemotePolicy:
             ValueError: the server refuses the observation, fails, is too slow, or answers with something else.
         """
         if not self._chunk:
-            began = time.perf_counter()
-            answer = self.ask(observation)
-            self.info = {"answer_ms": 1000 * (time.perf_counter() - began)}
-            self._chunk.extend(self._translated(answer.get("actions"))[: self._execute])
+            self._chunk.extend(self.plan(observation)[: self.execute])
         return self._chunk.popleft()
+
+    def plan(self, observation: Observation) -> Array:
+        """Return the server's chunk, (k, D) float32, clipped, of which `execute` are meant to act. Raises as `act`."""
+        began = time.perf_counter()
+        answer = self.ask(observation)
+        self.info = {"answer_ms": 1000 * (time.perf_counter() - began)}
+        actions = self._translated(answer.get("actions"))
+        self.execute = min(self._wanted or len(actions), len(actions))
+        return actions
 
     def ask(self, observation: Observation) -> dict[str, Any]:
         """Return the server's answer to an observation. Raises as `act` does."""

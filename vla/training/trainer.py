@@ -1,194 +1,37 @@
-"""Lightning's trainer from a config, with graceful stop, atomic checkpoints and exact resume."""
+"""Lightning's trainer from a config, with all callbacks, and random numbers that resume exactly."""
 
 from __future__ import annotations
 
 import ctypes
 import logging
-import os
 import platform
-import signal
-import threading
-import time
 import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from types import FrameType
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import torch
 from lightning import Callback, LightningModule, Trainer
 from lightning.pytorch.accelerators import CPUAccelerator
-from lightning.pytorch.callbacks import Checkpoint
 from lightning.pytorch.loggers import CSVLogger, Logger
-from lightning.pytorch.plugins import TorchCheckpointIO
 from lightning.pytorch.strategies import ParallelStrategy
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 
 from vla.config.build import build
-from vla.io.documents import parse_plain
-from vla.io.files import atomic_path
-from vla.io.types import NonNegative
 from vla.parallel.processes import cores
-from vla.runs.folder import LAST, METRICS, metric_rows
+from vla.runs.folder import METRICS, metric_rows
+from vla.training.checkpoints import AtomicCheckpointIO, PeriodicCheckpoint
 from vla.training.ema import EMA
 from vla.training.throughput import Throughput, TrainingProgressBar
 
 log = logging.getLogger(__name__)
 
 PRECISIONS = {"fp32": "32-true", "bf16": "bf16-mixed"}  # config → Lightning
-SAVE_EVERY = 500  # steps
 TRIM_THRESHOLD, MMAP_THRESHOLD = -1, -3  # of mallopt(3)
 MAX_MMAP_THRESHOLD = 2**25  # [B]
 SIZE_KEYS = ("history", "image_size", "chunk", "width")  # of a model; those that memory grows with
-
-
-class GracefulStop(Checkpoint):
-    """Saves and stops after the current step at the first SIGINT or SIGTERM, and stops at once at the second.
-
-    All processes of a training stop together. As a Lightning `Checkpoint` it runs after all other callbacks. It adds
-    `finished` and the training time `seconds` to every checkpoint.
-    """
-
-    def __init__(self, checkpoints: Path) -> None:
-        self._path, self._previous_seconds, self._began = checkpoints / LAST, 0.0, time.monotonic()
-        self.requested = self.stopped = self.started = self._signalled = self._step_complete = False
-
-    @property
-    def seconds(self) -> float:
-        """Return the training time so far, including resumed runs [s]."""
-        return self._previous_seconds + time.monotonic() - self._began
-
-    @contextmanager
-    def handling_signals(self) -> Iterator[None]:
-        """Handle the signals, if in the main thread, and start the clock."""
-        self._began = time.monotonic()
-        if threading.current_thread() is not threading.main_thread():
-            yield
-            return
-        previous = self._install_handlers()
-        try:
-            yield
-        finally:
-            for number, handler in previous.items():
-                signal.signal(number, handler)
-
-    def _install_handlers(self) -> dict[signal.Signals, Any]:
-        return {number: signal.signal(number, self._on_signal) for number in (signal.SIGINT, signal.SIGTERM)}
-
-    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Replace Lightning's own handlers, which can deadlock several processes; all state is restored by now."""
-        self.started = True
-        if signal.getsignal(signal.SIGINT) == self._on_signal:
-            self._install_handlers()
-
-    def _on_signal(self, number: int, frame: FrameType | None) -> None:
-        if self._signalled:  # unlike `requested`, which may come from another process
-            self.stopped = True  # within a step: the previous checkpoint is the last valid one
-            raise KeyboardInterrupt
-        self._signalled = self.requested = True
-
-    def on_train_batch_end(
-        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
-    ) -> None:
-        """Stop if requested, unless gradients are being accumulated or a validation follows."""
-        self._step_complete = (batch_idx + 1) % trainer.accumulate_grad_batches == 0
-        if not _validates(trainer, batch_idx):
-            self._stop(trainer)
-
-    def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Stop after the validation of a step: a checkpoint from before would skip it when resumed."""
-        self._stop(trainer)
-
-    def _stop(self, trainer: Trainer) -> None:
-        if not self._step_complete:
-            return
-        # A signal to one process after this point takes effect in the next step.
-        if trainer.strategy.reduce_boolean_decision(self.requested, all=False) and not trainer.should_stop:
-            self.requested = self.stopped = True
-            trainer.save_checkpoint(self._path, weights_only=False)
-            trainer.should_stop = True
-            trainer.limit_val_batches = 0  # else Lightning validates again before it stops
-            log.info("interrupted after %d steps, see %s; resume=last continues", trainer.global_step, self._path)
-
-    def on_save_checkpoint(self, trainer: Trainer, pl_module: LightningModule, checkpoint: dict[str, Any]) -> None:
-        """Add `finished` and `seconds`."""
-        checkpoint["finished"], checkpoint["seconds"] = trainer.state.finished, self.seconds
-
-    def on_load_checkpoint(self, trainer: Trainer, pl_module: LightningModule, checkpoint: dict[str, Any]) -> None:
-        """Restore the training time; a ValueError if it is no duration."""
-        self._previous_seconds = parse_plain(
-            checkpoint.get("seconds", 0.0), cast(type[float], NonNegative), "the training time"
-        )
-
-    @contextmanager
-    def explaining_restore(self, checkpoint: Path | None) -> Iterator[None]:
-        """Convert errors before the training starts from `checkpoint` into a sentence that names the file.
-
-        Raises:
-            ValueError: the state of the training in the file is damaged.
-        """
-        try:
-            yield
-        except (OSError, MisconfigurationException):
-            raise
-        except Exception as error:
-            if self.started or checkpoint is None:
-                raise
-            what = str(error) if isinstance(error, ValueError) else f"{type(error).__name__}: {error}"
-            raise ValueError(f"{checkpoint} cannot be resumed: {what[:1000]}") from error
-
-
-class PeriodicCheckpoint(Checkpoint):
-    """Saves `last.ckpt` every `SAVE_EVERY` steps; if validation runs at that step, after it."""
-
-    def __init__(self, checkpoints: Path) -> None:
-        self._path, self._due, self._step = checkpoints / LAST, False, -1
-
-    def on_train_batch_end(
-        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
-    ) -> None:
-        """Save if due, unless a validation follows."""
-        step = trainer.global_step
-        self._due, self._step = step != self._step and step % SAVE_EVERY == 0, step
-        if not _validates(trainer, batch_idx):
-            self._save(trainer)
-
-    def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Save if due."""
-        self._save(trainer)
-
-    def _save(self, trainer: Trainer) -> None:
-        if self._due:
-            self._due = False
-            trainer.save_checkpoint(self._path, weights_only=False)
-
-
-def _validates(trainer: Trainer, batch_idx: int) -> bool:
-    every = trainer.val_check_batch
-    return bool(trainer.enable_validation and every and (batch_idx + 1) % every == 0)
-
-
-class AtomicCheckpointIO(TorchCheckpointIO):
-    """Writes checkpoints atomically: a complete file replaces the previous one."""
-
-    def save_checkpoint(self, checkpoint: dict[str, Any], path: Any, storage_options: Any = None) -> None:
-        """Write a temporary file, then rename it to `path`.
-
-        Raises:
-            OSError: it cannot be written; an existing file is unchanged.
-        """
-        target = Path(path)
-        target.parent.mkdir(parents=True, exist_ok=True)
-        with atomic_path(target) as draft, draft.open("wb") as file:
-            try:
-                torch.save(checkpoint, file)
-            except RuntimeError as error:
-                if isinstance(error.__context__, OSError):  # the cause, such as a full disk
-                    raise error.__context__ from None
-                raise
-            os.fsync(file.fileno())
 
 
 class StepSeeding(Callback):

@@ -8,30 +8,39 @@ from __future__ import annotations
 
 import json
 from importlib import import_module
+from typing import Annotated, Literal
 
+from annotated_types import MinLen
 from rich import print as show
 from rich.table import Table
 
+from vla.config.check import TRAINING, Job
 from vla.config.experiment import Experiment
 from vla.io.files import write_text
+from vla.io.types import Count
 from vla.jobs.benchmark.measure import Measure
 
-STAGES = ("collect", "loader", "train", "policy", "deploy", "serve")
+JOB = Job(
+    (*TRAINING, "policy"),
+    {
+        "names": Annotated[list[Literal["collect", "loader", "train", "policy", "deploy", "serve"]], MinLen(1)],
+        "episodes": Count,
+        "batches": Count,
+        "steps": Count,
+        "rounds": Count,
+        "precisions": list[Literal["fp32", "bf16"]] | None,
+        "compile": list[bool],
+        "robosuite": str | None,
+        "lerobot": str | None,
+    },
+    adopts=True,
+)
 
 
 def run(experiment: Experiment) -> dict[str, Measure]:
-    """Measure the stages in `benchmark.names`, print a table and write `benchmark.json`; returns name → measure.
-
-    Raises:
-        ValueError: a name is no stage, or there are no names.
-    """
-    names = experiment["benchmark"]["names"]
-    if not names:
-        raise ValueError(f"benchmark.names is empty: the stages are {', '.join(STAGES)}")
-    if unknown := sorted(set(names) - set(STAGES)):
-        raise ValueError(f"benchmark.names has {unknown}, the stages are {sorted(STAGES)}")
+    """Measure the stages in `benchmark.names`, print a table and write `benchmark.json`; returns name → measure."""
     measures: dict[str, Measure] = {}
-    for name in names:
+    for name in experiment["benchmark"]["names"]:
         measures |= import_module(f"vla.jobs.benchmark.{name}").measures(experiment)
     write_text(experiment.output / "benchmark.json", json.dumps(measures, indent=2))
     table = Table("stage", "value", "unit", "n", "floor", "ratio")

@@ -65,15 +65,23 @@ class Cameras:
 
 
 @dataclass(frozen=True)
-class Table:
-    """Colour of the table."""
+class Colour:
+    """A random colour."""
 
     brightness: Shares  # range of brightness, 0…1
     tint: Share  # maximum change of each channel
 
+    def draw(self, random_state: np.random.RandomState) -> Array:
+        """Draw (3,) red, green and blue, which the tint may move beyond 0…1."""
+        return random_state.uniform(*self.brightness) + random_state.uniform(-self.tint, self.tint, 3)
+
+
+class Table(Colour):
+    """Colour of the table."""
+
     def __call__(self, scene: CompiledScene, random_state: np.random.RandomState) -> dict[str, Any]:
         """Draw a colour."""
-        rgb = random_state.uniform(*self.brightness) + random_state.uniform(-self.tint, self.tint, 3)
+        rgb = self.draw(random_state)
         scene.model.geom_rgba[scene.model.geom("table").id, :3] = rgb
         return {"rgb": rounded(rgb)}
 
@@ -107,15 +115,11 @@ def _pattern(kind: str, random_state: np.random.RandomState) -> Array:
     return ((across // width + along // width) % 2).astype(float)
 
 
-@dataclass(frozen=True)
-class Background:
+class Background(Colour):
     """Colour of the floor around the table."""
-
-    brightness: Shares  # range of brightness, 0…1
-    tint: Share  # maximum change of each channel
 
     def __call__(self, scene: CompiledScene, random_state: np.random.RandomState) -> dict[str, Any]:
         """Draw a colour."""
-        rgb = random_state.uniform(*self.brightness) + random_state.uniform(-self.tint, self.tint, 3)
+        rgb = self.draw(random_state)
         scene.model.geom_rgba[scene.model.geom("floor").id, :3] = np.clip(rgb, 0, 1)
         return {"rgb": rounded(rgb)}
