@@ -185,7 +185,7 @@ def test_folders_loggers_and_devices_are_never_those_of_a_checkpoint(tmp_path: P
         "logger": {"csv": {"_target_": "lightning.pytorch.loggers.CSVLogger", "name": "/theirs"}},
     }
     theirs["collect"] |= {"folder": "/theirs"}
-    theirs["inspect"] |= {"folder": "/theirs", "into": "/theirs"}
+    theirs["inspect"] = {"folder": "/theirs", "into": "/theirs"}
     theirs["export"] |= {"folder": "/theirs"}
     theirs["trainer"] |= {"default_root_dir": "/theirs", "accelerator": "theirs", "devices": 99, "profiler": "theirs"}
     path = tmp_path / "last.ckpt"
