@@ -155,6 +155,22 @@ def test_sensor_noise_is_the_same_in_a_replay_without_images() -> None:
     environment.close()
 
 
+def test_noise_of_images_is_normal_and_new_in_every_image() -> None:
+    environment = make_tabletop("task/randomize=hard", "task.image_size=[64,64]")
+    environment.reset(2)
+    compiled = environment.dm_env.task.compiled
+    clean = environment.renderer.render(compiled.data)[0].astype(float)
+    inside = (clean > 60) & (clean < 195)  # where nothing is cut off
+    first, second = (np.stack(list(environment.look().rgb.values())) - clean for _ in range(2))
+    environment.close()
+    deviation = compiled.noise.image
+    assert inside.sum() > 2000 and 6 <= deviation <= 15
+    for noise in (first[inside], second[inside]):
+        assert abs(noise.mean()) < 0.1 * deviation and noise.std() == pytest.approx(deviation, rel=0.06)
+        assert (np.abs(noise) < deviation).mean() == pytest.approx(0.683, abs=0.06)
+    assert abs(np.corrcoef(first[inside], second[inside])[0, 1]) < 0.1
+
+
 def test_streams_differ_between_axes_and_seeds() -> None:
     streams = Streams()
     draws = {(seed, axis): streams(seed, axis).normal() for seed in (0, 1, 2**40) for axis in ("size", "mass")}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from statistics import NormalDist
 from typing import Any, Literal
 
 import dm_env
@@ -25,6 +26,7 @@ TRANSLATION = 0.04  # largest translation per step [m]
 ROTATION = 0.25  # largest rotation per step [rad]
 VISIBLE = 2  # group of the geoms in pictures
 MILLIMETRES = 1000.0  # of a metre
+QUANTILES = np.array([NormalDist().inv_cdf((index + 0.5) / 256) for index in range(256)])  # of the normal distribution
 JOINTS = tuple(f"panda_joint{index}" for index in range(1, 8))
 ARM = RobotModel(
     joints=JOINTS,
@@ -201,11 +203,19 @@ class Tabletop:
             compiled.stale_textures.clear()
             self._changed = False
         pictures, metres = self.renderer.render(compiled.data)
+        if compiled.noise.image:
+            pictures = self._grainy(pictures)
         rgb = dict(zip(self.spec.cameras, pictures, strict=True))
         millimetres = np.rint(metres * np.float32(MILLIMETRES)).astype(np.uint16)
-        if compiled.noise.image:
-            for name, picture in rgb.items():
-                grain = self._image_noise.standard_normal(picture.shape, dtype=np.float32)
-                rgb[name] = np.clip(picture + compiled.noise.image * grain, 0, 255).astype(np.uint8)
         depth = dict(zip(self.spec.cameras, millimetres, strict=True))
         return Observation(rgb, self._state(), self._task.instruction, depth, self._task.truth())
+
+    def _grainy(self, pictures: Array) -> Array:
+        """Add normal noise to pictures (cameras, H, W, 3), in whole grey levels up to 127.
+
+        A random byte chooses one of 256 equally probable values, which takes an eighth of the time of normal numbers.
+        """
+        levels = np.rint(self._task.compiled.noise.image * QUANTILES).clip(-127, 127).astype(np.int8)
+        grain = self._image_noise.bytes(pictures.size).translate(levels.tobytes())
+        noise = np.frombuffer(grain, np.int8).reshape(pictures.shape)
+        return np.add(pictures, noise, dtype=np.int16).clip(0, 255).astype(np.uint8)
