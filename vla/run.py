@@ -210,23 +210,15 @@ def _compose(cfg: DictConfig) -> float | None:
 
 def _menu() -> str:
     """Return the text of --help; Hydra's own search through its config sources takes most of a second."""
-    groups: dict[str, dict[str, Path]] = {}
+    groups: dict[str, list[str]] = {}
     for folder in (CONF, *(folder for _, folder in option_folders())):
         for file in folder.rglob("*.yaml"):
             group = file.parent.relative_to(folder)
             if group.parts[:1] not in ((), ("hydra",)):
-                groups.setdefault(group.as_posix(), {}).setdefault(file.stem, file)
-    jobs = [f"  {name:11} {_description(file)}\n" for name, file in sorted(groups.pop("job").items())]
-    lines = [f"{group}: {', '.join(sorted(options))}\n" for group, options in sorted(groups.items())]
-    title = "\nGroups and their options, +GROUP=OPTION where it is not chosen by default\n"
+                groups.setdefault(group.as_posix(), []).append(file.stem)
+    lines = [f"{group}: {', '.join(sorted({*options}))}\n" for group, options in sorted(groups.items())]
     template = OmegaConf.select(OmegaConf.load(CONF / "config.yaml"), "hydra.help.template")
-    return Template(template).substitute(APP_CONFIG_GROUPS="".join(["Jobs\n", *jobs, title, *lines]))
-
-
-def _description(file: Path) -> str:
-    """Return the first comment of an option that says more than its package."""
-    lines = (line.removeprefix("# ") for line in file.read_text(encoding="utf-8").splitlines() if line.startswith("# "))
-    return next((line for line in lines if not line.startswith("@")), "")
+    return Template(template).substitute(APP_CONFIG_GROUPS="".join(lines))
 
 
 def main() -> None:

@@ -16,7 +16,7 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 
 import vla.config.check  # noqa: F401  registers the resolvers
 from vla.config.experiment import Node, plain
-from vla.config.packages import offer_options
+from vla.config.packages import offer_options, option_folders
 
 PACKAGE = Path(__file__).resolve().parents[1]
 # Inside the package if installed from a wheel, beside it in a clone.
@@ -67,3 +67,18 @@ def _hydra() -> Iterator[ConfigLoader]:
             yield GlobalHydra.instance().config_loader()
     finally:
         GlobalHydra.instance().hydra, VersionBase.instance().version_base = before
+
+
+def describe_jobs() -> str:
+    """Resolve `${jobs:}`: a line per option of the group `job`, with the first comment of its file."""
+    folders = (CONF, *(folder for _, folder in option_folders()))
+    files = {file.stem: file for folder in reversed(folders) for file in (folder / "job").glob("*.yaml")}
+    return "\n".join(f"  {name:11} {_comment(file)}" for name, file in sorted(files.items()))
+
+
+def _comment(file: Path) -> str:
+    lines = (line.removeprefix("# ") for line in file.read_text(encoding="utf-8").splitlines() if line.startswith("# "))
+    return next((line for line in lines if not line.startswith("@")), "")
+
+
+OmegaConf.register_new_resolver("jobs", describe_jobs, replace=True)
