@@ -38,7 +38,7 @@ def store_table(findings: StoreReport) -> Table:
     lengths = [entry.steps for entry in findings.whole] or [0]
     seeds = listed([entry.seed for entry in store.tried])
     table = Table(title=escape(str(store.folder)), show_header=False)
-    table.add_row("episodes", f"{len(findings.whole)} intact, of {len(store.tried)} seeds tried: {seeds}")
+    table.add_row("episodes", f"{len(findings.whole)} intact, of {len(store.tried)} seeds: {seeds}")
     table.add_row("steps", f"{sum(lengths)}, from {min(lengths)} to {max(lengths)} in an episode")
     table.add_row("time", _time(findings))
     if not store.derived:  # meaningless for selected episodes
