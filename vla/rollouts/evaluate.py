@@ -155,7 +155,8 @@ class Report:
             lines += [f"{task} {report._rate}" for task, report in self.tasks.items()]
         lines += [f"{tier.replace('_', ' ')} {report._rate}" for tier, report in self.by_tier.items()]
         if mean := self.mean_over_tiers:
-            lines.append(f"mean over tiers {_percent(*mean)}")
+            rate, low, high = (f"{100 * value:.1f}" for value in mean)
+            lines.append(f"mean over tiers {rate} % (95 % CI {low}-{high})")
         return "\n".join([*lines, f"success {self._rate}"])
 
     @property
