@@ -133,7 +133,7 @@ class ToyEnvironment:
 class ToyInTurn(ToyEnvironment):
     """The same with three tasks that the seeds take in turn; "b" fails more often than the others."""
 
-    tasks = ("a", "b", "c")
+    tasks: tuple[str, ...] = ("a", "b", "c")
 
     def task_of(self, seed: int) -> str:
         """The task of a seed."""

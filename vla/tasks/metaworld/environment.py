@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
+from annotated_types import Ge, Le, Predicate
 
-from vla.io.types import Count, ImageSize, Names, Natural, Text
+from vla.io.types import Count, ImageSize, Names, Natural, Share, Text
 from vla.spec import Array, Observation, Spec
 from vla.tasks.metaworld.package import tasks_of
 from vla.tasks.metaworld.scene import Scene
@@ -17,16 +18,26 @@ from vla.tasks.rendering.renderer import Rendering
 CONTROL_HZ = 80.0  # five substeps of 2.5 ms
 REACH = 0.01  # largest displacement of the hand per step, along each axis [m]
 STATE = ("hand_x", "hand_y", "hand_z", "opening")  # the first four numbers of an observation
+MOST_STEPS = 500  # of an episode, after which Meta-World refuses to go on
 # Of the simulator's observation (39,).
 OBJECT, GOAL = slice(4, 7), slice(36, 39)
+
+
+def within(window: Sequence[float]) -> bool:
+    """top above bottom, left of right"""
+    top, left, bottom, right = window
+    return top < bottom and left < right
+
+
+Window = Annotated[tuple[Share, Share, Share, Share], Predicate(within)]
 
 
 class MetaWorld:
     """Fifty tasks of a Sawyer arm, one of them per episode: the seed determines which, in turn.
 
-    Success is the first step that Meta-World calls one; an episode ends with it, or after 500 steps. The state is the
-    hand's position and the opening of the gripper, 0…1. The truth, where object and goal are, is for training and for
-    the expert only.
+    Success is the first step that Meta-World calls one; an episode ends with it, or when its steps are used up. The
+    state is the hand's position and the opening of the gripper, 0…1. The truth, where object and goal are, is for
+    training and for the expert only.
     """
 
     def __init__(
@@ -37,7 +48,9 @@ class MetaWorld:
         renderer: Rendering,
         image_size: ImageSize,
         cameras: Names,
+        window: Window | None,
         shadows: Natural,
+        steps: Annotated[int, Ge(1), Le(MOST_STEPS)],
         scenes: Count,
     ) -> None:
         """Compile nothing yet.
@@ -49,7 +62,10 @@ class MetaWorld:
             renderer: renderer of the images.
             image_size: height and width of every camera's images [px].
             cameras: names of cameras, such as "corner2", which is moved and turned as LeRobot does.
+            window: top, left, bottom and right of LeRobot's picture that "corner2" shows, as shares of its height and
+                width; None: all of it.
             shadows: edge of the shadow map [texels]; 0: no shadows.
+            steps: largest number of steps of an episode.
             scenes: largest number of compiled tasks that are kept, each with some 70 MB.
 
         Raises:
@@ -74,8 +90,8 @@ class MetaWorld:
             control_hz=CONTROL_HZ,
             truth=(("object", 3), ("goal", 3)),
         )
-        self._sentences, self._most = sentences, scenes
-        self._drawing = renderer, self.spec.cameras, self.spec.image_size, shadows
+        self._sentences, self._steps, self._most = sentences, steps, scenes
+        self._drawing = renderer, self.spec.cameras, self.spec.image_size, window, shadows
         self._scenes: dict[str, Scene] = {}
         self._blind = False
         self.done, self.outcome, self.task = True, "timeout", ""
@@ -88,7 +104,7 @@ class MetaWorld:
 
     def reset(self, seed: int) -> Observation:
         """Start the episode of `seed`."""
-        self.task, self.done, self.outcome = self.task_of(seed), False, "timeout"
+        self.task, self.done, self.outcome, self._taken = self.task_of(seed), False, "timeout", 0
         self._scene = self._scene_of(self.task)
         observation = self._scene.reset(seed)
         places = {"object": observation[OBJECT], "goal": observation[GOAL]}
@@ -99,9 +115,10 @@ class MetaWorld:
         """Apply one (4,) action, clipped to the spec's bounds, for one control period."""
         if self.done:
             raise ValueError("the episode is over; call reset(seed) before step(action)")
-        observation, solved, late = self._scene.step(_command(np.clip(action, self.spec.low, self.spec.high)))
+        observation, solved = self._scene.step(_command(np.clip(action, self.spec.low, self.spec.high)))
         self.outcome = "success" if solved else "timeout"
-        self.done = solved or late
+        self._taken += 1
+        self.done = solved or self._taken == self._steps
         return self._look(observation)
 
     @contextmanager

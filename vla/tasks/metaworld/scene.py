@@ -20,13 +20,20 @@ class Scene:
     """Simulator of a task with the cameras as LeRobot has them; its renderer is made with the first picture."""
 
     def __init__(
-        self, task: str, renderer: Rendering, cameras: Sequence[str], image_size: tuple[int, int], shadows: int
+        self,
+        task: str,
+        renderer: Rendering,
+        cameras: Sequence[str],
+        image_size: tuple[int, int],
+        window: Sequence[float] | None,
+        shadows: int,
     ) -> None:
         """Args:
         task: name of the task.
         renderer: renderer of the pictures.
         cameras: names in the model.
         image_size: height and width of the pictures [px].
+        window: top, left, bottom and right of what LeRobot's camera shows, as shares of its picture; None: all.
         shadows: edge of the shadow map [texels]; 0: no shadows.
 
         Raises:
@@ -42,6 +49,8 @@ class Scene:
         turned = np.empty(4)
         mujoco.mju_mulQuat(turned, model.cam_quat[camera].copy(), HALF_TURN)
         model.cam_quat[camera] = turned
+        if window is not None:
+            _show_window(model, camera, *window)
         model.vis.quality.shadowsize = shadows
         model.mat_reflectance[:] = 0  # the renderers leave reflections out
         self._view = View([known.index(name) for name in cameras], *image_size, site_groups=(0, 1, 2))
@@ -59,13 +68,13 @@ class Scene:
         self._changed = True
         return observation
 
-    def step(self, command: Array) -> tuple[Array, bool, bool]:
+    def step(self, command: Array) -> tuple[Array, bool]:
         """Apply a command (4,) of -1…1, displacement [cm] and effort that closes the gripper, for one control period.
 
-        Returns the observation (39,), and whether the task is solved and the time is up.
+        Returns the observation (39,), and whether the task is solved.
         """
-        observation, _, _, late, info = self.simulator.step(command)
-        return observation, bool(info["success"]), bool(late)
+        observation, _, _, _, info = self.simulator.step(command)
+        return observation, bool(info["success"])
 
     def pictures(self) -> Array:
         """Draw every camera's picture (cameras, H, W, 3) uint8."""
@@ -83,3 +92,11 @@ class Scene:
             self._renderer.close()
             self._renderer = None
         self.simulator.close()
+
+
+def _show_window(model: mujoco.MjModel, camera: int, top: float, left: float, bottom: float, right: float) -> None:
+    """Make a camera show a window of its square picture; numbers are shares of the picture, from its upper left."""
+    half = np.tan(np.radians(model.cam_fovy[camera] / 2))  # of the whole picture, at a distance of one
+    across, down = half * (2 * np.array([left, right]) - 1), half * (2 * np.array([top, bottom]) - 1)
+    model.cam_sensorsize[camera] = across[1] - across[0], down[1] - down[0]
+    model.cam_intrinsic[camera] = 1, 1, across.mean(), down.mean()  # focal lengths, principal point
