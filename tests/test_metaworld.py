@@ -202,7 +202,7 @@ def test_without_the_package_a_sentence_says_how_to_install_it(monkeypatch: pyte
 
 
 def test_disturbed_demonstrations_are_clean_labels_in_equal_shares(tmp_path: Path) -> None:
-    overrides = ("task.tasks=[button-press,drawer-close]", "task.image_size=[16,16]", "expert=metaworld_disturbed")
+    overrides = ("task.tasks=[handle-press,coffee-button]", "task.image_size=[16,16]", "expert=metaworld_disturbed")
 
     def gathered(folder: Path, scenes: int) -> EpisodeStore:
         asked = experiment(*overrides, f"task.scenes={scenes}")
@@ -214,7 +214,7 @@ def test_disturbed_demonstrations_are_clean_labels_in_equal_shares(tmp_path: Pat
         return store
 
     store = gathered(tmp_path / "one", 1)
-    assert [entry.task for entry in store.episodes] == ["button-press", "drawer-close"] * 2
+    assert [entry.task for entry in store.episodes] == ["handle-press", "coffee-button"] * 2
     rows = store.read(store.episodes[0])
     assert rows["truth"].shape[1] == 6 and rows["state"].shape[1] == 4
     assert (np.abs(rows["action"] - rows["executed"]).max(axis=1) > 1e-3).any()
