@@ -66,7 +66,7 @@ class MetaWorld:
                 width; None: all of it.
             shadows: edge of the shadow map [texels]; 0: no shadows.
             steps: largest number of steps of an episode.
-            scenes: largest number of compiled tasks that are kept, each with some 70 MB.
+            scenes: largest number of compiled tasks that are kept, each with some 80 MB.
 
         Raises:
             ValueError: `metaworld` is not installed, or a task is unknown or has no sentence.
