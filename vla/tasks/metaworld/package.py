@@ -13,8 +13,8 @@ from typing import Any
 import mujoco
 
 VERSION = "-v3"
-# Where a weld holds a body: anchor (3), relative position (3) and quaternion (4), torque scale. The model has further
-# numbers from MuJoCo 3.5 on, which upstream's row of eleven does not fit.
+# Where a weld holds a body: anchor (3), relative position (3) and quaternion (4), torque scale. A current MuJoCo has a
+# twelfth number, which upstream's row of eleven does not fit.
 WELD = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, -1.0, 0.0, 0.0, 0.0, 5.0)
 
 
