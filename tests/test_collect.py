@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections import Counter
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +18,8 @@ import toy
 from collecting import EPISODES, TRIED, content, lines
 
 from vla.data.episodes import EpisodeStore
+from vla.data.index import NOT_NEEDED
+from vla.data.verification import verify_store
 from vla.parallel.pool import LocalCluster
 from vla.rollouts.collect import (
     COLLECTION_TIME,
@@ -102,6 +105,34 @@ def test_a_larger_count_adds_only_what_is_missing(tmp_path: Path, whole: Path) -
     assert content(tmp_path) == content(whole)
     assert gather(tmp_path, episodes=5).added == 0
     assert content(tmp_path) == content(whole)
+
+
+def in_turn(folder: Path, episodes: int, workers: int = 1) -> Summary:
+    store = EpisodeStore.create_or_open(folder, toy.SPEC, {})
+    makers = toy.make_in_turn, toy.make_expert
+    return collect(store, *makers, episodes, LocalCluster(workers), 0, toy.make_in_turn())
+
+
+def test_tasks_that_the_seed_tells_get_equal_shares_at_any_time(tmp_path: Path) -> None:
+    summary = in_turn(tmp_path, 24)
+    store = EpisodeStore(tmp_path)
+    for rounds in range(1, 9):
+        assert Counter(entry.task for entry in store.episodes[: 3 * rounds]) == dict.fromkeys("abc", rounds)
+    assert [entry.seed for entry in store.tried] == list(range(len(store.tried)))
+    passed = [entry.task for entry in store.tried if entry.outcome == NOT_NEEDED]
+    assert passed and "b" not in passed
+    # Of seeds that were passed over, nothing is known: neither the expert's success nor its failures count them.
+    assert summary.tried == len(store.tried) - len(passed) and {*summary.failures} == {"timeout"}
+    assert summary.tasks["a"][0] == summary.tasks["b"][0] == 8 < summary.tasks["b"][1]
+    assert verify_store(store).success_rate == summary.success_rate == 24 / summary.tried
+
+
+def test_shares_depend_neither_on_workers_nor_on_interruptions(tmp_path: Path) -> None:
+    in_turn(tmp_path / "whole", 20)
+    in_turn(tmp_path / "parallel", 20, workers=2)
+    for episodes in (2, 7, 20):
+        in_turn(tmp_path / "grown", episodes)
+    assert content(tmp_path / "parallel") == content(tmp_path / "grown") == content(tmp_path / "whole")
 
 
 def test_how_long_it_took_is_added_up_and_shared_out_among_the_episodes(tmp_path: Path) -> None:

@@ -6,6 +6,7 @@ import os
 from functools import partial
 from pathlib import Path
 
+import numpy as np
 import pytest
 import toy_recordable as toy
 from rerun.chunk import RrdReader
@@ -13,6 +14,7 @@ from rerun.chunk import RrdReader
 from vla.parallel.pool import LocalCluster
 from vla.reports.evaluation import summary
 from vla.rollouts.evaluate import FIRST_SEED, Report, Result, evaluate, keep_recordings
+from vla.rollouts.statistics import wilson_interval
 from vla.spec import Environment
 
 SEEDS = range(FIRST_SEED, FIRST_SEED + 10)
@@ -43,6 +45,26 @@ def test_several_tasks_are_told_apart() -> None:
     assert summary(report)["tasks"] == {task: summary(report.tasks[task]) for task in ("lift", "push")}
     alone = Report(tuple(push))
     assert "push" not in str(alone) and summary(alone)["tasks"] == {}
+
+
+def test_tiers_weigh_the_same_whatever_the_number_of_their_tasks() -> None:
+    tiers = {"easy": ["reach", "push"], "very_hard": ["stack"], "unseen": ["fold"]}
+    asked = [("reach", 10), ("push", 8), ("stack", 2)]
+    results = [
+        Result(FIRST_SEED, "success" if n < won else "lost", task=task) for task, won in asked for n in range(10)
+    ]
+    report = Report(tuple(results), tiers)
+    *_, easy, hard, mean, success = str(report).splitlines()
+    assert easy.startswith("easy 18/20 (90.0 %, ") and hard.startswith("very hard 2/10 (20.0 %, ")
+    assert mean.startswith("mean over tiers 55.0 % (95 % CI ") and success.startswith("success 20/30 (66.7 %, ")
+    # Which task it is explains part of the outcomes: an interval for fixed tasks is narrower than Wilson's.
+    low, high = report.interval
+    assert low < report.success < high and high - low < 0.9 * np.diff(wilson_interval(20, 30))
+    told = summary(report)
+    assert told["mean_over_tiers"]["rate"] == pytest.approx(0.55)
+    assert {tier: part["success"] for tier, part in told["tiers"].items()} == {"easy": 0.9, "very_hard": 0.2}
+    assert told["tiers"]["easy"]["tasks"]["push"] == told["tasks"]["push"] == summary(report.tasks["push"])
+    assert "mean over tiers" not in str(Report(tuple(results[:20]), tiers))
 
 
 def test_milestones_have_a_rate_of_their_own() -> None:

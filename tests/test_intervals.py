@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from vla.rollouts.statistics import pooled_interval, wilson_interval
+from vla.rollouts.statistics import pooled_interval, stratified_interval, wilson_interval
 
 Trainings = list[dict[int, bool]]
 
@@ -60,3 +60,34 @@ def test_it_covers_what_other_trainings_would_do_on_other_scenes(
         for name, (low, high) in intervals.items():
             covered[name] += low <= truth <= high
     assert covered["pooled"] > promised * 400 > without * 400 > covered["independent"]
+
+
+def test_one_stratum_is_wilsons_interval_and_none_tells_nothing() -> None:
+    # Half a success and half a failure more change the variance a little.
+    assert stratified_interval([(80, 100, 1.0)]) == pytest.approx((0.8, *wilson_interval(80, 100)), abs=2e-3)
+    assert stratified_interval([]) == (0, 0, 1)
+
+
+def test_what_differs_between_strata_is_not_chance() -> None:
+    apart, alike = [(10, 10, 0.5), (0, 10, 0.5)], [(5, 10, 0.5), (5, 10, 0.5)]
+    assert stratified_interval(apart)[0] == stratified_interval(alike)[0] == 0.5
+    wide, narrow = np.diff(stratified_interval(alike)[1:]), np.diff(stratified_interval(apart)[1:])
+    assert 0 < narrow < wide < np.diff(wilson_interval(10, 20)) * 1.1
+
+
+def test_without_a_failure_it_is_as_wide_as_that_of_one_task() -> None:
+    assert stratified_interval([(10, 10, 0.02)] * 50) == pytest.approx((1, *wilson_interval(500, 500)))
+
+
+@pytest.mark.parametrize("rates", [(0.95, 0.4, 0.3, 0.4), (1.0, 0.98, 0.9, 0.95), (0.3, 0.02, 0.0, 0.05)])
+def test_it_covers_the_mean_over_tiers_of_fixed_tasks(rates: tuple[float, ...]) -> None:
+    random, sizes, episodes = np.random.default_rng(0), (28, 11, 6, 5), 10
+    spread = [np.clip(rate + random.normal(0, 0.1, size), 0, 1) for rate, size in zip(rates, sizes, strict=True)]
+    truth, true = np.mean([tier.mean() for tier in spread]), np.concatenate(spread)
+    weights = np.concatenate([np.full(size, 1 / (4 * size)) for size in sizes])
+    covered = 0
+    for _ in range(1000):
+        won = random.binomial(episodes, true)
+        _, low, high = stratified_interval([(int(k), episodes, w) for k, w in zip(won, weights, strict=True)])
+        covered += low <= truth <= high
+    assert covered / 1000 > 0.935

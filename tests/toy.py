@@ -130,6 +130,24 @@ class ToyEnvironment:
         )
 
 
+class ToyInTurn(ToyEnvironment):
+    """The same with three tasks that the seeds take in turn; "b" fails more often than the others."""
+
+    tasks: tuple[str, ...] = ("a", "b", "c")
+
+    def task_of(self, seed: int) -> str:
+        """The task of a seed."""
+        return self.tasks[seed % 3]
+
+    def reset(self, seed: int) -> Observation:
+        """Draw a point and a target."""
+        observation = super().reset(seed)
+        self.task = self.task_of(seed)
+        if self.task == "b" and seed % 2:
+            self._seed = 3  # which fails
+        return observation
+
+
 class ToyExpert:
     """Walks to the target with a little noise; what it means to do is in `info["clean"]`."""
 
@@ -159,6 +177,11 @@ def make_environment() -> ToyEnvironment:
 def make_arm() -> ToyEnvironment:
     """The same with a robot and depth."""
     return ToyEnvironment(spec=ARM_SPEC)
+
+
+def make_in_turn() -> ToyInTurn:
+    """A world whose seeds take tasks in turn."""
+    return ToyInTurn()
 
 
 def make_expert(environment: Environment) -> ToyExpert:

@@ -264,6 +264,17 @@ class Environment(Protocol):
 
 
 @runtime_checkable
+class Multitask(Protocol):
+    """Environment that tells the task of a seed before its episode: collection gives every task as many episodes."""
+
+    tasks: tuple[str, ...]
+
+    def task_of(self, seed: int) -> str:
+        """Return the task of the episode of `seed`, one of `tasks`, each of which returns within a few seeds."""
+        ...
+
+
+@runtime_checkable
 class Drawable(Protocol):
     """Environment that a recorder can draw in three dimensions."""
 

@@ -20,6 +20,7 @@ REMEDY = "copy the folder again from where it is whole, or delete it and collect
 SALVAGE = f"keep what is whole with job=inspect inspect.repair=true, {REMEDY}"
 DAMAGED = "damaged"  # outcome of a seed whose episode a repair could not save
 LOST = "lost"  # outcome of a seed whose index line is unreadable
+NOT_NEEDED = "not_needed"  # outcome of a seed that was passed over, because its task had its share of episodes
 CHECK = b', "check": '  # precedes the CRC-32 of the line without it, at the end of every line
 LARGEST = 4 << 30  # [bytes], millions of seeds
 LISTED = 8  # largest number of numbers in a message

@@ -19,7 +19,7 @@ from rich.progress import track
 
 from vla.data.episode_filter import EpisodeFilter
 from vla.data.episodes import EpisodeStore, observations_of, stored
-from vla.data.index import DAMAGED, LOST, Entry, listed
+from vla.data.index import DAMAGED, LOST, NOT_NEEDED, Entry, listed
 from vla.spec import Array, Episode
 
 # N steps, D action components
@@ -49,7 +49,8 @@ class StoreReport:
     @property
     def outcomes(self) -> dict[str, int]:
         """Outcome → number of tried seeds, the most frequent first."""
-        failures = Counter(entry.outcome for entry in self.store.tried if not entry.success and entry.outcome != LOST)
+        failed = [entry.outcome for entry in self.store.tried if not entry.success]
+        failures = Counter(outcome for outcome in failed if outcome not in (LOST, NOT_NEEDED))
         failures[DAMAGED] += sum(map(len, self.damaged.values()))
         return {"success": len(self.whole), **{cause: count for cause, count in failures.most_common() if count}}
 

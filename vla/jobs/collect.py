@@ -11,7 +11,7 @@ from vla.config.experiment import Experiment
 from vla.data.episodes import EpisodeStore
 from vla.data.formats.imported_demonstrations import ImportedDemonstrations
 from vla.rollouts.collect import collect
-from vla.spec import FIRST_SEED, Spec
+from vla.spec import FIRST_SEED, Environment, Multitask, Spec
 
 log = logging.getLogger(__name__)
 
@@ -43,7 +43,7 @@ def demonstrations(experiment: Experiment) -> EpisodeStore:
 def demonstration_spec(experiment: Experiment) -> Spec:
     """Return the spec of the demonstrations; a complete store contains it, otherwise the simulator is built."""
     store = complete_store(experiment)
-    return store.spec if store else _source(experiment)[0]
+    return store.spec if store else _source(experiment)[1]
 
 
 def complete_store(experiment: Experiment) -> EpisodeStore | None:
@@ -60,24 +60,27 @@ def complete_store(experiment: Experiment) -> EpisodeStore | None:
     return store if len(store.episodes) >= asked["episodes"] else None
 
 
-def _source(experiment: Experiment) -> tuple[Spec, ImportedDemonstrations | None]:
-    """Return the spec of the demonstrations, and the recordings to import, or None for an acting expert."""
+def _source(experiment: Experiment) -> tuple[Environment, Spec, ImportedDemonstrations | None]:
+    """Return the environment, closed, the spec of the demonstrations, and the recordings to import, or None for an
+    acting expert."""
     environment = experiment.make_environment()()
     environment.close()
     expert = build(experiment["expert"], "expert", spec=environment.spec)
-    return (expert.spec, expert) if isinstance(expert, ImportedDemonstrations) else (environment.spec, None)
+    recorded = expert if isinstance(expert, ImportedDemonstrations) else None
+    return environment, recorded.spec if recorded else environment.spec, recorded
 
 
 def _fill(experiment: Experiment) -> EpisodeStore:
     asked, cluster = experiment["collect"], experiment.cluster()
-    spec, recorded = _source(experiment)
+    environment, spec, recorded = _source(experiment)
     store = EpisodeStore.create_or_open(Path(asked["folder"]), spec, experiment.source)
     if recorded is not None:
         added = recorded.fill(store, asked["episodes"])
         log.info("%s: %d recorded episodes, %d of them new", store.folder, len(store.episodes), added)
         return store
     makers = experiment.make_environment(), experiment.make_expert()
-    summary = collect(store, *makers, asked["episodes"], cluster, asked["seed"])
+    multitask = environment if isinstance(environment, Multitask) else None
+    summary = collect(store, *makers, asked["episodes"], cluster, asked["seed"], multitask)
     if len(summary.tasks) > 1:
         for task, (solved, tried) in summary.tasks.items():
             log.info("%s: %d episodes of %d seeds", task, solved, tried)

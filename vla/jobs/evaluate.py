@@ -89,7 +89,8 @@ def _play(experiment: Experiment, checkpoint: Path | None) -> dict[str, Report]:
             continue
         watching = None if reports else recorder
         make_environment = experiment.make_environment(changes)
-        reports[name] = evaluate(make_environment, make_agent, watching, seeds, cluster, name, needs)
+        tiers = task.get("tiers")  # of worlds that have them
+        reports[name] = evaluate(make_environment, make_agent, watching, seeds, cluster, name, needs, tiers)
     return reports
 
 

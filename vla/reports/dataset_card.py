@@ -16,7 +16,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from vla.data.draws import flat
-from vla.data.index import Entry, listed
+from vla.data.index import NOT_NEEDED, Entry, listed
 from vla.data.verification import StoreReport, entries_by_config, episode_of
 from vla.io.files import write_text
 from vla.reports.evaluation import contact_sheet, spans
@@ -36,9 +36,9 @@ def store_table(findings: StoreReport) -> Table:
     """Describe a store in a table for the terminal."""
     store, spec = findings.store, findings.store.spec
     lengths = [entry.steps for entry in findings.whole] or [0]
-    seeds = listed([entry.seed for entry in store.tried])
+    tried = [entry.seed for entry in store.tried if entry.outcome != NOT_NEEDED]
     table = Table(title=escape(str(store.folder)), show_header=False)
-    table.add_row("episodes", f"{len(findings.whole)} intact, of {len(store.tried)} seeds tried: {seeds}")
+    table.add_row("episodes", f"{len(findings.whole)} intact, of {len(tried)} seeds tried: {listed(tried)}")
     table.add_row("steps", f"{sum(lengths)}, from {min(lengths)} to {max(lengths)} in an episode")
     table.add_row("time", _time(findings))
     if not store.derived:  # meaningless for selected episodes

@@ -63,9 +63,14 @@ def write_report(
 
 
 def summary(report: Report) -> dict[str, Any]:
-    """Summarise a report for JSON: rate, interval, outcomes, milestones, and the same per task if there are several."""
+    """Summarise a report for JSON: rate, interval, outcomes, milestones, and the same per task if there are several.
+
+    With tiers also the same per tier, and the mean over tiers.
+    """
     low, high = report.interval
-    tasks = report.tasks if len(report.tasks) > 1 else {}
+    tasks = report.tasks if len(report.tasks) > 1 or report.tiers else {}
+    tiers = report.by_tier if len(report.tiers) > 1 else {}
+    mean = report.mean_over_tiers
     return {
         "success": report.success,
         "ci_low": low,
@@ -76,6 +81,8 @@ def summary(report: Report) -> dict[str, Any]:
         "taxonomy": report.taxonomy,
         "milestones": {name: _milestone(count, report.episodes) for name, count in report.milestones.items()},
         "tasks": {task: summary(part) for task, part in tasks.items()},
+        **({"tiers": {tier: summary(part) for tier, part in tiers.items()}} if tiers else {}),
+        **({"mean_over_tiers": dict(zip(("rate", "ci_low", "ci_high"), mean, strict=True))} if mean else {}),
     }
 
 

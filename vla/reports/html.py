@@ -181,16 +181,23 @@ def _facts(run: Run) -> dict[str, str]:
 def _rate_tables(run: Run) -> dict[str, dict[str, tuple[Interval, str, str]]]:
     """Return table → name → (rate, count, p-value against the first condition) of a run's page."""
     if run.report is None:
-        return {"condition": {}, "task": {}, "milestone": {}}
+        return {"condition": {}, "tier": {}, "task": {}, "milestone": {}}
     first = next(iter(run.reports.values()))
+    mean = first.mean_over_tiers
     return {
         "condition": {
             name: (
-                (report.success, *report.interval),
+                _interval(report),
                 f"{report.successes}/{report.episodes}",
                 "" if report is first else f"{first.p_value(report):.2g}",
             )
             for name, report in run.reports.items()
+        },
+        "tier": {
+            **{
+                name: (_interval(part), f"{part.successes}/{part.episodes}", "") for name, part in first.by_tier.items()
+            },
+            **({"mean over tiers": (mean, "", "")} if mean else {}),
         },
         "task": {
             name: ((part.success, part.ci_low, part.ci_high), f"{part.successes}/{part.episodes}", "")
@@ -201,6 +208,10 @@ def _rate_tables(run: Run) -> dict[str, dict[str, tuple[Interval, str, str]]]:
             for name, part in run.report.milestones.items()
         },
     }
+
+
+def _interval(report: Report) -> Interval:
+    return report.success, *report.interval
 
 
 def _costs(run: Run) -> list[str]:

@@ -1,6 +1,8 @@
 """Collection of expert episodes into a store: parallel, verified, independent of the number of workers.
 
-Seeds are tried and committed in order, until the store holds the requested number of successes.
+Seeds are tried and committed in order, until the store holds the requested number of successes. Where the environment
+tells the task of a seed beforehand, tasks advance together: a seed is passed over while its task is ahead of another.
+The first n episodes per task are then the same however many are collected.
 """
 
 from __future__ import annotations
@@ -8,24 +10,25 @@ from __future__ import annotations
 import logging
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Annotated, cast
 
+import numpy as np
 from annotated_types import Ge, Le
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from vla.data.episodes import EpisodeStore
-from vla.data.index import DAMAGED
+from vla.data.index import DAMAGED, NOT_NEEDED
 from vla.io.documents import read_json
 from vla.io.files import write_text
 from vla.parallel.pool import Cluster, Future, Pool, WorkersLost
 from vla.parallel.processes import WorkerFactory
 from vla.rollouts.rollout import replay, rollout
-from vla.spec import FIRST_SEED, Agent, Environment, Episode
+from vla.spec import FIRST_SEED, Agent, Environment, Episode, Multitask
 
 log = logging.getLogger(__name__)
 
@@ -63,11 +66,12 @@ def collect(
     episodes: int,
     cluster: Cluster,
     seed: int,
+    multitask: Multitask | None = None,
 ) -> Summary:
     """Roll the expert out on `seed`, `seed` + 1, … until the store holds `episodes` successes.
 
     Existing episodes are kept. If another process is collecting into the same store, wait for it. Each process of
-    `cluster` calls the two factories once.
+    `cluster` calls the two factories once. `multitask` tells the task of a seed; its tasks get equal shares.
 
     Raises:
         ValueError: the store starts at another seed or is derived, the expert fails persistently, workers died, or the
@@ -85,13 +89,12 @@ def collect(
             if before < episodes:
                 began = time.monotonic()  # excludes the wait for another process
                 try:
-                    _fill_with(
-                        cluster, partial(DemonstrationWorker, make_environment, make_expert), store, episodes, seed
-                    )
+                    make = partial(DemonstrationWorker, make_environment, make_expert)
+                    _fill_with(cluster, make, store, episodes, seed, multitask)
                 finally:
                     _save_collection_time(store.folder, time.monotonic() - began)
     stored = len(store.episodes)
-    tried = [entry for entry in store.tried if entry.outcome != DAMAGED]
+    tried = [entry for entry in store.tried if entry.outcome not in (DAMAGED, NOT_NEEDED)]
     failures = Counter(entry.outcome for entry in tried if not entry.success)
     solved, asked = (Counter(entry.task for entry in entries) for entries in (store.episodes, tried))
     tasks = {task: (solved[task], asked[task]) for task in sorted(asked)}
@@ -131,37 +134,88 @@ def _require_first_seed(store: EpisodeStore, seed: int) -> None:
         raise ValueError(f"{store.folder} starts at seed {first}, not {seed}: set collect.seed={first}")
 
 
-def _fill_with(cluster: Cluster, make: WorkerFactory, store: EpisodeStore, episodes: int, seed: int) -> None:
+def _fill_with(
+    cluster: Cluster, make: WorkerFactory, store: EpisodeStore, episodes: int, seed: int, multitask: Multitask | None
+) -> None:
     """Fill the store, restarting workers that died: in long collections processes occasionally crash outside Python."""
     while True:
         tried = len(store.tried)
         try:
             with cluster.pool(make) as pool:
-                return _fill(store, pool, episodes, seed)
+                return _fill(store, pool, episodes, seed, multitask)
         except WorkersLost as lost:
             if len(store.tried) == tried:
                 raise WorkersLost(f"{lost}; committed episodes are safe, run again to continue") from lost
             log.warning("workers were lost after %d episodes; continuing with new ones", len(store.episodes))
 
 
-def _fill(store: EpisodeStore, pool: Pool, episodes: int, seed: int) -> None:
+class Attempts:
+    """Episodes of the seeds in order, rolled out in advance where their tasks will need them if all before succeed."""
+
+    def __init__(self, pool: Pool, multitask: Multitask | None, store: EpisodeStore, first: int) -> None:
+        """Args:
+        pool: of `DemonstrationWorker`s.
+        multitask: what tells the task of a seed, or None if all seeds are needed.
+        store: of the episodes so far.
+        first: seed of an empty store.
+        """
+        self._pool = pool
+        self._task_of = multitask.task_of if multitask else lambda seed: ""
+        self._solved = dict.fromkeys(multitask.tasks if multitask else [""], 0)
+        for entry in store.episodes:
+            self._solved[self._task_of(entry.seed)] += 1
+        self._next = first if store.next_seed is None else store.next_seed
+        self._pending: deque[tuple[int, Future | None]] = deque()
+
+    def next(self, most: int) -> Episode:
+        """Return the episode of the next seed, while at most `most` others are rolled out.
+
+        Its outcome is `NOT_NEEDED` if its task is ahead of another one.
+        """
+        self._advance(most)
+        seed, future = self._pending.popleft()
+        if not self._needed(seed, self._solved):
+            none = np.empty((0, 0), np.float32)
+            return Episode(seed, self._task_of(seed), "", NOT_NEEDED, frozenset(), {}, [], none, none)
+        episode: Episode = (future or self._pool.submit(seed)).result()
+        self._solved[self._task_of(seed)] += episode.success
+        return episode
+
+    def _advance(self, most: int) -> None:
+        going = [seed for seed, future in self._pending if future is not None]
+        expected = dict(self._solved)
+        for seed in going:
+            expected[self._task_of(seed)] += 1
+        missing = most - len(going)
+        while missing > 0:
+            if self._next >= FIRST_SEED:
+                raise ValueError(f"seeds from {FIRST_SEED} on are kept for evaluation: lower collect.seed")
+            needed = self._needed(self._next, expected)
+            self._pending.append((self._next, self._pool.submit(self._next) if needed else None))
+            expected[self._task_of(self._next)] += needed
+            missing -= needed
+            self._next += 1
+
+    def _needed(self, seed: int, solved: Mapping[str, int]) -> bool:
+        return solved[self._task_of(seed)] == min(solved.values())
+
+
+def _fill(store: EpisodeStore, pool: Pool, episodes: int, seed: int, multitask: Multitask | None) -> None:
     stored = before = len(store.episodes)
-    next_seed = seed if store.next_seed is None else store.next_seed
-    damaged = sum(entry.outcome == DAMAGED for entry in store.tried)
+    attempts = Attempts(pool, multitask, store, seed)
+    tried = sum(entry.outcome not in (DAMAGED, NOT_NEEDED) for entry in store.tried)
     in_a_row: dict[str, list[str]] = {}  # task → outcomes of the failures since its last success
     started = time.monotonic()
-    pending: deque[Future] = deque()
     columns = (TextColumn("collecting"), BarColumn(), MofNCompleteColumn(), TextColumn("{task.description}"))
     with Progress(*columns, TimeRemainingColumn()) as progress:
         task = progress.add_task("", total=episodes, completed=stored)
         while stored < episodes:
             # No more pending than missing: without failures no episode is wasted.
-            while len(pending) < min(LOOK_AHEAD * pool.size, episodes - stored):
-                if next_seed >= FIRST_SEED:
-                    raise ValueError(f"seeds from {FIRST_SEED} on are kept for evaluation: lower collect.seed")
-                pending.append(pool.submit(next_seed))
-                next_seed += 1
-            episode: Episode = pending.popleft().result()
+            episode = attempts.next(min(LOOK_AHEAD * pool.size, episodes - stored))
+            if episode.outcome == NOT_NEEDED:
+                store.fail(episode)
+                continue
+            tried += 1
             if episode.success:
                 store.append(episode)
                 stored += 1
@@ -172,8 +226,7 @@ def _fill(store: EpisodeStore, pool: Pool, episodes: int, seed: int) -> None:
                 failed.append(episode.outcome)
                 _give_up_after(episode.task, failed)
             speed = (stored - before) / (time.monotonic() - started)
-            note = f"{speed:.1f} episodes/s, expert {stored / (len(store.tried) - damaged):.0%}"
-            progress.update(task, completed=stored, description=note)
+            progress.update(task, completed=stored, description=f"{speed:.1f} episodes/s, expert {stored / tried:.0%}")
 
 
 def _give_up_after(task: str, failures: Sequence[str]) -> None:

@@ -9,7 +9,7 @@ import json
 import logging
 import traceback
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import partial
@@ -20,7 +20,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from vla.parallel.pool import THIS_PROCESS, Cluster, Crashed
 from vla.rollouts.rollout import rollout
-from vla.rollouts.statistics import mcnemar, wilson_interval
+from vla.rollouts.statistics import mcnemar, stratified_interval, wilson_interval
 from vla.spec import FIRST_SEED, Agent, Environment, Episode, Recorder
 
 log = logging.getLogger(__name__)
@@ -55,6 +55,7 @@ class Report:
     """
 
     results: tuple[Result, ...]
+    tiers: Mapping[str, Sequence[str]] = field(default_factory=dict)  # tier of a benchmark → its tasks
 
     @property
     def errors(self) -> list[Result]:
@@ -78,8 +79,15 @@ class Report:
 
     @property
     def interval(self) -> tuple[float, float]:
-        """95 % confidence interval of `success`."""
-        return wilson_interval(self.successes, self.episodes)
+        """95 % confidence interval of `success`; with tiers, the tasks are fixed strata."""
+        if not self.tiers:
+            return wilson_interval(self.successes, self.episodes)
+        played = [part for part in self.tasks.values() if part.episodes]
+        return stratified_interval([part._share_of(self.episodes) for part in played])[1:]
+
+    def _share_of(self, episodes: float) -> tuple[int, int, float]:
+        """Return successes, completed episodes, and their share of `episodes`."""
+        return self.successes, self.episodes, self.episodes / episodes
 
     @property
     def milestones(self) -> dict[str, int]:
@@ -97,6 +105,30 @@ class Report:
         names = sorted({result.task for result in self.results if result.task})
         return {name: Report(tuple(result for result in self.results if result.task == name)) for name in names}
 
+    @property
+    def by_tier(self) -> dict[str, Report]:
+        """Tier → report of its episodes; without tiers of which no episode was completed."""
+        parts = {
+            tier: Report(tuple(result for result in self.results if result.task in tasks), {tier: tasks})
+            for tier, tasks in self.tiers.items()
+        }
+        return {tier: part for tier, part in parts.items() if part.episodes}
+
+    @property
+    def mean_over_tiers(self) -> tuple[float, float, float] | None:
+        """Mean of the tiers' success rates, 0…1, with its 95 % confidence interval; None with fewer than two tiers."""
+        tiers = list(self.by_tier.values())
+        if len(tiers) < 2:
+            return None
+        return stratified_interval(
+            [
+                part._share_of(len(tiers) * tier.episodes)
+                for tier in tiers
+                for part in tier.tasks.values()
+                if part.episodes
+            ]
+        )
+
     def p_value(self, other: Report) -> float:
         """Return the two-sided exact p-value for equal success on the same seeds, over pairs without an error.
 
@@ -113,21 +145,32 @@ class Report:
         return mcnemar(pairs[True, False], pairs[False, True])
 
     def __str__(self) -> str:
-        """Format failures, errors, milestones, several tasks and, last, the success rate with its interval."""
+        """Format failures, errors, milestones, several tasks, tiers and, last, the success rate with its interval."""
         lines = [f"{outcome} {count}" for outcome, count in self.taxonomy.items() if outcome not in ("success", ERROR)]
         if self.errors:
             first = self.errors[0]
             lines.append(f"errors {len(self.errors)}, the first at seed {first.seed}: {first.error}")
         lines += [f"{name} {_rate(count, self.episodes)}" for name, count in self.milestones.items()]
         if len(self.tasks) > 1:
-            lines += [f"{task} {_rate(report.successes, report.episodes)}" for task, report in self.tasks.items()]
-        return "\n".join([*lines, f"success {_rate(self.successes, self.episodes)}"])
+            lines += [f"{task} {report._rate}" for task, report in self.tasks.items()]
+        lines += [f"{tier.replace('_', ' ')} {report._rate}" for tier, report in self.by_tier.items()]
+        if mean := self.mean_over_tiers:
+            rate, low, high = (f"{100 * value:.1f}" for value in mean)
+            lines.append(f"mean over tiers {rate} % (95 % CI {low}-{high})")
+        return "\n".join([*lines, f"success {self._rate}"])
+
+    @property
+    def _rate(self) -> str:
+        return f"{self.successes}/{self.episodes} ({_percent(self.success, *self.interval)})"
 
 
 def _rate(count: int, episodes: int) -> str:
-    low, high = wilson_interval(count, episodes)
     share = count / episodes if episodes else 0.0
-    return f"{count}/{episodes} ({100 * share:.1f} %, 95 % CI {100 * low:.1f}-{100 * high:.1f})"
+    return f"{count}/{episodes} ({_percent(share, *wilson_interval(count, episodes))})"
+
+
+def _percent(share: float, low: float, high: float) -> str:
+    return f"{100 * share:.1f} %, 95 % CI {100 * low:.1f}-{100 * high:.1f}"
 
 
 def evaluate(
@@ -138,8 +181,9 @@ def evaluate(
     cluster: Cluster = THIS_PROCESS,
     name: str = "evaluating",
     needs: Sequence[Path] = (),
+    tiers: Mapping[str, Sequence[str]] | None = None,
 ) -> Report:
-    """Play the episodes of the seeds; `name` is the label of the progress bar.
+    """Play the episodes of the seeds; `name` is the label of the progress bar, `tiers` are those of the report.
 
     Every process of the `cluster` calls the factories once and accesses the paths `needs`. Errors of a factory end the
     evaluation; errors of an episode, or a crash of its process, are reported in its result.
@@ -164,7 +208,7 @@ def evaluate(
             so_far = Report(tuple(results.values()))
             errors = f", {len(so_far.errors)} errors" if so_far.errors else ""
             bar.update(task, advance=1, note=f"success {100 * so_far.success:.0f} %{errors}")
-    return Report(tuple(results[seed] for seed in seeds))
+    return Report(tuple(results[seed] for seed in seeds), tiers or {})
 
 
 def keep_recordings(report: Report, folder: Path, target: Path, limit: int | None) -> int:

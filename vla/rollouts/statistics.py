@@ -26,6 +26,26 @@ def wilson_interval(successes: float, trials: float) -> tuple[float, float]:
     return low, centre + half_width if successes < trials else 1.0
 
 
+def stratified_interval(strata: Sequence[tuple[int, int, float]]) -> tuple[float, float, float]:
+    """Return the weighted mean of proportions and its 95 % confidence interval; (0, 0, 1) without trials.
+
+    Only chance within a stratum counts: strata, such as the tasks of a benchmark, are fixed. Wilson's interval for as
+    many trials as would give the mean the variance that it has; half a success and half a failure are added to every
+    stratum in estimating that variance, else one without failures would seem certain.
+
+    Args:
+        strata: successes, trials (at least one) and weight of each; the weights sum to 1.
+    """
+    if not strata:
+        return 0.0, 0.0, 1.0
+    won, trials, weights = np.array(strata, float).T
+    smooth = (won + 0.5) / (trials + 1)
+    mean, variance = weights @ smooth, np.square(weights) @ (smooth * (1 - smooth) / trials)
+    alike = float(mean * (1 - mean) / variance)
+    rate = float(weights @ (won / trials))
+    return rate, *wilson_interval(rate * alike, alike)
+
+
 def mcnemar(lost: int, won: int) -> float:
     """Return the two-sided exact p-value for equal success rates, given the numbers of discordant pairs.
 

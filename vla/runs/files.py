@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Annotated, Any
 
 from pydantic import ConfigDict, StringConstraints
@@ -53,6 +53,17 @@ class Milestone:
 
 
 @dataclass(frozen=True)
+class Mean:
+    """Mean of several success rates, with its confidence interval."""
+
+    __pydantic_config__ = STRICT
+
+    rate: Share
+    ci_low: Share
+    ci_high: Share
+
+
+@dataclass(frozen=True, kw_only=True)
 class Summary:
     """Success statistics, written by `vla.reports.evaluation.summary`."""
 
@@ -67,16 +78,18 @@ class Summary:
     taxonomy: dict[str, Natural]
     milestones: dict[str, Milestone]
     tasks: dict[str, Summary]
+    tiers: dict[str, Summary] = field(default_factory=dict)
+    mean_over_tiers: Mean | None = None
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Condition(Summary):
     """Success statistics under another condition, on the same seeds."""
 
     outcomes: list[str]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class ReportFile(Summary):
     """report.json, written by `vla.reports.evaluation.write_report`, without the names of chosen options."""
 

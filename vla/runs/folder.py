@@ -69,7 +69,8 @@ class Run:
             name: Report(tuple(map(Result, self.report.seeds, part.outcomes)))
             for name, part in self.report.conditions.items()
         }
-        return {IN_DISTRIBUTION: Report(tuple(self.report.per_episode)), **others}
+        tiers = {tier: [*part.tasks] for tier, part in self.report.tiers.items()}
+        return {IN_DISTRIBUTION: Report(tuple(self.report.per_episode), tiers), **others}
 
 
 def read_run(folder: Path) -> Run:

@@ -1,0 +1,235 @@
+"""Meta-World: its episodes and experts, its pictures against MuJoCo's and LeRobot's, and the jobs in it."""
+
+from __future__ import annotations
+
+import json
+import re
+import sys
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+import pytest
+from command_line import vla
+from composing import composed
+
+from vla.config.experiment import Experiment
+from vla.data.episodes import EpisodeStore
+from vla.parallel.pool import THIS_PROCESS
+from vla.rollouts.collect import collect
+from vla.rollouts.rollout import rollout
+from vla.spec import Array, Multitask, Observation
+from vla.tasks.metaworld import package
+from vla.tasks.metaworld.environment import MetaWorld
+from vla.tasks.metaworld.expert import Scripted
+
+LEROBOT = (0.75, 0.075, 0.7)  # where it puts the camera corner2 [m]
+
+
+def experiment(*overrides: str) -> Experiment:
+    return Experiment.of(composed("task=metaworld", *overrides))
+
+
+def world(*overrides: str) -> MetaWorld:
+    made = experiment("task.image_size=[96,96]", *overrides).make_environment()()
+    assert isinstance(made, MetaWorld)
+    return made
+
+
+def played(environment: MetaWorld, seed: int, steps: int) -> list[Observation]:
+    """What is seen in the first steps of an episode with random actions."""
+    random = np.random.default_rng(seed)
+    seen = [environment.reset(seed)]
+    for _ in range(steps):
+        seen.append(environment.step(random.uniform(environment.spec.low, environment.spec.high)))
+    return seen
+
+
+def same(one: list[Observation], other: list[Observation]) -> bool:
+    """Whether states, truth and pictures are the same, bit for bit."""
+    return all(
+        np.array_equal(a.state, b.state)
+        and all(np.array_equal(a.rgb[name], b.rgb[name]) for name in a.rgb)
+        and all(np.array_equal((a.truth or {})[name], (b.truth or {})[name]) for name in a.truth or {})
+        for a, b in zip(one, other, strict=True)
+    )
+
+
+def test_a_seed_is_the_same_episode_whatever_came_before() -> None:
+    environment = world("task.tasks=[coffee-push,door-open,stick-pull]")
+    before = [played(environment, seed, 12) for seed in (3, 4, 5)]
+    assert not same(before[0], played(environment, 6, 12))  # the same task at another place
+    assert all(same(before[seed - 3], played(environment, seed, 12)) for seed in (5, 4, 3))
+    assert same(before[1], played(world("task.tasks=[coffee-push,door-open,stick-pull]", "task.scenes=1"), 4, 12))
+    environment.close()
+
+
+def test_states_and_actions_are_those_of_the_spec() -> None:
+    environment = world("task.tasks=[push]")
+    spec = environment.spec
+    assert spec.action == ("dx", "dy", "dz", "gripper") and spec.units == ("m", "m", "m", "1")
+    assert spec.state == ("hand_x", "hand_y", "hand_z", "opening") and spec.control_hz == 80
+    with environment.blind():
+        start = environment.reset(0)
+        for _ in range(15):
+            there = environment.step(np.array([0.01, -0.005, 0.002, -1.0]))
+        assert there.rgb == {} and there.state.shape == (4,) and there.state.dtype == np.float32
+        moved = there.state - start.state
+        np.testing.assert_allclose(moved[:3] / moved[0], [1, -0.5, 0.2], atol=0.1)  # the hand lags behind the command
+        assert start.state[3] - there.state[3] > 0.3  # -1 closes
+        for _ in range(15):
+            there = environment.step(np.array([0, 0, 0, 1.0]))
+        assert there.state[3] > 0.9  # and 1 opens
+    truth = there.truth or {}
+    assert truth["object"].shape == truth["goal"].shape == (3,)
+    assert environment.draws["goal"]["place"] == truth["goal"][:2].tolist()
+
+
+def test_experts_solve_tasks_in_turn_within_the_bounds() -> None:
+    tasks = ("button-press", "pick-place", "assembly", "handle-pull")
+    environment = world(f"task.tasks=[{','.join(tasks)}]")
+    expert = Scripted(spec=environment.spec)
+    with environment.blind():
+        episodes = [rollout(environment, expert, seed) for seed in range(8)]
+    assert [(episode.task, episode.outcome) for episode in episodes] == [(task, "success") for task in tasks * 2]
+    assert isinstance(environment, Multitask) and environment.task_of(7) == "handle-pull"
+    for episode in episodes:
+        assert (np.abs(episode.actions) <= np.array(environment.spec.high, np.float32)).all()
+        assert 20 < len(episode.actions) < 250
+
+
+def test_an_episode_ends_after_its_steps() -> None:
+    environment = world("task.tasks=[assembly]", "task.steps=3")
+    with environment.blind():
+        played(environment, 0, 3)
+        assert environment.done and environment.outcome == "timeout"
+        with pytest.raises(ValueError, match="call reset"):
+            environment.step(np.zeros(4))
+
+
+def test_sentences_are_lerobots_and_can_be_told_apart() -> None:
+    task = experiment()["task"]
+    tasks = package.tasks_of("mt50")
+    assert len(tasks) == 50 and {*task["sentences"]} == {*tasks}
+    shared = [sentence for sentence, count in Counter(task["sentences"].values()).items() if count > 1]
+    assert shared == ["Push the puck to a goal"] == [task["sentences"]["push-back"]]
+    assert {tier: len(names) for tier, names in task["tiers"].items()} == {
+        "easy": 28,
+        "medium": 11,
+        "hard": 6,
+        "very_hard": 5,
+    }
+    assert sorted(name for names in task["tiers"].values() for name in names) == sorted(tasks)
+    environment = world("task.tasks=[push-back]", "task.sentences.push-back='Push the puck back to a goal'")
+    with environment.blind():
+        assert environment.reset(0).instruction == "Push the puck back to a goal"
+    assert world("task.tasks=mt10").tasks == package.tasks_of("mt10") and len(package.tasks_of("mt10")) == 10
+
+
+def test_the_fast_renderer_draws_what_mujocos_does() -> None:
+    tasks = "task.tasks=[basketball,coffee-button]"
+    fast, mujocos = world(tasks), world(tasks, "task/renderer=mujoco")
+    for seed in (0, 1):
+        one, other = (made.reset(seed).rgb["corner2"].astype(int) for made in (fast, mujocos))
+        assert np.abs(one - other).mean() < 4 and one.std() > 30
+    fast.close()
+    mujocos.close()
+
+
+def lerobots_picture(task: str, seed: int) -> tuple[Array, Array]:
+    """Its picture (480, 480, 3) after one step, drawn as it does, and the hand's position then."""
+    classes = package.metaworld().ALL_V3_ENVIRONMENTS
+    simulator = classes[task + package.VERSION](render_mode="rgb_array", camera_name="corner2")
+    simulator._partially_observable, simulator._set_task_called = False, True
+    simulator._freeze_rand_vec, simulator.seeded_rand_vec = False, True
+    simulator.__dict__.pop("sawyer_observation_space", None)
+    simulator.model.cam_pos[2] = LEROBOT
+    simulator.seed(seed)
+    simulator.reset(seed=seed)
+    observation = simulator.step(np.zeros(4, np.float32))[0]
+    picture = np.flip(simulator.render(), (0, 1))
+    simulator.close()
+    return picture, observation[:3]
+
+
+def test_the_camera_and_the_scene_are_lerobots() -> None:
+    picture, hand = lerobots_picture("drawer-open", 7)
+    environment = world("task.tasks=[drawer-open]", "task/renderer=mujoco", "task.image_size=[480,480]")
+    environment.reset(7)
+    ours = environment.step(np.zeros(4))
+    environment.close()
+    np.testing.assert_allclose(ours.state[:3], hand, atol=1e-6)
+    # Shadows and reflections apart, which change how light it is; edges lie where they lie in LeRobot's picture.
+    apart = np.abs(picture.astype(int) - ours.rgb["corner2"]).mean(-1)
+    assert np.median(apart) < 12
+    edges = [np.abs(np.diff(each.mean(-1), axis=0)) for each in (picture, ours.rgb["corner2"])]
+    likeness = np.corrcoef(edges[0].ravel(), edges[1].ravel())[0, 1]
+    turned = np.corrcoef(edges[0].ravel(), edges[1][::-1].ravel())[0, 1]
+    assert likeness > 0.8 > 0.2 > turned
+
+
+def test_a_window_is_a_part_of_the_whole_picture() -> None:
+    whole = world("task.tasks=[soccer]", "task.image_size=[100,100]")
+    part = world("task.tasks=[soccer]", "task.image_size=[60,50]", "task.window=[0.25,0.4,0.85,0.9]")
+    expected = whole.reset(0).rgb["corner2"][25:85, 40:90].astype(int)
+    assert np.abs(part.reset(0).rgb["corner2"] - expected).mean() < 0.1
+    whole.close()
+    part.close()
+
+
+@pytest.mark.parametrize(
+    ("override", "words"),
+    [
+        ("task.tasks=[reach,fly]", "names fly, which Meta-World has not"),
+        ("task.tasks=[reach] task.sentences.walk=Walk", "names walk, which Meta-World has not"),
+        ("task.tasks=[reach] task.cameras=[corner2,wrist]", "task.cameras names wrist; Meta-World has topview, corner"),
+        ("task.tasks=[reach] task.window=[0.5,0,0.4,1]", "top above bottom, left of right"),
+    ],
+)
+def test_what_there_is_not_is_named(override: str, words: str) -> None:
+    with pytest.raises(ValueError, match=words):
+        world(*(item if "walk" not in item else f"+{item}" for item in override.split())).reset(0)
+
+
+def test_without_the_package_a_sentence_says_how_to_install_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    package.metaworld.cache_clear()
+    monkeypatch.setitem(sys.modules, "metaworld", None)
+    with pytest.raises(ValueError, match=r"not installed .* pip install 'vla\[metaworld\]'"):
+        world()
+    monkeypatch.undo()
+    assert len(world().tasks) == 50
+
+
+def test_disturbed_demonstrations_are_clean_labels_in_equal_shares(tmp_path: Path) -> None:
+    tasks = "task.tasks=[handle-press,coffee-button]"
+    asked = experiment(tasks, "task.image_size=[16,16]", "expert=metaworld_disturbed")
+    environment = asked.make_environment()()
+    assert isinstance(environment, Multitask)
+    store = EpisodeStore.create_or_open(tmp_path, environment.spec, {})
+    collect(store, asked.make_environment(), asked.make_expert(), 4, THIS_PROCESS, 0, environment)
+    assert [entry.task for entry in store.episodes] == ["handle-press", "coffee-button"] * 2
+    rows = [store.read(entry) for entry in store.episodes]
+    assert {(each["truth"].shape[1], each["state"].shape[1]) for each in rows} == {(6, 4)}
+    apart = np.concatenate([np.abs(each["action"] - each["executed"]).max(axis=1) for each in rows])
+    assert (apart > 1e-3).mean() > 0.2
+
+
+def test_it_is_collected_learnt_and_reported_by_tier(tmp_path: Path) -> None:
+    printed = vla(
+        tmp_path,
+        *("task=metaworld", "task.tasks=[handle-press,coffee-push]", "task.image_size=[32,32]", "task.steps=80"),
+        *("collect.episodes=2", "cluster.workers=1", "trainer=cpu", "trainer.max_steps=2", "validate.episodes=0"),
+        *("trainer.val_check_interval=2", "data.batch_size=4", "data.validation_fraction=0"),
+        *("model.width=16", "model.keypoints=4", "model.text_width=8", "evaluate.episodes=2", "recorder=none"),
+        "output=run",
+    ).stdout
+    assert re.search(r"^easy \d/1 .*\nmedium \d/1 .*\nmean over tiers .*\nsuccess \d/2 ", printed, re.MULTILINE)
+    report = json.loads((tmp_path / "run/report.json").read_text())
+    assert {tier: [*part["tasks"]] for tier, part in report["tiers"].items()} == {
+        "easy": ["handle-press"],
+        "medium": ["coffee-push"],
+    }
+    assert 0 <= report["mean_over_tiers"]["ci_low"] <= report["mean_over_tiers"]["ci_high"] <= 1
+    assert report["per_episode"][1]["draws"]["object"]["height"] > 0
+    page = (tmp_path / "run/report.html").read_text()
+    assert "Success by tier of difficulty" in page and "mean over tiers" in page

@@ -1,0 +1,174 @@
+"""Meta-World as a `vla.spec.Environment`, under the protocol of LeRobot."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from annotated_types import Ge, Le, Predicate
+
+from vla.io.types import Count, ImageSize, Names, Natural, Share, Text
+from vla.spec import Array, Observation, Spec
+from vla.tasks.metaworld.package import tasks_of
+from vla.tasks.metaworld.scene import Scene
+from vla.tasks.rendering.renderer import Rendering
+
+CONTROL_HZ = 80.0  # five substeps of 2.5 ms
+REACH = 0.01  # largest displacement of the hand per step, along each axis [m]
+STATE = ("hand_x", "hand_y", "hand_z", "opening")  # the first four numbers of an observation
+MOST_STEPS = 500  # of an episode, after which Meta-World refuses to go on
+# Of the simulator's observation (39,).
+OBJECT, GOAL = slice(4, 7), slice(36, 39)
+
+
+def within(window: Sequence[float]) -> bool:
+    """top above bottom, left of right"""
+    top, left, bottom, right = window
+    return top < bottom and left < right
+
+
+Window = Annotated[tuple[Share, Share, Share, Share], Predicate(within)]
+
+
+class MetaWorld:
+    """Fifty tasks of a Sawyer arm, one of them per episode: the seed determines which, in turn.
+
+    Success is the first step that Meta-World calls one; an episode ends with it, or when its steps are used up. The
+    state is the hand's position and the opening of the gripper, 0…1. The truth, where object and goal are, is for
+    training and for the expert only.
+    """
+
+    def __init__(
+        self,
+        tasks: Literal["mt10", "mt25", "mt50"] | Names,
+        sentences: Mapping[str, Text],
+        tiers: Mapping[str, Names],
+        renderer: Rendering,
+        image_size: ImageSize,
+        cameras: Names,
+        window: Window | None,
+        shadows: Natural,
+        steps: Annotated[int, Ge(1), Le(MOST_STEPS)],
+        scenes: Count,
+    ) -> None:
+        """Compile nothing yet.
+
+        Args:
+            tasks: a benchmark of Meta-World, or names of its tasks.
+            sentences: task → instruction.
+            tiers: difficulty → tasks, for reports.
+            renderer: renderer of the images.
+            image_size: height and width of every camera's images [px].
+            cameras: names of cameras, such as "corner2", which is moved and turned as LeRobot does.
+            window: top, left, bottom and right of LeRobot's picture that "corner2" shows, as shares of its height and
+                width; None: all of it.
+            shadows: edge of the shadow map [texels]; 0: no shadows.
+            steps: largest number of steps of an episode.
+            scenes: largest number of compiled tasks that are kept, each with some 80 MB.
+
+        Raises:
+            ValueError: `metaworld` is not installed, or a task is unknown or has no sentence.
+        """
+        known = self._known = tasks_of("mt50")  # the truth names a task by its place here
+        self.tasks = tuple(tasks_of(tasks) if isinstance(tasks, str) else tasks)
+        listed = {*self.tasks, *sentences, *(name for names in tiers.values() for name in names)}
+        if unknown := sorted(listed - {*known}):
+            raise ValueError(f"task names {', '.join(unknown)}, which Meta-World has not; it has {', '.join(known)}")
+        if silent := [name for name in self.tasks if name not in sentences]:
+            raise ValueError(f"task.sentences has none for {', '.join(silent)}")
+        self.spec = Spec(
+            cameras=tuple(cameras),
+            image_size=(image_size[0], image_size[1]),
+            state=STATE,
+            state_units=("m", "m", "m", "1"),
+            action=("dx", "dy", "dz", "gripper"),
+            units=("m", "m", "m", "1"),
+            low=(-REACH, -REACH, -REACH, -1.0),
+            high=(REACH, REACH, REACH, 1.0),
+            control_hz=CONTROL_HZ,
+            truth=(("object", 3), ("goal", 3)),
+        )
+        self._sentences, self._steps, self._most = sentences, steps, scenes
+        self._drawing = renderer, self.spec.cameras, self.spec.image_size, window, shadows
+        self._scenes: dict[str, Scene] = {}
+        self._blind = False
+        self.done, self.outcome, self.task = True, "timeout", ""
+        self.milestones: frozenset[str] = frozenset()
+        self.draws: dict[str, Any] = {}
+
+    def task_of(self, seed: int) -> str:
+        """Return the task of the episode of `seed`."""
+        return self.tasks[seed % len(self.tasks)]
+
+    def reset(self, seed: int) -> Observation:
+        """Start the episode of `seed`."""
+        self.task, self.done, self.outcome, self._taken = self.task_of(seed), False, "timeout", 0
+        self._scene = self._scene_of(self.task)
+        observation = self._scene.reset(seed)
+        places = {"object": observation[OBJECT], "goal": observation[GOAL]}
+        self.draws = {name: {"place": place[:2].tolist(), "height": float(place[2])} for name, place in places.items()}
+        return self._look(observation)
+
+    def step(self, action: Array) -> Observation:
+        """Apply one (4,) action, clipped to the spec's bounds, for one control period."""
+        if self.done:
+            raise ValueError("the episode is over; call reset(seed) before step(action)")
+        observation, solved = self._scene.step(_command(np.clip(action, self.spec.low, self.spec.high)))
+        self.outcome = "success" if solved else "timeout"
+        self._taken += 1
+        self.done = solved or self._taken == self._steps
+        return self._look(observation)
+
+    @contextmanager
+    def blind(self) -> Iterator[None]:
+        """Disable images in observations within this context, which makes steps several times faster."""
+        self._blind = True
+        try:
+            yield
+        finally:
+            self._blind = False
+
+    def close(self) -> None:
+        """Free physics and GL."""
+        while self._scenes:
+            self._scenes.popitem()[1].close()
+
+    def _scene_of(self, task: str) -> Scene:
+        """Return the scene of a task; where there are too many, replace the newest.
+
+        Tasks take turns, so the oldest ones are needed first.
+        """
+        if task not in self._scenes:
+            if len(self._scenes) == self._most:
+                self._scenes.popitem()[1].close()
+            self._scenes[task] = Scene(task, *self._drawing)
+        return self._scenes[task]
+
+    def _look(self, observation: Array) -> Observation:
+        pictures = () if self._blind else self._scene.pictures()
+        truth = {
+            "object": observation[OBJECT],
+            "goal": observation[GOAL],
+            "commanded_position": self._scene.simulator.data.mocap_pos[0].copy(),
+            "observation": observation,
+            "task": np.array([self._known.index(self.task)]),
+        }
+        return Observation(
+            rgb=dict(zip(self.spec.cameras, pictures, strict=False)),
+            state=observation[: len(STATE)].astype(np.float32),
+            instruction=self._sentences[self.task],
+            truth=truth,
+        )
+
+
+def _command(action: Array) -> Array:
+    """Convert an action, displacement [m] and gripper with 1 for open, to Meta-World's, with 1 for closed."""
+    return np.array([*np.asarray(action[:3]) / REACH, -action[3]], np.float32)
+
+
+def action_of(command: Array) -> Array:
+    """Convert a command (4,) of Meta-World to the action (4,) float32 that gives it, clipped to its bounds."""
+    clipped = np.clip(command, -1, 1)
+    return np.array([*(REACH * clipped[:3]), -clipped[3]], np.float32)

@@ -1,0 +1,38 @@
+"""The scripted experts that come with Meta-World."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from vla.spec import Array, Observation, Spec
+from vla.tasks.metaworld.environment import action_of
+from vla.tasks.metaworld.package import expert, tasks_of
+
+
+class Scripted:
+    """Meta-World's expert of the task at hand, a function of the simulator's observation, clipped to the bounds."""
+
+    def __init__(self, *, spec: Spec) -> None:
+        """Args: the environment's spec."""
+        self.info: dict[str, Any] = {}
+        self._names = tasks_of("mt50")
+        self._experts: dict[str, Any] = {}
+
+    def reset(self, instruction: str, seed: int) -> None:
+        """Start an episode: the expert of a task is made anew, should it remember anything."""
+        self._experts.clear()
+
+    def act(self, observation: Observation) -> Array:
+        """Return the (4,) float32 action of the expert.
+
+        Raises:
+            ValueError: the observation lacks the simulator's truth.
+        """
+        if observation.truth is None:
+            raise ValueError("expert=metaworld needs the simulator's truth, which this observation lacks")
+        name = self._names[int(observation.truth["task"][0])]
+        if name not in self._experts:
+            self._experts[name] = expert(name)
+        return action_of(np.asarray(self._experts[name].get_action(observation.truth["observation"])))

@@ -1,0 +1,74 @@
+"""The package `metaworld`, made to work with a current MuJoCo, and its names of tasks.
+
+Task names are those of the package without their version: "push-back" is `push-back-v3`.
+"""
+
+from __future__ import annotations
+
+import warnings
+from functools import cache
+from types import ModuleType
+from typing import Any
+
+import mujoco
+
+VERSION = "-v3"
+# Where a weld holds a body: anchor (3), relative position (3) and quaternion (4), torque scale. A current MuJoCo has a
+# twelfth number, which upstream's row of eleven does not fit.
+WELD = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, -1.0, 0.0, 0.0, 0.0, 5.0)
+
+
+@cache
+def metaworld() -> ModuleType:
+    """Import the package and make its simulator construct models with this MuJoCo.
+
+    Raises:
+        ValueError: it is not installed.
+    """
+    try:
+        from metaworld import env_dict, sawyer_xyz_env
+    except ImportError as error:
+        raise ValueError(
+            f"task=metaworld needs the package metaworld, which is not installed ({error}): "
+            "pip install 'vla[metaworld]'"
+        ) from error
+    sawyer_xyz_env.SawyerMocapBase.reset_mocap_welds = _reset_welds
+    warnings.filterwarnings("ignore", r"Constant\(s\) may be too high", module=r"metaworld\.policies")  # clipped here
+    return env_dict
+
+
+def _reset_welds(simulator: Any) -> None:
+    model = simulator.model
+    model.eq_data[model.eq_type == mujoco.mjtEq.mjEQ_WELD, : len(WELD)] = WELD
+
+
+def tasks_of(benchmark: str) -> tuple[str, ...]:
+    """Return the names of the tasks of a benchmark, "mt10", "mt25" or "mt50", in the package's order."""
+    return tuple(name.removesuffix(VERSION) for name in getattr(metaworld(), f"{benchmark.upper()}_V3"))
+
+
+def simulator(task: str) -> Any:
+    """Make the simulator of a task, whose resets draw object and goal from the generator that `seed` sets.
+
+    Raises:
+        ValueError: there is no such task.
+    """
+    classes = metaworld().ALL_V3_ENVIRONMENTS
+    if task + VERSION not in classes:
+        known = ", ".join(tasks_of("mt50"))
+        raise ValueError(f"task.tasks names {task!r}; Meta-World has mt10, mt25, mt50 and {known}")
+    made = classes[task + VERSION]()
+    # What `set_task` of the benchmark MT1 does, but for freezing one place of object and goal.
+    made._partially_observable = False  # the goal is part of the observation, which only the expert sees
+    made.__dict__.pop("sawyer_observation_space", None)  # cached, and depends on it
+    made._set_task_called = True
+    made._freeze_rand_vec, made.seeded_rand_vec = False, True
+    return made
+
+
+def expert(task: str) -> Any:
+    """Make the scripted expert of a task."""
+    metaworld()
+    from metaworld.policies import ENV_POLICY_MAP
+
+    return ENV_POLICY_MAP[task + VERSION]()

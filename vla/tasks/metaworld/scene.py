@@ -1,0 +1,102 @@
+"""One task of Meta-World: its simulator, and its pictures."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import mujoco
+import numpy as np
+
+from vla.spec import Array
+from vla.tasks.metaworld.package import simulator
+from vla.tasks.rendering.renderer import Renderer, Rendering, View
+
+HALF_TURN = np.array([0.0, 0.0, 0.0, 1.0])  # about the optical axis, quaternion wxyz
+# LeRobot (src/lerobot/envs/metaworld.py) moves this camera, which hangs upside down, and turns its pictures.
+CAMERA, CAMERA_PLACE = "corner2", (0.75, 0.075, 0.7)  # [m]
+
+
+class Scene:
+    """Simulator of a task with the cameras as LeRobot has them; its renderer is made with the first picture."""
+
+    def __init__(
+        self,
+        task: str,
+        renderer: Rendering,
+        cameras: Sequence[str],
+        image_size: tuple[int, int],
+        window: Sequence[float] | None,
+        shadows: int,
+    ) -> None:
+        """Args:
+        task: name of the task.
+        renderer: renderer of the pictures.
+        cameras: names in the model.
+        image_size: height and width of the pictures [px].
+        window: top, left, bottom and right of what LeRobot's camera shows, as shares of its picture; None: all.
+        shadows: edge of the shadow map [texels]; 0: no shadows.
+
+        Raises:
+            ValueError: there is no such task or camera.
+        """
+        self.simulator = simulator(task)
+        model = self.model = self.simulator.model
+        known = [model.camera(number).name for number in range(model.ncam)]
+        if unknown := [name for name in cameras if name not in known]:
+            raise ValueError(f"task.cameras names {', '.join(unknown)}; Meta-World has {', '.join(known)}")
+        camera = known.index(CAMERA)
+        model.cam_pos[camera] = CAMERA_PLACE
+        turned = np.empty(4)
+        mujoco.mju_mulQuat(turned, model.cam_quat[camera].copy(), HALF_TURN)
+        model.cam_quat[camera] = turned
+        if window is not None:
+            _show_window(model, camera, *window)
+        model.vis.quality.shadowsize = shadows
+        model.mat_reflectance[:] = 0  # the renderers leave reflections out
+        self._view = View([known.index(name) for name in cameras], *image_size, site_groups=(0, 1, 2))
+        self._choice = renderer
+        self._renderer: Renderer | None = None
+        self._changed = True
+
+    def reset(self, seed: int) -> Array:
+        """Draw object and goal, and return the observation (39,): hand, gripper, objects, the same one step before,
+        goal."""
+        self.simulator.seed(seed)
+        observation, _ = self.simulator.reset()
+        # Goals are marked by sites of the model, which have moved: without this the first picture shows the old goal.
+        mujoco.mj_kinematics(self.model, self.simulator.data)
+        self._changed = True
+        return observation
+
+    def step(self, command: Array) -> tuple[Array, bool]:
+        """Apply a command (4,) of -1…1, displacement [cm] and effort that closes the gripper, for one control period.
+
+        Returns the observation (39,), and whether the task is solved.
+        """
+        observation, _, _, _, info = self.simulator.step(command)
+        return observation, bool(info["success"])
+
+    def pictures(self) -> Array:
+        """Draw every camera's picture (cameras, H, W, 3) uint8."""
+        if self._renderer is None:
+            self._renderer = self._choice.open(self.model, self._view)
+        elif self._changed:
+            self._renderer.update()
+        self._changed = False
+        pictures, _ = self._renderer.render(self.simulator.data)
+        return pictures
+
+    def close(self) -> None:
+        """Free physics and GL."""
+        if self._renderer is not None:
+            self._renderer.close()
+            self._renderer = None
+        self.simulator.close()
+
+
+def _show_window(model: mujoco.MjModel, camera: int, top: float, left: float, bottom: float, right: float) -> None:
+    """Make a camera show a window of its square picture; numbers are shares of the picture, from its upper left."""
+    half = np.tan(np.radians(model.cam_fovy[camera] / 2))  # of the whole picture, at a distance of one
+    across, down = half * (2 * np.array([left, right]) - 1), half * (2 * np.array([top, bottom]) - 1)
+    model.cam_sensorsize[camera] = across[1] - across[0], down[1] - down[0]
+    model.cam_intrinsic[camera] = 1, 1, across.mean(), down.mean()  # focal lengths, principal point
