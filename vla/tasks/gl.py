@@ -6,6 +6,8 @@ import os
 import subprocess
 import sys
 
+from vla.parallel.processes import without_triton
+
 TRIED = "VLA_GL_WORKS"  # the backend that worked in a probe, inherited by child processes
 FAILED = "VLA_GL_FAILS"  # those that did not
 NONE = "disabled"
@@ -17,8 +19,9 @@ EGL_PROBE = "import moderngl; moderngl.create_standalone_context(backend='egl')"
 def choose_backend() -> None:
     """Set MUJOCO_GL on a machine without a display: EGL, OSMesa if EGL fails, "disabled" if both fail.
 
-    A backend that the user has set is only probed.
+    A backend that the user has set is only probed. Triton, which conflicts with Mesa, is blocked too.
     """
+    without_triton()
     chosen = os.environ.get("MUJOCO_GL")
     if os.environ.get("DISPLAY") or sys.platform != "linux" or chosen in (NONE, os.environ.get(TRIED, NONE)):
         return
