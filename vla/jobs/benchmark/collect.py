@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
 from tempfile import TemporaryDirectory
 
@@ -15,7 +15,7 @@ from vla.parallel.pool import LocalCluster
 from vla.parallel.processes import WorkerFactory, cores
 from vla.rollouts.collect import DemonstrationWorker
 from vla.rollouts.rollout import replay, rollout
-from vla.spec import Episode
+from vla.spec import Agent, Environment, Episode
 
 
 def measures(experiment: Experiment) -> dict[str, Measure]:
@@ -32,14 +32,10 @@ def measures(experiment: Experiment) -> dict[str, Measure]:
     environment = makers[0]()
     expert = makers[1](environment)
     rollout(environment, expert, 0)  # warm-up: compiles shaders
-    seeds = range(asked["episodes"])
-    episodes, full = timed(lambda: [rollout(environment, expert, seed) for seed in seeds])
-    steps = sum(len(episode.actions) for episode in episodes)
     calls = environment.floor() if isinstance(environment, Floored) else {}
-    floor = {name: timed(partial(_repeat, call, steps))[1] for name, call in calls.items()}
-    with environment.blind():
-        _, blind = timed(lambda: [rollout(environment, expert, seed) for seed in seeds])
-        _, replaying = timed(lambda: [replay(environment, episode) for episode in episodes])
+    episodes, taken = _timed_parts(environment, expert, calls, asked["episodes"])
+    steps = sum(len(episode.actions) for episode in episodes)
+    floor, full, blind = {name: taken[name] for name in calls}, taken["full"], taken["blind"]
     with TemporaryDirectory() as folder:
         store = EpisodeStore.create_or_open(folder, environment.spec, {})
         with store.writing():
@@ -50,12 +46,12 @@ def measures(experiment: Experiment) -> dict[str, Measure]:
         **floor,
         "expert, controller, judge": blind - physics,
         "images into arrays": full - blind - rendering,
-        "replay": replaying,
+        "replay": taken["replay"],
         "storing": storing,
     }
     least = steps / sum(floor.values()) if floor else None
     found = {"collect": measure(steps / full, "control steps/s", steps, least)}
-    whole = 1000 * (full + replaying + storing) / steps
+    whole = 1000 * (full + taken["replay"] + storing) / steps
     for name, seconds in stages.items():
         found[f"collect: {name}"] = measure(1000 * seconds / steps, "ms/step", steps, whole)
     found |= renderings(experiment)
@@ -70,6 +66,27 @@ def measures(experiment: Experiment) -> dict[str, Measure]:
                 found["collect, against robosuite"] = measure(steps / full, unit, steps, rival)
             found[f"collect: verified, against {count} of robosuite"] = measure(rate, unit, n, rival)
     return found
+
+
+def _timed_parts(
+    environment: Environment, expert: Agent, calls: Mapping[str, Callable[[], object]], count: int
+) -> tuple[list[Episode], dict[str, float]]:
+    """Return episodes, and the time [s] of: "full" rollouts, "blind" ones, "replay", and each call once per step.
+
+    The parts of one episode follow each other, so that what else runs on the machine slows all parts alike.
+    """
+    episodes: list[Episode] = []
+    taken = dict.fromkeys(("full", "blind", "replay", *calls), 0.0)
+    for seed in range(count):
+        episode, seconds = timed(partial(rollout, environment, expert, seed))
+        episodes.append(episode)
+        taken["full"] += seconds
+        for name, call in calls.items():
+            taken[name] += timed(partial(_repeat, call, len(episode.actions)))[1]
+        with environment.blind():
+            taken["blind"] += timed(partial(rollout, environment, expert, seed))[1]
+            taken["replay"] += timed(partial(replay, environment, episode))[1]
+    return episodes, taken
 
 
 def _repeat(call: Callable[[], object], times: int) -> None:
