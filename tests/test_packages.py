@@ -112,10 +112,11 @@ def test_a_job_with_a_group_of_its_own_is_two_options_and_a_module(home: Path, i
         jobs.find("mypackage.survey")
 
 
-# Options that name a part of the tabletop: they are for this world only.
-OF_THE_TABLETOP = {
+# Options that name a part of a world of this project: they are for this world only.
+OF_ONE_WORLD = {
     *("ablation", "few", "learning_curve", "multitask", "recipe", "standard"),
     *("generalisation", "language", "levels", "paper", "suite", "tabletop", "no_excursions", "no_noise"),
+    *("renderer", "metaworld", "metaworld_disturbed"),
 }
 
 
@@ -125,10 +126,12 @@ def test_options_go_with_any_world_or_are_refused_for_it(
 ) -> None:
     monkeypatch.setenv(packages.TRUSTED, "mypackage")
     options = {path.stem for path in (CONF / group).glob("*.yaml")}
-    for option in sorted(options - OF_THE_TABLETOP):
+    for option in sorted(options - OF_ONE_WORLD):
         check(composed("task=mine", "expert=mine", f"{group}={option}"))
-    for option in sorted(options & OF_THE_TABLETOP):
-        with pytest.raises((ValueError, ConfigCompositionException), match=r"randomize|perturb|task/goal"):
+    for option in sorted(options & OF_ONE_WORLD):
+        with pytest.raises(
+            (ValueError, ConfigCompositionException), match=r"randomize|perturb|task/goal|renderer|window"
+        ):
             check(composed("task=mine", "expert=mine", f"{group}={option}"))
 
 
