@@ -21,7 +21,7 @@ from rerun.experimental import ViewerClient
 
 from vla.config.compose import compose_task
 from vla.config.experiment import make_environment, make_policy
-from vla.policy import read_header
+from vla.models.checkpoint import read_header
 from vla.rollouts.recorder import VIEWER
 from vla.spec import FIRST_SEED, Array
 

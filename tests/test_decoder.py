@@ -15,11 +15,11 @@ from observing import act, observations
 from small_training import loader, make_learner, make_trainer
 from toy import SPEC, ToyEnvironment
 
+from vla.models.checkpoint import read_checkpoint
 from vla.models.decoder import Decoder
 from vla.models.tokenizers.fast import Fast
 from vla.models.tokenizers.quantile import Quantile
 from vla.models.tokenizers.tokenizer import RT1
-from vla.policy import read_checkpoint
 from vla.rollouts.rollout import rollout
 
 MOTIONS = Motions()

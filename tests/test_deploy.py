@@ -244,7 +244,7 @@ def test_the_whole_loop_reports_and_its_bag_moves_an_agent_again(
 def test_the_node_acts_like_the_evaluated_policy(home: Path) -> None:
     """On the same observations, through messages and back, bit for bit."""
     from vla.config import experiment as parts
-    from vla.policy import read_checkpoint
+    from vla.models.checkpoint import read_checkpoint
     from vla.spec import Observation
 
     checkpoint = home / "run/checkpoints/last.ckpt"

@@ -10,7 +10,7 @@ from fake_batch import make_batch
 from lightning import Callback
 from small_training import loader, make_learner, make_trainer
 
-from vla.policy import read_checkpoint
+from vla.models.checkpoint import read_checkpoint
 from vla.training.ema import EMA, EVERY
 
 DECAY = 0.9

@@ -14,8 +14,8 @@ from small_training import CONFIG, fit, loader, make_learner, make_trainer
 from torch.utils.data import DataLoader
 from toy import SPEC
 
+from vla.models.checkpoint import read_checkpoint
 from vla.models.model import Model
-from vla.policy import read_checkpoint
 from vla.training.checkpoints import AtomicCheckpointIO
 
 

@@ -22,7 +22,8 @@ from torch.utils.data import DataLoader
 
 from vla import jobs
 from vla.config.experiment import Experiment, make_policy
-from vla.policy import Policy, read_checkpoint
+from vla.models.checkpoint import read_checkpoint
+from vla.policy import Policy
 from vla.training.ema import EMA
 
 if TYPE_CHECKING:

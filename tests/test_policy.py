@@ -15,9 +15,9 @@ from observing import act, observations
 from torch._inductor.runtime.cache_dir_utils import default_cache_dir
 from toy import SPEC, ToyEnvironment
 
+from vla.models.checkpoint import TensorBudget, read_checkpoint, read_header
 from vla.models.compile_cache import set_compile_cache
 from vla.models.model import Model, TokenModel
-from vla.policy import TensorBudget, read_checkpoint, read_header
 from vla.rollouts.rollout import rollout
 from vla.spec import Observation
 

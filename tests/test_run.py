@@ -23,7 +23,7 @@ from PIL import Image
 from rerun.chunk import RrdReader
 
 from vla.data.episodes import EpisodeStore
-from vla.policy import read_checkpoint
+from vla.models.checkpoint import read_checkpoint
 from vla.tasks.rendering.fast import Fast
 from vla.tasks.rendering.reference import Reference
 

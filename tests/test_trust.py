@@ -25,7 +25,7 @@ from vla import jobs
 from vla.config.adopt import adopt, finetune, resume
 from vla.config.annotations import LIBRARY, OWN, locate
 from vla.config.experiment import Experiment, make_policy, plain
-from vla.policy import read_checkpoint
+from vla.models.checkpoint import read_checkpoint
 
 # Everything under these could be named once, and some of it acts when it is built.
 PREFIXES = ("torch", "lightning", "dm_control.composer.variation")

@@ -17,7 +17,7 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 
 from vla.config.build import require_no_paths, require_trust, without_paths
 from vla.config.differences import at, differences
-from vla.policy import read_header
+from vla.models.checkpoint import read_header
 
 OF_POLICY = ("task", "tokenizer", "model")
 OF_MODEL = ("tokenizer", "model", "data")  # the batch size depends on the model

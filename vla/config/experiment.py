@@ -23,11 +23,12 @@ from vla.parallel.processes import without_triton
 if TYPE_CHECKING:
     from vla.data.datamodule import WindowDataModule
     from vla.data.episodes import EpisodeStore
+    from vla.models.checkpoint import Checkpoint
     from vla.models.learner import Learner
     from vla.models.model import Model
     from vla.models.tokenizers.tokenizer import ActionTokenizer
     from vla.parallel.pool import Cluster
-    from vla.policy import Checkpoint, Policy
+    from vla.policy import Policy
     from vla.spec import Agent, Environment, Recorder, Spec
 
 log = logging.getLogger(__name__)
@@ -128,7 +129,7 @@ class Experiment:
         Raises:
             ValueError: `origin` is no checkpoint, or its policy has another spec.
         """
-        from vla.policy import read_checkpoint
+        from vla.models.checkpoint import read_checkpoint
 
         node = self["model"]
         saved = read_checkpoint(origin) if origin else None
@@ -218,7 +219,7 @@ def make_policy(policy: Node, checkpoint: Path, environment: Environment | None 
     Raises:
         ValueError: there is no checkpoint, or its spec differs from the environment's.
     """
-    from vla.policy import read_checkpoint
+    from vla.models.checkpoint import read_checkpoint
 
     saved = read_checkpoint(checkpoint)
     if environment is not None:
@@ -239,7 +240,7 @@ def training_policy(policy: Node, model: Model) -> Policy:
 
 def _model(node: Node, spec: Spec, tokenizer: ActionTokenizer, saved: Checkpoint | None) -> Model:
     """Build the model of a node; with a checkpoint, refuse a model larger than its file."""
-    from vla.policy import TensorBudget
+    from vla.models.checkpoint import TensorBudget
 
     with TensorBudget(saved.path) if saved else nullcontext():
         model: Model = build(node, "model", spec=spec, tokenizer=tokenizer)

@@ -14,7 +14,7 @@ from filelock import FileLock, Timeout
 
 from vla.config.adopt import require_identity
 from vla.config.differences import differences
-from vla.policy import read_header
+from vla.models.checkpoint import read_header
 from vla.runs.folder import CHECKPOINTS, LAST, REPORT, chosen_checkpoint, read_report
 
 log = logging.getLogger(__name__)

@@ -1,0 +1,218 @@
+"""Checkpoints: a trained model with the config and the spec of its training, read as data."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from pickle import UnpicklingError
+from pickletools import genops
+from typing import Any
+from zipfile import ZIP_STORED, BadZipFile, ZipFile, ZipInfo
+
+import torch
+from torch import Tensor
+from torch.overrides import TorchFunctionMode
+
+from vla.io.documents import require_resolved
+from vla.models.model import Model
+from vla.spec import Spec
+
+REQUIRED_NODES = ("task", "tokenizer", "model")  # of the config in a checkpoint
+OPTIONAL_NODES = ("chosen", "expert", "collect", "data", "learner", "trainer", "validate")
+TRUTH_MODULES = ("truth_head", "truth_scale")  # modules of a model used in training only
+# What the pickle in a checkpoint may name.
+KNOWN = (
+    *("collections OrderedDict", "torch._utils _rebuild_tensor_v2", "torch._utils _rebuild_parameter"),
+    *(f"torch {kind}Storage" for kind in ("Float", "Double", "Half", "BFloat16", "Bool", "Byte")),
+    *(f"torch {kind}Storage" for kind in ("Char", "Short", "Int", "Long")),
+)
+
+
+@dataclass(frozen=True)
+class Header:
+    """A checkpoint without its weights."""
+
+    path: Path
+    config: dict[str, Any]  # of the training
+    spec: Spec
+    finished: bool  # the training was completed
+    steps: int  # optimiser steps
+
+
+@dataclass(frozen=True)
+class Checkpoint(Header):
+    """A checkpoint with the weights of its model."""
+
+    state: dict[str, Tensor]  # of the model
+
+    def restore(self, model: torch.nn.Module) -> None:
+        """Load the weights into `model`; parts that it only makes now, such as a text encoder, fit in the file too.
+
+        Raises:
+            ValueError: they belong to another model.
+        """
+        try:
+            with TensorBudget(self.path):
+                model.load_state_dict(self.state)
+        except Exception as error:  # whatever modules raise for a state that is not theirs
+            first = str(error).strip().splitlines()[-1].strip()[:200]
+            raise ValueError(f"{self.path} does not fit the model of its own configuration: {first}") from error
+
+    def initialize(self, model: Model) -> None:
+        """Load the weights for fine-tuning; the truth head keeps its initial weights if the truth differs.
+
+        Raises:
+            ValueError: they belong to another model.
+        """
+        state = self.state
+        if self.spec.truth != model.spec.truth:
+            state = {name: value for name, value in state.items() if name.partition(".")[0] not in TRUTH_MODULES}
+            for part, module in model.named_children():
+                if part in TRUTH_MODULES:
+                    state |= {f"{part}.{name}": value for name, value in module.state_dict().items()}
+        replace(self, state=state).restore(model)
+
+
+def read_header(path: str | Path) -> Header:
+    """Read a checkpoint without its weights, which takes the same time for any size.
+
+    Raises:
+        ValueError: there is no file, it is damaged, or it is not a checkpoint of this project.
+        OSError: the file cannot be read.
+    """
+    return _header(Path(path), _load(Path(path), weights=False))
+
+
+def read_checkpoint(path: str | Path) -> Checkpoint:
+    """Read a checkpoint as data: no code in it runs, and its configuration holds resolved plain values.
+
+    Raises:
+        ValueError: there is no file, it is damaged, or it is not a checkpoint of this project.
+        OSError: the file cannot be read.
+    """
+    content = _load(Path(path), weights=True)
+    header = _header(Path(path), content)
+    state = content.get("state_dict")
+    if not isinstance(state, dict) or not all(isinstance(key, str) for key in state):
+        raise ValueError(f"{path} holds no weights: copy it again from where it is whole")
+    prefix = "model."
+    state = {key[len(prefix) :]: value for key, value in state.items() if key.startswith(prefix)}
+    return Checkpoint(**vars(header), state=state)
+
+
+def _header(path: Path, content: dict[str, Any]) -> Header:
+    config, spec, steps = (content.get(name) for name in ("config", "spec", "global_step"))
+    if config is None or spec is None:
+        raise ValueError(f"{path} is no checkpoint of this project: it carries no configuration and spec")
+    require_resolved(config, f"the configuration in {path}")
+    nodes = config if isinstance(config, dict) else {}
+    present = [nodes[name] for name in (*REQUIRED_NODES, *OPTIONAL_NODES) if name in nodes]
+    if not nodes.keys() >= {*REQUIRED_NODES} or not all(isinstance(node, dict) for node in present):
+        raise ValueError(
+            f"{path} is no checkpoint of this project: its configuration lacks {', '.join(REQUIRED_NODES)}"
+        )
+    finished = content.get("finished") is True
+    return Header(path, config, Spec.from_dict(spec, f"{path}: spec"), finished, steps if isinstance(steps, int) else 0)
+
+
+def _load(path: Path, weights: bool) -> dict[str, Any]:
+    """Read the content of a checkpoint; without `weights` tensors are memory-mapped, neither read nor verified."""
+    if not path.is_file():
+        raise ValueError(f"there is no checkpoint {path}: those of a run lie in outputs/runs/…/checkpoints")
+    try:
+        # Only the zip format: legacy pickles raise arbitrary exceptions.
+        with path.open("rb") as file, ZipFile(file) as archive:
+            entries = archive.infolist()
+            # torch does not compress, so content larger than the file is an attack on the memory.
+            packed = any(entry.compress_type != ZIP_STORED for entry in entries)
+            if packed or sum(entry.file_size for entry in entries) > path.stat().st_size:
+                raise BadZipFile("its parts are compressed or overlap")
+            for entry in entries:
+                if weights or entry.filename.endswith("/data.pkl"):
+                    _verify(archive, entry)  # torch does not verify checksums
+                if entry.filename.endswith("/data.pkl"):
+                    _require_known(archive.read(entry))
+        content = torch.load(path, map_location="cpu", weights_only=True, mmap=not weights)
+        _require_stored(content, path.stat().st_size)
+    except OSError:
+        raise
+    except Exception as error:  # a pickle can raise nearly anything
+        raise ValueError(f"{path} cannot be read as a checkpoint, it is damaged or something else") from error
+    return content if isinstance(content, dict) else {}
+
+
+def _require_known(pickled: bytes) -> None:
+    """Require a pickle to call nothing but what makes the tensors of a checkpoint.
+
+    PyTorch by itself also lets a pickle call `bytearray(10**10)`, for example.
+
+    Raises:
+        UnpicklingError: it names something else.
+    """
+    for opcode, name, _ in genops(pickled):
+        if opcode.name == "GLOBAL" and name not in KNOWN:
+            raise UnpicklingError(f"it names {name}")
+
+
+def _require_stored(content: Any, size: int) -> None:
+    """Require the tensors to lie in a file of `size` [bytes]: strides of 0 describe any number of elements.
+
+    Raises:
+        UnpicklingError: a tensor is larger than its storage, or all storages together are larger than the file.
+    """
+    pending, seen, stored = [content], set[int](), dict[int, int]()
+    while pending:
+        value = pending.pop()
+        if isinstance(value, Tensor):
+            storage = value.untyped_storage()
+            stored[storage.data_ptr()] = storage.nbytes()
+            if value.nbytes > storage.nbytes():
+                raise UnpicklingError("a tensor is larger than its storage")
+        elif isinstance(value, (dict, list, tuple)) and id(value) not in seen:
+            seen.add(id(value))  # a pickle can refer to the same list many times, or to itself
+            pending += [*value, *value.values()] if isinstance(value, dict) else value
+    if sum(stored.values()) > size:
+        raise UnpicklingError("its tensors are larger than the file")
+
+
+def _verify(archive: ZipFile, entry: ZipInfo) -> None:
+    """Read an entry to its end, where zipfile verifies the checksum; raises BadZipFile if it differs."""
+    with archive.open(entry) as part:
+        while part.read(2**20):
+            pass
+
+
+class TensorBudget(TorchFunctionMode):
+    """Context that limits the total size of created tensors to what the weights in a checkpoint could fill.
+
+    A config that requires more is refused at the first tensor above the limit, before it is allocated.
+    """
+
+    FACTORIES: tuple[Any, ...] = (
+        *(torch.empty, torch.zeros, torch.ones, torch.full, torch.rand, torch.randn, torch.randint, torch.randperm),
+        *(torch.arange, torch.linspace, torch.eye),
+    )
+
+    def __init__(self, checkpoint: Path) -> None:
+        super().__init__()
+        self._path, self._remaining = checkpoint, 2 * checkpoint.stat().st_size + 2**26
+
+    def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        """Call `func` after subtracting the size of its result from the budget.
+
+        Raises:
+            ValueError: the budget is exceeded.
+        """
+        kwargs = kwargs or {}
+        if func in self.FACTORIES:
+            described = {name: value for name, value in kwargs.items() if name not in ("generator", "out")}
+            try:
+                self._remaining -= func(*args, **(described | {"device": "meta", "pin_memory": False})).nbytes
+            except RuntimeError as error:  # a size beyond any address
+                raise self._error() from error
+            if self._remaining < 0:
+                raise self._error()
+        return func(*args, **kwargs)
+
+    def _error(self) -> ValueError:
+        return ValueError(f"{self._path} describes a model that is larger than the file, which does not hold it")
