@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import json
+import logging
+import os
 import re
+import signal
 import threading
+import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 from dataclasses import replace
@@ -279,6 +283,25 @@ def test_beyond_this_machine_nobody_listens_without_a_key(tmp_path: Path) -> Non
         pass
     with pytest.raises(ValueError, match=r"set deploy\.keys\.images\.eye=KEY"):
         settings(policy, keys=replace(KEYS, images={})).run()
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_it_serves_until_it_is_told_to_stop(number: signal.Signals, caplog: pytest.LogCaptureFixture) -> None:
+    asked = []
+
+    def stop() -> None:
+        while not caplog.messages:
+            time.sleep(0.01)
+        url = caplog.messages[0].removeprefix("serving the policy at ").replace("ws://", "http://")
+        asked.append(urlopen(f"{url}/healthz").read())
+        os.kill(os.getpid(), number)
+
+    with caplog.at_level(logging.INFO, "vla.deploy.server"):
+        thread = threading.Thread(target=stop)
+        thread.start()
+        settings(as_policy(make_bc())).run()
+        thread.join()
+    assert asked == [b"OK\n"]
 
 
 def test_somebody_elses_actions_become_ours() -> None:
