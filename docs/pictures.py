@@ -78,7 +78,9 @@ def film(run: Path, picture: Path) -> None:
     checkpoint = run / "checkpoints/last.ckpt"
     config = read_header(checkpoint).config
     environment = make_environment(config["task"])
-    larger = make_environment({**config["task"], "image_size": [FILM_SIZE, FILM_SIZE], "meshes": "full"})
+    renderer = {**config["task"]["renderer"], "samples": 4, "soft": 2, "faces": None}
+    finer = {"image_size": [FILM_SIZE, FILM_SIZE], "meshes": "full", "renderer": renderer}
+    larger = make_environment({**config["task"], **finer})
     policy = make_policy(config["policy"], checkpoint, environment)
     frames: list[Image.Image] = []
     for seed in range(FIRST_SEED, FIRST_SEED + FILM_EPISODES):
