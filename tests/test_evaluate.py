@@ -88,7 +88,7 @@ def test_errors_are_neither_successes_nor_failures() -> None:
 
 
 def test_a_report_of_errors_alone_has_the_widest_interval() -> None:
-    assert str(results("error")).splitlines()[-1] == "success 0/0 (0.0 %, 95 % CI 0.0-100.0)"
+    assert str(results("error")).splitlines()[-1] == "success 0/0 (no episode was completed)"
 
 
 def test_two_workers_report_what_one_reports() -> None:

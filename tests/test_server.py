@@ -89,7 +89,7 @@ def observations(count: int, seed: int = 0) -> list[Observation]:
 def remote(url: str, **changes: Any) -> RemotePolicy:
     values: dict[str, Any] = {
         "url": url,
-        "images": {"observation/image": "eye"},
+        "images": {"eye": "observation/image", "other": "observation/other"},
         "image_size": None,
         "state": {"observation/state": None},
         "prompt": "prompt",
@@ -212,7 +212,7 @@ WRONG: dict[str, tuple[Any, str]] = {
     "keys": (pack({"image": 1, "prompt": "go"}), "lacks observation/image, observation/state: it has image, prompt"),
     "image": (pack({**WHOLE, "observation/image": np.zeros((4, 4), np.uint8)}), r"is an image \(H, W, 3\).*\(4, 4\)"),
     "range": (pack({**WHOLE, "observation/image": np.full((4, 4, 3), 255.0)}), "send uint8, or floats from 0 to 1"),
-    "state": (pack({**WHOLE, "observation/state": np.zeros(3)}), "hold 3 numbers, the policy needs 2: east, north"),
+    "state": (pack({**WHOLE, "observation/state": np.zeros(3)}), "has 3 numbers, the policy needs 2: east, north"),
     "finite": (pack({**WHOLE, "observation/state": [np.nan, 0.0]}), "holds a number that is not finite"),
     "words": (pack({**WHOLE, "observation/state": "far"}), "observation/state is no vector of numbers"),
     "prompt": (pack({**WHOLE, "prompt": "a" * (LONGEST_INSTRUCTION + 1)}), "of at most 1000 characters"),
@@ -281,7 +281,7 @@ def test_beyond_this_machine_nobody_listens_without_a_key(tmp_path: Path) -> Non
         settings(policy, certificate=str(tmp_path / "certificate.pem"))
     with serving(policy) as url, pytest.raises(OSError, match="in use"), serving(policy, port=int(url[-5:])):
         pass
-    with pytest.raises(ValueError, match=r"set deploy\.keys\.images\.eye=KEY"):
+    with pytest.raises(ValueError, match=r"add \+deploy\.keys\.images\.eye=KEY"):
         settings(policy, keys=replace(KEYS, images={})).run()
 
 
@@ -315,8 +315,8 @@ def test_somebody_elses_actions_become_ours() -> None:
         np.testing.assert_allclose(agent.act(observation), [y, -x, 1.0])
         with pytest.raises(ValueError, match=r"agent\.actions must map x, y, gripper, got x"):
             remote(url, actions={"x": Component(0)})
-        with pytest.raises(ValueError, match=r"agent\.images names back, the cameras are eye"):
-            remote(url, images={"observation/image": "back"})
+        with pytest.raises(ValueError, match=r"no key for the world's cameras, eye: add \+agent\.images\.eye=KEY"):
+            remote(url, images={"back": "observation/image", "eye": None})
         with pytest.raises(ValueError, match="failed: its actions have 3 components"):
             remote(url, actions={**swapped, "x": Component(3)}).act(observation)
 

@@ -84,7 +84,8 @@ def _meant_for_user(error: Exception) -> bool:
         return True
     remote = type(error.__cause__).__name__ == "_RemoteTraceback"
     text = str(error.__cause__) if remote else "".join(traceback.format_tb(error.__traceback__))
-    lines = re.findall(r'File "([^"]+)", line \d+, in .*\n\s+(.*)', text)
+    # Frames without source, of generated constructors, are followed by the next frame.
+    lines = re.findall(r'File "([^"]+)", line \d+, in .*\n\s+(?!File ")(.*)', text)
     if not isinstance(error, (ValueError, RuntimeError, ImportError)) or not lines:
         return False
     file, statement = lines[-1]

@@ -101,7 +101,7 @@ class PolicyNode(GuardedLifecycleNode):
         unnamed = sorted(set(spec.cameras) - set(topics.images))
         if unnamed:
             missing = ", ".join(unnamed)
-            raise ValueError(f"no topic for the policy's cameras {missing}: set deploy.topics.images.{unnamed[0]}")
+            raise ValueError(f"no topic for the policy's cameras {missing}: add +deploy.topics.images.{unnamed[0]}")
         robot = Robot(**{name: self.get_parameter(name).value for name in asdict(self.settings.robot)})
         self._command_type = self.get_parameter("command").value
         if self._command_type not in COMMANDS:

@@ -76,8 +76,8 @@ class Keys:
         state = np.concatenate([_vector(key, found[key]) for key in self.state])
         if len(state) != len(spec.state):
             raise ValueError(
-                f"{' and '.join(self.state)} hold {len(state)} numbers, the policy needs {len(spec.state)}: "
-                f"{', '.join(spec.state)}"
+                f"the state in {' and '.join(self.state)} has {len(state)} numbers, "
+                f"the policy needs {len(spec.state)}: {', '.join(spec.state)}"
             )
         return Observation(rgb, state, _prompt(self.prompt, found[self.prompt]))
 
@@ -145,7 +145,7 @@ class PolicyServer:
             ) from error
         policy = self.policy()
         if keyless := [camera for camera in policy.spec.cameras if camera not in self.keys.images]:
-            raise ValueError(f"the policy sees {', '.join(keyless)}: set deploy.keys.images.{keyless[0]}=KEY")
+            raise ValueError(f"the policy sees {', '.join(keyless)}: add +deploy.keys.images.{keyless[0]}=KEY")
         asyncio.run(Service(self, policy).serve())
 
 

@@ -161,12 +161,15 @@ class Report:
 
     @property
     def _rate(self) -> str:
+        if not self.episodes:
+            return _rate(0, 0)
         return f"{self.successes}/{self.episodes} ({_percent(self.success, *self.interval)})"
 
 
 def _rate(count: int, episodes: int) -> str:
-    share = count / episodes if episodes else 0.0
-    return f"{count}/{episodes} ({_percent(share, *wilson_interval(count, episodes))})"
+    if not episodes:
+        return "0/0 (no episode was completed)"
+    return f"{count}/{episodes} ({_percent(count / episodes, *wilson_interval(count, episodes))})"
 
 
 def _percent(share: float, low: float, high: float) -> str:

@@ -39,7 +39,8 @@ class RemotePolicy:
 
     Attributes:
         url: of the server, as in ws://127.0.0.1:8000.
-        images: key of the server's observation → our camera.
+        images: camera → key of the server's observation, null if it is not sent; other cameras are not sent either,
+            and those that the world lacks are ignored.
         image_size: height and width to resize images to [px]; null: as they are.
         state: key of the server's observation → our state components; null: all of them.
         prompt: key of the instruction.
@@ -54,7 +55,7 @@ class RemotePolicy:
     """
 
     url: Text
-    images: dict[str, Text]
+    images: dict[str, Text | None]
     image_size: Annotated[list[Pixels], Len(2, 2)] | None
     state: dict[str, list[Text] | None]
     prompt: Text
@@ -65,7 +66,13 @@ class RemotePolicy:
     spec: Spec
 
     def __post_init__(self) -> None:
-        _require_known("agent.images", self.images.values(), self.spec.cameras, "cameras")
+        self._images = {camera: key for camera, key in self.images.items() if key and camera in self.spec.cameras}
+        if not self._images:
+            cameras = self.spec.cameras
+            raise ValueError(
+                f"agent.images has no key for the world's cameras, {', '.join(cameras)}: add "
+                f"+agent.images.{cameras[0]}=KEY"
+            )
         names = [name for names in self.state.values() for name in names or ()]
         _require_known("agent.state", names, self.spec.state, "state components")
         if self.actions is not None and sorted(self.actions) != sorted(self.spec.action):
@@ -119,7 +126,7 @@ class RemotePolicy:
             key: observation.state if names is None else observation.state[self.spec.indices(names)]
             for key, names in self.state.items()
         }
-        images = {key: _resized(observation.rgb[camera], self.image_size) for key, camera in self.images.items()}
+        images = {key: _resized(observation.rgb[camera], self.image_size) for camera, key in self._images.items()}
         return {**images, **state, self.prompt: observation.instruction}
 
     def _translated(self, actions: Any) -> Array:
@@ -154,7 +161,9 @@ class RemotePolicy:
             metadata = self._received(connection)
         except InvalidStatus as error:
             said = bytes(error.response.body or b"").decode(errors="replace").strip()[:200]
-            raise self._error(said or f"HTTP status {error.response.status_code}") from error
+            raise self._error(
+                f"{said} (VLA_API_KEY)" if "API key" in said else said or f"HTTP status {error.response.status_code}"
+            ) from error
         except (OSError, WebSocketException) as error:
             raise ValueError(f"nobody serves a policy at {self.url} ({error}): start it, or set agent.url") from error
         return connection, metadata

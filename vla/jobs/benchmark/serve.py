@@ -72,7 +72,7 @@ def _serving(experiment: Experiment, policy: Policy) -> Iterator[RemotePolicy]:
     with Service(server, policy).in_thread() as url:
         yield RemotePolicy(
             url=url,
-            images={key: camera for camera, key in cameras.items()},
+            images=dict(cameras),
             image_size=None,
             state={keys.state[0]: None},
             prompt=keys.prompt,

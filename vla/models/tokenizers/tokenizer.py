@@ -275,7 +275,9 @@ def data_bounds(spec: Spec, statistics: Statistics | None, margin: float = 0.0) 
     min_span = MIN_SPAN * (allowed_high - allowed_low)
     constant = [name for name, narrow in zip(spec.action, high - low < min_span, strict=True) if narrow]
     if constant:
-        log.info("%s hardly varies in the demonstrations: bins over %g of its range", ", ".join(constant), MIN_SPAN)
+        log.info(
+            "little variation in the demonstrations, so bins over %g of the range: %s", MIN_SPAN, ", ".join(constant)
+        )
     span = np.maximum(high - low, min_span)
     half = (0.5 + margin) * span
     return (low + high) / 2 - half, (low + high) / 2 + half

@@ -75,7 +75,7 @@ class MetaWorld:
         self.tasks = tuple(tasks_of(tasks) if isinstance(tasks, str) else tasks)
         listed = {*self.tasks, *sentences, *(name for names in tiers.values() for name in names)}
         if unknown := sorted(listed - {*known}):
-            raise ValueError(f"task names {', '.join(unknown)}, which Meta-World has not; it has {', '.join(known)}")
+            raise ValueError(f"Meta-World has no task {', '.join(unknown)}: it has {', '.join(sorted(known))}")
         if silent := [name for name in self.tasks if name not in sentences]:
             raise ValueError(f"task.sentences has none for {', '.join(silent)}")
         self.spec = Spec(

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from vla.spec import Array, Observation, Spec
-from vla.tasks.metaworld.environment import action_of
+from vla.tasks.metaworld.environment import STATE, action_of
 from vla.tasks.metaworld.package import expert, tasks_of
 
 
@@ -15,7 +15,13 @@ class Scripted:
     """Meta-World's expert of the task at hand, a function of the simulator's observation, clipped to the bounds."""
 
     def __init__(self, *, spec: Spec) -> None:
-        """Args: the environment's spec."""
+        """Args: the environment's spec.
+
+        Raises:
+            ValueError: it is not that of Meta-World.
+        """
+        if spec.state != STATE:
+            raise ValueError("expert=metaworld acts in task=metaworld only: choose the expert of this task")
         self.info: dict[str, Any] = {}
         self._names = tasks_of("mt50")
         self._experts: dict[str, Any] = {}
