@@ -30,6 +30,11 @@ BAD_INPUT = {
     "no dataset": (("job=collect", "expert=lerobot", "expert.folder=nowhere"), "no LeRobot dataset in nowhere"),
     "nothing to compare": (("job=report",), "report.runs=[RUN,RUN]"),
     "more processes than cores": (("job=train", *SMALL, "trainer.devices=999"), "than this machine has cores"),
+    "no key for other machines": (
+        ("job=deploy", "deploy=server", "deploy.host=0.0.0.0"),
+        "set the environment variable",
+    ),
+    "another world's expert": (("job=preview", "expert=metaworld"), "expert=metaworld acts in task=metaworld only"),
     "no GPU": (("trainer=gpu", *(item for item in SMALL if "accelerator" not in item)), "gpu"),
 }
 

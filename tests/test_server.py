@@ -279,8 +279,12 @@ def test_beyond_this_machine_nobody_listens_without_a_key(tmp_path: Path) -> Non
     assert settings(policy, host="0.0.0.0", api_key="open").host == "0.0.0.0"
     with pytest.raises(ValueError, match=r"needs both deploy\.certificate and deploy\.private_key"):
         settings(policy, certificate=str(tmp_path / "certificate.pem"))
-    with serving(policy) as url, pytest.raises(OSError, match="in use"), serving(policy, port=int(url[-5:])):
-        pass
+    with serving(policy) as url:
+        port = int(url.rpartition(":")[2])
+        with pytest.raises(
+            ValueError, match=rf"cannot listen at deploy\.host=127\.0\.0\.1 deploy\.port={port}: .*in use"
+        ):
+            settings(policy, port=port).run()
     with pytest.raises(ValueError, match=r"add \+deploy\.keys\.images\.eye=KEY"):
         settings(policy, keys=replace(KEYS, images={})).run()
 

@@ -84,8 +84,8 @@ def _meant_for_user(error: Exception) -> bool:
         return True
     remote = type(error.__cause__).__name__ == "_RemoteTraceback"
     text = str(error.__cause__) if remote else "".join(traceback.format_tb(error.__traceback__))
-    # Frames without source, of generated constructors, are followed by the next frame.
-    lines = re.findall(r'File "([^"]+)", line \d+, in .*\n\s+(?!File ")(.*)', text)
+    # Generated constructors have no source; that of other frames is indented by four spaces.
+    lines = re.findall(r'File "([^"]+)", line \d+, in .*\n {4}(.*)', text)
     if not isinstance(error, (ValueError, RuntimeError, ImportError)) or not lines:
         return False
     file, statement = lines[-1]

@@ -133,8 +133,8 @@ class PolicyServer:
         """Serve until interrupted.
 
         Raises:
-            ValueError: websockets is not installed, there is no policy, or its cameras have no keys.
-            OSError: the address cannot be used.
+            ValueError: websockets is not installed, there is no policy, its cameras have no keys, or the address cannot
+                be used.
         """
         try:
             import websockets  # noqa: F401
@@ -146,7 +146,11 @@ class PolicyServer:
         policy = self.policy()
         if keyless := [camera for camera in policy.spec.cameras if camera not in self.keys.images]:
             raise ValueError(f"the policy sees {', '.join(keyless)}: add +deploy.keys.images.{keyless[0]}=KEY")
-        asyncio.run(Service(self, policy).serve())
+        try:
+            asyncio.run(Service(self, policy).serve())
+        except OSError as error:
+            where = f"deploy.host={self.host} deploy.port={self.port}"
+            raise ValueError(f"cannot listen at {where}: {error.strerror}; deploy.port=0 is any free one") from error
 
 
 class Service:
