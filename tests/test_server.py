@@ -272,6 +272,28 @@ def test_only_so_many_come_in_and_only_with_the_key() -> None:
         remote(url, api_key="open").close()
 
 
+def test_of_many_that_come_at_once_only_so_many_stay() -> None:
+    stayed: list[bool] = []
+
+    def come(url: str) -> None:
+        try:
+            with client(url) as connection:
+                received(connection)
+                together.wait(20)
+                stayed.append(True)
+        except (InvalidStatus, ConnectionClosed):
+            together.wait(20)
+
+    together = threading.Barrier(8)
+    with serving(as_policy(make_bc()), connections=2) as url:
+        threads = [threading.Thread(target=come, args=[url]) for _ in range(8)]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join(20)
+    assert len(stayed) == 2
+
+
 def test_beyond_this_machine_nobody_listens_without_a_key(tmp_path: Path) -> None:
     policy = as_policy(make_bc())
     with pytest.raises(ValueError, match=r"deploy\.host=0\.0\.0\.0 lets other machines use the policy: set"):
