@@ -33,8 +33,8 @@ from std_msgs.msg import String
 from vla.deploy import messages
 from vla.deploy.bag import POLICY_INPUTS
 from vla.deploy.demo_operator import DemoOperator, SimulatedEpisode
-from vla.deploy.images import resize
 from vla.deploy.ros import NETWORKS, Network, split_arguments
+from vla.io.images import resize
 from vla.rollouts.recorder import VIEWER
 from vla.tasks import gl as backend
 

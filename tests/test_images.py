@@ -7,7 +7,7 @@ from typing import get_args
 import numpy as np
 import pytest
 
-from vla.deploy.images import Crop, describe_resize, resize
+from vla.io.images import Crop, describe_resize, resize
 
 RANDOM = np.random.default_rng(0).integers(0, 256, (96, 96, 3), np.uint8)
 

@@ -71,7 +71,7 @@ def test_every_image_is_close_to_that_of_the_store(home: Path) -> None:
             file = home / "dataset" / video / f"chunk-000/file-{episode[f'{video}/file_index']:03d}.mp4"
             begin, end = episode[f"{video}/from_timestamp"], episode[f"{video}/to_timestamp"]
             assert end - begin == pytest.approx(episode["length"] / 10)
-            images = decode(file, begin, episode["length"], Fraction(10), ARM_SPEC.image_size)
+            images = np.stack([*decode(file, begin, episode["length"], Fraction(10), ARM_SPEC.image_size)])
             green = images[..., 1].mean((1, 2))  # counts the steps in the toy world
             np.testing.assert_allclose(green, expected[f"rgb_{camera}"][..., 1].mean((1, 2)), atol=6)
 

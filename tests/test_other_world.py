@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import toy
 from conftest import CONF
+from defaults import defaults_of
 from exporting import exporter
 from fake_batch import as_policy
 from hydra import compose, initialize_config_dir
@@ -111,7 +112,7 @@ def test_episodes_are_exported(folder: Path, tmp_path: Path, kind: str) -> None:
     elif kind == "packed":
         assert EpisodeStore(tmp_path / "export").packed == {"rgb_eye": "zlib"}
     else:
-        expert = LeRobotDemonstrations(tmp_path / "export", spec=toy.SPEC)
+        expert = LeRobotDemonstrations(**defaults_of("expert/lerobot", folder=tmp_path / "export"), spec=toy.SPEC)
         episode = expert.episode(0)
         assert episode.draws["recorded"]["lacks"] == []
         state = np.stack([seen.state for seen in episode.observations])

@@ -50,7 +50,9 @@ def sentence(error: Exception) -> str:
     if isinstance(error, ConfigCompositionException) and isinstance(cause, OmegaConfBaseException) and cause.full_key:
         return _unknown_key(cause)
     if isinstance(error, OmegaConfBaseException) and error.full_key:
-        return f"{error.full_key}: {str(error).splitlines()[0]}"
+        line = str(error).splitlines()[0]
+        _, resolver, reason = line.partition("ValueError raised while resolving interpolation: ")
+        return reason if resolver else f"{error.full_key}: {line}"
     if isinstance(error, OSError) and error.filename:
         return f"{error.filename}: {error.strerror}"
     if type(error).__name__ == "FatalError" and "OpenGL" in str(error):

@@ -263,6 +263,12 @@ class Environment(Protocol):
         ...
 
 
+class SpecOnly:
+    """Base class of worlds of which only recordings exist: they have a spec, but nothing can act in them."""
+
+    spec: Spec
+
+
 @runtime_checkable
 class Multitask(Protocol):
     """Environment that tells the task of a seed before its episode: collection gives every task as many episodes."""

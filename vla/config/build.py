@@ -42,7 +42,7 @@ class Group:
 GROUPS = {
     group.name: group
     for group in (
-        Group("task", ("vla.spec.Environment",)),
+        Group("task", ("vla.spec.Environment", "vla.spec.SpecOnly")),
         Group(
             "expert", ("vla.spec.Agent", "vla.data.formats.imported_demonstrations.ImportedDemonstrations"), ("spec",)
         ),

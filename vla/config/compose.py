@@ -14,7 +14,8 @@ from hydra.core.global_hydra import GlobalHydra
 from hydra.version import VersionBase
 from omegaconf import DictConfig, OmegaConf, open_dict
 
-import vla.config.check  # noqa: F401  registers the resolvers
+import vla.config.check
+import vla.config.recorded  # noqa: F401  these two register the resolvers
 from vla.config.experiment import Node, plain
 from vla.config.packages import offer_options, option_folders
 

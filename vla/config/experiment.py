@@ -14,11 +14,13 @@ from typing import TYPE_CHECKING, Any
 
 from omegaconf import DictConfig, OmegaConf
 
+from vla.config.annotations import locate
 from vla.config.build import build
 from vla.config.check import with_changes
 from vla.config.differences import differences
 from vla.config.packages import trusted, with_trust
 from vla.parallel.processes import without_triton
+from vla.spec import SpecOnly
 
 if TYPE_CHECKING:
     from vla.data.datamodule import WindowDataModule
@@ -72,6 +74,20 @@ class Experiment:
         folder = Path(self["output"])
         folder.mkdir(parents=True, exist_ok=True)
         return folder
+
+    @property
+    def playable(self) -> bool:
+        """Whether agents can act in the world of the task; else it is known from recordings only."""
+        return not issubclass(locate("task._target_", self["task"]["_target_"]), SpecOnly)
+
+    def world(self) -> Environment | SpecOnly:
+        """Build the world of the task, closed, for what it says of itself."""
+        if not self.playable:
+            recorded: SpecOnly = build(self["task"], "task")
+            return recorded
+        environment = self.make_environment()()
+        environment.close()
+        return environment
 
     @property
     def checkpoint(self) -> Path | None:
@@ -187,10 +203,20 @@ def plain(node: DictConfig) -> Node:
 
 
 def make_environment(task: Node) -> Environment:
-    """Build the environment of a task node."""
+    """Build the environment of a task node.
+
+    Raises:
+        ValueError: nothing can act in the world.
+    """
     without_triton()
-    environment: Environment = build(task, "task")
-    return environment
+    environment = build(task, "task")
+    if isinstance(environment, SpecOnly):
+        raise ValueError(
+            "task=recorded has no simulator, so nothing can be played in it: job=collect, train, evaluate, export and "
+            "inspect work with recordings, and so do deploy=server and deploy=ros2"
+        )
+    found: Environment = environment
+    return found
 
 
 def make_expert(expert: Node, environment: Environment) -> Agent:

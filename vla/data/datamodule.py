@@ -12,7 +12,7 @@ from __future__ import annotations
 import hashlib
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import lru_cache
 from pathlib import Path
@@ -21,6 +21,7 @@ import numpy as np
 from lightning import LightningDataModule
 
 from vla.data.episodes import EpisodeStore
+from vla.data.index import Entry
 from vla.data.window_batches import Batch, WindowBatcher
 from vla.io.types import Count, Natural, Rate, Seed
 from vla.spec import Array, Spec
@@ -33,6 +34,12 @@ GOLDEN = 2654435769
 def held_out(seed: Seed, fraction: float) -> bool:
     """Return whether the episode of `seed` is held out for validation, independently of other episodes."""
     return seed * GOLDEN % 2**32 < fraction * 2**32
+
+
+def digest_of(episodes: Sequence[Entry]) -> str:
+    """Return a digest of the content of episodes."""
+    entries = repr([(entry.seed, entry.steps, entry.crc) for entry in episodes])
+    return hashlib.sha256(entries.encode()).hexdigest()[:12]
 
 
 class Prefetcher:
@@ -139,8 +146,7 @@ class WindowDataModule(LightningDataModule):
                 f"{len(store.episodes)} episodes leave {len(sides[False])} for training and {len(sides[True])} for "
                 f"validation: raise collect.episodes, or set data.validation_fraction (now {self._fraction})"
             )
-        entries = repr([(entry.seed, entry.steps, entry.crc) for entry in store.episodes])
-        self._digest = hashlib.sha256(entries.encode()).hexdigest()[:12]
+        self._digest = digest_of(store.episodes)
         self.training_windows = np.concatenate(sides[False])  # row numbers
         self.held_out_windows = np.concatenate(sides[True]) if sides[True] else np.empty(0, np.int64)
         self.make_batch = WindowBatcher(store, self._history, self._chunk, self._depth, self._on_gpu())

@@ -15,7 +15,7 @@ import numpy as np
 from vla.deploy.camera_sync import CameraSync
 from vla.deploy.joint_limiter import JointLimiter, Robot
 from vla.io.types import Count, Point, Positive
-from vla.robots.controllers import controller_for
+from vla.robots.controllers import GRIPPER, UNITS, controller_for
 from vla.spec import Array, Observation, Spec
 
 # How to recover, for messages.
@@ -47,7 +47,8 @@ class Safety:
     tracking_for: Positive  # … for so long [s]
     fresh_frames: Count  # consecutive matching sets of images after which a held arm moves again
     rejected: Count  # consecutive rejected plans that cause a fault
-    workspace: tuple[Point, Point]  # opposite corners of the box for the tool point, in the base frame [m]
+    # opposite corners of the box for the tool point, in the base frame [m]; None for joint positions as actions
+    workspace: tuple[Point, Point] | None
 
 
 @dataclass(frozen=True)
@@ -72,6 +73,9 @@ class ControlLoop:
         if others := [name for name in spec.state if name not in model.components]:
             raise ValueError(f"the policy's state has {', '.join(others)}, which joint states do not contain")
         self._controller = controller_for(spec, safety.workspace)
+        self._grip = spec.action.index(GRIPPER) if GRIPPER in {*spec.action} - {*model.joints} else None
+        self._motion = [index for index in range(len(spec.action)) if index != self._grip]
+        self._factors = np.array([UNITS.get(unit.removesuffix("/s"), 1.0) for unit in spec.state_units])
         if len(robot.joints) != len(model.joints):
             raise ValueError(
                 f"the policy was trained with {len(model.joints)} joints, the robot has {len(robot.joints)}"
@@ -181,13 +185,14 @@ class ControlLoop:
         """Robot state (P,) float32 in the order of the spec."""
         model = self._model
         values = dict(zip(model.joints, joints, strict=True)) | dict(zip(model.velocities, velocities, strict=False))
-        return np.array([values.get(name, opening) for name in self.spec.state], np.float32)
+        return np.array([values.get(name, opening) for name in self.spec.state] / self._factors, np.float32)
 
     def set_plan(self, actions: Array, now: float) -> None:
         """Schedule the policy's actions (k, D); the first one starts at the time of the observation.
 
-        Each action is relative to the goal of the previous one, the first to the pose commanded at the observation.
-        Actions in the past are skipped, but still count towards the goals of later ones.
+        Cartesian actions are relative to the goal of the previous one, the first to the pose commanded at the
+        observation; joint positions are absolute. Actions in the past are skipped, but still count towards the goals
+        of later ones.
         """
         if self._pending is None:
             return
@@ -204,9 +209,10 @@ class ControlLoop:
         period = 1 / self.spec.control_hz
         actions = np.clip(actions, self.spec.low, self.spec.high)
         self._controller.reset(anchor)
-        goals = [self._controller.step(action[:-1]).copy() for action in actions]
+        goals = [self._controller.step(action[self._motion]).copy() for action in actions]
+        openings = [self._opening] * len(actions) if self._grip is None else actions[:, self._grip].tolist()
         ends = observed + period * np.arange(1, len(actions) + 1)
-        self._schedule = list(zip(ends.tolist(), goals, actions[:, -1].tolist(), strict=True))
+        self._schedule = list(zip(ends.tolist(), goals, openings, strict=True))
         self._next_inference = float(ends[-1])
         return None
 

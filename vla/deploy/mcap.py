@@ -20,6 +20,7 @@ from vla.deploy.joint_limiter import Robot
 from vla.deploy.settings import Topics
 from vla.io.types import Text
 from vla.parallel.pool import THIS_PROCESS, Cluster
+from vla.robots.controllers import joint_factors
 from vla.spec import Array, Spec
 
 SECOND = 1_000_000_000  # [ns]
@@ -99,6 +100,7 @@ class Mcap(FolderExporter):
 
     def _require_fit(self, spec: Spec) -> None:
         robot = spec.require_robot("export=mcap")
+        joint_factors(spec)  # raises an error before anything is written
         images, depths = (spec.cameras, self._topics.images), (spec.depth, self._depths)
         for key, (cameras, topics) in {"topics.images": images, "depths": depths}.items():
             if missing := [camera for camera in cameras if camera not in topics]:
@@ -127,6 +129,7 @@ class Mcap(FolderExporter):
     def _joint_state(self, stamp: int, spec: Spec, state: Array) -> Any:
         robot = spec.require_robot("export=mcap")
         joints, velocities = (state[spec.indices(names)] for names in (robot.joints, robot.velocities))
+        joints = joints * joint_factors(spec)
         fingers = self._robot.fingers if robot.gripper else []
         opening = (
             [float(state[spec.indices([robot.gripper])[0]]) / len(fingers) for _ in fingers] if robot.gripper else []

@@ -24,11 +24,12 @@ from std_msgs.msg import Float64MultiArray, String
 from std_srvs.srv import Trigger
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
-from vla.deploy import images, messages
+from vla.deploy import messages
 from vla.deploy.control_loop import ControlLoop, State
 from vla.deploy.joint_limiter import Robot
 from vla.deploy.lifecycle_node import GuardedLifecycleNode
 from vla.deploy.settings import PolicySettings
+from vla.io import images
 from vla.policy import Policy
 from vla.spec import LONGEST_INSTRUCTION, Array, Observation
 

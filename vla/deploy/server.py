@@ -29,8 +29,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 from annotated_types import Ge, Le, MinLen
 
-from vla.deploy.images import Crop, resize
 from vla.io.array_messages import pack, unpack
+from vla.io.images import Crop, resize
 from vla.io.types import Count, Text
 from vla.spec import LONGEST_INSTRUCTION, Array, Environment, Observation, Spec
 

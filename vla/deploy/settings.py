@@ -7,8 +7,8 @@ from dataclasses import asdict, dataclass
 from typing import Literal
 
 from vla.deploy.control_loop import Safety
-from vla.deploy.images import Crop
 from vla.deploy.joint_limiter import Robot
+from vla.io.images import Crop
 from vla.io.types import NonNegative, Positive
 
 NAME = re.compile(r"(~/|/)?[A-Za-z_]\w*(/[A-Za-z_]\w*)*", re.ASCII)  # of a topic

@@ -11,7 +11,7 @@ from vla.config.experiment import Experiment
 from vla.data.episodes import EpisodeStore
 from vla.data.formats.imported_demonstrations import ImportedDemonstrations
 from vla.rollouts.collect import collect
-from vla.spec import FIRST_SEED, Environment, Multitask, Spec
+from vla.spec import FIRST_SEED, Environment, Multitask, Spec, SpecOnly
 
 log = logging.getLogger(__name__)
 
@@ -60,26 +60,25 @@ def complete_store(experiment: Experiment) -> EpisodeStore | None:
     return store if len(store.episodes) >= asked["episodes"] else None
 
 
-def _source(experiment: Experiment) -> tuple[Environment, Spec, ImportedDemonstrations | None]:
-    """Return the environment, closed, the spec of the demonstrations, and the recordings to import, or None for an
-    acting expert."""
-    environment = experiment.make_environment()()
-    environment.close()
-    expert = build(experiment["expert"], "expert", spec=environment.spec)
+def _source(experiment: Experiment) -> tuple[Environment | SpecOnly, Spec, ImportedDemonstrations | None]:
+    """Return the world, closed, the spec of the demonstrations, and the recordings to import, or None for an acting
+    expert."""
+    world = experiment.world()
+    expert = build(experiment["expert"], "expert", spec=world.spec)
     recorded = expert if isinstance(expert, ImportedDemonstrations) else None
-    return environment, recorded.spec if recorded else environment.spec, recorded
+    return world, recorded.spec if recorded else world.spec, recorded
 
 
 def _fill(experiment: Experiment) -> EpisodeStore:
     asked, cluster = experiment["collect"], experiment.cluster()
-    environment, spec, recorded = _source(experiment)
+    world, spec, recorded = _source(experiment)
     store = EpisodeStore.create_or_open(Path(asked["folder"]), spec, experiment.source)
     if recorded is not None:
         added = recorded.fill(store, asked["episodes"])
         log.info("%s: %d recorded episodes, %d of them new", store.folder, len(store.episodes), added)
         return store
     makers = experiment.make_environment(), experiment.make_expert()
-    multitask = environment if isinstance(environment, Multitask) else None
+    multitask = world if isinstance(world, Multitask) else None
     summary = collect(store, *makers, asked["episodes"], cluster, asked["seed"], multitask)
     if len(summary.tasks) > 1:
         for task, (solved, tried) in summary.tasks.items():

@@ -1,4 +1,7 @@
-"""`job=evaluate`: the success rate of a policy on the same seeds under every condition; trains a policy if needed."""
+"""`job=evaluate`: the success rate of a policy on the same seeds under every condition; trains a policy if needed.
+
+In a world of recordings there is no success to measure, only errors of actions: `vla.jobs.open_loop`.
+"""
 
 from __future__ import annotations
 
@@ -14,6 +17,7 @@ from vla.config.check import Job, with_changes
 from vla.config.conditions import conditions
 from vla.config.experiment import Experiment
 from vla.io.files import writing
+from vla.jobs.open_loop import evaluate_open_loop
 from vla.jobs.train import train
 from vla.policy import latency
 from vla.reports.conditions import conditions_table, plot_conditions
@@ -34,7 +38,7 @@ JOB = Job(
 
 
 def run(experiment: Experiment) -> float | None:
-    """Measure the success rate; return None in all but the first process of a training.
+    """Measure the success rate, or open-loop errors; return None in all but the first process of a training.
 
     Raises:
         ValueError: an episode ended in an error; the report is written and contains it.
@@ -42,9 +46,13 @@ def run(experiment: Experiment) -> float | None:
     output = experiment.output
     if experiment["agent"]:
         return _evaluated(experiment, None)
+    if not experiment.playable and experiment["evaluate"]["conditions"]:
+        raise ValueError("evaluate.conditions change a world, and a recording has none: omit them")
     checkpoint = experiment.checkpoint or train(experiment)
     if checkpoint is None:
         return None
+    if not experiment.playable:
+        return evaluate_open_loop(experiment, checkpoint)
     own = checkpoint.resolve().parent == (output / CHECKPOINTS).resolve()
     if own and (success := cached_success(output, experiment.config, checkpoint)) is not None:
         return success

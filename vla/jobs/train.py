@@ -129,6 +129,8 @@ def _closed_loop(experiment: Experiment, checkpoints: Path) -> ClosedLoop | None
     """Return the callback that plays episodes in every validation, or None without episodes."""
     asked = experiment["validate"]
     seeds = range(asked["seed"], asked["seed"] + asked["episodes"])
+    if seeds and not experiment.playable:
+        raise ValueError(f"validate.episodes={len(seeds)}: nothing can be played in a recording: set it to 0")
     make_environment = experiment.make_environment(asked["changes"])
     make_policy = partial(training_policy, experiment["policy"])
     return ClosedLoop(make_environment, make_policy, seeds, checkpoints) if seeds else None

@@ -37,6 +37,7 @@ class Header:
     spec: Spec
     finished: bool  # the training was completed
     steps: int  # optimiser steps
+    windows: str  # digest of the demonstrations, empty if unknown
 
 
 @dataclass(frozen=True)
@@ -112,7 +113,16 @@ def _header(path: Path, content: dict[str, Any]) -> Header:
             f"{path} is no checkpoint of this project: its configuration lacks {', '.join(REQUIRED_NODES)}"
         )
     finished = content.get("finished") is True
-    return Header(path, config, Spec.from_dict(spec, f"{path}: spec"), finished, steps if isinstance(steps, int) else 0)
+    trained_on = content.get("WindowDataModule")
+    windows = trained_on.get("windows") if isinstance(trained_on, dict) else None
+    return Header(
+        path,
+        config,
+        Spec.from_dict(spec, f"{path}: spec"),
+        finished,
+        steps if isinstance(steps, int) else 0,
+        windows if isinstance(windows, str) else "",
+    )
 
 
 def _load(path: Path, weights: bool) -> dict[str, Any]:

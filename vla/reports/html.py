@@ -19,16 +19,19 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
 from vla.config.differences import ABSENT, at, differences
+from vla.data.index import listed
 from vla.io.files import write_text
 from vla.reports.style import BLUE, GREEN, GREY, RED, Interval
 from vla.reports.training_curves import colours, draw_run, draw_runs
 from vla.rollouts.evaluate import ERROR, IN_DISTRIBUTION, Report, Result
 from vla.runs.folder import Run, read_run, require_run
+from vla.spec import READABLE
 
 log = logging.getLogger(__name__)
 
 PAGE, COMPARISON, SWEEP = "report.html", "comparison.html", "sweep.html"
 RECORDING, SAMPLES, PLOTS, SUITE = "rollouts.rrd", "samples.png", "report.png", "suite.png"
+ERRORS = "errors.png"  # of an open-loop evaluation
 FAILURES, SUCCESSES = 6, 3  # filmstrips on a run's page
 NAMED = 5  # maximum number of tasks in a title
 COMPARED = 3  # failures per run on a comparison
@@ -61,7 +64,7 @@ def write_page(folder: Path) -> Path:
         ValueError: a file is damaged.
     """
     run = read_run(folder)
-    pictures = {name: folder / name for name in (SAMPLES, PLOTS, SUITE) if (folder / name).is_file()}
+    pictures = {name: folder / name for name in (SAMPLES, PLOTS, SUITE, ERRORS) if (folder / name).is_file()}
     return _write(
         folder / PAGE,
         "run.html",
@@ -70,6 +73,7 @@ def write_page(folder: Path) -> Path:
         facts=_facts(run),
         all_steps=at(run.config, "trainer.max_steps", None),
         tables=_rate_tables(run),
+        errors=_error_table(run),
         curves=draw_run(run.metrics),
         strips=_filmstrips(run, FAILURES, SUCCESSES),
         pictures=pictures,
@@ -157,7 +161,7 @@ def _title(run: Run) -> str:
 
 def _facts(run: Run) -> dict[str, str]:
     """Return the facts at the top of a run's page: name → text."""
-    training, report = run.training, run.report
+    training, report = run.training, run.report or run.errors
     facts = {}
     if run.parameters is not None:
         facts["parameters"] = f"{run.parameters / 1e6:.2f} M"
@@ -170,12 +174,24 @@ def _facts(run: Run) -> dict[str, str]:
     if run.metrics and (demonstrations := at(run.config, "collect.episodes")) != ABSENT:
         facts["demonstrations"] = str(demonstrations)
     if report and report.seeds:
-        facts["evaluated on"] = f"seeds {min(report.seeds)} to {max(report.seeds)}"
+        seeds = f"seeds {min(report.seeds)} to {max(report.seeds)}"
+        facts["evaluated on"] = seeds if run.report else f"the held-out episodes {listed(report.seeds)}"
     if report and report.checkpoint:
         folder, checkpoint = (Path(os.path.realpath(path)) for path in (run.folder, report.checkpoint))
         inside = checkpoint.is_relative_to(folder)
         facts["checkpoint"] = str(checkpoint.relative_to(folder) if inside else report.checkpoint)
     return facts
+
+
+def _error_table(run: Run) -> list[tuple[str, str, str]]:
+    """Return component, error with its interval, and error of a constant action."""
+    rows = []
+    for each in run.errors.components if run.errors else ():
+        factor, unit = READABLE.get(each.unit, (1.0, each.unit))
+        high = "∞" if each.ci_high is None else f"{factor * each.ci_high:.3g}"
+        interval = f"{factor * each.error:.3g} ({factor * each.ci_low:.3g}-{high}) {unit}"
+        rows.append((each.name, interval, f"{factor * each.constant:.3g} {unit}"))
+    return rows
 
 
 def _rate_tables(run: Run) -> dict[str, dict[str, tuple[Interval, str, str]]]:

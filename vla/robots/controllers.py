@@ -1,22 +1,28 @@
-"""Which controller executes the actions of a policy on its arm."""
+"""Which controller executes the actions of a policy on its arm.
+
+Shapes: J joints.
+"""
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from typing import Protocol
 
 import numpy as np
 
 from vla.io.types import Point
 from vla.robots import panda
-from vla.spec import Array, Spec
+from vla.spec import Array, RobotModel, Spec
 
-GRIPPER = "gripper"  # last action component, which opens the gripper at 1 and closes it at 0
+GRIPPER = "gripper"  # action component that opens the gripper at 1 and closes it at 0, unless it is a joint
+
+# Unit of a joint → factor to [rad], or to [m] of a prismatic one.
+UNITS = {"rad": 1.0, "deg": math.pi / 180, "m": 1.0}
 
 
 class Controller(Protocol):
     """Turns the motion of an action, all but the gripper, into joint targets."""
-
-    motion: tuple[tuple[str, str], ...]  # names and units of the action components that it takes
 
     def reset(self, joints: Array) -> None:
         """Set the last commanded joints (J,) [rad]."""
@@ -27,29 +33,91 @@ class Controller(Protocol):
         ...
 
 
-def controller_for(spec: Spec, workspace: tuple[Point, Point]) -> Controller:
-    """Build the controller of the arm in `spec`; the only one there is has the kinematics of the Panda and FR3.
+class JointController:
+    """Takes actions that are joint targets.
+
+    Args:
+        order: (J,) index of each joint among the components of the motion.
+        factors: (J,) from its unit to [rad].
+    """
+
+    def __init__(self, order: Sequence[int], factors: Array) -> None:
+        self._order, self._factors = list(order), factors
+
+    def reset(self, joints: Array) -> None:
+        """Do nothing: targets are absolute."""
+
+    def step(self, motion: Array) -> Array:
+        """Return the targets (J,) [rad]."""
+        targets: Array = motion[self._order] * self._factors
+        return targets
+
+
+def controller_for(spec: Spec, workspace: tuple[Point, Point] | None) -> Controller:
+    """Build the controller for the actions in `spec`: joint positions of any arm, or Cartesian motion of the Panda.
 
     Args:
         spec: of the policy.
-        workspace: opposite corners of the box for the tool point, in the base frame [m].
+        workspace: opposite corners of the box for the tool point of Cartesian motion, in the base frame [m].
 
     Raises:
-        ValueError: the arm or the actions are of another kind.
+        ValueError: the arm or the actions are of another kind, or the box cannot be kept.
     """
-    model, joints = spec.require_robot("deployment"), len(panda.CHAIN) - 1
-    differs = ""
+    model = spec.require_robot("deployment")
+    if set(model.joints) <= {*spec.action}:
+        return _joint_controller(spec, model, workspace)
+    differs, joints = "", len(panda.CHAIN) - 1
     if len(model.joints) != joints:
         differs = f"has {len(model.joints)} joints, the Panda {joints}"
     elif model.chain and not np.allclose(model.chain, panda.CHAIN):
         differs = "has another kinematic chain than the Panda"
     if differs:
-        raise ValueError(f"the policy's arm {differs}: another arm needs a controller in vla/robots/controllers.py")
-    controller = panda.CartesianController(1 / spec.control_hz, *workspace)
-    found, expected = list(zip(spec.action, spec.units, strict=True)), [*controller.motion, (GRIPPER, "1")]
+        raise ValueError(
+            f"the policy's arm {differs}: another arm needs actions that are its joint positions, or a controller in "
+            "vla/robots/controllers.py"
+        )
+    found = list(zip(spec.action, spec.units, strict=True))
+    expected = [*panda.CartesianController.motion, (GRIPPER, "1")]
     if found != expected:
         raise ValueError(f"the policy's action is {_listed(found)}, expected {_listed(expected)}")
-    return controller
+    if workspace is None:
+        raise ValueError("deploy.safety.workspace=null: Cartesian motion needs a box for the tool point")
+    return panda.CartesianController(1 / spec.control_hz, *workspace)
+
+
+def joint_factors(spec: Spec) -> Array:
+    """Return the (J,) factors from the units of the joints in the state to [rad].
+
+    Raises:
+        ValueError: there is no robot, or a joint has another unit.
+    """
+    joints = spec.require_robot("a position in rad").joints
+    units = dict(zip(spec.state, spec.state_units, strict=True))
+    return _factors([(name, units[name]) for name in joints])
+
+
+def _joint_controller(spec: Spec, model: RobotModel, workspace: tuple[Point, Point] | None) -> JointController:
+    if others := [name for name in spec.action if name not in (*model.joints, GRIPPER)]:
+        raise ValueError(f"the policy's action has {', '.join(others)}, which are no joints of its robot")
+    joint_factors(spec)  # those of the state must be known too
+    if workspace is not None:
+        raise ValueError(
+            "deploy.safety.workspace cannot be kept by a policy that acts with joint positions: set it to null, and "
+            "narrow deploy.robot.low and high where the arm must not go"
+        )
+    units = dict(zip(spec.action, spec.units, strict=True))
+    motion = [name for name in spec.action if name != GRIPPER or name in model.joints]
+    order = [motion.index(name) for name in model.joints]
+    return JointController(order, _factors([(name, units[name]) for name in model.joints]))
+
+
+def _factors(joints: list[tuple[str, str]]) -> Array:
+    if unknown := [joint for joint in joints if joint[1] not in UNITS]:
+        raise ValueError(
+            f"the joints {_listed(unknown)} have no unit of a position, {', '.join(UNITS)}: name it with task.units "
+            "before training"
+        )
+    return np.array([UNITS[unit] for _, unit in joints])
 
 
 def _listed(components: list[tuple[str, str]]) -> str:

@@ -46,6 +46,20 @@ def stratified_interval(strata: Sequence[tuple[int, int, float]]) -> tuple[float
     return rate, *wilson_interval(rate * alike, alike)
 
 
+def mean_interval(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the 95 % confidence intervals of the means of (E, D) non-negative values, as two arrays (D,).
+
+    Student's t interval over the E rows; with a single row it is unbounded.
+    """
+    mean, rows = values.mean(0), len(values)
+    if rows < 2:
+        return np.zeros_like(mean), np.full_like(mean, np.inf)
+    from scipy.stats import t  # the import takes a second
+
+    half_width = t.ppf(0.975, rows - 1) * values.std(0, ddof=1) / sqrt(rows)
+    return np.maximum(mean - half_width, 0), mean + half_width
+
+
 def mcnemar(lost: int, won: int) -> float:
     """Return the two-sided exact p-value for equal success rates, given the numbers of discordant pairs.
 

@@ -82,6 +82,36 @@ class Summary:
     mean_over_tiers: Mean | None = None
 
 
+@dataclass(frozen=True)
+class ComponentError:
+    """Mean absolute error of an action component over episodes, with its confidence interval."""
+
+    __pydantic_config__ = STRICT
+
+    name: str
+    unit: str
+    error: NonNegative
+    ci_low: NonNegative
+    ci_high: NonNegative | None  # None: unbounded
+    constant: NonNegative  # error of the mean action of the training episodes
+
+
+@dataclass(frozen=True, kw_only=True)
+class ErrorsFile:
+    """errors.json, written by `vla.reports.open_loop.write_errors`."""
+
+    __pydantic_config__ = ConfigDict(strict=True, extra="ignore", allow_inf_nan=False)
+
+    seeds: list[Natural]
+    components: list[ComponentError]
+    relative: NonNegative
+    checkpoint: str | None
+    config: Node
+    parameters: Count | None = None
+    latency_ms: Positive | None = None
+    wall_time_s: NonNegative | None = None
+
+
 @dataclass(frozen=True, kw_only=True)
 class Condition(Summary):
     """Success statistics under another condition, on the same seeds."""

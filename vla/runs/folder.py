@@ -20,7 +20,7 @@ from vla.config.differences import at
 from vla.io.documents import read_bounded, read_json, read_yaml
 from vla.io.files import write_text
 from vla.rollouts.evaluate import IN_DISTRIBUTION, Report, Result
-from vla.runs.files import Change, Node, ReportFile, Training
+from vla.runs.files import Change, ErrorsFile, Node, ReportFile, Training
 from vla.spec import Array
 
 log = logging.getLogger(__name__)
@@ -30,6 +30,7 @@ Curve = tuple[Array, Array]  # steps (N,) and values (N,)
 
 CONFIG, CHANGES, TRAINING = "config.yaml", "changes.yaml", "training.json"
 METRICS, REPORT = "metrics.csv", "report.json"
+ERRORS = "errors.json"  # of an open-loop evaluation, in place of a report
 CHECKPOINTS, LAST = "checkpoints", "last.ckpt"  # the folder of weights, and those of the newest save
 
 
@@ -43,6 +44,7 @@ class Run:
     training: Training | None
     metrics: dict[str, Curve]
     report: ReportFile | None
+    errors: ErrorsFile | None
 
     @property
     def model(self) -> str:
@@ -57,7 +59,7 @@ class Run:
     @property
     def parameters(self) -> int | None:
         """Number of the model's parameters, if known."""
-        known = self.training or self.report
+        known = self.training or self.report or self.errors
         return known.parameters if known else None
 
     @cached_property
@@ -79,11 +81,12 @@ def read_run(folder: Path) -> Run:
     Raises:
         ValueError: a file is damaged.
     """
-    report = read_report(folder)
-    config = _read(folder / CONFIG, partial(read_yaml, kind=Node), report.config if report else {})
+    report, errors = read_report(folder), _read(folder / ERRORS, partial(read_json, kind=ErrorsFile), None)
+    evaluated = report or errors
+    config = _read(folder / CONFIG, partial(read_yaml, kind=Node), evaluated.config if evaluated else {})
     changes = _read(folder / CHANGES, partial(read_yaml, kind=list[Change]), None)
     metrics: dict[str, Curve] = _read(folder / METRICS, _curves, {})
-    return Run(folder, config, changes, read_training(folder), metrics, report)
+    return Run(folder, config, changes, read_training(folder), metrics, report, errors)
 
 
 def read_report(folder: Path) -> ReportFile | None:
@@ -129,7 +132,7 @@ def require_run(folder: Path) -> Run:
     Raises:
         ValueError: the folder has neither, or a file is damaged.
     """
-    if not any((folder / name).is_file() for name in (REPORT, METRICS)):
+    if not any((folder / name).is_file() for name in (REPORT, ERRORS, METRICS)):
         raise ValueError(f"{folder} is no run: it has neither {REPORT} nor {METRICS}")
     return read_run(folder)
 

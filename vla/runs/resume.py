@@ -15,7 +15,7 @@ from filelock import FileLock, Timeout
 from vla.config.adopt import require_identity
 from vla.config.differences import differences
 from vla.models.checkpoint import read_header
-from vla.runs.folder import CHECKPOINTS, LAST, REPORT, chosen_checkpoint, read_report
+from vla.runs.folder import CHECKPOINTS, ERRORS, LAST, REPORT, chosen_checkpoint, read_report
 
 log = logging.getLogger(__name__)
 
@@ -95,7 +95,8 @@ def _newest_interrupted(runs: Path) -> Path:
         if _locked(last.parent):
             continue
         run, saved = last.parent.parent, read_header(last)
-        unreported = saved.config.get("job") == "evaluate" and not (run / REPORT).exists()
+        reported = (run / REPORT).exists() or (run / ERRORS).exists()
+        unreported = saved.config.get("job") == "evaluate" and not reported
         unchosen = chosen_checkpoint(run) is None  # killed between the last save and the selection
         if not saved.finished or unchosen or unreported:
             return run

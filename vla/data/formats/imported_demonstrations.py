@@ -1,20 +1,51 @@
-"""Existing demonstrations in place of an expert: their episodes are copied into the store."""
+"""Existing demonstrations in place of an expert: their episodes are copied into the store.
+
+Shapes: N steps.
+"""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from rich.progress import track
 
 from vla.data.episodes import EpisodeStore
-from vla.spec import Episode, Spec
+from vla.spec import Array, Episode, Spec
+
+QUANTILES = (0.01, 0.99)
+MARGIN = 0.5  # by which bounds exceed the quantiles, as a fraction of the distance between these
+STILL = 0.05  # distance between the quantiles, as a fraction of the range, below which rare values are no outliers
+
+
+@dataclass(frozen=True)
+class Recording:
+    """What a recording holds, from which `conf/task/recorded.yaml` takes the spec."""
+
+    cameras: tuple[str, ...]
+    control_hz: float
+    state: tuple[str, ...]  # components
+    action: tuple[str, ...]  # components
+    bounds: Mapping[str, tuple[float, float]]  # action component → low and high
+    episodes: int  # their number
 
 
 class ImportedDemonstrations(ABC):
     """Base class of imported episodes; `spec`, the layout of their steps, has no truth."""
 
     spec: Spec
+
+    @classmethod
+    def recording(cls, options: Mapping[str, Any]) -> Recording:
+        """Describe the recording that `options`, the arguments of the constructor but the spec, name.
+
+        Raises:
+            ValueError: it is missing or damaged, or this format is for given tasks only.
+        """
+        raise ValueError(f"{cls.__name__} does not describe its recordings: choose the task that they are of")
 
     @abstractmethod
     def __len__(self) -> int:
@@ -44,3 +75,17 @@ class ImportedDemonstrations(ABC):
             for number in track(missing, "importing"):
                 store.append(self.episode(number))
         return len(missing)
+
+
+def action_bounds(values: Array) -> tuple[float, float]:
+    """Return bounds for a component of the actions, given its values (N,).
+
+    They are the smallest and the largest value, unless one is an outlier: further from the quantiles than `MARGIN`
+    times the distance between these. A component that hardly moves, such as a gripper that closes once, has none.
+    """
+    least, most = float(values.min()), float(values.max())
+    low, high = (float(quantile) for quantile in np.quantile(values, QUANTILES))
+    if high - low > STILL * (most - least):
+        least, most = max(least, low - MARGIN * (high - low)), min(most, high + MARGIN * (high - low))
+    apart = 1e-3 * max(1.0, abs(least)) if least == most else 0.0
+    return least - apart, most + apart

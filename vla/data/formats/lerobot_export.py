@@ -122,7 +122,13 @@ class LeRobotExporter:
         if path.exists():
             deque(clips(), 0)  # the histograms are needed in any case
         else:
-            encode(path.with_suffix(".draft"), clips(), store.spec.image_size, layout.rate(store.spec), self._crf)
+            encode(
+                path.with_suffix(".draft"),
+                clips(),
+                store.spec.image_size,
+                layout.fraction(store.spec.control_hz),
+                self._crf,
+            )
             os.replace(path.with_suffix(".draft"), path)
         return counts
 
@@ -189,7 +195,7 @@ def _episode(store: EpisodeStore, number: int, columns: Columns, counts: Mapping
     for camera, found in counts.items():
         video = f"videos/{layout.image_key(camera)}"
         row |= {f"{video}/chunk_index": chunk, f"{video}/file_index": file}
-        row |= {f"{video}/from_timestamp": float(before / layout.rate(store.spec))}
-        row |= {f"{video}/to_timestamp": float((before + steps) / layout.rate(store.spec))}
+        row |= {f"{video}/from_timestamp": float(before / layout.fraction(store.spec.control_hz))}
+        row |= {f"{video}/to_timestamp": float((before + steps) / layout.fraction(store.spec.control_hz))}
         statistics[layout.image_key(camera)] = image_moments(found[number], steps)
     return row | {f"stats/{key}/{name}": value for key, of in statistics.items() for name, value in of.items()}

@@ -59,6 +59,40 @@ class Feature:
     dtype: str
     shape: Annotated[tuple[Count, ...], MaxLen(8)]
     names: Any = None
+    info: Any = None  # of a video
+    video_info: Any = None  # the same in older datasets
+
+    @property
+    def components(self) -> list[str] | None:
+        """Names from a list, a list within a dictionary, or a dictionary of indices; None if unknown."""
+        names = self.names
+        if isinstance(names, dict):
+            ordered = all(isinstance(index, int) for index in names.values())
+            names = sorted(names, key=names.__getitem__) if ordered else next(iter(names.values()))
+        known = isinstance(names, list) and all(isinstance(name, str) for name in names)
+        return names if names and known and [len(names)] == list(self.shape) else None
+
+    @property
+    def image_size(self) -> tuple[int, int]:
+        """Height and width [px], for colours first or last."""
+        first = len(self.shape) == 3 and self.shape[0] == 3 and self.shape[-1] != 3
+        height, width = (*self.shape[1:], 1, 1)[:2] if first else (*self.shape, 1, 1)[:2]
+        return height, width
+
+    @property
+    def is_depth(self) -> bool:
+        """Whether the images are depth."""
+        return True in (self._about("is_depth_map"), self._about("video.is_depth_map"))
+
+    @property
+    def video_rate(self) -> Any:
+        """Images per second of a video [Hz], None if unknown."""
+        return self._about("video.fps")
+
+    def _about(self, name: str) -> Any:
+        return next(
+            (part[name] for part in (self.info, self.video_info) if isinstance(part, dict) and name in part), None
+        )
 
 
 @dataclass
@@ -104,9 +138,9 @@ def place(pattern: str, file: int = 0, **names: str) -> str:
     return pattern.format(chunk_index=chunk, file_index=file, **names)
 
 
-def rate(spec: Spec) -> Fraction:
+def fraction(hz: float) -> Fraction:
     """Return steps per second as a fraction, the frame rate of videos."""
-    return Fraction(spec.control_hz).limit_denominator(1000)
+    return Fraction(hz).limit_denominator(1000)
 
 
 def features(spec: Spec, depth: bool) -> dict[str, dict[str, Any]]:

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Iterable
-from contextlib import suppress
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager, suppress
 from fractions import Fraction
 from pathlib import Path
 
 import av
-import numpy as np
 from av.video.frame import PictureType
 
 from vla.io.files import require_file
@@ -18,6 +17,7 @@ from vla.spec import Array
 
 CODEC = "libsvtav1"
 PIXELS = "yuv420p"  # the only layout that the encoder supports
+RATE_TOLERANCE = 0.01  # relative; the rate in a header may be measured
 
 
 def encode(path: Path, clips: Iterable[Array], size: tuple[int, int], fps: Fraction, crf: int) -> None:
@@ -62,32 +62,54 @@ def _open_codec(stream: av.VideoStream) -> None:
                 os.sched_setscheduler(int(thread), policy, parameters)
 
 
-def decode(path: Path, start: float, count: int, fps: Fraction, size: tuple[int, int]) -> Array:
-    """Decode `count` frames of a video from `start` [s] on, as (count, H, W, 3) uint8 with images of `size` (H, W).
+def decode(
+    path: Path, start: float, count: int, fps: Fraction, size: tuple[int, int], every: int = 1
+) -> Iterator[Array]:
+    """Yield every `every`-th of `count` frames of a video from `start` [s] on, (H, W, 3) uint8 of `size` (H, W).
 
     Raises:
         ValueError: the video cannot be read, has images of another size, or lacks a frame.
     """
-    images: dict[int, Array] = {}
+    wanted = 0
+    with _opened(path) as (file, stream):
+        _require_size(path, stream, size)  # before anything is decoded
+        file.seek(round(start / (stream.time_base or 1)), stream=stream)  # the key frame before it
+        for frame in file.decode(stream):
+            _require_size(path, frame, size)
+            number = -1 if frame.time is None else round((frame.time - start) * float(fps))
+            if number == wanted < count:
+                yield frame.to_ndarray(format="rgb24")
+                wanted += every
+            if wanted >= count or number > wanted:
+                break
+    if wanted < count:
+        raise ValueError(f"{path} lacks the frame at {start + wanted / float(fps):.3f} s")
+
+
+def require_video(path: Path, size: tuple[int, int], fps: Fraction, count: int) -> None:
+    """Require the header of a video to give images of `size` (H, W), their rate and a number of at least `count`.
+
+    Raises:
+        ValueError: it does not, or cannot be read.
+    """
+    with _opened(path) as (_, stream):
+        _require_size(path, stream, size)
+        rate, frames = stream.average_rate, stream.frames
+    if rate is not None and abs(rate - fps) > RATE_TOLERANCE * fps:
+        raise ValueError(f"{path} has {float(rate):g} images per second, the dataset {float(fps):g}")
+    if 0 < frames < count:  # 0: unknown
+        raise ValueError(f"{path} has {frames} images of the {count} that the dataset needs")
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[tuple[av.container.InputContainer, av.VideoStream]]:
+    """Open a video and its first stream; errors within, of reading it, become a ValueError."""
     require_file(path)
     try:
         with av.open(path) as file:
-            stream = file.streams.video[0]
-            _require_size(path, stream, size)  # before anything is decoded
-            file.seek(round(start / (stream.time_base or 1)), stream=stream)  # the key frame before it
-            for frame in file.decode(stream):
-                _require_size(path, frame, size)
-                number = -1 if frame.time is None else round((frame.time - start) * float(fps))
-                if number >= count:
-                    break
-                if number >= 0:
-                    images[number] = frame.to_ndarray(format="rgb24")
+            yield file, file.streams.video[0]
     except (av.error.FFmpegError, OSError, IndexError) as error:
         raise ValueError(f"{path} cannot be read as a video: {error}") from error
-    missing = [number for number in range(count) if number not in images]
-    if missing:
-        raise ValueError(f"{path} lacks the frame at {start + missing[0] / float(fps):.3f} s")
-    return np.stack([images[number] for number in range(count)])
 
 
 def _require_size(path: Path, images: av.VideoStream | av.VideoFrame, size: tuple[int, int]) -> None:

@@ -10,7 +10,7 @@ from typing import Literal
 import numpy as np
 from PIL import Image
 
-from vla.spec import Array
+Array = np.ndarray
 
 Crop = Literal["centre", "none"]
 
