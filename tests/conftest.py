@@ -84,6 +84,17 @@ def tabletop() -> Iterator[Tabletop]:
     environment.close()
 
 
+@pytest.fixture
+def recording(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A recording in place of any that a configuration names, in the layout of an SO-101 with two cameras."""
+    from vla.data.formats.imported_demonstrations import Recording
+
+    joints = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll", "gripper")
+    names = tuple(f"{joint}.pos" for joint in joints)
+    found = Recording(("front", "wrist"), 30.0, names, names, dict.fromkeys(names, (-90.0, 90.0)), 50)
+    monkeypatch.setattr("vla.config.recorded._recording", lambda expert: found)
+
+
 @pytest.fixture(scope="session")
 def main_job(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of one small main job, in `run`, and of what it printed; done once for all workers, to be copied."""

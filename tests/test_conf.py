@@ -27,6 +27,8 @@ OPTIONS = [
 ]
 
 
+pytestmark = pytest.mark.usefixtures("recording")
+
 # Options that are only for some options of another group.
 TOGETHER = {("tokenizer", "fast"): ["model=decoder"], ("job", "deploy"): ["deploy=ros2"]}
 

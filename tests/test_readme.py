@@ -25,6 +25,8 @@ from vla.deploy import ros
 from vla.jobs.bfloat16 import has_bfloat16
 from vla.parallel.processes import cores
 
+pytestmark = pytest.mark.usefixtures("recording")
+
 COMMANDS = [command for command in commands("vla.run") if command != "--help"]  # which is for `test_run`
 TOOLS = [(tool, command) for tool in ("say", "watch", "view", "bag") for command in commands(f"vla.deploy.{tool}")]
 TOOLS.remove(("bag", "play"))  # which a sentence names without its argument

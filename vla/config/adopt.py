@@ -21,7 +21,8 @@ from vla.models.checkpoint import read_header
 
 OF_POLICY = ("task", "tokenizer", "model")
 OF_MODEL = ("tokenizer", "model", "data")  # the batch size depends on the model
-# What a report on a policy includes of its training: nodes, which nothing builds then, and values of other nodes.
+# What a report on a policy includes of its training: nodes, which only an open-loop evaluation builds, and values of
+# other nodes.
 REPORTED = ("expert", "data", "learner", "validate", "seed")
 CHOSEN = {"experiment": "experiment", "model": "model"}  # name in `chosen` → group
 PRESETS = ("experiment", "variant", "shift")  # groups and keys that change other groups

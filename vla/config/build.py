@@ -6,13 +6,14 @@ arguments, types and allowed values. A node is checked against that signature be
 
 from __future__ import annotations
 
+import copy
 import inspect
 import sys
 from collections import ChainMap
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from difflib import get_close_matches
-from functools import cache
+from functools import cache, reduce
 from importlib import import_module
 from typing import Annotated, Any, Literal, get_args, get_origin
 
@@ -170,16 +171,23 @@ def require_no_paths(config: Mapping[str, Any], names: Collection[str], source: 
 
 
 def without_paths(config: Mapping[str, Any], name: str) -> Any:
-    """Return the node `name` of a config out of a file without the files and folders that it names, for reports.
+    """Return the node `name` of a config out of a file with null in place of the files and folders that it names.
 
     Of a class that may not be built only the name is returned.
     """
-    node = config[name]
+    node = copy.deepcopy(config[name])
     try:
-        require_no_paths(config, [name], name)
+        require_trust(config, [name], name)
+        for path in list(_paths_in(node, name)):
+            *parents, last = path.split(".")[1:]
+            reduce(_part, parents, node)[last] = None
     except ValueError:
         return {"_target_": node["_target_"]} if is_node(node) else None
     return node
+
+
+def _part(node: Any, key: str) -> Any:
+    return node[int(key)] if isinstance(node, list) else node[key]
 
 
 def _paths_in(node: Any, key: str) -> Iterator[str]:

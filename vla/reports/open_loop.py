@@ -105,7 +105,8 @@ def _plot_relative(axes: Axes, result: OpenLoop) -> None:
     if np.isfinite(high).all():
         axes.errorbar(error, places, xerr=[error - low, high - error], fmt="none", ecolor="black", capsize=3)
     axes.axvline(1, color=GREY, linestyle="--", linewidth=1)
-    axes.set_xlim(0, max(1.1, 1.1 * float(np.max(error))))
+    furthest = float(np.max(np.where(np.isfinite(high), high, error)))
+    axes.set_xlim(0, 1.05 * float(np.clip(furthest, 1.05, max(2.0, float(np.max(error))))))
     axes.set_yticks(places, names, fontsize=9)
     axes.set_xlabel("error as a fraction of that of a constant action (dashed)")
     axes.set_title(f"open-loop errors on {len(result.seeds)} held-out episodes", fontsize=11, loc="left")

@@ -18,7 +18,7 @@ from vla.spec import Array, Episode, Spec
 
 QUANTILES = (0.01, 0.99)
 MARGIN = 0.5  # by which bounds exceed the quantiles, as a fraction of the distance between these
-STILL = 0.05  # distance between the quantiles, as a fraction of the range, below which rare values are no outliers
+STILL = 0.02  # distance between the quantiles, as a fraction of the range, below which rare values are no outliers
 
 
 @dataclass(frozen=True)

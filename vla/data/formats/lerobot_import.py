@@ -13,7 +13,7 @@ from typing import Annotated, Any
 import numpy as np
 from annotated_types import MinLen, Predicate
 
-from vla.data.episodes import observations_of
+from vla.data.episodes import EpisodeStore, observations_of
 from vla.data.formats import lerobot_layout as layout
 from vla.data.formats import lerobot_tables as tables
 from vla.data.formats.imported_demonstrations import ImportedDemonstrations, Recording, action_bounds
@@ -87,7 +87,7 @@ class LeRobotDemonstrations(ImportedDemonstrations):
         actions = self._columns(spec.action, self._action, slice(None))
         if found := [*out_of_bounds(actions, spec)]:
             raise ValueError(f"{dataset.folder} is not of the task's kind of step: {'; '.join(found)}")
-        self._log(actions)
+        self._beyond = float(((actions < self._low) | (actions > self._high)).mean())
 
     @classmethod
     def recording(cls, options: Mapping[str, Any]) -> Recording:
@@ -147,22 +147,22 @@ class LeRobotDemonstrations(ImportedDemonstrations):
             raise ValueError(f"{path} has {layout.depth_key(camera)} of another size in episode {number}: {REMEDY}")
         return values.reshape(shape)
 
-    def _log(self, actions: Array) -> None:
-        """Log what an import changes: the size of images, and actions beyond the bounds."""
+    def fill(self, store: EpisodeStore, episodes: int) -> int:
+        """Append episodes, and log what an import changes: the size of images, and actions beyond the bounds."""
         size = self.spec.image_size
         for camera in self.spec.cameras:
             height, width = self._dataset.info.features[self._dataset.images[camera]].image_size
             if (height, width) != size:
                 cropped = "cropped at the centre and " if height * size[1] != width * size[0] else ""
                 log.info("camera %s: images of %d x %d are %sresized to %d x %d", camera, height, width, cropped, *size)
-        beyond = ((actions < self._low) | (actions > self._high)).mean()
-        if beyond:
-            log.info("%.2g %% of the actions are clipped to the bounds of the task", 100 * beyond)
+        if self._beyond:
+            log.info("%.2g %% of the actions are clipped to the bounds of the task", 100 * self._beyond)
+        return super().fill(store, episodes)
 
 
 def _opened(folder: Path | str | None, images: dict[str, Text] | None) -> LeRobotDataset:
     if folder is None:
-        raise ValueError("expert=lerobot needs the folder of a dataset: expert.folder=DIR")
+        raise ValueError("expert=lerobot needs a dataset: name its folder with expert=lerobot expert.folder=DIR")
     return LeRobotDataset(Path(folder), images)
 
 

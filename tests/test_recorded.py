@@ -1,0 +1,298 @@
+"""A dataset of any robot is imported, learned from and evaluated without a simulator, and moves a robot's joints."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import composing
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+import torch
+from arm import ROBOT, SAFETY
+from command_line import SMALL, here
+from exporting import exporter
+
+from vla.config.build import build
+from vla.config.experiment import plain
+from vla.data.episodes import EpisodeStore
+from vla.data.formats.imported_demonstrations import action_bounds
+from vla.deploy.control_loop import ControlLoop
+from vla.io.images import resize
+from vla.reports.open_loop import components
+from vla.robots.controllers import controller_for
+from vla.rollouts.open_loop import open_loop
+from vla.rollouts.statistics import mean_interval
+from vla.spec import Episode, Observation, RobotModel, Spec
+from vla.tasks.recorded import Recorded
+
+NAMES = tuple(f"joint{number}.pos" for number in range(1, 4))
+SPEC = Spec(
+    cameras=("top", "hand"),
+    image_size=(24, 32),
+    state=NAMES,
+    state_units=("deg",) * 3,
+    action=NAMES,
+    units=("deg",) * 3,
+    low=(-90.0,) * 3,
+    high=(90.0,) * 3,
+    control_hz=30.0,
+)
+STEPS, EPISODES = 12, 8
+TINY = ("model.width=16", "model.text_width=8", "model.keypoints=4")
+TRAINING = [option for option in SMALL if not option.startswith(("task.shadows", "task.time", "collect", "task.image"))]
+
+
+def episode(seed: int) -> Episode:
+    """Three joints that move at a constant speed; the brightness of the images tells the first one."""
+    random = np.random.default_rng(seed)
+    actions = (random.uniform(-30, 30, 3) + np.arange(1, STEPS + 1)[:, None] * random.uniform(-2, 2, 3)).astype("f4")
+    seen = [
+        Observation({name: np.full((24, 32, 3), 120 + at[0], np.uint8) for name in SPEC.cameras}, at - 1, "move")
+        for at in actions
+    ]
+    return Episode(seed, "move", "move", "success", frozenset(), {}, seen, actions, actions)
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A LeRobot dataset of a robot that nobody here knows."""
+    folder = tmp_path_factory.mktemp("recorded")
+    store = EpisodeStore.create_or_open(folder / "store", SPEC, {})
+    with store.writing():
+        for seed in range(EPISODES):
+            store.append(episode(seed))
+    made = Path(exporter("lerobot", folder / "dataset", "export.crf=5").export(store))
+    (made / "meta/checksums.json").unlink()
+    return made
+
+
+def composed(dataset: Path, *overrides: str) -> Any:
+    return plain(composing.composed("task=recorded", f"expert.folder={dataset}", *overrides))
+
+
+def test_the_spec_is_the_datasets(dataset: Path) -> None:
+    config = composed(dataset, "task.units=deg", "task.joints=all")
+    spec = build(config["task"], "task").spec
+    recorded = np.concatenate([episode(seed).actions for seed in range(EPISODES)])
+    assert spec == replace(
+        SPEC,
+        image_size=(96, 128),
+        low=tuple(recorded.min(0).tolist()),
+        high=tuple(recorded.max(0).tolist()),
+        robot=RobotModel(NAMES, ""),
+    )
+    assert config["collect"]["episodes"] == EPISODES and config["validate"]["episodes"] == 0
+
+
+def test_parts_of_a_dataset_are_chosen_by_name(dataset: Path) -> None:
+    chosen = ["joint3.pos", "joint1.pos"]
+    config = composed(
+        dataset,
+        "expert.images={eye: observation.images.hand}",
+        "expert.every=5",
+        f"task.action={json.dumps(chosen)}",
+        "task.image_size=[12,12]",
+    )
+    spec = build(config["task"], "task").spec
+    assert (spec.cameras, spec.control_hz, list(spec.action), len(spec.low)) == (("eye",), 6.0, chosen, 2)
+    found, there = build(config["expert"], "expert", spec=spec).episode(1), episode(1)
+    # Frames 0, 5 and 10, each with the last action before the next one.
+    np.testing.assert_array_equal(found.actions, there.actions[[4, 9, 11]][:, [2, 0]])
+    np.testing.assert_array_equal([seen.state for seen in found.observations], (there.actions - 1)[[0, 5, 10]])
+    for seen, original in zip(found.observations, there.observations[::5], strict=True):
+        expected = resize(original.rgb["hand"], (12, 12), "centre")
+        assert seen.rgb["eye"].shape == (12, 12, 3)
+        assert np.abs(seen.rgb["eye"].astype(int) - expected).max() <= 4
+
+
+def test_outliers_do_not_widen_the_bounds_and_rare_events_do() -> None:
+    moving = np.append(np.linspace(-1, 1, 1000), 30.0)
+    low, high = action_bounds(moving)
+    assert low == -1 and 1 < high < 3
+    assert action_bounds(np.append(np.zeros(1000), 1.0)) == (0.0, 1.0)  # a gripper that closes once
+    low, high = action_bounds(np.full(10, 5.0))
+    assert low < 5 < high
+
+
+def changed_info(dataset: Path, tmp_path: Path, change: Callable[[Any], None]) -> Path:
+    copy = Path(shutil.copytree(dataset, tmp_path / "dataset"))
+    info = json.loads((copy / "meta/info.json").read_text())
+    change(info)
+    (copy / "meta/info.json").write_text(json.dumps(info))
+    return copy
+
+
+def without(name: str) -> Callable[[Path], None]:
+    return lambda dataset: (dataset / name).unlink()
+
+
+def slower(dataset: Path) -> None:
+    path = dataset / "data/chunk-000/file-000.parquet"
+    rows = pq.read_table(path)
+    stamps = np.array(rows["timestamp"]) * np.where(np.array(rows["episode_index"]) == 3, 2, 1)
+    place = rows.column_names.index("timestamp")
+    pq.write_table(rows.set_column(place, "timestamp", pa.array(stamps, pa.float32())), path)
+
+
+@pytest.mark.parametrize(
+    ("damage", "says"),
+    [
+        (without("videos/observation.images.top/chunk-000/file-000.mp4"), r"lacks videos/observation\.images\.top/chu"),
+        (without("data/chunk-000/file-000.parquet"), r"lacks data/chunk-000/file-000\.parquet: copy"),
+        (slower, r"time stamps in episode 3 that do not follow its rate of 30 Hz"),
+    ],
+    ids=["video", "table", "rates"],
+)
+def test_what_is_missing_is_named_before_anything_is_imported(
+    dataset: Path, tmp_path: Path, damage: Callable[[Path], None], says: str
+) -> None:
+    spec = build(composed(dataset)["task"], "task").spec
+    copy = Path(shutil.copytree(dataset, tmp_path / "dataset"))
+    damage(copy)
+    with pytest.raises(ValueError, match=says):
+        build(composed(dataset)["expert"] | {"folder": str(copy)}, "expert", spec=spec)
+
+
+def test_cameras_of_another_rate_are_named(dataset: Path, tmp_path: Path) -> None:
+    def faster(info: Any) -> None:
+        info["features"]["observation.images.hand"]["info"]["video.fps"] = 60
+
+    copy = changed_info(dataset, tmp_path, faster)
+    config = composed(copy)
+    with pytest.raises(ValueError, match=r"has 30 Hz, but observation\.images\.hand 60 Hz: record all cameras at one"):
+        build(config["expert"], "expert", spec=build(config["task"], "task").spec)
+
+
+@pytest.mark.parametrize(
+    ("overrides", "says"),
+    [
+        (["expert.folder=nowhere"], "error: there is no LeRobot dataset in nowhere"),
+        (["task.action=[elbow]"], r"error: task.action names elbow, the recording has joint1.pos"),
+        (["task.units={elbow: rad}"], "error: task.units names elbow, the components are joint1.pos"),
+        (["validate.episodes=3"], "validate.episodes=3: nothing can be played in a recording"),
+        (["job=preview"], "task=recorded has no simulator, so nothing can be played in it"),
+    ],
+)
+def test_what_a_recording_cannot_do_is_said(dataset: Path, tmp_path: Path, overrides: list[str], says: str) -> None:
+    done = here(tmp_path, "task=recorded", f"expert.folder={dataset}", "job=train", *overrides, ok=False)
+    assert says in done.stderr
+
+
+def test_an_expert_that_acts_has_no_recording(tmp_path: Path) -> None:
+    done = here(tmp_path, "task=recorded", "expert=waypoint", ok=False)
+    assert done.stderr.startswith(
+        "error: task=recorded needs recorded demonstrations: expert=lerobot expert.folder=DIR"
+    )
+
+
+def test_a_policy_is_trained_and_its_errors_measured_without_a_simulator(dataset: Path, tmp_path: Path) -> None:
+    recording = ("task=recorded", f"expert.folder={dataset}", "task.image_size=[24,32]")
+    done = here(tmp_path, *recording, *TRAINING, *TINY, "hydra.run.dir=run", "output=run")
+    errors = json.loads((tmp_path / "run/errors.json").read_text())
+    assert [each["name"] for each in errors["components"]] == list(NAMES) and "success" not in errors
+    assert all(each["ci_low"] <= each["error"] <= each["ci_high"] for each in errors["components"])
+    assert "not a success rate" in done.stdout and "success" not in done.stdout.replace("not a success rate", "")
+    page = (tmp_path / "run/report.html").read_text()
+    assert "Errors on held-out recordings" in page and "joint2.pos" in page and "success:" not in page
+    checkpoint = tmp_path / "run/checkpoints/last.ckpt"
+    again = ("job=evaluate", f"checkpoint={checkpoint}", "hydra.run.dir=again", "output=again")
+    here(tmp_path, *again, *recording)
+    repeated = json.loads((tmp_path / "again/errors.json").read_text())
+    assert repeated["seeds"] == errors["seeds"] and repeated["components"] == errors["components"]
+    (kept,) = tmp_path.glob("outputs/episodes/*")  # both found it
+    shutil.rmtree(kept)
+    assert "name its folder with expert=lerobot expert.folder=DIR" in here(tmp_path, *again, ok=False).stderr
+    fewer = here(tmp_path, *again, *recording, "collect.episodes=6", ok=False)
+    assert "was trained on other episodes than the 6" in fewer.stderr
+    here(tmp_path, "job=report", "report.runs=[run,again]", "hydra.run.dir=compared", "output=compared")
+    seen = torch.load(checkpoint, weights_only=True)["spec"]["action"]
+    assert tuple(seen) == NAMES
+
+
+class Behind:
+    """An agent that acts one degree less than was recorded, and two in the second episode."""
+
+    def __init__(self) -> None:
+        self.info: dict[str, Any] = {}
+
+    def reset(self, instruction: str, seed: int) -> None:
+        """Remember the episode."""
+        self._seed = seed
+
+    def act(self, observation: Observation) -> np.ndarray:
+        """Return the recorded action, as the state tells it, less some."""
+        return observation.state + 1 - (1 + self._seed)
+
+
+def test_errors_are_means_over_episodes_with_an_interval() -> None:
+    result = open_loop(Behind(), SPEC, [episode(0), episode(1)], np.zeros(3))
+    np.testing.assert_allclose(result.errors, [[1] * 3, [2] * 3], rtol=1e-5)
+    # 1.5 +- t(0.975, 1) * 0.7071 / sqrt(2), with t(0.975, 1) = 12.7062; no error is below zero
+    for each in components(result):
+        assert each.error == pytest.approx(1.5) and each.ci_low == 0 and each.ci_high == pytest.approx(1.5 + 6.3531)
+    assert components(open_loop(Behind(), SPEC, [episode(0)], np.zeros(3)))[0].ci_high is None
+    low, high = mean_interval(np.array([[1.0], [2.0], [3.0]]))  # 2 +- t(0.975, 2) / sqrt(3), t = 4.3027
+    np.testing.assert_allclose([low[0], high[0]], [0.0, 2 + 4.3027 / np.sqrt(3)], rtol=1e-4)
+
+
+JOINTS = replace(ROBOT, joints=["a", "b", "c"], low=[-1.5] * 3, high=[1.5] * 3, speed=[2.0] * 3,
+                 acceleration=[50.0] * 3, fingers=[])  # fmt: skip
+
+
+def test_joint_positions_in_degrees_move_a_robot_in_radians() -> None:
+    spec = replace(SPEC, robot=RobotModel(NAMES, ""), control_hz=10.0)
+    with pytest.raises(ValueError, match=r"deploy\.safety\.workspace cannot be kept by .* joint positions: set it to"):
+        ControlLoop(spec, JOINTS, SAFETY, 50.0)
+    loop = ControlLoop(spec, JOINTS, replace(SAFETY, workspace=None), 50.0)
+    now, joints, seen, commands = 100.0, np.array([0.1, 0.2, 0.3]), [], []
+    goal = np.array([30.0, -45.0, 120.0])  # the last one is clipped to 90 degrees by the spec, and by the limits
+    for tick in range(150):
+        now += 0.02
+        loop.on_joint_state(joints, np.zeros(3), 0.0, now)
+        if tick == 5:
+            loop.on_instruction("move", now)
+        if tick % 5 == 0:
+            for camera in spec.cameras:
+                loop.on_image(camera, np.zeros((24, 32, 3), np.uint8), now)
+        if (observation := loop.next_observation(now)) is not None:
+            seen.append(observation.state)
+            loop.set_plan(goal[None].astype(np.float32), now)
+        command = loop.command(now)
+        assert command is not None
+        joints = command.position.copy()
+        commands.append(joints)
+    np.testing.assert_allclose(seen[0], np.rad2deg([0.1, 0.2, 0.3]), rtol=1e-5)
+    np.testing.assert_allclose(joints, [np.pi / 6, -np.pi / 4, 1.45], atol=0.01)
+    assert np.abs(np.diff(commands, axis=0)).max() <= 2.0 * 0.02 + 1e-9
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        ({"state_units": ("1",) * 3}, r"joint1\.pos \[1\], .* have no unit of a position, rad, deg, m: name it with"),
+        ({"units": ("1",) * 3}, r"joint1\.pos \[1\], .* have no unit of a position"),
+        (
+            {"action": (*NAMES[:2], "x"), "robot": RobotModel(NAMES[:2], "")},
+            r"action has x, which are no joints of its",
+        ),
+    ],
+)
+def test_actions_that_no_joint_can_follow_are_refused(change: dict[str, Any], says: str) -> None:
+    spec = replace(SPEC, **{"robot": RobotModel(NAMES, ""), "control_hz": 10.0, **change})
+    with pytest.raises(ValueError, match=says):
+        controller_for(spec, None)
+
+
+def test_a_recorded_world_says_what_contradicts_itself() -> None:
+    made = {"cameras": ["a"], "image_size": [8, 8], "control_hz": 5.0, "units": "1", "joints": None}
+    with pytest.raises(ValueError, match=r"low of x is 1\.0, not less than high, 0\.0"):
+        Recorded(**made, state=["x"], action=["x"], low=[1.0], high=[0.0])  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="joints must be a list of names, all or null, got some"):
+        Recorded(**{**made, "joints": "some"}, state=["x"], action=["x"], low=[0.0], high=[1.0])  # type: ignore[arg-type]
