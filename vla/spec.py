@@ -110,7 +110,10 @@ class Spec:
             ValueError: there is none; the message says that `what` needs it.
         """
         if self.robot is None:
-            raise ValueError(f"{what} needs a robot, and the spec has none (robot=None): its state is {self.state}")
+            raise ValueError(
+                f"{what} needs a robot, and the spec has none (robot=None): its state is {', '.join(self.state)}; "
+                "task.joints names the joints of a recording"
+            )
         return self.robot
 
     def random_observation(self, random: np.random.Generator) -> Observation:
