@@ -59,35 +59,22 @@ class LeRobotDemonstrations(ImportedDemonstrations):
     ) -> None:
         self.spec, self._every = spec.without_truth, every
         self._dataset = dataset = _opened(folder, images)
-        features, known = dataset.info.features, layout.features(spec, depth=True)
+        features = dataset.info.features
+        known = {key: layout.Feature(**feature) for key, feature in _exported(spec).items()}
         extra = [layout.RATES] if features.get(layout.RATES) and features[layout.RATES].components else []
         self._state = dataset.components(state, [spec.state[index] for index in spec.pose])
         self._action = dataset.components(action, spec.action)
         for name, place in dataset.components(extra).items():
             self._state.setdefault(name, place)
-        if found := [*mismatches(dataset, self._state, self._action, spec, every)]:
-            raise ValueError(f"{dataset.folder} is not of the task's kind of step: {'; '.join(found)}")
-
-        def has(key: str) -> bool:
-            there = features.get(key)
-            return there is not None and (there.dtype, [*there.shape], there.components or there.names) == (
-                known[key]["dtype"],
-                known[key]["shape"],
-                known[key]["names"],
-            )
-
-        self._has_depth = all(has(layout.depth_key(camera)) for camera in spec.depth)
-        self._has_executed = has(layout.EXECUTED)
+        self._low, self._high = np.array(spec.low, np.float32), np.array(spec.high, np.float32)
+        self._require_fit(action)
+        self._has_depth = all(features.get(key) == known[key] for key in map(layout.depth_key, spec.depth))
+        self._has_executed = features.get(layout.EXECUTED) == known[layout.EXECUTED]
         self._lacks = [] if self._has_depth else ["depth"]
         self._lacks += [] if self._has_executed else [layout.EXECUTED]
         self._lacks += [] if all(name in self._state for name in spec.state) else [layout.RATES]
         executed = [layout.EXECUTED] if self._has_executed else []
         dataset.open(spec.cameras, list(dict.fromkeys([*state, *action, *extra, *executed])))
-        self._low, self._high = np.array(spec.low, np.float32), np.array(spec.high, np.float32)
-        actions = self._columns(spec.action, self._action, slice(None))
-        if found := [*out_of_bounds(actions, spec)]:
-            raise ValueError(f"{dataset.folder} is not of the task's kind of step: {'; '.join(found)}")
-        self._beyond = float(((actions < self._low) | (actions > self._high)).mean())
 
     @classmethod
     def recording(cls, options: Mapping[str, Any]) -> Recording:
@@ -118,6 +105,19 @@ class LeRobotDemonstrations(ImportedDemonstrations):
         draws = {"recorded": {"episode": number, "lacks": self._lacks}}
         what = (number, "recorded", instruction, "success", frozenset[str](), draws)
         return Episode(*what, observations, actions, executed)
+
+    def _require_fit(self, keys: Keys) -> None:
+        """Require what the metadata and the actions, of the features `keys`, tell to be of the task's kind."""
+        dataset, spec = self._dataset, self.spec
+        found = [*mismatches(dataset, self._state, self._action, spec, self._every)]
+        if all(name in self._action for name in spec.action):
+            values = dataset.read(keys)
+            places = [self._action[name] for name in spec.action]
+            actions = np.stack([values[key][:, at] for key, at in places], axis=1)
+            found += out_of_bounds(actions, spec)
+            self._beyond = float(((actions < self._low) | (actions > self._high)).mean())
+        if found:
+            raise ValueError(f"{dataset.folder} is not of the task's kind of step: {'; '.join(found)}")
 
     def _states(self, rows: slice) -> Array:
         """Return (N, P) float32; joint velocities are differences of positions if the dataset has none."""
@@ -171,13 +171,20 @@ def _recording(
 ) -> Recording:
     dataset = _opened(folder, images)
     states, actions = dataset.components(state), dataset.components(action)
-    rows = dataset.table("data", dict.fromkeys(action, tables.numbers) | {"episode_index": tables.counts})
-    values = {key: dataset.matrix(rows, key) for key in action}
+    values = dataset.read(action)
     return Recording(
         cameras=tuple(dataset.images),
         control_hz=dataset.info.fps / every,
         state=tuple(states),
         action=tuple(actions),
         bounds={name: action_bounds(values[key][:, at]) for name, (key, at) in actions.items()},
-        episodes=len(np.unique(rows["episode_index"].to_numpy())),
+        episodes=len(dataset.table("meta/episodes", {"episode_index": tables.counts})),
     )
+
+
+def _exported(spec: Spec) -> dict[str, dict[str, Any]]:
+    """Return the features of an export that are no images, in the form in which a description is read."""
+    features = layout.features(spec, depth=True)
+    return {
+        key: {**feature, "shape": tuple(feature["shape"])} for key, feature in features.items() if "info" not in feature
+    }
