@@ -15,6 +15,7 @@ from hydra import compose, initialize_config_dir
 from hydra.utils import get_class
 from omegaconf import OmegaConf
 
+from vla.config import packages
 from vla.config.conditions import conditions
 from vla.config.experiment import plain
 
@@ -28,7 +29,14 @@ OPTIONS = [
 
 
 # Options that are only for some options of another group.
-TOGETHER = {("tokenizer", "fast"): ["model=decoder"], ("job", "deploy"): ["deploy=ros2"]}
+TOGETHER = {
+    ("tokenizer", "fast"): ["model=decoder"],
+    ("job", "deploy"): ["deploy=ros2"],
+    ("task", "gymnasium"): [
+        *("task.package=gymnasium_robotics", "task.id=Any-v0", "task.images={top: render}"),
+        "task.state={observation: null}",
+    ],
+}
 
 
 @cache
@@ -57,7 +65,8 @@ def test_empty_batches_are_refused() -> None:
 
 
 @pytest.mark.parametrize(("group", "option"), OPTIONS, ids=[f"{group}={option}" for group, option in OPTIONS])
-def test_option(group: str, option: str) -> None:
+def test_option(group: str, option: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(packages.TRUSTED, "gymnasium_robotics")
     top = group.partition("/")[0]
     job = [f"job={top}"] if top in ("export", "deploy") and option != "none" else []
     check(composed(*TOGETHER.get((group, option), brought_by(group)), f"{group}={option}", *job))
