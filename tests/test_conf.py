@@ -15,7 +15,6 @@ from hydra import compose, initialize_config_dir
 from hydra.utils import get_class
 from omegaconf import OmegaConf
 
-from vla.config import packages
 from vla.config.conditions import conditions
 from vla.config.experiment import plain
 
@@ -65,8 +64,7 @@ def test_empty_batches_are_refused() -> None:
 
 
 @pytest.mark.parametrize(("group", "option"), OPTIONS, ids=[f"{group}={option}" for group, option in OPTIONS])
-def test_option(group: str, option: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv(packages.TRUSTED, "gymnasium_robotics")
+def test_option(group: str, option: str) -> None:
     top = group.partition("/")[0]
     job = [f"job={top}"] if top in ("export", "deploy") and option != "none" else []
     check(composed(*TOGETHER.get((group, option), brought_by(group)), f"{group}={option}", *job))

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 import toy
-from composing import check, composed
+from composing import composed
 
 from vla.config import packages
 from vla.config.adopt import adopt
@@ -100,9 +100,9 @@ def test_what_the_command_line_names_is_trusted_and_what_a_file_names_is_not(
 ) -> None:
     monkeypatch.setenv(packages.TRUSTED, "")
     with pytest.raises(ValueError, match=r"task uses 'toy_gym', which is not trusted: add trust=\[toy_gym\]"):
-        check(composed(*VALUES))
+        build(node(), "task")
     packages.trust([], [], ["toy_gym", "???"])
-    check(composed(*VALUES))
+    build(node(), "task").close()
     for name in ("os", "torch", "numpy", None):
         with pytest.raises(
             ValueError, match=rf"package cannot name {name!r}: it takes packages made for vla or gymnas"
