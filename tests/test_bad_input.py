@@ -35,6 +35,8 @@ BAD_INPUT = {
         "set the environment variable",
     ),
     "another world's expert": (("job=preview", "expert=metaworld"), "expert=metaworld acts in task=metaworld only"),
+    "another world's goal": (("task=metaworld", "task/goal=lift"), "the option chosen for task has no goal"),
+    "no environment": (("job=preview", "task=gymnasium"), "task.package is missing: the options chosen need"),
     "no GPU": (("trainer=gpu", *(item for item in SMALL if "accelerator" not in item)), "gpu"),
 }
 

@@ -17,7 +17,7 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.errors import ConfigCompositionException, HydraException, MissingConfigException, OverrideParseException
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import OmegaConfBaseException
+from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 from yaml import YAMLError
 
 from vla import jobs
@@ -51,6 +51,8 @@ def sentence(error: Exception) -> str:
         return _unmatched(str(error).split("'")[1])
     if isinstance(error, ConfigCompositionException) and isinstance(cause, OmegaConfBaseException) and cause.full_key:
         return _unknown_key(cause)
+    if isinstance(error, MissingMandatoryValue) and error.full_key:
+        return f"{error.full_key} is missing: the options chosen need {error.full_key}=VALUE"
     if isinstance(error, OmegaConfBaseException) and error.full_key:
         line = str(error).splitlines()[0]
         _, resolver, reason = line.partition("ValueError raised while resolving interpolation: ")
