@@ -30,7 +30,7 @@ REPORTED_VALUES = {"collect": ("episodes", "seed"), "trainer": (*LENGTHS, "preci
 OF_THIS_COMMAND = ("output", "resume", "trust")  # keys that are not taken from a resumed run
 MACHINES = ("accelerator", "devices", "num_nodes", "strategy")  # keys of the trainer that its options change in one
 IDENTITY = (  # keys that nothing changes in one, because they make another training
-    *("task", "expert", "collect.episodes", "collect.seed", "collect.folder", "data"),
+    *("task", "expert", "collect.episodes", "collect.seed", "collect.folder", "collect.more", "data"),
     *("tokenizer", "model", "learner", "validate", "seed", "pretrained"),
     *(f"trainer.{name}" for name in ("val_check_interval", "accumulate_grad_batches", "gradient_clip_val")),
     *(f"trainer.{name}" for name in ("precision", "devices", "num_nodes")),
@@ -61,9 +61,9 @@ def finetune(cfg: DictConfig, overrides: Sequence[str]) -> DictConfig:
     Raises:
         ValueError: the file does not exist, the job does not train, or an override contradicts the weights.
     """
-    if cfg.checkpoint is not None or cfg.job not in ("train", "evaluate"):
+    if cfg.checkpoint is not None or cfg.job not in ("train", "evaluate", "improve"):
         raise ValueError(
-            f"pretrained={cfg.pretrained} initialises a new training: use it with job=train or evaluate, and "
+            f"pretrained={cfg.pretrained} initialises a new training: use it with job=train, evaluate or improve, and "
             "without checkpoint=, which evaluates a policy"
         )
     parsed = _parsed(overrides)
