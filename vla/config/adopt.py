@@ -87,6 +87,8 @@ def resume(cfg: DictConfig, run: Path, overrides: Sequence[str]) -> DictConfig:
     if cfg.checkpoint is not None or cfg.pretrained is not None:
         raise ValueError(f"resume={cfg.resume} continues a run unchanged: omit checkpoint= and pretrained=")
     last = run / "checkpoints/last.ckpt"
+    if any((run / name).is_dir() for name in ("round_0", "round_1")):
+        raise ValueError(f"resume={run} names a run of rounds, which goes on with its own command and output={run}")
     if not last.is_file():
         raise ValueError(f"resume={run}: nothing was trained in that folder, there is no {last}")
     output = Path(cfg.output).resolve()

@@ -54,16 +54,16 @@ def run(experiment: Experiment) -> float:
     Raises:
         ValueError: the expert cannot label, seeds are not fresh, or a round of another policy lies in the folder.
     """
-    _require_possible(experiment)
+    seeds = _require_possible(experiment)
+    _require_new(seeds, demonstrations(experiment))
     asked, output = experiment["improve"], experiment.output
-    _require_fresh_seeds(experiment, demonstrations(experiment))
     checkpoint, rounds, stores = experiment.pretrained, list[Round](), list[Path]()
     if checkpoint is None:
         checkpoint = _trained(experiment.with_values({"job": "train", "output": str(output / "round_0")}))
         rounds.append(_described(output / "round_0", None))
     for number in range(1, asked["rounds"] + 1):
         folder = output / f"round_{number}"
-        store = _labelled(experiment, checkpoint, folder / EPISODES, asked["seed"] + (number - 1) * asked["episodes"])
+        store = _labelled(experiment, checkpoint, folder / EPISODES, seeds[(number - 1) * asked["episodes"]])
         stores.append(store.folder)
         checkpoint = _trained(_round(experiment, checkpoint, folder, stores))
         rounds.append(_described(folder, store))
@@ -71,27 +71,28 @@ def run(experiment: Experiment) -> float:
     return evaluate_trained(experiment, checkpoint, rounds)
 
 
-def _require_possible(experiment: Experiment) -> None:
-    """Refuse what would fail later on.
+def _require_possible(experiment: Experiment) -> range:
+    """Return the seeds of all rounds, after refusing what would fail later on.
 
     Raises:
-        ValueError: the expert cannot label states of another agent, or training is to use several devices.
+        ValueError: seeds are of evaluation, training is to use several devices, or the expert cannot label.
     """
+    asked, trainer = experiment["improve"], experiment["trainer"]
+    seeds = range(asked["seed"], asked["seed"] + asked["rounds"] * asked["episodes"])
+    if seeds.stop > FIRST_SEED:
+        raise ValueError(f"improve.seed={seeds.start}: seeds from {FIRST_SEED} on are reserved for evaluation")
+    if str(trainer.get("devices", 1)) not in ("1", "[0]") or trainer.get("num_nodes", 1) != 1:
+        raise ValueError("job=improve trains on one device, because its trainings follow each other: trainer.devices=1")
     environment = experiment.make_environment()()
     try:
         require_memoryless(experiment.make_expert()(environment))
     finally:
         environment.close()
-    trainer = experiment["trainer"]
-    if str(trainer.get("devices", 1)) not in ("1", "[0]") or trainer.get("num_nodes", 1) != 1:
-        raise ValueError("job=improve trains on one device, because its trainings follow each other: trainer.devices=1")
+    return seeds
 
 
-def _require_fresh_seeds(experiment: Experiment, store: EpisodeStore) -> None:
-    asked = experiment["improve"]
-    seeds = range(asked["seed"], asked["seed"] + asked["rounds"] * asked["episodes"])
-    if seeds.stop > FIRST_SEED:
-        raise ValueError(f"improve.seed={seeds.start}: seeds from {FIRST_SEED} on are reserved for evaluation")
+def _require_new(seeds: range, store: EpisodeStore) -> None:
+    """Raise a ValueError if a demonstration has one of the seeds."""
     seen = [entry.seed for entry in store.tried if entry.seed in seeds]
     if seen:
         raise ValueError(
