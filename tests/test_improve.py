@@ -15,6 +15,7 @@ from collecting import content
 from command_line import SMALL, here
 from composing import check, composed
 
+from vla.config.adopt import resume
 from vla.config.experiment import Experiment
 from vla.data.episodes import EpisodeStore
 from vla.data.verification import derive_store, episode_of, verify_store
@@ -169,6 +170,12 @@ def test_the_episodes_of_a_round_may_have_another_task() -> None:
     check(composed("job=improve", "+improve.changes.time_limit=5.0"))
     with pytest.raises(ValueError, match=r"task \(improve.changes\).time is unknown"):
         check(composed("job=improve", "+improve.changes.time=5.0"))
+
+
+def test_rounds_are_not_resumed_as_one_training(tmp_path: Path) -> None:
+    (tmp_path / "run/round_1").mkdir(parents=True)
+    with pytest.raises(ValueError, match="goes on with its own command and output="):
+        resume(composed(f"output={tmp_path}/now"), tmp_path / "run", [])
 
 
 def result(run: Path) -> tuple[Any, ...]:

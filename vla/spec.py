@@ -339,8 +339,9 @@ class Agent(Protocol):
         ...
 
 
+@runtime_checkable
 class Expert(Agent, Protocol):
-    """Agent that also labels the states that another agent reaches, in `job=improve`."""
+    """Agent that may also label the states that another agent reaches, as `job=improve` needs it."""
 
     memoryless: bool  # its action, or the label in `info["clean"]`, depends on the observation alone
 

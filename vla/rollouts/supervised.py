@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from vla.spec import Agent, Array, Environment, Observation
+from vla.spec import Agent, Array, Environment, Expert, Observation
 
 
 class Supervised:
@@ -54,7 +54,7 @@ class Supervised:
 
 def require_memoryless(expert: Agent) -> None:
     """Raise a ValueError unless the expert's labels depend on the observation alone, as its `memoryless` says."""
-    if not getattr(expert, "memoryless", False):
+    if not (isinstance(expert, Expert) and expert.memoryless):
         raise ValueError(
             f"{type(expert).__name__} cannot label the states of another agent: of an expert that does not say "
             "memoryless = True, actions may depend on what it did before; choose another expert"
