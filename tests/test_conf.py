@@ -52,7 +52,7 @@ def test_deploying_nothing_is_refused() -> None:
 
 
 def test_empty_batches_are_refused() -> None:
-    with pytest.raises(ValueError, match=r"data\.batch_size must be int, at least 1, got 0"):
+    with pytest.raises(ValueError, match=r"data\.batch_size must be a whole number, at least 1, got 0"):
         check(composed("data.batch_size=0"))
 
 

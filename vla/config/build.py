@@ -7,6 +7,7 @@ arguments, types and allowed values. A node is checked against that signature be
 from __future__ import annotations
 
 import inspect
+import json
 import sys
 from collections import ChainMap
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
@@ -219,7 +220,7 @@ def _check_nodes(key: str, value: Any) -> None:
 
 
 def _short(value: Any) -> str:
-    text = repr(value)
+    text = json.dumps(value) if value is None or isinstance(value, bool) else repr(value)
     return text if len(text) <= 200 else f"{text[:200]}…"
 
 
@@ -245,7 +246,8 @@ def arguments(target: type) -> dict[str, inspect.Parameter]:
     return {name: each for name, each in found.items() if each.annotation is not Inherited}
 
 
-def _parameters(target: type) -> dict[str, inspect.Parameter]:
+@cache
+def _parameters(target: type) -> Mapping[str, inspect.Parameter]:
     """Return the arguments of a class's own constructor without `self`."""
     init: Any = vars(target)["__init__"]
     # The constructor of a dataclass also has the annotations of its base classes, of other modules.
