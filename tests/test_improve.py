@@ -178,39 +178,36 @@ def test_rounds_are_not_resumed_as_one_training(tmp_path: Path) -> None:
         resume(composed(f"output={tmp_path}/now"), tmp_path / "run", [])
 
 
-def result(run: Path) -> tuple[Any, ...]:
-    """What rounds leave that must not depend on interruptions: episodes, weights, and how the policy does."""
-    rounds = sorted(run.glob("round_*"))
-    episodes = [{name: data for name, data in content(folder / "episodes").items()} for folder in rounds]
-    weights = [read_checkpoint(folder / "checkpoints/last.ckpt").state for folder in rounds]
-    report = json.loads((run / "report.json").read_text())
-    counts = [(each["episodes"], each["successes"], each["validation"]) for each in report["rounds"]]
-    sums = [{name: values.double().sum().item() for name, values in state.items()} for state in weights]
-    return episodes, sums, counts, report["taxonomy"]
+def test_seeds_of_demonstrations_are_not_played_again(folder: Path) -> None:
+    store = EpisodeStore(folder)
+    with pytest.raises(ValueError, match=r"have 5 to 9: set improve\.seed=10, or higher"):
+        improve.require_new(range(5, 10), store)
+    improve.require_new(range(100, 110), store)
+
+
+def result(folder: Path) -> tuple[dict[str, bytes], dict[str, float]]:
+    """What a round leaves that must not depend on interruptions: its episodes and weights."""
+    state = read_checkpoint(folder / "checkpoints/last.ckpt").state
+    return content(folder / "episodes"), {name: values.double().sum().item() for name, values in state.items()}
 
 
 def test_rounds_that_were_killed_go_on_to_the_same_result(home: Path) -> None:
-    here(home, *ROUNDS, *FEW, "output=rounds", "validate.episodes=1")
-    whole, first = result(home / "rounds"), home / "rounds/round_1"
-    assert whole[2] == [(2, 0, 0.0)] * 2
-    page = (home / "rounds/report.html").read_text()
-    assert "labelled episodes" in page and (home / "rounds/rollouts.rrd").exists()
-    trained = read_checkpoint(first / "checkpoints/last.ckpt").config
-    assert trained["collect"]["more"] == ["rounds/round_1/episodes"] and trained["pretrained"].startswith("run/")
+    here(home, *ROUNDS, *FEW, "output=rounds", "improve.rounds=1")
+    first, second = (home / "rounds" / name for name in ("round_1", "round_2"))
+    whole = result(first)
+    page, report = (home / "rounds" / name for name in ("report.html", "report.json"))
+    (counts,) = json.loads(report.read_text())["rounds"]
+    assert (counts["episodes"], counts["successes"], counts["validation"]) == (2, 0, None)
+    assert "labelled episodes" in page.read_text() and (home / "rounds/rollouts.rrd").exists()
 
     # What a process leaves that is killed within the second episode: rows without a line in the index.
-    for part in (first / "checkpoints", home / "rounds/round_2"):
-        shutil.rmtree(part)
-    (home / "rounds/report.json").unlink()
+    shutil.rmtree(first / "checkpoints")
     index = first / "episodes/index.jsonl"
     index.write_bytes(index.read_bytes().splitlines(keepends=True)[0] + b'{"seed": 500')
-    here(home, *ROUNDS, *FEW, "output=rounds", "validate.episodes=1")
-    assert result(home / "rounds") == whole
-
-    taken = here(home, *ROUNDS, *FEW, "output=other", "improve.seed=3", ok=False)
-    assert "must be new" in taken.stderr and "set improve.seed=" in taken.stderr
-    again = here(home, *ROUNDS, *FEW, "output=rounds", "validate.episodes=1", "improve.rounds=3")
-    assert again.stdout.count("training is already finished") == 2
-    assert result(home / "rounds")[0][:2] == whole[0]
-    refused = here(home, *ROUNDS, *FEW, "output=rounds", "validate.episodes=1", "improve.beta=0.5", ok=False)
-    assert "was collected with another config for ['improve']" in refused.stderr
+    here(home, *ROUNDS, *FEW, "output=rounds", "improve.rounds=2")
+    assert result(first) == whole
+    assert [entry.seed for entry in EpisodeStore(second / "episodes").tried] == [500002, 500003]
+    trained = read_checkpoint(second / "checkpoints/last.ckpt").config
+    assert trained["collect"]["more"] == ["rounds/round_1/episodes", "rounds/round_2/episodes"]
+    assert trained["pretrained"] == "rounds/round_1/checkpoints/last.ckpt"
+    assert len(json.loads(report.read_text())["rounds"]) == 2

@@ -55,7 +55,7 @@ def run(experiment: Experiment) -> float:
         ValueError: the expert cannot label, seeds are not fresh, or a round of another policy lies in the folder.
     """
     seeds = _require_possible(experiment)
-    _require_new(seeds, demonstrations(experiment))
+    require_new(seeds, demonstrations(experiment))
     asked, output = experiment["improve"], experiment.output
     checkpoint, rounds, stores = experiment.pretrained, list[Round](), list[Path]()
     if checkpoint is None:
@@ -91,7 +91,7 @@ def _require_possible(experiment: Experiment) -> range:
     return seeds
 
 
-def _require_new(seeds: range, store: EpisodeStore) -> None:
+def require_new(seeds: range, store: EpisodeStore) -> None:
     """Raise a ValueError if a demonstration has one of the seeds."""
     seen = [entry.seed for entry in store.tried if entry.seed in seeds]
     if seen:
@@ -153,7 +153,7 @@ def _described(folder: Path, store: EpisodeStore | None) -> Round:
         successes=sum(entry.success for entry in episodes),
         collection_s=(collection_time(store, len(episodes)) or 0.0) if store else 0.0,
         training_s=found.training.seconds if found.training else 0.0,
-        validation=float(curve[1][-1]) if curve else None,
+        validation=round(float(curve[1][-1]), 6) if curve else None,
     )
 
 
