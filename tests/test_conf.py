@@ -28,7 +28,14 @@ OPTIONS = [
 
 
 # Options that are only for some options of another group.
-TOGETHER = {("tokenizer", "fast"): ["model=decoder"], ("job", "deploy"): ["deploy=ros2"]}
+TOGETHER = {
+    ("tokenizer", "fast"): ["model=decoder"],
+    ("job", "deploy"): ["deploy=ros2"],
+    ("task", "gymnasium"): [
+        *("task.package=gymnasium_robotics", "task.id=Any-v0", "task.images={top: render}"),
+        "task.state={observation: null}",
+    ],
+}
 
 
 @cache

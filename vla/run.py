@@ -21,7 +21,7 @@ from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
 from vla import jobs
-from vla.config.annotations import targets
+from vla.config.annotations import packages, targets
 from vla.config.build import suggestion
 from vla.config.check import Job, check
 from vla.config.compose import CONF
@@ -147,7 +147,8 @@ def _do(cfg: DictConfig) -> float | None:
     without_triton()
     composed: Any = OmegaConf.to_container(cfg, resolve=False)
     overrides = HydraConfig.get().overrides.task
-    trust(composed.get("trust"), [composed["job"], *targets(composed)])  # before anything is read from a file
+    # Before anything is read from a file.
+    trust(composed.get("trust"), [composed["job"], *targets(composed)], packages(composed))
     cfg = _adopted(cfg, overrides)
     job = jobs.find(cfg.job).JOB
     _require_sweepable(cfg, job)  # with the trainer that a run brings

@@ -100,6 +100,21 @@ def targets(value: Any) -> list[Any]:
     return own + [target for part in parts for target in targets(part)]
 
 
+def packages(value: Any) -> list[Any]:
+    """Return every package that a node in a plain value has imported: its argument `package`."""
+    own = [value["package"]] if is_node(value) and "package" in value else []
+    parts = value.values() if isinstance(value, dict) else value if isinstance(value, list) else ()
+    return own + [package for part in parts for package in packages(part)]
+
+
+def require_trusted_package(source: object, package: Any) -> None:
+    """Raise a ValueError if `package`, which `source` has imported, is not trusted."""
+    if not isinstance(package, str) or not is_trusted(package):
+        raise ValueError(
+            f"{source} uses {package!r}, which is not trusted: add trust=[{package}] if you trust its source"
+        )
+
+
 def fits(found: type, expected: Any) -> bool:
     """Return whether the class `found` satisfies `expected`, a class, a union or a protocol."""
     if get_origin(expected) in (Union, types.UnionType):
