@@ -151,6 +151,8 @@ class ToyInTurn(ToyEnvironment):
 class ToyExpert:
     """Walks to the target with a little noise; what it means to do is in `info["clean"]`."""
 
+    memoryless = True
+
     def __init__(self, noise: float = 0.005, lost: bool = False) -> None:
         """`noise` in [m]; a `lost` expert stays where it is."""
         self.info: dict[str, Any] = {}

@@ -231,7 +231,7 @@ class Episode:
     draws: dict[str, Any]  # randomisation axis → drawn values, JSON-able
     observations: list[Observation]  # N, each one before the action of the same index
     actions: Array  # (N, D) float32, labels for imitation
-    executed: Array  # (N, D) float32, as sent to the robot: differ where the expert is perturbed
+    executed: Array  # (N, D) float32, as sent to the robot: differ where the expert is perturbed, or only labels
 
     @property
     def success(self) -> bool:
@@ -346,6 +346,13 @@ class Agent(Protocol):
     def act(self, observation: Observation) -> Array:
         """Return the (D,) float32 action to execute now."""
         ...
+
+
+@runtime_checkable
+class Expert(Agent, Protocol):
+    """Agent that may also label the states that another agent reaches, as `job=improve` needs it."""
+
+    memoryless: bool  # its action, or the label in `info["clean"]`, depends on the observation alone
 
 
 class Recorder(Protocol):

@@ -31,7 +31,7 @@ REPORTED_VALUES = {"collect": ("episodes", "seed"), "trainer": (*LENGTHS, "preci
 OF_THIS_COMMAND = ("output", "resume", "trust")  # keys that are not taken from a resumed run
 MACHINES = ("accelerator", "devices", "num_nodes", "strategy")  # keys of the trainer that its options change in one
 IDENTITY = (  # keys that nothing changes in one, because they make another training
-    *("task", "expert", "collect.episodes", "collect.seed", "collect.folder", "data"),
+    *("task", "expert", "collect.episodes", "collect.seed", "collect.folder", "collect.more", "data"),
     *("tokenizer", "model", "learner", "validate", "seed", "pretrained"),
     *(f"trainer.{name}" for name in ("val_check_interval", "accumulate_grad_batches", "gradient_clip_val")),
     *(f"trainer.{name}" for name in ("precision", "devices", "num_nodes")),
@@ -62,9 +62,9 @@ def finetune(cfg: DictConfig, overrides: Sequence[str]) -> DictConfig:
     Raises:
         ValueError: the file does not exist, the job does not train, or an override contradicts the weights.
     """
-    if cfg.checkpoint is not None or cfg.job not in ("train", "evaluate"):
+    if cfg.checkpoint is not None or cfg.job not in ("train", "evaluate", "improve"):
         raise ValueError(
-            f"pretrained={cfg.pretrained} initialises a new training: use it with job=train or evaluate, and "
+            f"pretrained={cfg.pretrained} initialises a new training: use it with job=train, evaluate or improve, and "
             "without checkpoint=, which evaluates a policy"
         )
     parsed = _parsed(overrides)
@@ -88,6 +88,8 @@ def resume(cfg: DictConfig, run: Path, overrides: Sequence[str]) -> DictConfig:
     if cfg.checkpoint is not None or cfg.pretrained is not None:
         raise ValueError(f"resume={cfg.resume} continues a run unchanged: omit checkpoint= and pretrained=")
     last = run / "checkpoints/last.ckpt"
+    if any((run / name).is_dir() for name in ("round_0", "round_1")):
+        raise ValueError(f"resume={run} names a run of rounds, which goes on with its own command and output={run}")
     if not last.is_file():
         raise ValueError(f"resume={run}: nothing was trained in that folder, there is no {last}")
     output = Path(cfg.output).resolve()

@@ -60,7 +60,11 @@ GROUPS = {
             "expert", ("vla.spec.Agent", "vla.data.formats.imported_demonstrations.ImportedDemonstrations"), ("spec",)
         ),
         Group("cluster", ("vla.parallel.pool.Cluster",)),
-        Group("data", ("vla.data.datamodule.WindowDataModule",), ("folder", "spec", "history", "chunk", "episodes")),
+        Group(
+            "data",
+            ("vla.data.datamodule.WindowDataModule",),
+            ("folder", "spec", "history", "chunk", "episodes", "more"),
+        ),
         Group("tokenizer", ("vla.models.tokenizers.tokenizer.ActionTokenizer",), ("spec", "statistics")),
         Group("model", ("vla.models.model.Model",), ("spec", "tokenizer")),
         Group("learner", ("vla.models.learner.Learner",), ("model", "spec", "config")),

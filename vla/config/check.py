@@ -53,7 +53,7 @@ PLAIN: dict[str, Any] = {
     "trust": list[str],
     "output": Text,
     "chosen": dict[str, str | None],
-    "collect": {"episodes": Count, "seed": Seed, "folder": Text},
+    "collect": {"episodes": Count, "seed": Seed, "folder": Text, "more": list[Text] | None},
     "validate": {"episodes": Natural, "seed": UnseenSeed, "changes": dict[str, object]},
     "evaluate": {
         "episodes": Count,
@@ -105,10 +105,12 @@ def _check_changes(cfg: DictConfig, training: bool) -> None:
         for name in ("task", "evaluate", "validate")
     )
     changed = {}
-    if cfg.job == "evaluate":
+    if cfg.job in ("evaluate", "improve"):
         changed = {f"evaluate.conditions.{name}": changes for name, changes in conditions(evaluate).items()}
     if training and validate["changes"]:
         changed["validate.changes"] = validate["changes"]
+    if cfg.job == "improve" and cfg.improve.changes:
+        changed["improve.changes"] = cast("dict[str, Any]", OmegaConf.to_container(cfg.improve.changes, resolve=True))
     for name, changes in changed.items():
         check_node(f"task ({name})", with_changes(task, changes), makes(GROUPS["task"]))
 

@@ -182,7 +182,7 @@ class Experiment:
         return learner
 
     def data(self, store: EpisodeStore, history: int, chunk: int) -> WindowDataModule:
-        """Build windows of `history` frames and `chunk` actions from the first `collect.episodes` of a store."""
+        """Build windows of `history` frames and `chunk` actions from the episodes that `collect` names."""
         made: WindowDataModule = build(
             self["data"],
             "data",
@@ -191,6 +191,7 @@ class Experiment:
             history=history,
             chunk=chunk,
             episodes=self["collect"]["episodes"],
+            more=self["collect"]["more"] or (),
         )
         return made
 

@@ -22,7 +22,7 @@ from lightning import LightningDataModule
 
 from vla.data.episodes import EpisodeStore
 from vla.data.index import Entry
-from vla.data.window_batches import Batch, WindowBatcher
+from vla.data.window_batches import Batch, JoinedBatcher, WindowBatcher
 from vla.io.types import Count, Natural, Rate, Seed
 from vla.spec import Array, Spec
 
@@ -90,7 +90,7 @@ class SizedPrefetcher(Prefetcher):
 
 
 class WindowDataModule(LightningDataModule):
-    """Windows of an episode store, split by episode and divided among the processes of a trainer.
+    """Windows of episode stores, split by episode and divided among the processes of a trainer.
 
     Training batches are endless (bounded by the trainer's `max_steps`); validation is one pass over windows spaced
     evenly over the held-out episodes, in whole batches.
@@ -107,6 +107,7 @@ class WindowDataModule(LightningDataModule):
         depth: include depth in batches.
         ahead: batches made in advance.
         episodes: use only the first so many episodes; all of them when None.
+        more: further episode stores, all of whose episodes are used.
     """
 
     def __init__(
@@ -122,34 +123,39 @@ class WindowDataModule(LightningDataModule):
         depth: bool,
         ahead: Natural,
         episodes: Count | None = None,
+        more: Sequence[str | Path] = (),
     ) -> None:
         super().__init__()
         self.batch_size = batch_size
-        self._folder, self._spec, self._episodes = Path(folder), spec, episodes
+        self._folder, self._spec, self._episodes, self._more = Path(folder), spec, episodes, more
         self._history, self._chunk, self._depth = history, chunk, depth
         self._seed, self._ahead = seed, ahead
         self._fraction, self._validation_windows = validation_fraction, validation_windows
 
     def setup(self, stage: str | None = None) -> None:
-        """Open the store and split its episodes.
+        """Open the stores and split their episodes.
 
         Raises:
-            ValueError: the store cannot be read, has another spec, or too few episodes to split.
+            ValueError: a store cannot be read or has another spec, or there are too few episodes to split.
         """
-        store = EpisodeStore(self._folder, self._episodes)
-        self._spec.require(store.spec, "the model", f"the episode store {self._folder}")
+        stores = [EpisodeStore(self._folder, self._episodes), *map(EpisodeStore, self._more)]
+        rows = [max((entry.end for entry in store.episodes), default=0) for store in stores]
         sides: dict[bool, list[Array]] = {False: [], True: []}
-        for entry in store.episodes:
-            sides[held_out(entry.seed, self._fraction)].append(np.arange(entry.start, entry.end))
+        for store, first in zip(stores, np.cumsum([0, *rows]), strict=False):
+            self._spec.require(store.spec, "the model", f"the episode store {store.folder}")
+            for entry in store.episodes:
+                sides[held_out(entry.seed, self._fraction)].append(first + np.arange(entry.start, entry.end))
+        episodes = [entry for store in stores for entry in store.episodes]
         if not sides[False] or (self._fraction > 0 and not sides[True]):
             raise ValueError(
-                f"{len(store.episodes)} episodes leave {len(sides[False])} for training and {len(sides[True])} for "
+                f"{len(episodes)} episodes leave {len(sides[False])} for training and {len(sides[True])} for "
                 f"validation: raise collect.episodes, or set data.validation_fraction (now {self._fraction})"
             )
-        self._digest = digest_of(store.episodes)
+        self._digest = digest_of(episodes)
         self.training_windows = np.concatenate(sides[False])  # row numbers
         self.held_out_windows = np.concatenate(sides[True]) if sides[True] else np.empty(0, np.int64)
-        self.make_batch = WindowBatcher(store, self._history, self._chunk, self._depth, self._on_gpu())
+        layout = self._history, self._chunk, self._depth, self._on_gpu()
+        self.make_batch = JoinedBatcher([WindowBatcher(store, *layout) for store in stores], rows)
 
     def state_dict(self) -> dict[str, str]:
         """Return a digest of the demonstrations, which is saved with checkpoints."""

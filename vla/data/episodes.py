@@ -109,8 +109,8 @@ class EpisodeStore:
 
     @property
     def episodes(self) -> list[Entry]:
-        """Entries of the stored episodes, that is, of the seeds that succeeded."""
-        return [entry for entry in self.tried if entry.success][: self._limit]
+        """Entries of the stored episodes: of the seeds that succeeded, and of labelled failures."""
+        return [entry for entry in self.tried if entry.stored][: self._limit]
 
     @property
     def derived(self) -> bool:
@@ -219,12 +219,11 @@ class EpisodeStore:
                 os.fsync(file.fileno())
 
     def append(self, episode: Episode) -> None:
-        """Store a successful episode atomically.
+        """Store an episode atomically: a success, or a failure whose labels are to be kept.
 
         Raises:
             ValueError: it does not match the spec, has another seed than the next, or cannot be written.
         """
-        assert episode.success, "failures go to `fail`"
         rows = self._rows_of(episode)
         self._commit(self._entry(episode, episode.instruction, len(episode.actions), checksums(rows)), rows)
 

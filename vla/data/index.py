@@ -40,7 +40,7 @@ Crc = Annotated[int, Ge(0), Le(2**32 - 1)]
 
 @dataclass(frozen=True)
 class Entry:
-    """Index line of a tried seed; a failed one has no steps."""
+    """Index line of a tried seed; its episode is stored if it has steps, which a success always has."""
 
     __pydantic_config__ = STRICT
 
@@ -56,8 +56,13 @@ class Entry:
 
     @property
     def success(self) -> bool:
-        """True if the episode is stored."""
+        """True if the goal was reached and held."""
         return self.outcome == "success"
+
+    @property
+    def stored(self) -> bool:
+        """True if the episode is stored: every success, and the failures of a policy that an expert labels."""
+        return self.steps > 0
 
     @property
     def end(self) -> int:
@@ -85,8 +90,8 @@ def parse_line(line: bytes, name: str) -> Entry:
     if _sealed(body) != line:
         raise ValueError(f"{name} is damaged: it does not fit its checksum")
     entry = parse_json(body, Entry, name)
-    if entry.success != (entry.steps > 0):
-        raise ValueError(f"{name} is damaged: a success has steps, and a failure has none")
+    if entry.success and not entry.stored:
+        raise ValueError(f"{name} is damaged: a success has steps")
     return entry
 
 

@@ -49,16 +49,18 @@ class StoreReport:
     @property
     def outcomes(self) -> dict[str, int]:
         """Outcome → number of tried seeds, the most frequent first."""
-        failed = [entry.outcome for entry in self.store.tried if not entry.success]
-        failures = Counter(outcome for outcome in failed if outcome not in (LOST, NOT_NEEDED))
-        failures[DAMAGED] += sum(map(len, self.damaged.values()))
-        return {"success": len(self.whole), **{cause: count for cause, count in failures.most_common() if count}}
+        discarded = [entry for entry in self.store.tried if not entry.stored]
+        known = Counter(entry.outcome for entry in (*self.whole, *discarded))
+        known[DAMAGED] += sum(map(len, self.damaged.values()))
+        solved = known.pop("success", 0)
+        failures = {cause: count for cause, count in known.most_common() if count and cause not in (LOST, NOT_NEEDED)}
+        return {"success": solved, **failures}
 
     @property
     def success_rate(self) -> float:
         """Share of the solved seeds among those of known outcome, 0…1."""
         known = sum(self.outcomes.values()) - self.outcomes.get(DAMAGED, 0)
-        return len(self.whole) / known if known else 0.0
+        return self.outcomes["success"] / known if known else 0.0
 
     @property
     def sizes(self) -> dict[str, int]:
@@ -108,7 +110,7 @@ def find_episode(store: EpisodeStore, seed: int) -> tuple[dict[str, Any], Episod
     if not found:
         seeds = [entry.seed for entry in store.tried]
         raise ValueError(f"{store.folder} has no seed {seed}: it holds {listed(seeds) or 'none yet'}")
-    stored = [(config, entry) for config, entry in found if entry.success]
+    stored = [(config, entry) for config, entry in found if entry.stored]
     if not stored:
         seeds = sorted({entry.seed for entry in store.episodes}, key=lambda other: abs(other - seed))[:2]
         raise ValueError(
@@ -172,7 +174,7 @@ def derive_store(
     for store in stores[1:]:
         store.spec.require(stores[0].spec, f"the episode store {store.folder}", f"{stores[0].folder}")
     chosen = _choose(stores, where or {})
-    episodes = sum(any(entry.success for _, entry in found) for seeds in chosen.values() for found in seeds.values())
+    episodes = sum(any(entry.stored for _, entry in found) for seeds in chosen.values() for found in seeds.values())
     if not episodes:
         fitting = f" that fit inspect.where={dict(where)}" if where else ""
         raise ValueError(f"{', '.join(str(store.folder) for store in stores)}: there are no episodes{fitting}")
@@ -224,11 +226,11 @@ def _config(chosen: Chosen, stores: Sequence[EpisodeStore], where: Mapping[str, 
 def _write(store: EpisodeStore, seed: int, found: Sequence[Found], repair: bool) -> bool:
     """Add a seed to a store from its first undamaged copy; returns whether there was one."""
     known = found[0][1]
-    for source, entry in sorted(found, key=lambda place: not place[1].success):
+    for source, entry in sorted(found, key=lambda place: not place[1].stored):
         if entry.outcome == LOST:
             continue
         known = entry
-        if not entry.success:
+        if not entry.stored:
             store.fail(_without_rows(entry))
             return True
         try:

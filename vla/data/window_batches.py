@@ -5,6 +5,7 @@ Shapes: B batch, T history frames, k action chunk, D action components, S truth 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from sys import getrefcount
 from typing import Any
 
@@ -39,21 +40,22 @@ class BufferPool:
     """Pool of arrays that are reused once no array, view or tensor refers to them.
 
     Reuse saves the zeroing of new memory by the kernel, which takes longer than the copy itself. The pool grows to the
-    largest number of arrays in use at once.
+    largest number of arrays in use at once; a shorter array is the start of a longer one.
     """
 
     def __init__(self) -> None:
-        self._arrays: dict[tuple[tuple[int, ...], type], list[Array]] = {}
+        self._arrays: dict[tuple[Any, ...], list[Array]] = {}
 
     def empty(self, shape: tuple[int, ...], dtype: type) -> Array:
         """Return an array with arbitrary content."""
-        arrays = self._arrays.setdefault((shape, dtype), [])
+        length, *rest = shape
+        arrays = self._arrays.setdefault((*rest, dtype), [])
         for array in arrays:
             # References of the list, of `array` and of the argument; another thread at this line adds a fourth.
-            if getrefcount(array) == 3:
-                return array
+            if len(array) >= length and getrefcount(array) == 3:
+                return array[:length]
         arrays.append(np.empty(shape, dtype))
-        return arrays[-1]
+        return arrays[-1][:]
 
 
 class WindowBatcher:
@@ -152,3 +154,33 @@ class WindowBatcher:
     def _own(self, values: Array) -> torch.Tensor:
         tensor = torch.from_numpy(values)
         return tensor.pin_memory() if self._pin else tensor
+
+
+class JoinedBatcher:
+    """Callable that copies windows of several stores into batches, as `WindowBatcher` does of one.
+
+    Args:
+        batchers: one per store; rows are numbered store by store.
+        rows: number of rows of every store.
+    """
+
+    def __init__(self, batchers: Sequence[WindowBatcher], rows: Sequence[int]) -> None:
+        self._batchers, self._starts = batchers, np.cumsum([0, *rows])[:-1]
+
+    def __call__(self, windows: Array) -> Batch:
+        """Return the batch of `windows` (B,), in the order of their stores."""
+        store = self._starts.searchsorted(windows, side="right") - 1
+        numbers = np.unique(store).tolist()
+        parts = [self._batchers[number](windows[store == number] - self._starts[number]) for number in numbers]
+        return parts[0] if len(parts) == 1 else _joined(parts)
+
+
+def _joined(parts: Sequence[Any]) -> Any:
+    """Concatenate batches, that is, mappings of tensors, lists and mappings."""
+    first = parts[0]
+    if isinstance(first, dict):
+        return {name: _joined([part[name] for part in parts]) for name in first}
+    if isinstance(first, list):
+        return [item for part in parts for item in part]
+    joined = torch.cat(list(parts))
+    return joined.pin_memory() if first.is_pinned() else joined

@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import logging
 import time
-from contextlib import nullcontext
+from collections.abc import Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,7 @@ from vla.reports.conditions import conditions_table, plot_conditions
 from vla.reports.evaluation import plot_report, write_report
 from vla.reports.html import PAGE, optional, write_page
 from vla.rollouts.evaluate import IN_DISTRIBUTION, Report, evaluate, keep_recordings
+from vla.runs.files import Round
 from vla.runs.folder import CHECKPOINTS, save_config, wall_time
 from vla.runs.resume import cached_success, training_lock
 
@@ -53,21 +55,27 @@ def run(experiment: Experiment) -> float | None:
         return None
     if not experiment.playable:
         return evaluate_open_loop(experiment, checkpoint)
-    own = checkpoint.resolve().parent == (output / CHECKPOINTS).resolve()
-    if own and (success := cached_success(output, experiment.config, checkpoint)) is not None:
+    if checkpoint.resolve().parent == (output / CHECKPOINTS).resolve():
+        return evaluate_trained(experiment, checkpoint)
+    return _evaluated(experiment, checkpoint)
+
+
+def evaluate_trained(experiment: Experiment, checkpoint: Path, rounds: Sequence[Round] = ()) -> float:
+    """Return the success rate of a policy that this run trained, in `rounds` if given; a report of it is kept."""
+    if (success := cached_success(experiment.output, experiment.config, checkpoint)) is not None:
         return success
-    with training_lock(checkpoint.parent) if own else nullcontext():  # else resume=last would find it interrupted
-        return _evaluated(experiment, checkpoint)
+    with training_lock(checkpoint.parent):  # else resume=last would find it interrupted
+        return _evaluated(experiment, checkpoint, rounds)
 
 
-def _evaluated(experiment: Experiment, checkpoint: Path | None) -> float:
+def _evaluated(experiment: Experiment, checkpoint: Path | None, rounds: Sequence[Round] = ()) -> float:
     """Play the episodes, write the reports, and return the success rate; print it even if writing fails."""
     started, output = time.monotonic(), experiment.output
     reports = _play(experiment, checkpoint)
     report = reports[IN_DISTRIBUTION]
     try:
         with writing(output / "report.json"):
-            _write(experiment, checkpoint, reports, started)
+            _write(experiment, checkpoint, reports, rounds, started)
     finally:
         print(report)
     errors = [error for each in reports.values() for error in each.errors]
@@ -102,11 +110,17 @@ def _play(experiment: Experiment, checkpoint: Path | None) -> dict[str, Report]:
     return reports
 
 
-def _write(experiment: Experiment, checkpoint: Path | None, reports: dict[str, Report], started: float) -> None:
+def _write(
+    experiment: Experiment,
+    checkpoint: Path | None,
+    reports: dict[str, Report],
+    rounds: Sequence[Round],
+    started: float,
+) -> None:
     """Write all results of an evaluation that started at `started` [s]."""
     output, report = experiment.output, reports[IN_DISTRIBUTION]
     others = {name: each for name, each in reports.items() if name != IN_DISTRIBUTION}
-    facts = _facts(experiment, checkpoint, time.monotonic() - started)
+    facts = _facts(experiment, checkpoint, rounds, time.monotonic() - started)
     save_config(output, experiment.config, experiment.changes)
     if experiment["recorder"]:
         recording, limit = output / "rollouts.rrd", experiment["evaluate"]["recordings"]
@@ -127,7 +141,7 @@ def _write(experiment: Experiment, checkpoint: Path | None, reports: dict[str, R
     )
 
 
-def _facts(experiment: Experiment, checkpoint: Path | None, seconds: float) -> dict[str, Any]:
+def _facts(experiment: Experiment, checkpoint: Path | None, rounds: Sequence[Round], seconds: float) -> dict[str, Any]:
     """Return what a report says of the agent, given the duration of its evaluation [s]."""
     if checkpoint is None:
         chosen = experiment["chosen"]
@@ -137,5 +151,11 @@ def _facts(experiment: Experiment, checkpoint: Path | None, seconds: float) -> d
         **experiment["chosen"],
         "parameters": sum(p.numel() for p in policy.model.parameters()),
         "latency_ms": latency(policy),
-        "wall_time_s": wall_time(checkpoint, seconds),
+        "wall_time_s": wall_time(checkpoint, seconds + _before_last_training(rounds)),
+        "rounds": [asdict(one) for one in rounds],
     }
+
+
+def _before_last_training(rounds: Sequence[Round]) -> float:
+    """Return the duration of all rounds but for the training of the last [s], which its own folder has."""
+    return sum(each.collection_s + each.training_s for each in rounds) - (rounds[-1].training_s if rounds else 0.0)

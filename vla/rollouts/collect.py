@@ -46,7 +46,8 @@ ExpertFactory = Callable[[Environment], Agent]
 class Summary:
     """Result of a collection."""
 
-    episodes: int  # successes stored
+    episodes: int  # stored
+    successes: int  # of the tried seeds
     added: int  # of these, added by this call
     tried: int  # seeds of known outcome, that is, without the episodes lost in a repair
     failures: dict[str, int]  # outcome → seeds
@@ -56,7 +57,7 @@ class Summary:
     @property
     def success_rate(self) -> float:
         """Share of the tried seeds that the expert solved, 0…1."""
-        return self.episodes / self.tried if self.tried else 0.0
+        return self.successes / self.tried if self.tried else 0.0
 
 
 def collect(
@@ -67,11 +68,14 @@ def collect(
     cluster: Cluster,
     seed: int,
     multitask: Multitask | None = None,
+    keep_failures: bool = False,
+    needs: Sequence[Path] = (),
 ) -> Summary:
     """Roll the expert out on `seed`, `seed` + 1, … until the store holds `episodes` successes.
 
     Existing episodes are kept. If another process is collecting into the same store, wait for it. Each process of
-    `cluster` calls the two factories once. `multitask` tells the task of a seed; its tasks get equal shares.
+    `cluster` calls the two factories once and accesses the paths `needs`. `multitask` tells the task of a seed; its
+    tasks get equal shares. With `keep_failures` every seed gives an episode: failures are stored and count too.
 
     Raises:
         ValueError: the store starts at another seed or is derived, the expert fails persistently, workers died, or the
@@ -89,16 +93,19 @@ def collect(
             if before < episodes:
                 began = time.monotonic()  # excludes the wait for another process
                 try:
-                    make = partial(DemonstrationWorker, make_environment, make_expert)
-                    _fill_with(cluster, make, store, episodes, seed, multitask)
+                    make = partial(DemonstrationWorker, make_environment, make_expert, keep_failures)
+                    fill = partial(_fill, store, episodes=episodes, seed=seed, multitask=multitask, keep=keep_failures)
+                    _fill_with(cluster, make, needs, store, fill)
                 finally:
                     _save_collection_time(store.folder, time.monotonic() - began)
     stored = len(store.episodes)
     tried = [entry for entry in store.tried if entry.outcome not in (DAMAGED, NOT_NEEDED)]
     failures = Counter(entry.outcome for entry in tried if not entry.success)
-    solved, asked = (Counter(entry.task for entry in entries) for entries in (store.episodes, tried))
+    successes = [entry for entry in tried if entry.success]
+    solved, asked = (Counter(entry.task for entry in entries) for entries in (successes, tried))
     tasks = {task: (solved[task], asked[task]) for task in sorted(asked)}
-    return Summary(stored, stored - before, len(tried), dict(failures), tasks, time.monotonic() - started)
+    seconds = time.monotonic() - started
+    return Summary(stored, len(successes), stored - before, len(tried), dict(failures), tasks, seconds)
 
 
 def collection_time(store: EpisodeStore, episodes: int) -> float | None:
@@ -135,14 +142,14 @@ def _require_first_seed(store: EpisodeStore, seed: int) -> None:
 
 
 def _fill_with(
-    cluster: Cluster, make: WorkerFactory, store: EpisodeStore, episodes: int, seed: int, multitask: Multitask | None
+    cluster: Cluster, make: WorkerFactory, needs: Sequence[Path], store: EpisodeStore, fill: Callable[[Pool], None]
 ) -> None:
     """Fill the store, restarting workers that died: in long collections processes occasionally crash outside Python."""
     while True:
         tried = len(store.tried)
         try:
-            with cluster.pool(make) as pool:
-                return _fill(store, pool, episodes, seed, multitask)
+            with cluster.pool(make, needs) as pool:
+                return fill(pool)
         except WorkersLost as lost:
             if len(store.tried) == tried:
                 raise WorkersLost(f"{lost}; committed episodes are safe, run again to continue") from lost
@@ -200,8 +207,9 @@ class Attempts:
         return solved[self._task_of(seed)] == min(solved.values())
 
 
-def _fill(store: EpisodeStore, pool: Pool, episodes: int, seed: int, multitask: Multitask | None) -> None:
+def _fill(store: EpisodeStore, pool: Pool, episodes: int, seed: int, multitask: Multitask | None, keep: bool) -> None:
     stored = before = len(store.episodes)
+    solved = sum(entry.success for entry in store.tried)
     attempts = Attempts(pool, multitask, store, seed)
     tried = sum(entry.outcome not in (DAMAGED, NOT_NEEDED) for entry in store.tried)
     in_a_row: dict[str, list[str]] = {}  # task → outcomes of the failures since its last success
@@ -215,8 +223,8 @@ def _fill(store: EpisodeStore, pool: Pool, episodes: int, seed: int, multitask: 
             if episode.outcome == NOT_NEEDED:
                 store.fail(episode)
                 continue
-            tried += 1
-            if episode.success:
+            tried, solved = tried + 1, solved + episode.success
+            if episode.success or keep:
                 store.append(episode)
                 stored += 1
                 in_a_row[episode.task] = []
@@ -226,7 +234,7 @@ def _fill(store: EpisodeStore, pool: Pool, episodes: int, seed: int, multitask: 
                 failed.append(episode.outcome)
                 _give_up_after(episode.task, failed)
             speed = (stored - before) / (time.monotonic() - started)
-            progress.update(task, completed=stored, description=f"{speed:.1f} episodes/s, expert {stored / tried:.0%}")
+            progress.update(task, completed=stored, description=f"{speed:.1f} episodes/s, success {solved / tried:.0%}")
 
 
 def _give_up_after(task: str, failures: Sequence[str]) -> None:
@@ -240,16 +248,19 @@ def _give_up_after(task: str, failures: Sequence[str]) -> None:
 class DemonstrationWorker:
     """Worker with one environment and one expert."""
 
-    def __init__(self, make_environment: EnvironmentFactory, make_expert: ExpertFactory) -> None:
+    def __init__(
+        self, make_environment: EnvironmentFactory, make_expert: ExpertFactory, keep_failures: bool = False
+    ) -> None:
+        self._keep_failures = keep_failures
         self._environment = make_environment()
         self._expert = make_expert(self._environment)
 
     def attempt(self, seed: int) -> Episode:
-        """Roll out one seed and replay it if it succeeds; failures lose their observations."""
+        """Roll out one seed and replay it if it succeeds; failures that are not kept lose their observations."""
         episode = rollout(self._environment, self._expert, seed)
         if episode.success and not _is_reproducible(self._environment, episode):
             episode.outcome = NOT_REPEATABLE
-        return episode if episode.success else replace(episode, observations=[])
+        return episode if episode.success or self._keep_failures else replace(episode, observations=[])
 
     def close(self) -> None:
         """Close the environment."""

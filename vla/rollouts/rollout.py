@@ -10,7 +10,8 @@ from vla.spec import Agent, Environment, Episode, Recorder
 def rollout(environment: Environment, agent: Agent, seed: int, recorder: Recorder | None = None) -> Episode:
     """Run the episode of `seed` to its end.
 
-    The label for imitation is `agent.info["clean"]` if present, else the executed action.
+    The label for imitation is `agent.info["clean"]` if present, else the executed action. What the agent drew,
+    `agent.info["draws"]`, is added to the draws of the environment.
 
     Raises:
         ValueError: the agent returned an action of the wrong shape, or one that is not finite.
@@ -37,7 +38,7 @@ def rollout(environment: Environment, agent: Agent, seed: int, recorder: Recorde
         instruction=observations[0].instruction,
         outcome=environment.outcome,
         milestones=environment.milestones,
-        draws=environment.draws,
+        draws={**environment.draws, **agent.info.get("draws", {})},
         observations=observations,
         actions=np.asarray(clean, dtype=np.float32),
         executed=np.asarray(executed, dtype=np.float32),

@@ -41,6 +41,25 @@ class Training:
 
 
 @dataclass(frozen=True)
+class Round:
+    """Round of `job=improve`: episodes that the expert labelled, and the training that followed."""
+
+    __pydantic_config__ = STRICT
+
+    episodes: Natural  # 0: training on demonstrations alone
+    successes: Natural  # of these episodes, by the policy before this training
+    collection_s: NonNegative  # duration of the episodes
+    training_s: NonNegative
+    validation: Share | None  # success rate in the last validation; None without one
+
+    def __str__(self) -> str:
+        """Format the successes before and after the training."""
+        acted = f"{self.successes} of {self.episodes} labelled episodes were successes"
+        after = "" if self.validation is None else f"{100 * self.validation:.0f} % in validation afterwards"
+        return ", ".join(part for part in (acted if self.episodes else "", after) if part) or "trained"
+
+
+@dataclass(frozen=True)
 class Milestone:
     """Rate of a milestone, regardless of the outcome."""
 
@@ -131,6 +150,7 @@ class ReportFile(Summary):
     parameters: Count | None = None
     latency_ms: Positive | None = None
     wall_time_s: NonNegative | None = None
+    rounds: list[Round] = field(default_factory=list)  # of job=improve
 
     def __post_init__(self) -> None:
         """Require the same episodes in every part."""

@@ -109,6 +109,7 @@ class Perturbed:
         perturb: None disables perturbation.
         """
         self._spec, self._expert, self._perturb = spec, expert(spec=spec), perturb
+        self.memoryless = bool(getattr(self._expert, "memoryless", False))  # of the label
         self.info: dict[str, Any] = {}
 
     def reset(self, instruction: str, seed: int) -> None:

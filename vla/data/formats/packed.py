@@ -91,7 +91,7 @@ class PackedExporter:
             pieces_of = map_episodes(self._pieces, store, range(len(store.episodes)), cluster)
             episodes = stack.enter_context(closing(pieces_of))
             for entry in tried:
-                if entry.success:
+                if entry.stored:
                     pieces = next(episodes)
                     entry = replace(entry, crc=pieces.crc)
                     for name, images in pieces.images.items():
@@ -117,7 +117,7 @@ class PackedExporter:
 def _tried(store: EpisodeStore) -> list[Entry]:
     """Return the entries up to the last episode within the limit of `store`, or all of them if it has no limit."""
     shown = store.episodes
-    every = len(shown) == sum(entry.success for entry in store.tried)
+    every = len(shown) == sum(entry.stored for entry in store.tried)
     return store.tried if every else store.tried[: store.tried.index(shown[-1]) + 1]
 
 

@@ -1,0 +1,213 @@
+"""Rounds of an expert's labels for what a policy sees."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import toy
+from collecting import content
+from command_line import SMALL, here
+from composing import check, composed
+
+from vla.config.adopt import resume
+from vla.config.experiment import Experiment
+from vla.data.episodes import EpisodeStore
+from vla.data.verification import derive_store, episode_of, verify_store
+from vla.data.window_batches import WindowBatcher
+from vla.jobs import improve
+from vla.models.checkpoint import read_checkpoint
+from vla.parallel.pool import LocalCluster
+from vla.rollouts.collect import collect
+from vla.rollouts.rollout import replay, rollout
+from vla.rollouts.supervised import Supervised, make_supervised, require_memoryless
+from vla.spec import Array, Environment, Observation
+from vla.tasks.metaworld.expert import Scripted
+from vla.tasks.perturb import Perturbed
+from vla.tasks.tabletop.expert import Waypoint
+
+ROUNDS = ("job=improve", "pretrained=run/checkpoints/last.ckpt", *SMALL, "task.time_limit=2", "evaluate.episodes=1")
+FEW = ("improve.episodes=2", "improve.steps=2", "collect.folder=few", "collect.episodes=6")
+
+
+class Wanderer:
+    """A policy that sees the target seldom, and mostly goes astray."""
+
+    def __init__(self) -> None:
+        self.info: dict[str, Any] = {}
+
+    def reset(self, instruction: str, seed: int) -> None:
+        """Start over."""
+        self._random = np.random.default_rng([seed, 2])
+
+    def act(self, observation: Observation) -> Array:
+        """North-east, with noise."""
+        return np.array([*self._random.normal(0.02, 0.02, 2), 0.0], np.float32)
+
+
+def make_wanderer(environment: Environment) -> Wanderer:
+    return Wanderer()
+
+
+def supervised(beta: float) -> Supervised:
+    return Supervised(Wanderer(), toy.ToyExpert(), beta, segment=5)
+
+
+def label(folder: Path, workers: int, episodes: int = 12) -> EpisodeStore:
+    store = EpisodeStore.create_or_open(folder, toy.SPEC, {})
+    agent = partial(make_supervised, make_wanderer, toy.make_expert, 0.4, 5)
+    collect(store, toy.make_environment, agent, episodes, LocalCluster(workers), 100, keep_failures=True)
+    return EpisodeStore(folder)
+
+
+@pytest.fixture(scope="module")
+def labelled(tmp_path_factory: pytest.TempPathFactory) -> EpisodeStore:
+    """Twelve labelled episodes of the toy world."""
+    return label(tmp_path_factory.mktemp("labelled"), workers=1)
+
+
+def test_the_policy_acts_and_the_expert_labels() -> None:
+    episode = rollout(toy.make_environment(), supervised(beta=0.0), 7)
+    alone = rollout(toy.make_environment(), Wanderer(), 7)
+    np.testing.assert_array_equal(episode.executed, alone.executed)
+    assert not episode.success and episode.draws["expert_acts"] == []
+    for observation, action in zip(episode.observations, episode.actions, strict=True):
+        assert observation.truth is not None
+        way = observation.truth["target"] - observation.truth["point"]
+        np.testing.assert_array_equal(action, [*np.clip(way, -0.05, 0.05), 1.0])
+
+
+def test_an_expert_that_always_acts_is_not_perturbed() -> None:
+    episode = rollout(toy.make_environment(), supervised(beta=1.0), 7)
+    assert episode.success and np.array_equal(episode.executed, episode.actions)
+
+
+def test_an_episode_says_who_acted_when() -> None:
+    episode = rollout(toy.make_environment(), supervised(beta=0.4), 3)
+    by_expert = np.zeros(len(episode.actions), bool)
+    for first, last in episode.draws["expert_acts"]:
+        by_expert[first : last + 1] = True
+    assert 0 < by_expert.sum() < len(by_expert)
+    np.testing.assert_array_equal((episode.executed == episode.actions).all(axis=1), by_expert)
+
+
+def test_failures_are_kept_with_their_labels(labelled: EpisodeStore, tmp_path: Path) -> None:
+    assert [entry.seed for entry in labelled.episodes] == [*range(100, 112)]
+    failures = [entry for entry in labelled.episodes if not entry.success]
+    assert 0 < len(failures) < 12 and all(entry.steps == 40 for entry in failures)
+    assert replay(toy.make_environment(), episode_of(labelled, failures[0])) is None
+    outcomes = {"success": 12 - len(failures), "timeout": len(failures)}
+    assert verify_store(labelled).outcomes == outcomes
+    derive_store([labelled], tmp_path / "some", {"seed": [104, None]})
+    assert len(EpisodeStore(tmp_path / "some").episodes) == 8
+
+
+def test_labelled_episodes_do_not_depend_on_workers_or_interruptions(labelled: EpisodeStore, tmp_path: Path) -> None:
+    label(tmp_path / "two", workers=1, episodes=5)
+    label(tmp_path / "two", workers=2)
+    assert content(tmp_path / "two") == content(labelled.folder)
+
+
+def test_windows_of_several_stores_are_those_of_each(labelled: EpisodeStore, folder: Path) -> None:
+    from reading import windows
+
+    first = EpisodeStore(folder, 4)
+    module = windows(folder, episodes=4, more=[labelled.folder])
+    start, rows = first.episodes[-1].end, labelled.episodes[-1].end
+    both = np.concatenate([module.training_windows, module.held_out_windows])
+    assert sorted(both.tolist()) == [*range(start + rows)]
+    batch = module.make_batch(np.array([start + 3, 5, start + rows - 1, 0]))
+    for store, chosen, part in ((first, [5, 0], slice(0, 2)), (labelled, [3, rows - 1], slice(2, 4))):
+        alone = WindowBatcher(store, 3, 2)(np.array(chosen))
+        for name in ("state", "action", "truth", "valid", "present"):
+            np.testing.assert_array_equal(batch[name][part], alone[name])
+        np.testing.assert_array_equal(batch["rgb"]["eye"][part], alone["rgb"]["eye"])
+        assert batch["instruction"][part] == alone["instruction"]
+    with pytest.raises(ValueError, match="other demonstrations"):
+        windows(folder, episodes=4).load_state_dict(module.state_dict())
+
+
+def test_only_a_memoryless_expert_labels() -> None:
+    for expert in (Waypoint, Scripted):
+        assert expert.memoryless
+
+    class Counting(toy.ToyExpert):
+        memoryless = False
+
+    class Silent(Wanderer):
+        """Says nothing about its memory."""
+
+    for other in (Counting(), Silent(), Perturbed(toy.SPEC, lambda spec: Counting(), None)):
+        with pytest.raises(ValueError, match="cannot label the states of another agent"):
+            require_memoryless(other)
+    require_memoryless(Perturbed(toy.SPEC, lambda spec: toy.ToyExpert(), None))
+
+
+@pytest.mark.parametrize(
+    ("wrong", "sentence"),
+    [
+        ("improve.seed=999999", "reserved for evaluation"),
+        ("trainer.devices=2", "trains on one device"),
+        ("expert=clean", "Waypoint cannot label the states of another agent"),
+    ],
+)
+def test_what_cannot_be_improved_is_refused_before_any_work(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, wrong: str, sentence: str
+) -> None:
+    monkeypatch.setattr(Waypoint, "memoryless", False)
+    nowhere = (f"output={tmp_path}/run", f"collect.folder={tmp_path}/episodes")
+    with pytest.raises(ValueError, match=sentence):
+        improve.run(Experiment.of(composed("job=improve", *nowhere, wrong)))
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_episodes_of_a_round_may_have_another_task() -> None:
+    check(composed("job=improve", "+improve.changes.time_limit=5.0"))
+    with pytest.raises(ValueError, match=r"task \(improve.changes\).time is unknown"):
+        check(composed("job=improve", "+improve.changes.time=5.0"))
+
+
+def test_rounds_are_not_resumed_as_one_training(tmp_path: Path) -> None:
+    (tmp_path / "run/round_1").mkdir(parents=True)
+    with pytest.raises(ValueError, match="goes on with its own command and output="):
+        resume(composed(f"output={tmp_path}/now"), tmp_path / "run", [])
+
+
+def test_seeds_of_demonstrations_are_not_played_again(folder: Path) -> None:
+    store = EpisodeStore(folder)
+    with pytest.raises(ValueError, match=r"have 5 to 9: set improve\.seed=10, or higher"):
+        improve.require_new(range(5, 10), store)
+    improve.require_new(range(100, 110), store)
+
+
+def result(folder: Path) -> tuple[dict[str, bytes], dict[str, float]]:
+    """What a round leaves that must not depend on interruptions: its episodes and weights."""
+    state = read_checkpoint(folder / "checkpoints/last.ckpt").state
+    return content(folder / "episodes"), {name: values.double().sum().item() for name, values in state.items()}
+
+
+def test_rounds_that_were_killed_go_on_to_the_same_result(home: Path) -> None:
+    here(home, *ROUNDS, *FEW, "output=rounds", "improve.rounds=1")
+    first, second = (home / "rounds" / name for name in ("round_1", "round_2"))
+    whole = result(first)
+    page, report = (home / "rounds" / name for name in ("report.html", "report.json"))
+    (counts,) = json.loads(report.read_text())["rounds"]
+    assert (counts["episodes"], counts["successes"], counts["validation"]) == (2, 0, None)
+    assert "labelled episodes" in page.read_text() and (home / "rounds/rollouts.rrd").exists()
+
+    # What a process leaves that is killed within the second episode: rows without a line in the index.
+    shutil.rmtree(first / "checkpoints")
+    index = first / "episodes/index.jsonl"
+    index.write_bytes(index.read_bytes().splitlines(keepends=True)[0] + b'{"seed": 500')
+    here(home, *ROUNDS, *FEW, "output=rounds", "improve.rounds=2")
+    assert result(first) == whole
+    assert [entry.seed for entry in EpisodeStore(second / "episodes").tried] == [500002, 500003]
+    trained = read_checkpoint(second / "checkpoints/last.ckpt").config
+    assert trained["collect"]["more"] == ["rounds/round_1/episodes", "rounds/round_2/episodes"]
+    assert trained["pretrained"] == "rounds/round_1/checkpoints/last.ckpt"
+    assert len(json.loads(report.read_text())["rounds"]) == 2

@@ -1,0 +1,165 @@
+"""`job=improve`: rounds in which the expert labels what the policy saw, and training goes on (DAgger).
+
+S. Ross, G. Gordon, J. A. Bagnell, A Reduction of Imitation Learning and Structured Prediction to No-Regret Online
+Learning, AISTATS 2011 (arXiv 1011.0686), algorithm 3.1. The demonstrations are its first round, in which the expert
+acts; in the others the policy does, or both in turns (`improve.beta`). Every round is a run in a folder of its own,
+`round_1`, `round_2`, …, with its episodes beside its checkpoints; `round_0` is the training on demonstrations alone.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+
+import torch
+
+from vla.config.check import TRAINING, Job, with_changes
+from vla.config.experiment import Experiment
+from vla.data.episodes import EpisodeStore
+from vla.data.index import listed
+from vla.io.types import Count, Seed, Share
+from vla.jobs.collect import demonstrations
+from vla.jobs.evaluate import evaluate_trained
+from vla.jobs.train import train
+from vla.models.checkpoint import read_checkpoint
+from vla.rollouts.collect import collect, collection_time
+from vla.rollouts.supervised import make_supervised, require_memoryless
+from vla.runs.files import Round
+from vla.runs.folder import read_run
+from vla.spec import FIRST_SEED
+
+log = logging.getLogger(__name__)
+
+JOB = Job(
+    (*TRAINING, "policy", "recorder"),
+    options={
+        "rounds": Count,
+        "episodes": Count,
+        "seed": Seed,
+        "steps": Count,
+        "beta": Share,
+        "segment": Count,
+        "changes": dict[str, object],
+    },
+)
+EPISODES = "episodes"  # the store in the folder of a round
+
+
+def run(experiment: Experiment) -> float:
+    """Improve a policy in rounds and return its success rate; finished rounds, and parts of one, are kept.
+
+    Raises:
+        ValueError: the expert cannot label, seeds are not fresh, or a round of another policy lies in the folder.
+    """
+    seeds = _require_possible(experiment)
+    require_new(seeds, demonstrations(experiment))
+    asked, output = experiment["improve"], experiment.output
+    checkpoint, rounds, stores = experiment.pretrained, list[Round](), list[Path]()
+    if checkpoint is None:
+        checkpoint = _trained(experiment.with_values({"job": "train", "output": str(output / "round_0")}))
+        rounds.append(_described(output / "round_0", None))
+    for number in range(1, asked["rounds"] + 1):
+        folder = output / f"round_{number}"
+        store = _labelled(experiment, checkpoint, folder / EPISODES, seeds[(number - 1) * asked["episodes"]])
+        stores.append(store.folder)
+        checkpoint = _trained(_round(experiment, checkpoint, folder, stores))
+        rounds.append(_described(folder, store))
+        log.info("round %d: %s", number, rounds[-1])
+    return evaluate_trained(experiment, checkpoint, rounds)
+
+
+def _require_possible(experiment: Experiment) -> range:
+    """Return the seeds of all rounds, after refusing what would fail later on.
+
+    Raises:
+        ValueError: seeds are of evaluation, training is to use several devices, or the expert cannot label.
+    """
+    asked, trainer = experiment["improve"], experiment["trainer"]
+    seeds = range(asked["seed"], asked["seed"] + asked["rounds"] * asked["episodes"])
+    if seeds.stop > FIRST_SEED:
+        raise ValueError(f"improve.seed={seeds.start}: seeds from {FIRST_SEED} on are reserved for evaluation")
+    if str(trainer.get("devices", 1)) not in ("1", "[0]") or trainer.get("num_nodes", 1) != 1:
+        raise ValueError("job=improve trains on one device, because its trainings follow each other: trainer.devices=1")
+    environment = experiment.make_environment()()
+    try:
+        require_memoryless(experiment.make_expert()(environment))
+    finally:
+        environment.close()
+    return seeds
+
+
+def require_new(seeds: range, store: EpisodeStore) -> None:
+    """Raise a ValueError if a demonstration has one of the seeds."""
+    seen = [entry.seed for entry in store.tried if entry.seed in seeds]
+    if seen:
+        raise ValueError(
+            f"improve.seed={seeds.start}: the {len(seeds)} seeds of the rounds must be new, and the demonstrations in "
+            f"{store.folder} have {listed(seen)}: set improve.seed={max(seen) + 1}, or higher"
+        )
+
+
+def _labelled(experiment: Experiment, checkpoint: Path, folder: Path, seed: int) -> EpisodeStore:
+    """Return the store of a round: episodes of the policy in a checkpoint, labelled by the expert; add missing ones."""
+    asked = experiment["improve"]
+    task = with_changes(experiment["task"], asked["changes"])
+    environment = experiment.make_environment(asked["changes"])
+    own = {
+        "task": task,
+        "expert": experiment["expert"],
+        "policy": {**experiment["policy"], "weights": _digest(checkpoint)},
+        "improve": {**{name: asked[name] for name in ("episodes", "beta", "segment")}, "seed": seed},
+    }
+    world = environment()
+    world.close()
+    store = EpisodeStore.create_or_open(folder, world.spec, own)
+    policy = experiment.make_policy(checkpoint.resolve())
+    agent = partial(make_supervised, policy, experiment.make_expert(), asked["beta"], asked["segment"])
+    needs = [checkpoint.resolve()]
+    collect(store, environment, agent, asked["episodes"], experiment.cluster(), seed, keep_failures=True, needs=needs)
+    return EpisodeStore(folder)
+
+
+def _round(experiment: Experiment, checkpoint: Path, folder: Path, stores: Sequence[Path]) -> Experiment:
+    """Return the training of a round: from the weights of the one before, on demonstrations and all rounds so far."""
+    steps = experiment["improve"]["steps"]
+    more = [*(experiment["collect"]["more"] or ()), *map(str, stores)]
+    return experiment.with_values(
+        {
+            "job": "train",
+            "output": str(folder),
+            "pretrained": str(checkpoint),
+            "collect.more": more,
+            "trainer.max_steps": steps,
+            "trainer.val_check_interval": steps,  # once, at the end
+        }
+    )
+
+
+def _trained(experiment: Experiment) -> Path:
+    checkpoint = train(experiment)
+    assert checkpoint is not None, "this is the only process"
+    return checkpoint
+
+
+def _described(folder: Path, store: EpisodeStore | None) -> Round:
+    """Return what a finished round did; without a store it is the training on demonstrations alone."""
+    found, episodes = read_run(folder), store.episodes if store else []
+    curve = found.metrics.get("val/success")
+    return Round(
+        episodes=len(episodes),
+        successes=sum(entry.success for entry in episodes),
+        collection_s=(collection_time(store, len(episodes)) or 0.0) if store else 0.0,
+        training_s=found.training.seconds if found.training else 0.0,
+        validation=round(float(curve[1][-1]), 6) if curve else None,
+    )
+
+
+def _digest(checkpoint: Path) -> str:
+    """Return what identifies the weights in a checkpoint: twelve hexadecimal digits."""
+    digest = hashlib.sha256()
+    for name, values in sorted(read_checkpoint(checkpoint).state.items()):
+        digest.update(name.encode() + values.flatten().view(torch.uint8).numpy().tobytes())
+    return digest.hexdigest()[:12]

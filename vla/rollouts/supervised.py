@@ -1,0 +1,72 @@
+"""A policy under the eyes of an expert, which labels every state that the policy reaches (DAgger, arXiv 1011.0686)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from vla.spec import Agent, Array, Environment, Expert, Observation
+
+
+class Supervised:
+    """A policy that acts while an expert labels: `info["clean"]` is the expert's action, the label to imitate.
+
+    In some segments of an episode, drawn from its seed, the expert's own action is executed instead, without any
+    perturbation; `info["draws"]` names their steps.
+    """
+
+    def __init__(self, policy: Agent, expert: Agent, beta: float, segment: int) -> None:
+        """Args:
+        policy: what acts.
+        expert: what labels; memoryless, see `require_memoryless`.
+        beta: probability that the expert acts in a segment, 0…1; 0 lets the policy act throughout.
+        segment: length [steps].
+
+        Raises:
+            ValueError: the expert cannot label what it did not come to by itself.
+        """
+        require_memoryless(expert)
+        self._policy, self._expert, self._beta, self._segment = policy, expert, beta, segment
+        self.info: dict[str, Any] = {}
+
+    def reset(self, instruction: str, seed: int) -> None:
+        """Start an episode; `seed` seeds policy, expert and the draw of segments."""
+        self._policy.reset(instruction, seed)
+        self._expert.reset(instruction, seed)
+        self._random, self._step = np.random.default_rng([seed, 0xDA66E4]), 0
+        self._acts: list[tuple[int, int]] = []  # first and last step of every segment in which the expert acts
+
+    def act(self, observation: Observation) -> Array:
+        """Return the (D,) action to execute; the policy also sees what the expert acts on."""
+        if self._step % self._segment == 0:
+            self._expert_acts = bool(self._random.uniform() < self._beta)
+            if self._expert_acts:
+                self._acts.append((self._step, self._step + self._segment - 1))
+        self._step += 1
+        action = self._policy.act(observation)
+        executed = self._expert.act(observation)
+        label = self._expert.info.get("clean", executed)
+        self.info = {**self._policy.info, "clean": label, "draws": {"expert_acts": self._acts}}
+        return label if self._expert_acts else action
+
+
+def require_memoryless(expert: Agent) -> None:
+    """Raise a ValueError unless the expert's labels depend on the observation alone, as its `memoryless` says."""
+    if not (isinstance(expert, Expert) and expert.memoryless):
+        raise ValueError(
+            f"{type(expert).__name__} cannot label the states of another agent: of an expert that does not say "
+            "memoryless = True, actions may depend on what it did before; choose another expert"
+        )
+
+
+def make_supervised(
+    make_policy: Callable[[Environment], Agent],
+    make_expert: Callable[[Environment], Agent],
+    beta: float,
+    segment: int,
+    environment: Environment,
+) -> Supervised:
+    """Build the policy and its expert for an environment."""
+    return Supervised(make_policy(environment), make_expert(environment), beta, segment)
