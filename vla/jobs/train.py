@@ -130,7 +130,7 @@ def _closed_loop(experiment: Experiment, checkpoints: Path) -> ClosedLoop | None
     asked = experiment["validate"]
     seeds = range(asked["seed"], asked["seed"] + asked["episodes"])
     make_environment = experiment.make_environment(asked["changes"])
-    make_policy = partial(training_policy, experiment["policy"])
+    make_policy = partial(training_policy, experiment["policy"].get("precision", "fp32"))
     return ClosedLoop(make_environment, make_policy, seeds, checkpoints) if seeds else None
 
 
