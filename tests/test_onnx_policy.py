@@ -57,6 +57,10 @@ def test_programs_are_exported_once_for_the_same_weights_and_options(
     (programs,) = (path for path in tmp_path.iterdir() if path.is_dir())
     assert {path.name for path in programs.iterdir()} == {"act.onnx", "program.json"}
 
+    (programs / "act.onnx").write_bytes(b"torn")
+    with pytest.raises(ValueError, match=r"act\.onnx is damaged: delete its folder"):
+        as_onnx(model, tmp_path)
+
     exported = []
     monkeypatch.setattr("vla.deploy.onnx_policy.write_programs", lambda *arguments: exported.append(arguments[1]))
     monkeypatch.setattr("vla.deploy.onnx_policy.open_onnx", lambda path, threads: path)

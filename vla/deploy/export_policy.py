@@ -194,12 +194,19 @@ def _as_onnx(captured: ExportedProgram, inputs: Inputs) -> ONNXProgram:
 
 
 def open_onnx(path: Path, threads: int | None = None) -> Run:
-    """Return a function that runs an ONNX program on the CPU, by default with as many threads as PyTorch."""
+    """Return a function that runs an ONNX program on the CPU, by default with as many threads as PyTorch.
+
+    Raises:
+        ValueError: the file is damaged.
+    """
     from onnxruntime import InferenceSession, SessionOptions
 
     options = SessionOptions()
     options.intra_op_num_threads = threads or torch.get_num_threads()
-    session = InferenceSession(path, options, providers=["CPUExecutionProvider"])
+    try:
+        session = InferenceSession(path, options, providers=["CPUExecutionProvider"])
+    except Exception as error:  # of its own kinds
+        raise ValueError(f"{path} is damaged: delete its folder, and export the policy again") from error
     used = {node.name for node in session.get_inputs()}  # without inputs that the program ignores
 
     def run(inputs: Inputs) -> Tensor:

@@ -60,7 +60,7 @@ class OnnxPolicy(Policy):
         self.compiled = True  # for one observation
         act = open_onnx(programs / f"act.{suffix}", threads)
         self._predict_chunk = lambda batch: Prediction(act(inputs_of(batch)))
-        if (encoder := programs / f"encode.{suffix}").exists():
+        if (encoder := programs / f"encode.{suffix}").exists():  # the model caches tokens of past frames
             encode = open_onnx(encoder, threads)
             self._encode = lambda batch: encode(inputs_of(batch))
 
