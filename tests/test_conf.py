@@ -28,7 +28,14 @@ OPTIONS = [
 
 
 # Options that are only for some options of another group.
-TOGETHER = {("tokenizer", "fast"): ["model=decoder"], ("job", "deploy"): ["deploy=ros2"]}
+TOGETHER = {
+    ("tokenizer", "fast"): ["model=decoder"],
+    ("job", "deploy"): ["deploy=ros2"],
+    ("task", "gymnasium"): [
+        *("task.package=gymnasium_robotics", "task.id=Any-v0", "task.images={top: render}"),
+        "task.state={observation: null}",
+    ],
+}
 
 
 @cache
@@ -52,7 +59,7 @@ def test_deploying_nothing_is_refused() -> None:
 
 
 def test_empty_batches_are_refused() -> None:
-    with pytest.raises(ValueError, match=r"data\.batch_size must be int, at least 1, got 0"):
+    with pytest.raises(ValueError, match=r"data\.batch_size must be a whole number, at least 1, got 0"):
         check(composed("data.batch_size=0"))
 
 

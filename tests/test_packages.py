@@ -102,8 +102,8 @@ def test_a_job_with_a_group_of_its_own_is_two_options_and_a_module(home: Path, i
     away = [np.linalg.norm(start.truth["target"] - start.state) for start in starts]
     assert vla(home, *asked, "output=surveyed").stdout == f"mean {1000 * np.mean(away):.3f}\n"
     for wrong, words in (
-        ("metric.unit=0", "metric.unit must be float, more than 0, got 0"),
-        ("survey.episodes=0", "survey.episodes must be int, at least 1, got 0"),
+        ("metric.unit=0", "metric.unit must be a number, more than 0, got 0"),
+        ("survey.episodes=0", "survey.episodes must be a whole number, at least 1, got 0"),
         ("+survey.length=3", "survey.length is unknown: survey takes episodes, seed"),
         ("~metric", "job=mypackage.survey needs metric=OPTION"),
     ):

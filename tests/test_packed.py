@@ -112,5 +112,5 @@ def test_only_what_the_store_shows_is_packed_once(tmp_path: Path) -> None:
 def test_stores_that_cannot_be_packed_are_refused(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="holds no episodes yet"):
         exporter("packed", tmp_path / "new").export(add(tmp_path / "empty", []))
-    with pytest.raises(ValueError, match=r"export\.quality must be int, at least 1, at most 95, got 100"):
+    with pytest.raises(ValueError, match=r"export\.quality must be a whole number, at least 1, at most 95, got 100"):
         exporter("packed", tmp_path / "new", "export.quality=100")

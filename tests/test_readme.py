@@ -108,7 +108,7 @@ def require_floors(measures: dict[str, dict[str, Any]]) -> None:
     watched = ("", ": data-wait", ": MFU", ": memory", ": loss")
     assert set(measures) == {
         *("collect", *(f"collect: {stage}" for stage in stages), f"collect: {cores()} processes"),
-        *("collect: rendering, fast", "collect: rendering, mujoco"),
+        *(f"collect: rendering, {name}" for name in ("fast", "smooth", "mujoco")),
         *("loader", "loader: 1 frame", "loader: 6 frames"),
         *(f"train: {precision}{what}" for precision in precisions for what in watched),
         *("train: loader alone", "policy", "policy: every frame anew"),

@@ -107,7 +107,7 @@ def test_unknown_words_hardly_change_what_training_made_of_the_known_ones() -> N
 def test_n_grams_are_short(name: str) -> None:
     """Over the lengths up to 2^31, which a checkpoint could ask for, a single sentence took minutes."""
     node: Any = OmegaConf.to_container(OmegaConf.load(CONF / "model/text/ngrams.yaml"))
-    with pytest.raises(ValueError, match=rf"text\.{name} must be int, at least 1, at most \d\d, got"):
+    with pytest.raises(ValueError, match=rf"text\.{name} must be a whole number, at least 1, at most \d\d, got"):
         check_node("text", {**node, name: 2**31 - 1}, object)
 
 

@@ -21,7 +21,7 @@ from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
 from vla import jobs
-from vla.config.annotations import targets
+from vla.config.annotations import packages, targets
 from vla.config.build import suggestion
 from vla.config.check import Job, check
 from vla.config.compose import CONF
@@ -47,6 +47,8 @@ def sentence(error: Exception) -> str:
     if isinstance(error, OverrideParseException):
         reason = error.message.splitlines()[0]
         return f"cannot read {error.override}: {reason}; quote special characters, as in 'key=\"value\"'"
+    if isinstance(error, ConfigCompositionException) and "No match in the defaults list" in str(error):
+        return _unmatched(str(error).split("'")[1])
     if isinstance(error, ConfigCompositionException) and isinstance(cause, OmegaConfBaseException) and cause.full_key:
         return _unknown_key(cause)
     if isinstance(error, OmegaConfBaseException) and error.full_key:
@@ -60,6 +62,14 @@ def sentence(error: Exception) -> str:
     if "failed to map segment" in text:
         return f"the memory that this process may use is too little to load its libraries ({text}): raise ulimit -v"
     return text or type(error).__name__
+
+
+def _unmatched(group: str) -> str:
+    """Describe a choice from a group that the chosen options do not have, such as task/goal of another task."""
+    parent, _, name = group.rpartition("/")
+    if not parent:
+        return f"there is no group {group}; --help lists them"
+    return f"the option chosen for {parent} has no {name}: {group}=OPTION goes with another {parent}; --help lists them"
 
 
 def _unknown_key(error: OmegaConfBaseException) -> str:
@@ -137,7 +147,8 @@ def _do(cfg: DictConfig) -> float | None:
     without_triton()
     composed: Any = OmegaConf.to_container(cfg, resolve=False)
     overrides = HydraConfig.get().overrides.task
-    trust(composed.get("trust"), [composed["job"], *targets(composed)])  # before anything is read from a file
+    # Before anything is read from a file.
+    trust(composed.get("trust"), [composed["job"], *targets(composed)], packages(composed))
     cfg = _adopted(cfg, overrides)
     job = jobs.find(cfg.job).JOB
     _require_sweepable(cfg, job)  # with the trainer that a run brings

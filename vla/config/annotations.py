@@ -40,6 +40,14 @@ MAPPINGS = (dict, Mapping, MutableMapping)
 PATHS = (Path, os.PathLike)
 IN_EVERY_PROTOCOL = {"__init__", "__subclasshook__", "_no_init_or_replace_init"}
 BOUNDS = {Ge: "at least {0.ge}", Gt: "more than {0.gt}", Le: "at most {0.le}", Lt: "less than {0.lt}"}
+WORDS: dict[Any, tuple[str, str]] = {  # type → one, several
+    bool: ("true or false", "true or false"),
+    int: ("a whole number", "whole numbers"),
+    float: ("a number", "numbers"),
+    str: ("text", "texts"),
+    dict: ("a mapping", "mappings"),
+    object: ("any value", "values"),
+}
 ENDLESS = 2**31 - 1  # an upper bound that descriptions omit
 
 
@@ -92,6 +100,21 @@ def targets(value: Any) -> list[Any]:
     return own + [target for part in parts for target in targets(part)]
 
 
+def packages(value: Any) -> list[Any]:
+    """Return every package that a node in a plain value has imported: its argument `package`."""
+    own = [value["package"]] if is_node(value) and "package" in value else []
+    parts = value.values() if isinstance(value, dict) else value if isinstance(value, list) else ()
+    return own + [package for part in parts for package in packages(part)]
+
+
+def require_trusted_package(source: object, package: Any) -> None:
+    """Raise a ValueError if `package`, which `source` has imported, is not trusted."""
+    if not isinstance(package, str) or not is_trusted(package):
+        raise ValueError(
+            f"{source} uses {package!r}, which is not trusted: add trust=[{package}] if you trust its source"
+        )
+
+
 def fits(found: type, expected: Any) -> bool:
     """Return whether the class `found` satisfies `expected`, a class, a union or a protocol."""
     if get_origin(expected) in (Union, types.UnionType):
@@ -126,19 +149,34 @@ def describe(annotation: Any) -> str:
     if kind is Literal:
         return f"one of {', '.join(str(choice) for choice in arguments)}"
     if kind in (Union, types.UnionType):
-        return " or ".join(describe(argument) for argument in arguments)
+        choices = [describe(argument) for argument in arguments]
+        return (", or " if any("," in choice for choice in choices) else " or ").join(choices)
     if kind is Annotated:
         return ", ".join([describe(arguments[0]), *_bounds(arguments[1:])])
     if annotation in (None, types.NoneType):
         return "null"
-    if kind is tuple and get_origin(arguments[0]) is Annotated:
-        inner, *bounds = get_args(arguments[0])
-        each = f", each {', '.join(_bounds(bounds))}"
-        return describe(tuple[tuple(inner if part is not Ellipsis else part for part in arguments)]) + each  # type: ignore[misc]
-    if arguments and getattr(kind, "__name__", "") != "Callable":
-        inner = ", ".join("…" if argument is Ellipsis else describe(argument) for argument in arguments)
-        return f"{getattr(kind, '__name__', kind)}[{inner}]"
+    if kind is tuple or kind in SEQUENCES:
+        return _describe_list(
+            [part for part in arguments if part is not Ellipsis], kind is tuple and ... not in arguments
+        )
+    if kind in MAPPINGS:
+        return f"a mapping of names to {_plural(arguments[1])}"
+    if annotation in WORDS:
+        return WORDS[annotation][0]
     return str(getattr(arguments[1] if arguments else annotation, "__name__", annotation))
+
+
+def _describe_list(parts: Sequence[Any], fixed: bool) -> str:
+    if len(set(parts)) > 1:
+        return f"a list of {', '.join(describe(part) for part in parts)}"
+    return f"a list of {f'{len(parts)} ' if fixed else ''}{_plural(parts[0])}"
+
+
+def _plural(annotation: Any) -> str:
+    if get_origin(annotation) is Annotated:
+        inner, *bounds = get_args(annotation)
+        return f"{_plural(inner)}, each {', '.join(_bounds(bounds))}"
+    return WORDS[annotation][1] if annotation in WORDS else f"values, each {describe(annotation)}"
 
 
 def takes_path(annotation: Any) -> bool:

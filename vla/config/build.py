@@ -7,6 +7,7 @@ arguments, types and allowed values. A node is checked against that signature be
 from __future__ import annotations
 
 import inspect
+import json
 import sys
 from collections import ChainMap
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
@@ -20,7 +21,18 @@ from annotated_types import Gt, Le, MinLen
 from hydra.errors import InstantiationException
 from hydra.utils import instantiate
 
-from vla.config.annotations import describe, fits, is_node, locate, matches, require_trusted, takes_path, targets
+from vla.config.annotations import (
+    describe,
+    fits,
+    is_node,
+    locate,
+    matches,
+    packages,
+    require_trusted,
+    require_trusted_package,
+    takes_path,
+    targets,
+)
 from vla.io.documents import require_resolved
 from vla.io.types import Count, Inherited, Natural, NonNegative, Share, Text
 
@@ -142,6 +154,8 @@ def check_node(key: str, node: Any, expected: Any, runtime: Sequence[str] = ()) 
         if not several or str(name).startswith("_"):
             require_known(key, name, known, target.__name__)
         check_value(f"{key}.{name}", value, hints.get(name, Any))
+        if name == "package":
+            require_trusted_package(key, value)
     for name in known:
         by_caller = partial and (name in RUNTIME or parameters[name].kind is inspect.Parameter.KEYWORD_ONLY)
         if name not in node and not by_caller and parameters[name].default is inspect.Parameter.empty:
@@ -149,9 +163,12 @@ def check_node(key: str, node: Any, expected: Any, runtime: Sequence[str] = ()) 
 
 
 def require_trust(config: Mapping[str, Any], names: Iterable[Any], source: object) -> None:
-    """Raise a ValueError if a node among `names` of the file `source` names a class that is not trusted."""
-    for target in targets([config.get(name) for name in names]):
+    """Raise a ValueError if a node among `names` of the file `source` names a class or package that is not trusted."""
+    nodes = [config.get(name) for name in names]
+    for target in targets(nodes):
         require_trusted(source, target)
+    for package in packages(nodes):
+        require_trusted_package(source, package)
 
 
 def require_no_paths(config: Mapping[str, Any], names: Collection[str], source: object) -> None:
@@ -215,7 +232,7 @@ def _check_nodes(key: str, value: Any) -> None:
 
 
 def _short(value: Any) -> str:
-    text = repr(value)
+    text = json.dumps(value) if value is None or isinstance(value, bool) else repr(value)
     return text if len(text) <= 200 else f"{text[:200]}…"
 
 
@@ -241,7 +258,8 @@ def arguments(target: type) -> dict[str, inspect.Parameter]:
     return {name: each for name, each in found.items() if each.annotation is not Inherited}
 
 
-def _parameters(target: type) -> dict[str, inspect.Parameter]:
+@cache
+def _parameters(target: type) -> Mapping[str, inspect.Parameter]:
     """Return the arguments of a class's own constructor without `self`."""
     init: Any = vars(target)["__init__"]
     # The constructor of a dataclass also has the annotations of its base classes, of other modules.

@@ -23,6 +23,7 @@ from hydra.plugins.search_path_plugin import SearchPathPlugin
 TRUST = "VLA_TRUST"  # environment variable of the user: packages, separated by commas
 TRUSTED = "VLA_TRUSTED"  # environment variable that passes trusted packages and classes to child processes
 ENTRY_POINTS = "vla.conf"
+MISSING = "???"  # a value that the command line must give
 
 
 class InstalledOptions(SearchPathPlugin):
@@ -61,24 +62,28 @@ def option_folders() -> tuple[tuple[str, Path], ...]:
     return tuple(found)
 
 
-def trust(packages: Any, chosen: Iterable[Any]) -> None:
+def trust(packages: Any, chosen: Iterable[Any], used: Iterable[Any] = ()) -> None:
     """Set the third-party classes that this process and its children may build.
 
     Args:
         packages: names of packages, in addition to those in the environment variable `VLA_TRUST`.
         chosen: every `_target_` in the config composed from the command line, before any file is read. Of packages that
             add options, exactly these classes are trusted.
+        used: every `package` in it, which is trusted.
 
     Raises:
-        ValueError: `packages` is not a list, or names a package that cannot be trusted.
+        ValueError: `packages` is not a list, or a package cannot be trusted.
     """
     if not isinstance(packages, list):
         raise ValueError(f"trust must be a list of packages, as in trust=[mypackage], got {packages!r}")
-    named = [*packages, *_names(TRUST)]
+    used = [name for name in used if name != MISSING]
+    named = [*packages, *_names(TRUST), *used]
     for name in named:
         if not isinstance(name, str) or not can_be_trusted(name):
+            key = "package" if name in used else "trust"
             raise ValueError(
-                f"trust cannot name {name!r}: it takes packages made for vla, which have it among their dependencies"
+                f"{key} cannot name {name!r}: it takes packages made for vla or gymnasium, which have it among their "
+                "dependencies"
             )
     offering = {package for package, _ in option_folders()}
     classes = {each for each in chosen if isinstance(each, str) and each.partition(".")[0] in offering}
@@ -98,13 +103,13 @@ def is_trusted(target: str) -> bool:
 
 @cache
 def can_be_trusted(package: str) -> bool:
-    """Return whether a top-level package can be trusted: it depends on `vla`, or belongs to no distribution.
+    """Return whether a top-level package can be trusted: it depends on `vla` or gymnasium, or has no distribution.
 
     Constructors of the standard library and of other libraries may act on files, processes and networks.
     """
     if not package.isidentifier() or package.startswith("_") or package in sys.stdlib_module_names:
         return False
-    return all(map(_needs_vla, packages_distributions().get(package, ())))
+    return all(map(_made_for, packages_distributions().get(package, ())))
 
 
 def with_trust(names: list[str], function: Any, *arguments: Any, **named: Any) -> Any:
@@ -117,5 +122,6 @@ def _names(variable: str) -> list[str]:
     return [name for each in os.environ.get(variable, "").split(",") if (name := each.strip())]
 
 
-def _needs_vla(distribution: str) -> bool:
-    return any(re.fullmatch(r"vla\b(?![.-]).*", requirement, re.DOTALL) for requirement in requires(distribution) or ())
+def _made_for(distribution: str) -> bool:
+    needed = [requirement for requirement in requires(distribution) or () if "extra ==" not in requirement]
+    return any(re.fullmatch(r"(vla|gymnasium)\b(?![.-]).*", requirement, re.DOTALL) for requirement in needed)

@@ -22,7 +22,7 @@ class GymEnvironment(gymnasium.Env[dict[str, Any], Array]):
 
     An observation is a dictionary: one image per camera, (H, W, 3) uint8, the `state` (P,) float32 and the
     `instruction`. The reward is 1 for the step that succeeds, otherwise 0. Success terminates an episode, its time
-    limit truncates it. `info` contains the current outcome and the draws of the episode.
+    limit truncates it. `info` contains `is_success`, the current outcome and the draws of the episode.
     """
 
     metadata = {"render_modes": ["rgb_array"]}  # noqa: RUF012
@@ -72,7 +72,8 @@ class GymEnvironment(gymnasium.Env[dict[str, Any], Array]):
         return {**observation.rgb, "state": observation.state, "instruction": observation.instruction}
 
     def _info(self) -> dict[str, Any]:
-        return {"outcome": self.environment.outcome, "draws": deepcopy(self.environment.draws)}
+        outcome = self.environment.outcome
+        return {"is_success": outcome == "success", "outcome": outcome, "draws": deepcopy(self.environment.draws)}
 
 
 class Task(GymEnvironment):

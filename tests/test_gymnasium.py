@@ -1,0 +1,124 @@
+"""Environments of gymnasium as worlds: the same episodes as without gymnasium in between, and what is refused."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+import toy
+from composing import composed
+
+from vla.config import packages
+from vla.config.adopt import adopt
+from vla.config.build import build
+from vla.config.experiment import plain
+from vla.spec import Environment
+from vla.tasks.gymnasium import Gymnasium
+
+VALUES = (
+    *("task=gymnasium", "task.package=toy_gym", "task.id=toy/Toy-v0", "task.instruction=observation.instruction"),
+    *("task.image_size=[16,16]", "task.images={eye: observation.eye}", "task.action=[x,y,gripper]"),
+    *(
+        "task.state={observation.state: [east,north]}",
+        "task.truth={target: info.truth.target, point: info.truth.point}",
+    ),
+)
+
+
+def node(**changes: Any) -> dict[str, Any]:
+    return {**plain(composed(*VALUES))["task"], **changes}
+
+
+def make(**changes: Any) -> Any:
+    values = node(**changes)
+    values.pop("_target_")
+    return Gymnasium(**values)
+
+
+def test_the_spec_and_the_episodes_are_those_of_the_world_within() -> None:
+    world: Environment
+    world, own = make(), toy.ToyEnvironment()
+    assert {**world.spec.to_dict(), "state_units": 0, "units": 0} == {
+        **toy.SPEC.to_dict(),
+        "state_units": 0,
+        "units": 0,
+    }
+    for seed in (0, 3):
+        seen, expected, random = world.reset(seed), own.reset(seed), np.random.default_rng(seed)
+        while True:
+            assert seen.truth is not None and expected.truth is not None
+            np.testing.assert_array_equal(seen.rgb["eye"], expected.rgb["eye"])
+            np.testing.assert_array_equal(seen.state, expected.state)
+            np.testing.assert_array_equal(seen.truth["target"], expected.truth["target"])
+            assert (seen.instruction, world.outcome, world.done) == (expected.instruction, own.outcome, own.done)
+            if own.done:
+                break
+            towards = expected.truth["target"] - expected.state
+            action = np.array([*np.clip(towards, -0.05, 0.05), random.uniform()], np.float32)
+            seen, expected = world.step(action), own.step(action)
+        assert own.outcome == ("success" if seed == 0 else "timeout")
+    with pytest.raises(ValueError, match="the episode is over"):
+        world.step(np.zeros(3, np.float32))
+    with world.blind():
+        assert world.reset(1).rgb == {}
+
+
+def test_rendered_images_are_resized_and_components_numbered() -> None:
+    world = make(images={"above": "render"}, image_size=[8, 12], state={"observation.state": None}, action=None)
+    assert world.reset(5).rgb["above"].shape == (8, 12, 3)
+    assert world.spec.state == ("state_0", "state_1") and world.spec.action == ("action_0", "action_1", "action_2")
+    with world.blind():
+        assert world.reset(5).rgb == {}
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"id": "toy/None-v0"}, "task.id=toy/None-v0 is not registered by toy_gym"),
+        ({"id": "toy_gym:toy/Toy-v0"}, "is no environment of task.package=toy_gym"),
+        ({"id": "toy/Elsewhere-v0"}, "is no environment of task.package=toy_gym"),
+        ({"package": "not_there"}, "task.package=not_there cannot be imported"),
+        (
+            {"state": {"observation.pose": None}},
+            "there is no observation.pose in what the environment returns: instead",
+        ),
+        ({"state": {"observation.state": ["east"]}}, "observation.state has 2 components, and 1 names: east"),
+        ({"images": {"eye": "observation.state"}}, "task.images.eye names no (H, W, 3) image of uint8, but float32"),
+    ],
+)
+def test_what_does_not_fit_is_named(changes: dict[str, Any], words: str) -> None:
+    with pytest.raises(ValueError, match=re.escape(words)):
+        make(**changes)
+
+
+def test_what_the_command_line_names_is_trusted_and_what_a_file_names_is_not(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(packages.TRUSTED, "")
+    with pytest.raises(ValueError, match=r"task uses 'toy_gym', which is not trusted: add trust=\[toy_gym\]"):
+        build(node(), "task")
+    packages.trust([], [], ["toy_gym", "???"])
+    build(node(), "task").close()
+    for name in ("os", "torch", "numpy", None):
+        with pytest.raises(
+            ValueError, match=rf"package cannot name {name!r}: it takes packages made for vla or gymnas"
+        ):
+            packages.trust([], [], [name])
+    packages.trust([], [])
+    file = tmp_path / "last.ckpt"
+    torch.save({"config": plain(composed(*VALUES)), "spec": toy.SPEC.to_dict(), "state_dict": {}}, file)
+    with pytest.raises(ValueError, match=r"last\.ckpt uses 'toy_gym', which is not trusted: add trust=\[toy_gym\]"):
+        adopt(composed(f"checkpoint={file}"), [])
+    with pytest.raises(ValueError, match="'toy_gym', which is not trusted"):
+        build(node(), "task")
+
+
+def test_demonstrations_are_collected_and_replayed_as_in_the_world_within(folder: Path, tmp_path: Path) -> None:
+    store = toy.make_store(tmp_path / "gymnasium", make)
+    assert {entry.task for entry in store.episodes} == {"toy/Toy-v0"}
+    for name in ("rgb_eye.bin", "state.bin", "action.bin", "executed.bin", "truth.bin"):
+        assert (store.folder / name).read_bytes() == (folder / name).read_bytes(), name

@@ -1,0 +1,213 @@
+"""Any registered gymnasium environment with continuous actions as a `vla.spec.Environment`."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from importlib import import_module
+from typing import Annotated, Any
+
+import gymnasium
+import numpy as np
+from annotated_types import MinLen
+from gymnasium.envs.registration import EnvSpec
+from gymnasium.error import Error
+from gymnasium.spaces import Box
+from PIL import Image
+
+from vla.io.types import Count, ImageSize, Names, Positive, Text
+from vla.spec import Array, Observation, Spec
+from vla.tasks.gl import choose_backend
+
+OBSERVATION, INFO, RENDER = "observation", "info", "render"
+PATHS = (f"{OBSERVATION}.", f"{INFO}.")
+
+
+class Gymnasium:
+    """A gymnasium environment, of whose observation and `info` a mapping takes images, state, truth and success.
+
+    A value is named by a dotted path: `observation.pixels.top` is the entry `top` of the entry `pixels` of the
+    observation, `info.is_success` one of the dictionary `info`, `render` what `render()` returns. `observation` alone
+    is an observation that is an array. An episode ends with its first success, or when the environment ends it.
+    """
+
+    def __init__(
+        self,
+        package: Text,
+        id: Text,
+        options: Mapping[str, object] | None,
+        steps: Count | None,
+        control_hz: Positive | None,
+        instruction: Text,
+        images: Annotated[Mapping[Text, Text], MinLen(1)],
+        image_size: ImageSize,
+        state: Annotated[Mapping[Text, Names | None], MinLen(1)],
+        action: Names | None,
+        success: Text,
+        truth: Mapping[Text, Text] | None,
+    ) -> None:
+        """Make the environment.
+
+        Args:
+            package: installed package that registers the environment when it is imported, and contains its class; one
+                that a file names must be trusted.
+            id: registered name, such as "gym_pusht/PushT-v0".
+            options: further arguments of `gymnasium.make`.
+            steps: of an episode, at most; None: as registered.
+            control_hz: rate of actions [Hz]; None: the `render_fps` of the environment.
+            instruction: of every episode, or a path that begins with "observation." or "info.".
+            images: camera → path of its image, (H, W, 3) uint8 of any size.
+            image_size: height and width to which images are resized [px].
+            state: path of an array → names of its components; None: numbered.
+            action: names of the components of an action; None: numbered.
+            success: path of what is true in a step that succeeds.
+            truth: name → path of an array, for training and experts only.
+
+        Raises:
+            ValueError: the package is not installed or does not contain the environment, an action has no bounds, or an
+                observation lacks a path.
+        """
+        truth = truth or {}
+        self._environment = _make(package, id, options or {}, steps, render=RENDER in images.values())
+        self._images, self._success, self._truth, self._instruction = images, success, truth, instruction
+        self._size, self._state = (image_size[0], image_size[1]), tuple(state)
+        self._blind = False
+        self.task, self.milestones = id, frozenset[str]()
+        self.done, self.outcome = True, "timeout"
+        self.draws: dict[str, Any] = {}
+        space = self._environment.action_space
+        if not isinstance(space, Box) or len(space.shape) != 1 or not space.is_bounded():
+            raise ValueError(f"{id} has the actions {space}: task=gymnasium takes a bounded Box with one axis")
+        values = self._values(*self._environment.reset(seed=0))
+        names = [name for path, given in state.items() for name in _named(path, _get(values, path), given)]
+        rate = control_hz or self._environment.metadata.get("render_fps")
+        if rate is None:
+            raise ValueError(f"{id} does not tell its rate: set task.control_hz")
+        self.spec = Spec(
+            cameras=tuple(images),
+            image_size=self._size,
+            state=tuple(names),
+            state_units=("1",) * len(names),
+            action=tuple(_named("action", space.low, action)),
+            units=("1",) * len(space.low),
+            low=tuple(float(str(value)) for value in space.low),  # 0.1, not the 0.10000000149 of float32
+            high=tuple(float(str(value)) for value in space.high),
+            control_hz=float(rate),
+            truth=tuple((name, np.size(_get(values, path))) for name, path in truth.items()),
+        )
+        self._observe(values)  # refuses images that are none
+        _get(values, success, default=False)
+
+    def reset(self, seed: int) -> Observation:
+        """Start the episode of `seed`, which seeds the environment."""
+        self.done, self.outcome = False, "timeout"
+        return self._observe(self._values(*self._environment.reset(seed=seed)))
+
+    def step(self, action: Array) -> Observation:
+        """Apply one (D,) action, clipped to the bounds."""
+        if self.done:
+            raise ValueError("the episode is over; call reset(seed) before step(action)")
+        clipped = np.clip(action, self.spec.low, self.spec.high).astype(self._environment.action_space.dtype)
+        observation, _, terminated, truncated, info = self._environment.step(clipped)
+        values = self._values(observation, info)
+        success = bool(_get(values, self._success, default=False))
+        self.outcome = "success" if success else "failure" if terminated else "timeout"
+        self.done = success or terminated or truncated
+        return self._observe(values)
+
+    @contextmanager
+    def blind(self) -> Iterator[None]:
+        """Return no images within this context; only those of `render()` become cheaper."""
+        self._blind = True
+        try:
+            yield
+        finally:
+            self._blind = False
+
+    def close(self) -> None:
+        """Close the environment."""
+        self._environment.close()
+
+    def _values(self, observation: Any, info: Mapping[str, Any]) -> dict[str, Any]:
+        drawn = RENDER in self._images.values() and not self._blind
+        return {OBSERVATION: observation, INFO: info, **({RENDER: self._environment.render()} if drawn else {})}
+
+    def _observe(self, values: Mapping[str, Any]) -> Observation:
+        pictures = {} if self._blind else {name: _get(values, path) for name, path in self._images.items()}
+        return Observation(
+            rgb={name: _resized(name, picture, self._size) for name, picture in pictures.items()},
+            state=np.concatenate([np.ravel(_get(values, path)) for path in self._state]).astype(np.float32),
+            instruction=str(_get(values, said)) if (said := self._instruction).startswith(PATHS) else said,
+            truth={name: np.ravel(_get(values, path)).astype(np.float32) for name, path in self._truth.items()},
+        )
+
+
+def _make(package: str, id: str, options: Mapping[str, object], steps: int | None, render: bool) -> Any:
+    """Make the environment, which must be a class of the package: a file is trusted by the package that it names."""
+    choose_backend()  # before the package imports MuJoCo
+    try:
+        import_module(package)
+    except ImportError as error:
+        raise ValueError(f"task.package={package} cannot be imported: {error}") from error
+    try:
+        spec = gymnasium.spec(id) if ":" not in id else None
+    except Error as error:
+        raise ValueError(f"task.id={id} is not registered by {package}: {error}") from error
+    if spec is None or _home(spec) != package:
+        raise ValueError(f"task.id={id} is no environment of task.package={package}")
+    return gymnasium.make(
+        spec,
+        max_episode_steps=steps,
+        disable_env_checker=True,
+        **options,
+        **({"render_mode": "rgb_array"} if render else {}),
+    )
+
+
+def _home(spec: EnvSpec) -> str:
+    """Return the package of an environment's class or factory."""
+    entry = spec.entry_point
+    module = entry if isinstance(entry, str) else getattr(entry, "__module__", "")
+    return module.partition(":")[0].partition(".")[0]
+
+
+def _get(values: Any, path: str, default: Any = None) -> Any:
+    """Return the value at a dotted path.
+
+    Raises:
+        ValueError: there is none, and no default.
+    """
+    found = values
+    for name in path.split("."):
+        if not isinstance(found, Mapping) or name not in found:
+            if default is not None:
+                return default
+            there = ", ".join(map(str, found)) if isinstance(found, Mapping) else "no further names"
+            raise ValueError(f"there is no {path} in what the environment returns: instead of {name} there is {there}")
+        found = found[name]
+    return found
+
+
+def _named(path: str, values: Any, names: Names | None) -> tuple[str, ...]:
+    """Return the names of the components of an array.
+
+    Raises:
+        ValueError: there are more or fewer components than names.
+    """
+    size = np.size(values)
+    if names is None:
+        return tuple(f"{path.rpartition('.')[2]}_{index}" for index in range(size))
+    if len(names) != size:
+        raise ValueError(f"{path} has {size} components, and {len(names)} names: {', '.join(names)}")
+    return tuple(names)
+
+
+def _resized(camera: str, picture: Any, size: tuple[int, int]) -> Array:
+    picture = np.asarray(picture)
+    if picture.dtype != np.uint8 or picture.ndim != 3 or picture.shape[2] != 3:
+        raise ValueError(
+            f"task.images.{camera} names no (H, W, 3) image of uint8, but {picture.dtype} of {picture.shape}"
+        )
+    if picture.shape[:2] == size:
+        return np.ascontiguousarray(picture)
+    return np.asarray(Image.fromarray(picture).resize(size[::-1], Image.Resampling.BOX))
