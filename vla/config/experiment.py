@@ -258,10 +258,10 @@ def make_policy(policy: Node, checkpoint: Path, environment: Environment | None 
     return made
 
 
-def training_policy(policy: Node, model: Model) -> Policy:
-    """Build the policy of a model in training, on the model's device and without a second compilation."""
-    here = {**policy, "device": next(model.parameters()).device.type, "compile": False}
-    made: Policy = build(here, "policy", model=model, spec=model.spec)
+def training_policy(precision: str, model: Model) -> Policy:
+    """Build the policy of a model in training, on the model's device and without a second compilation or an export."""
+    here = {"device": next(model.parameters()).device.type, "precision": precision, "compile": False}
+    made: Policy = build({"_target_": "vla.policy.Policy", **here}, "policy", model=model, spec=model.spec)
     return made
 
 

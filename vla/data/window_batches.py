@@ -104,7 +104,7 @@ class WindowBatcher:
         """
         episode = self._first.searchsorted(windows, side="right") - 1  # (B,)
         if not self._verified[episode].all():
-            self._verify(np.unique(episode[~self._verified[episode]]))
+            self.verify(np.unique(episode[~self._verified[episode]]))
         first, last = self._first[episode, None], self._last[episode, None]
         frames = windows[:, None] + self._ages  # (B, T)
         labels = frames[:, :, None] + self._aheads  # (B, T, k)
@@ -130,7 +130,13 @@ class WindowBatcher:
         batch["instruction"] = [self._instructions[number] for number in episode.tolist()]
         return batch
 
-    def _verify(self, episodes: Array) -> None:
+    def verify(self, episodes: Array | None = None) -> None:
+        """Compare the images of episodes, numbers (N,) or all, with their checksums, which else their first windows do.
+
+        Raises:
+            ValueError: they differ.
+        """
+        episodes = np.arange(len(self._entries)) if episodes is None else episodes
         entries = [self._entries[number] for number in episodes.tolist()]
         images = {f"{kind}_{camera}": rows for kind, of in self._images.items() for camera, rows in of.items()}
         self._store.verify(entries, images)

@@ -8,7 +8,7 @@ import io
 import json
 import logging
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.export import Dim, ExportedProgram
+from torch.onnx import ONNXProgram
 
 from vla.io.files import atomic_path
 from vla.io.types import Text
@@ -26,6 +27,7 @@ log = logging.getLogger(__name__)
 
 Inputs = dict[str, Tensor]
 Run = Callable[[Inputs], Tensor]
+Write = Callable[[ExportedProgram, Inputs, Path], Run]
 
 TOLERANCE = 1e-3  # largest difference between the outputs of a program and of the model, relative to their range
 INSTRUCTIONS = ("lift it", "put the small green block on the blue pad")  # of different lengths
@@ -89,35 +91,44 @@ class ProgramExporter:
         if self._folder.exists():
             raise ValueError(f"{self._folder} exists already: choose another export.folder")
         if self._onnx:
-            _require_onnx()
-        with atomic_path(self._folder) as draft:
-            draft.mkdir(parents=True)
-            report = self._write(draft, Policy("cpu", "fp32", compile=False, model=policy.model, spec=policy.spec))
-            (draft / "program.json").write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
+            require_onnx("export.onnx=false")
+        policy = Policy("cpu", "fp32", compile=False, model=policy.model, spec=policy.spec)
+        write_programs(policy, self._folder, {"pt2": write_pt2, **({"onnx": write_onnx} if self._onnx else {})})
         return self._folder
 
-    def _write(self, folder: Path, policy: Policy) -> dict[str, Any]:
-        model, span = policy.model, torch.tensor(np.subtract(policy.spec.high, policy.spec.low), dtype=torch.float32)
-        report: dict[str, Any] = {"model": type(model).__name__, "spec": policy.spec.to_dict()}
+
+def write_programs(policy: Policy, folder: Path, formats: Mapping[str, Write], tolerance: float = TOLERANCE) -> None:
+    """Write the programs of a policy and `program.json` into a new folder, atomically.
+
+    Args:
+        policy: on the CPU, in float32 and not compiled.
+        folder: must not exist.
+        formats: suffix of a program → function that writes it.
+        tolerance: largest difference between the outputs of a program and of the model, relative to their range.
+
+    Raises:
+        ValueError: the output of a program differs from the model's.
+    """
+    model, span = policy.model, torch.tensor(np.subtract(policy.spec.high, policy.spec.low), dtype=torch.float32)
+    report: dict[str, Any] = {"model": type(model).__name__, "spec": policy.spec.to_dict()}
+    with atomic_path(folder) as draft:
+        draft.mkdir(parents=True)
         for name, steps in example_inputs(policy).items():
             program = (Act if name == "act" else Encode)(model)
             captured = capture(program, steps[0])
-            archive = io.BytesIO()
-            torch.export.save(captured, archive)
-            (folder / f"{name}.pt2").write_bytes(archive.getbuffer())  # torch's own writing hides errors of the disk
-            runs: dict[str, Run] = {"model": program, f"{name}.pt2": torch.export.load(folder / f"{name}.pt2").module()}
-            if self._onnx:
-                runs[f"{name}.onnx"] = write_onnx(captured, steps[0], folder / f"{name}.onnx")
+            runs: dict[str, Run] = {"model": program}
+            for suffix, write in formats.items():
+                runs[f"{name}.{suffix}"] = write(captured, steps[0], draft / f"{name}.{suffix}")
             measures = compare(runs, steps, span if name == "act" else None)
             report[name] = {"inputs": {key: _describe(value) for key, value in steps[0].items()}, "runs": measures}
             for run, measure in measures.items():
                 log.info("%s: %.1f ms per step, largest difference %.1e", run, measure["ms"], measure["difference"])
-                if not measure["difference"] <= TOLERANCE:  # also true for NaN
+                if not measure["difference"] <= tolerance:  # also true for NaN
                     raise ValueError(
                         f"{run} differs from the model by {measure['difference']:.1e} of the output range: "
                         f"this model cannot be exported{', try export.onnx=false' if 'onnx' in run else ''}"
                     )
-        return report
+        (draft / "program.json").write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
 
 
 def example_inputs(policy: Policy) -> dict[str, list[Inputs]]:
@@ -129,28 +140,73 @@ def example_inputs(policy: Policy) -> dict[str, list[Inputs]]:
         policy.plan(observation)
         window = policy.window()
         if "tokens" in window:
-            steps.setdefault("encode", []).append(_inputs(policy.frame(observation)))
+            steps.setdefault("encode", []).append(inputs_of(policy.frame(observation)))
         noise = policy.model.sample_noise(draws)
-        steps.setdefault("act", []).append(_inputs(window if noise is None else {**window, "noise": noise}))
+        steps.setdefault("act", []).append(inputs_of(window if noise is None else {**window, "noise": noise}))
     return steps
 
 
 def capture(program: Encode | Act, inputs: Inputs) -> ExportedProgram:
-    """Trace the program as one graph for instructions of any length."""
-    lengths = {program.model.text.tokenize([instruction]).shape[1] for instruction in INSTRUCTIONS}
+    """Trace the program as one graph for instructions of any length.
+
+    Raises:
+        ValueError: it computes outside PyTorch, as `tokenizer=fast` does.
+    """
+    model = program.model
+    lengths = {model.text.tokenize([instruction]).shape[1] for instruction in INSTRUCTIONS}
     text = {1: Dim.DYNAMIC} if len(lengths) > 1 else {}
     shapes = {name: text if name == "text" else {} for name in inputs}
-    return torch.export.export(program.eval(), (inputs,), dynamic_shapes=(shapes,))
+    try:
+        return torch.export.export(program.eval(), (inputs,), dynamic_shapes=(shapes,))
+    except Exception as error:  # of many kinds
+        names = f"{type(model).__name__} with {type(model.tokenizer).__name__}"
+        raise ValueError(f"{names} cannot be exported: {str(error).strip().splitlines()[0]}") from error
+
+
+def write_pt2(captured: ExportedProgram, inputs: Inputs, path: Path) -> Run:
+    """Write a captured program in PyTorch's format; returns a function that runs it."""
+    archive = io.BytesIO()
+    torch.export.save(captured, archive)
+    path.write_bytes(archive.getbuffer())  # torch's own writing hides errors of the disk
+    return torch.export.load(path).module()
 
 
 def write_onnx(captured: ExportedProgram, inputs: Inputs, path: Path) -> Run:
     """Write a captured program as ONNX with inputs of the same names; returns a function that runs it."""
-    from onnxruntime import InferenceSession
+    _as_onnx(captured, inputs).save(path)
+    return open_onnx(path)
 
+
+def write_quantized(captured: ExportedProgram, inputs: Inputs, path: Path) -> Run:
+    """Write a captured program as ONNX with matrix products of 8-bit integers; returns a function that runs it."""
+    from onnxruntime.quantization import QuantType, quantize_dynamic
+
+    exact = _as_onnx(captured, inputs).model_proto
+    del exact.graph.value_info[:]  # shapes of weights, which quantisation transposes
+    quantize_dynamic(exact, path, weight_type=QuantType.QUInt8, op_types_to_quantize=["MatMul", "Gemm"])
+    return open_onnx(path)
+
+
+def _as_onnx(captured: ExportedProgram, inputs: Inputs) -> ONNXProgram:
     onnx = torch.onnx.export(captured, dynamo=True, verbose=False, input_names=list(inputs), output_names=["output"])
     assert onnx is not None
-    onnx.save(path)
-    session = InferenceSession(path, providers=["CPUExecutionProvider"])
+    return onnx
+
+
+def open_onnx(path: Path, threads: int | None = None) -> Run:
+    """Return a function that runs an ONNX program on the CPU, by default with as many threads as PyTorch.
+
+    Raises:
+        ValueError: the file is damaged.
+    """
+    from onnxruntime import InferenceSession, SessionOptions
+
+    options = SessionOptions()
+    options.intra_op_num_threads = threads or torch.get_num_threads()
+    try:
+        session = InferenceSession(path, options, providers=["CPUExecutionProvider"])
+    except Exception as error:  # of its own kinds
+        raise ValueError(f"{path} is damaged: delete its folder, and export the policy again") from error
     used = {node.name for node in session.get_inputs()}  # without inputs that the program ignores
 
     def run(inputs: Inputs) -> Tensor:
@@ -182,15 +238,16 @@ def compare(runs: dict[str, Run], steps: list[Inputs], span: Tensor | None) -> d
     return measures
 
 
-def _require_onnx() -> None:
+def require_onnx(otherwise: str) -> None:
+    """Raise a ValueError that names what to do `otherwise`, unless ONNX is installed."""
     try:
         import onnxruntime  # noqa: F401
         import onnxscript  # noqa: F401
     except ImportError as error:
-        raise ValueError("ONNX is not installed: pip install 'vla[onnx]', or export.onnx=false") from error
+        raise ValueError(f"ONNX is not installed: pip install 'vla[onnx]', or {otherwise}") from error
 
 
-def _inputs(batch: Batch) -> Inputs:
+def inputs_of(batch: Batch) -> Inputs:
     return {**batch["rgb"], **{name: value for name, value in batch.items() if name != "rgb"}}
 
 

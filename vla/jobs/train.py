@@ -132,7 +132,7 @@ def _closed_loop(experiment: Experiment, checkpoints: Path) -> ClosedLoop | None
     if seeds and not experiment.playable:
         raise ValueError(f"validate.episodes={len(seeds)}: nothing can be played in a recording: set it to 0")
     make_environment = experiment.make_environment(asked["changes"])
-    make_policy = partial(training_policy, experiment["policy"])
+    make_policy = partial(training_policy, experiment["policy"].get("precision", "fp32"))
     return ClosedLoop(make_environment, make_policy, seeds, checkpoints) if seeds else None
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import cycle
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
@@ -57,10 +58,13 @@ def _loading(data: WindowDataModule, store: EpisodeStore, history: int, batches:
         first = starts[np.searchsorted(starts, windows, side="right") - 1]
         rows.append(np.maximum(windows[:, None] + np.arange(1 - history, 1), first[:, None]))  # (B, T)
 
+    # Into two batches by turns, because one is in use while the next is made: a single one would stay in the cache.
+    buffers = [[np.empty((*rows[0].shape, *image.shape[1:]), image.dtype) for image in images] for _ in range(2)]
+
     def bare() -> None:
-        for index in rows:
-            for image in images:
-                image.take(index, axis=0)
+        for index, arrays in zip(rows, cycle(buffers)):
+            for image, array in zip(images, arrays, strict=True):
+                image.take(index, axis=0, out=array, mode="clip")  # "clip" writes into `out` without a buffer
 
     def load() -> None:
         stream = iter(data.train_dataloader())

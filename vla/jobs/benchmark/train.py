@@ -159,6 +159,7 @@ class Trial(lightning.Callback):
         """Return the time of the loader for the batches of a round [s], without training."""
         data = self._data()
         data.setup("fit")
+        data.make_batch.verify()
         stream = iter(data.train_dataloader())
         next(stream)
         started = time.perf_counter()
@@ -171,7 +172,8 @@ class Trial(lightning.Callback):
         return self._experiment.data(self._store, model.history, model.chunk)
 
     def on_train_start(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
-        """Reset the peak of the memory."""
+        """Verify the demonstrations, which long trainings do once, and reset the peak of the memory."""
+        trainer.datamodule.make_batch.verify()  # type: ignore[attr-defined]
         self._held = reset_peak(pl_module.device)
 
     def on_train_batch_end(

@@ -1,0 +1,105 @@
+"""A policy that runs ONNX programs acts like the one that runs the model."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from composing import composed
+from defaults import defaults_of
+from fake_batch import as_policy, make_decoder, make_denoising, make_rt1
+from observing import act, observations
+from toy import SPEC
+
+from vla.config.experiment import Experiment
+from vla.deploy.onnx_policy import OnnxPolicy
+from vla.models.flow import Flow
+from vla.models.model import Model
+from vla.models.tokenizers.fast import Fast
+
+RANGE = np.subtract(SPEC.high, SPEC.low)
+
+
+def make_flow() -> Model:
+    """Return a model with short programs."""
+    model = make_denoising(Flow)
+    model.steps = 2
+    return model
+
+
+def as_onnx(model: Model, folder: Path, **options: Any) -> OnnxPolicy:
+    return OnnxPolicy(**defaults_of("policy/onnx", **{"folder": folder, **options}), model=model, spec=SPEC)
+
+
+@pytest.mark.parametrize("make", [partial(make_rt1, keypoints=0, chunk=2), make_flow], ids=["rt1", "flow"])
+def test_it_acts_like_the_model_through_two_instructions(make: Callable[[], Model], tmp_path: Path) -> None:
+    """With a history that fills and is cleared, chunks that are executed, and noise."""
+    model = make()
+    seen = observations(5)
+    seen += [replace(each, instruction="now something else, in a few more words") for each in seen]
+    exact, onnx = as_policy(model), as_onnx(model, tmp_path)
+    for policy in (exact, onnx):
+        policy.reset(seen[0].instruction, 1)
+    expected = act(exact, seen)
+    assert np.abs(np.diff(expected, axis=0)).max() > 1e-3  # they depend on the observations
+    assert (np.abs(act(onnx, seen) - expected) / RANGE).max() < 1e-3
+    other = onnx.session()
+    other.reset(seen[0].instruction, 1)
+    assert (np.abs(act(other, seen[:5]) - expected[:5]) / RANGE).max() < 1e-3
+
+
+def test_programs_are_exported_once_for_the_same_weights_and_options(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    model = make_flow()
+    as_onnx(model, tmp_path)
+    (programs,) = (path for path in tmp_path.iterdir() if path.is_dir())
+    assert {path.name for path in programs.iterdir()} == {"act.onnx", "program.json"}
+
+    (programs / "act.onnx").write_bytes(b"torn")
+    with pytest.raises(ValueError, match=r"act\.onnx is damaged: delete its folder"):
+        as_onnx(model, tmp_path)
+
+    exported = []
+    monkeypatch.setattr("vla.deploy.onnx_policy.write_programs", lambda *arguments: exported.append(arguments[1]))
+    monkeypatch.setattr("vla.deploy.onnx_policy.open_onnx", lambda path, threads: path)
+    as_onnx(model, tmp_path)
+    assert exported == []
+    model.temperature *= 2  # type: ignore[operator]
+    as_onnx(model, tmp_path)
+    with torch.no_grad():
+        next(model.parameters())[0] += 1
+    as_onnx(model, tmp_path)
+    assert len({programs, *exported}) == 3
+
+
+def test_quantised_programs_act_about_like_the_model(tmp_path: Path) -> None:
+    torch.manual_seed(0)
+    model, seen = make_rt1(), observations(4)
+    exact, quantised = act(as_policy(model), seen), act(as_onnx(model, tmp_path, quantize=True), seen)
+    assert 1e-5 < (np.abs(quantised - exact) / RANGE).max() < 0.02
+
+
+def test_a_checkpoint_acts_through_its_programs(home: Path, tmp_path: Path) -> None:
+    def policy(*overrides: str) -> Any:
+        return Experiment.of(composed(f"checkpoint={home}/run/checkpoints/last.ckpt", *overrides)).make_policy()()
+
+    model, onnx = policy(), policy("policy=onnx", f"policy.folder={tmp_path}")
+    random = np.random.default_rng(0)
+    for _ in range(3):
+        seen = model.spec.random_observation(random)
+        assert onnx.plan(seen) == pytest.approx(model.plan(seen), abs=1e-5)
+    assert onnx.compiled  # a server plans for one client at a time
+
+
+def test_a_model_that_cannot_be_exported_is_named(tmp_path: Path) -> None:
+    tokenizer = Fast(spec=SPEC, **defaults_of("tokenizer/fast", chunk=4))
+    with pytest.raises(ValueError, match="Decoder with Fast cannot be exported"):
+        as_onnx(make_decoder(chunk=4, tokenizer=tokenizer), tmp_path)
+    assert [path for path in tmp_path.iterdir() if path.is_dir()] == []
