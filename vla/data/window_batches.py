@@ -180,6 +180,15 @@ class JoinedBatcher:
         parts = [self._batchers[number](windows[store == number] - self._starts[number]) for number in numbers]
         return parts[0] if len(parts) == 1 else _joined(parts)
 
+    def verify(self) -> None:
+        """Compare the images of all episodes with their checksums.
+
+        Raises:
+            ValueError: they differ.
+        """
+        for batcher in self._batchers:
+            batcher.verify()
+
 
 def _joined(parts: Sequence[Any]) -> Any:
     """Concatenate batches, that is, mappings of tensors, lists and mappings."""
