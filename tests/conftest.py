@@ -7,7 +7,7 @@ import gc
 import os
 import shutil
 import signal
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from tempfile import mkdtemp
 from typing import TYPE_CHECKING, Any
@@ -95,20 +95,29 @@ def recording(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("vla.config.recorded._recording", lambda expert: found)
 
 
-@pytest.fixture(scope="session")
-def main_job(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folder of one small main job, in `run`, and of what it printed; done once for all workers, to be copied."""
-    import command_line
-
-    base = tmp_path_factory.getbasetemp()
-    folder = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "main_job"
+def made_once(factory: pytest.TempPathFactory, name: str, make: Callable[[Path], object]) -> Path:
+    """Return a folder that the first of all workers has filled; the others wait, and nobody changes it."""
+    base = factory.getbasetemp()
+    folder = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / name
     with FileLock(f"{folder}.lock"):
-        if not (folder / "printed.txt").exists():
+        if not Path(f"{folder}.made").exists():
             shutil.rmtree(folder, ignore_errors=True)  # of a worker that failed
             folder.mkdir()
-            done = command_line.vla(folder, *command_line.SMALL, "validate.episodes=1", *command_line.IN_RUN)
-            (folder / "printed.txt").write_text(done.stdout)
+            make(folder)
+            Path(f"{folder}.made").touch()
     return folder
+
+
+@pytest.fixture(scope="session")
+def main_job(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of one small main job, in `run`, and of what it printed; to be copied."""
+    import command_line
+
+    def work(folder: Path) -> None:
+        done = command_line.vla(folder, *command_line.SMALL, "validate.episodes=1", *command_line.IN_RUN)
+        (folder / "printed.txt").write_text(done.stdout)
+
+    return made_once(tmp_path_factory, "main_job", work)
 
 
 @pytest.fixture(scope="module")

@@ -22,6 +22,7 @@ from clusters import PLACES, address_in, dask
 from collecting import content
 from command_line import vla
 from composing import CONF, check, composed
+from conftest import made_once
 from hydra.errors import ConfigCompositionException
 
 from vla import jobs
@@ -45,10 +46,14 @@ TINY = (
 @pytest.fixture(scope="module")
 def installed(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     """The folder into which the package is installed; programs that are started find it there."""
-    source, target = (tmp_path_factory.mktemp("package") / name for name in ("mypackage", "target"))
-    shutil.copytree(EXAMPLE, source)  # building leaves files beside the source
-    options = ("-q", "--no-index", "--no-deps", "--no-build-isolation", "--disable-pip-version-check")
-    subprocess.run([sys.executable, "-m", "pip", "install", *options, "--target", target, source], check=True)
+
+    def install(folder: Path) -> None:
+        shutil.copytree(EXAMPLE, folder / "mypackage")  # building leaves files beside the source
+        options = ("-q", "--no-index", "--no-deps", "--no-build-isolation", "--disable-pip-version-check")
+        target, source = folder / "target", folder / "mypackage"
+        subprocess.run([sys.executable, "-m", "pip", "install", *options, "--target", target, source], check=True)
+
+    target = made_once(tmp_path_factory, "package", install) / "target"
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("PYTHONPATH", os.pathsep.join([str(target), PLACES]))
         yield target
@@ -56,10 +61,13 @@ def installed(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
 
 @pytest.fixture(scope="module")
 def home(installed: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """An empty folder to work in, with the outcome of the main job in `run`, done by two workers in each stage."""
-    folder = tmp_path_factory.mktemp("home")
-    vla(folder, "experiment=mine", *TINY, "collect.folder=episodes", "output=run")
-    return folder
+    """A folder to work in, with the outcome of the main job in `run`, done by two workers in each stage."""
+
+    def work(folder: Path) -> None:
+        vla(folder, "experiment=mine", *TINY, "collect.folder=episodes", "output=run")
+
+    done = made_once(tmp_path_factory, "package_job", work)
+    return Path(shutil.copytree(done, tmp_path_factory.mktemp("home") / "home"))
 
 
 @pytest.fixture
