@@ -130,6 +130,12 @@ def test_what_other_people_leave_out_is_made_up_and_said(home: Path, tmp_path: P
     assert not velocities[0].any()
 
 
+def test_more_components_than_memory_holds_are_refused(home: Path, tmp_path: Path) -> None:
+    dataset = changed_info(home, tmp_path, lambda info: info["features"]["action"].update(shape=[10**9]))
+    with pytest.raises(ValueError, match="1000000000 components in action, the limit is 10000"):
+        demonstrations(str(dataset), ARM_SPEC)
+
+
 @pytest.mark.parametrize(
     ("spec", "says"),
     [

@@ -24,6 +24,7 @@ from vla.spec import LONGEST_INSTRUCTION, Array
 
 COLUMNS = {"episode_index": counts, "task_index": counts, "frame_index": counts, "timestamp": numbers}
 IMAGES = ("video", "image")
+MOST_COMPONENTS = 10_000  # of a feature; a damaged or hostile file may name any number
 
 
 class LeRobotDataset:
@@ -57,12 +58,14 @@ class LeRobotDataset:
         Unnamed components are called by `anonymous` if there are as many, else by their feature and index.
 
         Raises:
-            ValueError: there is no such feature, or it is no vector.
+            ValueError: there is no such feature, or it is no vector of a reasonable size.
         """
         for key in keys:
             if key not in self.info.features or len(self.info.features[key].shape) != 1:
                 vectors = [name for name, feature in self.info.features.items() if len(feature.shape) == 1]
                 raise ValueError(f"{self.folder} has no vector {key}, it has {', '.join(vectors)[:500]}")
+            if (size := self.info.features[key].shape[0]) > MOST_COMPONENTS:
+                raise ValueError(f"{self.folder} has {size} components in {key}, the limit is {MOST_COMPONENTS}")
         named = {key: dict(enumerate(self.info.features[key].components or ())) for key in keys}
         places = [(key, index) for key in keys for index in range(self.info.features[key].shape[0])]
         if not any(named.values()) and len(places) == len(anonymous):
