@@ -1,0 +1,71 @@
+"""Which checkpoint, and what it sees."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from lerobot.configs import FeatureType, PolicyFeature, PreTrainedConfig
+from lerobot.utils.constants import ACTION
+
+from vla.envs.lerobot import IMAGES, RATES, STATE
+from vla.models.checkpoint import read_header
+
+
+@PreTrainedConfig.register_subclass("vla")
+@dataclass
+class VlaConfig(PreTrainedConfig):
+    """A checkpoint of vla.
+
+    Attributes:
+        checkpoint: its file; in a folder of `--policy.path`, relative to it.
+        precision: "fp32" or "bf16".
+        compile: compile the model.
+    """
+
+    checkpoint: str = ""
+    precision: str = "fp32"
+    compile: bool = False
+    push_to_hub: bool = False
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.checkpoint and Path(self.checkpoint).is_file():
+            self.describe(Path(self.checkpoint))
+
+    def describe(self, checkpoint: Path) -> None:
+        """Describe what the policy sees, under the names of LeRobot.
+
+        Raises:
+            ValueError: there is no checkpoint, or it is damaged.
+        """
+        spec = read_header(checkpoint).spec
+        vectors = {STATE: len(spec.pose), **({RATES: len(spec.rates)} if spec.rates else {})}
+        self.input_features = {
+            **{f"{IMAGES}{name}": PolicyFeature(FeatureType.VISUAL, (3, *spec.image_size)) for name in spec.cameras},
+            **{key: PolicyFeature(FeatureType.STATE, (size,)) for key, size in vectors.items()},
+        }
+        self.output_features = {ACTION: PolicyFeature(FeatureType.ACTION, (len(spec.action),))}
+
+    @property
+    def observation_delta_indices(self) -> None:
+        """None: the policy remembers its history itself."""
+
+    @property
+    def action_delta_indices(self) -> None:
+        """None: the policy is not trained here."""
+
+    @property
+    def reward_delta_indices(self) -> None:
+        """None: the policy is not trained here."""
+
+    def get_optimizer_preset(self) -> Any:
+        """Raise: the policy is not trained here."""
+        raise NotImplementedError("policies of vla are trained with python -m vla.run")
+
+    def get_scheduler_preset(self) -> None:
+        """Return None."""
+
+    def validate_features(self) -> None:
+        """Accept: the policy itself compares every observation with its spec."""

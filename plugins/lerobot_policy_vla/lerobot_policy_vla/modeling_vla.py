@@ -1,0 +1,96 @@
+"""A checkpoint of vla as a policy of LeRobot."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+import torch
+from lerobot.configs import PreTrainedConfig
+from lerobot.policies.pretrained import PreTrainedPolicy
+from torch import Tensor
+
+from lerobot_policy_vla.configuration_vla import VlaConfig
+from vla.config.experiment import make_policy
+from vla.envs.lerobot import TASK, observations
+from vla.policy import Policy
+from vla.spec import Array
+
+FILE = "policy.ckpt"  # of the checkpoint in a folder
+
+
+class VlaPolicy(PreTrainedPolicy):
+    """A checkpoint of vla as a policy of LeRobot, with one history per environment.
+
+    Raises:
+        ValueError: there is no checkpoint, or it is damaged.
+    """
+
+    config_class = VlaConfig
+    name = "vla"
+
+    def __init__(self, config: VlaConfig, **_: Any) -> None:
+        super().__init__(config)
+        if not config.checkpoint:
+            raise ValueError("which checkpoint? --policy.checkpoint=FILE")
+        device = "cuda" if str(config.device).startswith("cuda") else "cpu"
+        options = {"device": device, "precision": config.precision, "compile": config.compile}
+        self._policy: Policy = make_policy({"_target_": "vla.policy.Policy", **options}, Path(config.checkpoint))
+        self.model = self._policy.model  # a module, so that it moves with this one
+        self._sessions: list[Policy] = []
+
+    @classmethod
+    def from_pretrained(
+        cls, pretrained_name_or_path: str | Path, *, config: PreTrainedConfig | None = None, **_: Any
+    ) -> Self:
+        """Load a folder that `save_pretrained` wrote.
+
+        Raises:
+            ValueError: it holds no checkpoint, or a damaged one.
+        """
+        folder = Path(pretrained_name_or_path)
+        config = config or PreTrainedConfig.from_pretrained(folder)
+        assert isinstance(config, VlaConfig)
+        config.checkpoint = str(folder / FILE)
+        config.describe(folder / FILE)
+        return cls(config)
+
+    def _save_pretrained(self, save_directory: Path, state_dict: dict[str, Tensor] | None = None) -> None:
+        """Write the checkpoint, which holds its whole configuration, beside the configuration of LeRobot."""
+        shutil.copyfile(self.config.checkpoint, save_directory / FILE)
+        self.config.checkpoint = FILE
+        self.config._save_pretrained(save_directory)
+        self.config.checkpoint = str(save_directory / FILE)
+
+    def reset(self) -> None:
+        """Forget the histories of all environments."""
+        self._sessions = []
+
+    def select_action(self, batch: dict[str, Any], **_: Any) -> Tensor:
+        """Return the action to execute in each environment, (B, D)."""
+        return self._ask(batch, Policy.act)
+
+    def predict_action_chunk(self, batch: dict[str, Any], **_: Any) -> Tensor:
+        """Return a chunk of actions for each environment, (B, k, D)."""
+        return self._ask(batch, Policy.plan)
+
+    def forward(self, batch: dict[str, Tensor]) -> tuple[Tensor, dict[str, Any] | None]:
+        """Raise: the policy is not trained here."""
+        raise NotImplementedError("policies of vla are trained with python -m vla.run")
+
+    def get_optim_params(self) -> dict[str, Any]:
+        """Raise: the policy is not trained here."""
+        raise NotImplementedError("policies of vla are trained with python -m vla.run")
+
+    def _ask(self, batch: dict[str, Any], question: Any) -> Tensor:
+        arrays: dict[str, Any] = {
+            key: value.float().cpu().numpy() for key, value in batch.items() if isinstance(value, Tensor)
+        }
+        seen = observations({**arrays, TASK: batch.get(TASK, [""])}, self._policy.spec)
+        if len(self._sessions) != len(seen):
+            self._sessions = [self._policy.session() for _ in seen]
+        # One by one, so that every action is exactly the one that the policy gives alone.
+        answers: list[Array] = [question(session, each) for session, each in zip(self._sessions, seen, strict=True)]
+        return torch.from_numpy(np.stack(answers)).to(self._policy.device)

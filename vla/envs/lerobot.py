@@ -1,0 +1,115 @@
+"""Observations under the names of LeRobot, in both directions. LeRobot itself is not needed.
+
+The state of LeRobot is the pose. Rates of change, of which its policies would make inputs of their own accord, are
+separate: `observation.velocities`.
+
+Shapes: B observations, P components of the state, H by W pixels.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium.spaces import Box, Dict
+
+from vla.envs.gym import Task
+from vla.spec import Array, Observation, Spec
+
+IMAGES, STATE, RATES = "observation.images.", "observation.state", "observation.velocities"
+TASK = "task"  # the instructions
+AGENT = {STATE: "agent_pos", RATES: "velocities"}  # what an environment calls them, before LeRobot renames them
+
+
+class LeRobotEnvironment(gymnasium.Wrapper[dict[str, Any], Array, dict[str, Any], Array]):
+    """A task of the config as the environments that LeRobot evaluates policies in.
+
+    An observation has `pixels`, camera → (H, W, 3) uint8, `agent_pos`, the pose, and `velocities`, the rates of change,
+    if the state has any, both float32. `info` has `is_success` only.
+
+    Args:
+        task: an option of the group `task`.
+        longest: number of steps after which LeRobot ends an episode that has not ended itself.
+        options: options and values of the task, see `vla.config.compose.compose_task`.
+    """
+
+    def __init__(self, task: str, longest: int, options: Mapping[str, Any]) -> None:
+        inner = Task(task, "rgb_array", **options)
+        super().__init__(inner)
+        self.vla_spec, self._world = inner.environment.spec, inner.environment
+        self._max_episode_steps = longest
+        self.task_description = ""  # instruction of the episode
+        self.task = ""
+        image = Box(0, 255, (*self.vla_spec.image_size, 3), np.uint8)
+        vectors = {AGENT[key]: Box(-np.inf, np.inf, (len(part),)) for key, part in _parts(self.vla_spec).items()}
+        self.observation_space = Dict({"pixels": Dict(dict.fromkeys(self.vla_spec.cameras, image)), **vectors})
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[dict[str, Any], dict[str, Any]]:
+        """Start the episode of `seed`."""
+        observation, info = self.env.reset(seed=seed, options=options)
+        return self._renamed(observation), _success(info)
+
+    def step(self, action: Array) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
+        """Apply one (D,) action for one control period."""
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        return self._renamed(observation), float(reward), terminated, truncated, _success(info)
+
+    def _renamed(self, observation: dict[str, Any]) -> dict[str, Any]:
+        self.task_description = observation["instruction"]
+        self.task = self._world.task
+        vectors = {AGENT[key]: observation["state"][part] for key, part in _parts(self.vla_spec).items()}
+        return {"pixels": {camera: observation[camera] for camera in self.vla_spec.cameras}, **vectors}
+
+
+def arrays(observation: Observation, spec: Spec) -> dict[str, Array]:
+    """Convert an observation to what a LeRobot dataset has of a step, float32, images (3, H, W) from 0 to 1."""
+    images = {f"{IMAGES}{name}": observation.rgb[name].transpose(2, 0, 1) / np.float32(255) for name in spec.cameras}
+    return {**images, **{key: observation.state[indices] for key, indices in _parts(spec).items()}}
+
+
+def observations(batch: Mapping[str, Any], spec: Spec) -> list[Observation]:
+    """Convert a batch of LeRobot's to observations.
+
+    Args:
+        batch: `observation.images.CAMERA` (B, 3, H, W) from 0 to 1, `observation.state` and `observation.velocities`
+            (B, …) arrays, and `task`, B instructions.
+        spec: of the policy.
+
+    Raises:
+        ValueError: an entry is missing or has another shape.
+    """
+    parts = _parts(spec)
+    needed = [*(f"{IMAGES}{camera}" for camera in spec.cameras), *parts, TASK]
+    if missing := [key for key in needed if key not in batch]:
+        raise ValueError(f"the policy needs {', '.join(missing)}; there are {', '.join(map(str, batch))}")
+    count = len(batch[STATE])
+    state = np.zeros((count, len(spec.state)), np.float32)
+    for key, indices in parts.items():
+        if batch[key].shape != (count, len(indices)):
+            names = ", ".join(spec.state[index] for index in indices)
+            raise ValueError(f"{key} must be ({count}, {len(indices)}): {names}; it is {batch[key].shape}")
+        state[:, indices] = batch[key]
+    images = {camera: _pixels(batch[f"{IMAGES}{camera}"]) for camera in spec.cameras}
+    instructions: Sequence[str] = batch[TASK]
+    return [
+        Observation({camera: image[row] for camera, image in images.items()}, state[row], instructions[row])
+        for row in range(count)
+    ]
+
+
+def _parts(spec: Spec) -> dict[str, list[int]]:
+    """Return key of a vector → indices of its components in the state."""
+    return {STATE: spec.pose, **({RATES: spec.rates} if spec.rates else {})}
+
+
+def _success(info: dict[str, Any]) -> dict[str, Any]:
+    return {"is_success": info["is_success"]}
+
+
+def _pixels(images: Array) -> Array:
+    """Convert (B, 3, H, W) from 0 to 1 to (B, H, W, 3) uint8, exactly if they are bytes divided by 255."""
+    return np.ascontiguousarray(np.round(255 * images).clip(0, 255).astype(np.uint8).transpose(0, 2, 3, 1))
