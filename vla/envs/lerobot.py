@@ -67,7 +67,10 @@ class LeRobotEnvironment(gymnasium.Wrapper[dict[str, Any], Array, dict[str, Any]
 
 def arrays(observation: Observation, spec: Spec) -> dict[str, Array]:
     """Convert an observation to what a LeRobot dataset has of a step, float32, images (3, H, W) from 0 to 1."""
-    images = {f"{IMAGES}{name}": observation.rgb[name].transpose(2, 0, 1) / np.float32(255) for name in spec.cameras}
+    images = {
+        f"{IMAGES}{name}": np.ascontiguousarray(observation.rgb[name].transpose(2, 0, 1)) / np.float32(255)
+        for name in spec.cameras
+    }
     return {**images, **{key: observation.state[indices] for key, indices in _parts(spec).items()}}
 
 

@@ -8,7 +8,7 @@ from lerobot_policy_vla import VlaConfig, VlaPolicy, make_vla_pre_post_processor
 
 def main(checkpoint: str, folder: str) -> None:
     """Write the policy and its processors."""
-    config = VlaConfig(checkpoint=checkpoint, device="cpu")
+    config = VlaConfig(checkpoint=checkpoint)
     VlaPolicy(config).save_pretrained(Path(folder))
     for pipeline in make_vla_pre_post_processors(config):
         pipeline.save_pretrained(Path(folder))
