@@ -7,7 +7,8 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
-OTHERS = ("packages.md", "tutorial.md")  # whose commands need what the pages let a reader write, see their own tests
+# Their commands need what the pages let a reader write or install, see their own tests.
+OTHERS = ("lerobot.md", "packages.md", "tutorial.md")
 NAMES = sorted(path for path in (ROOT / "docs").glob("*.md") if path.name not in OTHERS)
 PAGES = (README, *(page.read_text(encoding="utf-8") for page in NAMES))
 TEXT = "\n".join(PAGES).replace("\\\n", " ")  # commands that go over several lines

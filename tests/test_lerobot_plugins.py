@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import ast
+import re
+import shlex
 import tomllib
 from pathlib import Path
 from typing import Any, cast
@@ -10,8 +12,10 @@ from typing import Any, cast
 import gymnasium
 import numpy as np
 import pytest
+from composing import composed
 from toy import ARM_SPEC, SPEC
 
+from vla.config.experiment import plain
 from vla.data.formats import lerobot_layout as layout
 from vla.envs import lerobot
 from vla.envs.lerobot import LeRobotEnvironment, arrays, observations
@@ -93,3 +97,17 @@ def test_lerobot_finds_the_plugins_by_its_rules() -> None:
     ):
         tree = ast.parse((policy / f"{module}.py").read_text(encoding="utf-8"))
         assert name in [node.name for node in tree.body if isinstance(node, (ast.ClassDef, ast.FunctionDef))]
+
+
+def test_the_commands_of_the_page_compose() -> None:
+    page = (ROOT / "docs/lerobot.md").read_text(encoding="utf-8")
+    options = PLUGINS["lerobot_policy_vla"] / "lerobot_policy_vla/conf"
+    export, evaluate = re.findall(r"^python -m vla\.run (.*)$", page, re.MULTILINE)
+    assert composed(*shlex.split(export)).export.folder == "DATASET"
+    agent = plain(composed(*shlex.split(evaluate), f"hydra.searchpath=[file://{options}]"))["agent"]
+    target = agent.pop("_target_")
+    module, _, name = target.rpartition(".")
+    tree = ast.parse((PLUGINS["lerobot_policy_vla"] / f"{module.replace('.', '/')}.py").read_text(encoding="utf-8"))
+    (made,) = (node for node in tree.body if isinstance(node, ast.ClassDef) and node.name == name)
+    (init,) = (node for node in made.body if isinstance(node, ast.FunctionDef) and node.name == "__init__")
+    assert [argument.arg for argument in init.args.args] == ["self", *agent]
