@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Annotated, Any, cast
 
-from annotated_types import Ge
+from annotated_types import Ge, Gt, Lt
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
@@ -58,6 +58,7 @@ PLAIN: dict[str, Any] = {
     "evaluate": {
         "episodes": Count,
         "seed": UnseenSeed,
+        "margin": Annotated[float, Gt(0), Lt(1)],
         "recordings": Natural | None,
         "conditions": dict[str, dict[str, object]],
         "one_by_one": dict[str, dict[str, dict[str, object]]],

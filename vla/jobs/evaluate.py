@@ -24,7 +24,7 @@ from vla.policy import latency
 from vla.reports.conditions import conditions_table, plot_conditions
 from vla.reports.evaluation import plot_report, write_report
 from vla.reports.html import PAGE, optional, write_page
-from vla.rollouts.evaluate import IN_DISTRIBUTION, Report, evaluate, keep_recordings
+from vla.rollouts.evaluate import IN_DISTRIBUTION, Report, compare_conditions, evaluate, keep_recordings
 from vla.runs.files import Round
 from vla.runs.folder import CHECKPOINTS, save_config, wall_time
 from vla.runs.resume import cached_success, training_lock
@@ -120,6 +120,7 @@ def _write(
     """Write all results of an evaluation that started at `started` [s]."""
     output, report = experiment.output, reports[IN_DISTRIBUTION]
     others = {name: each for name, each in reports.items() if name != IN_DISTRIBUTION}
+    compared = compare_conditions(reports, experiment["evaluate"]["margin"])
     facts = _facts(experiment, checkpoint, rounds, time.monotonic() - started)
     save_config(output, experiment.config, experiment.changes)
     if experiment["recorder"]:
@@ -129,11 +130,10 @@ def _write(
     plot_report(report, output / "report.png")
     if others:
         plot_conditions(reports, output / "suite.png")
-        show(conditions_table(reports))
+        show(conditions_table(reports, compared))
+    used = str(checkpoint) if checkpoint else None
     # Last, because its existence marks the evaluation as finished.
-    write_report(
-        report, output / "report.json", str(checkpoint) if checkpoint else None, experiment.config, facts, others
-    )
+    write_report(report, output / "report.json", used, experiment.config, facts, others, compared)
     with optional(output / PAGE):
         write_page(output)
     log.info(

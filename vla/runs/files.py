@@ -9,6 +9,7 @@ from pydantic import ConfigDict, StringConstraints
 
 from vla.io.documents import STRICT
 from vla.io.types import Count, Natural, NonNegative, Positive, Share
+from vla.rollouts.comparison import Comparison
 from vla.rollouts.evaluate import Result
 
 Node = dict[str, Any]
@@ -99,6 +100,7 @@ class Summary:
     tasks: dict[str, Summary]
     tiers: dict[str, Summary] = field(default_factory=dict)
     mean_over_tiers: Mean | None = None
+    anytime: bool = False  # intervals are valid whatever the reason to stop playing
 
 
 @dataclass(frozen=True)
@@ -135,7 +137,8 @@ class ErrorsFile:
 class Condition(Summary):
     """Success statistics under another condition, on the same seeds."""
 
-    outcomes: list[str]
+    outcomes: list[str]  # with `anytime`, of the first seeds
+    comparison: Comparison | None = None  # with the training condition
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -157,5 +160,7 @@ class ReportFile(Summary):
         if [result.seed for result in self.per_episode] != self.seeds:
             raise ValueError("per_episode has other episodes than seeds")
         for name, condition in self.conditions.items():
-            if len(condition.outcomes) != len(self.seeds):
+            if len(condition.outcomes) != len(self.seeds) and not (
+                self.anytime and len(condition.outcomes) < len(self.seeds)
+            ):
                 raise ValueError(f"conditions.{name} has {len(condition.outcomes)} outcomes of {len(self.seeds)} seeds")
