@@ -6,7 +6,7 @@ import hashlib
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Annotated, Any, cast
+from typing import Annotated, Any, Literal, cast
 
 from annotated_types import Ge, Gt, Lt
 from hydra.core.hydra_config import HydraConfig
@@ -58,6 +58,9 @@ PLAIN: dict[str, Any] = {
     "evaluate": {
         "episodes": Count,
         "seed": UnseenSeed,
+        "until": Literal["decided"] | None,
+        "bar": Annotated[float, Gt(0), Lt(1)] | None,
+        "against": Text | None,
         "margin": Annotated[float, Gt(0), Lt(1)],
         "recordings": Natural | None,
         "conditions": dict[str, dict[str, object]],

@@ -71,6 +71,7 @@ def write_page(folder: Path) -> Path:
         "run.html",
         title=_title(run),
         run=run,
+        anytime=any(report.anytime for report in run.reports.values()),
         facts=_facts(run),
         all_steps=at(run.config, "trainer.max_steps", None),
         tables=_rate_tables(run),

@@ -211,11 +211,16 @@ def evaluate(
     name: str = "evaluating",
     needs: Sequence[Path] = (),
     tiers: Mapping[str, Sequence[str]] | None = None,
+    until: Callable[[Report], bool] | None = None,
 ) -> Report:
     """Play the episodes of the seeds; `name` is the label of the progress bar, `tiers` are those of the report.
 
     Every process of the `cluster` calls the factories once and accesses the paths `needs`. Errors of a factory end the
     evaluation; errors of an episode, or a crash of its process, are reported in its result.
+
+    With `until` it ends before the last seed as soon as that is true of a report of the first seeds, in their order;
+    with tiers, of whole rounds of their tasks, which take turns. Episodes of later seeds do not count even if they were
+    played, so that the report does not depend on the number of workers.
 
     Raises:
         ValueError: there are no seeds, seeds are in the range of collection, or the cluster raises one.
@@ -225,6 +230,7 @@ def evaluate(
     make = partial(_RolloutWorker, make_environment, make_agent, make_recorder)
     columns = (TextColumn(name), BarColumn(), MofNCompleteColumn(), TextColumn("{task.fields[note]}"))
     results: dict[int, Result] = {}
+    counted, clear, turns = 0, False, sum(map(len, (tiers or {}).values())) or 1
     with cluster.pool(make, needs) as pool, Progress(*columns, TimeRemainingColumn()) as bar:
         task = bar.add_task("", total=len(seeds), note="")
         seed_of = {pool.submit(seed): seed for seed in seeds}
@@ -237,13 +243,19 @@ def evaluate(
             so_far = Report(tuple(results.values()))
             errors = f", {len(so_far.errors)} errors" if so_far.errors else ""
             bar.update(task, advance=1, note=f"success {100 * so_far.success:.0f} %{errors}")
-    return Report(tuple(results[seed] for seed in seeds), tiers or {})
+            while counted < len(seeds) and seeds[counted] in results and not clear:
+                counted += 1
+                if until is not None and counted % turns == 0:
+                    clear = until(Report(tuple(results[seed] for seed in seeds[:counted]), anytime=True))
+            if clear:
+                break
+    return Report(tuple(results[seed] for seed in seeds[:counted]), tiers or {}, anytime=until is not None)
 
 
 def keep_recordings(report: Report, folder: Path, target: Path, limit: int | None) -> int:
     """Merge the recordings of an evaluation into one file, failures first, at most `limit`; returns their number.
 
-    The single files are removed, and their folder if it is empty.
+    The single files are removed, those of episodes that do not count included, and their folder if it is empty.
     """
     from vla.rollouts.recorder import merge, recording_name  # imports the viewer's library
 
@@ -251,7 +263,7 @@ def keep_recordings(report: Report, folder: Path, target: Path, limit: int | Non
     files = [file for name in names if (file := folder / f"{name}.rrd").exists()]
     if files[:limit]:
         merge(files[:limit], target)
-    for file in files:
+    for file in folder.glob("*.rrd"):
         file.unlink()
     with suppress(OSError):
         folder.rmdir()

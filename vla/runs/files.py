@@ -154,13 +154,13 @@ class ReportFile(Summary):
     latency_ms: Positive | None = None
     wall_time_s: NonNegative | None = None
     rounds: list[Round] = field(default_factory=list)  # of job=improve
+    statements: list[str] = field(default_factory=list)  # on what the evaluation was to decide
 
     def __post_init__(self) -> None:
         """Require the same episodes in every part."""
         if [result.seed for result in self.per_episode] != self.seeds:
             raise ValueError("per_episode has other episodes than seeds")
         for name, condition in self.conditions.items():
-            if len(condition.outcomes) != len(self.seeds) and not (
-                self.anytime and len(condition.outcomes) < len(self.seeds)
-            ):
-                raise ValueError(f"conditions.{name} has {len(condition.outcomes)} outcomes of {len(self.seeds)} seeds")
+            played = len(condition.outcomes)
+            if played > len(self.seeds) or (played < len(self.seeds) and not condition.anytime):
+                raise ValueError(f"conditions.{name} has {played} outcomes of {len(self.seeds)} seeds")
