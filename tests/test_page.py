@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 from finished_runs import CONFIG, CURVES, SAID, a_report, a_run, compared
+from matplotlib.figure import Figure
 from PIL import Image
 from toy_recordable import ThinkingAgent, make_environment
 
@@ -22,6 +23,7 @@ from vla.reports.evaluation import plot_report, write_report
 from vla.reports.filmstrips import MOMENTS, read_filmstrips
 from vla.reports.first_batch import draw_samples
 from vla.reports.html import optional, write_page
+from vla.reports.posteriors import compact_letters
 from vla.reports.sweep import tabulate
 from vla.reports.training_curves import draw_run, draw_runs
 from vla.rollouts.evaluate import FIRST_SEED, Report, Result, keep_recordings
@@ -214,7 +216,33 @@ def test_runs_are_compared_on_the_seeds_they_share(tmp_path: Path) -> None:
     assert "good/run and short/run seen 2 1 0 -50.0 (" in told
     assert "model.width 16 8 16" in told
     assert 'href="../good/run/report.html"' in markup and "bad/run/report.html" not in markup
-    assert markup.count("<svg") == 6
+    assert markup.count("<svg") == 7
+
+
+def test_violins_have_letters_that_tell_which_runs_differ(tmp_path: Path, figures: list[Figure]) -> None:
+    outcomes = {"best": "s" * 40, "good": "s" * 33 + "d" * 7, "fair": "s" * 28 + "d" * 12, "bad": "s" * 10 + "d" * 30}
+    runs = [a_run(tmp_path / name, each) for name, each in outcomes.items()]
+    told = text(compared(runs, tmp_path / "new"))
+    (axes,) = figures[0].axes
+    assert [label.get_text() for label in axes.get_yticklabels()] == ["best", "good", "fair", "bad"]
+    # Lost and won of the pairs: 7 and 0, 12 and 0, 5 and 0 (p = 0.06), and more.
+    assert [each.get_text() for each in axes.texts] == ["a", "b", "b", "c"]
+    assert "What success may be" in told
+    assert "What success may be" not in text(compared(runs[:2], tmp_path / "two"))
+    elsewhere = a_run(tmp_path / "elsewhere", "s" * 40, light=0.2)
+    assert "What success may be" not in text(compared([*runs, elsewhere], tmp_path / "five"))
+
+
+def test_names_share_a_letter_unless_they_are_apart() -> None:
+    names, random = "abcdefg", np.random.default_rng(0)
+    pairs = [(one, other) for one in names for other in names if one < other]
+    for share in (0.0, 0.3, 0.7, 1.0):
+        apart = [pair for pair in pairs if random.random() < share]
+        letters = compact_letters(names, apart)
+        assert all(letters.values())
+        for one, other in pairs:
+            assert ((one, other) in apart) == (not {*letters[one]} & {*letters[other]})
+    assert compact_letters("abc", [("a", "c")]) == {"a": "a", "b": "ab", "c": "b"}
 
 
 def test_other_scenes_under_the_same_seeds_are_not_compared(tmp_path: Path) -> None:

@@ -22,9 +22,10 @@ from vla.data.index import listed
 from vla.io.files import write_text
 from vla.reports.comparison import RunComparison
 from vla.reports.conditions import comparison_texts
+from vla.reports.posteriors import draw_posteriors
 from vla.reports.style import BLUE, GREEN, GREY, RED, Interval
 from vla.reports.training_curves import colours, draw_run, draw_runs
-from vla.rollouts.evaluate import Report
+from vla.rollouts.evaluate import IN_DISTRIBUTION, Report
 from vla.runs.folder import Run, read_run
 from vla.spec import READABLE
 
@@ -98,12 +99,14 @@ def write_comparison(runs: Mapping[str, Run], compared: Sequence[RunComparison],
         )
         for (name, run), colour in zip(runs.items(), colours(len(runs)), strict=True)
     ]
+    reports = {name: run.reports[IN_DISTRIBUTION] for name, run in runs.items() if run.reports}
     return _write(
         target / COMPARISON,
         "comparison.html",
         title=f"{len(runs)} runs" if len(runs) > 1 else next(iter(runs)),
         lines=lines,
         heads=(["run"], ["model", "parameters [M]", "action [ms]", "steps", "time"], ""),
+        posteriors=draw_posteriors(reports, compared, colours(len(runs))) if len(reports) == len(runs) else None,
         curves=draw_runs({name: run.metrics for name, run in runs.items()}),
         pairs=[(each, comparison_texts(each.found)) for each in compared],
         anytime=any(report.anytime for run in runs.values() for report in run.reports.values()),
