@@ -26,6 +26,7 @@ from vla.reports.conditions import conditions_table, plot_conditions
 from vla.reports.evaluation import plot_report, write_report
 from vla.reports.html import PAGE, optional, write_page
 from vla.rollouts.evaluate import IN_DISTRIBUTION, Report, compare_conditions, evaluate, keep_recordings
+from vla.rollouts.memory import Sense, make_impaired
 from vla.rollouts.statements import AgainstBar, AgainstCondition, AgainstRun, Statement
 from vla.runs.files import Round
 from vla.runs.folder import CHECKPOINTS, require_run, save_config, wall_time
@@ -103,13 +104,15 @@ def _statements(experiment: Experiment) -> list[Statement]:
         if report is None:
             raise ValueError(f"evaluate.against={against} has no report.json to compare with: evaluate that run first")
         found.append(AgainstRun(against, {result.seed: result for result in report.per_episode}, asked["margin"]))
-    if asked["until"] and not found and not conditions(asked):
+    if asked["until"] and not found and not conditions(asked) and not asked["without"]:
         raise ValueError(
             "evaluate.until=decided needs something to decide: evaluate.bar=0.95, evaluate.against=RUN, or conditions, "
             "as in evaluate=suite"
         )
-    if not experiment.playable and (found or asked["until"]):
-        raise ValueError("evaluate.bar, against and until are about success, which a recording has not: omit them")
+    if not experiment.playable and (found or asked["until"] or asked["without"]):
+        raise ValueError(
+            "evaluate.bar, against, until and without are about success, which a recording has not: omit them"
+        )
     return found
 
 
@@ -128,18 +131,20 @@ def _play(experiment: Experiment, checkpoint: Path | None, statements: Sequence[
     if recorder:
         recordings.mkdir(exist_ok=True)
         needs.append(recordings)
-    named = {IN_DISTRIBUTION: {}, **conditions(asked)}
-    different = sum(with_changes(task, changes) != task for changes in named.values())
+    impaired: dict[str, Sense] = {f"without_{sense}": sense for sense in asked["without"]}
+    named = {IN_DISTRIBUTION: {}, **conditions(asked), **{name: {} for name in impaired}}
+    different = sum(name in impaired or with_changes(task, changes) != task for name, changes in named.items())
     until, reports = [each.is_clear for each in statements], dict[str, Report]()
     for name, changes in named.items():
-        if reports and with_changes(task, changes) == task:  # equal to the training condition
+        if reports and name not in impaired and with_changes(task, changes) == task:  # equal to the training condition
             reports[name] = reports[IN_DISTRIBUTION]
             continue
+        make = partial(make_impaired, make_agent, impaired[name]) if name in impaired else make_agent
         watching = None if reports else recorder
         make_environment = experiment.make_environment(changes)
         tiers = task.get("tiers")  # of worlds that have them
         clear = partial(_all, until) if asked["until"] and until else None
-        reports[name] = evaluate(make_environment, make_agent, watching, seeds, cluster, name, needs, tiers, clear)
+        reports[name] = evaluate(make_environment, make, watching, seeds, cluster, name, needs, tiers, clear)
         first = reports[IN_DISTRIBUTION]
         seeds = [result.seed for result in first.results]
         until = [AgainstCondition(first, asked["margin"], different).is_clear]
