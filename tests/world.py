@@ -31,7 +31,7 @@ from vla.deploy.settings import Topics
 from vla.robots.panda import HOME
 from vla.spec import Array, Observation
 
-TOPICS = Topics({"front": "/front", "wrist": "/wrist"}, "/joint_states", "/words", "/commands", "/gripper")
+TOPICS = Topics({"front": "/front", "wrist": "/wrist"}, "/joint_states", "/words", "/commands", "/gripper", None)
 KINDS = {"joint_state": JointState, "trajectory": JointTrajectory, "forward": Float64MultiArray}
 
 

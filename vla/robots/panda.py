@@ -174,3 +174,9 @@ class CartesianController:
         self.joints = self.joints + np.clip(solution - self.joints, -reach, reach)
         self.pose = forward(self.joints)[0]
         return self.joints
+
+    def motion_between(self, before: Array, after: Array) -> Array:
+        """Return the (6,) translation [m] and rotation vector [rad] of the tool between joints (7,) [rad]."""
+        start, end = forward(before)[0], forward(after)[0]
+        turn = vector_from_rotation(end[:3, :3] @ start[:3, :3].T)
+        return np.concatenate([end[:3, 3] - start[:3, 3], turn])
