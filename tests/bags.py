@@ -43,7 +43,7 @@ class Part:
 def moving(steps: int, seed: int, gripper: float = 1.0) -> Array:
     """Actions of a motion (steps, 7)."""
     random = np.random.default_rng(seed)
-    direction = random.uniform(-0.004, 0.004, 6) + [0, 0, 0.004, 0, 0, 0.02]
+    direction = random.uniform(-0.004, 0.004, 6) + np.array([0, 0, 0.004, 0, 0, 0.02])
     return np.column_stack([np.repeat(direction[None], steps, 0), np.full(steps, gripper)]).astype(np.float32)
 
 

@@ -27,7 +27,13 @@ def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def imported(folder: Path, steps: Any = "corrected", spec: Any = SPEC, **changed: Any) -> BagDemonstrations:
-    options = {"topics": TOPICS, "status": "/vla_agent/status", "robot": ROBOT, "image_crop": "centre", **changed}
+    options: dict[str, Any] = {
+        "topics": TOPICS,
+        "status": "/vla_agent/status",
+        "robot": ROBOT,
+        "image_crop": "centre",
+        **changed,
+    }
     return BagDemonstrations(folder, steps, **options, spec=spec)
 
 
@@ -55,7 +61,7 @@ def test_everything_is_an_episode_per_try_and_says_who_acted(bag: Path) -> None:
     episodes = [demonstrations.episode(number) for number in range(len(demonstrations))]
     words = ["put the red block on the pad"] * 3 + ["lift the blue block"]
     assert [episode.instruction for episode in episodes] == words
-    assert [episode.draws["expert_acts"] for episode in episodes][0] == []
+    assert episodes[0].draws["expert_acts"] == []
     assert [round(episode.draws["recorded"]["corrected"]) for episode in episodes] == [0, 1, 0, 0]
     np.testing.assert_allclose(episodes[0].actions[:18], bags.executed((1,))[:18], atol=2e-4)
     state = episodes[0].observations[0].state

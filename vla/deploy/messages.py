@@ -130,7 +130,7 @@ class JointStates:
             ValueError: as `joints_from`; fingers are missing if none came within the last `FINGERS_AGE`.
         """
         fingers, names = self._robot.fingers, {*message.name}
-        if fingers and names.isdisjoint(self._robot.joints) and names >= {*fingers}:
+        if fingers and names == {*fingers}:
             self._fingers = (at, float(_positions(message, fingers)[0].sum()))
             return None
         recent = at - self._fingers[0] <= FINGERS_AGE and names.isdisjoint(fingers)
