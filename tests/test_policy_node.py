@@ -17,7 +17,7 @@ from lifecycle_msgs.srv import GetState
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import Image, JointState
 from std_msgs.msg import Float64MultiArray, String
-from std_srvs.srv import Trigger
+from std_srvs.srv import SetBool, Trigger
 from world import KINDS, World, positions
 
 from vla.deploy import messages
@@ -36,8 +36,8 @@ def make_world() -> Iterator[Callable[..., World]]:
     """A world on a domain of its own."""
     worlds: list[World] = []
 
-    def make(command: str = "joint_state", *arguments: str) -> World:
-        worlds.append(World(next(domains), command, list(arguments)))
+    def make(command: str = "joint_state", *arguments: str, compressed: bool = False) -> World:
+        worlds.append(World(next(domains), command, list(arguments), compressed))
         return worlds[-1]
 
     yield make
@@ -158,6 +158,41 @@ def test_stop_and_resume(world: World) -> None:
     assert world.commands[-1].position == world.commands[-5].position
     assert world.ask(Trigger, "resume", Trigger.Request()).success
     assert world.becomes(State.RUNNING)
+
+
+def test_a_person_takes_the_arm_over_and_hands_it_back(world: World) -> None:
+    assert world.ask(SetBool, "hand_over", SetBool.Request(data=True)).success
+    world.live(0.1)
+    world.commands.clear()
+    person = world.node.create_publisher(JointState, "/commands", 1)
+    world.live(1.2)
+    assert world.commands == [] and world.state is State.HANDED_OVER
+    assert {pair.key: pair.value for pair in world.statuses[-1].values}["handed over"] == "yes"
+    refused = world.ask(SetBool, "hand_over", SetBool.Request(data=False))
+    assert not refused.success and "1 other publisher(s) on /commands" in refused.message
+    world.node.destroy_publisher(person)
+    world.joints = world.joints + 0.1
+    world.live(0.5)
+    left = world.joints
+    assert world.ask(SetBool, "hand_over", SetBool.Request(data=False)).success
+    world.live(5.0, until=lambda: world.commands)
+    assert world.commands[0].name == ROBOT.joints  # the gripper stays as it is
+    np.testing.assert_allclose(world.commands[0].position, left)
+    assert world.becomes(State.RUNNING)
+    steps = np.diff([command.position[:7] for command in world.commands], axis=0)
+    assert (np.abs(steps) <= ROBOT.max_speed * 0.02 + 1e-9).all()
+
+
+def test_a_dry_run_commands_nothing_and_tells_what_it_would(make_world: Callable[..., World]) -> None:
+    """With compressed images."""
+    world = make_world("joint_state", "--ros-args", "-p", "dry_run:=true", compressed=True)
+    would: list[JointState] = []
+    world.node.create_subscription(JointState, "/vla_agent/dry_run/commands", would.append, 100)
+    world.start()
+    world.live(1.5)
+    assert world.commands == [] and world.state is State.RUNNING
+    moved = np.abs(np.array([command.position[:7] for command in would]) - HOME).max()
+    assert 1e-3 < moved < 0.1 and (world.joints == HOME).all()
 
 
 def test_an_instruction_that_is_ignored_after_a_stop_is_reported(

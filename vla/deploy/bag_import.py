@@ -134,7 +134,7 @@ class BagDemonstrations(ImportedDemonstrations):
 
     def _steps_in(self, stretch: Stretch) -> list[Step]:
         """Return the steps of a stretch, made as the policy node makes its observations; a ValueError without any."""
-        observer, steps = Observer(self.spec), list[Step]()
+        observer, steps, period = Observer(self.spec), list[Step](), 1 / self.spec.control_hz
         last = earliest = -np.inf
         for now, each in self._index.inputs:
             if now > stretch.end:
@@ -148,13 +148,13 @@ class BagDemonstrations(ImportedDemonstrations):
                 continue
             observer.cameras.add(each.camera, np.array(each.stamp), each.at)
             taken = observer.due(last, earliest)
-            if taken is None or taken < stretch.start or observer.newest is None:
+            if taken is None or observer.newest is None or not stretch.start <= taken <= stretch.end - period:
                 continue
             measured = observer.measured_at(taken)
             if abs(measured.at - taken) <= MEASURED_WITHIN:
                 pictures = {camera: int(stamp) for camera, stamp in observer.cameras.images.items()}
                 steps.append(Step(taken, pictures, observer.state(measured)))
-                last, earliest = taken, taken + 1 / self.spec.control_hz
+                last, earliest = taken, taken + period
         if not steps:
             raise ValueError(
                 f"{self._index.folder} has no matching images of {', '.join(self._topics)} from {stretch.start:.1f} to "
