@@ -22,7 +22,7 @@ from world import KINDS, World, positions
 
 from vla.deploy import messages
 from vla.deploy.control_loop import State
-from vla.robots.panda import HOME
+from vla.robots.panda import HOME, forward
 
 pytestmark = pytest.mark.realtime
 
@@ -318,6 +318,16 @@ def test_plain_positions_for_a_forward_controller(make_world: Callable[..., Worl
     world.node.create_subscription(Float64MultiArray, "/gripper", fingers.append, 10)
     world.start()
     assert len(world.commands[-1].data) == 7 and list(fingers[-1].data) == [0.04, 0.04]
+
+
+def test_a_twist_for_a_servo_moves_the_tool_as_fast_as_the_policy_says(make_world: Callable[..., World]) -> None:
+    world = make_world("twist")
+    world.start()
+    before = forward(world.joints)[0][:3, 3]
+    world.live(1.0)
+    moved = forward(world.joints)[0][:3, 3] - before
+    assert world.state is State.RUNNING and world.commands[-1].header.frame_id == "panda_link0"
+    assert moved[0] > 0.02 and np.abs(moved[1:]).max() < 0.2 * moved[0]
 
 
 def test_ros_arguments_remap_and_set_parameters(make_world: Callable[..., World]) -> None:

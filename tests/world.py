@@ -15,6 +15,7 @@ from arm import FORWARD, ROBOT, SAFETY, SPEC
 from builtin_interfaces.msg import Time
 from defaults import defaults_of
 from diagnostic_msgs.msg import DiagnosticStatus
+from geometry_msgs.msg import TwistStamped
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
 from PIL import Image as Picture
@@ -31,11 +32,12 @@ from vla.deploy.policy_node import PolicyNode
 from vla.deploy.ros import Network
 from vla.deploy.ros2 import PolicyDeployment
 from vla.deploy.settings import Topics
-from vla.robots.panda import HOME
+from vla.robots.panda import HOME, forward
 from vla.spec import Array, Observation
 
 TOPICS = Topics({"front": "/front", "wrist": "/wrist"}, "/joint_states", "/words", "/commands", "/gripper", None)
 KINDS = {"joint_state": JointState, "trajectory": JointTrajectory, "forward": Float64MultiArray}
+TWIST = {"twist": TwistStamped}
 
 
 class Forward:
@@ -93,7 +95,7 @@ class World:
         self.states = self.node.create_publisher(JointState, "/joint_states", 1)
         self.words = self.node.create_publisher(String, "/words", 1)
         self.commands: list[Any] = []
-        self.node.create_subscription(KINDS[command], "/commands", self.commands.append, 100)
+        self.node.create_subscription({**KINDS, **TWIST}[command], "/commands", self.commands.append, 100)
         self.statuses: list[DiagnosticStatus] = []
         self.node.create_subscription(DiagnosticStatus, "/vla_agent/status", self.statuses.append, 100)
         self.joints = HOME.copy()
@@ -122,7 +124,9 @@ class World:
                 self.simulated += 0.02
                 self.clock.publish(Clock(clock=self._now()))
             if self.measures:
-                if self.commands:
+                if self.commands and isinstance(self.commands[-1], TwistStamped):
+                    self.joints = self.joints + 0.02 * rates(self.commands[-1], self.joints)
+                elif self.commands:
                     self.joints = positions(self.commands[-1])[0]
                 self.states.publish(joint_state(self.joints))
             if tick % 5 == 0:
@@ -189,6 +193,14 @@ def positions(command: Any) -> Array:
     if isinstance(command, JointTrajectory):
         return np.array([point.positions for point in command.points])
     return np.array([command.position[:7] if isinstance(command, JointState) else command.data])
+
+
+def rates(command: TwistStamped, joints: Array) -> Array:
+    """Return the joint velocities (7,) [rad/s] that a servo would choose for a twist."""
+    linear, angular = command.twist.linear, command.twist.angular
+    twist = np.array([linear.x, linear.y, linear.z, angular.x, angular.y, angular.z])
+    velocities: Array = np.linalg.pinv(forward(joints)[1]) @ twist
+    return velocities
 
 
 def joint_state(joints: Array) -> JointState:

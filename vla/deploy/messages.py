@@ -200,6 +200,15 @@ def fill_trajectory(
     return message
 
 
+def fill_twist(message: Any, frame: str, velocity: Array) -> Any:
+    """Fill a geometry_msgs/TwistStamped with the (6,) velocity of the tool [m/s], [rad/s] in a frame."""
+    message.header.frame_id = frame
+    parts = (message.twist.linear, message.twist.angular)
+    for part, values in zip(parts, velocity.reshape(2, 3).tolist(), strict=True):
+        part.x, part.y, part.z = values
+    return message
+
+
 def finger_positions(robot: Robot, command: Command) -> list[float]:
     """Return the target position of every finger joint [m]; none if the command leaves the gripper as it is."""
     return [] if command.opening is None else [command.opening * robot.finger_travel] * len(robot.fingers)

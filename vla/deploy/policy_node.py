@@ -13,6 +13,7 @@ from typing import Any, get_args
 import numpy as np
 from builtin_interfaces.msg import Duration
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from geometry_msgs.msg import TwistStamped
 from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor, SetParametersResult
 from rclpy.clock import Clock, ClockType
 from rclpy.context import Context
@@ -32,6 +33,8 @@ from vla.deploy.observer import age_of
 from vla.deploy.settings import COMPRESSED, PolicySettings
 from vla.io import images
 from vla.policy import Policy
+from vla.robots.controllers import acts_on_joints
+from vla.robots.panda import velocity_of
 from vla.spec import LONGEST_INSTRUCTION, Array, Observation
 
 LEVELS = {
@@ -43,7 +46,12 @@ LEVELS = {
     State.FAULT: DiagnosticStatus.ERROR,
 }
 MAX_MESSAGE = 300  # length of a log line or status message [characters]
-COMMANDS = {"joint_state": JointState, "trajectory": JointTrajectory, "forward": Float64MultiArray}
+COMMANDS = {
+    "joint_state": JointState,
+    "trajectory": JointTrajectory,
+    "forward": Float64MultiArray,
+    "twist": TwistStamped,
+}
 
 
 class PolicyNode(GuardedLifecycleNode):
@@ -114,7 +122,11 @@ class PolicyNode(GuardedLifecycleNode):
         if self._crop not in get_args(images.Crop):
             raise ValueError(f"image_crop is '{self._crop}', expected one of {', '.join(get_args(images.Crop))}")
         dry_run = self.get_parameter("dry_run").value
-        loop = ControlLoop(spec, robot, self.settings.safety, self.get_parameter("command_hz").value, not dry_run)
+        twist = self._command_type == "twist"
+        if twist and acts_on_joints(spec):
+            raise ValueError("command=twist needs a policy of Cartesian actions, this one's are joint positions")
+        rate, follows = self.get_parameter("command_hz").value, not (dry_run or twist)
+        loop = ControlLoop(spec, robot, self.settings.safety, rate, follows)
         self._warm_up()
         reliable = self.get_parameter("image_reliability").value == "reliable"
         best_effort = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
@@ -339,6 +351,10 @@ class PolicyNode(GuardedLifecycleNode):
             message = messages.fill_trajectory(
                 JointTrajectory(), JointTrajectoryPoint, Duration, robot, ahead, self.loop.tick
             )
+        elif self._command_type == "twist":
+            frame = self.settings.twist_frame or self.policy.spec.require_robot("deployment").frame
+            message = messages.fill_twist(TwistStamped(), frame, velocity_of(command.position, command.velocity))
+            message.header.stamp = self.get_clock().now().to_msg()
         else:
             message = Float64MultiArray(data=command.position.tolist())
         self._commands.publish(message)

@@ -9,7 +9,7 @@ from typing import Literal
 from vla.deploy.control_loop import Safety
 from vla.deploy.joint_limiter import Robot
 from vla.io.images import Crop
-from vla.io.types import NonNegative, Positive
+from vla.io.types import NonNegative, Positive, Text
 
 COMPRESSED = "/compressed"  # end of the topics of sensor_msgs/CompressedImage, as of image_transport
 NAME = re.compile(r"(~/|/)?[A-Za-z_]\w*(/[A-Za-z_]\w*)*", re.ASCII)  # of a topic
@@ -57,7 +57,9 @@ class PolicySettings:
         robot: the arm and its limits.
         topics: names of the topics.
         safety: time-outs and limits.
-        command: JointState with positions, JointTrajectory that ends at rest, or Float64MultiArray of positions.
+        command: JointState with positions, JointTrajectory that ends at rest, Float64MultiArray of positions, or
+            TwistStamped of the tool, for Cartesian actions.
+        twist_frame: base frame of a TwistStamped; None: as the policy names it.
         command_hz: commands per second.
         image_reliability: QoS of the images; "reliable" helps with large images on a lossy network.
         image_crop: for images with another aspect ratio than in training: crop the centre, or distort the whole.
@@ -67,7 +69,8 @@ class PolicySettings:
     robot: Robot
     topics: Topics
     safety: Safety
-    command: Literal["joint_state", "trajectory", "forward"]
+    command: Literal["joint_state", "trajectory", "forward", "twist"]
+    twist_frame: Text | None
     command_hz: Positive
     image_reliability: Literal["best_effort", "reliable"]
     image_crop: Crop
