@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import random
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -167,3 +168,28 @@ def test_without_a_correction_there_is_nothing_to_import_but_what_the_policy_did
     with pytest.raises(ValueError, match=r"has no corrections: .* expert\.steps=all"):
         imported(bag)
     assert len(imported(bag, "all")) == 1
+
+
+@pytest.mark.parametrize("name", ["bag.mcap", "metadata.yaml"])
+def test_a_damaged_bag_is_imported_or_refused_in_a_sentence(tmp_path: Path, name: str) -> None:
+    """Bits that flip in many places, ends that are missing, sizes that are huge."""
+    whole = bags.write(tmp_path / "bag", bags.SESSION[9:])
+    data, generator = (whole / name).read_bytes(), random.Random(0)
+    refused = 0
+    for trial in range(32):
+        changed, place = bytearray(data), generator.randrange(len(data) - 8)
+        if trial % 4 == 0:
+            del changed[place:]
+        elif trial % 4 == 1:
+            changed[place : place + 8] = (1 << generator.randrange(20, 62)).to_bytes(8, "little")
+        else:
+            changed[place] ^= 1 << generator.randrange(8)
+        (whole / name).write_bytes(changed)
+        try:
+            demonstrations = imported(whole, "all")
+            for number in range(len(demonstrations)):
+                assert np.isfinite(demonstrations.episode(number).actions).all()
+        except ValueError as error:
+            assert str(whole) in str(error) and "\n" not in str(error) and len(str(error)) < 1000
+            refused += 1
+    assert refused > 5

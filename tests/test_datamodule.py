@@ -130,7 +130,7 @@ def test_a_further_store_may_lack_the_truth(folder: Path, tmp_path: Path) -> Non
     last = source.episodes[-1].end
     batch = module.make_batch(np.array([0, last, last + 1]))
     assert torch.isfinite(batch["truth"][0]).all() and batch["truth"][1:, -1].isnan().all()
-    np.testing.assert_array_equal(batch["state"][1, -1], source.rows("state")[0])
+    np.testing.assert_array_equal(batch["state"][1, -1], np.asarray(source.rows("state"))[0])
 
 
 def test_every_window_comes_once_per_shuffle(folder: Path) -> None:

@@ -14,6 +14,7 @@ import resource
 import time
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
+from functools import cache
 from pathlib import Path
 from threading import Event
 from typing import Any
@@ -47,12 +48,10 @@ class BagRecorder(TopicListener):
             ValueError: the folder exists.
         """
         from rosbags.rosbag2 import StoragePlugin, Writer
-        from rosbags.typesys import Stores, get_typestore
 
         if folder.exists():
             raise ValueError(f"{folder} exists already: choose another folder")
         folder.parent.mkdir(parents=True, exist_ok=True)
-        self._types = get_typestore(Stores.ROS2_JAZZY)
         self._writer = Writer(folder, version=9, storage_plugin=StoragePlugin.MCAP)
         self._writer.open()
         self.messages = 0
@@ -60,7 +59,7 @@ class BagRecorder(TopicListener):
 
     def callback_for(self, topic: str, kind: str) -> Callable[[bytes], None]:
         """Return a callback that writes the messages of a topic."""
-        connection = self._writer.add_connection(topic, kind, typestore=self._types)
+        connection = self._writer.add_connection(topic, kind, typestore=message_types())
 
         def write(message: bytes) -> None:
             self._writer.write(connection, time.time_ns(), message)
@@ -105,6 +104,14 @@ def play(node: Any, folder: Path, topics: Collection[str], stopped: Event, speed
             publishers[topic].publish(message)
             published += 1
     return published
+
+
+@cache
+def message_types() -> Any:
+    """Return the message types of ROS 2 Jazzy, as `rosbags` knows them."""
+    from rosbags.typesys import Stores, get_typestore
+
+    return get_typestore(Stores.ROS2_JAZZY)
 
 
 @contextmanager

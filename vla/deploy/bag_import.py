@@ -17,7 +17,7 @@ import numpy as np
 from vla.data.episodes import EpisodeStore
 from vla.data.formats.imported_demonstrations import ImportedDemonstrations, Recording, action_bounds
 from vla.deploy import messages
-from vla.deploy.bag import damage, messages_of, opened
+from vla.deploy.bag import damage, message_types, messages_of, opened
 from vla.deploy.bag_index import BagIndex, Picture, Stretch, read_index
 from vla.deploy.joint_limiter import Robot
 from vla.deploy.observer import Observer
@@ -164,9 +164,7 @@ class BagDemonstrations(ImportedDemonstrations):
 
     def _images(self, steps: Sequence[Step]) -> dict[tuple[str, int], Array]:
         """Return camera and time of recording [ns] → image (H, W, 3)."""
-        from rosbags.typesys import Stores, get_typestore
-
-        types = get_typestore(Stores.ROS2_JAZZY)
+        types = message_types()
         cameras = {topic: camera for camera, topic in self._topics.items()}
         wanted = {(camera, stamp) for step in steps for camera, stamp in step.pictures.items()}
         span = min(stamp for _, stamp in wanted), max(stamp for _, stamp in wanted) + 1

@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from vla.deploy import messages
-from vla.deploy.bag import damage, messages_of, opened
+from vla.deploy.bag import damage, message_types, messages_of, opened
 from vla.deploy.control_loop import State
 from vla.deploy.joint_limiter import Robot
 from vla.deploy.observer import Measured, age_of
@@ -197,9 +197,7 @@ class _Reading:
         return {topic: kinds[there[topic]] for topic, kinds in wanted.items() if topic in there}
 
     def _read(self, reader: Any, topics: Topics) -> None:
-        from rosbags.typesys import Stores, get_typestore
-
-        types = get_typestore(Stores.ROS2_JAZZY)
+        types = message_types()
         connections = [connection for connection in reader.connections if connection.topic in self._handlers]
         kinds = {connection.topic: connection.msgtype for connection in connections}
         folder, start, read = self.index.folder, reader.start_time, 0
