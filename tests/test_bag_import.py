@@ -9,11 +9,14 @@ from pathlib import Path
 from typing import Any
 
 import bags
+import composing
 import numpy as np
 import pytest
 from arm import ROBOT, SPEC
 from rosbags.rosbag2 import StoragePlugin
 
+from vla.config.build import build
+from vla.config.experiment import plain
 from vla.deploy.bag_import import BagDemonstrations
 from vla.deploy.settings import Topics
 from vla.spec import Episode
@@ -103,6 +106,22 @@ def test_a_session_without_a_policy_is_all_of_a_person(tmp_path: Path, storage: 
     episodes = [demonstrations.episode(number) for number in range(len(demonstrations))]
     assert [episode.instruction for episode in episodes] == ["lift it", "put it down"]  # the second repeats the first
     assert brightness(episodes[1])[-1] >= 37
+
+
+def test_joint_positions_of_any_robot_are_learned_from_a_bag_alone(bag: Path) -> None:
+    topics = [f"expert.topics.{name}={getattr(TOPICS, name)}" for name in ("joint_states", "instruction", "commands")]
+    images = [f"expert.topics.images.{camera}={topic}" for camera, topic in TOPICS.images.items()]
+    chosen = ("task=recorded", "task.joints=all", "task.units=rad", "task.image_size=[8,8]", "expert=bag")
+    robot = "expert.robot.fingers=[left,right]"
+    config: Any = plain(composing.composed(*chosen, f"expert.folder={bag}", robot, *topics, *images))
+    spec = build(config["task"], "task").spec
+    assert (spec.control_hz, spec.cameras, spec.action) == (10.0, ("front", "wrist"), tuple(ROBOT.joints))
+    demonstrations = build(config["expert"], "expert", spec=spec)
+    assert len(demonstrations) == config["collect"]["episodes"] == 1
+    episode = demonstrations.episode(0)
+    states = [seen.state for seen in episode.observations]
+    np.testing.assert_allclose(episode.actions[:-1], states[1:], atol=0.01)
+    assert np.abs(np.diff(episode.actions, axis=0)).sum() > 0.05
 
 
 def cut(folder: Path) -> None:
