@@ -193,6 +193,7 @@ def test_a_dry_run_commands_nothing_and_tells_what_it_would(make_world: Callable
     assert world.commands == [] and world.state is State.RUNNING
     moved = np.abs(np.array([command.position[:7] for command in would]) - HOME).max()
     assert 1e-3 < moved < 0.1 and (world.joints == HOME).all()
+    assert {pair.key: pair.value for pair in world.statuses[-1].values}["handed over"] == "yes"
 
 
 def test_an_instruction_that_is_ignored_after_a_stop_is_reported(

@@ -223,8 +223,8 @@ class _Reading:
     # Messages.
 
     def _image(self, camera: str, stamp: int, at: float, message: Any) -> None:
-        if camera not in self._seen:
-            messages.image_from(message)  # the others are decoded when they are needed
+        if camera not in self._seen or not hasattr(message, "format"):
+            messages.image_from(message)  # other compressed ones are decoded when they are needed
             self._seen.add(camera)
         age = age_of((message.header.stamp.sec, message.header.stamp.nanosec), stamp * 1e-9)
         self.index.inputs.append((at, Picture(camera, at - age, stamp)))

@@ -32,7 +32,7 @@ ENCODINGS = {
     "bgra8": (4, slice(2, None, -1)),
 }
 
-HANDED_OVER = "handed over"  # value in the agent's status: whether a person moves the arm, yes or no
+HANDED_OVER = "handed over"  # in the agent's status: yes if a person moves the arm, always in a dry run; no
 MOST_PIXELS = 4096 * 4096  # of a compressed image, whose header may promise any number
 FINGERS_AGE = 0.5  # oldest state of fingers that come in messages of their own [s]
 

@@ -121,7 +121,7 @@ class PolicyNode(GuardedLifecycleNode):
         self._crop = self.get_parameter("image_crop").value
         if self._crop not in get_args(images.Crop):
             raise ValueError(f"image_crop is '{self._crop}', expected one of {', '.join(get_args(images.Crop))}")
-        dry_run = self.get_parameter("dry_run").value
+        self._dry_run = dry_run = self.get_parameter("dry_run").value
         twist = self._command_type == "twist"
         if twist and acts_on_joints(spec):
             raise ValueError("command=twist needs a policy of Cartesian actions, this one's are joint positions")
@@ -381,7 +381,7 @@ class PolicyNode(GuardedLifecycleNode):
                 self.get_logger().warning(line)
         values = {
             "state": loop.state.value,
-            messages.HANDED_OVER: "yes" if loop.handed_over else "no",
+            messages.HANDED_OVER: "yes" if loop.handed_over or self._dry_run else "no",
             "instruction": messages.shorten(loop.instruction),
             "messages dropped": str(self._dropped),
             "ticks skipped": str(loop.overruns),
