@@ -35,7 +35,7 @@ GAP = 0.3  # longest time between two commands of one motion [s]
 REPEATED = 2.0  # an equal instruction within this time is a repetition, as `ros2 topic pub` sends them [s]
 STILL, STILL_OPENING = 0.01, 0.002  # an arm that has moved less [rad], and its gripper [m], has not begun to move
 LEAD = 0.1  # of a motion that are kept before it begins and after it ends [s]
-SHORTEST = 0.3  # shorter stretches are left out [s]
+SHORTEST = 0.5  # shorter stretches are left out [s]
 
 
 class Picture(NamedTuple):
