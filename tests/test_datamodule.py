@@ -126,7 +126,9 @@ def test_a_further_store_may_lack_the_truth(folder: Path, tmp_path: Path) -> Non
             seen = observations_of(lacking.spec, rows, entry.instruction)
             what = (seed, "recorded", entry.instruction, "unverified", frozenset[str](), {})
             lacking.append(Episode(*what, seen, rows["action"], rows["executed"]))
-    module = windows(folder, more=[lacking.folder])
+    module, twice = (windows(folder, more=[lacking.folder] * number) for number in (1, 2))
+    added = len(module.training_windows) - len(windows(folder).training_windows)
+    assert len(twice.training_windows) == len(module.training_windows) + added and added > 0
     last = source.episodes[-1].end
     batch = module.make_batch(np.array([0, last, last + 1]))
     assert torch.isfinite(batch["truth"][0]).all() and batch["truth"][1:, -1].isnan().all()
