@@ -65,9 +65,11 @@ def vector_from_rotation(rotation: Array) -> Array:
 
 
 def solve(arm: Kinematics, target: Array, joints: Array) -> Array:
-    """Find joints near `joints` (J,) that bring the arm's tool centre point to the (4, 4) pose `target`, by damped least squares.
+    """Find joints near `joints` (J,) that bring the tool centre point to the (4, 4) pose `target`.
 
-    Unreachable poses are approached as far as the joint limits allow.
+    By damped least squares (Nakamura and Hanafusa, "Inverse kinematic solutions with singularity robustness for robot
+    manipulator control", 1986), with the home posture in their null space. Unreachable poses are approached as far as
+    the joint limits allow.
     """
     joints = joints.copy()
     for _ in range(ITERATIONS):

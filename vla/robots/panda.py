@@ -42,6 +42,7 @@ FINGER_TRAVEL = 0.04  # of each finger [m], franka_description, hand.xacro
 FINGER_SPEED = 0.2  # of each finger [m/s], ibid.
 MAX_OPENING = 2 * FINGER_TRAVEL  # between the fingertips [m]
 
+
 def _link(a: float, d: float, turn: int) -> Array:
     """Return the constant part of a joint's transform: rotation about x by alpha, then the offsets a and d."""
     cosine, sine = np.cos(turn * np.pi / 2), np.sin(turn * np.pi / 2)

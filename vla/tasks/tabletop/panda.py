@@ -110,10 +110,9 @@ class Panda(composer.Entity, Robot):
 
     prefix = "panda/"
     arm, kinematics, lead = ARM, PANDA, DAMPING_RATIO
-    joints = [f"panda/joint{index}" for index in range(1, 8)]
-    servos = joints
-    fingers, grips, tool = ["panda/left_finger", "panda/right_finger"], ["panda/fingers"], "panda/tcp"
-    fingertips = [["panda/left_pad"], ["panda/right_pad"]]
+    joints = servos = tuple(f"panda/joint{index}" for index in range(1, 8))
+    fingers, grips, tool = ("panda/left_finger", "panda/right_finger"), ("panda/fingers",), "panda/tcp"
+    fingertips = (("panda/left_pad",), ("panda/right_pad",))
     closed, opened = np.zeros(1), np.array([FINGER_TRAVEL])
     travel, finger_speed, widest = FINGER_TRAVEL, FINGER_SPEED, MAX_OPENING
 

@@ -56,24 +56,24 @@ def spread(points: Array, count: int) -> Array:
 class Robot:
     """An arm with position servos and a gripper whose two sides close along the y axis of the tool.
 
-    The z axis of the tool points out of the gripper. A gripper command is 0 when closed and `travel` when open. Elements
-    are named as in the compiled scene; a camera `wrist` is among them.
+    The z axis of the tool points out of the gripper. A gripper command is 0 when closed and `travel` when open.
+    Elements have their names in the compiled scene; a camera `wrist` is among them.
     """
 
     prefix: str  # of the names of all its elements
     arm: RobotModel  # for the spec
     kinematics: Kinematics
-    joints: list[str]  # J hinges, base to tip
-    servos: list[str]  # their actuators, which take positions [rad]
+    joints: Sequence[str]  # J hinges, base to tip
+    servos: Sequence[str]  # their actuators, which take positions [rad]
     lead: float  # damping over stiffness of the servos [s]
-    fingers: list[str]  # joints of the gripper
-    grips: list[str]  # G actuators of the gripper
+    fingers: Sequence[str]  # joints of the gripper
+    grips: Sequence[str]  # G actuators of the gripper
     closed: Array  # (G,) controls of a closed gripper
     opened: Array  # (G,) controls of an open gripper
     travel: float
     finger_speed: float  # largest change of the command per second
     widest: float  # opening of an open gripper [m]
-    fingertips: list[list[str]]  # geoms of either side
+    fingertips: Sequence[Sequence[str]]  # geoms of either side
     tool: str  # site
 
     def compile(self, scene: mjcf.RootElement) -> mjcf.Physics:

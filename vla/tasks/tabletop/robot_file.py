@@ -1,8 +1,8 @@
 """A robot arm with a gripper from files in MJCF or URDF.
 
-Joints, limits, masses, shapes and the kinematic chain are those of the compiled model. What all robots of the tabletop share
-is added to it: position servos with gravity compensation, contacts with the world only, fingertips that do not slip, a tool
-frame and a wrist camera.
+Joints, limits, masses, shapes and the kinematic chain are those of the compiled model. What all robots of the tabletop
+share is added to it: position servos with gravity compensation, contacts with the world only, fingertips that do not
+slip, a tool frame and a wrist camera.
 """
 
 from __future__ import annotations
@@ -29,10 +29,12 @@ FREQUENCY = 100.0  # natural frequency of a joint of the arm with its servo, at 
 LEAD = 0.05  # damping over stiffness of the servos [s], as of the Panda's, so that joints are overdamped
 ARMATURE = 0.1  # smallest reflected rotor inertia of a joint of the arm [kg m²], as of the Panda's
 SOFTNESS = 0.1  # share of a finger's travel after which its servo gives its whole force
+FASTEST = 0.02  # time in which its whole force moves a finger through its travel, at least [s]
 CLOSING = 0.2  # shortest time in which the gripper closes [s]
 OPENINGS, SETTLING = 17, 250  # commands at which the opening is measured; steps in which the fingers come to rest
 LEAST_TRAVEL = 0.02  # change of the opening of a gripper that can hold a block [m]
 TIMESTEP = 0.004  # of the scene [s]
+ASIDE = 0.08  # largest distance between the tool point and the middle between the closed fingertips [m]
 FAR = 1.0  # up to which an opening is measured [m]
 
 Values = Annotated[dict[str, float], MinLen(1)]
@@ -142,7 +144,9 @@ class RobotFile(Robot):
                 raise ValueError(f"task.robot.joints names {name}, which is not a hinge")
             low, high = joint.range
             if model.jnt_limited[joint.id] and not low <= position <= high:
-                raise ValueError(f"task.robot.home has {name} at {position}, outside its limits, {low:.3f} to {high:.3f}")
+                raise ValueError(
+                    f"task.robot.home has {name} at {position}, outside its limits, {low:.3f} to {high:.3f}"
+                )
         return dict(zip(joints, home, strict=True))
 
     def _add_servos(self, home: dict[str, float]) -> list[str]:
@@ -155,7 +159,9 @@ class RobotFile(Robot):
         inertia = np.empty((model.nv, model.nv))
         mujoco.mj_fullM(model, data, inertia)
         stiffness = [FREQUENCY**2 * inertia[dof, dof] for dof in (model.joint(name).dofadr[0] for name in home)]
-        return [robot_spec.add_servo(self._spec, name, k, LEAD * k, None) for name, k in zip(home, stiffness, strict=True)]
+        return [
+            robot_spec.add_servo(self._spec, name, k, LEAD * k, None) for name, k in zip(home, stiffness, strict=True)
+        ]
 
     def _grip(self, name: str, opened: float, closed: float, force: float) -> str:
         """Return the name of an actuator of the gripper, which a joint gets."""
@@ -163,7 +169,9 @@ class RobotFile(Robot):
             return name
         known = [element.name for element in (*self._spec.actuators, *self._spec.joints)]
         robot_spec.require("open", [name], known, "actuator or joint")
-        stiffness = force / (SOFTNESS * max(abs(opened - closed), 1e-3))
+        travel = max(abs(opened - closed), 1e-3)
+        robot_spec.set_armature(self._spec, [name], force * FASTEST**2 / (2 * travel))
+        stiffness = force / (SOFTNESS * travel)
         return robot_spec.add_servo(self._spec, name, stiffness, LEAD * stiffness, force)
 
     def _measure_gripper(self, home: Array) -> None:
@@ -185,11 +193,18 @@ class RobotFile(Robot):
             rows.append([self.opening(model, data), *(data.joint(name).qpos[0] for name in self.fingers)])
         table = np.array(rows)[::-1]
         self._openings, self._positions = np.maximum.accumulate(table[:, 0]), table[:, 1:]
-        self._commands, self.widest = commands[::-1], float(self._openings[-1])
-        if not self.widest - self._openings[0] > LEAST_TRAVEL:
+        self._commands, self.narrowest, self.widest = commands[::-1], *self._openings[[0, -1]].tolist()
+        tool, tips = data.site(self.tool), [data.geom(name).xpos for side in self.fingertips for name in side]
+        middle = tool.xmat.reshape(3, 3).T @ (np.mean(tips, axis=0) - tool.xpos)
+        if np.linalg.norm(middle) > ASIDE:
+            raise ValueError(
+                f"task.robot.offset: the middle between the fingertips is at {np.round(middle, 2).tolist()} m from the "
+                "tool point, forward, to the right and down: the tool point belongs there"
+            )
+        if not self.widest - self.narrowest > LEAST_TRAVEL:
             raise ValueError(
                 f"task.robot.open and task.robot.closed leave the fingertips {1000 * self.widest:.0f} and "
-                f"{1000 * self._openings[0]:.0f} mm apart, which holds no block"
+                f"{1000 * self.narrowest:.0f} mm apart, which holds no block"
             )
 
     def grip(self, opening: float) -> tuple[Array, float]:
@@ -205,7 +220,9 @@ class RobotFile(Robot):
     def _kinematics(self, home: Array, speed: float) -> Kinematics:
         model, data = self._model, self._data
         joints = [model.joint(name) for name in self.joints]
-        positions, dofs = ([int(at[0]) for at in each] for each in zip(*((j.qposadr, j.dofadr) for j in joints), strict=True))
+        positions, dofs = (
+            [int(at[0]) for at in each] for each in zip(*((j.qposadr, j.dofadr) for j in joints), strict=True)
+        )
         limits = np.array([j.range if model.jnt_limited[j.id] else (-np.inf, np.inf) for j in joints])
         site = model.site(self.tool).id
         jacobian = np.empty((6, model.nv))

@@ -1,7 +1,7 @@
 """Robot models in MJCF or URDF: read, and made alike for the tabletop.
 
-The files are data, which MuJoCo compiles. Names that they lack, files that are missing and models that do not compile end
-in one sentence.
+The files are data, which MuJoCo compiles. Names that they lack, files that are missing and models that do not compile
+end in one sentence.
 """
 
 from __future__ import annotations
@@ -104,6 +104,8 @@ def simplify(spec: mujoco.MjSpec, joints: Collection[str], grips: Collection[str
     for element in [*spec.joints]:
         if element.name in fixed or (not element.name and model.jnt_bodyid[element.id] not in hand):
             spec.delete(element)
+        else:
+            element.name = element.name or f"vla_joint{element.id}"
     for element in (*spec.lights, *spec.cameras, *spec.sensors, *spec.keys, *spec.textures):
         spec.delete(element)
     _simplify_geoms(spec, model)
@@ -166,7 +168,9 @@ def soften(spec: mujoco.MjSpec, names: Sequence[str]) -> list[str]:
     if not tips:
         raise ValueError(f"task.robot.fingertips names {', '.join(names)}, where nothing collides")
     for tip in tips:
-        tip.friction, tip.condim, tip.priority = (FINGERTIP_CONTACT[each] for each in ("friction", "condim", "priority"))
+        tip.friction, tip.condim, tip.priority = (
+            FINGERTIP_CONTACT[each] for each in ("friction", "condim", "priority")
+        )
         tip.solref = FINGERTIP_CONTACT["solref"]
         tip.solimp[:3] = FINGERTIP_CONTACT["solimp"]
     return [tip.name for tip in tips]
@@ -185,7 +189,9 @@ def add_servo(spec: mujoco.MjSpec, joint: str, stiffness: float, damping: float,
     return SERVO + joint
 
 
-def add_tool(spec: mujoco.MjSpec, name: str, home: dict[str, float], base: Array, offset: Array) -> tuple[Any, Array, Array]:
+def add_tool(
+    spec: mujoco.MjSpec, name: str, home: dict[str, float], base: Array, offset: Array
+) -> tuple[Any, Array, Array]:
     """Add the site of the tool, whose axes are those of the site or body `name`.
 
     Args:
@@ -214,9 +220,9 @@ def add_tool(spec: mujoco.MjSpec, name: str, home: dict[str, float], base: Array
     turn = np.round(axes)
     if np.abs(axes).max(axis=0).min() < ALIGNED or abs(np.linalg.det(turn) - 1) > 0.1:
         raise ValueError(
-            f"task.robot.home leaves the axes of {name} askew: one must point down, one forward and one sideways, "
-            f"up to {np.degrees(np.arccos(ALIGNED)):.0f} degrees; down, seen from it, is {np.round(axes[:, 2], 2).tolist()} "
-            f"and forward {np.round(axes[:, 0], 2).tolist()}"
+            f"task.robot.home leaves the axes of {name} askew: one must point down and one forward, up to "
+            f"{np.degrees(np.arccos(ALIGNED)):.0f} degrees; in its frame down is {np.round(axes[:, 2], 2).tolist()}, "
+            f"forward {np.round(axes[:, 0], 2).tolist()}"
         )
     around = data.body(body.name) if body.name else data.body(body.id)
     frame = around.xmat.reshape(3, 3)
@@ -227,7 +233,10 @@ def add_tool(spec: mujoco.MjSpec, name: str, home: dict[str, float], base: Array
 
 
 def add_camera(body: Any, position: Array, rotation: Array, camera: Array, target: Array) -> None:
-    """Add the wrist camera; `camera` looks at `target`, both (3,) in the frame of the tool at a pose in the body [m]."""
+    """Add the wrist camera to the body of the tool, whose pose in it is given.
+
+    It is at `camera` and looks at `target`, (3,) in the frame of the tool [m].
+    """
     axes = look_at(camera, target, (1, 0, 0))
     body.add_camera(name=WRIST, pos=position + rotation @ camera, quat=quaternion(rotation @ axes), fovy=FOVY)
 

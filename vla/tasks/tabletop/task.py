@@ -35,6 +35,8 @@ class FastEnvironment(composer.Environment):
 
     def _recompile_physics(self) -> None:
         # MuJoCo compiles what dm_control cannot read.
+        if physics := getattr(self, "_physics", None):
+            physics.free()
         self._physics = self._task.scene.compile()
         self._physics.legacy_step = self._legacy_step
 
