@@ -13,6 +13,8 @@ from composing import composed
 from conftest import make_tabletop
 from defaults import defaults_of
 
+from vla.config.build import require_no_paths
+from vla.config.experiment import plain
 from vla.robots.chain import frame_positions
 from vla.rollouts.rollout import rollout
 from vla.spec import Spec
@@ -25,7 +27,7 @@ if TYPE_CHECKING:
 HINGES = (("0 0 1", 0.1), ("0 1 0", 0.2), ("0 1 0", 0.4), ("0 0 1", 0.2), ("0 1 0", 0.2), ("0 0 1", 0.05))
 HOME = [0.0, 0.37, 1.82, 0.0, 0.95, 0.0]
 FINGERS = {"left": "0 1 0", "right": "0 -1 0"}
-ARM = {
+ARM: dict[str, Any] = {
     "joints": [f"j{index}" for index in range(6)],
     "home": HOME,
     "tool": "hand",
@@ -190,8 +192,9 @@ def test_what_does_not_fit_the_model_is_named(tmp_path: Path, changes: dict[str,
 
     file = tmp_path / "arm.xml"
     file.write_text(mjcf())
+    arguments: dict[str, Any] = {**defaults_of("task/robot/file"), **ARM, "file": file, **changes}
     with pytest.raises(ValueError, match=message):
-        RobotFile(**{**defaults_of("task/robot/file"), **ARM, "file": file, **changes})
+        RobotFile(**arguments)
 
 
 @pytest.mark.parametrize(
@@ -209,21 +212,32 @@ def test_a_file_that_does_not_compile_is_named(tmp_path: Path, text: str | None,
 
     if text is not None:
         (tmp_path / "arm.xml").write_text(text)
+    arguments: dict[str, Any] = {**defaults_of("task/robot/file"), **ARM, "file": tmp_path / "arm.xml"}
     with pytest.raises(ValueError, match=message) as raised:
-        RobotFile(**{**defaults_of("task/robot/file"), **ARM, "file": tmp_path / "arm.xml"})
+        RobotFile(**arguments)
     assert "\n" not in str(raised.value)
 
 
-@pytest.mark.parametrize("path", ["/etc/passwd", "nowhere/arm.xml", "dm_control/../../arm.xml", "arm.xml"])
+@pytest.mark.parametrize(
+    "path", ["/etc/passwd", "nowhere/arm.xml", "dm_control/../../a.xml", "dm_control//etc/passwd", "arm.xml"]
+)
 def test_an_installed_arm_is_within_its_package(path: str) -> None:
-    with pytest.raises(ValueError, match="must begin with the name of an installed package and stay within it"):
-        make_installed(path)
-
-
-def make_installed(path: str) -> None:
     from vla.tasks.tabletop.robot_file import InstalledRobot
 
-    InstalledRobot(**{**defaults_of("task/robot/jaco"), "file": path})
+    arguments: dict[str, Any] = {**defaults_of("task/robot/jaco"), "file": path}
+    with pytest.raises(ValueError, match="must begin with the name of an installed package and stay within it"):
+        InstalledRobot(**arguments)
+
+
+def test_a_checkpoint_names_no_file_but_of_a_package() -> None:
+    named = [f"task.robot.{name}={json.dumps(value)}".replace('"', "") for name, value in ARM.items()]
+    config: Any = {"task": plain(composed("task/robot=file", "task.robot.file=arm.xml", *named))["task"]}
+    with pytest.raises(
+        ValueError, match=r"last\.ckpt names a path in task\.robot\.file: .*; task\.robot\.file=PATH gives"
+    ):
+        require_no_paths(config, ("task",), "last.ckpt", ())
+    require_no_paths(config, ("task",), "last.ckpt", ("task.robot.file",))
+    require_no_paths({"task": plain(composed("task/robot=jaco"))["task"]}, ("task",), "last.ckpt", ())
 
 
 def test_the_panda_is_the_tabletop_without_a_file() -> None:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from importlib.util import find_spec
 from itertools import product
+from os.path import normpath
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -269,9 +270,11 @@ class InstalledRobot(RobotFile):
 def _installed(path: str) -> Path:
     package, _, rest = path.partition("/")
     found = find_spec(package) if package.isidentifier() else None
-    if found is None or found.origin is None or ".." in rest.split("/"):
+    folder = Path(found.origin).parent if found and found.origin else None
+    file = Path(normpath(folder / rest)) if folder else None
+    if folder is None or file is None or folder not in file.parents:
         raise ValueError(f"task.robot: {path} must begin with the name of an installed package and stay within it")
-    return Path(found.origin).parent / rest
+    return file
 
 
 def _frame(position: Array, axis: Array) -> Array:
