@@ -6,7 +6,6 @@ import json
 import shutil
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -26,7 +25,6 @@ from vla.parallel.pool import LocalCluster
 from vla.rollouts.collect import collect
 from vla.rollouts.rollout import replay, rollout
 from vla.rollouts.supervised import Supervised, make_supervised, require_memoryless
-from vla.spec import Array, Environment, Observation
 from vla.tasks.metaworld.expert import Scripted
 from vla.tasks.perturb import Perturbed
 from vla.tasks.tabletop.expert import Waypoint
@@ -35,32 +33,13 @@ ROUNDS = ("job=improve", "pretrained=run/checkpoints/last.ckpt", *SMALL, "task.t
 FEW = ("improve.episodes=2", "improve.steps=2", "collect.folder=few", "collect.episodes=6")
 
 
-class Wanderer:
-    """A policy that sees the target seldom, and mostly goes astray."""
-
-    def __init__(self) -> None:
-        self.info: dict[str, Any] = {}
-
-    def reset(self, instruction: str, seed: int) -> None:
-        """Start over."""
-        self._random = np.random.default_rng([seed, 2])
-
-    def act(self, observation: Observation) -> Array:
-        """North-east, with noise."""
-        return np.array([*self._random.normal(0.02, 0.02, 2), 0.0], np.float32)
-
-
-def make_wanderer(environment: Environment) -> Wanderer:
-    return Wanderer()
-
-
 def supervised(beta: float) -> Supervised:
-    return Supervised(Wanderer(), toy.ToyExpert(), beta, segment=5)
+    return Supervised(toy.Wanderer(), toy.ToyExpert(), beta, segment=5)
 
 
 def label(folder: Path, workers: int, episodes: int = 12) -> EpisodeStore:
     store = EpisodeStore.create_or_open(folder, toy.SPEC, {})
-    agent = partial(make_supervised, make_wanderer, toy.make_expert, 0.4, 5)
+    agent = partial(make_supervised, toy.make_wanderer, toy.make_expert, 0.4, 5)
     collect(store, toy.make_environment, agent, episodes, LocalCluster(workers), 100, keep_failures=True)
     return EpisodeStore(folder)
 
@@ -73,7 +52,7 @@ def labelled(tmp_path_factory: pytest.TempPathFactory) -> EpisodeStore:
 
 def test_the_policy_acts_and_the_expert_labels() -> None:
     episode = rollout(toy.make_environment(), supervised(beta=0.0), 7)
-    alone = rollout(toy.make_environment(), Wanderer(), 7)
+    alone = rollout(toy.make_environment(), toy.Wanderer(), 7)
     np.testing.assert_array_equal(episode.executed, alone.executed)
     assert not episode.success and episode.draws["expert_acts"] == []
     for observation, action in zip(episode.observations, episode.actions, strict=True):
@@ -139,7 +118,7 @@ def test_only_a_memoryless_expert_labels() -> None:
     class Counting(toy.ToyExpert):
         memoryless = False
 
-    class Silent(Wanderer):
+    class Silent(toy.Wanderer):
         """Says nothing about its memory."""
 
     for other in (Counting(), Silent(), Perturbed(toy.SPEC, lambda spec: Counting(), None)):

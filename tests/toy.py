@@ -216,3 +216,22 @@ def make_store(folder: Path, make: Callable[[], ToyEnvironment] = make_environme
     store = EpisodeStore.create_or_open(folder, make().spec, {})
     collect(store, make, make_expert, EPISODES, LocalCluster(1), seed=0)
     return store
+
+
+class Wanderer:
+    """A policy that sees the target seldom, and mostly goes astray."""
+
+    def __init__(self) -> None:
+        self.info: dict[str, Any] = {}
+
+    def reset(self, instruction: str, seed: int) -> None:
+        """Start over."""
+        self._random = np.random.default_rng([seed, 2])
+
+    def act(self, observation: Observation) -> Array:
+        """North-east, with noise."""
+        return np.array([*self._random.normal(0.02, 0.02, 2), 0.0], np.float32)
+
+
+def make_wanderer(environment: Environment) -> Wanderer:
+    return Wanderer()

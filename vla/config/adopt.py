@@ -114,12 +114,23 @@ def resume(cfg: DictConfig, run: Path, overrides: Sequence[str]) -> DictConfig:
 
 def _reported(cfg: DictConfig, saved: Mapping[str, Any]) -> dict[str, Any]:
     """Return the nodes of `cfg` that describe a training, as they were in that of a checkpoint, without its paths."""
-    nodes = {name: without_paths(saved, name) for name in REPORTED if name in saved}
+    own = cast("dict[str, Any]", OmegaConf.to_container(cfg))
+    nodes = {}
+    for name in (name for name in REPORTED if name in saved):
+        # Only texts can be paths, and those of this command are none of the author's: spare the import of Lightning.
+        known = _texts(saved[name]) <= _texts(own.get(name))
+        nodes[name] = saved[name] if known else without_paths(saved, name)
     for name, keys in REPORTED_VALUES.items():
         values = {key: value for key, value in saved.get(name, {}).items() if key in keys}
-        own = cast("dict[str, Any] | None", OmegaConf.to_container(cfg[name]))
-        nodes[name] = {**(own or {}), **values}
+        nodes[name] = {**(own[name] or {}), **values}
     return nodes
+
+
+def _texts(node: Any) -> set[str]:
+    """Return all strings in nested values."""
+    if isinstance(node, dict | list):
+        return set().union(*map(_texts, node.values() if isinstance(node, dict) else node))
+    return {node} if isinstance(node, str) else set()
 
 
 def require_identity(saved: Mapping[str, Any], config: Mapping[str, Any], folder: Path) -> None:

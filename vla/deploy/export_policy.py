@@ -203,6 +203,8 @@ def open_onnx(path: Path, threads: int | None = None) -> Run:
 
     options = SessionOptions()
     options.intra_op_num_threads = threads or torch.get_num_threads()
+    # Else the idle threads of one program wait in a busy loop, and slow down the program that runs next.
+    options.add_session_config_entry("session.force_spinning_stop", "1")
     try:
         session = InferenceSession(path, options, providers=["CPUExecutionProvider"])
     except Exception as error:  # of its own kinds

@@ -18,8 +18,6 @@ from vla.config.check import Job, with_changes
 from vla.config.conditions import conditions
 from vla.config.experiment import Experiment
 from vla.io.files import writing
-from vla.jobs.open_loop import evaluate_open_loop
-from vla.jobs.train import train
 from vla.policy import latency
 from vla.reports.conditions import conditions_table, plot_conditions
 from vla.reports.evaluation import plot_report, write_report
@@ -50,10 +48,16 @@ def run(experiment: Experiment) -> float | None:
         return _evaluated(experiment, None)
     if not experiment.playable and experiment["evaluate"]["conditions"]:
         raise ValueError("evaluate.conditions change a world, and a recording has none: omit them")
-    checkpoint = experiment.checkpoint or train(experiment)
+    # Both modules import Lightning, which takes seconds.
+    if (checkpoint := experiment.checkpoint) is None:
+        from vla.jobs.train import train
+
+        checkpoint = train(experiment)
     if checkpoint is None:
         return None
     if not experiment.playable:
+        from vla.jobs.open_loop import evaluate_open_loop
+
         return evaluate_open_loop(experiment, checkpoint)
     if checkpoint.resolve().parent == (output / CHECKPOINTS).resolve():
         return evaluate_trained(experiment, checkpoint)

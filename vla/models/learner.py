@@ -112,6 +112,8 @@ class Learner(LightningModule):
 
     def transfer_batch_to_device(self, batch: Batch, device: torch.device, dataloader_idx: int) -> Batch:
         """Move everything but the instructions, which Lightning would search for tensors."""
+        if device.type == "cpu":
+            return batch  # it was made there
         tensors = {name: value for name, value in batch.items() if name != "instruction"}
         moved: Batch = super().transfer_batch_to_device(tensors, device, dataloader_idx)
         return {**moved, "instruction": batch["instruction"]}

@@ -44,11 +44,15 @@ class StepSeeding(Callback):
         self._seed = seed
 
     def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, batch: Any, batch_idx: int) -> None:
-        """Seed torch on all devices."""
+        """Seed the generators of the processor and of the module's device."""
         parts = trainer.accumulate_grad_batches
         step = trainer.global_step * parts + batch_idx % parts
         numbers = np.random.SeedSequence([self._seed, step, trainer.global_rank]).generate_state(1, np.uint64)
-        torch.manual_seed(int(numbers[0]))
+        seed = int(numbers[0])
+        if pl_module.device.type == "cpu":
+            torch.default_generator.manual_seed(seed)  # `torch.manual_seed` asks for other devices, which takes longer
+        else:
+            torch.manual_seed(seed)
 
 
 def make_trainer(config: Mapping[str, Any], checkpoints: Path | None, *callbacks: Callback) -> Trainer:

@@ -12,6 +12,7 @@ from vla.config.build import build
 from vla.config.compose import compose
 from vla.config.experiment import Experiment, plain
 from vla.data.episodes import EpisodeStore
+from vla.data.window_batches import aligned_empty
 from vla.jobs.benchmark.baselines.peer import DURATION, peer
 from vla.jobs.benchmark.measure import Measure, measure, timed
 from vla.jobs.collect import demonstrations
@@ -59,7 +60,7 @@ def _loading(data: WindowDataModule, store: EpisodeStore, history: int, batches:
         rows.append(np.maximum(windows[:, None] + np.arange(1 - history, 1), first[:, None]))  # (B, T)
 
     # Into two batches by turns, because one is in use while the next is made: a single one would stay in the cache.
-    buffers = [[np.empty((*rows[0].shape, *image.shape[1:]), image.dtype) for image in images] for _ in range(2)]
+    buffers = [[aligned_empty((*rows[0].shape, *image.shape[1:]), image.dtype) for image in images] for _ in range(2)]
 
     def bare() -> None:
         for index, arrays in zip(rows, cycle(buffers)):
