@@ -131,7 +131,7 @@ def renderers(picture: Path) -> None:
 
 
 def arm(option: str, picture: Path) -> None:
-    """Save how the expert acts with the arm of `task/robot=OPTION`: four moments of an episode, from the side, as WebP."""
+    """Save four moments of an episode of the expert with the arm of `task/robot=OPTION`, from the side, as WebP."""
     from vla.tasks.tabletop.expert import Waypoint
     from vla.tasks.tabletop.robot import look_at
     from vla.tasks.tabletop.robot_spec import quaternion

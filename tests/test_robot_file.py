@@ -173,6 +173,7 @@ WRONG: tuple[tuple[dict[str, Any], str], ...] = (
         r"task\.robot\.joints names j9, which is no joint: there are lift, j0, j1",
     ),
     ({"joints": ["lift"], "home": [0.0]}, r"task\.robot\.joints names lift, which is not a hinge"),
+    ({"joints": [f"j{index}" for index in (0, 2, 1, 3, 4, 5)]}, r"task\.robot\.joints names j1 after .*: base to tip"),
     ({"tool": "tcp"}, r"task\.robot\.tool names tcp, which is no site or body"),
     ({"open": {"claw": 1.0}, "closed": {"claw": 0.0}}, r"task\.robot\.open names claw, which is no actuator or joint"),
     ({"open": {"left": 0.04}}, r"task\.robot\.open names left, task\.robot\.closed left, right"),

@@ -96,8 +96,7 @@ class RobotFile(Robot):
             raise ValueError(f"task.robot.open names {', '.join(open)}, task.robot.closed {', '.join(closed)}")
         robot_spec.simplify(self._spec, joints, open)
         robot_spec.set_armature(self._spec, joints, ARMATURE)
-        base = rotation_z(yaw)
-        body, position, rotation = robot_spec.add_tool(self._spec, tool, start, base, np.array(offset))
+        body, position, rotation = robot_spec.add_tool(self._spec, tool, start, rotation_z(yaw), np.array(offset))
         robot_spec.add_camera(body, position, rotation, np.array(camera), np.array(target))
         tips = [robot_spec.soften(self._spec, side) for side in fingertips]
         servos = self._add_servos(start)
@@ -133,14 +132,18 @@ class RobotFile(Robot):
         """Return joint → position at home.
 
         Raises:
-            ValueError: no such joint, one that is not a hinge, or a position out of its limits.
+            ValueError: no such joint, one that is not a hinge or not in order, or a position out of its limits.
         """
         robot_spec.require("joints", joints, (joint.name for joint in self._spec.joints), "joint")
         if len(home) != len(joints):
             raise ValueError(f"task.robot.home has {len(home)} positions for {len(joints)} joints")
         model = robot_spec.compiled(self._spec)
+        carried = set(range(model.nbody))
         for name, position in zip(joints, home, strict=True):
             joint = model.joint(name)
+            if int(joint.bodyid[0]) not in carried:
+                raise ValueError(f"task.robot.joints names {name} after a joint that does not carry it: base to tip")
+            carried = robot_spec.descendants(model, int(joint.bodyid[0]))
             if joint.type[0] != mujoco.mjtJoint.mjJNT_HINGE:
                 raise ValueError(f"task.robot.joints names {name}, which is not a hinge")
             low, high = joint.range

@@ -94,7 +94,7 @@ def simplify(spec: mujoco.MjSpec, joints: Collection[str], grips: Collection[str
     """
     model = compiled(spec)
     last = model.joint(list(joints)[-1]).id
-    hand = _descendants(model, int(model.jnt_bodyid[last]))
+    hand = descendants(model, int(model.jnt_bodyid[last]))
     fixed = [j.name for j in map(model.joint, range(model.njnt)) if j.name not in joints and j.bodyid[0] not in hand]
     for body, masses in zip(spec.bodies, range(model.nbody), strict=True):
         _weigh(body, model, masses)
@@ -115,7 +115,8 @@ def simplify(spec: mujoco.MjSpec, joints: Collection[str], grips: Collection[str
         spec.delete(element)
 
 
-def _descendants(model: mujoco.MjModel, body: int) -> set[int]:
+def descendants(model: mujoco.MjModel, body: int) -> set[int]:
+    """Return a body and all bodies that it carries."""
     found = {body}
     for child in range(body + 1, model.nbody):  # parents come before their children
         if model.body_parentid[child] in found:
