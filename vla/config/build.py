@@ -184,15 +184,15 @@ def require_no_paths(
     Args:
         config: plain, with the nodes `names`, as far as there are any.
         source: where it comes from, for the error.
-        given: dotted names of arguments that the command line gives in place of the file's; None: it cannot.
+        given: dotted names of nodes that the command line gives in place of the file's; None: it cannot.
 
     Raises:
         ValueError: with the dotted name of the first such argument, or a class that may not be built.
     """
     require_trust(config, names, source)
     for key in (key for name in names for key in _paths_in(config.get(name), name)):
-        if key not in (given or ()):
-            hint = "" if given is None else f"; {key}=PATH gives yours"
+        if not any(f"{key}.".startswith(f"{name}.") for name in given or ()):
+            hint = "" if given is None else f"; {key.rpartition('.')[0].replace('.', '/')}=OPTION gives yours"
             raise ValueError(
                 f"{source} names a path in {key}: paths are taken from your own runs and commands only{hint}"
             )
