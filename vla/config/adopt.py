@@ -49,7 +49,8 @@ def adopt(cfg: DictConfig, overrides: Sequence[str]) -> DictConfig:
     parsed = _parsed(overrides)
     _require_own_parts(parsed, ("tokenizer", "model", *PRESETS))
     saved = read_header(cfg.checkpoint).config
-    require_no_paths(saved, OF_POLICY, cfg.checkpoint)
+    given = [_path(override) for override in parsed if not override.is_delete()]
+    require_no_paths(saved, OF_POLICY, cfg.checkpoint, given)
     named, kept = {override.key_or_group for override in parsed}, saved.get("chosen", {})
     chosen = {name: cfg.chosen[name] if group in named else kept.get(name) for name, group in CHOSEN.items()}
     reported = _reported(cfg, saved) if cfg.job == "evaluate" else {}
@@ -102,6 +103,8 @@ def resume(cfg: DictConfig, run: Path, overrides: Sequence[str]) -> DictConfig:
     _require_own_parts(parsed, PRESETS)
     taken = {str(name): saved[name] for name in cfg if name in saved and name not in OF_THIS_COMMAND}
     require_trust(taken, taken, last)
+    asked = cast("dict[str, Any]", OmegaConf.to_container(cfg.evaluate))
+    taken["evaluate"] = {**asked, **taken.get("evaluate", {})}  # options that are newer than the run
     if any(_path(override) == "trainer" for override in parsed):
         kept = {name: value for name, value in saved.get("trainer", {}).items() if name not in MACHINES}
         taken["trainer"] = kept | {name: cfg.trainer[name] for name in MACHINES if name in cfg.trainer}
