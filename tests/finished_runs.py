@@ -5,8 +5,10 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+from vla.reports.comparison import compare_runs, read_runs
 from vla.reports.evaluation import write_report
-from vla.rollouts.evaluate import FIRST_SEED, Report, Result
+from vla.reports.html import write_comparison
+from vla.rollouts.evaluate import FIRST_SEED, Report, Result, compare_conditions
 from vla.runs.folder import save_config
 
 SAID = "lift the <script>alert('red')</script> block"
@@ -52,7 +54,15 @@ def a_run(
     told = {"evaluate": {"conditions": {"dark": {"light": light}}}}
     config = {**CONFIG, **told, "model": {"_target_": "vla.models.bc.BC", "width": width}}
     size = {"parameters": 1_500_000, "latency_ms": 2.5}
-    write_report(report, folder / "report.json", f"{folder}/checkpoints/last.ckpt", config, size, {"dark": in_the_dark})
+    compared = compare_conditions({"seen": report, "dark": in_the_dark}, 0.02)
+    used = f"{folder}/checkpoints/last.ckpt"
+    write_report(report, folder / "report.json", used, config, size, {"dark": in_the_dark}, compared)
     (folder / "metrics.csv").write_text(curves)
     save_config(folder, config, [{"key": "model.width", "here": width, "default": 32}])
     return folder
+
+
+def compared(folders: list[Path], target: Path) -> Path:
+    """The page of `job=report`."""
+    runs = read_runs(folders)
+    return write_comparison(runs, compare_runs(runs, 0.02), target)

@@ -13,7 +13,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from finished_runs import CONFIG, CURVES, SAID, a_report, a_run
+from finished_runs import CONFIG, CURVES, SAID, a_report, a_run, compared
+from matplotlib.figure import Figure
 from PIL import Image
 from toy_recordable import ThinkingAgent, make_environment
 
@@ -21,7 +22,8 @@ from vla.config.differences import differences
 from vla.reports.evaluation import plot_report, write_report
 from vla.reports.filmstrips import MOMENTS, read_filmstrips
 from vla.reports.first_batch import draw_samples
-from vla.reports.html import optional, write_comparison, write_page
+from vla.reports.html import optional, write_page
+from vla.reports.posteriors import compact_letters
 from vla.reports.sweep import tabulate
 from vla.reports.training_curves import draw_run, draw_runs
 from vla.rollouts.evaluate import FIRST_SEED, Report, Result, keep_recordings
@@ -73,7 +75,7 @@ def test_the_page_tells_everything_that_lies_in_the_folder(whole: Path) -> None:
         "time per action 2.5 ms",
         "40 steps in 6 min 40 s",
         "checkpoint checkpoints/last.ckpt",
-        "dark 0.0 (0.0-39.0) 0/6 0.12",  # four lost, none won: 2 / 2^4
+        "dark 0.0 (0.0-39.0) 0/6 -66.7 (-90.3 to -13.1) 0.12 0.12 open",  # four lost, none won: 2 / 2^4
         "success 4 dropped 2",
         "timeout",
         "seed 1000003, 40 steps",
@@ -102,7 +104,7 @@ def test_failures_come_first_and_every_camera_is_shown_at_eight_moments(whole: P
 
 def test_a_page_refers_to_nothing_outside_and_runs_nothing(whole: Path, tmp_path: Path) -> None:
     other = a_run(tmp_path / "a <b>", "ssssds")
-    for page in (whole / "report.html", write_comparison([whole, other], tmp_path)):
+    for page in (whole / "report.html", compared([whole, other], tmp_path)):
         markup = page.read_text()
         assert "http" not in markup and "<script" not in markup and "<link" not in markup and "@import" not in markup
         for address in re.findall(r'(?:src|href)="([^"]*)"', markup):
@@ -205,21 +207,60 @@ def test_runs_are_compared_on_the_seeds_they_share(tmp_path: Path) -> None:
     bad = a_run(tmp_path / "bad/run", "ddddddsd", width=8)
     short = a_run(tmp_path / "short/run", "ds")
     write_page(good)
-    page = write_comparison([good, bad, short], tmp_path / "new")
+    page = compared([good, bad, short], tmp_path / "new")
     told, markup = text(page), page.read_text()
     assert page == tmp_path / "new/comparison.html" and told.startswith("3 runs")
     assert "good/run 100.0 (67.6-100.0)" in told
-    assert "good/run and bad/run seen 8 7 0 0.016 dark 8 6 0 0.031" in told  # seven lost, none won: 2 / 2^7
-    assert "good/run and short/run seen 2 1 0 1" in told
+    assert "good/run and bad/run seen 8 7 0 -87.5 (" in told
+    assert ") 0.016 0.078 open dark 8 6 0 -75.0 (" in told  # seven lost, none won: 2 / 2^7; the clearest of five
+    assert "good/run and short/run seen 2 1 0 -50.0 (" in told
     assert "model.width 16 8 16" in told
     assert 'href="../good/run/report.html"' in markup and "bad/run/report.html" not in markup
-    assert markup.count("<svg") == 6
+    assert markup.count("<svg") == 7
+
+
+def test_violins_have_letters_that_tell_which_runs_differ(tmp_path: Path, figures: list[Figure]) -> None:
+    outcomes = {"best": "s" * 40, "good": "s" * 33 + "d" * 7, "fair": "s" * 28 + "d" * 12, "bad": "s" * 10 + "d" * 30}
+    runs = [a_run(tmp_path / name, each) for name, each in outcomes.items()]
+    told = text(compared(runs, tmp_path / "new"))
+    (axes,) = figures[0].axes
+    assert [label.get_text() for label in axes.get_yticklabels()] == ["best", "good", "fair", "bad"]
+    # Lost and won of the pairs: 7 and 0, 12 and 0, 5 and 0 (p = 0.06), and more.
+    assert [each.get_text() for each in axes.texts] == ["a", "b", "b", "c"]
+    assert "What success may be" in told
+    assert "What success may be" not in text(compared(runs[:2], tmp_path / "two"))
+    elsewhere = a_run(tmp_path / "elsewhere", "s" * 40, light=0.2)
+    assert "What success may be" not in text(compared([*runs, elsewhere], tmp_path / "five"))
+
+
+def test_names_share_a_letter_unless_they_are_apart() -> None:
+    names, random = "abcdefg", np.random.default_rng(0)
+    pairs = [(one, other) for one in names for other in names if one < other]
+    for share in (0.0, 0.3, 0.7, 1.0):
+        apart = [pair for pair in pairs if random.random() < share]
+        letters = compact_letters(names, apart)
+        assert all(letters.values())
+        for one, other in pairs:
+            assert ((one, other) in apart) == (not {*letters[one]} & {*letters[other]})
+    assert compact_letters("abc", [("a", "c")]) == {"a": "a", "b": "ab", "c": "b"}
 
 
 def test_other_scenes_under_the_same_seeds_are_not_compared(tmp_path: Path) -> None:
     plain, dark = a_run(tmp_path / "plain", "ssssssss"), a_run(tmp_path / "dark", "dddddddd", light=0.1)
-    told = text(write_comparison([plain, dark], tmp_path / "new"))
-    assert "plain 100.0" in told and "on the same seeds" not in told
+    told = text(compared([plain, dark], tmp_path / "new"))
+    assert "plain 100.0" in told and "Differences in success" not in told
+
+
+def test_other_seeds_of_the_same_world_are_compared_as_they_are(tmp_path: Path) -> None:
+    one, other = a_run(tmp_path / "one", "sssssssd"), a_run(tmp_path / "other", "sddddddd")
+    file = other / "report.json"
+    moved = json.loads(file.read_text())
+    moved["seeds"] = [seed + 100 for seed in moved["seeds"]]
+    for result, seed in zip(moved["per_episode"], moved["seeds"], strict=True):
+        result["seed"] = seed
+    file.write_text(json.dumps(moved))
+    told = text(compared([one, other], tmp_path / "new"))
+    assert "seen 16 different episodes -75.0 (-89.5 to -26.1) 0.01 0.02 worse" in told
 
 
 def test_runs_with_nothing_to_compare_are_refused(tmp_path: Path) -> None:
@@ -231,14 +272,14 @@ def test_runs_with_nothing_to_compare_are_refused(tmp_path: Path) -> None:
         ([run, tmp_path / "run/../run"], "contains a folder twice"),
     ):
         with pytest.raises(ValueError, match=says):
-            write_comparison(folders, tmp_path / "new")
+            compared(folders, tmp_path / "new")
     loop = tmp_path / "loop"
     loop.symlink_to(loop)
     with pytest.raises(ValueError, match="loop is no run"):
-        write_comparison([loop], tmp_path / "new")
+        compared([loop], tmp_path / "new")
     (run / "rollouts.rrd").write_text("{")
     with pytest.raises(ValueError, match=r"rollouts\.rrd cannot be read"):
-        write_comparison([run], tmp_path / "new")
+        compared([run], tmp_path / "new")
     assert not (tmp_path / "new").exists()
 
 

@@ -35,6 +35,7 @@ STANDS = {
     "ENCODER": "encoder",
     "FILE": FILE,
     "HOST": "127.0.0.1",
+    "plan.runs=[RUN,RUN]": "plan.runs=[run,outputs/runs/half]",
     "RUN,RUN": "run",
     "resume=RUN": "resume=outputs/runs/half",
 }

@@ -18,6 +18,7 @@ import torch
 from arm import ROBOT, SAFETY
 from command_line import SMALL, here
 from exporting import exporter
+from finished_runs import compared
 
 from vla.config.build import build
 from vla.config.experiment import plain
@@ -25,7 +26,6 @@ from vla.data.episodes import EpisodeStore
 from vla.data.formats.imported_demonstrations import action_bounds
 from vla.deploy.control_loop import ControlLoop
 from vla.io.images import resize
-from vla.reports.html import write_comparison
 from vla.reports.open_loop import components
 from vla.robots.controllers import controller_for
 from vla.rollouts.open_loop import open_loop
@@ -212,7 +212,7 @@ def test_a_policy_is_trained_and_its_errors_measured_without_a_simulator(dataset
     assert "name its folder with expert=lerobot expert.folder=DIR" in here(tmp_path, *again, ok=False).stderr
     fewer = here(tmp_path, *again, *recording, "collect.episodes=6", ok=False)
     assert "was trained on other episodes than the 6" in fewer.stderr
-    assert "learner.lr" not in write_comparison([tmp_path / "run", tmp_path / "again"], tmp_path).read_text()
+    assert "learner.lr" not in compared([tmp_path / "run", tmp_path / "again"], tmp_path).read_text()
     assert torch.load(checkpoint, weights_only=True)["spec"]["action"] == list(NAMES)
 
 

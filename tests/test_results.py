@@ -9,9 +9,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from finished_runs import CONFIG, a_run
+from finished_runs import CONFIG, a_run, compared
 
-from vla.reports.html import write_comparison
 from vla.runs.files import Change, Training
 from vla.runs.folder import chosen_checkpoint, read_run, save_choice, save_training, wall_time
 
@@ -79,7 +78,7 @@ def test_a_file_of_another_kind_is_refused_by_name_with_a_way_out(
     path = folder / file
     path.write_text(content if isinstance(content, str) else content(path.read_text()))
     with pytest.raises(ValueError, match=says) as refused:
-        write_comparison([folder], tmp_path / "new")
+        compared([folder], tmp_path / "new")
     told = str(refused.value)
     assert str(path) in told and told.endswith("; remove the file, or repeat the run")
     assert "\n" not in told and len(told) < 1000 and not (tmp_path / "new").exists()
@@ -91,7 +90,7 @@ def test_a_configuration_with_other_things_in_it_is_shown_as_it_is(config: dict[
     (folder / "config.yaml").write_text(json.dumps(config))
     report = folder / "report.json"
     report.write_text(json.dumps({**json.loads(report.read_text()), "config": config}))
-    page = write_comparison([folder, other], tmp_path).read_text()
+    page = compared([folder, other], tmp_path).read_text()
     assert "model" in page
 
 
@@ -109,7 +108,7 @@ def test_points_that_are_no_number_are_not_drawn(tmp_path: Path) -> None:
     assert {name: (at.tolist(), of.tolist()) for name, (at, of) in run.metrics.items()} == {
         "train/loss": ([9, 39], [2.5, 1.5])
     }
-    assert "<svg" in write_comparison([run.folder], tmp_path).read_text()
+    assert "<svg" in compared([run.folder], tmp_path).read_text()
 
 
 def test_a_damaged_description_of_the_training_costs_no_evaluation(

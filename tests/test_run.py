@@ -105,6 +105,36 @@ def test_a_policy_sees_the_pictures_of_its_training_and_those_of_the_other_rende
     assert "renderer_mujoco" in done.stdout
 
 
+def test_an_evaluation_ends_when_what_it_is_asked_is_decided(home: Path) -> None:
+    policy = ("checkpoint=run/checkpoints/last.ckpt", "cluster.workers=1", "task.time_limit=0.2", "recorder=none")
+    asked = (*policy, "evaluate.episodes=40", "evaluate.until=decided", "evaluate.margin=0.9")
+    done = here(home, *asked, "evaluate.bar=0.5", "evaluate=memory", "output=beside")
+    report = json.loads((home / "beside/report.json").read_text())
+    assert report["conditions"].keys() == {"without_images", "without_instruction"}
+    blind = report["conditions"]["without_images"]
+    assert report["anytime"] and blind["anytime"] and 1 < blind["episodes"] < report["episodes"] < 40
+    assert report["successes"] == 0 and report["ci_high"] < 0.5  # hardly trained
+    assert report["statements"] == ["success is below the bar of 50 %"]
+    assert blind["comparison"]["verdict"] == "not worse by 90 points"
+    assert report["statements"][0] in done.stdout and "anytime-valid 95 % CI" in done.stdout.strip().splitlines()[-1]
+    page = (home / "beside/report.html").read_text()
+    assert report["statements"][0] in page and "anytime-valid" in page
+    here(home, *asked, "evaluate.against=beside", "output=against")
+    again = json.loads((home / "against/report.json").read_text())
+    assert again["statements"][0].startswith(f"compared with beside on {blind['episodes']} common episodes: not worse")
+
+
+def test_what_an_evaluation_cannot_decide_is_refused_before_any_work(home: Path) -> None:
+    arguments = ("checkpoint=run/checkpoints/last.ckpt", "cluster.workers=1", "output=refused")
+    for asked, says in (
+        ("evaluate.until=decided", "needs something to decide: evaluate.bar=0.95"),
+        ("evaluate.against=nowhere", "nowhere is no run"),
+        ("evaluate.bar=1.0", "evaluate.bar must be a number, more than 0, less than 1, or null"),
+    ):
+        refused = here(home, *arguments, asked, ok=False)
+        assert says in refused.stderr and not (home / "refused/report.json").exists(), refused.stderr
+
+
 def test_the_same_command_in_the_same_folder_does_nothing_twice(home: Path) -> None:
     arguments = (*SMALL, "validate.episodes=1", "hydra.run.dir=run")
     made = {home / "run" / name: (home / "run" / name).stat().st_mtime_ns for name in ("report.json", "metrics.csv")}

@@ -12,7 +12,7 @@ from PIL import Image
 from rich.console import Console
 
 from vla.reports.conditions import conditions_table, plot_conditions
-from vla.rollouts.evaluate import FIRST_SEED, Report, Result
+from vla.rollouts.evaluate import FIRST_SEED, Report, Result, compare_conditions
 
 
 def a_report(outcomes: str) -> Report:
@@ -21,27 +21,35 @@ def a_report(outcomes: str) -> Report:
     return Report(tuple(Result(FIRST_SEED + index, names[outcome]) for index, outcome in enumerate(outcomes)))
 
 
+def p_value(first: str, second: str) -> float:
+    return a_report(first).compare(a_report(second)).p
+
+
 def test_only_pairs_that_differ_count() -> None:
     # one lost, five won: 2 · (1 + 6) / 2^6
-    assert a_report("1000001111").p_value(a_report("0111111111")) == pytest.approx(14 / 64)
-    assert a_report("1100").p_value(a_report("1100")) == 1.0
-    assert a_report("1e00").p_value(a_report("1000")) == 1.0
+    assert p_value("1000001111", "0111111111") == pytest.approx(14 / 64)
+    assert p_value("1100", "1100") == 1.0
+    assert p_value("1e00", "1000") == 1.0
     # ten lost, none won: 2 / 2^10
-    assert a_report("1" * 10).p_value(a_report("0" * 10)) == pytest.approx(2 / 1024)
+    assert p_value("1" * 10, "0" * 10) == pytest.approx(2 / 1024)
+    told = a_report("1100e").compare(a_report("10101"))
+    assert (told.difference, told.episodes, told.only_first, told.only_second) == (0, 4, 1, 1)
 
 
 def test_reports_on_different_seeds_are_not_compared() -> None:
     with pytest.raises(ValueError, match="same seeds"):
-        a_report("11").p_value(a_report("1"))
+        a_report("11").compare(a_report("1"))
 
 
 def test_the_table_and_the_picture_show_every_condition(tmp_path: Path, figures: list[Figure]) -> None:
     hard, wide = (a_report("1" * count + "0" * (20 - count)) for count in (10, 15))
     reports = {"seen": a_report("1" * 20), "light_hard": hard, "light_wide": wide}
-    console = Console(file=io.StringIO(), width=100)
-    console.print(conditions_table(reports))
+    console = Console(file=io.StringIO(), width=120)
+    console.print(conditions_table(reports, compare_conditions(reports, 0.02)))
     told = console.file.getvalue()  # type: ignore[attr-defined]
     assert "light_hard" in told and "50.0" in told and "29.9-70.1" in told and "0.002" in told
+    # ten lost, none won, and of two comparisons the clearer one counts twice
+    assert "-50.0" in told and "0.0039" in told and "worse" in told
     plot_conditions(reports, tmp_path / "suite.png")
     (axes,) = figures[0].axes
     assert points(axes) == [(1.0, 1.0), (0.75, 0.13), (0.5, -0.13)]

@@ -6,16 +6,16 @@ import hashlib
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Annotated, Any, cast
+from typing import Annotated, Any, Literal, cast
 
-from annotated_types import Ge
+from annotated_types import Ge, Gt, Lt, Predicate
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
 from vla.config.annotations import fits, locate
 from vla.config.build import GROUPS, Group, arguments, check_node, check_value, makes, require_known
 from vla.config.conditions import conditions
-from vla.io.types import Count, Natural, Seed, Shift, Text
+from vla.io.types import Count, Natural, Seed, Shift, Text, unique
 from vla.spec import FIRST_SEED
 
 UnseenSeed = Annotated[Seed, Ge(FIRST_SEED)]
@@ -58,9 +58,14 @@ PLAIN: dict[str, Any] = {
     "evaluate": {
         "episodes": Count,
         "seed": UnseenSeed,
+        "until": Literal["decided"] | None,
+        "bar": Annotated[float, Gt(0), Lt(1)] | None,
+        "against": Text | None,
+        "margin": Annotated[float, Gt(0), Lt(1)],
         "recordings": Natural | None,
         "conditions": dict[str, dict[str, object]],
         "one_by_one": dict[str, dict[str, dict[str, object]]],
+        "without": Annotated[list[Literal["images", "instruction"]], Predicate(unique)],
     },
 }
 

@@ -7,8 +7,9 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -22,9 +23,11 @@ from vla.policy import latency
 from vla.reports.conditions import conditions_table, plot_conditions
 from vla.reports.evaluation import plot_report, write_report
 from vla.reports.html import PAGE, optional, write_page
-from vla.rollouts.evaluate import IN_DISTRIBUTION, Report, evaluate, keep_recordings
+from vla.rollouts.evaluate import IN_DISTRIBUTION, Report, compare_conditions, evaluate, keep_recordings
+from vla.rollouts.memory import Sense, make_impaired
+from vla.rollouts.statements import AgainstBar, AgainstCondition, AgainstRun, Statement
 from vla.runs.files import Round
-from vla.runs.folder import CHECKPOINTS, save_config, wall_time
+from vla.runs.folder import CHECKPOINTS, require_run, save_config, wall_time
 from vla.runs.resume import cached_success, training_lock
 
 log = logging.getLogger(__name__)
@@ -44,6 +47,7 @@ def run(experiment: Experiment) -> float | None:
         ValueError: an episode ended in an error; the report is written and contains it.
     """
     output = experiment.output
+    _statements(experiment)  # that they can be made, before any work
     if experiment["agent"]:
         return _evaluated(experiment, None)
     if not experiment.playable and experiment["evaluate"]["conditions"]:
@@ -75,26 +79,55 @@ def evaluate_trained(experiment: Experiment, checkpoint: Path, rounds: Sequence[
 def _evaluated(experiment: Experiment, checkpoint: Path | None, rounds: Sequence[Round] = ()) -> float:
     """Play the episodes, write the reports, and return the success rate; print it even if writing fails."""
     started, output = time.monotonic(), experiment.output
-    reports = _play(experiment, checkpoint)
+    statements = _statements(experiment)
+    reports = _play(experiment, checkpoint, statements)
     report = reports[IN_DISTRIBUTION]
     try:
         with writing(output / "report.json"):
-            _write(experiment, checkpoint, reports, rounds, started)
+            _write(experiment, checkpoint, reports, statements, rounds, started)
     finally:
-        print(report)
+        print("\n".join([*(each.say(report) for each in statements), str(report)]))
     errors = [error for each in reports.values() for error in each.errors]
     if errors:
         raise ValueError(f"{len(errors)} episodes ended in an error, see {output / 'report.json'}")
     return report.success
 
 
-def _play(experiment: Experiment, checkpoint: Path | None) -> dict[str, Report]:
+def _statements(experiment: Experiment) -> list[Statement]:
+    """Return what the evaluation is to decide about the training condition.
+
+    Raises:
+        ValueError: there is no such run to compare with, or nothing to decide.
+    """
+    asked = experiment["evaluate"]
+    bar, against, found = asked["bar"], asked["against"], list[Statement]()
+    if bar is not None:
+        found.append(AgainstBar(bar))
+    if against is not None:
+        report = require_run(Path(against)).report
+        if report is None:
+            raise ValueError(f"evaluate.against={against} has no report.json to compare with: evaluate that run first")
+        found.append(AgainstRun(against, {result.seed: result for result in report.per_episode}, asked["margin"]))
+    if asked["until"] and not found and not conditions(asked) and not asked["without"]:
+        raise ValueError(
+            "evaluate.until=decided needs something to decide: evaluate.bar=0.95, evaluate.against=RUN, or conditions, "
+            "as in evaluate=suite"
+        )
+    if not experiment.playable and (found or asked["until"] or asked["without"]):
+        raise ValueError(
+            "evaluate.bar, against, until and without are about success, which a recording has not: omit them"
+        )
+    return found
+
+
+def _play(experiment: Experiment, checkpoint: Path | None, statements: Sequence[Statement]) -> dict[str, Report]:
     """Return condition → report on the same seeds; only the first, the training condition, is recorded.
 
-    Without a checkpoint the agent of the config acts.
+    Without a checkpoint the agent of the config acts. With `evaluate.until` the first condition is played until all
+    statements are clear, and every other one, on the seeds of the first, until its difference from the first is.
     """
     asked, task = experiment["evaluate"], experiment["task"]
-    seeds = range(asked["seed"], asked["seed"] + asked["episodes"])
+    seeds: Sequence[int] = range(asked["seed"], asked["seed"] + asked["episodes"])
     cluster, needs = experiment.cluster(), [checkpoint.resolve()] if checkpoint else []
     make_agent = experiment.make_agent() or experiment.make_policy(needs[0])
     recordings = experiment.output.resolve() / "recordings"
@@ -102,29 +135,44 @@ def _play(experiment: Experiment, checkpoint: Path | None) -> dict[str, Report]:
     if recorder:
         recordings.mkdir(exist_ok=True)
         needs.append(recordings)
-    reports: dict[str, Report] = {}
-    for name, changes in {IN_DISTRIBUTION: {}, **conditions(asked)}.items():
-        if reports and with_changes(task, changes) == task:  # equal to the training condition
+    impaired: dict[str, Sense] = {f"without_{sense}": sense for sense in asked["without"]}
+    named = {IN_DISTRIBUTION: {}, **conditions(asked), **{name: {} for name in impaired}}
+    different = sum(name in impaired or with_changes(task, changes) != task for name, changes in named.items())
+    until, reports = [each.is_clear for each in statements], dict[str, Report]()
+    for name, changes in named.items():
+        if reports and name not in impaired and with_changes(task, changes) == task:  # equal to the training condition
             reports[name] = reports[IN_DISTRIBUTION]
             continue
+        make = partial(make_impaired, make_agent, impaired[name]) if name in impaired else make_agent
         watching = None if reports else recorder
         make_environment = experiment.make_environment(changes)
         tiers = task.get("tiers")  # of worlds that have them
-        reports[name] = evaluate(make_environment, make_agent, watching, seeds, cluster, name, needs, tiers)
+        clear = partial(_all, until) if asked["until"] and until else None
+        reports[name] = evaluate(make_environment, make, watching, seeds, cluster, name, needs, tiers, clear)
+        first = reports[IN_DISTRIBUTION]
+        seeds = [result.seed for result in first.results]
+        until = [AgainstCondition(first, asked["margin"], different).is_clear]
     return reports
+
+
+def _all(conditions: Sequence[Callable[[Report], bool]], report: Report) -> bool:
+    return all(each(report) for each in conditions)
 
 
 def _write(
     experiment: Experiment,
     checkpoint: Path | None,
     reports: dict[str, Report],
+    statements: Sequence[Statement],
     rounds: Sequence[Round],
     started: float,
 ) -> None:
     """Write all results of an evaluation that started at `started` [s]."""
     output, report = experiment.output, reports[IN_DISTRIBUTION]
     others = {name: each for name, each in reports.items() if name != IN_DISTRIBUTION}
+    compared = compare_conditions(reports, experiment["evaluate"]["margin"])
     facts = _facts(experiment, checkpoint, rounds, time.monotonic() - started)
+    facts["statements"] = [each.say(report) for each in statements]
     save_config(output, experiment.config, experiment.changes)
     if experiment["recorder"]:
         recording, limit = output / "rollouts.rrd", experiment["evaluate"]["recordings"]
@@ -133,11 +181,10 @@ def _write(
     plot_report(report, output / "report.png")
     if others:
         plot_conditions(reports, output / "suite.png")
-        show(conditions_table(reports))
+        show(conditions_table(reports, compared))
+    used = str(checkpoint) if checkpoint else None
     # Last, because its existence marks the evaluation as finished.
-    write_report(
-        report, output / "report.json", str(checkpoint) if checkpoint else None, experiment.config, facts, others
-    )
+    write_report(report, output / "report.json", used, experiment.config, facts, others, compared)
     with optional(output / PAGE):
         write_page(output)
     log.info(

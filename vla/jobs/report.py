@@ -5,9 +5,12 @@ from __future__ import annotations
 import logging
 from pathlib import Path
 
+from rich import print as show
+
 from vla.config.check import Job
 from vla.config.experiment import Experiment
 from vla.io.types import Text
+from vla.reports.comparison import compare_runs, read_runs, runs_table
 from vla.reports.html import write_comparison
 
 log = logging.getLogger(__name__)
@@ -16,7 +19,9 @@ JOB = Job((), {"runs": list[Text]})
 
 
 def run(experiment: Experiment) -> None:
-    """Write `comparison.html`."""
-    log.info(
-        "wrote %s", write_comparison([Path(run) for run in experiment["report"]["runs"]], Path(experiment["output"]))
-    )
+    """Write `comparison.html`, and print how the runs differ."""
+    runs = read_runs([Path(folder) for folder in experiment["report"]["runs"]])
+    compared = compare_runs(runs, experiment["evaluate"]["margin"])
+    if compared:
+        show(runs_table(compared))
+    log.info("wrote %s", write_comparison(runs, compared, Path(experiment["output"])))

@@ -9,22 +9,32 @@ from matplotlib.figure import Figure
 from rich.table import Table
 
 from vla.reports.style import BLUE, GREEN, GREY, RED, error_bars, save
+from vla.rollouts.comparison import Comparison
 from vla.rollouts.evaluate import Report
 
 # Suffix of a condition's name → colour, and vertical offset within the row.
 LEVELS = {"": (GREEN, 0.0), "wide": (BLUE, -0.13), "hard": (RED, 0.13)}
+COMPARED = ("difference", "95 % CI", "p", "p Holm", "verdict")  # heads of `comparison_texts`
 
 
-def conditions_table(reports: Mapping[str, Report]) -> Table:
-    """Tabulate success, its interval, and the p-value against the first condition, one row per condition."""
-    table = Table("condition", "success", "of", "%", "95 % CI", "p")
-    first = next(iter(reports.values()))
+def conditions_table(reports: Mapping[str, Report], compared: Mapping[str, Comparison]) -> Table:
+    """Tabulate success and its interval per condition, and its comparison with the first condition."""
+    table = Table("condition", "success", "of", "%", "95 % CI", *COMPARED)
     for name, report in reports.items():
         low, high = report.interval
-        p = "" if report is first else f"{first.p_value(report):.2g}"
-        shares = f"{100 * report.success:.1f}", f"{100 * low:.1f}-{100 * high:.1f}"
-        table.add_row(name, str(report.successes), str(report.episodes), *shares, p)
+        rate = f"{100 * report.success:.1f}", f"{100 * low:.1f}-{100 * high:.1f}"
+        found = comparison_texts(compared[name]) if name in compared else ()
+        table.add_row(name, str(report.successes), str(report.episodes), *rate, *found)
     return table
+
+
+def comparison_texts(compared: Comparison) -> tuple[str, str, str, str, str]:
+    """Format difference and interval in percentage points, both p-values, and the verdict."""
+    difference, low, high = (
+        f"{100 * share:+.1f}" for share in (compared.difference, compared.ci_low, compared.ci_high)
+    )
+    together = "" if compared.p_holm is None else f"{compared.p_holm:.2g}"
+    return difference, f"{low} to {high}", f"{compared.p:.2g}", together, compared.verdict
 
 
 def plot_conditions(reports: Mapping[str, Report], path: Path) -> None:

@@ -20,6 +20,7 @@ from vla.data.draws import flat, leaves
 from vla.io.files import write_text
 from vla.reports.factors import association, factors, groups, numeric
 from vla.reports.style import GREEN, GREY, RED, error_bars, save
+from vla.rollouts.comparison import Comparison
 from vla.rollouts.evaluate import ERROR, Report, Result
 from vla.rollouts.statistics import wilson_interval
 from vla.spec import Array, Observation
@@ -36,6 +37,7 @@ def write_report(
     config: Mapping[str, Any],
     facts: Mapping[str, Any] | None = None,
     conditions: Mapping[str, Report] | None = None,
+    compared: Mapping[str, Comparison] | None = None,
 ) -> None:
     """Write a report as JSON atomically.
 
@@ -46,6 +48,7 @@ def write_report(
         config: the resolved config.
         facts: further entries, such as chosen options, parameters and latency.
         conditions: condition → report on the same seeds.
+        compared: condition → comparison of its success with the first.
     """
     content = {
         **summary(report),
@@ -53,7 +56,11 @@ def write_report(
         "checkpoint": checkpoint,
         **(facts or {}),
         "conditions": {
-            name: {**summary(other), "outcomes": [result.outcome for result in other.results]}
+            name: {
+                **summary(other),
+                "comparison": asdict(compared[name]) if compared else None,
+                "outcomes": [result.outcome for result in other.results],
+            }
             for name, other in (conditions or {}).items()
         },
         "config": config,
@@ -79,16 +86,17 @@ def summary(report: Report) -> dict[str, Any]:
         "successes": report.successes,
         "errors": len(report.errors),
         "taxonomy": report.taxonomy,
-        "milestones": {name: _milestone(count, report.episodes) for name, count in report.milestones.items()},
+        "milestones": {name: _milestone(report, count) for name, count in report.milestones.items()},
         "tasks": {task: summary(part) for task, part in tasks.items()},
         **({"tiers": {tier: summary(part) for tier, part in tiers.items()}} if tiers else {}),
         **({"mean_over_tiers": dict(zip(("rate", "ci_low", "ci_high"), mean, strict=True))} if mean else {}),
+        **({"anytime": True} if report.anytime else {}),
     }
 
 
-def _milestone(count: int, episodes: int) -> dict[str, Any]:
-    low, high = wilson_interval(count, episodes)
-    return {"rate": count / max(episodes, 1), "ci_low": low, "ci_high": high, "episodes": count}
+def _milestone(report: Report, count: int) -> dict[str, Any]:
+    low, high = report.interval_of(count)
+    return {"rate": count / max(report.episodes, 1), "ci_low": low, "ci_high": high, "episodes": count}
 
 
 def plot_report(report: Report, path: Path) -> None:

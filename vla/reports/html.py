@@ -9,7 +9,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from datetime import datetime
-from itertools import combinations
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
@@ -21,10 +20,13 @@ from markupsafe import Markup
 from vla.config.differences import ABSENT, at, differences
 from vla.data.index import listed
 from vla.io.files import write_text
+from vla.reports.comparison import RunComparison
+from vla.reports.conditions import comparison_texts
+from vla.reports.posteriors import draw_posteriors
 from vla.reports.style import BLUE, GREEN, GREY, RED, Interval
 from vla.reports.training_curves import colours, draw_run, draw_runs
-from vla.rollouts.evaluate import ERROR, IN_DISTRIBUTION, Report, Result
-from vla.runs.folder import Run, read_run, require_run
+from vla.rollouts.evaluate import IN_DISTRIBUTION, Report
+from vla.runs.folder import Run, read_run
 from vla.spec import READABLE
 
 log = logging.getLogger(__name__)
@@ -70,6 +72,7 @@ def write_page(folder: Path) -> Path:
         "run.html",
         title=_title(run),
         run=run,
+        anytime=any(report.anytime for report in run.reports.values()),
         facts=_facts(run),
         all_steps=at(run.config, "trainer.max_steps", None),
         tables=_rate_tables(run),
@@ -80,16 +83,12 @@ def write_page(folder: Path) -> Path:
     )
 
 
-def write_comparison(folders: Sequence[Path], target: Path) -> Path:
-    """Write a page that compares several runs into the folder `target`, and return its path.
+def write_comparison(runs: Mapping[str, Run], compared: Sequence[RunComparison], target: Path) -> Path:
+    """Write a page on several runs, by name, and their comparisons into the folder `target`, and return its path.
 
     Raises:
-        ValueError: no folder is given, a folder is no run, or a file in it is damaged.
+        ValueError: a recording is damaged.
     """
-    if not folders:
-        raise ValueError("name the runs to compare, as in report.runs=[RUN,RUN]")
-    read = [require_run(folder) for folder in folders]
-    runs = dict(zip(_names(folders), read, strict=True))
     lines = [
         TableRow(
             [name],
@@ -100,14 +99,17 @@ def write_comparison(folders: Sequence[Path], target: Path) -> Path:
         )
         for (name, run), colour in zip(runs.items(), colours(len(runs)), strict=True)
     ]
+    reports = {name: run.reports[IN_DISTRIBUTION] for name, run in runs.items() if run.reports}
     return _write(
         target / COMPARISON,
         "comparison.html",
         title=f"{len(runs)} runs" if len(runs) > 1 else next(iter(runs)),
         lines=lines,
         heads=(["run"], ["model", "parameters [M]", "action [ms]", "steps", "time"], ""),
+        posteriors=draw_posteriors(reports, compared, colours(len(runs))) if len(reports) == len(runs) else None,
         curves=draw_runs({name: run.metrics for name, run in runs.items()}),
-        pairs=_pairs(runs),
+        pairs=[(each, comparison_texts(each.found)) for each in compared],
+        anytime=any(report.anytime for run in runs.values() for report in run.reports.values()),
         differences=_config_differences(runs),
         strips={name: strips for name, run in runs.items() if (strips := _filmstrips(run, COMPARED, 0))},
         links={name: _links(run.folder, target) for name, run in runs.items()},
@@ -194,33 +196,34 @@ def _error_table(run: Run) -> list[tuple[str, str, str]]:
     return rows
 
 
-def _rate_tables(run: Run) -> dict[str, dict[str, tuple[Interval, str, str]]]:
-    """Return table → name → (rate, count, p-value against the first condition) of a run's page."""
+def _rate_tables(run: Run) -> dict[str, dict[str, tuple[Interval, str, Sequence[str]]]]:
+    """Return table → name → (rate, count, comparison with the first condition) of a run's page."""
     if run.report is None:
         return {"condition": {}, "tier": {}, "task": {}, "milestone": {}}
-    first = next(iter(run.reports.values()))
+    first, conditions = next(iter(run.reports.values())), run.report.conditions
     mean = first.mean_over_tiers
+    compared = {name: each.comparison for name, each in conditions.items() if each.comparison}
     return {
         "condition": {
             name: (
                 _interval(report),
                 f"{report.successes}/{report.episodes}",
-                "" if report is first else f"{first.p_value(report):.2g}",
+                comparison_texts(compared[name]) if name in compared else (),
             )
             for name, report in run.reports.items()
         },
         "tier": {
             **{
-                name: (_interval(part), f"{part.successes}/{part.episodes}", "") for name, part in first.by_tier.items()
+                name: (_interval(part), f"{part.successes}/{part.episodes}", ()) for name, part in first.by_tier.items()
             },
-            **({"mean over tiers": (mean, "", "")} if mean else {}),
+            **({"mean over tiers": (mean, "", ())} if mean else {}),
         },
         "task": {
-            name: ((part.success, part.ci_low, part.ci_high), f"{part.successes}/{part.episodes}", "")
+            name: ((part.success, part.ci_low, part.ci_high), f"{part.successes}/{part.episodes}", ())
             for name, part in run.report.tasks.items()
         },
         "milestone": {
-            name: ((part.rate, part.ci_low, part.ci_high), f"{part.episodes}/{run.report.episodes}", "")
+            name: ((part.rate, part.ci_low, part.ci_high), f"{part.episodes}/{run.report.episodes}", ())
             for name, part in run.report.milestones.items()
         },
     }
@@ -250,34 +253,6 @@ def _links(run: Path, page: Path) -> dict[str, str]:
     }
 
 
-def _pairs(runs: Mapping[str, Run]) -> list[dict[str, Any]]:
-    """Compare every two runs on their common episodes, per condition: discordant pairs and the p-value."""
-    found = []
-    for one, other in combinations(runs, 2):
-        for condition in runs[one].reports:
-            first, second = (_by_seed(runs[name], condition) for name in (one, other))
-            # The same seed gives another episode under another goal or level of randomisation.
-            seeds = [seed for seed, (_, scene) in first.items() if seed in second and scene == second[seed][1]]
-            if seeds:
-                a, b = (Report(tuple(results[seed][0] for seed in seeds)) for results in (first, second))
-                won = [
-                    (x.outcome == "success", y.outcome == "success") for x, y in zip(a.results, b.results, strict=True)
-                ]
-                counts = {"first": won.count((True, False)), "second": won.count((False, True)), "seeds": len(seeds)}
-                found.append({"one": one, "other": other, "condition": condition, **counts, "p": a.p_value(b)})
-    return found
-
-
-def _by_seed(run: Run, condition: str) -> dict[int, tuple[Result, Any]]:
-    """Return seed → result under a condition, and what identifies its scene and instruction."""
-    results = [result for result in run.reports.get(condition, Report(())).results if result.outcome != ERROR]
-    if condition == IN_DISTRIBUTION:
-        return {result.seed: (result, (result.instruction, result.draws)) for result in results}
-    config = run.report.config if run.report else {}
-    scene = at(config, "task"), at(at(config, "evaluate.conditions"), condition)
-    return {result.seed: (result, scene) for result in results}
-
-
 def _config_differences(runs: Mapping[str, Run]) -> dict[str, list[Any]]:
     """Return dotted key → its value in each run, for all keys that differ."""
     first, *others = (run.config for run in runs.values())
@@ -291,16 +266,6 @@ def _filmstrips(run: Run, failures: int, successes: int) -> list[Any]:
     from vla.reports.filmstrips import read_filmstrips  # imports rerun
 
     return read_filmstrips(run.folder / RECORDING, failures, successes)
-
-
-def _names(folders: Sequence[Path]) -> list[str]:
-    """Return the shortest path suffixes of equal length that distinguish the folders."""
-    paths = [folder.resolve().parts for folder in folders]
-    for length in range(1, max(map(len, paths)) + 1):
-        names = ["/".join(path[-length:]) for path in paths]
-        if len(set(names)) == len(names):
-            return names
-    raise ValueError("report.runs contains a folder twice")
 
 
 def _percent(share: float) -> str:

@@ -1,10 +1,15 @@
-"""What all plots share: colours, error bars and the files."""
+"""What all plots share: colours, error bars, files, and pictures within a page."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import io
+import re
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
+import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
 
@@ -14,6 +19,7 @@ from vla.spec import Array
 Interval = tuple[float, float, float]  # success rate and its 95 % confidence interval
 
 GREEN, RED, BLUE, GREY = "#2e9e5b", "#d2483f", "#3b76c4", "#8a8f98"
+INK = "#010203"  # placeholder for the page's text colour
 
 
 def error_bars(rates: Iterable[Interval]) -> tuple[Array, Array]:
@@ -28,3 +34,22 @@ def save(figure: Figure, path: Path, dpi: int = 110) -> None:
         axes.spines[["top", "right"]].set_visible(False)
     with atomic_path(path) as draft:
         figure.savefig(draft, format="png", dpi=dpi)
+
+
+@contextmanager
+def svg_style(title: str) -> Iterator[None]:
+    """Draw within this context what `as_svg` converts; the title makes its identifiers unique on a page."""
+    settings: Any = {"svg.fonttype": "none", "svg.hashsalt": title, "text.parse_math": False, "font.size": 9}
+    settings |= {f"{part}.color": INK for part in ("text", "xtick", "ytick")}
+    settings |= {"axes.edgecolor": INK, "axes.labelcolor": INK, "grid.color": INK, "axes.linewidth": 0.6}
+    with matplotlib.rc_context(settings):
+        yield
+
+
+def as_svg(figure: Figure) -> str:
+    """Convert a figure to SVG in the page's text colour, without external references, not even XML namespaces."""
+    file = io.StringIO()
+    figure.savefig(file, format="svg", transparent=True, metadata={"Date": None})
+    svg = file.getvalue()
+    svg = re.sub(r"<metadata>.*?</metadata>", "", svg[svg.index("<svg") :], flags=re.DOTALL)
+    return re.sub(r' xmlns(:\w+)?="[^"]*"', "", svg).replace(INK, "currentColor")

@@ -2,21 +2,18 @@
 
 from __future__ import annotations
 
-import io
 import re
 from collections.abc import Mapping
 from typing import Any
 
-import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
 
-from vla.reports.style import BLUE, GREEN, GREY, RED
+from vla.reports.style import BLUE, GREEN, GREY, RED, as_svg, svg_style
 from vla.runs.folder import Curve
 
 COLOURS = (GREEN, BLUE, RED, "#d9942b", "#8a5bb8", "#2f9fa3", "#b5628f", GREY)  # of runs, or of components
 SIZE = (3.4, 2.3)  # of a figure [inch]
-INK = "#010203"  # placeholder for the page's text colour
 DECADE = 10.0  # ratio of maximum to minimum above which a loss has a logarithmic axis
 
 Lines = list[tuple[str, bool, str, Curve]]  # label or "", logged in training (not validation), colour, curve
@@ -76,11 +73,7 @@ def _ordered(families: Mapping[str, Lines]) -> dict[str, Lines]:
 
 
 def _draw(title: str, lines: Lines) -> str:
-    """Draw an SVG without external references, not even XML namespaces."""
-    settings: Any = {"svg.fonttype": "none", "svg.hashsalt": title, "text.parse_math": False, "font.size": 9}
-    settings |= {f"{part}.color": INK for part in ("text", "xtick", "ytick")}
-    settings |= {"axes.edgecolor": INK, "axes.labelcolor": INK, "grid.color": INK, "axes.linewidth": 0.6}
-    with matplotlib.rc_context(settings):
+    with svg_style(title):
         figure = Figure(figsize=SIZE, layout="constrained")
         axes = figure.add_subplot()
         for label, training, colour, (steps, values) in lines:
@@ -102,11 +95,7 @@ def _draw(title: str, lines: Lines) -> str:
         axes.grid(alpha=0.12)
         axes.spines[["top", "right"]].set_visible(False)
         axes.tick_params(width=0.6)
-        file = io.StringIO()
-        figure.savefig(file, format="svg", transparent=True, metadata={"Date": None})
-    svg = file.getvalue()
-    svg = re.sub(r"<metadata>.*?</metadata>", "", svg[svg.index("<svg") :], flags=re.DOTALL)
-    return re.sub(r' xmlns(:\w+)?="[^"]*"', "", svg).replace(INK, "currentColor")
+        return as_svg(figure)
 
 
 def _spans_decades(lines: Lines) -> bool:

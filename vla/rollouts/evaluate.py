@@ -9,9 +9,9 @@ import json
 import logging
 import traceback
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -19,8 +19,10 @@ from typing import Any
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from vla.parallel.pool import THIS_PROCESS, Cluster, Crashed
+from vla.rollouts.comparison import Comparison, Pairs, compare_pairs, concluded
 from vla.rollouts.rollout import rollout
-from vla.rollouts.statistics import mcnemar, stratified_interval, wilson_interval
+from vla.rollouts.sequential import anytime_interval
+from vla.rollouts.statistics import stratified_interval, wilson_interval
 from vla.spec import FIRST_SEED, Agent, Environment, Episode, Recorder
 
 log = logging.getLogger(__name__)
@@ -56,6 +58,7 @@ class Report:
 
     results: tuple[Result, ...]
     tiers: Mapping[str, Sequence[str]] = field(default_factory=dict)  # tier of a benchmark → its tasks
+    anytime: bool = False  # intervals and p-values are valid whatever the reason to stop playing
 
     @property
     def errors(self) -> list[Result]:
@@ -80,10 +83,14 @@ class Report:
     @property
     def interval(self) -> tuple[float, float]:
         """95 % confidence interval of `success`; with tiers, the tasks are fixed strata."""
-        if not self.tiers:
-            return wilson_interval(self.successes, self.episodes)
+        if self.anytime or not self.tiers:
+            return self.interval_of(self.successes)
         played = [part for part in self.tasks.values() if part.episodes]
         return stratified_interval([part._share_of(self.episodes) for part in played])[1:]
+
+    def interval_of(self, count: int) -> tuple[float, float]:
+        """Return the 95 % confidence interval of the rate of an event that `count` completed episodes had."""
+        return anytime_interval(count, self.episodes - count) if self.anytime else wilson_interval(count, self.episodes)
 
     def _share_of(self, episodes: float) -> tuple[int, int, float]:
         """Return successes, completed episodes, and their share of `episodes`."""
@@ -103,22 +110,27 @@ class Report:
     def tasks(self) -> dict[str, Report]:
         """Task → report of its episodes, sorted by name; without errors of unknown task."""
         names = sorted({result.task for result in self.results if result.task})
-        return {name: Report(tuple(result for result in self.results if result.task == name)) for name in names}
+        return {name: self._part([name]) for name in names}
 
     @property
     def by_tier(self) -> dict[str, Report]:
         """Tier → report of its episodes; without tiers of which no episode was completed."""
-        parts = {
-            tier: Report(tuple(result for result in self.results if result.task in tasks), {tier: tasks})
-            for tier, tasks in self.tiers.items()
-        }
+        parts = {tier: self._part(tasks, {tier: tasks}) for tier, tasks in self.tiers.items()}
         return {tier: part for tier, part in parts.items() if part.episodes}
+
+    def _part(self, tasks: Sequence[str], tiers: Mapping[str, Sequence[str]] | None = None) -> Report:
+        return replace(
+            self, results=tuple(result for result in self.results if result.task in tasks), tiers=tiers or {}
+        )
 
     @property
     def mean_over_tiers(self) -> tuple[float, float, float] | None:
-        """Mean of the tiers' success rates, 0…1, with its 95 % confidence interval; None with fewer than two tiers."""
+        """Mean of the tiers' success rates, 0…1, with its 95 % confidence interval.
+
+        None with fewer than two tiers, or if it must be valid whatever the reason to stop playing.
+        """
         tiers = list(self.by_tier.values())
-        if len(tiers) < 2:
+        if len(tiers) < 2 or self.anytime:
             return None
         return stratified_interval(
             [
@@ -129,20 +141,21 @@ class Report:
             ]
         )
 
-    def p_value(self, other: Report) -> float:
-        """Return the two-sided exact p-value for equal success on the same seeds, over pairs without an error.
+    def compare(self, other: Report) -> Comparison:
+        """Compare the success of another report, as the second, with this one, the first, on the same seeds.
+
+        Pairs with an error do not count. Where episodes were played until it was clear, one report may be longer.
 
         Raises:
             ValueError: the reports have different seeds.
         """
-        if [result.seed for result in self.results] != [result.seed for result in other.results]:
+        anytime = self.anytime or other.anytime
+        together = list(zip(self.results, other.results, strict=False))
+        if any(one.seed != two.seed for one, two in together) or (
+            len(self.results) != len(other.results) and not anytime
+        ):
             raise ValueError("only reports on the same seeds can be compared")
-        pairs = Counter(
-            (one.outcome == "success", two.outcome == "success")
-            for one, two in zip(self.results, other.results, strict=True)
-            if ERROR not in (one.outcome, two.outcome)
-        )
-        return mcnemar(pairs[True, False], pairs[False, True])
+        return compare_pairs(pairs_of(together), anytime)
 
     def __str__(self) -> str:
         """Format failures, errors, milestones, several tasks, tiers and, last, the success rate with its interval."""
@@ -150,30 +163,43 @@ class Report:
         if self.errors:
             first = self.errors[0]
             lines.append(f"errors {len(self.errors)}, the first at seed {first.seed}: {first.error}")
-        lines += [f"{name} {_rate(count, self.episodes)}" for name, count in self.milestones.items()]
+        lines += [f"{name} {self._rate(count)}" for name, count in self.milestones.items()]
         if len(self.tasks) > 1:
-            lines += [f"{task} {report._rate}" for task, report in self.tasks.items()]
-        lines += [f"{tier.replace('_', ' ')} {report._rate}" for tier, report in self.by_tier.items()]
+            lines += [f"{task} {report._rate()}" for task, report in self.tasks.items()]
+        lines += [f"{tier.replace('_', ' ')} {report._rate()}" for tier, report in self.by_tier.items()]
         if mean := self.mean_over_tiers:
             rate, low, high = (f"{100 * value:.1f}" for value in mean)
             lines.append(f"mean over tiers {rate} % (95 % CI {low}-{high})")
-        return "\n".join([*lines, f"success {self._rate}"])
+        return "\n".join([*lines, f"success {self._rate()}"])
 
-    @property
-    def _rate(self) -> str:
+    def _rate(self, count: int | None = None) -> str:
+        """Format the rate of an event that `count` completed episodes had, by default that of success."""
         if not self.episodes:
-            return _rate(0, 0)
-        return f"{self.successes}/{self.episodes} ({_percent(self.success, *self.interval)})"
+            return "0/0 (no episode was completed)"
+        count, (low, high) = (self.successes, self.interval) if count is None else (count, self.interval_of(count))
+        share, kind = count / self.episodes, "anytime-valid 95 % CI" if self.anytime else "95 % CI"
+        return f"{count}/{self.episodes} ({100 * share:.1f} %, {kind} {100 * low:.1f}-{100 * high:.1f})"
 
 
-def _rate(count: int, episodes: int) -> str:
-    if not episodes:
-        return "0/0 (no episode was completed)"
-    return f"{count}/{episodes} ({_percent(count / episodes, *wilson_interval(count, episodes))})"
+def pairs_of(together: Iterable[tuple[Result, Result]]) -> Pairs:
+    """Count the outcomes of pairs of episodes, without those of which one was not completed."""
+    counts = Counter(
+        (one.outcome == "success", two.outcome == "success")
+        for one, two in together
+        if ERROR not in (one.outcome, two.outcome)
+    )
+    return Pairs(counts[True, True], counts[True, False], counts[False, True], counts[False, False])
 
 
-def _percent(share: float, low: float, high: float) -> str:
-    return f"{100 * share:.1f} %, 95 % CI {100 * low:.1f}-{100 * high:.1f}"
+def compare_conditions(reports: Mapping[str, Report], margin: float) -> dict[str, Comparison]:
+    """Return condition → comparison of its success with that of the first condition, which has none.
+
+    Args:
+        reports: by condition.
+        margin: what counts as not worse, 0…1.
+    """
+    (_, first), *others = reports.items()
+    return concluded({name: first.compare(report) for name, report in others}, margin)
 
 
 def evaluate(
@@ -185,11 +211,16 @@ def evaluate(
     name: str = "evaluating",
     needs: Sequence[Path] = (),
     tiers: Mapping[str, Sequence[str]] | None = None,
+    until: Callable[[Report], bool] | None = None,
 ) -> Report:
     """Play the episodes of the seeds; `name` is the label of the progress bar, `tiers` are those of the report.
 
     Every process of the `cluster` calls the factories once and accesses the paths `needs`. Errors of a factory end the
     evaluation; errors of an episode, or a crash of its process, are reported in its result.
+
+    With `until` it ends before the last seed as soon as that is true of a report of the first seeds, in their order;
+    with tiers, of whole rounds of their tasks, which take turns. Episodes of later seeds do not count even if they were
+    played, so that the report does not depend on the number of workers.
 
     Raises:
         ValueError: there are no seeds, seeds are in the range of collection, or the cluster raises one.
@@ -199,6 +230,7 @@ def evaluate(
     make = partial(_RolloutWorker, make_environment, make_agent, make_recorder)
     columns = (TextColumn(name), BarColumn(), MofNCompleteColumn(), TextColumn("{task.fields[note]}"))
     results: dict[int, Result] = {}
+    counted, clear, turns = 0, False, sum(map(len, (tiers or {}).values())) or 1
     with cluster.pool(make, needs) as pool, Progress(*columns, TimeRemainingColumn()) as bar:
         task = bar.add_task("", total=len(seeds), note="")
         seed_of = {pool.submit(seed): seed for seed in seeds}
@@ -211,13 +243,19 @@ def evaluate(
             so_far = Report(tuple(results.values()))
             errors = f", {len(so_far.errors)} errors" if so_far.errors else ""
             bar.update(task, advance=1, note=f"success {100 * so_far.success:.0f} %{errors}")
-    return Report(tuple(results[seed] for seed in seeds), tiers or {})
+            while counted < len(seeds) and seeds[counted] in results and not clear:
+                counted += 1
+                if until is not None and counted % turns == 0:
+                    clear = until(Report(tuple(results[seed] for seed in seeds[:counted]), anytime=True))
+            if clear:
+                break
+    return Report(tuple(results[seed] for seed in seeds[:counted]), tiers or {}, anytime=until is not None)
 
 
 def keep_recordings(report: Report, folder: Path, target: Path, limit: int | None) -> int:
     """Merge the recordings of an evaluation into one file, failures first, at most `limit`; returns their number.
 
-    The single files are removed, and their folder if it is empty.
+    The single files are removed, those of episodes that do not count included, and their folder if it is empty.
     """
     from vla.rollouts.recorder import merge, recording_name  # imports the viewer's library
 
@@ -225,7 +263,7 @@ def keep_recordings(report: Report, folder: Path, target: Path, limit: int | Non
     files = [file for name in names if (file := folder / f"{name}.rrd").exists()]
     if files[:limit]:
         merge(files[:limit], target)
-    for file in files:
+    for file in folder.glob("*.rrd"):
         file.unlink()
     with suppress(OSError):
         folder.rmdir()

@@ -1,4 +1,4 @@
-"""Confidence intervals of success rates, and tests of their differences."""
+"""Confidence intervals of success rates and of means."""
 
 from __future__ import annotations
 
@@ -58,19 +58,6 @@ def mean_interval(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
     half_width = t.ppf(0.975, rows - 1) * values.std(0, ddof=1) / sqrt(rows)
     return np.maximum(mean - half_width, 0), mean + half_width
-
-
-def mcnemar(lost: int, won: int) -> float:
-    """Return the two-sided exact p-value for equal success rates, given the numbers of discordant pairs.
-
-    Under the null hypothesis both kinds of pairs are equally likely (Q. McNemar, "Note on the sampling error of
-    the difference between correlated proportions or percentages", Psychometrika 12, 1947).
-    """
-    if lost == won:
-        return 1.0
-    from scipy.stats import binomtest  # the import takes a second
-
-    return float(binomtest(lost, lost + won).pvalue)
 
 
 def pooled_interval(trainings: Sequence[Mapping[int, bool]]) -> tuple[float, float]:

@@ -9,6 +9,7 @@ from pydantic import ConfigDict, StringConstraints
 
 from vla.io.documents import STRICT
 from vla.io.types import Count, Natural, NonNegative, Positive, Share
+from vla.rollouts.comparison import Comparison
 from vla.rollouts.evaluate import Result
 
 Node = dict[str, Any]
@@ -99,6 +100,7 @@ class Summary:
     tasks: dict[str, Summary]
     tiers: dict[str, Summary] = field(default_factory=dict)
     mean_over_tiers: Mean | None = None
+    anytime: bool = False  # intervals are valid whatever the reason to stop playing
 
 
 @dataclass(frozen=True)
@@ -135,7 +137,8 @@ class ErrorsFile:
 class Condition(Summary):
     """Success statistics under another condition, on the same seeds."""
 
-    outcomes: list[str]
+    outcomes: list[str]  # with `anytime`, of the first seeds
+    comparison: Comparison | None = None  # with the training condition
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -151,11 +154,13 @@ class ReportFile(Summary):
     latency_ms: Positive | None = None
     wall_time_s: NonNegative | None = None
     rounds: list[Round] = field(default_factory=list)  # of job=improve
+    statements: list[str] = field(default_factory=list)  # on what the evaluation was to decide
 
     def __post_init__(self) -> None:
         """Require the same episodes in every part."""
         if [result.seed for result in self.per_episode] != self.seeds:
             raise ValueError("per_episode has other episodes than seeds")
         for name, condition in self.conditions.items():
-            if len(condition.outcomes) != len(self.seeds):
-                raise ValueError(f"conditions.{name} has {len(condition.outcomes)} outcomes of {len(self.seeds)} seeds")
+            played = len(condition.outcomes)
+            if played > len(self.seeds) or (played < len(self.seeds) and not condition.anytime):
+                raise ValueError(f"conditions.{name} has {played} outcomes of {len(self.seeds)} seeds")

@@ -68,11 +68,11 @@ class Run:
         if not self.report:
             return {}
         others = {
-            name: Report(tuple(map(Result, self.report.seeds, part.outcomes)))
+            name: Report(tuple(map(Result, self.report.seeds, part.outcomes)), anytime=part.anytime)
             for name, part in self.report.conditions.items()
         }
         tiers = {tier: [*part.tasks] for tier, part in self.report.tiers.items()}
-        return {IN_DISTRIBUTION: Report(tuple(self.report.per_episode), tiers), **others}
+        return {IN_DISTRIBUTION: Report(tuple(self.report.per_episode), tiers, self.report.anytime), **others}
 
 
 def read_run(folder: Path) -> Run:

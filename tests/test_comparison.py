@@ -1,0 +1,95 @@
+"""Differences of success rates: published values, and what intervals and tests promise by exact enumeration."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+from scipy.stats import fisher_exact, multinomial
+
+from vla.rollouts.comparison import (
+    Comparison,
+    Pairs,
+    compare_pairs,
+    compare_samples,
+    concluded,
+    fisher,
+    newcombe,
+    newcombe_paired,
+)
+
+
+def a_comparison(p: float, difference: float = 0.1, low: float = -0.1, differ: int = 9) -> Comparison:
+    return Comparison(difference, low, 0.5, p, 100, differ, differ)
+
+
+def test_intervals_equal_the_published_ones() -> None:
+    # Newcombe 1998, page 2638: of 50 pairs 36 both, 12 and 2 one alone; page 877: 56 of 70 against 48 of 80
+    np.testing.assert_allclose(newcombe_paired(Pairs(36, 2, 12, 0)), (0.0569, 0.3404), atol=5e-5)
+    np.testing.assert_allclose(newcombe(48, 80, 56, 70), (0.0524, 0.3339), atol=5e-5)
+    assert newcombe_paired(Pairs(0, 0, 0, 0)) == (-1, 1)
+
+
+def test_the_order_of_the_policies_only_changes_the_sign() -> None:
+    for pairs in (Pairs(20, 3, 9, 8), Pairs(50, 0, 4, 0), Pairs(0, 6, 6, 2)):
+        low, high = newcombe_paired(pairs)
+        there = newcombe_paired(pairs._replace(first=pairs.second, second=pairs.first))
+        assert there == pytest.approx((-high, -low))
+    low, high = newcombe(3, 10, 19, 20)
+    assert newcombe(19, 20, 3, 10) == pytest.approx((-high, -low))
+
+
+@pytest.mark.parametrize("shares", [(0.88, 0.07, 0.03, 0.02), (0.5, 0.2, 0.2, 0.1), (0.2, 0.1, 0.6, 0.1)])
+def test_the_interval_of_pairs_covers_the_difference(shares: tuple[float, ...]) -> None:
+    episodes, covered = 30, 0.0
+    tables = [
+        Pairs(both, first, second, episodes - both - first - second)
+        for both, first, second in itertools.product(range(episodes + 1), repeat=3)
+        if both + first + second <= episodes
+    ]
+    likely = multinomial.pmf(np.array(tables), episodes, shares)
+    for pairs, probability in zip(tables, likely, strict=True):
+        if probability > 1e-6:
+            low, high = newcombe_paired(pairs)
+            covered += probability * (low <= shares[2] - shares[1] <= high)
+    assert covered > 0.94
+
+
+def test_the_test_of_different_episodes_is_fishers() -> None:
+    for one, two in ((5, 9), (10, 3), (0, 12), (7, 8)):
+        table = [[two, 20 - two], [one, 10 - one]]
+        smaller = min(fisher_exact(table, side).pvalue for side in ("less", "greater"))
+        assert fisher(one, 10, two, 20) == pytest.approx(min(1.0, 2 * smaller))
+    told = compare_samples(5, 10, 19, 20)
+    assert (told.difference, told.episodes, told.only_first) == (pytest.approx(0.45), 30, None)
+
+
+def test_p_values_are_adjusted_step_by_step() -> None:
+    found = concluded({name: a_comparison(p) for name, p in zip("abcd", (0.01, 0.04, 0.03, 0.005), strict=True)}, 0.02)
+    assert list(found) == list("abcd")
+    assert [each.p_holm for each in found.values()] == pytest.approx([0.03, 0.06, 0.06, 0.02])
+    # Pairs that never differ could not have told anything.
+    found = concluded({"a": a_comparison(0.03), "b": a_comparison(1.0, 0.0, differ=0)}, 0.02)
+    assert [each.p_holm for each in found.values()] == pytest.approx([0.03, 1.0])
+    assert concluded({}, 0.02) == {}
+
+
+def test_together_they_rarely_find_what_is_not_there() -> None:
+    random, wrong = np.random.default_rng(0), 0
+    for _ in range(300):
+        lost = random.binomial(40, 0.5, 20)
+        tests = {n: compare_pairs(Pairs(60, int(k), int(40 - k), 0)) for n, k in enumerate(lost)}
+        wrong += any(each.verdict in ("better", "worse") for each in concluded(tests, 0.02).values())
+    assert wrong <= 0.05 * 300
+
+
+def test_the_verdict_is_a_difference_or_its_absence_or_nothing() -> None:
+    for p, difference, low, verdict in (
+        (0.01, 0.1, 0.04, "better"),
+        (0.01, -0.1, -0.2, "worse"),
+        (0.01, -0.01, -0.015, "worse, by less than 2 points"),
+        (0.6, -0.001, -0.012, "not worse by 2 points"),
+        (0.6, 0.001, -0.03, "open"),
+    ):
+        assert a_comparison(p, difference, low).conclude(p, 0.02).verdict == verdict

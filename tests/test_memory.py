@@ -1,0 +1,86 @@
+"""What a policy has memorised: policies without a sense, and demonstrations replayed."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+import toy
+from toy_recordable import RecordableEnvironment
+
+from vla.data.episodes import EpisodeStore
+from vla.rollouts.evaluate import FIRST_SEED, evaluate
+from vla.rollouts.memory import Impaired, NearestDemonstration, make_impaired
+from vla.rollouts.rollout import rollout
+from vla.spec import Array, Observation
+
+
+class Noting(toy.ToyExpert):
+    """The toy expert, which keeps what it saw and heard."""
+
+    def reset(self, instruction: str, seed: int) -> None:
+        """As the toy does."""
+        super().reset(instruction, seed)
+        self.seen: list[Observation] = []
+        self.heard = instruction
+
+    def act(self, observation: Observation) -> Array:
+        """As the toy does."""
+        self.seen.append(observation)
+        return super().act(observation)
+
+
+def test_without_images_all_is_grey_and_without_an_instruction_nothing_is_said() -> None:
+    environment, agent = RecordableEnvironment(), Noting()
+    seen = rollout(environment, Impaired(agent, "images"), FIRST_SEED).observations[0]
+    for blind in agent.seen:
+        assert all((image == 128).all() for image in blind.rgb.values())
+        assert not any(image.any() for image in blind.depth.values())
+    assert agent.seen[0].rgb.keys() == seen.rgb.keys() and agent.seen[0].instruction == agent.heard == seen.instruction
+    assert np.array_equal(agent.seen[0].state, seen.state)
+    rollout(environment, Impaired(agent, "instruction"), FIRST_SEED)
+    assert agent.heard == agent.seen[0].instruction == ""
+    assert np.array_equal(agent.seen[0].rgb["front"], seen.rgb["front"])
+
+
+def test_an_expert_that_needs_neither_succeeds_as_before() -> None:
+    seeds = range(FIRST_SEED, FIRST_SEED + 5)
+    make = partial(make_impaired, toy.make_expert, "images")
+    assert evaluate(toy.make_environment, make, None, seeds) == evaluate(
+        toy.make_environment, toy.make_expert, None, seeds
+    )
+
+
+def test_the_nearest_demonstration_of_a_known_scene_is_its_own(folder: Path) -> None:
+    store, environment = EpisodeStore(folder), toy.make_environment()
+    agent = NearestDemonstration(folder, 20, spec=environment.spec)
+    for entry in store.episodes[:3]:
+        again = rollout(environment, agent, entry.seed)
+        assert again.success and np.array_equal(again.executed, store.rows("executed")[entry.span])
+    # Among those with the same instruction, if there is one.
+    seen = environment.reset(store.episodes[0].seed)
+    other = next(entry.instruction for entry in store.episodes if entry.instruction != seen.instruction)
+    own, theirs, any_of_them = (
+        _first_action(agent, replace(seen, instruction=said)) for said in (seen.instruction, other, "whatever")
+    )
+    assert np.array_equal(own, any_of_them) and not np.array_equal(own, theirs)
+
+
+def _first_action(agent: NearestDemonstration, observation: Observation) -> Array:
+    agent.reset(observation.instruction, 0)
+    return agent.act(observation)
+
+
+def test_new_scenes_are_mostly_failed_and_other_stores_refused(folder: Path) -> None:
+    make = partial(NearestDemonstration, folder, 30)
+    report = evaluate(
+        toy.make_environment, lambda environment: make(spec=environment.spec), None, range(FIRST_SEED, FIRST_SEED + 20)
+    )
+    assert report.success < 0.3 and not report.errors  # the expert succeeds in four of five
+    with pytest.raises(ValueError, match="has cameras"):
+        NearestDemonstration(folder, 20, spec=toy.ARM_SPEC)
+    with pytest.raises(ValueError, match="30 of 31 episodes"):
+        NearestDemonstration(folder, 31, spec=toy.SPEC)

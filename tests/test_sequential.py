@@ -1,0 +1,141 @@
+"""Statements that are valid whenever one stops: closed forms, how often they err, and evaluations that use them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import toy_recordable as toy
+from scipy.special import betaln
+
+from vla.parallel.pool import LocalCluster
+from vla.rollouts.comparison import Pairs, compare_pairs
+from vla.rollouts.evaluate import FIRST_SEED, Report, Result, evaluate, keep_recordings
+from vla.rollouts.sequential import (
+    anytime_difference,
+    anytime_interval,
+    anytime_p,
+    is_beside,
+    is_settled,
+    log_capital,
+)
+from vla.rollouts.statements import AgainstBar, AgainstRun
+from vla.rollouts.statistics import wilson_interval
+
+SEEDS = range(FIRST_SEED, FIRST_SEED + 60)
+
+
+@pytest.mark.parametrize("mean", [0.1, 0.5, 0.95])
+def test_the_capital_is_the_closed_form_of_the_beta_mixture(mean: float) -> None:
+    for ones, zeros in ((0, 0), (3, 0), (30, 10), (600, 400)):
+        mixture = betaln(ones + 0.5, zeros + 0.5) - betaln(0.5, 0.5)
+        fair = ones * np.log(mean) + zeros * np.log(1 - mean)
+        assert float(log_capital(mean, ones, zeros)) == pytest.approx(mixture - fair)
+
+
+def test_the_capital_is_fair_if_the_hypothesis_holds() -> None:
+    for shares in ((0.2, 0.3, 0.5), (0.1, 0.1, 0.8), (0.7, 0.2, 0.1)):  # of 1, 0 and 1/2
+        mean, counts = shares[0] + shares[2] / 2, np.array([9, 4, 11])
+        before = np.exp(log_capital(mean, *counts))
+        after = [np.exp(log_capital(mean, *(counts + step))) for step in np.eye(3, dtype=int)]
+        assert np.dot(shares, after) == pytest.approx(before)
+
+
+def test_pairs_that_do_not_differ_change_no_p_value_but_narrow_the_interval() -> None:
+    assert anytime_p(2, 12) == compare_pairs(Pairs(80, 2, 12, 6), anytime=True).p
+    low, high = anytime_difference(2, 12, 100)
+    wide, wider = anytime_difference(2, 12, 14)
+    assert wide < low < 0.1 < high < wider
+    assert anytime_p(0, 0) == anytime_p(5, 5) == 1 and anytime_p(0, 9) < 0.05 < anytime_p(0, 3)
+
+
+def test_intervals_contain_those_of_a_fixed_number() -> None:
+    for won, lost in ((0, 30), (28, 2), (50, 50), (300, 0)):
+        (low, high), (inner, outer) = anytime_interval(won, lost), wilson_interval(won, won + lost)
+        assert low <= inner < outer <= high
+    assert anytime_interval(0, 0) == (0, 1) and anytime_difference(0, 0, 0) == (-1, 1)
+
+
+def test_what_is_decided_agrees_with_the_intervals() -> None:
+    for won, lost in ((95, 5), (99, 1), (60, 40), (9, 1)):
+        low, high = anytime_interval(won, lost)
+        assert is_beside(0.9, won, lost) == (not low <= 0.9 <= high)
+    for first, second, pairs in ((0, 5, 20), (1, 20, 100), (5, 6, 90), (5, 5, 2000), (3, 3, 400)):
+        low, high = anytime_difference(first, second, pairs)
+        assert is_settled(first, second, pairs, 0.03) == (not low <= 0 <= high or (low > -0.03 and high < 0.03))
+
+
+@pytest.mark.parametrize("bar", [0.5, 0.9])
+def test_a_bar_is_rarely_excluded_by_a_policy_that_is_at_it(bar: float) -> None:
+    random, wrong, naive = np.random.default_rng(0), 0, 0
+    for _ in range(400):
+        won = np.cumsum(random.random(300) < bar)
+        lost = np.arange(1, 301) - won
+        wrong += bool((log_capital(bar, won, lost) >= np.log(20)).any())
+        intervals = [wilson_interval(int(k), n) for n, k in enumerate(won[19:], 20)]
+        naive += any(not low <= bar <= high for low, high in intervals)
+    assert (
+        wrong <= 0.05 * 400 < 0.2 * 400 < naive
+    )  # an interval for a fixed number errs if it is looked at again and again
+
+
+@pytest.mark.parametrize("lost", [0.04, 0.02])
+def test_policies_that_are_equal_or_a_margin_apart_are_rarely_called_otherwise(lost: float) -> None:
+    random, wrong, won = np.random.default_rng(0), 0, 0.04
+    for _ in range(200):
+        drawn = random.random(1500)
+        first, second = np.cumsum(drawn < lost), np.cumsum(drawn > 1 - won)
+        for n in range(50, 1501, 50):
+            if is_settled(int(first[n - 1]), int(second[n - 1]), n, 0.02):
+                low, high = anytime_difference(int(first[n - 1]), int(second[n - 1]), n)
+                wrong += not low <= won - lost <= high
+                break
+    assert wrong <= 0.05 * 200
+
+
+def test_an_evaluation_stops_when_it_is_clear_whatever_the_number_of_workers() -> None:
+    until = AgainstBar(0.5).is_clear
+    alone = evaluate(toy.make_environment, toy.make_agent, None, SEEDS, until=until)
+    assert evaluate(toy.make_environment, toy.make_agent, None, SEEDS, LocalCluster(2), until=until) == alone
+    assert alone.anytime and [result.seed for result in alone.results] == [*SEEDS[: alone.episodes]]
+    assert until(alone) and not any(until(Report(alone.results[:played])) for played in range(alone.episodes))
+    assert alone.interval[0] > 0.5 and "anytime-valid 95 % CI" in str(alone)
+    assert AgainstBar(0.5).say(alone) == "success is above the bar of 50 %"
+    everything = evaluate(toy.make_environment, toy.make_agent, None, SEEDS[:4], until=AgainstBar(0.7).is_clear)
+    assert everything.episodes == 4 and "open" in AgainstBar(0.7).say(everything)
+
+
+def test_tasks_that_take_turns_are_played_in_whole_rounds() -> None:
+    tiers = {"easy": ["reach", "push", "pull"], "hard": ["stack"]}
+    report = evaluate(toy.make_environment, toy.make_agent, None, SEEDS, tiers=tiers, until=lambda report: True)
+    assert report.episodes == 4 and report.mean_over_tiers is None
+
+
+def test_recordings_of_episodes_that_do_not_count_are_removed(tmp_path: Path) -> None:
+    folder = tmp_path / "recordings"
+    until = AgainstBar(0.5).is_clear
+    report = evaluate(
+        toy.make_environment, toy.make_agent, toy.make_recorder(folder), SEEDS, LocalCluster(2), until=until
+    )
+    assert keep_recordings(report, folder, tmp_path / "rollouts.rrd", None) == report.episodes
+    assert [path.name for path in tmp_path.iterdir()] == ["rollouts.rrd"]
+
+
+def a_report(outcomes: str, anytime: bool = True) -> Report:
+    """A success for every 1, an error for every e."""
+    names = {"1": "success", "0": "dropped", "e": "error"}
+    results = [Result(FIRST_SEED + n, names[each], "lift", draws={"n": n}) for n, each in enumerate(outcomes)]
+    return Report(tuple(results), anytime=anytime)
+
+
+def test_a_run_is_compared_on_the_episodes_that_both_played() -> None:
+    other = AgainstRun("A", {result.seed: result for result in a_report("0" * 12).results}, 0.02)
+    assert not other.is_clear(a_report("111e11")) and other.is_clear(a_report("1" * 9))
+    assert other.say(a_report("1" * 10 + "e111")).startswith(
+        "compared with A on 11 common episodes: better, +100.0 points"
+    )
+    elsewhere = AgainstRun("A", {FIRST_SEED: Result(FIRST_SEED, "success", "push")}, 0.02)
+    assert elsewhere.say(a_report("1")) == "no episode in common with A"
+    with pytest.raises(ValueError, match="has no episode in common"):
+        elsewhere.is_clear(a_report("1"))

@@ -1,0 +1,110 @@
+"""`job=plan`: how many episodes tell two success rates apart, and how many less if playing stops when it is clear."""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+from typing import Annotated
+
+from annotated_types import Gt, Lt
+from rich import print as show
+from rich.table import Table
+
+from vla.config.check import Job
+from vla.config.experiment import Experiment
+from vla.io.types import Share, Text
+from vla.reports.comparison import compare_runs, read_runs
+from vla.rollouts.evaluate import IN_DISTRIBUTION
+from vla.rollouts.planning import (
+    MOST,
+    SIMULATIONS,
+    Stopping,
+    episodes_needed,
+    power_for_bar,
+    power_of_pairs,
+    power_of_samples,
+    stopping,
+)
+
+Between = Annotated[float, Gt(0), Lt(1)]
+
+JOB = Job(
+    (),
+    {
+        "rates": tuple[Between, Between],
+        "power": Between,
+        "discordant": Share | None,
+        "runs": tuple[Text, Text] | None,
+    },
+)
+
+
+def run(experiment: Experiment) -> None:
+    """Print a table, with a row per way to compare."""
+    asked = experiment["plan"]
+    one, other = asked["rates"]
+    if one == other:
+        raise ValueError(f"plan.rates={asked['rates']} are equal: no number of episodes tells them apart")
+    share = _discordant(asked["runs"]) if asked["runs"] else asked["discordant"]
+    show(plan_table(one, other, asked["power"], share))
+    show(
+        f"Without stopping the numbers are exact; with it they are for the same power, of {SIMULATIONS} simulated "
+        "evaluations, and so is the share of those that find a difference where there is none."
+    )
+
+
+def plan_table(one: float, other: float, power: float, discordant: float | None) -> Table:
+    """Tabulate numbers of episodes, of each policy if there are two.
+
+    Args:
+        one: success rate of the first policy, or a bar.
+        other: success rate of the second policy.
+        power: probability of finding the difference.
+        discordant: share of the episodes in which only one of them succeeds; None: the limits of what it can be.
+
+    Raises:
+        ValueError: the rates cannot differ in such a share.
+    """
+    difference, apart = abs(other - one), one * (1 - other) + other * (1 - one)
+    largest = min(one + other, 2 - one - other)
+    if discordant is None:
+        shares = {" (independent failures)": apart, " (the better never fails alone)": difference}
+    elif difference <= discordant <= largest + 1e-9:
+        shares = {"": discordant}
+    else:
+        raise ValueError(
+            f"policies of {_percent(one)} and {_percent(other)} differ in {_percent(difference)} to "
+            f"{_percent(largest)} of the same episodes, not in {_percent(discordant)}: change plan.rates"
+        )
+    table = Table("compared", "episodes", "until=decided: at most", "on average", "false differences")
+    fixed = episodes_needed(partial(power_for_bar, rate=other, bar=one), power)
+    stops = stopping(one, other, 1 - other, power, fixed) if fixed else None
+    table.add_row(f"one policy, {_percent(other)} against a bar of {_percent(one)}", *_numbers(fixed, stops))
+    fixed = episodes_needed(partial(power_of_samples, one=one, other=other), power)
+    table.add_row("two policies, different episodes", *_numbers(fixed, None))
+    for how, share in shares.items():
+        fixed = episodes_needed(partial(power_of_pairs, discordant=share, difference=difference), power)
+        stops = stopping(0.5, (share + difference) / 2, (share - difference) / 2, power, fixed) if fixed else None
+        table.add_row(f"two policies, same episodes, {_percent(share)} differ{how}", *_numbers(fixed, stops))
+    return table
+
+
+def _numbers(fixed: int | None, stops: Stopping | None) -> tuple[str, ...]:
+    if stops is None:
+        return (f"{fixed}" if fixed else f"more than {MOST}",)
+    return str(fixed), str(stops.most), f"{stops.mean:.0f}", _percent(stops.wrong)
+
+
+def _discordant(runs: list[str]) -> float:
+    """Return the share of the common episodes in which only one of two runs succeeds."""
+    for each in compare_runs(read_runs([Path(folder) for folder in runs]), 0.0):
+        found = each.found
+        if each.condition == IN_DISTRIBUTION and found.only_first is not None and found.only_second is not None:
+            return (found.only_first + found.only_second) / found.episodes
+    raise ValueError(
+        f"plan.runs={runs} have no episode in common: give the share of differing ones, plan.discordant=0.05"
+    )
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:.3g} %"

@@ -1,0 +1,106 @@
+"""Comparison of runs, every two of them, by their success under each condition."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations
+from pathlib import Path
+from typing import Any
+
+from rich.table import Table
+
+from vla.config.differences import at
+from vla.reports.conditions import COMPARED, comparison_texts
+from vla.rollouts.comparison import Comparison, compare_pairs, compare_samples, concluded
+from vla.rollouts.evaluate import ERROR, IN_DISTRIBUTION, Report, Result, pairs_of
+from vla.runs.folder import Run, require_run
+
+
+@dataclass(frozen=True)
+class RunComparison:
+    """Comparison of two runs under a condition."""
+
+    one: str
+    other: str
+    condition: str
+    found: Comparison
+
+
+def read_runs(folders: Sequence[Path]) -> dict[str, Run]:
+    """Return name → run.
+
+    Raises:
+        ValueError: no folder is given, a folder is no run or given twice, or a file in it is damaged.
+    """
+    if not folders:
+        raise ValueError("name the runs to compare, as in report.runs=[RUN,RUN]")
+    read = [require_run(folder) for folder in folders]
+    return dict(zip(_names(folders), read, strict=True))
+
+
+def _names(folders: Sequence[Path]) -> list[str]:
+    """Return the shortest path suffixes of equal length that distinguish the folders."""
+    paths = [folder.resolve().parts for folder in folders]
+    for length in range(1, max(map(len, paths)) + 1):
+        names = ["/".join(path[-length:]) for path in paths]
+        if len(set(names)) == len(names):
+            return names
+    raise ValueError("report.runs contains a folder twice")
+
+
+def compare_runs(runs: Mapping[str, Run], margin: float) -> list[RunComparison]:
+    """Compare every two runs under each condition: on their common episodes, or without any on different ones.
+
+    Runs in different worlds are not compared. Verdicts take all comparisons into account.
+
+    Args:
+        runs: by name.
+        margin: what counts as not worse, 0…1.
+    """
+    found = [
+        RunComparison(one, other, condition, compared)
+        for one, other in combinations(runs, 2)
+        for condition in runs[one].reports
+        if (compared := _compared(runs[one], runs[other], condition))
+    ]
+    verdicts = concluded({number: each.found for number, each in enumerate(found)}, margin)
+    return [replace(each, found=verdicts[number]) for number, each in enumerate(found)]
+
+
+def runs_table(compared: Sequence[RunComparison]) -> Table:
+    """Tabulate comparisons of runs."""
+    table = Table("second run", "minus first", "condition", "episodes", *COMPARED)
+    for each in compared:
+        table.add_row(each.other, each.one, each.condition, str(each.found.episodes), *comparison_texts(each.found))
+    return table
+
+
+def _compared(one: Run, other: Run, condition: str) -> Comparison | None:
+    """Compare two runs under a condition; None if they were evaluated in different worlds."""
+    first, second = (_by_seed(run, condition) for run in (one, other))
+    # The same seed gives another episode under another goal or level of randomisation.
+    seeds = [seed for seed, (_, scene) in first.items() if seed in second and scene == second[seed][1]]
+    anytime = any(run.reports[condition].anytime for run in (one, other) if condition in run.reports)
+    if seeds:
+        return compare_pairs(pairs_of((first[seed][0], second[seed][0]) for seed in seeds), anytime)
+    alike = _scenes(one, condition) == _scenes(other, condition) and not first.keys() & second.keys()
+    if not (first and second and alike) or anytime:
+        return None
+    a, b = one.reports[condition], other.reports[condition]
+    return compare_samples(a.successes, a.episodes, b.successes, b.episodes)
+
+
+def _by_seed(run: Run, condition: str) -> dict[int, tuple[Result, Any]]:
+    """Return seed → result under a condition, and what identifies its scene and instruction."""
+    results = [result for result in run.reports.get(condition, Report(())).results if result.outcome != ERROR]
+    if condition == IN_DISTRIBUTION:
+        return {result.seed: (result, (result.instruction, result.draws)) for result in results}
+    return {result.seed: (result, _scenes(run, condition)) for result in results}
+
+
+def _scenes(run: Run, condition: str) -> tuple[Any, ...]:
+    """Return what the scenes of all seeds depend on: the task, and how a condition changes it."""
+    config = run.report.config if run.report else {}
+    asked = at(config, "evaluate")
+    return at(config, "task"), at(at(asked, "conditions"), condition), at(asked, "one_by_one")

@@ -1,0 +1,104 @@
+"""Controls of what a policy has memorised: policies that lack a sense, and demonstrations replayed open loop."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from vla.data.episodes import EpisodeStore
+from vla.io.types import Count
+from vla.spec import Agent, Array, Environment, Observation, Spec
+
+Sense = Literal["images", "instruction"]
+
+GREY = 128
+STRIDE = 4  # of the pixels in which demonstrations are compared
+
+
+class Impaired:
+    """An agent that sees only grey images without depth, or hears only an empty instruction."""
+
+    def __init__(self, agent: Agent, lacks: Sense) -> None:
+        """Args: the agent, and what it lacks."""
+        self._agent, self._lacks = agent, lacks
+        self.info: dict[str, Any] = {}
+
+    def reset(self, instruction: str, seed: int) -> None:
+        """Start an episode."""
+        self._agent.reset("" if self._lacks == "instruction" else instruction, seed)
+
+    def act(self, observation: Observation) -> Array:
+        """Return the (D,) action of the agent."""
+        if self._lacks == "instruction":
+            observation = replace(observation, instruction="")
+        else:
+            rgb = {camera: np.full_like(image, GREY) for camera, image in observation.rgb.items()}
+            depth = {camera: np.zeros_like(image) for camera, image in observation.depth.items()}
+            observation = replace(observation, rgb=rgb, depth=depth)
+        action = self._agent.act(observation)
+        self.info = self._agent.info
+        return action
+
+
+def make_impaired(make_agent: Callable[[Environment], Agent], lacks: Sense, environment: Environment) -> Impaired:
+    """Build an agent that lacks a sense for an environment."""
+    return Impaired(make_agent(environment), lacks)
+
+
+class NearestDemonstration:
+    """Replays the demonstration with the most similar first images, whatever happens; then repeats its last action.
+
+    It is one with the same instruction, if there is any. Similarity is the mean absolute difference of every
+    `STRIDE`th pixel of all cameras. It succeeds where a memory of the demonstrations is enough.
+    """
+
+    def __init__(self, folder: Path, episodes: Count, *, spec: Spec) -> None:
+        """Args:
+        folder: of the episode store.
+        episodes: the first ones to know.
+        spec: of the environment.
+
+        Raises:
+            ValueError: there is no such store, it has fewer episodes, or another spec.
+        """
+        store = EpisodeStore(folder, episodes)
+        store.spec.without_truth.require(spec.without_truth, f"the episode store {folder}", "the task")
+        self._entries, self._executed = store.episodes, store.rows("executed")
+        self._instructions = np.array([entry.instruction for entry in self._entries])
+        starts = [entry.span.start for entry in self._entries]
+        images = [np.stack([_few(rows[start]) for start in starts]) for rows in map(store.rows, _fields(spec))]
+        self._cameras, self._images = spec.cameras, np.stack(images, axis=1)  # (E, cameras, h, w, 3)
+        self.info: dict[str, Any] = {}
+        self.reset("", 0)
+
+    def reset(self, instruction: str, seed: int) -> None:
+        """Start an episode; the demonstration is chosen at the first action."""
+        self._actions: Array | None = None
+        self._step = 0
+
+    def act(self, observation: Observation) -> Array:
+        """Return the next (D,) action of the demonstration."""
+        if self._actions is None:
+            self._actions = np.array(self._executed[self._entries[self._nearest(observation)].span])
+        action = self._actions[min(self._step, len(self._actions) - 1)]
+        self._step += 1
+        return np.asarray(action, np.float32)
+
+    def _nearest(self, observation: Observation) -> int:
+        seen = np.stack([_few(observation.rgb[camera]) for camera in self._cameras]).astype(np.int16)
+        known = np.flatnonzero(self._instructions == observation.instruction)
+        candidates = known if len(known) else np.arange(len(self._entries))
+        distances = [np.abs(self._images[index] - seen).mean() for index in candidates]
+        return int(candidates[np.argmin(distances)])
+
+
+def _few(image: Array) -> Array:
+    return image[::STRIDE, ::STRIDE]
+
+
+def _fields(spec: Spec) -> list[str]:
+    return [f"rgb_{camera}" for camera in spec.cameras]

@@ -1,0 +1,113 @@
+"""Statements that are valid however the number of episodes was chosen, so that an evaluation may stop when it is clear.
+
+A gambler bets on the next observation at the odds that a hypothesis calls fair. Under the hypothesis the capital,
+1 at first, ever reaches 20 with a probability of at most 1/20 (J. Ville, "Étude critique de la notion de collectif",
+1939). The hypotheses on which it is below 20 form a 95 % confidence sequence (I. Waudby-Smith, A. Ramdas, "Estimating
+means of bounded random variables by betting", Journal of the Royal Statistical Society B 86, 2024): the intervals after
+all numbers of episodes cover the truth together with a probability of 95 %.
+
+The capital is spread evenly over `BETS` constant bets. For successes and failures it is that of the mixture with the
+density Beta(1/2, 1/2) (R. Krichevsky, V. Trofimov, "The performance of universal encoding", IEEE Transactions on
+Information Theory 27, 1981), exactly up to 2 `BETS` - 1 observations; for pairs it is the universal portfolio of
+T. Cover and E. Ordentlich ("Universal portfolios with side information", ibid. 42, 1996).
+
+Where tasks take turns, this holds after whole rounds: by the inequality of arithmetic and geometric means, bets at the
+odds of the mean over tasks then lose.
+"""
+
+from __future__ import annotations
+
+from math import log
+
+import numpy as np
+
+from vla.spec import Array
+
+BETS = 512
+LEVEL = 0.05  # largest probability of a false statement
+
+# Shares of the capital put on success: the nodes at which equal weights integrate Beta(1/2, 1/2).
+ON_SUCCESS = np.cos((2 * np.arange(BETS) + 1) * np.pi / (4 * BETS)) ** 2
+
+
+def log_capital(mean: float, ones: Array | int, zeros: Array | int, halves: Array | int = 0) -> Array:
+    """Return the logarithm of the capital after bets against the hypothesis that observations have this mean.
+
+    Args:
+        mean: of observations of 0, 1/2 and 1; between 0 and 1.
+        ones: number of observations of 1, of any shape.
+        zeros: of 0, of the same shape.
+        halves: of 1/2, of the same shape.
+    """
+    one, zero = ON_SUCCESS / mean, (1 - ON_SUCCESS) / (1 - mean)
+    counts = np.stack(np.broadcast_arrays(ones, zeros, halves), -1).astype(float)
+    growth = counts @ np.log([one, zero, (one + zero) / 2])
+    largest = growth.max(-1)
+    return np.asarray(largest + np.log(np.exp(growth - largest[..., None]).mean(-1)))
+
+
+def anytime_interval(ones: int, zeros: int, halves: int = 0, level: float = LEVEL) -> tuple[float, float]:
+    """Return the confidence interval of the mean of observations of 0, 1/2 and 1; (0, 1) without observations."""
+    seen, limit = ones + zeros + halves, log(1 / level)
+    if seen == 0:
+        return 0.0, 1.0
+    estimate = (ones + halves / 2) / seen
+
+    def bound(end: float) -> float:
+        """Bisect between a capital below the limit, at the estimate, and one above; it is log-convex in the mean."""
+        inside, outside = estimate, end
+        for _ in range(40):
+            middle = (inside + outside) / 2
+            if log_capital(middle, ones, zeros, halves) < limit:
+                inside = middle
+            else:
+                outside = middle
+        return inside
+
+    return 0.0 if ones + halves == 0 else bound(0.0), 1.0 if zeros + halves == 0 else bound(1.0)
+
+
+def anytime_difference(first: int, second: int, pairs: int) -> tuple[float, float]:
+    """Return the confidence interval of the second success rate minus the first.
+
+    Args:
+        first: pairs in which only the first succeeded.
+        second: pairs in which only the second succeeded.
+        pairs: all of them.
+    """
+    low, high = anytime_interval(second, first, pairs - first - second)
+    return 2 * low - 1, 2 * high - 1
+
+
+def anytime_p(first: int, second: int) -> float:
+    """Return a p-value for equal success, valid at any time: one over the capital from bets on a fair coin.
+
+    Of a pair that differs, it is as likely to favour either; the others do not change the capital.
+
+    Args:
+        first: pairs in which only the first succeeded.
+        second: pairs in which only the second succeeded.
+    """
+    return float(np.exp(-max(log_capital(0.5, second, first), 0.0)))
+
+
+def is_beside(bar: float, successes: int, failures: int) -> bool:
+    """Return whether a success rate has been shown to be above or below a bar, which is between 0 and 1."""
+    return bool(log_capital(bar, successes, failures) >= log(1 / LEVEL))
+
+
+def is_settled(first: int, second: int, pairs: int, margin: float, comparisons: int = 1) -> bool:
+    """Return whether two success rates have been shown to differ, or to differ by less than a margin.
+
+    Args:
+        first: pairs in which only the first succeeded.
+        second: pairs in which only the second succeeded.
+        pairs: all of them.
+        margin: of what counts as equal, between 0 and 1.
+        comparisons: number of those made together, for a difference in any of which 5 % hold.
+    """
+    if log_capital(0.5, second, first) >= log(comparisons / LEVEL):
+        return True
+    within = abs(second - first) < margin * pairs
+    ends = ((1 - margin) / 2, (1 + margin) / 2)
+    return within and all(log_capital(end, second, first, pairs - first - second) >= log(1 / LEVEL) for end in ends)

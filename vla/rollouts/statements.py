@@ -1,0 +1,98 @@
+"""What an evaluation is to decide: whether success is above a bar, and how it compares with that of another run."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Protocol
+
+from vla.rollouts.comparison import Comparison, compare_pairs
+from vla.rollouts.evaluate import Report, Result, pairs_of
+from vla.rollouts.sequential import is_beside, is_settled
+
+
+class Statement(Protocol):
+    """Something to decide by playing episodes."""
+
+    def is_clear(self, report: Report) -> bool:
+        """Return whether it is decided by the episodes of a report, to be asked after any number of them."""
+        ...
+
+    def say(self, report: Report) -> str:
+        """Return a sentence on it for a finished report."""
+        ...
+
+
+@dataclass(frozen=True)
+class AgainstBar:
+    """Whether the success rate is above or below `bar`, between 0 and 1."""
+
+    bar: float
+
+    def is_clear(self, report: Report) -> bool:
+        """See `Statement`."""
+        return is_beside(self.bar, report.successes, report.episodes - report.successes)
+
+    def say(self, report: Report) -> str:
+        """See `Statement`."""
+        low, high = report.interval
+        verdict = "above" if low > self.bar else "below" if high < self.bar else "open: perhaps above, perhaps below"
+        return f"success is {verdict} the bar of {100 * self.bar:g} %"
+
+
+@dataclass(frozen=True)
+class AgainstRun:
+    """Whether success differs from that of another run on the same episodes, or by less than `margin`."""
+
+    run: str
+    results: Mapping[int, Result]  # seed → result of the other run
+    margin: float
+
+    def is_clear(self, report: Report) -> bool:
+        """See `Statement`.
+
+        Raises:
+            ValueError: the other run has no episode in common.
+        """
+        found = self._compared(report)
+        if report.episodes and not found.episodes:
+            raise ValueError(
+                f"evaluate.against={self.run} has no episode in common with this evaluation: it needs a run with the "
+                "same task, randomisation and evaluate.seed"
+            )
+        assert found.only_first is not None and found.only_second is not None
+        return is_settled(found.only_first, found.only_second, found.episodes, self.margin)
+
+    def say(self, report: Report) -> str:
+        """See `Statement`."""
+        found = self._compared(report)
+        if not found.episodes:
+            return f"no episode in common with {self.run}"
+        verdict = found.conclude(found.p, self.margin).verdict
+        difference, low, high = (f"{100 * share:+.1f}" for share in (found.difference, found.ci_low, found.ci_high))
+        return (
+            f"compared with {self.run} on {found.episodes} common episodes: {verdict}, {difference} points "
+            f"({low} to {high}), p = {found.p:.2g}"
+        )
+
+    def _compared(self, report: Report) -> Comparison:
+        pairs = [(self.results[mine.seed], mine) for mine in report.results if mine.seed in self.results]
+        # The same seed gives another episode under another goal or level of randomisation.
+        same = [
+            (their, mine) for their, mine in pairs if (their.instruction, their.draws) == (mine.instruction, mine.draws)
+        ]
+        return compare_pairs(pairs_of(same), report.anytime)
+
+
+@dataclass(frozen=True)
+class AgainstCondition:
+    """Whether success under a condition differs from that of the `first` condition, or by less than `margin`."""
+
+    first: Report
+    margin: float
+    conditions: int  # number of those compared
+
+    def is_clear(self, report: Report) -> bool:
+        """See `Statement`."""
+        pairs = pairs_of(zip(self.first.results, report.results, strict=False))
+        return is_settled(pairs.first, pairs.second, sum(pairs), self.margin, self.conditions)
