@@ -79,6 +79,18 @@ def test_padding_does_not_count_in_the_auxiliary_loss() -> None:
     assert model.loss(batch)["truth_loss"] == model.loss(other)["truth_loss"]
 
 
+def test_frames_of_unknown_truth_do_not_count_in_the_auxiliary_loss() -> None:
+    model = make_rt1().eval()
+    batch = with_text(model, make_batch(3))
+    unknown = {**batch, "truth": batch["truth"].clone()}
+    unknown["truth"][:2] = torch.nan
+    losses = model.loss(unknown)
+    standard = model.truth_scale(batch["truth"], batch["present"])
+    error = (model(batch)["truth"].float() - standard).square().mean(-1)
+    torch.testing.assert_close(losses["truth_loss"], error[2:].mean())
+    assert torch.isfinite(losses["loss"])
+
+
 def test_standardize_gathers_the_statistics_of_what_is_present() -> None:
     torch.manual_seed(0)
     normalizer = RunningNormalizer(3)

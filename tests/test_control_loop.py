@@ -21,8 +21,8 @@ IMAGE = np.zeros((8, 8, 3), np.uint8)
 class World:
     """A simulated arm that follows its commands, two cameras, and a clock."""
 
-    def __init__(self, safety: Safety = SAFETY) -> None:
-        self.loop = ControlLoop(SPEC, ROBOT, safety, 50.0)
+    def __init__(self, safety: Safety = SAFETY, follows_positions: bool = True) -> None:
+        self.loop = ControlLoop(SPEC, ROBOT, safety, 50.0, follows_positions)
         self.now, self.joints = 100.0, HOME.copy()
         self.cameras, self.measures, self.follows = ["front", "wrist"], True, True
         self.apart = 0.0  # delay of the wrist's images [s]
@@ -232,6 +232,74 @@ def test_an_arm_that_does_not_follow_is_a_fault(world: World) -> None:
     world.follows = False
     world.run(3.0)
     assert world.loop.state is State.FAULT and "away from its command" in world.loop.reason
+
+
+def handed_over(world: World) -> None:
+    """Hand the resting arm over, and let a person move it elsewhere."""
+    world.loop.hold("a person takes over")
+    world.run(0.2)
+    assert world.loop.limiter.resting
+    world.loop.hand_over()
+    world.joints = world.joints + 0.2
+
+
+def test_an_arm_in_the_hands_of_a_person_is_not_commanded_and_goes_on_from_where_it_is_left(world: World) -> None:
+    world.run(0.3)
+    handed_over(world)
+    assert world.run(3.0) == [] and world.loop.state is State.HANDED_OVER
+    assert world.loop.on_instruction("lift the red block", world.now)
+    left = world.joints
+    world.loop.take_back(world.now)
+    commands = world.run(1.0)
+    np.testing.assert_array_equal(commands[0].position, left)
+    assert commands[0].opening is None and commands[-1].opening == 1.0  # once the policy says so
+    steps = np.diff([command.position for command in commands], axis=0)
+    assert (np.abs(np.diff(steps, axis=0)) <= ROBOT.max_acceleration * 0.02**2 + 1e-9).all()
+    assert world.loop.state is State.RUNNING and np.abs(steps).sum() > 0.01
+
+
+@pytest.mark.parametrize(
+    ("move", "says"),
+    [
+        (lambda world: setattr(world, "joints", JOINT_HIGH - 0.01), "outside .* move it inside first"),
+        (lambda world: setattr(world, "measures", False), "joint state is older"),
+        (lambda world: world.loop.on_joint_state(world.joints + 0.01, np.zeros(7), 0.08, world.now), "still moves"),
+    ],
+    ids=["outside", "unseen", "moving"],
+)
+def test_an_arm_is_taken_back_only_at_rest_and_within_its_limits(
+    world: World, move: Callable[[World], None], says: str
+) -> None:
+    handed_over(world)
+    world.run(0.5)
+    move(world)
+    if "moves" not in says:
+        world.run(0.5)
+    with pytest.raises(ValueError, match=says):
+        world.loop.take_back(world.now)
+    assert world.run(0.2) == [] and world.loop.state is State.HANDED_OVER
+
+
+def test_whatever_happens_in_the_hands_of_a_person_nothing_is_commanded(world: World) -> None:
+    handed_over(world)
+    world.loop.stop("by hand")
+    assert world.run(0.2) == [] and world.loop.state is State.STOPPED
+    assert world.loop.resume(world.now) and world.loop.state is State.HANDED_OVER
+    world.loop.fail("internal error")
+    assert world.run(0.2) == [] and world.loop.state is State.FAULT
+    world.loop.restart()
+    assert len(world.run(0.2)) == 10
+
+
+def test_in_a_dry_run_every_plan_starts_where_the_arm_is() -> None:
+    world = World(follows_positions=False)
+    world.follows = False
+    world.run(0.1)
+    world.loop.on_instruction("go", world.now)
+    commands = world.run(3.0)
+    assert world.loop.state is State.RUNNING  # the arm does not follow, which is no fault
+    away = np.array([forward(command.position)[0][:3, 3] for command in commands]) - world.tool
+    assert 0.005 < away[:, 0].max() < 0.012 and np.abs(away[:, 1:]).max() < 0.002  # one action of 1 cm
 
 
 def test_the_tool_stays_in_the_workspace() -> None:

@@ -15,12 +15,12 @@ import toy
 from reading import fit, windows
 
 from vla.data.datamodule import Prefetcher, held_out
-from vla.data.episodes import EpisodeStore
+from vla.data.episodes import EpisodeStore, observations_of
 from vla.data.verification import derive_store
 from vla.data.window_batches import WindowBatcher, disturbed
 from vla.parallel.pool import LocalCluster
 from vla.rollouts.collect import collect
-from vla.spec import Array
+from vla.spec import Array, Episode
 
 EPISODES = toy.EPISODES
 
@@ -115,6 +115,24 @@ def test_nothing_is_labelled_before_the_start_or_beyond_the_end(folder: Path) ->
     assert batch["valid"][1].tolist() == [[True, True], [True, True], [True, False]]
     assert not batch["rgb"]["eye"][0, :2].any() and not batch["state"][0, :2].any()
     assert torch.equal(batch["action"][1, 2, 0], batch["action"][1, 2, 1])
+
+
+def test_a_further_store_may_lack_the_truth(folder: Path, tmp_path: Path) -> None:
+    source = EpisodeStore(folder)
+    lacking = EpisodeStore.create_or_open(tmp_path / "lacking", source.spec.without_truth, {})
+    with lacking.writing():
+        for seed, entry in enumerate(source.episodes[:4]):
+            rows = source.read(entry)
+            seen = observations_of(lacking.spec, rows, entry.instruction)
+            what = (seed, "recorded", entry.instruction, "unverified", frozenset[str](), {})
+            lacking.append(Episode(*what, seen, rows["action"], rows["executed"]))
+    module, twice = (windows(folder, more=[lacking.folder] * number) for number in (1, 2))
+    added = len(module.training_windows) - len(windows(folder).training_windows)
+    assert len(twice.training_windows) == len(module.training_windows) + added and added > 0
+    last = source.episodes[-1].end
+    batch = module.make_batch(np.array([0, last, last + 1]))
+    assert torch.isfinite(batch["truth"][0]).all() and batch["truth"][1:, -1].isnan().all()
+    np.testing.assert_array_equal(batch["state"][1, -1], np.asarray(source.rows("state"))[0])
 
 
 def test_every_window_comes_once_per_shuffle(folder: Path) -> None:

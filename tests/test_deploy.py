@@ -21,7 +21,7 @@ import numpy as np
 import pytest
 import rclpy
 from arm import ROBOT
-from command_line import here, vla
+from command_line import SMALL, here, vla
 from defaults import defaults_of
 from documented import TEXT
 from rclpy.context import Context
@@ -30,11 +30,14 @@ from rerun.chunk import RrdReader
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 
+from vla.data.episodes import EpisodeStore
 from vla.deploy import messages
 from vla.deploy.bag import POLICY_INPUTS
 from vla.deploy.demo_operator import DemoOperator, SimulatedEpisode
 from vla.deploy.ros import NETWORKS, Network, split_arguments
 from vla.io.images import resize
+from vla.models.checkpoint import read_header
+from vla.robots.panda import forward
 from vla.rollouts.recorder import VIEWER
 from vla.tasks import gl as backend
 
@@ -239,6 +242,30 @@ def test_the_whole_loop_reports_and_its_bag_moves_an_agent_again(
     assert player.wait(60) == 0, player.communicate()[0]
     probe.spin(0.2)
     assert np.ptp([command.position[:7] for command in probe.commands], axis=0).max() > 0.01
+    learn_from_the_bag(home)
+
+
+def learn_from_the_bag(home: Path) -> None:
+    """The other two commands of docs/ros2.md, after the one that recorded."""
+    bag = ("expert=bag", "expert.folder=loop/bag", "collect.folder=lessons")
+    nobody = here(home, "job=collect", CHECKPOINT, *bag, ok=False)
+    assert "error: loop/bag has no corrections" in nobody.stderr
+    here(home, "job=collect", CHECKPOINT, *bag, "expert.steps=all")
+    store = EpisodeStore(home / "lessons")
+    policy = read_header(home / "run/checkpoints/last.ckpt")
+    store.spec.require(policy.spec.without_truth, "the bag", "the policy")
+    assert len(store.episodes) == 2
+    for entry in store.episodes:
+        assert 8 <= entry.steps <= 20 and "block" in entry.instruction
+        rows = store.read(entry)
+        assert rows["rgb_front"].std() > 5 and entry.draws["expert_acts"] == []
+        tools = [forward(joints)[0][:3, 3] for joints in rows["state"][:, :7]]
+        moved = rows["action"][:6, :3].sum(0)  # within reach of the arm, that of an untrained policy
+        np.testing.assert_allclose(moved, tools[6] - tools[0], atol=0.04)
+        assert np.linalg.norm(moved) > 0.05
+    lessons = (*SMALL, "collect.more=[lessons]", "output=wiser")
+    here(home, "job=train", CHECKPOINT.replace("checkpoint", "pretrained", 1), *lessons)
+    assert (home / "wiser/checkpoints/last.ckpt").is_file()
 
 
 def test_the_node_acts_like_the_evaluated_policy(home: Path) -> None:

@@ -6,6 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from composing import CONF
+from defaults import defaults_of
 
 from vla.deploy.joint_limiter import JointLimiter, Robot
 
@@ -103,3 +105,11 @@ def test_an_arm_outside_its_limits_is_not_taken_over() -> None:
 def test_a_robot_that_cannot_be_is_refused(wrong: dict) -> None:
     with pytest.raises(ValueError, match=r"deploy\.robot"):
         replace(ROBOT, **wrong)
+
+
+@pytest.mark.parametrize("robot", sorted(path.stem for path in (CONF / "deploy/robot").glob("*.yaml")))
+def test_every_robot_has_limits_of_every_joint(robot: str) -> None:
+    arm = Robot(**defaults_of(f"deploy/robot/{robot}"))
+    assert (arm.min_position < arm.max_position).all() and len({*arm.joints}) == len(arm.joints) == len(arm.low)
+    assert (arm.max_speed > 0.3).all() and (arm.max_acceleration > 0.7).all()  # in rad, not in degrees or turns
+    assert (arm.max_speed < 7).all() and (np.abs(arm.low) < 7).all() and (np.abs(arm.high) < 7).all()

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import io
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from vla.deploy import messages
 from vla.deploy.control_loop import Command
@@ -71,6 +73,44 @@ def test_padded_rows_and_other_encodings_are_understood() -> None:
 def test_an_image_that_is_none_is_refused(changed: dict, reason: str) -> None:
     with pytest.raises(ValueError, match=reason):
         messages.image_from(image(**changed))
+
+
+@pytest.mark.parametrize(("kind", "mode"), [("PNG", "RGB"), ("PNG", "RGBA"), ("JPEG", "RGB")])
+def test_a_compressed_image_is_decoded(kind: str, mode: str) -> None:
+    data, picture = io.BytesIO(), np.full((40, 30, 3), (200, 100, 50), np.uint8)
+    Image.fromarray(picture).convert(mode).save(data, kind)
+    message = SimpleNamespace(format="rgb8; jpeg compressed bgr8", data=np.frombuffer(data.getvalue(), np.uint8))
+    found = messages.image_from(message)
+    assert found.shape == (40, 30, 3) and np.abs(found.astype(int) - picture).max() <= 2
+
+
+@pytest.mark.parametrize("damage", [lambda whole: b"", lambda whole: whole[:-40], lambda whole: b"GIF89a" + whole])
+def test_a_compressed_image_that_is_none_is_refused(damage: Any) -> None:
+    data = io.BytesIO()
+    Image.fromarray(PIXELS.repeat(30, 0).repeat(30, 1)).save(data, "PNG")
+    with pytest.raises(ValueError, match="image of format 'png' is no JPEG or PNG, or damaged"):
+        messages.image_from(SimpleNamespace(format="png", data=damage(data.getvalue())))
+
+
+def test_a_compressed_depth_is_no_image_of_colours() -> None:
+    data = io.BytesIO()
+    Image.fromarray(np.zeros((4, 5), np.uint16)).save(data, "PNG")
+    with pytest.raises(ValueError, match=r"'16UC1; compressedDepth' has 5 by 4 pixels of I;16"):
+        messages.image_from(SimpleNamespace(format="16UC1; compressedDepth", data=data.getvalue()))
+
+
+def test_fingers_may_come_in_messages_of_their_own() -> None:
+    states = messages.JointStates(ROBOT)
+    arm = SimpleNamespace(name=["two", "one"], position=[2.0, 1.0], velocity=[])
+    fingers = SimpleNamespace(name=["left", "right"], position=[0.02, 0.01], velocity=[])
+    with pytest.raises(ValueError, match="joint state lacks left, right; it has two, one"):
+        states.read(arm, 0.0)
+    assert states.read(fingers, 1.0) is None
+    position, _, opening = states.read(arm, 1.4) or pytest.fail("it has the arm")
+    assert position.tolist() == [1.0, 2.0] and opening == pytest.approx(0.03)
+    with pytest.raises(ValueError, match="lacks left, right"):
+        states.read(arm, 1.6)  # the fingers are silent
+    assert states.read(joints(), 2.0) is not None
 
 
 def test_joints_are_found_by_name() -> None:

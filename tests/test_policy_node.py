@@ -17,12 +17,12 @@ from lifecycle_msgs.srv import GetState
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import Image, JointState
 from std_msgs.msg import Float64MultiArray, String
-from std_srvs.srv import Trigger
+from std_srvs.srv import SetBool, Trigger
 from world import KINDS, World, positions
 
 from vla.deploy import messages
 from vla.deploy.control_loop import State
-from vla.robots.panda import HOME
+from vla.robots.panda import HOME, forward
 
 pytestmark = pytest.mark.realtime
 
@@ -36,8 +36,8 @@ def make_world() -> Iterator[Callable[..., World]]:
     """A world on a domain of its own."""
     worlds: list[World] = []
 
-    def make(command: str = "joint_state", *arguments: str) -> World:
-        worlds.append(World(next(domains), command, list(arguments)))
+    def make(command: str = "joint_state", *arguments: str, compressed: bool = False) -> World:
+        worlds.append(World(next(domains), command, list(arguments), compressed))
         return worlds[-1]
 
     yield make
@@ -158,6 +158,42 @@ def test_stop_and_resume(world: World) -> None:
     assert world.commands[-1].position == world.commands[-5].position
     assert world.ask(Trigger, "resume", Trigger.Request()).success
     assert world.becomes(State.RUNNING)
+
+
+def test_a_person_takes_the_arm_over_and_hands_it_back(world: World) -> None:
+    assert world.ask(SetBool, "hand_over", SetBool.Request(data=True)).success
+    world.live(0.1)
+    world.commands.clear()
+    person = world.node.create_publisher(JointState, "/commands", 1)
+    world.live(1.2)
+    assert world.commands == [] and world.state is State.HANDED_OVER
+    assert {pair.key: pair.value for pair in world.statuses[-1].values}["handed over"] == "yes"
+    refused = world.ask(SetBool, "hand_over", SetBool.Request(data=False))
+    assert not refused.success and "1 other publisher(s) on /commands" in refused.message
+    world.node.destroy_publisher(person)
+    world.joints = world.joints + 0.1
+    world.live(0.5)
+    left = world.joints
+    assert world.ask(SetBool, "hand_over", SetBool.Request(data=False)).success
+    world.live(5.0, until=lambda: world.commands)
+    assert world.commands[0].name == ROBOT.joints  # the gripper stays as it is
+    np.testing.assert_allclose(world.commands[0].position, left)
+    assert world.becomes(State.RUNNING)
+    steps = np.diff([command.position[:7] for command in world.commands], axis=0)
+    assert (np.abs(steps) <= ROBOT.max_speed * 0.02 + 1e-9).all()
+
+
+def test_a_dry_run_commands_nothing_and_tells_what_it_would(make_world: Callable[..., World]) -> None:
+    """With compressed images."""
+    world = make_world("joint_state", "--ros-args", "-p", "dry_run:=true", compressed=True)
+    would: list[JointState] = []
+    world.node.create_subscription(JointState, "/vla_agent/dry_run/commands", would.append, 100)
+    world.start()
+    world.live(1.5)
+    assert world.commands == [] and world.state is State.RUNNING
+    moved = np.abs(np.array([command.position[:7] for command in would]) - HOME).max()
+    assert 1e-3 < moved < 0.1 and (world.joints == HOME).all()
+    assert {pair.key: pair.value for pair in world.statuses[-1].values}["handed over"] == "yes"
 
 
 def test_an_instruction_that_is_ignored_after_a_stop_is_reported(
@@ -283,6 +319,16 @@ def test_plain_positions_for_a_forward_controller(make_world: Callable[..., Worl
     world.node.create_subscription(Float64MultiArray, "/gripper", fingers.append, 10)
     world.start()
     assert len(world.commands[-1].data) == 7 and list(fingers[-1].data) == [0.04, 0.04]
+
+
+def test_a_twist_for_a_servo_moves_the_tool_as_fast_as_the_policy_says(make_world: Callable[..., World]) -> None:
+    world = make_world("twist")
+    world.start()
+    before = forward(world.joints)[0][:3, 3]
+    world.live(1.0)
+    moved = forward(world.joints)[0][:3, 3] - before
+    assert world.state is State.RUNNING and world.commands[-1].header.frame_id == "panda_link0"
+    assert moved[0] > 0.02 and np.abs(moved[1:]).max() < 0.2 * moved[0]
 
 
 def test_ros_arguments_remap_and_set_parameters(make_world: Callable[..., World]) -> None:

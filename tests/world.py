@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import io
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,12 +15,14 @@ from arm import FORWARD, ROBOT, SAFETY, SPEC
 from builtin_interfaces.msg import Time
 from defaults import defaults_of
 from diagnostic_msgs.msg import DiagnosticStatus
+from geometry_msgs.msg import TwistStamped
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
+from PIL import Image as Picture
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rosgraph_msgs.msg import Clock
-from sensor_msgs.msg import Image, JointState
+from sensor_msgs.msg import CompressedImage, Image, JointState
 from std_msgs.msg import Float64MultiArray, String
 from trajectory_msgs.msg import JointTrajectory
 
@@ -28,11 +32,12 @@ from vla.deploy.policy_node import PolicyNode
 from vla.deploy.ros import Network
 from vla.deploy.ros2 import PolicyDeployment
 from vla.deploy.settings import Topics
-from vla.robots.panda import HOME
+from vla.robots.panda import HOME, forward
 from vla.spec import Array, Observation
 
-TOPICS = Topics({"front": "/front", "wrist": "/wrist"}, "/joint_states", "/words", "/commands", "/gripper")
+TOPICS = Topics({"front": "/front", "wrist": "/wrist"}, "/joint_states", "/words", "/commands", "/gripper", None)
 KINDS = {"joint_state": JointState, "trajectory": JointTrajectory, "forward": Float64MultiArray}
+TWIST = {"twist": TwistStamped}
 
 
 class Forward:
@@ -61,17 +66,19 @@ class Forward:
 class World:
     """Cameras, an arm that follows its commands, and an operator; the policy node runs in the same thread."""
 
-    def __init__(self, domain: int, command: Any, arguments: list[str]) -> None:
+    def __init__(self, domain: int, command: Any, arguments: list[str], compressed: bool = False) -> None:
         Network.named("loopback").apply()
         self.contexts = [Context(), Context()]
         for context, given in zip(self.contexts, (arguments, None), strict=True):
             rclpy.init(args=given, context=context, domain_id=domain)
         self.policy = Forward()
         nothing: Any = None
+        self.compressed = compressed
+        topics = {camera: f"/{camera}{'/compressed' if compressed else ''}" for camera in SPEC.cameras}
         self.settings = PolicyDeployment(
             robot=ROBOT,
             network=Network.named("loopback"),
-            topics=TOPICS,
+            topics=replace(TOPICS, images=topics),
             safety=SAFETY,
             **defaults_of("deploy/ros2", command=command),
             policy=nothing,
@@ -83,11 +90,12 @@ class World:
         self.executors = [SingleThreadedExecutor(context=context) for context in self.contexts]
         for executor, node in zip(self.executors, (self.agent, self.node), strict=True):
             executor.add_node(node)
-        self.images = {camera: self.node.create_publisher(Image, f"/{camera}", 1) for camera in SPEC.cameras}
+        kind = CompressedImage if compressed else Image
+        self.images = {camera: self.node.create_publisher(kind, topic, 1) for camera, topic in topics.items()}
         self.states = self.node.create_publisher(JointState, "/joint_states", 1)
         self.words = self.node.create_publisher(String, "/words", 1)
         self.commands: list[Any] = []
-        self.node.create_subscription(KINDS[command], "/commands", self.commands.append, 100)
+        self.node.create_subscription({**KINDS, **TWIST}[command], "/commands", self.commands.append, 100)
         self.statuses: list[DiagnosticStatus] = []
         self.node.create_subscription(DiagnosticStatus, "/vla_agent/status", self.statuses.append, 100)
         self.joints = HOME.copy()
@@ -116,7 +124,9 @@ class World:
                 self.simulated += 0.02
                 self.clock.publish(Clock(clock=self._now()))
             if self.measures:
-                if self.commands:
+                if self.commands and isinstance(self.commands[-1], TwistStamped):
+                    self.joints = self.joints + 0.02 * rates(self.commands[-1], self.joints)
+                elif self.commands:
                     self.joints = positions(self.commands[-1])[0]
                 self.states.publish(joint_state(self.joints))
             if tick % 5 == 0:
@@ -124,7 +134,7 @@ class World:
                     image = messages.fill_image(Image(), np.zeros((8, 8, 3), np.uint8), camera)
                     image.header.stamp = self._now()
                     self.changed(image)
-                    self.images[camera].publish(image)
+                    self.images[camera].publish(packed(image) if self.compressed else image)
             tick += 1
             self._spin_for(0.02)
 
@@ -185,7 +195,22 @@ def positions(command: Any) -> Array:
     return np.array([command.position[:7] if isinstance(command, JointState) else command.data])
 
 
+def rates(command: TwistStamped, joints: Array) -> Array:
+    """Return the joint velocities (7,) [rad/s] that a servo would choose for a twist."""
+    linear, angular = command.twist.linear, command.twist.angular
+    twist = np.array([linear.x, linear.y, linear.z, angular.x, angular.y, angular.z])
+    velocities: Array = np.linalg.pinv(forward(joints)[1]) @ twist
+    return velocities
+
+
 def joint_state(joints: Array) -> JointState:
     """Return a joint state in another order and with an additional joint."""
     names = [*reversed(ROBOT.joints), *ROBOT.fingers, "of_another_robot"]
     return JointState(name=names, position=[*joints[::-1].tolist(), 0.04, 0.04, 1.0])
+
+
+def packed(image: Image) -> CompressedImage:
+    """Compress an image as `image_transport` does."""
+    data = io.BytesIO()
+    Picture.fromarray(messages.image_from(image)).save(data, "PNG")
+    return CompressedImage(header=image.header, format="rgb8; png compressed bgr8", data=data.getvalue())

@@ -30,7 +30,7 @@ from vla.config.packages import offer_options, option_folders, trust
 from vla.deploy import ros
 from vla.parallel.fast_exit import fast_exit
 from vla.parallel.processes import without_triton
-from vla.runs.sweep import failures, save_failure
+from vla.runs.cells import failures, save_failure
 
 PACKAGE = Path(__file__).resolve().parent
 SWEEP = "in the sweep "  # prefix of a note on a cell's error

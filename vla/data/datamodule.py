@@ -14,6 +14,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 
@@ -107,7 +108,7 @@ class WindowDataModule(LightningDataModule):
         depth: include depth in batches.
         ahead: batches made in advance.
         episodes: use only the first so many episodes; all of them when None.
-        more: further episode stores, all of whose episodes are used.
+        more: further episode stores, all of whose episodes are used; they may lack the simulator's truth.
     """
 
     def __init__(
@@ -142,7 +143,8 @@ class WindowDataModule(LightningDataModule):
         rows = [max((entry.end for entry in store.episodes), default=0) for store in stores]
         sides: dict[bool, list[Array]] = {False: [], True: []}
         for store, first in zip(stores, np.cumsum([0, *rows]), strict=False):
-            self._spec.require(store.spec, "the model", f"the episode store {store.folder}")
+            there = store.spec if store.spec.truth else replace(store.spec, truth=self._spec.truth)
+            self._spec.require(there, "the model", f"the episode store {store.folder}")
             for entry in store.episodes:
                 sides[held_out(entry.seed, self._fraction)].append(first + np.arange(entry.start, entry.end))
         episodes = [entry for store in stores for entry in store.episodes]
@@ -154,7 +156,7 @@ class WindowDataModule(LightningDataModule):
         self._digest = digest_of(episodes)
         self.training_windows = np.concatenate(sides[False])  # row numbers
         self.held_out_windows = np.concatenate(sides[True]) if sides[True] else np.empty(0, np.int64)
-        layout = self._history, self._chunk, self._depth, self._on_gpu()
+        layout = self._history, self._chunk, self._depth, self._on_gpu(), self._spec.truth_size
         self.make_batch = JoinedBatcher([WindowBatcher(store, *layout) for store in stores], rows)
 
     def state_dict(self) -> dict[str, str]:

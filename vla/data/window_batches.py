@@ -81,12 +81,21 @@ class WindowBatcher:
         chunk: actions k that label a frame.
         depth: include depth.
         pin: allocate page-locked memory, from which copies to a GPU are asynchronous.
+        truth_size: scalars S of the truth, which are not a number where the store has no truth; None: its own.
 
     Raises:
         ValueError: numeric rows of the store differ from their checksums.
     """
 
-    def __init__(self, store: EpisodeStore, history: int, chunk: int, depth: bool = False, pin: bool = False) -> None:
+    def __init__(
+        self,
+        store: EpisodeStore,
+        history: int,
+        chunk: int,
+        depth: bool = False,
+        pin: bool = False,
+        truth_size: int | None = None,
+    ) -> None:
         self._pin, self._buffers = pin, BufferPool()
         self._ages, self._aheads = np.arange(1 - history, 1), np.arange(chunk)
         cameras = {"rgb": store.spec.cameras, **({"depth": store.spec.depth} if depth else {})}
@@ -95,8 +104,10 @@ class WindowBatcher:
         names = ("state", *(("truth",) if store.spec.truth else ()))
         numbers = {name: store.rows(name) for name in (*names, "action", "executed")}
         store.verify(store.episodes, numbers)
-        self._numbers = np.concatenate([numbers[name][:] for name in names], axis=1)
-        self._truth_size = store.spec.truth_size
+        self._truth_size = store.spec.truth_size if truth_size is None else truth_size
+        known = [numbers[name][:] for name in names]
+        unknown = np.full((len(known[0]), self._truth_size - store.spec.truth_size), np.nan, np.float32)
+        self._numbers = np.concatenate([*known, unknown], axis=1)
         self._action = numbers["action"]
         off = disturbed(self._action[:], numbers["executed"][:], store.spec)
         self._disturbances = np.append(0, off.cumsum())  # before each row

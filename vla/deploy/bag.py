@@ -14,6 +14,7 @@ import resource
 import time
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
+from functools import cache
 from pathlib import Path
 from threading import Event
 from typing import Any
@@ -47,12 +48,10 @@ class BagRecorder(TopicListener):
             ValueError: the folder exists.
         """
         from rosbags.rosbag2 import StoragePlugin, Writer
-        from rosbags.typesys import Stores, get_typestore
 
         if folder.exists():
             raise ValueError(f"{folder} exists already: choose another folder")
         folder.parent.mkdir(parents=True, exist_ok=True)
-        self._types = get_typestore(Stores.ROS2_JAZZY)
         self._writer = Writer(folder, version=9, storage_plugin=StoragePlugin.MCAP)
         self._writer.open()
         self.messages = 0
@@ -60,7 +59,7 @@ class BagRecorder(TopicListener):
 
     def callback_for(self, topic: str, kind: str) -> Callable[[bytes], None]:
         """Return a callback that writes the messages of a topic."""
-        connection = self._writer.add_connection(topic, kind, typestore=self._types)
+        connection = self._writer.add_connection(topic, kind, typestore=message_types())
 
         def write(message: bytes) -> None:
             self._writer.write(connection, time.time_ns(), message)
@@ -94,10 +93,10 @@ def play(node: Any, folder: Path, topics: Collection[str], stopped: Event, speed
         while time.monotonic() < deadline and not all(p.get_subscription_count() for p in publishers.values()):
             stopped.wait(0.02)
         begin, start, end = time.monotonic(), reader.start_time, reader.end_time
-        for topic, stamp, raw in _messages(reader, connections, folder):
+        for topic, stamp, raw in messages_of(reader, connections, folder):
             if not start <= stamp <= end:
                 raise ValueError(f"{folder} is damaged: a message lies outside its time range")
-            with _damage(folder):
+            with damage(folder):
                 message = _stamped_now(node, raw, classes[topic])
             stopped.wait(max(0.0, begin + (stamp - start) * 1e-9 / speed - time.monotonic()))
             if stopped.is_set():
@@ -105,6 +104,14 @@ def play(node: Any, folder: Path, topics: Collection[str], stopped: Event, speed
             publishers[topic].publish(message)
             published += 1
     return published
+
+
+@cache
+def message_types() -> Any:
+    """Return the message types of ROS 2 Jazzy, as `rosbags` knows them."""
+    from rosbags.typesys import Stores, get_typestore
+
+    return get_typestore(Stores.ROS2_JAZZY)
 
 
 @contextmanager
@@ -122,7 +129,7 @@ def opened(folder: Path) -> Iterator[Any]:
     read_yaml(description, dict[str, Any])  # rosbags limits neither its size nor its depth
     for path in folder.iterdir():
         require_file(path)
-    with _damage(folder):
+    with damage(folder):
         reader = Reader(folder)
         reader.open()
     try:
@@ -131,11 +138,13 @@ def opened(folder: Path) -> Iterator[Any]:
         reader.close()
 
 
-def _messages(reader: Any, connections: Sequence[Any], folder: Path) -> Iterator[tuple[str, int, bytes]]:
-    """Yield topic, time [ns] and bytes of every message of some connections."""
-    messages = reader.messages(connections)
+def messages_of(
+    reader: Any, connections: Sequence[Any], folder: Path, start: int | None = None, stop: int | None = None
+) -> Iterator[tuple[str, int, bytes]]:
+    """Yield topic, time [ns] and bytes of every message of some connections, from `start` to before `stop` [ns]."""
+    messages = reader.messages(connections, start, stop)
     while True:
-        with _damage(folder):
+        with damage(folder):
             message = next(messages, None)
         if message is None:
             return
@@ -144,7 +153,7 @@ def _messages(reader: Any, connections: Sequence[Any], folder: Path) -> Iterator
 
 
 @contextmanager
-def _damage(folder: Path) -> Iterator[None]:
+def damage(folder: Path) -> Iterator[None]:
     """Turn the exceptions of rosbags and ROS, which can be of any type, into a ValueError about the bag."""
     try:
         yield

@@ -9,10 +9,11 @@ import rclpy
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
 from std_msgs.msg import String
-from std_srvs.srv import Trigger
+from std_srvs.srv import SetBool, Trigger
 
 TIMEOUT = 10.0  # of the discovery of a subscriber or service, and of a service call [s]
 SETTLED = 0.7  # discovery is complete after so long without a new subscriber [s]
+HAND_OVER = "/vla_agent/hand_over"
 RESUME, CHANGE, RESET = "/vla_agent/resume", "/vla_agent/change_state", "/vla_simulator/reset"
 
 
@@ -42,6 +43,17 @@ def resume(node: Any) -> None:
         ValueError: there is no agent, or it is not stopped.
     """
     answer = _call(node, Trigger, RESUME, Trigger.Request())
+    if not answer.success:
+        raise ValueError(answer.message)
+
+
+def hand_over(node: Any, to_person: bool) -> None:
+    """Make the agent leave the arm to a person, or take it back.
+
+    Raises:
+        ValueError: there is no agent, or it refuses, as while the arm moves.
+    """
+    answer = _call(node, SetBool, HAND_OVER, SetBool.Request(data=to_person))
     if not answer.success:
         raise ValueError(answer.message)
 

@@ -12,17 +12,17 @@ from enum import StrEnum
 
 import numpy as np
 
-from vla.deploy.camera_sync import CameraSync
 from vla.deploy.joint_limiter import JointLimiter, Robot
+from vla.deploy.observer import HISTORY, Measured, Observer
 from vla.io.types import Count, Point, Positive
-from vla.robots.controllers import GRIPPER, UNITS, controller_for
+from vla.robots.controllers import GRIPPER, controller_for
 from vla.spec import Array, Observation, Spec
 
 # How to recover, for messages.
 RESUME = 'python -m vla.deploy.say --resume "INSTRUCTION", or call ~/resume'
 RESTART = "deactivate and activate the agent, or start it again"
-EARLY_SHARE = 0.25  # share of a control period by which an image may precede the next planned inference
-HISTORY = 1.0  # duration of the history of joint states and commands [s]
+HAND_BACK = "python -m vla.deploy.say --hand-back, or call ~/hand_over with false"
+STILL, STILL_FOR = 0.005, 0.2  # an arm that has moved less [rad] for so long [s] is at rest
 
 
 class State(StrEnum):
@@ -32,6 +32,7 @@ class State(StrEnum):
     RUNNING = "running"
     HOLDING = "holding"  # an input is late or invalid; runs again after fresh images
     STOPPED = "stopped"  # by request, until resumed; or by time-out, until the next instruction
+    HANDED_OVER = "handed over"  # a person moves the arm, until it is handed back; commands nothing
     FAULT = "fault"  # needs inspection; until deactivated
 
 
@@ -57,25 +58,31 @@ class Command:
 
     position: Array  # (J,) [rad]
     velocity: Array  # (J,) [rad/s]
-    opening: float  # of the gripper, 0 closed … 1 open
+    opening: float | None  # of the gripper, 0 closed … 1 open; None leaves it as it is
 
 
 class ControlLoop:
     """Turns images, joint states and instructions into joint commands within limits; not thread-safe."""
 
-    def __init__(self, spec: Spec, robot: Robot, safety: Safety, command_hz: float) -> None:
-        """Args: the spec of the policy; the arm; time-outs and limits; commands per second [Hz].
+    def __init__(
+        self, spec: Spec, robot: Robot, safety: Safety, command_hz: float, follows_positions: bool = True
+    ) -> None:
+        """Args:
+        spec: of the policy.
+        robot: the arm.
+        safety: time-outs and limits.
+        command_hz: commands per second [Hz].
+        follows_positions: whether the arm goes where the commands say. Otherwise it goes its own way, as in a dry run,
+            and the commands of every plan start at the measured pose.
 
         Raises:
             ValueError: the policy does not fit the arm or the command rate.
         """
         model = spec.require_robot("deployment")
-        if others := [name for name in spec.state if name not in model.components]:
-            raise ValueError(f"the policy's state has {', '.join(others)}, which joint states do not contain")
+        Observer(spec)  # raises an error if the state has more than joint states contain
         self._controller = controller_for(spec, safety.workspace)
         self._grip = spec.action.index(GRIPPER) if GRIPPER in {*spec.action} - {*model.joints} else None
         self._motion = [index for index in range(len(spec.action)) if index != self._grip]
-        self._factors = np.array([UNITS.get(unit.removesuffix("/s"), 1.0) for unit in spec.state_units])
         if len(robot.joints) != len(model.joints):
             raise ValueError(
                 f"the policy was trained with {len(model.joints)} joints, the robot has {len(robot.joints)}"
@@ -83,7 +90,7 @@ class ControlLoop:
         if command_hz < spec.control_hz:
             raise ValueError(f"command_hz is {command_hz}, below the {spec.control_hz} actions/s of the policy")
         self.spec, self.safety, self.tick = spec, safety, 1 / command_hz
-        self._model = model
+        self._follows_positions = follows_positions
         self.limiter = JointLimiter(robot, self.tick)
         self.restart()
 
@@ -93,12 +100,13 @@ class ControlLoop:
         self.state, self.reason = State.WAITING, "no joint state yet"
         self.instruction, self._instructed_at, self._timed_out = "", 0.0, False
         self.overruns, self.rejections = 0, 0
-        self._cameras = CameraSync(self.spec.cameras)
-        self._measured: deque[tuple[float, Array, Array, float]] = deque()  # at, joints, velocities, opening
+        self.handed_over = False
+        self._observer = Observer(self.spec)
         self._commanded: deque[tuple[float, Array]] = deque()  # at, joints
-        self._schedule: list[tuple[float, Array, float]] = []  # when due, goal, opening
+        self._schedule: list[tuple[float, Array, float | None]] = []  # when due, goal, opening
         self._pending: tuple[float, float, Array] | None = None  # requested at, observed at, commanded then
-        self._next_inference, self._opening = -np.inf, 1.0
+        self._next_inference = -np.inf
+        self._opening: float | None = 1.0
         self.observed_at = -np.inf  # time stamp of the last observation
         self.resumed = True  # True if the last observation is the first since the loop started to run
         self._last_observed = -np.inf  # as `observed_at`, but reset whenever the loop stops running
@@ -113,13 +121,11 @@ class ControlLoop:
 
     def on_image(self, camera: str, image: Array, at: float) -> None:
         """Add an image (H, W, 3) uint8 that was taken at `at`."""
-        self._cameras.add(camera, image, at)
+        self._observer.cameras.add(camera, image, at)
 
     def on_joint_state(self, joints: Array, velocities: Array, opening: float, at: float) -> None:
         """Add measured joints (J,) [rad], their velocities [rad/s] and the gripper's opening [m], at `at`."""
-        self._measured.append((at, joints, velocities, opening))
-        while self._measured[0][0] < at - HISTORY:
-            self._measured.popleft()
+        self._observer.on_joint_state(Measured(at, joints, velocities, opening))
 
     def on_instruction(self, instruction: str, now: float) -> bool:
         """Set the instruction, which also ends a stop by time-out; an empty one stops the arm.
@@ -146,8 +152,40 @@ class ControlLoop:
         if self.state is not State.STOPPED:
             return False
         self._instructed_at = now
-        self._set_state(State.HOLDING, "resumed, waiting for fresh images")
+        self._go_on("resumed")
         return True
+
+    def hand_over(self) -> None:
+        """Leave the arm, which is to be at rest, to a person; nothing is commanded from now on."""
+        self.handed_over, self._pending = True, None
+        if self.state not in (State.STOPPED, State.FAULT):
+            self._go_on("")
+
+    def take_back(self, now: float) -> None:
+        """Command the arm again, from its measured pose; the gripper is left as it is until the policy moves it.
+
+        Raises:
+            ValueError: the arm moves, is outside its limits, or has no recent joint state; the person keeps it.
+        """
+        measured = self._observer.newest
+        if measured is None or now - measured.at > self.safety.joints_age:
+            raise ValueError(f"the newest joint state is older than {self.safety.joints_age} s")
+        if self._observer.moved(STILL_FOR) > STILL:
+            raise ValueError("the arm still moves: let it rest first")
+        self.limiter.start(measured.joints)
+        self._commanded.clear()
+        self._record(now)
+        self.handed_over, self._opening, self._off_track_since = False, None, None
+        self._instructed_at = now
+        if self.state is State.HANDED_OVER:
+            self._go_on("handed back")
+
+    def _go_on(self, why: str) -> None:
+        """Run again after fresh images, as soon as no person moves the arm."""
+        if self.handed_over:
+            self._set_state(State.HANDED_OVER, f"a person moves the arm; to continue: {HAND_BACK}")
+        else:
+            self._set_state(State.HOLDING, f"{why}, waiting for fresh images")
 
     def fail(self, reason: str) -> None:
         """Brake and hold until deactivated."""
@@ -162,30 +200,19 @@ class ControlLoop:
 
     def next_observation(self, now: float) -> Observation | None:
         """Return the observation for the policy if an inference is due; then call `set_plan` or `reject_plan`."""
-        observed = self._cameras.taken_at
+        observed = self._observer.due(self._last_observed, self._next_inference)
         if self.state is not State.RUNNING or self._pending is not None or observed is None:
-            return None
-        if observed <= self._last_observed or observed < self._next_inference - EARLY_SHARE / self.spec.control_hz:
             return None
         if self._schedule and now > self._schedule[-1][0] + 0.5 / self.spec.control_hz:
             self.overruns += 1
-        _, joints, velocities, opening = min(self._measured, key=lambda measured: abs(measured[0] - observed))
         # Anchor on the pose commanded at that time. The measured pose lags behind it; the last goal runs ahead of an
         # arm that its limits slow down, and the policy would overshoot.
         anchor = min(self._commanded, key=lambda command: abs(command[0] - observed))[1]
+        if not self._follows_positions:
+            anchor = self._observer.measured_at(observed).joints
         self.resumed, self._last_observed, self.observed_at = np.isinf(self._last_observed), observed, observed
         self._pending = (now, observed, anchor)
-        return Observation(
-            rgb=self._cameras.images,
-            state=self._state(joints, velocities, opening),
-            instruction=self.instruction,
-        )
-
-    def _state(self, joints: Array, velocities: Array, opening: float) -> Array:
-        """Robot state (P,) float32 in the order of the spec."""
-        model = self._model
-        values = dict(zip(model.joints, joints, strict=True)) | dict(zip(model.velocities, velocities, strict=False))
-        return np.array([values.get(name, opening) for name in self.spec.state] / self._factors, np.float32)
+        return self._observer.observation(observed, self.instruction)
 
     def set_plan(self, actions: Array, now: float) -> None:
         """Schedule the policy's actions (k, D); the first one starts at the time of the observation.
@@ -211,6 +238,8 @@ class ControlLoop:
         self._controller.reset(anchor)
         goals = [self._controller.step(action[self._motion]).copy() for action in actions]
         openings = [self._opening] * len(actions) if self._grip is None else actions[:, self._grip].tolist()
+        if not self._follows_positions and (measured := self._observer.newest) is not None:
+            self.limiter.position = np.array(measured.joints, float)
         ends = observed + period * np.arange(1, len(actions) + 1)
         self._schedule = list(zip(ends.tolist(), goals, openings, strict=True))
         self._next_inference = float(ends[-1])
@@ -224,7 +253,9 @@ class ControlLoop:
     # Commands.
 
     def command(self, now: float) -> Command | None:
-        """Return the command of this tick; None before the first joint state."""
+        """Return the command of this tick; None before the first joint state, and while a person moves the arm."""
+        if self.handed_over:
+            return None
         self._supervise(now)
         if not self._commanded:
             return None
@@ -258,15 +289,15 @@ class ControlLoop:
 
     def _supervise(self, now: float) -> None:
         """Change the state if an input is missing, late or invalid, or fresh again."""
-        if not self._measured:
+        newest = self._observer.newest
+        if newest is None:
             return
-        measured = self._measured[-1][1]
         if not self._commanded:
-            self._take_over(measured, now)
+            self._take_over(newest, now)
         if self.state in (State.STOPPED, State.FAULT):
             return
-        problem = self._input_problem(now)
-        if self._off_track(measured, now):
+        problem = self._input_problem(newest, now)
+        if self._off_track(newest, now):
             return self.fail(f"a joint is more than {self.safety.tracking} rad away from its command")
         if not self.instruction:
             return self._set_state(State.WAITING, "no instruction yet")
@@ -275,36 +306,36 @@ class ControlLoop:
             self._timed_out = True
             return None
         if problem:
-            self._cameras.fresh = 0
+            self._observer.cameras.fresh = 0
             return self._set_state(State.HOLDING if self.state is State.RUNNING else self.state, problem)
-        recovered = self.state is State.HOLDING and self._cameras.fresh >= self.safety.fresh_frames
+        recovered = self.state is State.HOLDING and self._observer.cameras.fresh >= self.safety.fresh_frames
         if self.state is State.WAITING or recovered:
             self._set_state(State.RUNNING, "")
         return None
 
-    def _take_over(self, measured: Array, now: float) -> None:
+    def _take_over(self, measured: Measured, now: float) -> None:
         try:
-            self.limiter.start(measured)
+            self.limiter.start(measured.joints)
         except ValueError as error:
             return self.fail(str(error))
         stroke = max(self.robot.finger_travel * len(self.robot.fingers), 1e-6)
-        self._opening = float(np.clip(self._measured[-1][3] / stroke, 0.0, 1.0))
+        self._opening = float(np.clip(measured.opening / stroke, 0.0, 1.0))
         return self._record(now)
 
-    def _input_problem(self, now: float) -> str:
+    def _input_problem(self, newest: Measured, now: float) -> str:
         """Describe which input or inference is overdue; empty if none is."""
-        if problem := self._cameras.problem(now, self.safety.image_age):
+        if problem := self._observer.cameras.problem(now, self.safety.image_age):
             return problem
-        if now - self._measured[-1][0] > self.safety.joints_age:
+        if now - newest.at > self.safety.joints_age:
             return f"the newest joint state is older than {self.safety.joints_age} s"
         if self._pending is not None and now - self._pending[0] > self.safety.inference:
             return f"inference takes longer than {self.safety.inference} s"
         return ""
 
-    def _off_track(self, measured: Array, now: float) -> bool:
+    def _off_track(self, newest: Measured, now: float) -> bool:
         """Return whether the tracking error has exceeded its limit for too long."""
-        outdated = now - self._measured[-1][0] > self.safety.joints_age
-        if outdated or np.abs(self.limiter.position - measured).max() <= self.safety.tracking:
+        outdated = now - newest.at > self.safety.joints_age or not self._follows_positions
+        if outdated or np.abs(self.limiter.position - newest.joints).max() <= self.safety.tracking:
             self._off_track_since = None
         elif self._off_track_since is None:
             self._off_track_since = now
@@ -319,7 +350,7 @@ class ControlLoop:
 
     def _set_state(self, state: State, reason: str) -> None:
         if state is not self.state and state is not State.RUNNING:
-            self._cameras.fresh, self._schedule = 0, []
+            self._observer.cameras.fresh, self._schedule = 0, []
             self._next_inference = self._last_observed = -np.inf
         self.state, self.reason = state, reason
 

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import asdict
-from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +15,7 @@ import numpy as np
 from vla.data.episodes import EpisodeStore
 from vla.data.formats.files import FolderExporter
 from vla.data.index import Entry
+from vla.deploy.bag import message_types
 from vla.deploy.joint_limiter import Robot
 from vla.deploy.settings import Topics
 from vla.io.types import Text
@@ -61,7 +61,7 @@ class Mcap(FolderExporter):
         self._topics, self._robot, self._depths = topics, robot, depths
         self._action, self._executed = action, executed
         try:
-            _types()
+            message_types()
         except ImportError as error:
             raise ValueError("export=mcap needs the package rosbags: pip install 'vla[ros]' or rosbags") from error
 
@@ -87,7 +87,7 @@ class Mcap(FolderExporter):
 
         writer = Writer(folder, version=9, storage_plugin=StoragePlugin.MCAP)
         writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
-        types = _types()
+        types = message_types()
         with writer:
             connections: dict[str, Any] = {}
             for step in range(entry.steps):
@@ -144,15 +144,8 @@ class Mcap(FolderExporter):
         )
 
 
-@cache
-def _types() -> Any:
-    from rosbags.typesys import Stores, get_typestore
-
-    return get_typestore(Stores.ROS2_JAZZY)
-
-
 def _make(kind: str, **fields: Any) -> Any:
-    make: Callable[..., Any] = _types().types[kind]
+    make: Callable[..., Any] = message_types().types[kind]
     return make(**fields)
 
 

@@ -7,13 +7,17 @@ Shapes: H by W pixels, J joints.
 
 from __future__ import annotations
 
+import io
 import json
+import struct
+import zlib
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Annotated, Any
 
 import numpy as np
 from annotated_types import MaxLen
+from PIL import Image
 
 from vla.deploy.control_loop import Command
 from vla.deploy.joint_limiter import Robot
@@ -27,6 +31,10 @@ ENCODINGS = {
     "rgba8": (4, slice(0, 3)),
     "bgra8": (4, slice(2, None, -1)),
 }
+
+HANDED_OVER = "handed over"  # in the agent's status: yes if a person moves the arm, always in a dry run; no
+MOST_PIXELS = 4096 * 4096  # of a compressed image, whose header may promise any number
+FINGERS_AGE = 0.5  # oldest state of fingers that come in messages of their own [s]
 
 
 @dataclass(frozen=True)
@@ -46,11 +54,13 @@ def shorten(text: str, longest: int = 80) -> str:
 
 
 def image_from(message: Any) -> Array:
-    """Read the (H, W, 3) uint8 RGB image of a sensor_msgs/Image.
+    """Read the (H, W, 3) uint8 RGB image of a sensor_msgs/Image or CompressedImage.
 
     Raises:
         ValueError: the encoding is not supported, or the size is zero or does not match the data.
     """
+    if hasattr(message, "format"):
+        return _decompressed(message)
     if message.encoding not in ENCODINGS:
         raise ValueError(f"image encoding is {shorten(message.encoding)!r}, expected one of {', '.join(ENCODINGS)}")
     depth, order = ENCODINGS[message.encoding]
@@ -63,6 +73,18 @@ def image_from(message: Any) -> Array:
         raise ValueError(f"image has {len(message.data)} bytes, {height} rows of {step} are {step * height}")
     rows = np.frombuffer(message.data, np.uint8).reshape(height, step)[:, : width * depth]
     return np.ascontiguousarray(rows.reshape(height, width, depth)[..., order])
+
+
+def _decompressed(message: Any) -> Array:
+    """Decode a sensor_msgs/CompressedImage of colours, JPEG or PNG, whatever its format field says."""
+    quoted = repr(shorten(message.format))
+    try:
+        with Image.open(io.BytesIO(message.data), formats=["JPEG", "PNG"]) as image:
+            if image.mode not in ("RGB", "RGBA") or image.width * image.height > MOST_PIXELS:
+                raise ValueError(f"image of format {quoted} has {image.width} by {image.height} pixels of {image.mode}")
+            return np.array(image.convert("RGB"))
+    except (OSError, SyntaxError, EOFError, struct.error, zlib.error, Image.DecompressionBombError) as error:
+        raise ValueError(f"image of format {quoted} is no JPEG or PNG, or damaged") from error
 
 
 def fill_image(message: Any, image: Array, frame: str) -> Any:
@@ -94,18 +116,47 @@ def arm_from(message: Any) -> ArmDescription:
     return arm
 
 
-def joints_from(message: Any, robot: Robot) -> tuple[Array, Array, float]:
+class JointStates:
+    """Joint states of an arm, whose fingers come in the same messages or in others."""
+
+    def __init__(self, robot: Robot) -> None:
+        """Args: the names of the joints."""
+        self._robot, self._fingers = robot, (-np.inf, 0.0)  # when they came, opening
+
+    def read(self, message: Any, at: float) -> tuple[Array, Array, float] | None:
+        """Read a sensor_msgs/JointState that came at `at` [s], as `joints_from` does; None if it has the fingers only.
+
+        Raises:
+            ValueError: as `joints_from`; fingers are missing if none came within the last `FINGERS_AGE`.
+        """
+        fingers, names = self._robot.fingers, {*message.name}
+        if fingers and names == {*fingers}:
+            self._fingers = (at, float(_positions(message, fingers)[0].sum()))
+            return None
+        recent = at - self._fingers[0] <= FINGERS_AGE and names.isdisjoint(fingers)
+        return joints_from(message, self._robot, self._fingers[1] if recent else None)
+
+
+def joints_from(message: Any, robot: Robot, opening: float | None = None) -> tuple[Array, Array, float]:
     """Read positions (J,) [rad], velocities (J,) [rad/s] and gripper opening [m] of a sensor_msgs/JointState, by name.
 
-    Missing velocities become zero.
+    Missing velocities become zero. With an `opening` from elsewhere the fingers need not be there.
 
     Raises:
         ValueError: a joint is missing or named twice, the lengths differ, or a number is not finite.
     """
+    fingers = robot.fingers if opening is None else []
+    position, velocity = _positions(message, [*robot.joints, *fingers])
+    arm = len(robot.joints)
+    return position[:arm], velocity[:arm], float(position[arm:].sum()) if opening is None else opening
+
+
+def _positions(message: Any, joints: Sequence[str]) -> tuple[Array, Array]:
+    """Read positions and velocities of some joints, by name."""
     names = list(message.name)
     if len(set(names)) != len(names):
         raise ValueError("joint state names a joint twice")
-    missing = [name for name in (*robot.joints, *robot.fingers) if name not in names]
+    missing = [name for name in joints if name not in names]
     if missing:
         raise ValueError(f"joint state lacks {', '.join(missing)}; it has {', '.join(names) or 'no names'}")
     if len(message.position) != len(names) or len(message.velocity) not in (0, len(names)):
@@ -116,15 +167,18 @@ def joints_from(message: Any, robot: Robot) -> tuple[Array, Array, float]:
     velocity = np.array(message.velocity, dtype=float) if len(message.velocity) else np.zeros(len(names))
     if not (np.isfinite(position).all() and np.isfinite(velocity).all()):
         raise ValueError("joint state has a number that is not finite")
-    arm = [names.index(name) for name in robot.joints]
-    fingers = [names.index(name) for name in robot.fingers]
-    return position[arm], velocity[arm], float(position[fingers].sum())
+    places = [names.index(name) for name in joints]
+    return position[places], velocity[places]
 
 
 def fill_joint_state(message: Any, robot: Robot, command: Command) -> Any:
-    """Fill a sensor_msgs/JointState with target positions of arm and fingers only, as Isaac Sim expects."""
-    message.name = [*robot.joints, *robot.fingers]
-    message.position = [*command.position.tolist(), *finger_positions(robot, command)]
+    """Fill a sensor_msgs/JointState with target positions of arm and fingers only, as Isaac Sim expects.
+
+    Without an opening in the command, it is of the arm alone.
+    """
+    fingers = finger_positions(robot, command)
+    message.name = [*robot.joints, *robot.fingers[: len(fingers)]]
+    message.position = [*command.position.tolist(), *fingers]
     return message
 
 
@@ -146,9 +200,18 @@ def fill_trajectory(
     return message
 
 
+def fill_twist(message: Any, frame: str, velocity: Array) -> Any:
+    """Fill a geometry_msgs/TwistStamped with the (6,) velocity of the tool [m/s], [rad/s] in a frame."""
+    message.header.frame_id = frame
+    parts = (message.twist.linear, message.twist.angular)
+    for part, values in zip(parts, velocity.reshape(2, 3).tolist(), strict=True):
+        part.x, part.y, part.z = values
+    return message
+
+
 def finger_positions(robot: Robot, command: Command) -> list[float]:
-    """Return the target position of every finger joint [m]."""
-    return [command.opening * robot.finger_travel] * len(robot.fingers)
+    """Return the target position of every finger joint [m]; none if the command leaves the gripper as it is."""
+    return [] if command.opening is None else [command.opening * robot.finger_travel] * len(robot.fingers)
 
 
 def command_from(message: Any, robot: Robot) -> tuple[Array, float | None]:

@@ -13,35 +13,45 @@ from typing import Any, get_args
 import numpy as np
 from builtin_interfaces.msg import Duration
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from geometry_msgs.msg import TwistStamped
 from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor, SetParametersResult
 from rclpy.clock import Clock, ClockType
 from rclpy.context import Context
 from rclpy.exceptions import ParameterException
 from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile, ReliabilityPolicy
-from sensor_msgs.msg import Image, JointState
+from sensor_msgs.msg import CompressedImage, Image, JointState
 from std_msgs.msg import Float64MultiArray, String
-from std_srvs.srv import Trigger
+from std_srvs.srv import SetBool, Trigger
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from vla.deploy import messages
-from vla.deploy.control_loop import ControlLoop, State
+from vla.deploy.control_loop import Command, ControlLoop, State
 from vla.deploy.joint_limiter import Robot
 from vla.deploy.lifecycle_node import GuardedLifecycleNode
-from vla.deploy.settings import PolicySettings
+from vla.deploy.observer import age_of
+from vla.deploy.settings import COMPRESSED, PolicySettings
 from vla.io import images
 from vla.policy import Policy
+from vla.robots.controllers import acts_on_joints
+from vla.robots.panda import velocity_of
 from vla.spec import LONGEST_INSTRUCTION, Array, Observation
 
 LEVELS = {
     State.WAITING: DiagnosticStatus.OK,
     State.RUNNING: DiagnosticStatus.OK,
+    State.HANDED_OVER: DiagnosticStatus.OK,
     State.HOLDING: DiagnosticStatus.WARN,
     State.STOPPED: DiagnosticStatus.WARN,
     State.FAULT: DiagnosticStatus.ERROR,
 }
 MAX_MESSAGE = 300  # length of a log line or status message [characters]
-COMMANDS = {"joint_state": JointState, "trajectory": JointTrajectory, "forward": Float64MultiArray}
+COMMANDS = {
+    "joint_state": JointState,
+    "trajectory": JointTrajectory,
+    "forward": Float64MultiArray,
+    "twist": TwistStamped,
+}
 
 
 class PolicyNode(GuardedLifecycleNode):
@@ -77,6 +87,7 @@ class PolicyNode(GuardedLifecycleNode):
         self.declare_parameter("command", self.settings.command)
         self.declare_parameter("image_reliability", self.settings.image_reliability)
         self.declare_parameter("image_crop", self.settings.image_crop)
+        self.declare_parameter("dry_run", self.settings.dry_run)
         rate = FloatingPointRange(from_value=1.0, to_value=1000.0)
         self.declare_parameter("command_hz", self.settings.command_hz, ParameterDescriptor(floating_point_range=[rate]))
         self.add_on_set_parameters_callback(self._on_set_parameters)
@@ -110,25 +121,35 @@ class PolicyNode(GuardedLifecycleNode):
         self._crop = self.get_parameter("image_crop").value
         if self._crop not in get_args(images.Crop):
             raise ValueError(f"image_crop is '{self._crop}', expected one of {', '.join(get_args(images.Crop))}")
-        loop = ControlLoop(spec, robot, self.settings.safety, self.get_parameter("command_hz").value)
+        self._dry_run = dry_run = self.get_parameter("dry_run").value
+        twist = self._command_type == "twist"
+        if twist and acts_on_joints(spec):
+            raise ValueError("command=twist needs a policy of Cartesian actions, this one's are joint positions")
+        rate, follows = self.get_parameter("command_hz").value, not (dry_run or twist)
+        loop = ControlLoop(spec, robot, self.settings.safety, rate, follows)
         self._warm_up()
         reliable = self.get_parameter("image_reliability").value == "reliable"
         best_effort = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
         image_qos = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE) if reliable else best_effort
         for camera in spec.cameras:
-            self.add_subscription(Image, topics.images[camera], partial(self._on_image, camera), image_qos)
-        self.add_subscription(JointState, topics.joint_states, self._on_joint_state, best_effort)
+            kind = CompressedImage if topics.images[camera].endswith(COMPRESSED) else Image
+            self.add_subscription(kind, topics.images[camera], partial(self._on_image, camera), image_qos)
+        self._joint_states = messages.JointStates(robot)
+        for topic in filter(None, {topics.joint_states, topics.finger_states}):
+            self.add_subscription(JointState, topic, self._on_joint_state, best_effort)
         self.add_subscription(String, topics.instruction, self._on_instruction, QoSProfile(depth=1))
-        self._commands = self.add_publisher(COMMANDS[self._command_type], topics.commands, while_active=True)
-        self._gripper = (
-            self.add_publisher(Float64MultiArray, topics.gripper, while_active=True) if topics.gripper else None
-        )
+        commands, gripper = topics.commands, topics.gripper
+        if dry_run:
+            commands, gripper = "~/dry_run/commands", gripper and "~/dry_run/gripper"
+        self._commands = self.add_publisher(COMMANDS[self._command_type], commands, while_active=True)
+        self._gripper = self.add_publisher(Float64MultiArray, gripper, while_active=True) if gripper else None
         self._status = self.add_publisher(DiagnosticStatus, "~/status")
         self._diagnostics = self.add_publisher(DiagnosticArray, "/diagnostics")
         self._arm = self.add_publisher(String, "~/arm")
         self._description = messages.fill_arm(String(), robot, spec.require_robot("deployment"))
         self.add_service(Trigger, "~/stop", self._on_stop)
         self.add_service(Trigger, "~/resume", self._on_resume)
+        self.add_service(SetBool, "~/hand_over", self._on_hand_over)
         self._pool = ThreadPoolExecutor(1, thread_name_prefix="policy")
         self._latencies, self._stamps, self._sizes, self._dropped = {}, {}, {}, 0
         self.loop = loop
@@ -144,9 +165,7 @@ class PolicyNode(GuardedLifecycleNode):
     def activate(self) -> None:
         """Take over the arm at its measured pose."""
         assert self.loop is not None
-        others = self.count_publishers(self._commands.topic_name) - 1
-        if others > 0:
-            raise ValueError(f"{others} other publisher(s) on {self._commands.topic_name}: stop them before activation")
+        self._require_only_commander()
         self.loop.restart()
         self._inference, self._last_tick = None, None
         self._timers = [
@@ -154,20 +173,29 @@ class PolicyNode(GuardedLifecycleNode):
             self.create_timer(1.0, self.guard(self._report), clock=self._steady),
         ]
 
+    def _require_only_commander(self) -> None:
+        others = self.count_publishers(self._commands.topic_name) - 1
+        if others > 0:
+            raise ValueError(f"{others} other publisher(s) on {self._commands.topic_name}: stop them first")
+
     def brake(self) -> None:
         """Publish commands until the arm is at rest, then stop the timers."""
         if not self._timers or self.loop is None:
             return
         self.loop.stop("deactivated", "activate the agent")
-        while True:
-            self._send()
-            if self.loop.limiter.resting:
-                break
-            time.sleep(self.loop.tick)
+        self._come_to_rest(self.loop)
         for timer in self._timers:
             self.destroy_timer(timer)
         self._timers = []
         self._report()
+
+    def _come_to_rest(self, loop: ControlLoop) -> None:
+        """Publish commands of a loop that brakes until the arm is at rest."""
+        while True:
+            self._send()
+            if loop.limiter.resting:
+                break
+            time.sleep(loop.tick)
 
     def clean_up(self) -> None:
         """Shut the inference thread down and drop the control loop."""
@@ -181,7 +209,7 @@ class PolicyNode(GuardedLifecycleNode):
 
     # Inputs.
 
-    def _on_image(self, camera: str, message: Image) -> None:
+    def _on_image(self, camera: str, message: Any) -> None:
         now = time.monotonic()
         stamp = (message.header.stamp.sec, message.header.stamp.nanosec)
         if not self._timers or self.loop is None:
@@ -197,7 +225,7 @@ class PolicyNode(GuardedLifecycleNode):
             self._sizes[camera] = image.shape
             if resizing := images.describe_resize(image, self.policy.spec.image_size, self._crop):
                 self.get_logger().info(f"camera {camera}: {resizing}")
-        age = self._age(stamp)
+        age = age_of(stamp, self.get_clock().now().nanoseconds * 1e-9)
         self._record("image age", age)
         self.loop.on_image(camera, image, now - age)
         return self._advance()
@@ -207,10 +235,11 @@ class PolicyNode(GuardedLifecycleNode):
         if not self._timers or self.loop is None:
             return
         try:
-            joints, velocities, opening = messages.joints_from(message, self.loop.robot)
+            measured = self._joint_states.read(message, now)
         except ValueError as error:
             return self._drop(str(error))
-        self.loop.on_joint_state(joints, velocities, opening, now)
+        if measured is not None:
+            self.loop.on_joint_state(*measured, now)
 
     def _on_instruction(self, message: String) -> None:
         if not self._timers or self.loop is None:
@@ -244,14 +273,29 @@ class PolicyNode(GuardedLifecycleNode):
         response.message = "" if response.success else "nothing to resume: the agent is not stopped"
         return response
 
+    def _on_hand_over(self, request: Any, response: Any) -> Any:
+        """Leave the resting arm to a person, or take it back at its measured pose."""
+        loop = self.loop
+        if loop is None or not self._timers:
+            response.message = "the agent is not active"
+            return response
+        try:
+            if request.data and not loop.handed_over:
+                loop.hold("a person takes over")
+                self._come_to_rest(loop)
+                loop.hand_over()
+            elif not request.data and loop.handed_over:
+                self._require_only_commander()
+                loop.take_back(time.monotonic())
+            response.success = True
+        except ValueError as error:
+            response.message = str(error)
+        self._report()
+        return response
+
     def _drop(self, reason: str) -> None:
         self._dropped += 1
         self.get_logger().warning(messages.shorten(reason, MAX_MESSAGE), throttle_duration_sec=1.0)
-
-    def _age(self, stamp: tuple[int, int]) -> float:
-        """Return the age [s] of a message by its stamp; 0 if the stamp cannot come from this clock."""
-        age = self.get_clock().now().nanoseconds * 1e-9 - (stamp[0] + stamp[1] * 1e-9)
-        return age if stamp != (0, 0) and 0 <= age < 10.0 else 0.0
 
     # Commands.
 
@@ -291,8 +335,13 @@ class PolicyNode(GuardedLifecycleNode):
         assert self.loop is not None
         now = time.monotonic()
         command = self.loop.command(now)
-        if command is None:
-            return
+        if command is not None:
+            self._publish(command, now)
+        if (self.loop.state, self.loop.reason) != self._reported:
+            self._report()
+
+    def _publish(self, command: Command, now: float) -> None:
+        assert self.loop is not None
         robot = self.loop.robot
         if self._command_type == "joint_state":
             message = messages.fill_joint_state(JointState(), robot, command)
@@ -302,13 +351,16 @@ class PolicyNode(GuardedLifecycleNode):
             message = messages.fill_trajectory(
                 JointTrajectory(), JointTrajectoryPoint, Duration, robot, ahead, self.loop.tick
             )
+        elif self._command_type == "twist":
+            frame = self.settings.twist_frame or self.policy.spec.require_robot("deployment").frame
+            message = messages.fill_twist(TwistStamped(), frame, velocity_of(command.position, command.velocity))
+            message.header.stamp = self.get_clock().now().to_msg()
         else:
             message = Float64MultiArray(data=command.position.tolist())
         self._commands.publish(message)
-        if self._gripper is not None:
-            self._gripper.publish(Float64MultiArray(data=messages.finger_positions(robot, command)))
-        if (self.loop.state, self.loop.reason) != self._reported:
-            self._report()
+        fingers = messages.finger_positions(robot, command)
+        if self._gripper is not None and fingers:
+            self._gripper.publish(Float64MultiArray(data=fingers))
 
     def _record(self, name: str, seconds: float) -> None:
         self._latencies.setdefault(name, deque(maxlen=500)).append(seconds)
@@ -329,6 +381,7 @@ class PolicyNode(GuardedLifecycleNode):
                 self.get_logger().warning(line)
         values = {
             "state": loop.state.value,
+            messages.HANDED_OVER: "yes" if loop.handed_over or self._dry_run else "no",
             "instruction": messages.shorten(loop.instruction),
             "messages dropped": str(self._dropped),
             "ticks skipped": str(loop.overruns),
@@ -348,7 +401,7 @@ class PolicyNode(GuardedLifecycleNode):
     def _check_publishers(self) -> None:
         """Fault if another node commands the arm, hold if a camera topic has several publishers."""
         assert self.loop is not None
-        if self.count_publishers(self._commands.topic_name) > 1:
+        if self.count_publishers(self._commands.topic_name) > 1 and not self.loop.handed_over:
             self.loop.fail(f"another node commands the arm on {self._commands.topic_name}")
         for camera in self.policy.spec.cameras:
             topic = self.resolve_topic_name(self.settings.topics.images[camera])

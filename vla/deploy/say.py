@@ -10,26 +10,33 @@ from vla.spec import LONGEST_INSTRUCTION
 
 
 def main() -> None:
-    """Reset, send the instruction and resume, as requested, in this order."""
+    """Reset, hand the arm over, send the instruction, hand back and resume, as requested, in this order."""
     parser = argparse.ArgumentParser(prog="python -m vla.deploy.say", description=__doc__)
     parser.add_argument("instruction", nargs="?")
     parser.add_argument("--topic", default="/user/command")
     parser.add_argument("--resume", action="store_true", help="resume a stopped agent")
     parser.add_argument("--reset", action="store_true", help="start the next episode of the simulator")
+    arm = parser.add_mutually_exclusive_group()
+    arm.add_argument("--hand-over", action="store_true", help="stop the agent's commands, for a person to move the arm")
+    arm.add_argument("--hand-back", action="store_true", help="let the agent command the arm again, from where it is")
     parser.add_argument("--network", choices=NETWORKS, default="loopback")
     options = parser.parse_args()
-    if options.instruction is None and not (options.resume or options.reset):
-        parser.error("nothing to do: add an instruction, --resume or --reset")
+    if options.instruction is None and not any((options.resume, options.reset, options.hand_over, options.hand_back)):
+        parser.error("nothing to do: add an instruction, --resume, --hand-over, --hand-back or --reset")
     instruction = options.instruction or ""
     if len(instruction) > LONGEST_INSTRUCTION:
         sys.exit(f"error: the instruction has {len(instruction)} characters, the limit is {LONGEST_INSTRUCTION}")
     with command_node("vla_say", options.network) as (node, _):
-        from vla.deploy.calls import next_episode, resume, say
+        from vla.deploy.calls import hand_over, next_episode, resume, say
 
         if options.reset:
             print(next_episode(node))
+        if options.hand_over:
+            hand_over(node, to_person=True)
         if options.instruction is not None:
             say(node, options.topic, instruction)
+        if options.hand_back:
+            hand_over(node, to_person=False)
         if options.resume:
             resume(node)
 

@@ -9,8 +9,9 @@ from typing import Literal
 from vla.deploy.control_loop import Safety
 from vla.deploy.joint_limiter import Robot
 from vla.io.images import Crop
-from vla.io.types import NonNegative, Positive
+from vla.io.types import NonNegative, Positive, Text
 
+COMPRESSED = "/compressed"  # end of the topics of sensor_msgs/CompressedImage, as of image_transport
 NAME = re.compile(r"(~/|/)?[A-Za-z_]\w*(/[A-Za-z_]\w*)*", re.ASCII)  # of a topic
 
 
@@ -22,11 +23,12 @@ class Topics:
         ValueError: a name is not valid in ROS.
     """
 
-    images: dict[str, str]  # camera → topic of sensor_msgs/Image
+    images: dict[str, str]  # camera → topic of sensor_msgs/Image, or of CompressedImage if it ends with /compressed
     joint_states: str  # sensor_msgs/JointState
     instruction: str  # std_msgs/String
     commands: str
     gripper: str | None  # Float64MultiArray of finger positions, for commands without fingers
+    finger_states: str | None  # sensor_msgs/JointState of the fingers, if these come on another topic than the arm
 
     def __post_init__(self) -> None:
         named = {**asdict(self), **{f"images.{camera}": topic for camera, topic in self.images.items()}}
@@ -55,16 +57,21 @@ class PolicySettings:
         robot: the arm and its limits.
         topics: names of the topics.
         safety: time-outs and limits.
-        command: JointState with positions, JointTrajectory that ends at rest, or Float64MultiArray of positions.
+        command: JointState with positions, JointTrajectory that ends at rest, Float64MultiArray of positions, or
+            TwistStamped of the tool, for Cartesian actions.
+        twist_frame: base frame of a TwistStamped; None: as the policy names it.
         command_hz: commands per second.
         image_reliability: QoS of the images; "reliable" helps with large images on a lossy network.
         image_crop: for images with another aspect ratio than in training: crop the centre, or distort the whole.
+        dry_run: publish the commands below ~/dry_run, where nothing obeys them.
     """
 
     robot: Robot
     topics: Topics
     safety: Safety
-    command: Literal["joint_state", "trajectory", "forward"]
+    command: Literal["joint_state", "trajectory", "forward", "twist"]
+    twist_frame: Text | None
     command_hz: Positive
     image_reliability: Literal["best_effort", "reliable"]
     image_crop: Crop
+    dry_run: bool

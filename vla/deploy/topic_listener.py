@@ -9,7 +9,7 @@ from typing import Any
 
 PRIVATE = ("/rosout", "/parameter_events")  # of ROS itself
 DISCOVERY_PERIOD = 0.5  # between two queries for new topics [s]
-MESSAGE_PACKAGES = ("sensor_msgs", "std_msgs", "trajectory_msgs", "diagnostic_msgs", "rosgraph_msgs")
+MESSAGE_PACKAGES = ("sensor_msgs", "std_msgs", "trajectory_msgs", "geometry_msgs", "diagnostic_msgs", "rosgraph_msgs")
 
 
 def message_class(name: str) -> Any:

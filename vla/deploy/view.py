@@ -70,11 +70,12 @@ class View(TopicListener):
 
     def callback_for(self, topic: str, kind: str) -> Callable[[Any], None] | None:
         """Return the callback that logs the messages of a topic; None for types that are not shown."""
-        if kind == "sensor_msgs/msg/Image":
+        if kind in ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"):
             self._cameras.append(topic)
             self._send_layout()
         log: dict[str, Callable[[str, Any], None]] = {
             "sensor_msgs/msg/Image": self._image,
+            "sensor_msgs/msg/CompressedImage": self._image,
             "sensor_msgs/msg/JointState": self._joint_state,
             "trajectory_msgs/msg/JointTrajectory": self._trajectory,
             "diagnostic_msgs/msg/DiagnosticStatus": self._status,

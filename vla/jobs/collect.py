@@ -15,7 +15,7 @@ from vla.spec import FIRST_SEED, Environment, Multitask, Spec, SpecOnly
 
 log = logging.getLogger(__name__)
 
-JOB = Job(("task", "expert", "cluster"))
+JOB = Job(("task", "expert", "cluster"), adopts=True)
 
 
 def run(experiment: Experiment) -> None:

@@ -11,7 +11,7 @@ from hydra.experimental.callback import Callback
 from hydra.types import RunMode
 from omegaconf import DictConfig
 
-from vla.runs.sweep import FAILURE
+from vla.runs.cells import FAILURE
 
 
 class SweepTable(Callback):

@@ -181,10 +181,11 @@ class Model(nn.Module, ABC):
         losses["loss"] = losses["action_loss"]
         if self.truth_head is not None:
             frames = output["truth"].shape[1]
-            present = batch["present"][:, -frames:]
-            target = self.truth_scale(batch["truth"][:, -frames:], present)
+            truth = batch["truth"][:, -frames:]
+            known = batch["present"][:, -frames:] & truth.isfinite().all(-1)
+            target = self.truth_scale(truth.nan_to_num(), known)
             error = (output["truth"].float() - target).square().mean(-1)  # (B, T')
-            losses["truth_loss"] = (error * present).sum() / present.sum().clamp(min=1)
+            losses["truth_loss"] = (error * known).sum() / known.sum().clamp(min=1)
             losses["loss"] = losses["loss"] + self.auxiliary * losses["truth_loss"]
         return losses
 

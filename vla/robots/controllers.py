@@ -32,6 +32,10 @@ class Controller(Protocol):
         """Return joint targets (J,) [rad] one control period ahead."""
         ...
 
+    def motion_between(self, before: Array, after: Array) -> Array:
+        """Return the motion that takes joints (J,) [rad] from `before` to `after`: the inverse of `step`."""
+        ...
+
 
 class JointController:
     """Takes actions that are joint targets.
@@ -52,6 +56,12 @@ class JointController:
         targets: Array = motion[self._order] * self._factors
         return targets
 
+    def motion_between(self, before: Array, after: Array) -> Array:
+        """Return the joints `after` (J,) in the order and units of the action."""
+        motion = np.empty(len(after))
+        motion[self._order] = after / self._factors
+        return motion
+
 
 def controller_for(spec: Spec, workspace: tuple[Point, Point] | None) -> Controller:
     """Build the controller for the actions in `spec`: joint positions of any arm, or Cartesian motion of the Panda.
@@ -64,7 +74,7 @@ def controller_for(spec: Spec, workspace: tuple[Point, Point] | None) -> Control
         ValueError: the arm or the actions are of another kind, or the box cannot be kept.
     """
     model = spec.require_robot("deployment")
-    if set(model.joints) <= {*spec.action}:
+    if acts_on_joints(spec):
         return _joint_controller(spec, model, workspace)
     differs, joints = "", len(panda.CHAIN) - 1
     if len(model.joints) != joints:
@@ -83,6 +93,20 @@ def controller_for(spec: Spec, workspace: tuple[Point, Point] | None) -> Control
     if workspace is None:
         raise ValueError("deploy.safety.workspace=null: Cartesian motion needs a box for the tool point")
     return panda.CartesianController(1 / spec.control_hz, *workspace)
+
+
+def acts_on_joints(spec: Spec) -> bool:
+    """Return whether the actions in `spec` are joint positions; a ValueError if it has no robot."""
+    return {*spec.require_robot("deployment").joints} <= {*spec.action}
+
+
+def recorded_controller(spec: Spec) -> Controller:
+    """Build the controller for actions that have been executed already, by the person who is responsible for them.
+
+    Raises:
+        ValueError: the arm or the actions are of another kind.
+    """
+    return controller_for(spec, None if acts_on_joints(spec) else ((-math.inf,) * 3, (math.inf,) * 3))
 
 
 def joint_factors(spec: Spec) -> Array:

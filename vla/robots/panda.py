@@ -114,6 +114,17 @@ def forward(joints: Array) -> tuple[Array, Array]:
     return pose, np.array([ay * z - az * y, az * x - ax * z, ax * y - ay * x, ax, ay, az])
 
 
+def velocity_of(joints: Array, velocities: Array) -> Array:
+    """Return the (6,) velocity of the tool centre point [m/s], [rad/s] in the base frame.
+
+    Args:
+        joints: (7,) [rad].
+        velocities: of the joints (7,) [rad/s].
+    """
+    velocity: Array = forward(joints)[1] @ velocities
+    return velocity
+
+
 def solve(target: Array, joints: Array) -> Array:
     """Find joints near `joints` that bring the tool centre point to the (4, 4) pose `target`, by damped least squares.
 
@@ -174,3 +185,9 @@ class CartesianController:
         self.joints = self.joints + np.clip(solution - self.joints, -reach, reach)
         self.pose = forward(self.joints)[0]
         return self.joints
+
+    def motion_between(self, before: Array, after: Array) -> Array:
+        """Return the (6,) translation [m] and rotation vector [rad] of the tool between joints (7,) [rad]."""
+        start, end = forward(before)[0], forward(after)[0]
+        turn = vector_from_rotation(end[:3, :3] @ start[:3, :3].T)
+        return np.concatenate([end[:3, 3] - start[:3, 3], turn])

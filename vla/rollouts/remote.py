@@ -9,10 +9,9 @@ import time
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from annotated_types import Len
 from PIL import Image, ImageOps
 
 from vla.io.array_messages import pack, unpack
@@ -59,7 +58,7 @@ class RemotePolicy:
 
     url: Text
     images: dict[str, Text | None]
-    image_size: Annotated[list[Pixels], Len(2, 2)] | None
+    image_size: tuple[Pixels, Pixels] | None
     state: dict[str, list[Text] | None]
     prompt: Text
     actions: dict[str, Component] | None

@@ -36,8 +36,10 @@ class AgainstBar:
     def say(self, report: Report) -> str:
         """See `Statement`."""
         low, high = report.interval
-        verdict = "above" if low > self.bar else "below" if high < self.bar else "open: perhaps above, perhaps below"
-        return f"success is {verdict} the bar of {100 * self.bar:g} %"
+        bar = f"the bar of {100 * self.bar:g} %"
+        if low <= self.bar <= high:
+            return f"open: success may be above or below {bar}"
+        return f"success is {'above' if low > self.bar else 'below'} {bar}"
 
 
 @dataclass(frozen=True)

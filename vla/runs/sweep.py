@@ -1,23 +1,17 @@
-"""A sweep's folder on disk: its cells, failures and results.
-
-A cell is the run folder of one job of the sweep; cells that differ only in the training seed form one row.
-"""
+"""Results of a sweep: cells that differ only in the training seed form one row."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from vla.io.documents import read_bounded, read_yaml
-from vla.io.files import write_text
 from vla.rollouts.evaluate import ERROR
 from vla.rollouts.statistics import pooled_interval
+from vla.runs.cells import FAILURE, cells, overrides_of, varied_keys
 from vla.runs.folder import REPORT, read_run
 
 DEMONSTRATIONS = "collect.episodes"  # override that is the x axis of learning curves
 SEED = "seed"  # override that distinguishes the cells of one row
-OVERRIDES = ".hydra/overrides.yaml"  # written by Hydra in the folder of every cell
-FAILURE = "error.txt"  # in the folder of a failed cell
 
 
 @dataclass
@@ -57,23 +51,6 @@ class SweepRow:
         return (rate, *pooled_interval(self.played[condition]))
 
 
-def save_failure(cell: Path, reason: str) -> None:
-    """Save why a cell failed; the list of failures quotes the first line."""
-    write_text(cell / FAILURE, f"{reason}\n")
-
-
-def failures(folder: Path) -> str:
-    """Describe the failed cells of a sweep: their number, then choices and reason of each."""
-    choices_of = {cell: overrides_of(cell) for cell in cells(folder, OVERRIDES)}
-    varied = varied_keys(list(choices_of.values()))
-    lines = []
-    for cell in cells(folder, FAILURE):
-        choices = "".join(f" {key}={choices_of[cell][key]}" for key in varied if key in choices_of[cell])
-        reason = read_bounded(cell / FAILURE).decode("utf-8", "replace").partition("\n")[0]
-        lines.append(f"\n  {cell.name}{choices}: {reason}")
-    return f"{len(lines)} of {len(choices_of)} cells failed, see {FAILURE} of each in {folder}{''.join(lines)}"
-
-
 def read_rows(folder: Path) -> list[SweepRow]:
     """Read the rows of all cells that have a report and did not fail, in the order of the sweep."""
     reported = [
@@ -96,21 +73,3 @@ def read_rows(folder: Path) -> list[SweepRow]:
             ended = {result.seed: result.outcome == "success" for result in report.results if result.outcome != ERROR}
             row.played.setdefault(condition, []).append(ended)
     return list(rows.values())
-
-
-def cells(folder: Path, having: str) -> list[Path]:
-    """Return the cells that contain the file `having`, in the order of the sweep."""
-    found = [cell for cell in folder.iterdir() if (cell / having).exists()]
-    return sorted(found, key=lambda cell: (len(cell.name), cell.name))
-
-
-def overrides_of(cell: Path) -> dict[str, str]:
-    """Return key → value of a cell's command line."""
-    pairs = (override.partition("=") for override in read_yaml(cell / OVERRIDES, list[str]))
-    return {key.lstrip("+~"): value for key, _, value in pairs}
-
-
-def varied_keys(choices: list[dict[str, str]]) -> list[str]:
-    """Return the overrides that differ between cells."""
-    keys = dict.fromkeys(key for overrides in choices for key in overrides)
-    return [key for key in keys if len({overrides.get(key) for overrides in choices}) > 1]

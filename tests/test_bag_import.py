@@ -1,0 +1,214 @@
+"""A recorded bag becomes episodes: the observations of the policy node, who acted, and what was done."""
+
+from __future__ import annotations
+
+import random
+import shutil
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import bags
+import composing
+import numpy as np
+import pytest
+from arm import ROBOT, SPEC
+from rosbags.rosbag2 import StoragePlugin
+
+from vla.config.build import build
+from vla.config.experiment import plain
+from vla.deploy.bag_import import BagDemonstrations
+from vla.deploy.settings import Topics
+from vla.spec import Episode
+
+TOPICS = Topics(dict(bags.IMAGES), "/joint_states", "/words", "/commands", None, None)
+
+
+@pytest.fixture(scope="module")
+def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A session in which a policy errs and a person takes over."""
+    return bags.write(tmp_path_factory.mktemp("bags") / "bag")
+
+
+def imported(folder: Path, steps: Any = "corrected", spec: Any = SPEC, **changed: Any) -> BagDemonstrations:
+    options: dict[str, Any] = {
+        "topics": TOPICS,
+        "status": "/vla_agent/status",
+        "robot": ROBOT,
+        "image_crop": "centre",
+        **changed,
+    }
+    return BagDemonstrations(folder, steps, **options, spec=spec)
+
+
+def brightness(episode: Episode) -> list[int]:
+    """Return the numbers of the steps that the images show."""
+    return [int(seen.rgb["front"].mean()) // 3 for seen in episode.observations]
+
+
+def test_what_a_person_did_is_an_episode_from_the_first_motion_to_the_last(bag: Path) -> None:
+    demonstrations = imported(bag)
+    assert len(demonstrations) == 1
+    episode = demonstrations.episode(0)
+    assert episode.instruction == "put the red block on the pad" and episode.outcome == "unverified"
+    numbers = brightness(episode)
+    assert numbers == list(range(numbers[0], numbers[-1] + 1))
+    assert 32 <= numbers[0] <= 33 and 44 <= numbers[-1] <= 46  # of the 33 … 44 in which the person moved the arm
+    assert episode.draws["expert_acts"] == [(0, len(numbers) - 1)] and episode.draws["recorded"]["corrected"] == 1.0
+    first = numbers.index(33)
+    np.testing.assert_allclose(episode.actions[first : first + 12], bags.executed((4,)), atol=2e-4)
+    assert episode.actions.dtype == np.float32 and (episode.actions[first:, 6] == 0).all()
+
+
+def test_everything_is_an_episode_per_try_and_says_who_acted(bag: Path) -> None:
+    demonstrations = imported(bag, "all")
+    episodes = [demonstrations.episode(number) for number in range(len(demonstrations))]
+    words = ["put the red block on the pad"] * 3 + ["lift the blue block"]
+    assert [episode.instruction for episode in episodes] == words
+    assert episodes[0].draws["expert_acts"] == []
+    assert [round(episode.draws["recorded"]["corrected"]) for episode in episodes] == [0, 1, 0, 0]
+    np.testing.assert_allclose(episodes[0].actions[:18], bags.executed((1,))[:18], atol=2e-4)
+    state = episodes[0].observations[0].state
+    assert state[14] == pytest.approx(0.08) and np.abs(state[:7] - bags.HOME).max() < 0.05
+    assert [seen.instruction for seen in episodes[3].observations] == ["lift the blue block"] * 6
+
+
+def test_a_policy_that_runs_on_from_the_hand_of_a_person_is_one_episode(tmp_path: Path) -> None:
+    parts = (
+        bags.Part("running", bags.moving(10, 0), instruction="lift it"),
+        bags.Part("handed over", bags.moving(10, 1), person=True),
+        bags.Part("running", bags.moving(10, 2)),
+    )
+    (episode,) = [*map(imported(bags.write(tmp_path / "bag", parts), "all").episode, range(1))]
+    ((first, last),) = episode.draws["expert_acts"]
+    assert len(episode.actions) == 29 and 9 <= first <= 10 and 18 <= last <= 19
+
+
+def test_an_arm_that_is_guided_by_hand_moves_as_measured(tmp_path: Path) -> None:
+    parts = (
+        bags.Part("running", bags.moving(5, 0), instruction="lift it"),
+        bags.Part("handed over", bags.moving(10, 1), person=True, commands=False),
+        bags.Part("holding", np.repeat(bags.RESTING, 3, 0)),
+    )
+    episode = imported(bags.write(tmp_path / "bag", parts)).episode(0)
+    first = brightness(episode).index(6)
+    np.testing.assert_allclose(episode.actions[first : first + 8, :6], bags.moving(8, 1)[:, :6], atol=2e-4)
+
+
+@pytest.mark.parametrize("storage", [StoragePlugin.MCAP, StoragePlugin.SQLITE3], ids=["mcap", "sqlite3"])
+def test_a_session_without_a_policy_is_all_of_a_person(tmp_path: Path, storage: StoragePlugin) -> None:
+    parts = [
+        bags.Part("", np.concatenate([np.repeat(bags.RESTING, 3, 0), bags.moving(10, seed)]), instruction=words)
+        for seed, words in enumerate(["lift it", "lift it", "put it down", ""])
+    ]
+    bag = bags.write(tmp_path / "bag", parts, storage, status=False, compressed=True)
+    demonstrations = imported(bag)
+    episodes = [demonstrations.episode(number) for number in range(len(demonstrations))]
+    assert [episode.instruction for episode in episodes] == ["lift it", "put it down"]  # the second repeats the first
+    assert brightness(episodes[1])[-1] >= 37
+
+
+def test_joint_positions_of_any_robot_are_learned_from_a_bag_alone(bag: Path) -> None:
+    topics = [f"expert.topics.{name}={getattr(TOPICS, name)}" for name in ("joint_states", "instruction", "commands")]
+    images = [f"expert.topics.images.{camera}={topic}" for camera, topic in TOPICS.images.items()]
+    chosen = ("task=recorded", "task.joints=all", "task.units=rad", "task.image_size=[8,8]", "expert=bag")
+    robot = "expert.robot.fingers=[left,right]"
+    config: Any = plain(composing.composed(*chosen, f"expert.folder={bag}", robot, *topics, *images))
+    spec = build(config["task"], "task").spec
+    assert (spec.control_hz, spec.cameras, spec.action) == (10.0, ("front", "wrist"), tuple(ROBOT.joints))
+    demonstrations = build(config["expert"], "expert", spec=spec)
+    assert len(demonstrations) == config["collect"]["episodes"] == 1
+    episode = demonstrations.episode(0)
+    states = [seen.state for seen in episode.observations]
+    np.testing.assert_allclose(episode.actions[:-1], states[1:], atol=0.01)
+    assert np.abs(np.diff(episode.actions, axis=0)).sum() > 0.05
+
+
+def cut(folder: Path) -> None:
+    file = folder / "bag.mcap"
+    file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
+
+
+def without_description(folder: Path) -> None:
+    (folder / "metadata.yaml").unlink()
+
+
+def nothing(folder: Path) -> None:
+    pass
+
+
+@pytest.mark.parametrize(
+    ("damage", "changed", "says"),
+    [
+        (cut, {}, "bag is damaged or not a bag: "),
+        (without_description, {}, r"is not a bag: it has no metadata\.yaml"),
+        (
+            nothing,
+            {"topics": replace(TOPICS, images={"front": "/top", "wrist": "/wrist"})},
+            "has no topic /top, it has",
+        ),
+        (
+            nothing,
+            {"topics": replace(TOPICS, joint_states="/front")},
+            "/front is of type sensor_msgs/msg/Image, expect",
+        ),
+        (nothing, {"robot": replace(ROBOT, joints=[f"fr3_joint{n}" for n in range(1, 8)])}, "lacks fr3_joint1, .* has"),
+        (nothing, {"robot": replace(ROBOT, fingers=["thumb"])}, "can be used: joint state lacks thumb; it has left"),
+        (nothing, {"spec": replace(SPEC, robot=None)}, "expert=bag needs a robot"),
+        (nothing, {"spec": replace(SPEC, cameras=("top",))}, r"no topic for the cameras top: add \+expert\.topics"),
+    ],
+)
+def test_a_bag_that_does_not_fit_is_refused_in_a_sentence(
+    bag: Path, tmp_path: Path, damage: Any, changed: Any, says: str
+) -> None:
+    copy = Path(shutil.copytree(bag, tmp_path / "bag"))
+    damage(copy)
+    with pytest.raises(ValueError, match=says) as refused:
+        imported(copy, **changed)
+    assert "\n" not in str(refused.value)
+
+
+def test_images_of_another_kind_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    layout = {"height": 8, "width": 8, "encoding": "mono8", "is_bigendian": 0, "step": 8, "data": np.zeros(64, "u1")}
+    monkeypatch.setattr(
+        bags.Session,
+        "_images",
+        lambda self: [
+            self.send(topic, bags.make("sensor_msgs/msg/Image", header=self._header(), **layout))
+            for topic in bags.IMAGES.values()
+        ],
+    )
+    with pytest.raises(ValueError, match="no message on /front can be used: image encoding is 'mono8', expected one"):
+        imported(bags.write(tmp_path / "bag"))
+
+
+def test_without_a_correction_there_is_nothing_to_import_but_what_the_policy_did(tmp_path: Path) -> None:
+    bag = bags.write(tmp_path / "bag", bags.SESSION[-2:])
+    with pytest.raises(ValueError, match=r"has no corrections: .* expert\.steps=all"):
+        imported(bag)
+    assert len(imported(bag, "all")) == 1
+
+
+@pytest.mark.parametrize("name", ["bag.mcap", "metadata.yaml"])
+def test_a_damaged_bag_is_imported_or_refused_in_a_sentence(tmp_path: Path, name: str) -> None:
+    """Bits that flip in many places, ends that are missing, sizes that are huge."""
+    whole = bags.write(tmp_path / "bag", bags.SESSION[9:])
+    data, generator = (whole / name).read_bytes(), random.Random(0)
+    refused = 0
+    for trial in range(32):
+        changed, place = bytearray(data), generator.randrange(len(data) - 8)
+        if trial % 4 == 0:
+            del changed[place:]
+        elif trial % 4 == 1:
+            changed[place : place + 8] = (1 << generator.randrange(20, 62)).to_bytes(8, "little")
+        else:
+            changed[place] ^= 1 << generator.randrange(8)
+        (whole / name).write_bytes(changed)
+        try:
+            demonstrations = imported(whole, "all")
+            for number in range(len(demonstrations)):
+                assert np.isfinite(demonstrations.episode(number).actions).all()
+        except ValueError as error:
+            assert str(whole) in str(error) and "\n" not in str(error) and len(str(error)) < 1000
+            refused += 1
+    assert refused > 5

@@ -1,0 +1,242 @@
+"""Import of ROS 2 bags of a deployed policy, or of a person who moves the robot, as demonstrations.
+
+Shapes: N steps, P state components, D action components.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping, Sequence
+from contextlib import nullcontext
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+
+from vla.data.episodes import EpisodeStore
+from vla.data.formats.imported_demonstrations import ImportedDemonstrations, Recording, action_bounds
+from vla.deploy import messages
+from vla.deploy.bag import damage, message_types, messages_of, opened
+from vla.deploy.bag_index import BagIndex, Picture, Stretch, read_index
+from vla.deploy.joint_limiter import Robot
+from vla.deploy.observer import Observer
+from vla.deploy.settings import Topics
+from vla.io.images import Crop, resize
+from vla.io.types import Text
+from vla.robots.controllers import GRIPPER, recorded_controller
+from vla.spec import Array, Episode, Observation, Spec
+
+MEASURED_WITHIN = 0.2  # largest time between an observation and its joint state [s]
+
+log = logging.getLogger(__name__)
+
+
+class Step(NamedTuple):
+    """One step of an episode, without its images."""
+
+    at: float  # when its images were taken [s]
+    pictures: dict[str, int]  # camera → when its image was recorded [ns]
+    state: Array  # (P,) float32
+
+
+class BagDemonstrations(ImportedDemonstrations):
+    """Episodes of a bag, at the control rate of the task, with the observations that the policy node makes of it.
+
+    The action of a step is the motion that was commanded for one control period, whoever commanded it; where nobody
+    did, as when an arm is guided by hand, the measured one. The gripper's is its last command, or its measured opening
+    if there is none in the bag. Actions beyond the bounds of the task are clipped, depth is 0 (no return). Whether an
+    episode succeeded is not known: its outcome is "unverified". Its draws list the steps in which a person acted,
+    `expert_acts`, as in `job=improve`, and their share, `recorded.corrected`.
+
+    Args:
+        folder: of the bag.
+        steps: "corrected": every motion of a person is an episode; "all": every try of an instruction is, with what
+            the policy did.
+        topics: in the bag.
+        status: topic of the policy node's status, which tells who moves the arm; without it, a person always does.
+        robot: names of the joints, and travel of the fingers.
+        image_crop: as in the policy node.
+        spec: of the task.
+
+    Raises:
+        ValueError: the bag is missing, damaged or incomplete, lacks topics, or is of another robot.
+    """
+
+    def __init__(
+        self,
+        folder: Path | str | None,
+        steps: Literal["corrected", "all"],
+        topics: Topics,
+        status: Text,
+        robot: Robot,
+        image_crop: Crop,
+        *,
+        spec: Spec,
+    ) -> None:
+        self.spec, self._robot, self._crop = spec.without_truth, robot, image_crop
+        model = spec.require_robot("expert=bag")
+        if len(robot.joints) != len(model.joints):
+            raise ValueError(f"the task's robot has {len(model.joints)} joints, expert.robot has {len(robot.joints)}")
+        if missing := [camera for camera in spec.cameras if camera not in topics.images]:
+            raise ValueError(f"no topic for the cameras {', '.join(missing)}: add +expert.topics.images.{missing[0]}")
+        self._controller = recorded_controller(spec)
+        self._grip = spec.action.index(GRIPPER) if GRIPPER in {*spec.action} - {*model.joints} else None
+        self._topics = {camera: topics.images[camera] for camera in spec.cameras}
+        self._index = _indexed(folder, topics, robot, status, self._topics)
+        self._stretches = _chosen(self._index, steps)
+        self._steps = [self._steps_in(stretch) for stretch in self._stretches]
+        self._beyond = 0
+
+    @classmethod
+    def recording(cls, options: Mapping[str, Any]) -> Recording:
+        """Describe a bag: its state and action are the joints, see `ImportedDemonstrations.recording`."""
+        return _recording(**options)
+
+    def __len__(self) -> int:
+        """Return the number of episodes."""
+        return len(self._stretches)
+
+    def episode(self, number: int) -> Episode:
+        """Return one episode, with its images.
+
+        Raises:
+            ValueError: images are damaged.
+        """
+        spec, stretch, steps = self.spec, self._stretches[number], self._steps[number]
+        images = self._images(steps)
+        observations = [
+            Observation(
+                {camera: images[camera, step.pictures[camera]] for camera in spec.cameras},
+                step.state,
+                stretch.instruction,
+                {camera: np.zeros(spec.image_size, np.uint16) for camera in spec.depth},
+            )
+            for step in steps
+        ]
+        actions = np.array([self._action(step.at) for step in steps])
+        clipped = np.clip(actions, spec.low, spec.high).astype(np.float32)
+        self._beyond += int((np.abs(clipped - actions) > 1e-6).any(1).sum())
+        acts = _runs([any(start <= step.at <= end for start, end in stretch.person) for step in steps])
+        share = sum(last - first + 1 for first, last in acts) / len(steps)
+        recorded = {"episode": number, "corrected": round(share, 3), "lacks": ["depth"] if spec.depth else []}
+        draws = {"recorded": recorded, "expert_acts": acts}
+        what = (number, "recorded", stretch.instruction, "unverified", frozenset[str](), draws)
+        return Episode(*what, observations, clipped, clipped)
+
+    def fill(self, store: EpisodeStore, episodes: int) -> int:
+        """Append episodes, and log what the import changes."""
+        self._beyond = 0
+        added = super().fill(store, episodes)
+        if self._beyond:
+            log.info("%d actions are clipped to the bounds of the task", self._beyond)
+        return added
+
+    def _steps_in(self, stretch: Stretch) -> list[Step]:
+        """Return the steps of a stretch, made as the policy node makes its observations; a ValueError without any."""
+        observer, steps, period = Observer(self.spec), list[Step](), 1 / self.spec.control_hz
+        last = earliest = -np.inf
+        for now, each in self._index.inputs:
+            if now > stretch.end:
+                break
+            if now < stretch.start - 1.0:
+                continue
+            if not isinstance(each, Picture):
+                observer.on_joint_state(each)
+                continue
+            if each.camera not in self._topics:
+                continue
+            observer.cameras.add(each.camera, np.array(each.stamp), each.at)
+            taken = observer.due(last, earliest)
+            if taken is None or observer.newest is None or not stretch.start <= taken <= stretch.end - period:
+                continue
+            measured = observer.measured_at(taken)
+            if abs(measured.at - taken) <= MEASURED_WITHIN:
+                pictures = {camera: int(stamp) for camera, stamp in observer.cameras.images.items()}
+                steps.append(Step(taken, pictures, observer.state(measured)))
+                last, earliest = taken, taken + period
+        if not steps:
+            raise ValueError(
+                f"{self._index.folder} has no matching images of {', '.join(self._topics)} from {stretch.start:.1f} to "
+                f"{stretch.end:.1f} s, in '{messages.shorten(stretch.instruction)}'"
+            )
+        return steps
+
+    def _images(self, steps: Sequence[Step]) -> dict[tuple[str, int], Array]:
+        """Return camera and time of recording [ns] → image (H, W, 3)."""
+        types = message_types()
+        cameras = {topic: camera for camera, topic in self._topics.items()}
+        wanted = {(camera, stamp) for step in steps for camera, stamp in step.pictures.items()}
+        span = min(stamp for _, stamp in wanted), max(stamp for _, stamp in wanted) + 1
+        images: dict[tuple[str, int], Array] = {}
+        folder = self._index.folder
+        with opened(folder) as reader:
+            connections = [connection for connection in reader.connections if connection.topic in cameras]
+            kinds = {connection.topic: connection.msgtype for connection in connections}
+            for topic, stamp, raw in messages_of(reader, connections, folder, *span):
+                if (key := (cameras[topic], stamp)) in wanted:
+                    with damage(folder):
+                        image = messages.image_from(types.deserialize_cdr(raw, kinds[topic]))
+                    images[key] = resize(image, self.spec.image_size, self._crop)
+        return images
+
+    def _action(self, at: float) -> Array:
+        """Return the (D,) motion from `at` over one control period."""
+        index, end = self._index, at + 1 / self.spec.control_hz
+        track = index.commands if index.commands.covers(at) and index.commands.covers(end) else index.measured
+        motion = self._controller.motion_between(track.between(at), track.between(end))
+        if self._grip is None:
+            return motion
+        opening = index.grips.last(end)
+        if opening is None:
+            stroke = max(self._robot.finger_travel * len(self._robot.fingers), 1e-6)
+            opening = float(index.openings.between(end)) / stroke
+        return np.insert(motion, self._grip, opening)
+
+
+def _indexed(folder: Path | str | None, topics: Topics, robot: Robot, status: str, images: dict[str, str]) -> BagIndex:
+    if folder is None:
+        raise ValueError("expert=bag needs a bag: name its folder with expert=bag expert.folder=DIR")
+    return read_index(Path(folder), replace(topics, images=images), robot, status)
+
+
+def _chosen(index: BagIndex, steps: str) -> list[Stretch]:
+    """Return the stretches that are episodes; a ValueError if there are none."""
+    found = index.corrections() if steps == "corrected" else index.stretches
+    if not found and index.stretches:
+        raise ValueError(
+            f"{index.folder} has no corrections: nobody moved the arm after ~/hand_over. expert.steps=all also takes "
+            "what the policy did"
+        )
+    if not found:
+        raise ValueError(f"{index.folder} has no instruction that an arm followed")
+    return found
+
+
+def _recording(
+    folder: Path | str | None,
+    steps: str,
+    topics: Mapping[str, Any],
+    status: str,
+    robot: Mapping[str, Any],
+    image_crop: str,
+) -> Recording:
+    arm = Robot(**{name: value for name, value in robot.items() if name != "_target_"})
+    named = Topics(**{name: value for name, value in topics.items() if name != "_target_"})
+    with opened(Path(folder)) if folder else nullcontext() as reader:
+        there = {connection.topic for connection in reader.connections} if reader else set[str]()
+    images = {camera: topic for camera, topic in named.images.items() if topic in there} or named.images
+    index = _indexed(folder, named, arm, status, images)
+    track = index.commands if index.commands.times else index.measured
+    bounds = {name: action_bounds(values) for name, values in zip(arm.joints, np.transpose(track.values), strict=True)}
+    cameras = tuple(images)
+    taken = [each.at for _, each in index.inputs if isinstance(each, Picture) and each.camera == cameras[0]]
+    rate = round(1 / float(np.median(np.diff(taken))), 1) if len(taken) > 1 else 1.0
+    joints = tuple(arm.joints)
+    return Recording(cameras, rate, joints, joints, bounds, len(_chosen(index, steps)))
+
+
+def _runs(flags: Sequence[bool]) -> list[tuple[int, int]]:
+    """Return the first and the last step of every run of true ones."""
+    edges = np.flatnonzero(np.diff([False, *flags, False])).reshape(-1, 2)
+    return [(int(first), int(last) - 1) for first, last in edges]
