@@ -29,6 +29,7 @@ DOCS = Path(__file__).parent
 HEIGHT = 1800  # of the page, as far as it is shown [px]
 STEP = 12  # at which the rollout is shown: about to grasp
 FILM_SIZE, FILM_EPISODES, FILM_PAUSE = 320, 5, 8  # of the moving picture: pixels, episodes, frames after each
+ARM_VIEW, ARM_TARGET, ARM_STEPS = (1.1, -0.75, 0.6), (0.3, 0.0, 0.2), (4, 11, 16, 20)  # of the pictures of arms [m]
 SCENES, SCENE_SIZE = 3, 200  # of the picture of both renderers: scenes, edge of an image [px]
 
 
@@ -129,11 +130,39 @@ def renderers(picture: Path) -> None:
     captioned([sheet], "task/renderer=fast" + 40 * " " + "task/renderer=mujoco").save(picture, quality=85, method=6)
 
 
+def arm(option: str, picture: Path) -> None:
+    """Save four moments of an episode of the expert with the arm of `task/robot=OPTION`, from the side, as WebP."""
+    from vla.tasks.tabletop.expert import Waypoint
+    from vla.tasks.tabletop.robot import look_at
+    from vla.tasks.tabletop.robot_spec import quaternion
+
+    options = {
+        "image_size": (240, 240),
+        "cameras": ["front"],
+        "meshes": "full",
+        "renderer.soft": 1,
+        "renderer.faces": None,
+    }
+    environment: Any = make_environment(compose_task("tabletop", robot=option, renderer="smooth", **options))
+    expert, observation = Waypoint(environment.spec), environment.reset(FIRST_SEED)
+    compiled = environment.dm_env.task.compiled
+    camera = compiled.cameras["front"]
+    compiled.model.cam_pos[camera] = ARM_VIEW
+    compiled.model.cam_quat[camera] = quaternion(look_at(ARM_VIEW, ARM_TARGET, (0, 0, 1)))
+    images = []
+    while not environment.done:
+        observation = environment.step(expert.act(observation))
+        images.append(observation.rgb["front"])
+    Image.fromarray(np.concatenate([images[step] for step in ARM_STEPS], axis=1)).save(picture, quality=80, method=6)
+    environment.close()
+
+
 def main(run: Path) -> None:
     """Previews, one rollout in the viewer, the card of a small store, the report of `run` and its page."""
     film(run, DOCS / "rollouts.webp")
     renderers(DOCS / "renderers.webp")
     fifty_tasks(DOCS / "metaworld.webp")
+    arm("jaco", DOCS / "jaco.webp")  # and so ur5e.webp, with the option that worlds.md describes
     with tempfile.TemporaryDirectory() as folder:
         vla("job=preview", "preview.episodes=6", f"output={folder}")
         shutil.copy(Path(folder) / "preview.png", DOCS / "preview.png")

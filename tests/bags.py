@@ -15,7 +15,8 @@ from PIL import Image
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
-from vla.robots.panda import HOME, CartesianController
+from vla.robots.cartesian import CartesianController
+from vla.robots.panda import HOME, PANDA
 from vla.spec import Array
 
 START = 1_700_000_000_000_000_000  # [ns]
@@ -70,7 +71,7 @@ class Session:
     def __init__(self, writer: Writer, status: bool, compressed: bool) -> None:
         self._writer, self._status, self._compressed = writer, status, compressed
         self._connections: dict[str, Any] = {}
-        self._controller = CartesianController(1 / SPEC.control_hz, [-9.0] * 3, [9.0] * 3)
+        self._controller = CartesianController(PANDA, 1 / SPEC.control_hz, [-9.0] * 3, [9.0] * 3)
         self._controller.reset(HOME)
         self.joints, self.opening, self.step, self.now = HOME.copy(), 1.0, 0, 0.0
 

@@ -33,6 +33,10 @@ pytestmark = pytest.mark.usefixtures("recording")
 TOGETHER = {
     ("tokenizer", "fast"): ["model=decoder"],
     ("job", "deploy"): ["deploy=ros2"],
+    ("task/robot", "file"): [
+        *("task.robot.file=arm.xml", "task.robot.joints=[a]", "task.robot.home=[0.0]", "task.robot.tool=tcp"),
+        *("task.robot.open={a: 1.0}", "task.robot.closed={a: 0.0}", "task.robot.fingertips=[[a],[b]]"),
+    ],
     ("task", "gymnasium"): [
         *("task.package=gymnasium_robotics", "task.id=Any-v0", "task.images={top: render}"),
         "task.state={observation: null}",

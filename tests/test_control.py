@@ -8,19 +8,15 @@ import mujoco
 import numpy as np
 import pytest
 
-from vla.robots.panda import (
+from vla.robots.cartesian import (
     DOWN,
-    HOME,
-    JOINT_HIGH,
-    JOINT_LOW,
-    JOINT_SPEED,
     CartesianController,
-    forward,
     rotation_from_vector,
     rotation_z,
     solve,
     vector_from_rotation,
 )
+from vla.robots.panda import HOME, JOINT_HIGH, JOINT_LOW, JOINT_SPEED, PANDA, forward
 
 if TYPE_CHECKING:
     from vla.tasks.tabletop.environment import Tabletop
@@ -53,9 +49,9 @@ def test_rotation_vectors_are_inverse_to_rotations() -> None:
 def test_solve_reaches_the_workspace(position: tuple[float, float, float]) -> None:
     target = np.eye(4)
     target[:3, 3], target[:3, :3] = position, rotation_z(0.5) @ DOWN
-    joints = solve(target, HOME)
+    joints = solve(PANDA, target, HOME)
     for _ in range(3):  # far from home, a few more steps are needed
-        joints = solve(target, joints)
+        joints = solve(PANDA, target, joints)
     pose = forward(joints)[0]
     assert np.linalg.norm(pose[:3, 3] - position) < 1e-3
     assert np.linalg.norm(vector_from_rotation(target[:3, :3] @ pose[:3, :3].T)) < 1e-2
@@ -63,7 +59,7 @@ def test_solve_reaches_the_workspace(position: tuple[float, float, float]) -> No
 
 def test_controller_keeps_joint_limits_speed_limits_and_the_workspace() -> None:
     low, high = np.array([0.25, -0.4, 0.01]), np.array([0.75, 0.4, 0.5])
-    controller = CartesianController(0.1, low, high)
+    controller = CartesianController(PANDA, 0.1, low, high)
     controller.reset(HOME)
     random = np.random.default_rng(0)
     for _ in range(200):
@@ -74,7 +70,7 @@ def test_controller_keeps_joint_limits_speed_limits_and_the_workspace() -> None:
 
 
 def test_deltas_are_anchored_on_the_commanded_pose() -> None:
-    controller = CartesianController(0.1, (-1, -1, -1), (1, 1, 1))
+    controller = CartesianController(PANDA, 0.1, (-1, -1, -1), (1, 1, 1))
     controller.reset(HOME)
     start = controller.pose[:3, 3].copy()
     for _ in range(5):

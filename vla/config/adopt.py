@@ -49,7 +49,8 @@ def adopt(cfg: DictConfig, overrides: Sequence[str]) -> DictConfig:
     parsed = _parsed(overrides)
     _require_own_parts(parsed, ("tokenizer", "model", *PRESETS))
     saved = read_header(cfg.checkpoint).config
-    require_no_paths(saved, OF_POLICY, cfg.checkpoint)
+    given = [_path(override) for override in parsed if not override.is_delete()]
+    require_no_paths(saved, OF_POLICY, cfg.checkpoint, given)
     named, kept = {override.key_or_group for override in parsed}, saved.get("chosen", {})
     chosen = {name: cfg.chosen[name] if group in named else kept.get(name) for name, group in CHOSEN.items()}
     reported = _reported(cfg, saved) if cfg.job == "evaluate" else {}

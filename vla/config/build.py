@@ -176,19 +176,26 @@ def require_trust(config: Mapping[str, Any], names: Iterable[Any], source: objec
         require_trusted_package(source, package)
 
 
-def require_no_paths(config: Mapping[str, Any], names: Collection[str], source: object) -> None:
+def require_no_paths(
+    config: Mapping[str, Any], names: Collection[str], source: object, given: Collection[str] | None = None
+) -> None:
     """Refuse nodes out of a file in which a class is given a file or folder to read or write.
 
     Args:
         config: plain, with the nodes `names`, as far as there are any.
         source: where it comes from, for the error.
+        given: dotted names of nodes that the command line gives in place of the file's; None: it cannot.
 
     Raises:
         ValueError: with the dotted name of the first such argument, or a class that may not be built.
     """
     require_trust(config, names, source)
     for key in (key for name in names for key in _paths_in(config.get(name), name)):
-        raise ValueError(f"{source} names a path in {key}: paths are taken from your own runs and commands only")
+        if not any(f"{key}.".startswith(f"{name}.") for name in given or ()):
+            hint = "" if given is None else f"; {key.rpartition('.')[0].replace('.', '/')}=OPTION gives yours"
+            raise ValueError(
+                f"{source} names a path in {key}: paths are taken from your own runs and commands only{hint}"
+            )
 
 
 def without_paths(config: Mapping[str, Any], name: str) -> Any:

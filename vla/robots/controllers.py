@@ -13,6 +13,7 @@ import numpy as np
 
 from vla.io.types import Point
 from vla.robots import panda
+from vla.robots.cartesian import CartesianController
 from vla.spec import Array, RobotModel, Spec
 
 GRIPPER = "gripper"  # action component that opens the gripper at 1 and closes it at 0, unless it is a joint
@@ -87,12 +88,12 @@ def controller_for(spec: Spec, workspace: tuple[Point, Point] | None) -> Control
             "vla/robots/controllers.py"
         )
     found = list(zip(spec.action, spec.units, strict=True))
-    expected = [*panda.CartesianController.motion, (GRIPPER, "1")]
+    expected = [*CartesianController.motion, (GRIPPER, "1")]
     if found != expected:
         raise ValueError(f"the policy's action is {_listed(found)}, expected {_listed(expected)}")
     if workspace is None:
         raise ValueError("deploy.safety.workspace=null: Cartesian motion needs a box for the tool point")
-    return panda.CartesianController(1 / spec.control_hz, *workspace)
+    return CartesianController(panda.PANDA, 1 / spec.control_hz, *workspace)
 
 
 def acts_on_joints(spec: Spec) -> bool:

@@ -1,15 +1,12 @@
-"""Cartesian control of the Panda: forward kinematics and one differential inverse-kinematics step, in plain numpy.
-
-Shared by the simulator and the robot node, and therefore free of MuJoCo and torch.
-"""
+"""Kinematics of the Panda in plain numpy, and its limits."""
 
 from __future__ import annotations
 
 import math
 
 import numpy as np
-from numpy.typing import ArrayLike
 
+from vla.robots.cartesian import LIMIT_MARGIN, Kinematics, rotation_z
 from vla.spec import Array
 
 # Denavit-Hartenberg parameters in Craig's convention, Franka Control Interface documentation, "Denavit-Hartenberg":
@@ -38,20 +35,12 @@ CHAIN = (
 JOINT_LOW = np.array([-2.8973, -1.7628, -2.8973, -3.0718, -2.8973, -0.0175, -2.8973])  # [rad]
 JOINT_HIGH = np.array([2.8973, 1.7628, 2.8973, -0.0698, 2.8973, 3.7525, 2.8973])  # [rad]
 JOINT_SPEED = np.array([2.175, 2.175, 2.175, 2.175, 2.61, 2.61, 2.61])  # [rad/s]
-LIMIT_MARGIN = 0.05  # distance kept from the joint limits [rad]
 LOWEST, HIGHEST = JOINT_LOW + LIMIT_MARGIN, JOINT_HIGH - LIMIT_MARGIN
 
 HOME = np.array([0.0, 0.1, 0.0, -2.1, 0.0, 2.2, 0.785])  # gripper pointing down over the table [rad]
 FINGER_TRAVEL = 0.04  # of each finger [m], franka_description, hand.xacro
 FINGER_SPEED = 0.2  # of each finger [m/s], ibid.
 MAX_OPENING = 2 * FINGER_TRAVEL  # between the fingertips [m]
-DOWN = np.diag([1.0, -1.0, -1.0])  # rotation of a gripper that points down
-
-DAMPING = 0.02  # of the least squares: bounds joint speeds near singularities
-_DAMPING = DAMPING**2 * np.eye(6)
-POSTURE_GAIN = 0.1  # share of the null-space error from the home posture that one iteration removes
-ITERATIONS = 6
-TOLERANCE = 1e-4  # [m] and [rad]
 
 
 def _link(a: float, d: float, turn: int) -> Array:
@@ -63,36 +52,9 @@ def _link(a: float, d: float, turn: int) -> Array:
 _LINKS = np.stack([_link(*parameters) for parameters in DENAVIT_HARTENBERG])
 
 
-def rotation_z(angle: float) -> Array:
-    """(3, 3) rotation by `angle` [rad] about z."""
-    cosine, sine = np.cos(angle), np.sin(angle)
-    return np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
-
-
 _TOOL = np.eye(4)
 _TOOL[:3, :3] = rotation_z(HAND_YAW)
 _TOOL[2, 3] = FLANGE + HAND_TO_TCP
-
-
-def rotation_from_vector(vector: ArrayLike) -> Array:
-    """(3, 3) rotation by |vector| [rad] about the axis of `vector` (Rodrigues' formula)."""
-    x, y, z = np.asarray(vector, dtype=float)
-    angle = float(np.sqrt(x * x + y * y + z * z))
-    if angle < 1e-12:
-        return np.eye(3)
-    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0.0]]) / angle
-    return np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
-
-
-def vector_from_rotation(rotation: Array) -> Array:
-    """(3,) rotation vector [rad] of a (3, 3) rotation whose angle is below pi."""
-    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = rotation.tolist()
-    x, y, z = zy - yz, xz - zx, yx - xy
-    sine = math.sqrt(x * x + y * y + z * z) / 2
-    if sine < 1e-12:
-        return np.zeros(3)
-    scale = math.atan2(sine, (xx + yy + zz - 1) / 2) / (2 * sine)
-    return np.array([x * scale, y * scale, z * scale])
 
 
 def forward(joints: Array) -> tuple[Array, Array]:
@@ -125,69 +87,4 @@ def velocity_of(joints: Array, velocities: Array) -> Array:
     return velocity
 
 
-def solve(target: Array, joints: Array) -> Array:
-    """Find joints near `joints` that bring the tool centre point to the (4, 4) pose `target`, by damped least squares.
-
-    Unreachable poses are approached as far as the joint limits allow.
-    """
-    joints = joints.copy()
-    for _ in range(ITERATIONS):
-        pose, jacobian = forward(joints)
-        error = np.concatenate([target[:3, 3] - pose[:3, 3], vector_from_rotation(target[:3, :3] @ pose[:3, :3].T)])
-        if np.abs(error).max() < TOLERANCE:
-            break
-        inverse = jacobian.T @ np.linalg.inv(jacobian @ jacobian.T + _DAMPING)
-        posture = POSTURE_GAIN * (HOME - joints)
-        joints += inverse @ error + posture - inverse @ (jacobian @ posture)
-        joints = np.minimum(np.maximum(joints, LOWEST), HIGHEST)
-    return joints
-
-
-class CartesianController:
-    """Turns Cartesian deltas into joint targets.
-
-    Deltas are relative to the last *commanded* pose: relative to the measured one, which lags, the arm would drift and,
-    with latency, oscillate.
-    """
-
-    # Names and units of the action components that it takes.
-    motion: tuple[tuple[str, str], ...] = (
-        ("dx", "m"),
-        ("dy", "m"),
-        ("dz", "m"),
-        ("rx", "rad"),
-        ("ry", "rad"),
-        ("rz", "rad"),
-    )
-
-    def __init__(self, period: float, low: ArrayLike, high: ArrayLike) -> None:
-        """Args: control period [s]; corners (3,) of the box for the tool point in the base frame [m]."""
-        self.period, self.low, self.high = period, np.asarray(low), np.asarray(high)
-        self.joints = HOME.copy()  # (7,) last commanded [rad]
-        self.pose = forward(self.joints)[0]  # (4, 4) last commanded
-
-    def reset(self, joints: Array) -> None:
-        """Set the last commanded joints (7,) [rad], for example to the measured ones."""
-        self.joints = np.array(joints, dtype=float)
-        self.pose = forward(self.joints)[0]
-
-    def step(self, motion: Array) -> Array:
-        """Return joint targets (7,) [rad] one period ahead, within position and speed limits.
-
-        Args:
-            motion: (6,) translation [m] and rotation vector [rad] in the base frame.
-        """
-        target = np.eye(4)
-        target[:3, 3] = np.clip(self.pose[:3, 3] + motion[:3], self.low, self.high)
-        target[:3, :3] = rotation_from_vector(motion[3:6]) @ self.pose[:3, :3]
-        reach = JOINT_SPEED * self.period
-        solution = solve(target, self.joints)
-        self.joints = self.joints + np.clip(solution - self.joints, -reach, reach)
-        self.pose = forward(self.joints)[0]
-        return self.joints
-
-    def motion_between(self, before: Array, after: Array) -> Array:
-        """Return the (6,) translation [m] and rotation vector [rad] of the tool between joints (7,) [rad]."""
-        start, end = forward(before)[0], forward(after)[0]
-        turn = vector_from_rotation(end[:3, :3] @ start[:3, :3].T)
-        return np.concatenate([end[:3, 3] - start[:3, 3], turn])
+PANDA = Kinematics(forward, HOME, LOWEST, HIGHEST, JOINT_SPEED)

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import mujoco
-from dm_control import mjcf
 
 from vla.robots.panda import CHAIN
 from vla.spec import Array, Shape
 from vla.tasks.tabletop.compiled_scene import CompiledScene
+from vla.tasks.tabletop.panda import Panda
 from vla.tasks.tabletop.scene import Scene
-
-ROBOT = "panda/"  # prefix of its body names
 
 
 class Arm:
@@ -19,13 +17,13 @@ class Arm:
     chain = CHAIN
 
     def __init__(self) -> None:
-        scene = Scene(blocks=0)
-        self._physics = mjcf.Physics.from_mjcf_model(scene.mjcf_model)
+        scene = Scene(robot=Panda(), blocks=0)
+        self._physics = scene.compile()
         self._compiled = CompiledScene(scene, self._physics)
 
     def shapes(self) -> list[Shape]:
         """Return the visible shapes."""
-        return [shape for shape in self._compiled.shapes() if shape.body.startswith(ROBOT)]
+        return [shape for shape in self._compiled.shapes() if shape.body.startswith(Panda.prefix)]
 
     def poses(self, joints: Array, opening: float) -> dict[str, Array]:
         """Return body name → (7,) position [m] and quaternion wxyz in the base frame.
@@ -36,4 +34,4 @@ class Arm:
         """
         self._compiled.place_arm(joints, opening)
         mujoco.mj_kinematics(self._compiled.model, self._compiled.data)
-        return {body: pose for body, pose in self._compiled.poses().items() if body.startswith(ROBOT)}
+        return {body: pose for body, pose in self._compiled.poses().items() if body.startswith(Panda.prefix)}

@@ -9,7 +9,6 @@ import mujoco
 import numpy as np
 from dm_control import mjcf
 
-from vla.robots.panda import HOME, MAX_OPENING
 from vla.spec import Array, Shape
 from vla.tasks.tabletop.scene import BLOCK_DENSITY, BLOCK_HALF_SIZE, COLOURS, PAD_THICKNESS, PADS, Scene
 
@@ -57,22 +56,24 @@ class CompiledScene:
         """Args: the scene and its compiled physics."""
         self.model: mujoco.MjModel = physics.model.ptr
         self.data: mujoco.MjData = physics.data.ptr
-        bind = physics.bind
-        self.joints = np.array([bind(joint).qposadr for joint in scene.panda.joints]).ravel()
-        self.velocities = np.array([bind(joint).dofadr for joint in scene.panda.joints]).ravel()
-        self.fingers = np.array([bind(finger).qposadr for finger in scene.panda.fingers]).ravel()
-        self.pads = [int(bind(pad).element_id) for pad in scene.panda.pads]
-        self.tcp = int(bind(scene.panda.tcp).element_id)
+        bind, robot = physics.bind, scene.robot
+        self.robot = robot
+        self.joints = np.array([self.model.joint(name).qposadr[0] for name in robot.joints])
+        self.velocities = np.array([self.model.joint(name).dofadr[0] for name in robot.joints])
+        self.fingers = np.array([self.model.joint(name).qposadr[0] for name in robot.fingers])
+        self._side = {self.model.geom(name).id: side for side, tips in enumerate(robot.fingertips) for name in tips}
+        self.tcp = self.model.site(robot.tool).id
+        self.arm_actuators = np.array([self.model.actuator(name).id for name in robot.servos])
+        self._grips = np.array([self.model.actuator(name).id for name in robot.grips])
         self.block_geoms = np.array([bind(block.geom).element_id for block in scene.blocks], dtype=int)
         self.block_bodies = self.model.geom_bodyid[self.block_geoms]
         free = self.model.body_jntadr[self.block_bodies]
         self.block_positions = self.model.jnt_qposadr[free]  # address of x y z, quaternion wxyz
         self.block_velocities = self.model.jnt_dofadr[free]
         self.zones = [int(self.model.body(f"{name}_pad").mocapid[0]) for name in PADS]
-        self.cameras = {"front": self.model.camera("front").id, "wrist": self.model.camera("panda/wrist").id}
-        self.arm_actuators = np.arange(len(self.joints))  # the finger actuator follows them
+        self.cameras = {"front": self.model.camera("front").id, "wrist": self.model.camera(f"{robot.prefix}wrist").id}
         self.robot_geoms = np.flatnonzero(
-            [model_body.startswith("panda/") for model_body in map(self._body_of, range(self.model.ngeom))]
+            [model_body.startswith(robot.prefix) for model_body in map(self._body_of, range(self.model.ngeom))]
         )
         self._materials = {name: int(self.model.geom_matid[self.model.geom(name).id]) for name in ("table", "floor")}
         self.model.geom_matid[:] = -1  # plain surfaces render faster without a material
@@ -97,7 +98,7 @@ class CompiledScene:
             self.place_pad(pad, 0.4, 0.15 * pad)
         for index in range(count):
             self.place_block(index, 0.52, 0.12 * (index - (self.present - 1) / 2), 0.0)
-        self.place_arm(HOME, MAX_OPENING)
+        self.place_arm(self.robot.kinematics.home, self.robot.widest)
 
     def _body_of(self, geom: int) -> str:
         return str(self.model.body(self.model.geom_bodyid[geom]).name)
@@ -164,9 +165,20 @@ class CompiledScene:
         self.data.mocap_pos[self.zones[pad]] = (x, y, PAD_THICKNESS)
 
     def place_arm(self, joints: Array, opening: float) -> None:
-        """Set the arm to `joints` (7,) [rad] and the gripper to `opening` between the fingertips [m]."""
+        """Set the arm to `joints` (J,) [rad] and the gripper to `opening` between the fingertips [m]."""
         self.data.qpos[self.joints] = joints
-        self.data.qpos[self.fingers] = opening / 2
+        self.data.qpos[self.fingers], self.grip = self.robot.grip(opening)
+
+    def opening(self) -> float:
+        """Return the measured distance between the fingertips [m]."""
+        return self.robot.opening(self.model, self.data)
+
+    def controls(self, commands: Array) -> Array:
+        """Return the actuators' controls (N, nu) for commands (N, J + 1): joint targets [rad], gripper command."""
+        robot, controls = self.robot, np.empty((len(commands), self.model.nu))
+        controls[:, self.arm_actuators] = commands[:, :-1]
+        controls[:, self._grips] = robot.closed + commands[:, -1:] * ((robot.opened - robot.closed) / robot.travel)
+        return controls
 
     def turn_camera(self, camera: int, rotation: Array) -> None:
         """Turn camera `camera` by the rotation vector `rotation` (3,) [rad] in its own frame."""
@@ -186,22 +198,24 @@ class CompiledScene:
         return self.data.geom_xpos[self.block_geoms[: self.present]].copy()
 
     def touching(self) -> set[tuple[int, int]]:
-        """Return (fingertip index, block index) of every contact between a fingertip and a block."""
+        """Return (side, block index) of every contact between a fingertip of either side and a block."""
         pairs = set()
         block_of = {int(geom): index for index, geom in enumerate(self.block_geoms)}
         for first, second in self.data.contact.geom[: self.data.ncon].tolist():
-            for pad, other in ((first, second), (second, first)):
-                if pad in self.pads and other in block_of:
-                    pairs.add((self.pads.index(pad), block_of[other]))
+            for tip, other in ((first, second), (second, first)):
+                if tip in self._side and other in block_of:
+                    pairs.add((self._side[tip], block_of[other]))
         return pairs
 
     def shapes(self) -> list[Shape]:
         """Return the visible shapes."""
         model, shapes = self.model, []
-        kinds: dict[int, Literal["mesh", "box", "cylinder"]] = {
+        kinds: dict[int, Literal["mesh", "box", "cylinder", "sphere", "capsule"]] = {
             int(mujoco.mjtGeom.mjGEOM_MESH): "mesh",
             int(mujoco.mjtGeom.mjGEOM_BOX): "box",
             int(mujoco.mjtGeom.mjGEOM_CYLINDER): "cylinder",
+            int(mujoco.mjtGeom.mjGEOM_SPHERE): "sphere",
+            int(mujoco.mjtGeom.mjGEOM_CAPSULE): "capsule",
         }
         for geom in np.flatnonzero(model.geom_group == 2):
             kind = kinds.get(int(model.geom_type[geom]))

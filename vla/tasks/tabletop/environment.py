@@ -12,13 +12,15 @@ import mujoco
 import numpy as np
 
 from vla.io.types import Count, ImageSize, Names, Point, Positive
-from vla.robots.panda import CHAIN, FINGER_TRAVEL
-from vla.spec import Array, Observation, RobotModel, Shape, Spec
+from vla.spec import Array, Observation, Shape, Spec
 from vla.tasks.gl import require_backend
 from vla.tasks.rendering.renderer import Renderer, Rendering, View
 from vla.tasks.tabletop.goals.goal import Goal
 from vla.tasks.tabletop.goals.mixed import Mixed
+from vla.tasks.tabletop.panda import Panda
 from vla.tasks.tabletop.randomize.randomizer import Randomizer
+from vla.tasks.tabletop.robot import Robot
+from vla.tasks.tabletop.robot_file import RobotFile
 from vla.tasks.tabletop.scene import COLOURS, Scene
 from vla.tasks.tabletop.task import CONTROL_HZ, FastEnvironment, TabletopTask
 
@@ -27,14 +29,6 @@ ROTATION = 0.25  # largest rotation per step [rad]
 VISIBLE = 2  # group of the geoms in pictures
 MILLIMETRES = 1000.0  # of a metre
 QUANTILES = np.array([NormalDist().inv_cdf((index + 0.5) / 256) for index in range(256)])  # of the normal distribution
-JOINTS = tuple(f"panda_joint{index}" for index in range(1, 8))
-ARM = RobotModel(
-    joints=JOINTS,
-    frame="panda_link0",
-    velocities=tuple(f"{joint}_velocity" for joint in JOINTS),
-    gripper="gripper",
-    chain=CHAIN,
-)
 
 
 class Tabletop:
@@ -53,6 +47,7 @@ class Tabletop:
         time_limit: Positive,
         meshes: Literal["light", "full"],
         shadows: bool,
+        robot: RobotFile | None = None,
     ) -> None:
         """Build and compile the scene.
 
@@ -66,22 +61,29 @@ class Tabletop:
             time_limit: maximum length of an episode per block to be moved [s].
             meshes: robot meshes with few faces ("light") or all of them ("full", much slower on a CPU).
             shadows: whether the lamp casts shadows.
+            robot: an arm from a file; None: the Panda.
 
         Raises:
-            ValueError: an unknown camera, or more blocks than colours.
+            ValueError: an unknown camera, more blocks than colours, or a robot that does not work.
             RuntimeError: this machine cannot render.
         """
         require_backend()
         most = len(COLOURS) - goal.absent
         if not goal.blocks <= blocks <= most:
             raise ValueError(f"task.blocks must be from {goal.blocks} to {most}, one colour each, got {blocks}")
+        if robot is None:
+            chosen: Robot = Panda(meshes=meshes)
+        else:
+            robot.draw(meshes)
+            chosen = robot
+        arm, joints = chosen.arm, len(chosen.joints)
         low = np.array([-TRANSLATION] * 3 + [-ROTATION] * 3 + [0.0])
         high = np.array([TRANSLATION] * 3 + [ROTATION] * 3 + [1.0])
         self.spec = Spec(
             cameras=tuple(cameras),
             image_size=(image_size[0], image_size[1]),
-            state=ARM.components,
-            state_units=("rad",) * 7 + ("rad/s",) * 7 + ("m",),
+            state=arm.components,
+            state_units=("rad",) * joints + ("rad/s",) * joints + ("m",),
             action=("dx", "dy", "dz", "rx", "ry", "rz", "gripper"),
             units=("m", "m", "m", "rad", "rad", "rad", "1"),
             low=tuple(low.tolist()),
@@ -89,11 +91,9 @@ class Tabletop:
             control_hz=CONTROL_HZ,
             depth=tuple(cameras),
             truth=(("tcp", 3), ("block", 3), ("destination", 3), ("faces", 2)),
-            robot=ARM,
+            robot=arm,
         )
-        task = TabletopTask(
-            goal, randomize, Scene(blocks=blocks, meshes=meshes, shadows=shadows), low, high, time_limit
-        )
+        task = TabletopTask(goal, randomize, Scene(chosen, blocks=blocks, shadows=shadows), low, high, time_limit)
         self.dm_env = FastEnvironment(task)
         self._task = task
         unknown = sorted(set(cameras) - set(task.compiled.cameras))
@@ -127,11 +127,11 @@ class Tabletop:
         return self.look()
 
     def drive(self, joints: Array, opening: float, seconds: float) -> None:
-        """Move towards joint targets (7,) [rad] and a gripper opening 0…1 for `seconds`; call `judge` once per control
+        """Move towards joint targets (J,) [rad] and a gripper opening 0…1 for `seconds`; call `judge` once per control
         period."""
         physics = self.dm_env.physics
         substeps = round(seconds / physics.timestep())
-        self._task.follow(physics, np.append(joints, opening * FINGER_TRAVEL), substeps)
+        self._task.follow(physics, joints, opening, substeps)
 
     def judge(self) -> None:
         """Update the outcome after one control period of driving; this may end the episode."""
@@ -143,10 +143,10 @@ class Tabletop:
         self.done, self.outcome, self.milestones = done, classifier.outcome, classifier.milestones
 
     def _state(self) -> Array:
-        """Measure (15,) float32: joint positions [rad], their velocities [rad/s] and the gripper's opening [m]."""
+        """Measure (2 J + 1,) float32: joint positions [rad], their velocities [rad/s] and the gripper's opening [m]."""
         compiled, noise = self._task.compiled, self._task.compiled.noise
         joints, velocities = compiled.data.qpos[compiled.joints], compiled.data.qvel[compiled.velocities]
-        opening = float(compiled.data.qpos[compiled.fingers].sum())
+        opening = compiled.opening()
         if noise.joints or noise.gripper:
             joints = joints + noise.joints * self._joint_noise.randn(len(joints))
             opening = max(0.0, opening + noise.gripper * float(self._joint_noise.randn()))

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from vla.robots.panda import DOWN, MAX_OPENING, rotation_z, vector_from_rotation
+from vla.robots.cartesian import DOWN, rotation_z, vector_from_rotation
 from vla.spec import Array, Observation, Spec
 from vla.tasks.tabletop.goals.goal import SKILLS, Skill
 
@@ -80,7 +80,7 @@ class Waypoint:
         yaw = _yaw_to_faces(truth)
         away = float(np.hypot(offset[0], offset[1]))
         between = away < GRASP_XY + 0.004 and abs(offset[2]) < GRASP_Z + 0.004
-        closing = between and width - 0.006 < opening < MAX_OPENING - 0.004
+        closing = between and width - 0.006 < opening < truth["widest"][0] - 0.004
         aligned = away < GRASP_XY and abs(offset[2]) < GRASP_Z
         if closing or (aligned and opening > width - 0.006):
             return self._action(truth, offset, yaw, 0.0)

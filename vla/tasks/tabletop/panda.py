@@ -6,11 +6,24 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Literal
 
+import mujoco
 import numpy as np
 from dm_control import composer, mjcf
 
-from vla.robots.panda import CHAIN, FINGER_TRAVEL, FLANGE, HAND_TO_TCP, HAND_YAW, JOINT_HIGH, JOINT_LOW
-from vla.spec import Array
+from vla.robots.panda import (
+    CHAIN,
+    FINGER_SPEED,
+    FINGER_TRAVEL,
+    FLANGE,
+    HAND_TO_TCP,
+    HAND_YAW,
+    JOINT_HIGH,
+    JOINT_LOW,
+    MAX_OPENING,
+    PANDA,
+)
+from vla.spec import Array, RobotModel
+from vla.tasks.tabletop.robot import CORNERS, FINGERTIP_CONTACT, ROBOT_CONTACT, CameraPose, Robot, look_at, spread
 
 # Mass [kg], centre of mass [m] and inertia xx yy zz xy xz yz [kg m²]: franka_description, inertial.yaml (identified
 # by Gaz et al., "Dynamic Identification of the Franka Emika Panda Robot", RA-L 2019).
@@ -60,12 +73,18 @@ FINGER_OFFSET = 0.0584  # hand to finger along z [m], ibid.
 GRIP_STIFFNESS, GRIP_DAMPING = 1000.0, 40.0  # of the finger servo [N/m], [N s/m]
 GRIP_FORCE = 20.0  # of both fingers together [N]; the Franka Hand gives up to 70 N continuously
 
-CORNERS = 64  # vertices of every "light" mesh
 SHELL = (0.93, 0.94, 0.95, 1.0)
 DARK = (0.22, 0.23, 0.25, 1.0)
-# Robot geometry collides with the world but not with itself.
-ROBOT_CONTACT = {"contype": 2, "conaffinity": 1}
 NO_CONTACT = {"contype": 0, "conaffinity": 0}
+WRIST = CameraPose(position=(0.085, 0.0, 0.035), target=(0.02, 0.0, 0.12), fovy=75.0)  # in the hand's frame
+JOINTS = tuple(f"panda_joint{index}" for index in range(1, 8))
+ARM = RobotModel(
+    joints=JOINTS,
+    frame="panda_link0",
+    velocities=tuple(f"{joint}_velocity" for joint in JOINTS),
+    gripper="gripper",
+    chain=CHAIN,
+)
 
 
 def mesh_folder() -> Path:
@@ -86,18 +105,16 @@ def read_corners(path: Path) -> Array:
     return np.unique(np.fromfile(path, triangle, offset=84)["corners"].reshape(-1, 3), axis=0)
 
 
-def spread(points: Array, count: int) -> Array:
-    """Select at most `count` of the (N, 3) points by farthest-point sampling."""
-    chosen = [int(np.linalg.norm(points - points.mean(0), axis=1).argmax())]
-    nearest = np.linalg.norm(points - points[chosen[0]], axis=1)
-    while len(chosen) < min(count, len(points)):
-        chosen.append(int(nearest.argmax()))
-        nearest = np.minimum(nearest, np.linalg.norm(points - points[chosen[-1]], axis=1))
-    return points[chosen]
-
-
-class Panda(composer.Entity):
+class Panda(composer.Entity, Robot):
     """Seven position-servoed joints with gravity compensation and a gripper whose fingers share one servo."""
+
+    prefix = "panda/"
+    arm, kinematics, lead = ARM, PANDA, DAMPING_RATIO
+    joints = servos = tuple(f"panda/joint{index}" for index in range(1, 8))
+    fingers, grips, tool = ("panda/left_finger", "panda/right_finger"), ("panda/fingers",), "panda/tcp"
+    fingertips = (("panda/left_pad",), ("panda/right_pad",))
+    closed, opened = np.zeros(1), np.array([FINGER_TRAVEL])
+    travel, finger_speed, widest = FINGER_TRAVEL, FINGER_SPEED, MAX_OPENING
 
     def _build(self, meshes: Literal["light", "full"] = "light") -> None:
         """Args: meshes: visual meshes, "light" (1 200 faces) or "full" (134 000). Collision meshes are the same."""
@@ -110,7 +127,6 @@ class Panda(composer.Entity):
             "inertial", mass=0.629769, pos=(-0.041018, -0.00014, 0.049974), diaginertia=(0.00315, 0.00388, 0.004285)
         )
         self._add_mesh(body, "link0", SHELL)
-        self._joints: list[mjcf.Element] = []
         for index, link in enumerate(LINKS):
             body = self._add_link(body, index, link)
         self._add_gripper(body)
@@ -139,7 +155,6 @@ class Panda(composer.Entity):
         joint = body.add(
             "joint", name=f"joint{index + 1}", axis=(0, 0, 1), range=limits, limited=True, armature=ARMATURE
         )
-        self._joints.append(joint)
         self._mjcf_root.actuator.add(
             "position",
             name=f"joint{index + 1}",
@@ -156,13 +171,14 @@ class Panda(composer.Entity):
         hand = link.add("body", name="hand", pos=(0, 0, FLANGE), euler=(0, 0, HAND_YAW), gravcomp=1)
         hand.add("inertial", mass=HAND_MASS, pos=(-0.01, 0, 0.03), diaginertia=(0.001, 0.0025, 0.0017))
         self._add_mesh(hand, "hand", SHELL)
-        self._tcp = hand.add("site", name="tcp", pos=(0, 0, HAND_TO_TCP), size=(0.004,), group=4)
-        self._hand = hand
-        self._fingers, self._pads = [], []
+        hand.add("site", name="tcp", pos=(0, 0, HAND_TO_TCP), size=(0.004,), group=4)
+        axes = look_at(WRIST.position, WRIST.target, (1, 0, 0))
+        hand.add("camera", name="wrist", pos=WRIST.position, xyaxes=(*axes[:, 0], *axes[:, 1]), fovy=WRIST.fovy)
+        fingers = []
         for side, euler in (("left", (0, 0, 0)), ("right", (0, 0, 3.141592653589793))):
             finger = hand.add("body", name=f"{side}_finger", pos=(0, 0, FINGER_OFFSET), euler=euler, gravcomp=1)
             finger.add("inertial", mass=FINGER_MASS, pos=(0, 0, 0), diaginertia=(2.375e-6, 2.375e-6, 7.5e-7))
-            self._fingers.append(
+            fingers.append(
                 finger.add(
                     "joint",
                     name=f"{side}_finger",
@@ -174,30 +190,24 @@ class Panda(composer.Entity):
                 )
             )
             self._add_mesh(finger, "finger", DARK, collide=False)
-            # The soft fingertip is the only part of a finger that collides, so contacts stay few and stable.
-            self._pads.append(
-                finger.add(
-                    "geom",
-                    name=f"{side}_pad",
-                    type="box",
-                    size=(0.0085, 0.004, 0.0085),
-                    pos=(0, 0.0045, 0.0445),
-                    friction=(2.0, 0.05, 0.0002),
-                    condim=4,
-                    priority=1,
-                    solref=(0.01, 1),
-                    solimp=(0.95, 0.99, 0.001),
-                    rgba=DARK,
-                    group=2,
-                    mass=0,
-                    **ROBOT_CONTACT,
-                )
+            # The soft fingertip is the only part of a finger that collides.
+            finger.add(
+                "geom",
+                name=f"{side}_pad",
+                type="box",
+                size=(0.0085, 0.004, 0.0085),
+                pos=(0, 0.0045, 0.0445),
+                rgba=DARK,
+                group=2,
+                mass=0,
+                **FINGERTIP_CONTACT,
+                **ROBOT_CONTACT,
             )
         tendon = self._mjcf_root.tendon.add("fixed", name="fingers")
-        for joint in self._fingers:
+        for joint in fingers:
             tendon.add("joint", joint=joint, coef=0.5)
         self._mjcf_root.equality.add(
-            "joint", joint1=self._fingers[0], joint2=self._fingers[1], solref=(0.005, 1), solimp=(0.95, 0.99, 0.001)
+            "joint", joint1=fingers[0], joint2=fingers[1], solref=(0.005, 1), solimp=(0.95, 0.99, 0.001)
         )
         self._mjcf_root.actuator.add(
             "position",
@@ -209,32 +219,15 @@ class Panda(composer.Entity):
             forcerange=(-GRIP_FORCE, GRIP_FORCE),
         )
 
+    def grip(self, opening: float) -> tuple[float, float]:
+        """Return half the opening, for both fingers and their common servo."""
+        return opening / 2, opening / 2
+
+    def opening(self, model: mujoco.MjModel, data: mujoco.MjData) -> float:
+        """Return the sum of both fingers' positions [m]."""
+        return float(sum(data.joint(finger).qpos[0] for finger in self.fingers))
+
     @property
     def mjcf_model(self) -> mjcf.RootElement:
         """The model's root element."""
         return self._mjcf_root
-
-    @property
-    def joints(self) -> list[mjcf.Element]:
-        """The seven arm joints, base to tip."""
-        return self._joints
-
-    @property
-    def fingers(self) -> list[mjcf.Element]:
-        """The two finger joints."""
-        return self._fingers
-
-    @property
-    def pads(self) -> list[mjcf.Element]:
-        """The fingertip geoms."""
-        return self._pads
-
-    @property
-    def hand(self) -> mjcf.Element:
-        """The hand's body, to mount a camera on."""
-        return self._hand
-
-    @property
-    def tcp(self) -> mjcf.Element:
-        """The site between the fingertips."""
-        return self._tcp

@@ -2,15 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Literal
-
 import numpy as np
 from dm_control import composer, mjcf
 
-from vla.spec import Array
-from vla.tasks.tabletop.panda import Panda
+from vla.tasks.tabletop.robot import CameraPose, Robot, look_at
 
 COLOURS: dict[str, tuple[float, float, float]] = {
     "red": (0.85, 0.10, 0.10),
@@ -35,27 +30,7 @@ TEXTURE = 64  # edge of the table's and the floor's texture [px]
 BLOCK_CONTACT = {"contype": 1, "conaffinity": 3}
 
 
-@dataclass(frozen=True)
-class CameraPose:
-    """A camera that looks from `position` at `target`, with a vertical field of view."""
-
-    position: tuple[float, float, float]  # [m]
-    target: tuple[float, float, float]  # [m]
-    fovy: float  # [degrees]
-
-
 FRONT = CameraPose(position=(1.02, 0.0, 0.52), target=(0.5, 0.0, 0.05), fovy=45.0)  # in the base frame
-WRIST = CameraPose(position=(0.085, 0.0, 0.035), target=(0.02, 0.0, 0.12), fovy=75.0)  # in the hand's frame
-WRIST_UP = (1.0, 0.0, 0.0)
-
-
-def look_at(position: Sequence[float] | Array, target: Sequence[float] | Array, up: Sequence[float] | Array) -> Array:
-    """Return the rotation (3, 3) of a camera at `position` that looks at `target` along its negative z axis, y up."""
-    back = np.asarray(position, dtype=float) - np.asarray(target, dtype=float)
-    back /= np.linalg.norm(back)
-    right = np.cross(up, back)
-    right /= np.linalg.norm(right)
-    return np.stack([right, np.cross(back, right), back], axis=1)
 
 
 class Block(composer.Entity):
@@ -85,17 +60,18 @@ class Block(composer.Entity):
 class Scene(composer.Entity):
     """The complete scene; `CompiledScene` indexes its compiled model."""
 
-    def _build(self, blocks: int = 4, meshes: Literal["light", "full"] = "light", shadows: bool = True) -> None:
-        """Args: number of blocks; robot meshes, "light" or "full"; whether the lamp casts shadows."""
+    def _build(self, robot: Robot, blocks: int = 4, shadows: bool = True) -> None:
+        """Args: the robot; number of blocks; whether the lamp casts shadows."""
         self._root = mjcf.RootElement(model="tabletop")
         self._root.compiler.angle = "radian"
         self._set_physics()
         self._set_quality()
         self._add_table()
         self._add_lights(shadows)
-        self.panda = Panda(meshes=meshes)
-        self.attach(self.panda)
-        self._add_cameras()
+        self.robot = robot
+        if isinstance(robot, composer.Entity):
+            self.attach(robot)
+        self._add_camera()
         self.blocks = [Block(name=f"block{index}") for index in range(blocks)]
         for block in self.blocks:
             frame = self.attach(block)
@@ -105,6 +81,10 @@ class Scene(composer.Entity):
     def mjcf_model(self) -> mjcf.RootElement:
         """The model's root element."""
         return self._root
+
+    def compile(self) -> mjcf.Physics:
+        """Compile the scene with its robot."""
+        return self.robot.compile(self._root)
 
     def _set_physics(self) -> None:
         option = self._root.option
@@ -187,12 +167,8 @@ class Scene(composer.Entity):
             specular=(0.15,) * 3,
         )
 
-    def _add_cameras(self) -> None:
-        front = look_at(FRONT.position, FRONT.target, (0, 0, 1))
+    def _add_camera(self) -> None:
+        axes = look_at(FRONT.position, FRONT.target, (0, 0, 1))
         self._root.worldbody.add(
-            "camera", name="front", pos=FRONT.position, xyaxes=(*front[:, 0], *front[:, 1]), fovy=FRONT.fovy
-        )
-        wrist = look_at(WRIST.position, WRIST.target, WRIST_UP)
-        self.panda.hand.add(
-            "camera", name="wrist", pos=WRIST.position, xyaxes=(*wrist[:, 0], *wrist[:, 1]), fovy=WRIST.fovy
+            "camera", name="front", pos=FRONT.position, xyaxes=(*axes[:, 0], *axes[:, 1]), fovy=FRONT.fovy
         )

@@ -11,7 +11,7 @@ import numpy as np
 from dm_control import composer, mjcf
 from dm_env import specs
 
-from vla.robots.panda import FINGER_SPEED, FINGER_TRAVEL, CartesianController
+from vla.robots.cartesian import CartesianController
 from vla.spec import FIRST_SEED, Array
 from vla.tasks.language import HeldOut
 from vla.tasks.streams import Streams
@@ -19,13 +19,11 @@ from vla.tasks.tabletop.compiled_scene import CompiledScene
 from vla.tasks.tabletop.goals.goal import SKILLS, Goal, Referents, WorldState
 from vla.tasks.tabletop.goals.mixed import Mixed
 from vla.tasks.tabletop.outcome import OutcomeClassifier
-from vla.tasks.tabletop.panda import DAMPING_RATIO
 from vla.tasks.tabletop.randomize.randomizer import Randomizer
 from vla.tasks.tabletop.scene import COLOURS, PADS, Scene
 
 CONTROL_HZ = 10.0
 WORKSPACE = ((0.25, -0.40, 0.008), (0.75, 0.40, 0.50))  # corners of the box that bounds the tool point [m]
-FINGER_STEP = FINGER_SPEED / CONTROL_HZ  # largest motion of a finger per control period [m]
 
 
 class FastEnvironment(composer.Environment):
@@ -34,6 +32,13 @@ class FastEnvironment(composer.Environment):
     def __init__(self, task: TabletopTask) -> None:
         # Every reset writes into the compiled model instead of compiling again.
         super().__init__(task, recompile_mjcf_every_episode=False)
+
+    def _recompile_physics(self) -> None:
+        # MuJoCo compiles what dm_control cannot read.
+        if physics := getattr(self, "_physics", None):
+            physics.free()
+        self._physics = self._task.scene.compile()
+        self._physics.legacy_step = self._legacy_step
 
     def _substep(self, action: Array) -> None:
         self._task.advance(self._physics, self._task.substeps)
@@ -64,7 +69,7 @@ class TabletopTask(composer.Task):
         self._low, self._high = low, high
         self.control_timestep = 1 / CONTROL_HZ
         self.substeps = round(self.control_timestep / self.physics_timestep)
-        self.controller = CartesianController(self.control_timestep, *WORKSPACE)
+        self.controller = CartesianController(scene.robot.kinematics, self.control_timestep, *WORKSPACE)
         self.seed: int | None = None  # of the next episode; None: drawn from composer's random state
         self.draws: dict[str, Any] = {}
         self.instruction = ""
@@ -102,9 +107,9 @@ class TabletopTask(composer.Task):
         self.draws = {"named": self._named(), **draws, "language": language}
         data = self.compiled.data
         self.controller.reset(data.qpos[self.compiled.joints])
-        self._command = np.append(self.controller.joints, data.qpos[self.compiled.fingers].mean())
-        data.ctrl[:] = self._command
-        self._late: deque[Array] = deque()  # commands delayed by the latency
+        self._command = np.append(self.controller.joints, self.compiled.grip)
+        data.ctrl[:] = self.compiled.controls(self._command[None])[0]
+        self._late: deque[Array] = deque()  # controls delayed by the latency
         self._delay = round(self.compiled.latency / physics.timestep())
         self._cached: tuple[float, WorldState] | None = None  # simulation time [s] and state
         self._starts, self._lifts = self.compiled.block_centres(), np.zeros(self.compiled.present)
@@ -160,16 +165,18 @@ class TabletopTask(composer.Task):
     def before_step(self, physics: mjcf.Physics, action: Array, random_state: np.random.RandomState) -> None:
         """Convert the action to joint targets, interpolated linearly over the control period."""
         action = np.clip(action, self._low, self._high)
-        grip = self._command[7]
-        goal = np.append(self.controller.step(action[:6]), action[6] * FINGER_TRAVEL)
-        goal[7] = grip + np.clip(goal[7] - grip, -FINGER_STEP, FINGER_STEP)
+        robot, grip = self.scene.robot, self._command[-1]
+        furthest = robot.finger_speed / CONTROL_HZ
+        goal = np.append(self.controller.step(action[:6]), action[6] * robot.travel)
+        goal[-1] = grip + np.clip(goal[-1] - grip, -furthest, furthest)
         self._increment = (goal - self._command) / self.substeps
 
-    def follow(self, physics: mjcf.Physics, goal: Array, substeps: int) -> None:
-        """Step physics while interpolating the targets of joints [rad] and fingers [m] linearly to `goal` (8,)."""
-        furthest = FINGER_SPEED * substeps * physics.timestep()
-        finger = self._command[7] + np.clip(goal[7] - self._command[7], -furthest, furthest)
-        self._increment = (np.append(goal[:7], finger) - self._command) / substeps
+    def follow(self, physics: mjcf.Physics, joints: Array, opening: float, substeps: int) -> None:
+        """Step physics while interpolating the targets linearly to `joints` (J,) [rad] and an opening 0…1."""
+        robot, grip = self.scene.robot, self._command[-1]
+        furthest = robot.finger_speed * substeps * physics.timestep()
+        finger = grip + np.clip(opening * robot.travel - grip, -furthest, furthest)
+        self._increment = (np.append(joints, finger) - self._command) / substeps
         self.advance(physics, substeps)
 
     def advance(self, physics: mjcf.Physics, substeps: int) -> None:
@@ -177,12 +184,12 @@ class TabletopTask(composer.Task):
         lag."""
         commands = self._command + np.arange(1, substeps + 1)[:, None] * self._increment
         targets = commands.copy()
-        targets[:, :7] += DAMPING_RATIO / physics.timestep() * self._increment[:7]
+        targets[:, :-1] += self.scene.robot.lead / physics.timestep() * self._increment[:-1]
         self._command = commands[-1]
         model, data = physics.model.ptr, physics.data.ptr
         with physics.check_invalid_state():
-            for target in targets:
-                self._late.append(target)
+            for controls in self.compiled.controls(targets):
+                self._late.append(controls)
                 if len(self._late) > self._delay:
                     data.ctrl[:] = self._late.popleft()
                 mujoco.mj_step2(model, data)
@@ -245,6 +252,7 @@ class TabletopTask(composer.Task):
             "grasped": np.array([float(state.held[now.block])]),
             "skill": np.array([float(SKILLS.index(now.skill))]),
             "tolerance": np.array([now.tolerance]),
+            "widest": np.array([self.scene.robot.widest]),  # opening of the gripper
         }
 
     def get_reward(self, physics: mjcf.Physics) -> float:

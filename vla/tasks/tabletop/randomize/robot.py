@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from vla.io.types import NonNegativeRange, PositiveRange, Share
-from vla.robots.panda import DOWN, HOME, rotation_z, solve
+from vla.robots.cartesian import DOWN, rotation_z, solve
 from vla.tasks.tabletop.compiled_scene import CompiledScene, Noise
 from vla.tasks.tabletop.randomize.randomizer import Angles, Lengths, Places, rounded
 
@@ -29,7 +29,8 @@ class Arm:
         yaw, opening = random_state.uniform(*self.yaw), random_state.uniform(*self.opening)
         target = np.eye(4)
         target[:3, 3], target[:3, :3] = position, rotation_z(yaw) @ DOWN
-        scene.place_arm(solve(target, HOME), opening)
+        arm = scene.robot.kinematics
+        scene.place_arm(solve(arm, target, arm.home), opening)
         return {"tcp": rounded(position), "yaw": round(yaw, 5), "opening": round(opening, 5)}
 
 

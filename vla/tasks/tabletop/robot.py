@@ -1,0 +1,89 @@
+"""What scene and task need to know of an arm with a gripper, whatever it is made of."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+from dm_control import mjcf
+
+from vla.robots.cartesian import Kinematics
+from vla.spec import Array, RobotModel
+
+# Robot geometry collides with the world but not with itself.
+ROBOT_CONTACT = {"contype": 2, "conaffinity": 1}
+# Fingertips are soft and do not slip.
+FINGERTIP_CONTACT = {
+    "friction": (2.0, 0.05, 0.0002),
+    "condim": 4,
+    "priority": 1,
+    "solref": (0.01, 1),
+    "solimp": (0.95, 0.99, 0.001),
+}
+CORNERS = 64  # vertices of every "light" mesh
+
+
+@dataclass(frozen=True)
+class CameraPose:
+    """A camera that looks from `position` at `target`, with a vertical field of view."""
+
+    position: tuple[float, float, float]  # [m]
+    target: tuple[float, float, float]  # [m]
+    fovy: float  # [degrees]
+
+
+def look_at(position: Sequence[float] | Array, target: Sequence[float] | Array, up: Sequence[float] | Array) -> Array:
+    """Return the rotation (3, 3) of a camera at `position` that looks at `target` along its negative z axis, y up."""
+    back = np.asarray(position, dtype=float) - np.asarray(target, dtype=float)
+    back /= np.linalg.norm(back)
+    right = np.cross(up, back)
+    right /= np.linalg.norm(right)
+    return np.stack([right, np.cross(back, right), back], axis=1)
+
+
+def spread(points: Array, count: int) -> Array:
+    """Select at most `count` of the (N, 3) points by farthest-point sampling."""
+    chosen = [int(np.linalg.norm(points - points.mean(0), axis=1).argmax())]
+    nearest = np.linalg.norm(points - points[chosen[0]], axis=1)
+    while len(chosen) < min(count, len(points)):
+        chosen.append(int(nearest.argmax()))
+        nearest = np.minimum(nearest, np.linalg.norm(points - points[chosen[-1]], axis=1))
+    return points[chosen]
+
+
+class Robot:
+    """An arm with position servos and a gripper whose two sides close along the y axis of the tool.
+
+    The z axis of the tool points out of the gripper. A gripper command is 0 when closed and `travel` when open.
+    Elements have their names in the compiled scene; a camera `wrist` is among them.
+    """
+
+    prefix: str  # of the names of all its elements
+    arm: RobotModel  # for the spec
+    kinematics: Kinematics
+    joints: Sequence[str]  # J hinges, base to tip
+    servos: Sequence[str]  # their actuators, which take positions [rad]
+    lead: float  # damping over stiffness of the servos [s]
+    fingers: Sequence[str]  # joints of the gripper
+    grips: Sequence[str]  # G actuators of the gripper
+    closed: Array  # (G,) controls of a closed gripper
+    opened: Array  # (G,) controls of an open gripper
+    travel: float
+    finger_speed: float  # largest change of the command per second
+    widest: float  # opening of an open gripper [m]
+    fingertips: Sequence[Sequence[str]]  # geoms of either side
+    tool: str  # site
+
+    def compile(self, scene: mjcf.RootElement) -> mjcf.Physics:
+        """Compile a scene together with the robot."""
+        return mjcf.Physics.from_mjcf_model(scene)
+
+    def grip(self, opening: float) -> tuple[Array | float, float]:
+        """Return the positions of the finger joints and the gripper command for an opening [m]."""
+        raise NotImplementedError
+
+    def opening(self, model: mujoco.MjModel, data: mujoco.MjData) -> float:
+        """Measure the opening [m] in a compiled scene."""
+        raise NotImplementedError
