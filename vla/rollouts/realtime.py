@@ -31,13 +31,13 @@ class Network:
         latency: shortest time from an observation to its actions, inference included [s].
         jitter: largest addition to it, uniformly distributed [s].
         loss: probability that an observation or its answer is lost; another one is sent when the longest time is over.
-        ensemble: as of `RealTime`.
+        ensemble: as of `Schedule`.
     """
 
     latency: NonNegative
-    jitter: NonNegative = 0.0
-    loss: Rate = 0.0
-    ensemble: NonNegative | None = None
+    jitter: NonNegative
+    loss: Rate
+    ensemble: NonNegative | None
 
 
 class Schedule:

@@ -93,7 +93,8 @@ class RemotePolicy:
             link = BackgroundLink(self.plan, self.spec.control_hz)
             self._open.callback(link.close)
         else:
-            link = SimulatedLink(self.plan, Network(latency=0.0), self.spec.control_hz)
+            none = Network(latency=0.0, jitter=0.0, loss=0.0, ensemble=None)
+            link = SimulatedLink(self.plan, none, self.spec.control_hz)
         self._real_time = RealTime(self.spec, link, lambda: self.execute or 1, self.ensemble)
 
     def reset(self, instruction: str, seed: int) -> None:
