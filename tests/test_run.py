@@ -95,11 +95,15 @@ def test_a_policy_sees_the_pictures_of_its_training_and_those_of_the_other_rende
 
         monkeypatch.setattr(kind, "open", noted)
     arguments = ("checkpoint=run/checkpoints/last.ckpt", "evaluate=renderer", "evaluate.episodes=2", "output=renderers")
-    done = here(home, *arguments, "cluster.workers=1", "task.time_limit=1.0")
+    network = "{_target_: vla.rollouts.realtime.Network, latency: 0.3, jitter: 0, loss: 0, ensemble: null}"
+    arguments += ("cluster.workers=1", "task.time_limit=1.0")
+    clash = here(home, *arguments, f"+evaluate.networks.renderer_fast={network}", ok=False)
+    assert "evaluate.networks.renderer_fast has the name of another condition" in clash.stderr
+    done = here(home, *arguments, f"+evaluate.networks.slow={network}")
     report = json.loads((home / "renderers/report.json").read_text())
-    assert opened == ["Fast", "Reference"]
+    assert opened == ["Fast", "Reference", "Fast"]
     conditions = report["conditions"]
-    assert conditions.keys() == {"renderer_fast", "renderer_mujoco"}
+    assert conditions.keys() == {"renderer_fast", "renderer_mujoco", "slow"}
     assert conditions["renderer_fast"]["outcomes"] == [result["outcome"] for result in report["per_episode"]]
     assert conditions["renderer_mujoco"]["episodes"] == 2
     assert "renderer_mujoco" in done.stdout

@@ -9,7 +9,7 @@ import re
 import signal
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import replace
 from pathlib import Path
@@ -28,13 +28,14 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 
 from vla.config.experiment import Experiment
+from vla.deploy import server
 from vla.deploy.server import Keys, PolicyServer, Service
 from vla.io.array_messages import LARGEST_MAP, LONGEST_LIST, pack, unpack
 from vla.policy import Policy, plan_together
 from vla.rollouts.evaluate import play
 from vla.rollouts.remote import Component, RemotePolicy
 from vla.rollouts.rollout import rollout
-from vla.spec import FIRST_SEED, LONGEST_INSTRUCTION, Observation
+from vla.spec import FIRST_SEED, LONGEST_INSTRUCTION, Array, Observation
 
 KEYS = Keys({"eye": "observation/image"}, ["observation/state"], "prompt")
 
@@ -95,6 +96,8 @@ def remote(url: str, **changes: Any) -> RemotePolicy:
         "prompt": "prompt",
         "actions": None,
         "execute": None,
+        "asynchronous": False,
+        "ensemble": None,
         "timeout": 10.0,
         "api_key": None,
         "spec": SPEC,
@@ -128,6 +131,34 @@ def test_an_agent_in_another_process_plays_like_the_policy_here() -> None:
         agent.close()
     for episode in episodes:
         np.testing.assert_array_equal(episode.executed, expected.executed)
+
+
+def test_a_slow_server_is_not_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    policy, gate, plan = as_policy(make_bc(chunk=3)), threading.Event(), server._plan
+    asked: list[Observation] = []
+
+    def gated(sessions: Sequence[Any], observations: Sequence[Observation]) -> list[Array]:
+        asked.extend(observations)
+        assert len(asked) == 1 or gate.wait(30)
+        return plan(sessions, observations)
+
+    monkeypatch.setattr(server, "_plan", gated)
+    seen = observations(60)
+    with serving(policy) as url:
+        agent = remote(url, asynchronous=True, execute=1, spec=replace(SPEC, control_hz=200.0))
+        agent.reset(seen[0].instruction, 0)
+        first = policy.session().plan(seen[0])
+        actions = [agent.act(observation) for observation in seen[:5]]
+        np.testing.assert_array_equal(actions[:3], first)  # though the server does not answer any more
+        held = np.where([True, True, False], 0, first[2])
+        np.testing.assert_array_equal(actions[3:], [held, held])
+        gate.set()
+        later = next(action for each in seen[5:] if not np.array_equal(action := agent.act(each), held))
+        # The second observation was sent at step 1; two actions followed, the third of its chunk is due.
+        np.testing.assert_array_equal(later, policy.session().plan(seen[1])[2])
+        agent.reset(seen[0].instruction, 0)  # whatever is awaited is dropped
+        np.testing.assert_array_equal(agent.act(seen[0]), first[0])
+        agent.close()
 
 
 def test_clients_have_histories_of_their_own_and_share_passes() -> None:

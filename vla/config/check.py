@@ -66,6 +66,7 @@ PLAIN: dict[str, Any] = {
         "conditions": dict[str, dict[str, object]],
         "one_by_one": dict[str, dict[str, dict[str, object]]],
         "without": Annotated[list[Literal["images", "instruction"]], Predicate(unique)],
+        "networks": dict[str, object],
     },
 }
 

@@ -15,6 +15,7 @@ from typing import Any
 
 from rich import print as show
 
+from vla.config.build import Group, build
 from vla.config.check import Job, with_changes
 from vla.config.conditions import conditions
 from vla.config.experiment import Experiment
@@ -23,8 +24,9 @@ from vla.policy import latency
 from vla.reports.conditions import conditions_table, plot_conditions
 from vla.reports.evaluation import plot_report, write_report
 from vla.reports.html import PAGE, optional, write_page
-from vla.rollouts.evaluate import IN_DISTRIBUTION, Report, compare_conditions, evaluate, keep_recordings
-from vla.rollouts.memory import Sense, make_impaired
+from vla.rollouts.evaluate import IN_DISTRIBUTION, AgentFactory, Report, compare_conditions, evaluate, keep_recordings
+from vla.rollouts.memory import make_impaired
+from vla.rollouts.realtime import Network, make_distant
 from vla.rollouts.statements import AgainstBar, AgainstCondition, AgainstRun, Statement
 from vla.runs.files import Round
 from vla.runs.folder import CHECKPOINTS, require_run, save_config, wall_time
@@ -48,6 +50,7 @@ def run(experiment: Experiment) -> float | None:
     """
     output = experiment.output
     _statements(experiment)  # that they can be made, before any work
+    _networks(experiment)
     if experiment["agent"]:
         return _evaluated(experiment, None)
     if not experiment.playable and experiment["evaluate"]["conditions"]:
@@ -108,16 +111,30 @@ def _statements(experiment: Experiment) -> list[Statement]:
         if report is None:
             raise ValueError(f"evaluate.against={against} has no report.json to compare with: evaluate that run first")
         found.append(AgainstRun(against, {result.seed: result for result in report.per_episode}, asked["margin"]))
-    if asked["until"] and not found and not conditions(asked) and not asked["without"]:
+    if asked["until"] and not found and not (conditions(asked) or asked["without"] or asked["networks"]):
         raise ValueError(
             "evaluate.until=decided needs something to decide: evaluate.bar=0.95, evaluate.against=RUN, or conditions, "
             "as in evaluate=suite"
         )
-    if not experiment.playable and (found or asked["until"] or asked["without"]):
+    if not experiment.playable and (found or asked["until"] or asked["without"] or asked["networks"]):
         raise ValueError(
-            "evaluate.bar, against, until and without are about success, which a recording has not: omit them"
+            "evaluate.bar, against, until, without and networks are about success, which a recording has not: omit them"
         )
     return found
+
+
+def _networks(experiment: Experiment) -> dict[str, Network]:
+    """Return condition → network of `evaluate.networks`.
+
+    Raises:
+        ValueError: one is invalid, or has the name of another condition.
+    """
+    asked = experiment["evaluate"]
+    for name in asked["networks"]:
+        if name in {IN_DISTRIBUTION, *conditions(asked), *(f"without_{sense}" for sense in asked["without"])}:
+            raise ValueError(f"evaluate.networks.{name} has the name of another condition: rename it")
+    kind = Group("evaluate.networks", ("vla.rollouts.realtime.Network",))
+    return {name: build(node, kind) for name, node in asked["networks"].items()}
 
 
 def _play(experiment: Experiment, checkpoint: Path | None, statements: Sequence[Statement]) -> dict[str, Report]:
@@ -135,20 +152,24 @@ def _play(experiment: Experiment, checkpoint: Path | None, statements: Sequence[
     if recorder:
         recordings.mkdir(exist_ok=True)
         needs.append(recordings)
-    impaired: dict[str, Sense] = {f"without_{sense}": sense for sense in asked["without"]}
-    named = {IN_DISTRIBUTION: {}, **conditions(asked), **{name: {} for name in impaired}}
-    different = sum(name in impaired or with_changes(task, changes) != task for name, changes in named.items())
+    others: dict[str, AgentFactory] = {
+        **{f"without_{sense}": partial(make_impaired, make_agent, sense) for sense in asked["without"]},
+        **{name: partial(make_distant, make_agent, network) for name, network in _networks(experiment).items()},
+    }
+    named = {IN_DISTRIBUTION: {}, **conditions(asked), **{name: {} for name in others}}
+    different = sum(name in others or with_changes(task, changes) != task for name, changes in named.items())
     until, reports = [each.is_clear for each in statements], dict[str, Report]()
     for name, changes in named.items():
-        if reports and name not in impaired and with_changes(task, changes) == task:  # equal to the training condition
+        if reports and name not in others and with_changes(task, changes) == task:  # equal to the training condition
             reports[name] = reports[IN_DISTRIBUTION]
             continue
-        make = partial(make_impaired, make_agent, impaired[name]) if name in impaired else make_agent
         watching = None if reports else recorder
         make_environment = experiment.make_environment(changes)
         tiers = task.get("tiers")  # of worlds that have them
         clear = partial(_all, until) if asked["until"] and until else None
-        reports[name] = evaluate(make_environment, make, watching, seeds, cluster, name, needs, tiers, clear)
+        reports[name] = evaluate(
+            make_environment, others.get(name, make_agent), watching, seeds, cluster, name, needs, tiers, clear
+        )
         first = reports[IN_DISTRIBUTION]
         seeds = [result.seed for result in first.results]
         until = [AgainstCondition(first, asked["margin"], different).is_clear]

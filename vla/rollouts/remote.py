@@ -6,7 +6,6 @@
 from __future__ import annotations
 
 import time
-from collections import deque
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -16,7 +15,8 @@ import numpy as np
 from PIL import Image, ImageOps
 
 from vla.io.array_messages import pack, unpack
-from vla.io.types import Count, Natural, Pixels, Positive, Text
+from vla.io.types import Count, Natural, NonNegative, Pixels, Positive, Text
+from vla.rollouts.realtime import BackgroundLink, Network, RealTime, SimulatedLink
 from vla.spec import Array, Observation, Spec
 
 if TYPE_CHECKING:
@@ -45,6 +45,9 @@ class RemotePolicy:
         prompt: key of the instruction.
         actions: our action component → how to compute it; null: the server's actions are ours.
         execute: actions of each chunk to execute; null: as many as the server says, or all.
+        asynchronous: act at the spec's control rate by the clock, and go on with the chunk, or hold, while the server
+            computes the next one; else wait for it.
+        ensemble: as of `vla.rollouts.realtime.Schedule`; null: only the newest chunk counts.
         timeout: longest time to wait for an answer [s].
         api_key: sent as Authorization: Api-Key …
         spec: of the environment.
@@ -60,6 +63,8 @@ class RemotePolicy:
     prompt: Text
     actions: dict[str, Component] | None
     execute: Count | None
+    asynchronous: bool
+    ensemble: NonNegative | None
     timeout: Positive
     api_key: Text | None
     spec: Spec
@@ -77,7 +82,6 @@ class RemotePolicy:
         if self.actions is not None and sorted(self.actions) != sorted(self.spec.action):
             raise ValueError(f"agent.actions must map {', '.join(self.spec.action)}, got {', '.join(self.actions)}")
         self.info: dict[str, Any] = {}
-        self._chunk: deque[Array] = deque()
         self._low, self._high = np.array(self.spec.low, np.float32), np.array(self.spec.high, np.float32)
         self._open = ExitStack()
         self._connection, self.metadata = self._connected()
@@ -85,10 +89,17 @@ class RemotePolicy:
         told = told if isinstance(told, int) and told >= 1 else None
         # A policy with a history wants to see every frame.
         self._wanted = self.execute or (1 if isinstance(history, int) and history > 1 else told)
+        if self.asynchronous:
+            link = BackgroundLink(self.plan, self.spec.control_hz)
+            self._open.callback(link.close)
+        else:
+            none = Network(latency=0.0, jitter=0.0, loss=0.0, ensemble=None)
+            link = SimulatedLink(self.plan, none, self.spec.control_hz)
+        self._real_time = RealTime(self.spec, link, lambda: self.execute or 1, self.ensemble)
 
     def reset(self, instruction: str, seed: int) -> None:
-        """Start an episode: drop the rest of the chunk, and tell a server that has episodes."""
-        self._chunk.clear()
+        """Start an episode: drop all chunks, and tell a server that has episodes."""
+        self._real_time.reset(seed)
         if self.metadata.get("reset") is True:
             self._ask({"reset": True, "prompt": instruction, "seed": seed})
 
@@ -98,9 +109,7 @@ class RemotePolicy:
         Raises:
             ValueError: the server refuses the observation, fails, is too slow, or answers with something else.
         """
-        if not self._chunk:
-            self._chunk.extend(self.plan(observation)[: self.execute])
-        return self._chunk.popleft()
+        return self._real_time.act(observation)
 
     def plan(self, observation: Observation) -> Array:
         """Return the server's chunk, (k, D) float32, clipped, of which `execute` are meant to act. Raises as `act`."""

@@ -78,6 +78,8 @@ def _serving(experiment: Experiment, policy: Policy) -> Iterator[RemotePolicy]:
             prompt=keys.prompt,
             actions=None,
             execute=None,
+            asynchronous=False,
+            ensemble=None,
             timeout=60.0,
             api_key=None,
             spec=policy.spec,

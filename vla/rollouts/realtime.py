@@ -1,0 +1,252 @@
+"""Chunks executed in real time: one is executed while the next is computed, and what has become too old is skipped.
+
+Time is counted in executed actions. While an arm holds because no action is there, it stays where it was observed, and
+the plan for it does not age.
+
+Shapes: k action chunk, D action components.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+
+from vla.io.types import NonNegative, Rate
+from vla.spec import Agent, Array, Environment, Observation, Spec
+
+Plan = Callable[[Observation], Array]  # returns a chunk (k, D)
+
+
+@dataclass(frozen=True)
+class Network:
+    """A simulated network between an arm and its policy.
+
+    Attributes:
+        latency: shortest time from an observation to its actions, inference included [s].
+        jitter: largest addition to it, uniformly distributed [s].
+        loss: probability that an observation or its answer is lost; another one is sent when the longest time is over.
+        ensemble: as of `Schedule`.
+    """
+
+    latency: NonNegative
+    jitter: NonNegative
+    loss: Rate
+    ensemble: NonNegative | None
+
+
+class Schedule:
+    """The actions of the chunks so far, by the number of the step at which they are due; steps are executed actions."""
+
+    def __init__(self, ensemble: float | None) -> None:
+        """`ensemble` is None, or the m of weights exp(-m i) of all chunks for a step, i = 0 for the oldest.
+
+        Source: Zhao et al., Learning Fine-Grained Bimanual Manipulation with Low-Cost Hardware, arXiv 2304.13705,
+        algorithm 2.
+        """
+        self._ensemble = ensemble
+        self._chunks: list[tuple[int, Array]] = []  # first step, actions
+        self.step = 0  # the next one
+
+    def add(self, actions: Array, observed: int) -> None:
+        """Add a chunk (k, D) for an observation before the step `observed`; those of earlier steps are skipped."""
+        self._chunks.append((observed, actions))
+
+    def is_due(self, execute: int) -> bool:
+        """Return whether the next observation is wanted, `execute` steps after that of the newest chunk."""
+        return not self._chunks or self.step >= self._chunks[-1][0] + execute
+
+    def next(self) -> Array | None:
+        """Return the action (D,) of the next step, and advance; None if no chunk reaches that far."""
+        self._chunks = [(first, actions) for first, actions in self._chunks if self.step < first + len(actions)]
+        if not self._chunks:
+            return None
+        found = np.stack([actions[self.step - first] for first, actions in self._chunks])
+        self.step += 1
+        if self._ensemble is None:
+            return found[-1]
+        weights = np.exp(-self._ensemble * np.arange(len(found)))
+        return (weights @ found / weights.sum()).astype(np.float32)
+
+
+class Link(Protocol):
+    """Way to a policy for one observation at a time."""
+
+    @property
+    def busy(self) -> bool:
+        """Whether an answer is awaited."""
+        ...
+
+    def reset(self, seed: int) -> None:
+        """Start an episode; an answer that is awaited is dropped."""
+        ...
+
+    def tick(self) -> None:
+        """Begin a control step."""
+        ...
+
+    def send(self, observation: Observation) -> None:
+        """Send an observation; only if not busy."""
+        ...
+
+    def receive(self, wait: bool) -> Array | None:
+        """Return the chunk (k, D) if it has arrived, which ends the wait; with `wait` it always has."""
+        ...
+
+
+class RealTime:
+    """Acts at every step with the newest chunk that has arrived, and holds where there is none.
+
+    An episode starts with the first answer, for which it waits. To hold is to repeat the last action, but zero in
+    components that move the arm: those that may be negative or positive, apart from grippers and positions, which are
+    also part of the state.
+    """
+
+    def __init__(self, spec: Spec, link: Link, execute: Callable[[], int], ensemble: float | None) -> None:
+        """Args:
+        spec: of the actions.
+        link: to the policy.
+        execute: returns the number of actions after which the next observation is sent, once an answer is there.
+        ensemble: as of `Schedule`: average the actions of all chunks for a step, and send every observation.
+        """
+        self._link, self._execute, self._ensemble = link, execute, ensemble
+        columns = zip(spec.action, spec.low, spec.high, strict=True)
+        moves = [low < 0 < high and "gripper" not in name and name not in spec.state for name, low, high in columns]
+        self._kept = ~np.array(moves)
+        self.reset(0)
+
+    def reset(self, seed: int) -> None:
+        """Start an episode."""
+        self._link.reset(seed)
+        self._schedule, self._observed = Schedule(self._ensemble), 0
+        self._last: Array | None = None
+
+    def act(self, observation: Observation) -> Array:
+        """Return the action (D,) to execute now. Raises what the policy raises."""
+        self._link.tick()
+        self._take(wait=False)
+        execute = 1 if self._ensemble is not None or self._last is None else self._execute()
+        if not self._link.busy and self._schedule.is_due(execute):
+            self._link.send(observation)
+            self._observed = self._schedule.step
+            self._take(wait=self._last is None)
+        action = self._schedule.next()
+        if action is None:
+            assert self._last is not None, "the first answer has actions"
+            return np.where(self._kept, self._last, 0).astype(np.float32)
+        self._last = action
+        return action
+
+    def _take(self, wait: bool) -> None:
+        actions = self._link.receive(wait) if self._link.busy else None
+        if actions is not None:
+            self._schedule.add(actions, self._observed)
+
+
+class SimulatedLink:
+    """A network whose delays pass in control steps, so that an episode is a function of its seed."""
+
+    def __init__(self, plan: Plan, network: Network, control_hz: float) -> None:
+        """Args: the policy; the network; steps per second [Hz]."""
+        self._plan, self._network, self._hz = plan, network, control_hz
+        self.reset(0)
+
+    def reset(self, seed: int) -> None:
+        """Start an episode."""
+        self._random = np.random.default_rng([seed, 3])
+        self._now, self.busy = 0, False
+
+    def tick(self) -> None:
+        """Begin a control step."""
+        self._now += 1
+
+    def send(self, observation: Observation) -> None:
+        """Compute the chunk, and draw when it arrives; a server computes one that is lost on its way back, too."""
+        late, lost = self._random.random(2)
+        network = self._network
+        self._lost = bool(lost < network.loss)
+        seconds = network.latency + network.jitter * (1.0 if self._lost else late)
+        steps = math.ceil(seconds * self._hz - 1e-9)
+        self._due = self._now + (max(steps, 1) if self._lost else steps)
+        self._actions, self.busy = self._plan(observation), True
+
+    def receive(self, wait: bool) -> Array | None:
+        """Return the chunk if it has arrived, which ends the wait."""
+        if self._now < self._due and not wait:
+            return None
+        self.busy = False
+        return None if self._lost and not wait else self._actions
+
+
+class BackgroundLink:
+    """A policy that plans in a thread, while control steps follow the clock; late ones are not made up for."""
+
+    def __init__(self, plan: Plan, control_hz: float) -> None:
+        """Args: the policy; steps per second [Hz]."""
+        self._plan, self._period = plan, 1 / control_hz
+        self._thread = ThreadPoolExecutor(1, "policy")
+        self._answer: Future[Array] | None = None
+        self._next = 0.0
+
+    @property
+    def busy(self) -> bool:
+        """Whether an answer is awaited."""
+        return self._answer is not None
+
+    def reset(self, seed: int) -> None:
+        """Start an episode once the policy is idle."""
+        if self._answer is not None:
+            self._answer.exception()
+        self._answer, self._next = None, 0.0
+
+    def tick(self) -> None:
+        """Wait for the next control step."""
+        now = time.monotonic()
+        time.sleep(max(0.0, self._next - now))
+        self._next = max(now, self._next) + self._period
+
+    def send(self, observation: Observation) -> None:
+        """Let the thread plan."""
+        self._answer = self._thread.submit(self._plan, observation)
+
+    def receive(self, wait: bool) -> Array | None:
+        """Return the chunk if it is there; raises what the policy raised."""
+        if self._answer is None or not (wait or self._answer.done()):
+            return None
+        answer, self._answer = self._answer, None
+        return answer.result()
+
+    def close(self) -> None:
+        """End the thread once the policy is idle."""
+        self._thread.shutdown()
+
+
+class Distant:
+    """An agent at the other end of a simulated network; one that does not plan chunks has chunks of one action."""
+
+    def __init__(self, agent: Agent, network: Network, spec: Spec) -> None:
+        """Args: the agent, the network, and the spec of the environment."""
+        self._agent = agent
+        plan: Plan = getattr(agent, "plan", lambda observation: agent.act(observation)[None])
+        link = SimulatedLink(plan, network, spec.control_hz)
+        self._real_time = RealTime(spec, link, lambda: getattr(agent, "execute", None) or 1, network.ensemble)
+        self.info: dict[str, Any] = {}
+
+    def reset(self, instruction: str, seed: int) -> None:
+        """Start an episode."""
+        self._agent.reset(instruction, seed)
+        self._real_time.reset(seed)
+
+    def act(self, observation: Observation) -> Array:
+        """Return the action (D,) to execute now."""
+        return self._real_time.act(observation)
+
+
+def make_distant(make_agent: Callable[[Environment], Agent], network: Network, environment: Environment) -> Distant:
+    """Build an agent at the other end of a network for an environment."""
+    return Distant(make_agent(environment), network, environment.spec)
