@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import itertools
 import json
-import os
 from pathlib import Path
-from unittest.mock import patch
 
 import pytest
 from command_line import here
 from finished_runs import a_run
+from rich import get_console
 from scipy.stats import binom, multinomial
 
 from vla.rollouts.comparison import fisher, mcnemar
@@ -77,12 +76,12 @@ def test_stopping_rarely_errs_and_is_early_where_the_difference_is_large() -> No
     assert stopping(0.5, 0.11, 0.1, 0.99, 10) is None
 
 
-def test_the_command_prints_a_row_per_design(tmp_path: Path) -> None:
+def test_the_command_prints_a_row_per_design(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for name, outcomes in (("one", "s" * 40 + "d" * 10), ("other", "s" * 37 + "d" * 2 + "s" * 11)):
         a_run(tmp_path / name, outcomes)
     where = ("job=plan", "output=planned", "hydra.run.dir=planned", "plan.rates=[0.8,0.95]")
-    with patch.dict(os.environ, {"COLUMNS": "140"}):
-        told = here(tmp_path, *where, "plan.runs=[one,other]").stdout
+    monkeypatch.setattr(get_console(), "width", 140)  # so that no cell is broken into lines
+    told = here(tmp_path, *where, "plan.runs=[one,other]").stdout
     fixed = episodes_needed(lambda episodes: power_of_pairs(episodes, 12 / 50, 0.15), 0.8)
     for words in ("a bar of 80 %", "different episodes", "24 % differ", f" {fixed} "):
         assert words in " ".join(told.split()), words
