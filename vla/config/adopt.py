@@ -103,8 +103,6 @@ def resume(cfg: DictConfig, run: Path, overrides: Sequence[str]) -> DictConfig:
     _require_own_parts(parsed, PRESETS)
     taken = {str(name): saved[name] for name in cfg if name in saved and name not in OF_THIS_COMMAND}
     require_trust(taken, taken, last)
-    asked = cast("dict[str, Any]", OmegaConf.to_container(cfg.evaluate))
-    taken["evaluate"] = {**asked, **taken.get("evaluate", {})}  # options that are newer than the run
     if any(_path(override) == "trainer" for override in parsed):
         kept = {name: value for name, value in saved.get("trainer", {}).items() if name not in MACHINES}
         taken["trainer"] = kept | {name: cfg.trainer[name] for name in MACHINES if name in cfg.trainer}
