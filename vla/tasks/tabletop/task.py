@@ -13,7 +13,7 @@ from dm_env import specs
 
 from vla.robots.cartesian import CartesianController
 from vla.spec import FIRST_SEED, Array
-from vla.tasks.language import HeldOut
+from vla.tasks.language import HeldOut, paraphrase
 from vla.tasks.streams import Streams
 from vla.tasks.tabletop.compiled_scene import CompiledScene
 from vla.tasks.tabletop.goals.goal import SKILLS, Goal, Referents, WorldState
@@ -102,8 +102,12 @@ class TabletopTask(composer.Task):
         physics.forward()
         held_out = self._held_out(seed)
         self.referents = self._choose(held_out, self.streams(seed, "named"))
-        self.instruction = self.goal.language.say(self._slots(seed), held_out, self.streams(seed, "language"))
+        slots = self._slots(seed)
+        self.instruction = self.goal.language.say(slots, held_out, self.streams(seed, "language"))
         language = {"instruction": self.instruction, "held_out": held_out or "none"}
+        if self.compiled.paraphrases and seed >= FIRST_SEED:
+            self.instruction = paraphrase(self.instruction, self.compiled.paraphrases, slots.values())
+            language = {"instruction": self.instruction, "held_out": "names"}
         self.draws = {"named": self._named(), **draws, "language": language}
         data = self.compiled.data
         self.controller.reset(data.qpos[self.compiled.joints])
