@@ -106,6 +106,9 @@ def test_intensity_and_colour_of_the_light_are_changed_one_at_a_time(level: str)
 def test_the_suite_has_every_axis_by_itself_at_each_level() -> None:
     suite = conditions(plain(composed("evaluate=suite").evaluate))
     levels = {level: composed(f"task/randomize={level}").task.randomize for level in ("wide", "hard")}
+    for level in levels:  # no level of all axes has it
+        assert levels[level]["disturbance"] is None
+        levels[level]["disturbance"] = composed(f"task/randomize/disturbance={level}").task.randomize["disturbance"]
     axes = [axis for axis in levels["wide"] if axis != "phrasing"]  # whose levels are the same
     assert {"swapped", "impossible", "empty", "phrasing"} < set(suite)
     for axis, level in product(axes, levels):

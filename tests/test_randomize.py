@@ -15,8 +15,8 @@ from vla.tasks.tabletop.environment import Tabletop
 from vla.tasks.tabletop.randomize.blocks import Colours, Distractors, Masses, Placement, Shapes
 
 DEFAULT = {"distractors", "colour", "size", "mass", "friction", "placement", "arm", "light", "camera", "table"}
-# What is asked for, which "naming" changes, is no draw.
-AXES = sorted({path.name for path in (CONF / "task/randomize").iterdir() if path.is_dir()} - {"naming"})
+# What is asked for, which "naming" changes, is no draw, and a disturbance is no property of the scene.
+AXES = sorted({path.name for path in (CONF / "task/randomize").iterdir() if path.is_dir()} - {"naming", "disturbance"})
 INVISIBLE = {"mass", "friction", "gain", "latency", "phrasing"}  # until something moves, or speaks
 
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import asdict, dataclass, field, replace
 from typing import Annotated, Any, Literal, Protocol, runtime_checkable
@@ -295,6 +295,16 @@ class Drawable(Protocol):
 
     def poses(self) -> dict[str, Array]:
         """Return body name → (7,) position [m] and quaternion wxyz in the world."""
+        ...
+
+
+@runtime_checkable
+class Eventful(Protocol):
+    """Environment in which things happen that the agent does not do; recordings tell when."""
+
+    @property
+    def events(self) -> Sequence[tuple[int, str]]:
+        """What has happened in this episode: index of the last observation before it or the first one that shows it."""
         ...
 
 

@@ -32,6 +32,7 @@ Rate = Annotated[float, Ge(0), Lt(1)]  # of dropout, of a moving average
 Range = Annotated[tuple[float, float], Predicate(ascending)]  # low, high
 NonNegativeRange = Annotated[tuple[NonNegative, NonNegative], Predicate(ascending)]
 PositiveRange = Annotated[tuple[Positive, Positive], Predicate(ascending)]
+NaturalRange = Annotated[tuple[Natural, Natural], Predicate(ascending)]
 CountRange = Annotated[tuple[Count, Count], Predicate(ascending)]
 Pixels = Annotated[int, Ge(8), Le(1024)]
 ImageSize = tuple[Pixels, Pixels]  # height, width

@@ -13,6 +13,7 @@ from rerun.chunk import RrdReader, StoreEntry
 
 MOMENTS = 8  # frames of a filmstrip
 PROPERTIES, INSTRUCTION, CAMERAS = "/__properties/episode", "/instruction", "/camera/**"
+EVENTS = "/events"
 
 
 @dataclass(frozen=True)
@@ -25,6 +26,7 @@ class Filmstrip:
     length: int  # of the episode [steps]
     steps: list[int]  # of the frames
     pictures: dict[str, list[bytes]]  # camera → one JPEG per step
+    events: list[tuple[int, str]]  # step and description of what happened without the agent
 
 
 def read_filmstrips(file: Path, failures: int, successes: int) -> list[Filmstrip]:
@@ -64,13 +66,18 @@ def _chosen(entries: Sequence[StoreEntry], failures: int, successes: int) -> lis
 def _strip(reader: RrdReader, entry: StoreEntry) -> Filmstrip:
     properties: dict[str, Any] = {}
     frames: dict[str, dict[int, Any]] = {}  # camera → step → blob
-    for chunk in reader.store(store=entry).stream().filter(content=[PROPERTIES, INSTRUCTION, CAMERAS]).to_chunks():
+    events: list[tuple[int, str]] = []
+    content = [PROPERTIES, INSTRUCTION, CAMERAS, EVENTS]
+    for chunk in reader.store(store=entry).stream().filter(content=content).to_chunks():
         batch = chunk.to_record_batch()
         if chunk.entity_path.startswith("/camera/"):
             _, _, camera, kind = chunk.entity_path.split("/")
             if kind == "rgb":
                 blobs = zip(batch.column("step").to_pylist(), batch.column("EncodedImage:blob"), strict=True)
                 frames.setdefault(camera, {}).update(blobs)
+        elif chunk.entity_path == EVENTS:
+            texts = [text for (text,) in batch.column("TextLog:text").to_pylist()]
+            events += zip(batch.column("step").to_pylist(), texts, strict=True)
         else:
             properties.update({name: values[0] for name, values in batch.to_pydict().items()})
     steps: list[int] = sorted(next(iter(frames.values()), {}))
@@ -79,4 +86,4 @@ def _strip(reader: RrdReader, entry: StoreEntry) -> Filmstrip:
     pictures = {camera: [bytes(at[step][0].as_py()) for step in chosen] for camera, at in frames.items()}
     heading = properties["TextDocument:text"][0].partition("\n")[0].removeprefix("### ")
     seed, outcome, length = (properties[name][0] for name in ("seed", "outcome", "steps"))
-    return Filmstrip(seed, outcome, heading, length, chosen, pictures)
+    return Filmstrip(seed, outcome, heading, length, chosen, pictures, sorted(events))

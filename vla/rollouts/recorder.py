@@ -17,13 +17,14 @@ from PIL import Image
 
 from vla.io.files import atomic_path
 from vla.io.types import Point
-from vla.spec import Array, Drawable, Environment, Episode, Observation, Shape, Spec
+from vla.spec import Array, Drawable, Environment, Episode, Eventful, Observation, Shape, Spec
 
 # N steps, S series of a plot, D action components, K bins, V vertices, F faces
 
 VIEWER = str(Path(rerun_cli.__file__).with_name("rerun"))  # the binary: killing its wrapper script would orphan it
 CURVES = np.array([0xE5574CFF, 0x5ABE64FF, 0x508CF0FF, 0xF0AA3CFF, 0xB46EE6FF, 0x3CC8C8FF, 0xDCDCDCFF], np.uint32)
 HEAT = np.array([(10, 8, 24), (70, 18, 95), (160, 45, 95), (235, 105, 55), (252, 190, 75), (252, 253, 200)])
+EVENTS = "events"  # entity of the log
 TOKENS = (210, 256)  # height and width of the image of token probabilities [px]
 
 
@@ -35,7 +36,7 @@ def recording_name(seed: int, outcome: str) -> str:
 class RerunRecorder:
     """Recorder of one .rrd file per episode, with the timelines "step" and "time" [s].
 
-    It contains the scene if the environment is `Drawable`.
+    It contains the scene if the environment is `Drawable`, and a log if it is `Eventful`.
     """
 
     def __init__(self, folder: str | os.PathLike[str]) -> None:
@@ -47,6 +48,7 @@ class RerunRecorder:
         """Begin an episode; an unfinished one is discarded."""
         self._spec = environment.spec
         self._world = environment if isinstance(environment, Drawable) else None
+        self._eventful = environment if isinstance(environment, Eventful) else None
         self._shapes = self._world.shapes() if self._world else []
         self._steps, self._poses = 0, list[dict[str, Array]]()
         self._probabilities: dict[int, Array] = {}
@@ -66,9 +68,11 @@ class RerunRecorder:
         stream = rr.RecordingStream("vla", recording_id=f"{name}-{os.urandom(3).hex()}")
         content = rr.binary_stream(stream)  # Rerun's own file sink can block for ever on a full disk
         viewpoint = self._world.viewpoint if self._world else None
-        stream.send_blueprint(_blueprint(spec, bool(self._probabilities), viewpoint), make_active=False)
+        events = self._eventful.events if self._eventful else ()
+        stream.send_blueprint(_blueprint(spec, bool(self._probabilities), bool(events), viewpoint), make_active=False)
         writer = _Writer(stream, spec)
         writer.facts(episode)
+        writer.events(events)
         if self._poses:
             draw_shapes(stream, self._shapes)
             writer.poses(self._poses)
@@ -101,6 +105,12 @@ class _Writer:
         draws = "\n".join(f"- **{axis}** {draw}" for axis, draw in episode.draws.items())
         self._static("instruction", rr.TextDocument(f"### {episode.instruction}\n\n{end}", media_type="text/markdown"))
         self._static("draws", rr.TextDocument(draws, media_type="text/markdown"))
+
+    def events(self, events: Sequence[tuple[int, str]]) -> None:
+        """Write what happened without the agent, at the last step before it or the first one that shows it."""
+        if events:
+            steps, texts = zip(*events, strict=True)
+            self._columns(EVENTS, np.array(steps), rr.TextLog.columns(text=texts))
 
     def poses(self, poses: Sequence[Mapping[str, Array]]) -> None:
         """Write body poses at the steps where they change: for many bodies, never."""
@@ -235,9 +245,11 @@ def _normals(vertices: Array, faces: Array) -> Array:
     return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
 
 
-def _blueprint(spec: Spec, tokens: bool, viewpoint: tuple[Point, Point] | None) -> rrb.Blueprint:
+def _blueprint(spec: Spec, tokens: bool, events: bool, viewpoint: tuple[Point, Point] | None) -> rrb.Blueprint:
     """Lay out the scene, if there is one, on the left, texts and cameras on the right, curves and tokens below."""
-    texts = [rrb.TextDocumentView(origin=f"/{name}", name=name) for name in ("instruction", "draws")]
+    texts: list[Any] = [rrb.TextDocumentView(origin=f"/{name}", name=name) for name in ("instruction", "draws")]
+    if events:
+        texts.insert(1, rrb.TextLogView(origin=f"/{EVENTS}", name=EVENTS))
     images = [(name, kind) for kind, names in (("rgb", spec.cameras), ("depth", spec.depth)) for name in names]
     views = [rrb.Spatial2DView(origin=_path("camera", name, kind), name=f"{name} {kind}") for name, kind in images]
     states = _curves("state", spec.state_units)

@@ -24,6 +24,23 @@ class Noise:
     gripper: float = 0.0  # [m]
 
 
+Kind = Literal["push", "drop", "move_block", "move_target"]
+KINDS: tuple[Kind, ...] = ("push", "drop", "move_block", "move_target")
+
+
+@dataclass(frozen=True)
+class Disturbance:
+    """What happens in the course of an episode, in numbers drawn at its start; see `vla.tasks.tabletop.disturber`."""
+
+    kind: Kind
+    times: int  # how often
+    delay: int  # control steps for which it must be possible before it happens
+    distance: float  # of a push or a move [m]
+    angle: float  # of its horizontal direction; if there is no room, the next free direction is taken [rad]
+    low: tuple[float, float]  # corner x, y of the area in which a push or a move ends [m]
+    high: tuple[float, float]  # the opposite corner [m]
+
+
 class CompiledScene:
     """Indices of a scene's elements in its compiled model, and the nominal model for resets."""
 
@@ -94,6 +111,7 @@ class CompiledScene:
         self.held_out: float = 0.0  # probability of a held-out instruction in an evaluation
         self.paraphrases: dict[str, str] = {}  # phrase → its replacement in the instructions of an evaluation
         self.skip = 0  # number of blocks skipped in the order of naming
+        self.disturbance: Disturbance | None = None
         self.paint_blocks(list(COLOURS)[:count], np.array(list(COLOURS.values()))[:count])
         for pad in range(len(PADS)):
             self.place_pad(pad, 0.4, 0.15 * pad)
@@ -193,6 +211,12 @@ class CompiledScene:
         """Put block `index` on the table at (x, y) [m], turned by `yaw` [rad]."""
         start = self.block_positions[index]
         self.data.qpos[start : start + 7] = (x, y, self.extents[index, 2], np.cos(yaw / 2), 0, 0, np.sin(yaw / 2))
+
+    def move_block(self, index: int, x: float, y: float) -> None:
+        """Move block `index` horizontally to (x, y) [m] and stop it, in the course of an episode."""
+        start, velocity = self.block_positions[index], self.block_velocities[index]
+        self.data.qpos[start : start + 2] = x, y
+        self.data.qvel[velocity : velocity + 6] = 0.0
 
     def block_centres(self) -> Array:
         """Return the centres (present, 3) of the blocks on the table [m]."""

@@ -32,7 +32,7 @@ QUANTILES = np.array([NormalDist().inv_cdf((index + 0.5) / 256) for index in ran
 
 
 class Tabletop:
-    """`TabletopTask` as an `Environment` with camera observations, also `Drawable` and `Drivable`."""
+    """`TabletopTask` as an `Environment` with camera observations, also `Drawable`, `Drivable` and `Eventful`."""
 
     viewpoint: tuple[Point, Point] = ((1.2, -0.7, 0.75), (0.38, 0.0, 0.2))
 
@@ -141,6 +141,13 @@ class Tabletop:
     def _update_outcome(self, done: bool) -> None:
         classifier = self._task.classifier
         self.done, self.outcome, self.milestones = done, classifier.outcome, classifier.milestones
+        if self.events:
+            self.milestones |= {"disturbed"}
+
+    @property
+    def events(self) -> list[tuple[int, str]]:
+        """Control step and description of every disturbance so far in this episode."""
+        return self._task.events
 
     def _state(self) -> Array:
         """Measure (2 J + 1,) float32: joint positions [rad], their velocities [rad/s] and the gripper's opening [m]."""

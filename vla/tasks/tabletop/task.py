@@ -11,12 +11,13 @@ import numpy as np
 from dm_control import composer, mjcf
 from dm_env import specs
 
-from vla.robots.cartesian import CartesianController
+from vla.robots.cartesian import CartesianController, solve
 from vla.spec import FIRST_SEED, Array
 from vla.tasks.language import HeldOut, paraphrase
 from vla.tasks.streams import Streams
 from vla.tasks.tabletop.compiled_scene import CompiledScene
-from vla.tasks.tabletop.goals.goal import SKILLS, Goal, Referents, WorldState
+from vla.tasks.tabletop.disturber import PUSH, Disturber
+from vla.tasks.tabletop.goals.goal import SKILLS, Goal, Referents, WorldState, current
 from vla.tasks.tabletop.goals.mixed import Mixed
 from vla.tasks.tabletop.outcome import OutcomeClassifier
 from vla.tasks.tabletop.randomize.randomizer import Randomizer
@@ -73,6 +74,7 @@ class TabletopTask(composer.Task):
         self.seed: int | None = None  # of the next episode; None: drawn from composer's random state
         self.draws: dict[str, Any] = {}
         self.instruction = ""
+        self.disturber: Disturber | None = None
         self.streams = Streams()
 
     @property
@@ -118,6 +120,8 @@ class TabletopTask(composer.Task):
         self._cached: tuple[float, WorldState] | None = None  # simulation time [s] and state
         self._starts, self._lifts = self.compiled.block_centres(), np.zeros(self.compiled.present)
         self.classifier = OutcomeClassifier(self.goal.hold_steps)
+        drawn = self.compiled.disturbance
+        self.disturber, self._shove = Disturber(drawn, self.compiled) if drawn else None, np.zeros(3)
         self._periods, self._most_periods = 0, round(self._time_limit * self.goal.moves * CONTROL_HZ)
 
     def _held_out(self, seed: int) -> HeldOut | None:
@@ -169,6 +173,8 @@ class TabletopTask(composer.Task):
     def before_step(self, physics: mjcf.Physics, action: Array, random_state: np.random.RandomState) -> None:
         """Convert the action to joint targets, interpolated linearly over the control period."""
         action = np.clip(action, self._low, self._high)
+        if self.disturber:
+            action = self.disturber.overrule(action)
         robot, grip = self.scene.robot, self._command[-1]
         furthest = robot.finger_speed / CONTROL_HZ
         goal = np.append(self.controller.step(action[:6]), action[6] * robot.travel)
@@ -176,12 +182,29 @@ class TabletopTask(composer.Task):
         self._increment = (goal - self._command) / self.substeps
 
     def follow(self, physics: mjcf.Physics, joints: Array, opening: float, substeps: int) -> None:
-        """Step physics while interpolating the targets linearly to `joints` (J,) [rad] and an opening 0…1."""
+        """Step physics while interpolating the targets linearly to `joints` (J,) [rad] and an opening 0…1.
+
+        An arm that is pushed returns afterwards, because its driver does not know.
+        """
+        if self.disturber:
+            joints, opening = self._disturbed(joints, opening, substeps * physics.timestep())
         robot, grip = self.scene.robot, self._command[-1]
         furthest = robot.finger_speed * substeps * physics.timestep()
         finger = grip + np.clip(opening * robot.travel - grip, -furthest, furthest)
         self._increment = (np.append(joints, finger) - self._command) / substeps
         self.advance(physics, substeps)
+
+    def _disturbed(self, joints: Array, opening: float, seconds: float) -> tuple[Array, float]:
+        """Return joint targets and opening under the disturbance; the tool is pushed no faster than by an action."""
+        assert self.disturber
+        furthest = PUSH * CONTROL_HZ * seconds
+        self._shove += np.clip(self.disturber.offset - self._shove, -furthest, furthest)
+        if self._shove.any():
+            kinematics = self.scene.robot.kinematics
+            target = kinematics.forward(joints)[0]
+            target[:3, 3] = np.clip(target[:3, 3] + self._shove, *WORKSPACE)
+            joints = solve(kinematics, target, joints)
+        return joints, 1.0 if self.disturber.opens else opening
 
     def advance(self, physics: mjcf.Physics, substeps: int) -> None:
         """Step physics while interpolating the targets; a lead compensates the servo's damping, so the arm does not
@@ -204,7 +227,11 @@ class TabletopTask(composer.Task):
         self._periods += 1
         self._lifts = np.maximum(self._lifts, (self.compiled.block_centres() - self._starts)[:, 2])
         state = self.world_state()
-        self.classifier.update(state, self.goal.subgoals(state, self.referents), self.referents.blocks)
+        subgoals = self.goal.subgoals(state, self.referents)
+        self.classifier.update(state, subgoals, self.referents.blocks)
+        if self.disturber and not self.over and self.disturber.update(self._periods, state, current(subgoals)):
+            mujoco.mj_step1(physics.model.ptr, physics.data.ptr)  # poses and contacts after the move
+            self._cached = None
 
     def world_state(self) -> WorldState:
         """Return the current true state."""
@@ -240,7 +267,7 @@ class TabletopTask(composer.Task):
         """
         compiled, state = self.compiled, self.world_state()
         subgoals = self.goal.subgoals(state, self.referents)
-        now = next((subgoal for subgoal in subgoals if not subgoal.done), subgoals[-1])
+        now = current(subgoals)
         block = compiled.data.geom_xmat[compiled.block_geoms[now.block]].reshape(3, 3)
         edge = block[:, int(np.argmin(np.abs(block[2])))]  # the most horizontal edge, for any face up
         gripper = self.controller.pose[:, 0]
@@ -262,6 +289,11 @@ class TabletopTask(composer.Task):
     def get_reward(self, physics: mjcf.Physics) -> float:
         """Return 1 after the goal was reached and held."""
         return float(self.classifier.success)
+
+    @property
+    def events(self) -> list[tuple[int, str]]:
+        """Control step and description of every disturbance so far."""
+        return self.disturber.events if self.disturber else []
 
     @property
     def over(self) -> bool:

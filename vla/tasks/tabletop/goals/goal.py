@@ -67,6 +67,11 @@ class Subgoal:
     tolerance: float = 0.02  # horizontal distance from the destination at which to release the block [m]
 
 
+def current(subgoals: Sequence[Subgoal]) -> Subgoal:
+    """Return the first subgoal that is not done, or the last one."""
+    return next((subgoal for subgoal in subgoals if not subgoal.done), subgoals[-1])
+
+
 class Goal(ABC):
     """One kind of task.
 

@@ -1,0 +1,171 @@
+"""What happens in the course of an episode without the agent: pushes, drops, and moves of objects.
+
+It follows from the draws of the episode and from the states that it goes through, so a replay of the agent's actions
+reproduces it. The agent learns of it through its observations alone.
+
+- push: for a few control steps the arm moves sideways instead of as commanded, within its limits.
+- drop: the gripper opens while it holds the named block above the table.
+- move_block: the named block is moved on the table while the gripper approaches it from above.
+- move_target: the pad, or the block to stack on, is moved while the named block is carried or pushed there.
+
+Objects are moved to free places, clear of the gripper.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from typing import Literal
+
+import numpy as np
+
+from vla.spec import Array
+from vla.tasks.tabletop.compiled_scene import CompiledScene, Disturbance
+from vla.tasks.tabletop.goals.goal import Subgoal, WorldState
+from vla.tasks.tabletop.outcome import CLEAR
+from vla.tasks.tabletop.scene import PAD_RADIUS
+
+PUSH = 0.04  # largest motion of a push per control step [m]
+OPEN_STEPS = 3  # control steps for which a drop keeps the gripper open
+APPROACH = 0.2  # distance between tool and block at which it is being approached [m]
+ABOVE = 0.02  # height of the gripper above an object at which it can be moved [m]
+BESIDE = 0.09  # horizontal distance from the gripper at which it can be moved, too [m]
+GAP = 0.02  # between a moved object and its neighbours [m]
+DIRECTIONS = 24  # tried until one is free
+GOLDEN = math.pi * (3 - math.sqrt(5))  # angle between a direction and the next one to try [rad]
+
+Target = tuple[Literal["pad", "block"], int]  # kind and index of the object at the destination of a subgoal
+
+
+class Disturber:
+    """Disturbance of one episode.
+
+    Attributes:
+        motion: translation (3,) of the tool in the next control period, in place of the commanded motion, or None [m].
+        offset: displacement (3,) of the tool by a push, at the end of that period [m].
+        opens: whether the gripper opens in that period, whatever is commanded.
+        events: control step and description of everything that has happened.
+    """
+
+    def __init__(self, drawn: Disturbance, scene: CompiledScene) -> None:
+        """Args: what was drawn for the episode; the scene."""
+        self._drawn, self._scene = drawn, scene
+        self._steps_left = 0  # of a push or a drop
+        self._possible_for = 0  # [steps]
+        self.motion: Array | None = None
+        self.offset = np.zeros(3)
+        self.opens = False
+        self.events: list[tuple[int, str]] = []
+
+    def overrule(self, action: Array) -> Array:
+        """Return the action (7,) to execute in place of `action`."""
+        if self.motion is not None:
+            action = np.array([*self.motion, 0, 0, 0, action[6]])
+        if self.opens:
+            action = np.append(action[:6], 1.0)
+        return action
+
+    def update(self, step: int, state: WorldState, now: Subgoal) -> bool:
+        """Continue a push or a drop, or let a disturbance happen that is due; return whether an object was moved.
+
+        Args:
+            step: index of the control step that comes next.
+            state: state before it.
+            now: subgoal that is pursued.
+        """
+        self._steps_left = max(0, self._steps_left - 1)
+        if self._steps_left:
+            self.offset = self.offset if self.motion is None else self.offset + self.motion
+            return False
+        self.motion, self.offset, self.opens = None, np.zeros(3), False
+        if len(self.events) == self._drawn.times or not self._possible(state, now):
+            return False
+        self._possible_for += 1
+        if self._possible_for <= self._drawn.delay or not (told := self._happen(state, now)):
+            return False
+        self._possible_for = 0
+        self.events.append((step, told))
+        return self._drawn.kind.startswith("move")
+
+    def _possible(self, state: WorldState, now: Subgoal) -> bool:
+        """Return whether it makes sense in this state."""
+        kind, block = self._drawn.kind, now.block
+        if kind == "push":
+            return True
+        if now.done or now.skill == "stay":
+            return False
+        lifted = bool(state.held[block] and state.positions[block, 2] > state.extents[block, 2] + CLEAR)
+        if kind == "drop":
+            return lifted
+        if kind == "move_target":
+            return lifted or bool(now.skill == "push" and state.touched[block])
+        near = np.linalg.norm(state.tool - state.positions[block]) < APPROACH
+        return bool(near) and state.resting(block)
+
+    def _happen(self, state: WorldState, now: Subgoal) -> str:
+        """Do it and return its description; empty if there is no room."""
+        kind, distance = self._drawn.kind, self._drawn.distance
+        if kind == "drop":
+            self.opens, self._steps_left = True, OPEN_STEPS
+            return "drop: the gripper opens"
+        if kind == "push":
+            return self._push(state)
+        target: Target | None = ("block", now.block) if kind == "move_block" else _target(state, now)
+        if target is None or (place := self._free_place(state, target)) is None:
+            return ""
+        what, index = target
+        (self._scene.place_pad if what == "pad" else self._scene.move_block)(index, *place)
+        return f"{kind}: the {what} is moved by {100 * distance:.1f} cm"
+
+    def _push(self, state: WorldState) -> str:
+        """Begin a push in the first direction that ends in the area."""
+        for place in self._around(state.tool):
+            self._steps_left = max(1, math.ceil(self._drawn.distance / PUSH))
+            self.motion = np.append(place - state.tool[:2], 0.0) / self._steps_left
+            self.offset = self.motion
+            return f"push: the arm is pushed by {100 * self._drawn.distance:.1f} cm"
+        return ""
+
+    def _around(self, start: Array) -> Iterator[Array]:
+        """Yield the places (2,) at the drawn distance from `start` that are in the area, the drawn direction first."""
+        for number in range(DIRECTIONS):
+            angle = self._drawn.angle + number * GOLDEN
+            place = start[:2] + self._drawn.distance * np.array([math.cos(angle), math.sin(angle)])
+            if (place >= self._drawn.low).all() and (place <= self._drawn.high).all():
+                yield place
+
+    def _free_place(self, state: WorldState, target: Target) -> Array | None:
+        """Return the first place (2,) for an object away from its neighbours and the gripper, or None."""
+        what, index = target
+        radii = np.linalg.norm(state.extents, axis=1)  # of the blocks, whatever face is up
+        blocks = [number for number in range(len(radii)) if target != ("block", number) and not state.held[number]]
+        pads = [number for number in range(len(state.pads)) if target != ("pad", number)]
+        others = [(state.positions[number], radii[number]) for number in blocks]
+        others += [(state.pads[number], PAD_RADIUS) for number in pads]
+        start, radius = (state.pads[index], PAD_RADIUS) if what == "pad" else (state.positions[index], radii[index])
+        if what == "block" and not _clear_of_gripper(state, index, start):
+            return None
+        for place in self._around(start):
+            if all(math.dist(place, at[:2]) > radius + other + GAP for at, other in others) and (
+                what == "pad" or _clear_of_gripper(state, index, place)
+            ):
+                return place
+        return None
+
+
+def _target(state: WorldState, now: Subgoal) -> Target | None:
+    """Return the pad, else the other block that rests on the table, at the destination of a subgoal."""
+    for pad, place in enumerate(state.pads):
+        if now.skill != "hold" and np.array_equal(place[:2], now.destination[:2]):
+            return "pad", pad
+    for block, place in enumerate(state.positions):
+        if block != now.block and np.array_equal(place[:2], now.destination[:2]) and state.resting(block):
+            return "block", block
+    return None
+
+
+def _clear_of_gripper(state: WorldState, block: int, place: Array) -> bool:
+    """Return whether gripper and held blocks are far from, or above, a block that lies at `place`."""
+    lowest = min([state.tool[2], *(state.positions[:, 2] - state.extents[:, 2])[state.held]])
+    above = lowest > state.positions[block, 2] + state.extents[block, 2] + ABOVE
+    return bool(above or math.dist(state.tool[:2], place[:2]) > BESIDE)
