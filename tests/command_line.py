@@ -7,12 +7,15 @@ import os
 import subprocess
 import sys
 from contextlib import chdir, redirect_stderr, redirect_stdout
+from functools import cache
 from io import StringIO
 from pathlib import Path
 from unittest.mock import patch
 
 import absl.logging
 import warm
+from hydra._internal.hydra import Hydra
+from omegaconf import DictConfig
 
 SMALL = (
     "validate.episodes=0",
@@ -39,8 +42,21 @@ def vla(folder: Path, *arguments: str, ok: bool = True) -> subprocess.CompletedP
     return done
 
 
+@cache
+def _default(folders: object) -> DictConfig:
+    """The configuration without overrides, which every command compares its own with."""
+    from hydra import compose
+
+    return compose("config")
+
+
 def here(folder: Path, *arguments: str, ok: bool = True) -> subprocess.CompletedProcess[str]:
-    """What `vla` gives, without a process of its own, which takes seconds: for whatever leaves nothing behind in it."""
+    """What `vla` gives, without a process of its own, which takes seconds: for whatever leaves nothing behind in it.
+
+    The configuration is composed once, not three times: the default is kept, and no argument is `hydra.mode`, for which
+    Hydra composes it, too.
+    """
+    from vla.config.packages import option_folders
     from vla.run import main
 
     # Hydra closes all handlers of logs, and that of absl then closes its stream unless it is one of Python's own.
@@ -52,6 +68,8 @@ def here(folder: Path, *arguments: str, ok: bool = True) -> subprocess.Completed
         with (
             patch.object(sys, "argv", ["vla", *arguments]),
             patch.dict(os.environ),
+            patch.object(Hydra, "get_mode", return_value=None),
+            patch("vla.run.compose", lambda name: _default(tuple(option_folders()))),
             chdir(folder),
             redirect_stdout(out),
             redirect_stderr(err),

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import shutil
+from copy import deepcopy
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -37,13 +37,27 @@ def as_onnx(model: Model, folder: Path, **options: Any) -> OnnxPolicy:
     return OnnxPolicy(**defaults_of("policy/onnx", **{"folder": folder, **options}), model=model, spec=SPEC)
 
 
-@pytest.mark.parametrize("make", [partial(make_rt1, keypoints=0, chunk=2), make_flow], ids=["rt1", "flow"])
-def test_it_acts_like_the_model_through_two_instructions(make: Callable[[], Model], tmp_path: Path) -> None:
+@pytest.fixture(scope="module")
+def flow(tmp_path_factory: pytest.TempPathFactory) -> tuple[Model, Path]:
+    """A model, and the folder of its programs."""
+    model, folder = make_flow(), tmp_path_factory.mktemp("flow")
+    as_onnx(model, folder)
+    return model, folder
+
+
+@pytest.fixture
+def rt1(tmp_path: Path) -> tuple[Model, Path]:
+    """A model, and where its programs go."""
+    return make_rt1(keypoints=0, chunk=2), tmp_path
+
+
+@pytest.mark.parametrize("kind", ["rt1", "flow"])
+def test_it_acts_like_the_model_through_two_instructions(kind: str, request: pytest.FixtureRequest) -> None:
     """With a history that fills and is cleared, chunks that are executed, and noise."""
-    model = make()
+    model, folder = request.getfixturevalue(kind)
     seen = observations(5)
     seen += [replace(each, instruction="now something else, in a few more words") for each in seen]
-    exact, onnx = as_policy(model), as_onnx(model, tmp_path)
+    exact, onnx = as_policy(model), as_onnx(model, folder)
     for policy in (exact, onnx):
         policy.reset(seen[0].instruction, 1)
     expected = act(exact, seen)
@@ -55,10 +69,10 @@ def test_it_acts_like_the_model_through_two_instructions(make: Callable[[], Mode
 
 
 def test_programs_are_exported_once_for_the_same_weights_and_options(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    flow: tuple[Model, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    model = make_flow()
-    as_onnx(model, tmp_path)
+    model = deepcopy(flow[0])
+    shutil.copytree(flow[1], tmp_path, dirs_exist_ok=True)
     (programs,) = (path for path in tmp_path.iterdir() if path.is_dir())
     assert {path.name for path in programs.iterdir()} == {"act.onnx", "program.json"}
 

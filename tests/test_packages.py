@@ -159,8 +159,8 @@ def test_its_parts_do_the_main_job(home: Path) -> None:
 
 
 def test_each_stage_is_a_job_of_its_own(home: Path) -> None:
-    """And gives what the main job gave."""
-    mine = ("experiment=mine", *TINY, "collect.folder=alone", "output=staged")
+    """And gives what the main job gave, with another number of workers."""
+    mine = ("experiment=mine", *TINY, "cluster.workers=1", "collect.folder=alone", "output=staged")
     vla(home, "job=collect", *mine)
     assert content(home / "alone") == content(home / "episodes")
     vla(home, "job=train", *mine)

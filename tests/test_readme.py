@@ -133,7 +133,7 @@ def test_the_benchmark_measures_every_stage_against_its_floor(folder: Path) -> N
 
 
 def test_an_ablation_ends_in_a_table(folder: Path) -> None:
-    few = (*SMALL, "variant=no_transformer,no_history", "seed=0", "evaluate.episodes=1", "task.time_limit=5")
+    few = (*SMALL, "collect.episodes=5", "variant=no_transformer,no_history", "seed=0", "evaluate.episodes=1")
     run(folder, "-m experiment=ablation", *few, "hydra.sweep.dir=ablation")
     lines = (folder / "ablation/sweep.md").read_text().splitlines()
     assert "| variant | seen [%] | instructions [%] | distractors [%] | backgrounds [%] |" in lines[0]

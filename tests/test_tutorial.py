@@ -22,7 +22,7 @@ def small(command: str) -> list[str]:
         return ["preview.episodes=1"]
     if "checkpoint=" in command:
         return ["evaluate.episodes=1", "cluster.workers=1", "recorder=none"]
-    return [*SMALL, "task.time_limit=5", "recorder=none"]
+    return [*SMALL, "collect.episodes=6", "recorder=none"]
 
 
 def test_the_tutorial_ends_with_a_policy_for_its_own_goal(tmp_path: Path) -> None:
