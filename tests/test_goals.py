@@ -83,8 +83,8 @@ def test_staying_is_to_move_no_block_and_to_rest() -> None:
 
 
 def test_a_mixture_draws_all_of_its_goals_and_needs_the_room_of_the_largest() -> None:
-    mixed = Mixed({"lift": Lift(GRAMMAR, height=0.1), "stack": Stack(GRAMMAR), "push": None})
+    mixed = Mixed({"lift": Lift(GRAMMAR, height=0.1), "stack": Stack(GRAMMAR), "push": None}, 0.0, 0.0)
     drawn = {type(mixed.draw(np.random.RandomState(seed))) for seed in range(20)}
     assert drawn == {Lift, Stack} and mixed.blocks == 3
     with pytest.raises(ValueError, match="names no goal"):
-        Mixed({"push": None})
+        Mixed({"push": None}, 0.0, 0.0)
