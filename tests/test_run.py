@@ -63,7 +63,7 @@ def test_the_main_job_collects_trains_evaluates_and_records(home: Path) -> None:
     success = header.split(",").index("val/success")
     assert [row.split(",")[success] for row in rows if row.split(",")[success]] == ["0.0", "0.0"]  # hardly trained
     page = (home / "run/report.html").read_text()
-    for words in ("4 steps", "collect.episodes", ">800<", "First training batch", 'href="rollouts.rrd"'):
+    for words in ("4 steps", "collect.episodes", ">500<", "First training batch", 'href="rollouts.rrd"'):
         assert words in page, words
     assert yaml.safe_load((home / "run/config.yaml").read_text()) == report["config"]
     printed = (home / "printed.txt").read_text()
