@@ -98,7 +98,7 @@ def test_an_unknown_key_is_named_with_what_was_probably_meant() -> None:
             "expert.perturb.steps must be a list of 2 whole numbers, each at least 1, in ascending",
         ),
         ("collect.folder", "", "collect.folder must be text, not empty, got ''"),
-        ("task.goal", "lift", "task.goal must be Goal or Mixed, got 'lift'"),
+        ("task.goal", "lift", "task.goal must be Goal, Mixed or Chain, got 'lift'"),
         (
             "task.randomize.mass.factor",
             [0.5, "a"],
