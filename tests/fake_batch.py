@@ -23,7 +23,7 @@ from vla.models.vision.image_tokenizer import FilmConv
 from vla.policy import Policy
 from vla.spec import Spec
 
-TINY_IMAGE = partial(FilmConv, [8, 8], [5, 3], [2, 1], chroma=True)
+TINY_IMAGE = partial(FilmConv, [8, 8], [5, 3], [2, 1], chroma=True, positions=False)
 TINY_TEXT = partial(NGrams, **defaults_of("model/text/ngrams", vocabulary=64, forget=0.0))
 
 
@@ -110,6 +110,7 @@ def make_rt1(
         heads=2,
         key_width=16,
         dropout=dropout,
+        position_std=0.05,
         shift=(0, 0),
         spec=SPEC,
         tokenizer=Uniform(spec=SPEC, **defaults_of("tokenizer/uniform", bins=64)),

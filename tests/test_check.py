@@ -175,7 +175,7 @@ def test_build_gives_plain_containers_runtime_arguments_and_nested_factories() -
     cluster = build({"_target_": "vla.parallel.pool.LocalCluster"}, "cluster", workers=3)
     assert cluster.workers == 3
     image = {"_target_": "vla.models.vision.image_tokenizer.FilmConv", "_partial_": True, "channels": [8]}
-    image |= {"kernels": [3], "strides": [2], "chroma": True}
+    image |= {"kernels": [3], "strides": [2], "chroma": True, "positions": False}
     text = {"_target_": "vla.models.text.ngrams.NGrams", "_partial_": True, **defaults_of("model/text/ngrams")}
     node = {"_target_": "vla.models.bc.BC", "image": image, "text": text, **defaults_of("model/bc")}
     uniform = {"_target_": "vla.models.tokenizers.tokenizer.Uniform", **defaults_of("tokenizer/uniform")}
@@ -213,7 +213,7 @@ def test_what_is_checked_is_what_is_built() -> None:
 
 def test_conditions_of_an_evaluation_are_checked_with_the_task_that_they_change() -> None:
     wrong = {"heavy": {"goal": MASSES}}
-    with pytest.raises(ValueError, match=r"task \(evaluate\.conditions\.heavy\)\.goal must be Goal or Mixed"):
+    with pytest.raises(ValueError, match=r"task \(evaluate\.conditions\.heavy\)\.goal must be Goal, Mixed or Chain"):
         cfg = composed()
         cfg.evaluate.conditions = wrong
         check(cfg)

@@ -23,7 +23,7 @@ def test_film_scales_and_shifts_every_channel() -> None:
 
 
 def test_film_conv_listens_to_the_text() -> None:
-    encoder = FilmConv([4, 6], [5, 3], [2, 2], text_width=8, chroma=True)
+    encoder = FilmConv([4, 6], [5, 3], [2, 2], text_width=8, chroma=True, positions=False)
     images = torch.rand(1, 3, 16, 16).expand(2, -1, -1, -1)
     features = encoder(images, torch.randn(2, 8))
     assert features.shape == (2, 6, 4, 4) and not torch.allclose(features[0], features[1])
@@ -31,7 +31,7 @@ def test_film_conv_listens_to_the_text() -> None:
 
 def test_with_chroma_alone_a_dimmer_lamp_changes_little() -> None:
     torch.manual_seed(0)
-    encoder = FilmConv([8], [5], [2], text_width=8, chroma=True)
+    encoder = FilmConv([8], [5], [2], text_width=8, chroma=True, positions=False)
     torch.nn.init.zeros_(encoder.get_parameter("convs.0.weight"))  # so that only relative colours are left
     bright, text = 0.3 + 0.7 * torch.rand(1, 3, 16, 16), torch.randn(1, 8)
     with torch.no_grad():
@@ -39,15 +39,31 @@ def test_with_chroma_alone_a_dimmer_lamp_changes_little() -> None:
     assert (features - dim).norm() < 0.2 * (features - other).norm()
 
 
+def test_features_can_tell_their_position() -> None:
+    encoder = FilmConv([4], [3], [1], text_width=8, chroma=True, positions=True)
+    features = encoder(torch.rand(2, 3, 5, 7), torch.randn(2, 8))
+    assert features.shape == (2, 4 + 2, 5, 7) == (2, encoder.channels, 5, 7)
+    x, y = features[1, -2:]
+    assert x[3, [0, 3, 6]].tolist() == pytest.approx([-4, 0, 4], abs=1e-6)
+    assert y[[0, 2, 4], 3].tolist() == pytest.approx([-4, 0, 4], abs=1e-6)
+
+
 def test_film_conv_wants_lists_of_one_length() -> None:
     with pytest.raises(ValueError, match="one entry per convolution"):
-        FilmConv([4, 6], [5], [2, 2], text_width=8, chroma=True)
+        FilmConv([4, 6], [5], [2, 2], text_width=8, chroma=True, positions=False)
 
 
 def test_81_positions_become_8_tokens() -> None:
     learner = TokenLearner(512, 8)
     assert learner(torch.randn(2, 512, 9, 9)).shape == (2, 8, 512)
     assert sum(p.numel() for p in learner.parameters()) == 2 * 512 + 512 * 64 + 64 + 64 * 8 + 8  # 34 k
+
+
+def test_tokens_first_attend_to_a_few_positions() -> None:
+    torch.manual_seed(0)
+    learner = TokenLearner(32, 8)
+    weights = learner.attention(torch.randn(16, 144, 32)).softmax(1)
+    assert 5 < (1 / weights.square().sum(1)).mean() < 50  # of 144
 
 
 def test_tokens_are_weighted_means_of_the_features_themselves() -> None:

@@ -2,16 +2,24 @@
 
 from __future__ import annotations
 
+import itertools
+import re
 from typing import Any
 
 import numpy as np
 import pytest
-from conftest import make_tabletop
+from composing import composed
+from conftest import CONF, make_tabletop
 from hydra.errors import InstantiationException
+from hydra.utils import instantiate
+from matplotlib.colors import XKCD_COLORS, rgb_to_hsv, to_rgb
 
+from vla.config.conditions import conditions
+from vla.config.experiment import plain
+from vla.io.documents import read_yaml
 from vla.spec import FIRST_SEED
-from vla.tasks.language import Grammar, HeldOut, Silence
-from vla.tasks.tabletop.scene import COLOURS
+from vla.tasks.language import Grammar, HeldOut, Silence, paraphrase
+from vla.tasks.tabletop.scene import COLOURS, PADS
 
 GRAMMAR = Grammar(
     phrasings=["{put} the {block} block there", "the {block} block, please"],
@@ -42,6 +50,84 @@ def test_a_held_out_part_that_training_uses_is_refused() -> None:
         Grammar(["{put} {block}"], {"put": ["put"]}, ["{block}"], {"put": ["put"]})
     with pytest.raises(ValueError, match="empty"):
         Grammar(["{put} {block}"], {"put": ["put"]}, [], {"put": ["set"]})
+
+
+def test_other_words_replace_all_that_is_named_or_nothing_is_said() -> None:
+    words = {"the pad": "the disc", "the red block": "the crimson cube", "the red": "the other"}
+    said = paraphrase("put the red block on the pad", words, ["red"])
+    assert said == "put the crimson cube on the disc"
+    for instruction in ("put the red cup on the pad, the red one", "lift the redder block"):
+        with pytest.raises(ValueError, match=r"task\.randomize\.phrasing\.words has no other words .* in '(put|lift) "):
+            paraphrase(instruction, {"the pad": "the disc"}, ["red"])
+
+
+def heard() -> set[str]:
+    """Every word of a training instruction, of any goal."""
+    said = {*COLOURS, *PADS}
+    for path in (CONF / "task/goal").glob("*.yaml"):
+        language = read_yaml(path, dict[str, Any]).get("language", {})
+        said |= {*language.get("phrasings", ()), *itertools.chain(*language.get("words", {}).values())}
+    return {word for each in said for word in re.findall(r"\w+", re.sub(r"{\w+}", "", each))}
+
+
+UNHEARD = read_yaml(CONF / "task/randomize/phrasing/unheard.yaml", dict[str, Any])["words"]
+GRAMMATICAL = {"the", "one", "that", "looks", "like", "a", "an"}
+
+
+def test_no_word_that_names_something_unheard_is_in_any_training_instruction() -> None:
+    new = {word for others in UNHEARD.values() for other in others for word in other.split()} - GRAMMATICAL
+    assert {"crimson", "scarlet", "navy", "emerald", "golden", "cube", "brick", "disc", "spot", "tomato"} <= new
+    assert {"red", "block", "pad", "black", "put"} <= heard() and not new & heard()
+
+
+def test_every_unheard_name_means_one_thing_of_the_scene() -> None:
+    named = [name for others in UNHEARD.values() for name in others]
+    assert len(named) == len(set(named))
+    assert {*UNHEARD} == {f"the {colour} block" for colour in COLOURS} | {
+        "the pad",
+        *(f"the {pad} pad" for pad in PADS),
+    }
+
+    def hue(rgb: Any) -> float:
+        return float(rgb_to_hsv(rgb)[0])
+
+    surveyed = 0  # by Munroe, see xkcd.com/color/rgb
+    for colour in COLOURS:
+        for word in {word for name in UNHEARD[f"the {colour} block"] for word in name.split()} - {"brick"}:
+            if f"xkcd:{word}" in XKCD_COLORS:
+                other = hue(to_rgb(f"xkcd:{word}"))
+                apart = {name: abs((hue(rgb) - other + 0.5) % 1 - 0.5) for name, rgb in COLOURS.items()}
+                assert min(apart, key=lambda name: apart[name]) == colour, word
+                surveyed += 1
+    assert surveyed > 15
+
+
+def test_an_unheard_instruction_is_the_plain_one_with_other_names() -> None:
+    node = conditions(plain(composed("evaluate=unheard").evaluate))["unheard"]["randomize"]["phrasing"]
+    environment = make_tabletop("task/goal=mixed", "task/randomize=none")
+    task = environment.dm_env.task
+    axes = {"heard": task.randomize, "unheard": {**task.randomize, "phrasing": instantiate(node)}}
+
+    def reset(seed: int, name: str) -> dict[str, Any]:
+        task.randomize = axes[name]
+        environment.reset(seed)
+        return environment.draws
+
+    with environment.blind():
+        for seed in range(FIRST_SEED, FIRST_SEED + 30):
+            heard, unheard = reset(seed, "heard"), reset(seed, "unheard")
+            assert unheard["named"] == heard["named"] and unheard["language"]["held_out"] == "names"
+            said = heard["language"]["instruction"]
+            phrases = [phrase for phrase in UNHEARD if phrase in said]
+            possible = set()
+            for others in itertools.product(*(UNHEARD[phrase] for phrase in phrases)):
+                other = said
+                for phrase, name in zip(phrases, others, strict=True):
+                    other = other.replace(phrase, name)
+                possible.add(other)
+            assert unheard["language"]["instruction"] in possible
+        assert reset(0, "unheard")["language"] == reset(0, "heard")["language"]  # in training it changes nothing
+    environment.close()
 
 
 def draws(goal: str, level: str, first: int, count: int) -> list[dict[str, Any]]:

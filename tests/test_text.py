@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from functools import partial
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -13,8 +15,11 @@ from conftest import CONF
 from defaults import defaults_of
 from hydra.utils import instantiate
 from omegaconf import OmegaConf
+from tiny_encoder import write_encoder
 
 from vla.config.build import check_node
+from vla.models.text.both import Both
+from vla.models.text.huggingface import HuggingFace
 from vla.models.text.ngrams import NGrams
 from vla.models.text.tensor_cache import TensorCache
 
@@ -129,3 +134,18 @@ def test_a_cache_holds_what_was_used_last_within_its_bytes() -> None:
     get("x" * 10_000, 1)
     assert cache.size <= 20_000
     assert get("a", 1).shape == (1,)
+
+
+def test_both_are_n_grams_beside_a_sentence_encoder(tmp_path: Path) -> None:
+    folder = str(write_encoder(tmp_path))
+    options = defaults_of("model/text/ngrams", vocabulary=2**24, forget=0.0)
+    torch.manual_seed(0)
+    ngrams, sentence = NGrams(width=3, **{**options, "vocabulary": 64}), HuggingFace(folder, width=4)
+    large = Both(partial(NGrams, **options), partial(HuggingFace, folder), width=2)
+    exact = large.ngrams.tokenize(SENTENCES)
+    assert exact.max() > 2**23 and torch.equal(large.tokenize(SENTENCES)[:, 16:].long(), exact)
+    both = Both(lambda width: ngrams, lambda width: sentence, width=7)
+    expected = torch.cat([part(part.tokenize(SENTENCES)) for part in (ngrams, sentence)], 1)
+    torch.testing.assert_close(both(both.tokenize(SENTENCES)), expected)
+    both = Both(partial(NGrams, **{**options, "vocabulary": 64}), partial(HuggingFace, folder), width=7)
+    assert both(both.tokenize(SENTENCES)).shape == (3, 7)

@@ -237,3 +237,13 @@ def test_compressed_checkpoints_are_refused_before_they_are_unpacked(tmp_path: P
             file.write(bytes(2**20))
     with pytest.raises(ValueError, match=r"bomb\.ckpt cannot be read as a checkpoint"):
         read_checkpoint(tmp_path / "bomb.ckpt")
+
+
+def test_a_checkpoint_behind_another_file_is_not_read(tmp_path: Path) -> None:
+    """PyTorch would read the other one, in its old format, which is not verified."""
+    path = checkpoint(tmp_path / "last.ckpt", "model.width", 64)
+    content = path.read_bytes()
+    torch.save(torch.load(path, weights_only=True), path, _use_new_zipfile_serialization=False)
+    path.write_bytes(path.read_bytes() + content)
+    with pytest.raises(ValueError, match=r"last\.ckpt cannot be read as a checkpoint"):
+        read_checkpoint(path)

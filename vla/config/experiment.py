@@ -277,7 +277,11 @@ def _model(node: Node, spec: Spec, tokenizer: ActionTokenizer, saved: Checkpoint
 def _without_pretraining(model: Node) -> Node:
     """Remove pretrained weights from a model node whose weights all come from a checkpoint."""
     nowhere = {"image": "pretrained", "text": "name"}
-    parts = {
-        part: model[part] for part, key in nowhere.items() if isinstance(model.get(part), dict) and key in model[part]
-    }
-    return {**model, **{part: {**node, nowhere[part]: ""} for part, node in parts.items()}}
+    parts = {part: _emptied(model[part], key) for part, key in nowhere.items() if isinstance(model.get(part), dict)}
+    return {**model, **parts}
+
+
+def _emptied(node: Node, key: str) -> Node:
+    """Empty the argument `key` of a node and of the nodes in it."""
+    emptied = {name: _emptied(value, key) if isinstance(value, dict) else value for name, value in node.items()}
+    return emptied | ({key: ""} if key in node else {})

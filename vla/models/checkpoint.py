@@ -4,10 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from pickle import UnpicklingError
-from pickletools import genops
 from typing import Any
-from zipfile import ZIP_STORED, BadZipFile, ZipFile, ZipInfo
 
 import torch
 from torch import Tensor
@@ -15,17 +12,12 @@ from torch.overrides import TorchFunctionMode
 
 from vla.io.documents import require_resolved
 from vla.models.model import Model
+from vla.models.pickles import require_stored, require_tensor_archive
 from vla.spec import Spec
 
 REQUIRED_NODES = ("task", "tokenizer", "model")  # of the config in a checkpoint
 OPTIONAL_NODES = ("chosen", "expert", "collect", "data", "learner", "trainer", "validate")
 TRUTH_MODULES = ("truth_head", "truth_scale")  # modules of a model used in training only
-# What the pickle in a checkpoint may name.
-KNOWN = (
-    *("collections OrderedDict", "torch._utils _rebuild_tensor_v2", "torch._utils _rebuild_parameter"),
-    *(f"torch {kind}Storage" for kind in ("Float", "Double", "Half", "BFloat16", "Bool", "Byte")),
-    *(f"torch {kind}Storage" for kind in ("Char", "Short", "Int", "Long")),
-)
 
 
 @dataclass(frozen=True)
@@ -131,65 +123,15 @@ def _load(path: Path, weights: bool) -> dict[str, Any]:
         raise ValueError(f"there is no checkpoint {path}: those of a run lie in outputs/runs/…/checkpoints")
     try:
         # Only the zip format: legacy pickles raise arbitrary exceptions.
-        with path.open("rb") as file, ZipFile(file) as archive:
-            entries = archive.infolist()
-            # torch does not compress, so content larger than the file is an attack on the memory.
-            packed = any(entry.compress_type != ZIP_STORED for entry in entries)
-            if packed or sum(entry.file_size for entry in entries) > path.stat().st_size:
-                raise BadZipFile("its parts are compressed or overlap")
-            for entry in entries:
-                if weights or entry.filename.endswith("/data.pkl"):
-                    _verify(archive, entry)  # torch does not verify checksums
-                if entry.filename.endswith("/data.pkl"):
-                    _require_known(archive.read(entry))
+        with path.open("rb") as file:
+            require_tensor_archive(file, path.stat().st_size, checksums=weights)
         content = torch.load(path, map_location="cpu", weights_only=True, mmap=not weights)
-        _require_stored(content, path.stat().st_size)
+        require_stored(content, path.stat().st_size)
     except OSError:
         raise
     except Exception as error:  # a pickle can raise nearly anything
         raise ValueError(f"{path} cannot be read as a checkpoint, it is damaged or something else") from error
     return content if isinstance(content, dict) else {}
-
-
-def _require_known(pickled: bytes) -> None:
-    """Require a pickle to call nothing but what makes the tensors of a checkpoint.
-
-    PyTorch by itself also lets a pickle call `bytearray(10**10)`, for example.
-
-    Raises:
-        UnpicklingError: it names something else.
-    """
-    for opcode, name, _ in genops(pickled):
-        if opcode.name == "GLOBAL" and name not in KNOWN:
-            raise UnpicklingError(f"it names {name}")
-
-
-def _require_stored(content: Any, size: int) -> None:
-    """Require the tensors to lie in a file of `size` [bytes]: strides of 0 describe any number of elements.
-
-    Raises:
-        UnpicklingError: a tensor is larger than its storage, or all storages together are larger than the file.
-    """
-    pending, seen, stored = [content], set[int](), dict[int, int]()
-    while pending:
-        value = pending.pop()
-        if isinstance(value, Tensor):
-            storage = value.untyped_storage()
-            stored[storage.data_ptr()] = storage.nbytes()
-            if value.nbytes > storage.nbytes():
-                raise UnpicklingError("a tensor is larger than its storage")
-        elif isinstance(value, (dict, list, tuple)) and id(value) not in seen:
-            seen.add(id(value))  # a pickle can refer to the same list many times, or to itself
-            pending += [*value, *value.values()] if isinstance(value, dict) else value
-    if sum(stored.values()) > size:
-        raise UnpicklingError("its tensors are larger than the file")
-
-
-def _verify(archive: ZipFile, entry: ZipInfo) -> None:
-    """Read an entry to its end, where zipfile verifies the checksum; raises BadZipFile if it differs."""
-    with archive.open(entry) as part:
-        while part.read(2**20):
-            pass
 
 
 class TensorBudget(TorchFunctionMode):

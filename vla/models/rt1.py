@@ -10,7 +10,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from vla.io.types import Inherited, Layers, Rate, Width
+from vla.io.types import Inherited, Layers, Positive, Rate, Width
 from vla.models.frame_tokens import FrameModel
 from vla.models.model import Batch, TokenModel
 
@@ -55,16 +55,26 @@ class RT1(FrameModel, TokenModel):
     Args:
         layers, heads, key_width: of the transformer.
         dropout: of attention weights and feed-forward outputs.
+        position_std: standard deviation of the initial position embeddings. If it is small against the tokens, all
+            action slots first attend to the mean of all tokens, and learn slowly which one tells what.
     """
 
     mask: Tensor
 
-    def __init__(self, layers: Layers, heads: Layers, key_width: Width, dropout: Rate, **inherited: Inherited) -> None:
+    def __init__(
+        self,
+        layers: Layers,
+        heads: Layers,
+        key_width: Width,
+        dropout: Rate,
+        position_std: Positive,
+        **inherited: Inherited,
+    ) -> None:
         super().__init__(**inherited)
         width = self.width
         self.slots = self.chunk * len(self.spec.action)  # A
         self.positions = nn.Embedding(self.history * (self.tokens + self.slots), width)
-        nn.init.normal_(self.positions.weight, std=0.05)  # small against the content of the tokens
+        nn.init.normal_(self.positions.weight, std=position_std)
         self.layers = nn.ModuleList(Layer(width, heads, key_width, dropout) for _ in range(layers))
         self.head = nn.Linear(width, self.tokenizer.bins)
         self.register_buffer("mask", attention_mask(self.history, self.tokens, self.slots), persistent=False)

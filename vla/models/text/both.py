@@ -1,0 +1,37 @@
+"""N-grams and a sentence encoder together.
+
+Shapes: B sentences, L n-grams of the longest, E width of the frozen encoder.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from vla.models.text.huggingface import HuggingFace
+from vla.models.text.ngrams import NGrams, TextEncoder
+
+
+class Both(TextEncoder):
+    """The vectors of n-grams and of a sentence encoder, concatenated; each is half of the whole.
+
+    Args:
+        ngrams: factory of the n-grams, called with `width`.
+        sentence: factory of the sentence encoder, called with `width`.
+        width: length of the vector.
+    """
+
+    def __init__(self, ngrams: Callable[..., NGrams], sentence: Callable[..., HuggingFace], *, width: int) -> None:
+        super().__init__(width)
+        self.ngrams, self.sentence = ngrams(width=width // 2), sentence(width=width - width // 2)
+
+    def tokenize(self, sentences: list[str]) -> Tensor:
+        """Return (B, E + L) float32: frozen vectors, and hashes of n-grams, below 2^24 and therefore exact."""
+        return torch.cat([self.sentence.tokenize(sentences), self.ngrams.tokenize(sentences).float()], 1)
+
+    def forward(self, tokens: Tensor) -> Tensor:
+        """Return (B, width) vectors for the (B, E + L) output of `tokenize`."""
+        length = self.sentence.length
+        return torch.cat([self.ngrams(tokens[:, length:].long()), self.sentence(tokens[:, :length])], 1)
