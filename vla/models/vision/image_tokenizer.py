@@ -139,14 +139,12 @@ class TokenLearner(nn.Module):
     def __init__(self, channels: int, tokens: int) -> None:
         super().__init__()
         hidden = min(channels, 64)  # 64 as published
-        self.attention = nn.Sequential(
-            nn.LayerNorm(channels, eps=1e-6),
-            nn.Linear(channels, hidden),
-            nn.GELU(approximate="tanh"),
-            nn.Linear(hidden, tokens),
-        )
+        score = nn.Linear(hidden, tokens)
         # As for keypoints: uniform attention averages the image away and has almost no gradient.
-        nn.init.normal_(self.attention[-1].weight, std=INITIAL_CONTRAST / (GELU_STD * math.sqrt(hidden)))
+        nn.init.normal_(score.weight, std=INITIAL_CONTRAST / (GELU_STD * math.sqrt(hidden)))
+        self.attention = nn.Sequential(
+            nn.LayerNorm(channels, eps=1e-6), nn.Linear(channels, hidden), nn.GELU(approximate="tanh"), score
+        )
 
     def forward(self, features: Tensor) -> Tensor:
         """Map (N, C, h, w) features to (N, M, C) tokens."""
