@@ -98,7 +98,7 @@ def test_an_unknown_key_is_named_with_what_was_probably_meant() -> None:
             "expert.perturb.steps must be a list of 2 whole numbers, each at least 1, in ascending",
         ),
         ("collect.folder", "", "collect.folder must be text, not empty, got ''"),
-        ("task.goal", "lift", "task.goal must be Goal or Mixed, got 'lift'"),
+        ("task.goal", "lift", "task.goal must be Goal or Mixed or Chain, got 'lift'"),
         (
             "task.randomize.mass.factor",
             [0.5, "a"],
@@ -213,7 +213,7 @@ def test_what_is_checked_is_what_is_built() -> None:
 
 def test_conditions_of_an_evaluation_are_checked_with_the_task_that_they_change() -> None:
     wrong = {"heavy": {"goal": MASSES}}
-    with pytest.raises(ValueError, match=r"task \(evaluate\.conditions\.heavy\)\.goal must be Goal or Mixed"):
+    with pytest.raises(ValueError, match=r"task \(evaluate\.conditions\.heavy\)\.goal must be Goal or Mixed or Chain"):
         cfg = composed()
         cfg.evaluate.conditions = wrong
         check(cfg)

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 
 QUIET = {"start": 0.0, "noise": 0.0, "rate": 0.0, "unturned": 0.0, "missed": 0.0}
-GOALS = ("lift", "pick_place", "pick_place_two", "push", "stack", "stay")
+GOALS = ("lift", "pick_place", "pick_place_two", "push", "stack", "stay", "wait")
 
 
 def perturbed(spec: Spec, **changes: Any) -> Perturbed:

@@ -15,9 +15,10 @@ from vla.tasks.tabletop.goals.lift import Lift
 from vla.tasks.tabletop.goals.mixed import Mixed
 from vla.tasks.tabletop.goals.pick_place import PickPlace
 from vla.tasks.tabletop.goals.pick_place_two import PickPlaceTwo
+from vla.tasks.tabletop.goals.place import Place
 from vla.tasks.tabletop.goals.push import Push
 from vla.tasks.tabletop.goals.stack import Stack
-from vla.tasks.tabletop.goals.stay import Stay
+from vla.tasks.tabletop.goals.stay import Stay, Wait
 
 GRAMMAR = Grammar(["move {block}"], {}, ["{block}"], {"move": ["shift"]})
 
@@ -83,8 +84,27 @@ def test_staying_is_to_move_no_block_and_to_rest() -> None:
 
 
 def test_a_mixture_draws_all_of_its_goals_and_needs_the_room_of_the_largest() -> None:
-    mixed = Mixed({"lift": Lift(GRAMMAR, height=0.1), "stack": Stack(GRAMMAR), "push": None})
+    mixed = Mixed({"lift": Lift(GRAMMAR, height=0.1), "stack": Stack(GRAMMAR), "push": None}, 0.0, 0.0)
     drawn = {type(mixed.draw(np.random.RandomState(seed))) for seed in range(20)}
     assert drawn == {Lift, Stack} and mixed.blocks == 3
     with pytest.raises(ValueError, match="names no goal"):
-        Mixed({"push": None})
+        Mixed({"push": None}, 0.0, 0.0)
+
+
+def test_a_share_of_a_mixture_demands_to_leave_everything_in_place_and_the_rest_stays_what_it_was() -> None:
+    goals: dict[str, Goal | None] = {"lift": Lift(GRAMMAR, height=0.1), "place": Place(GRAMMAR, radius=0.04)}
+    mixed, without = Mixed(goals, 0.2, 0.1), Mixed(goals, 0.0, 0.0)
+    drawn = [[each.draw(np.random.RandomState(seed)) for each in (mixed, without)] for seed in range(1000)]
+    stays, waits = (sum(type(goal) is kind for goal, _ in drawn) for kind in (Stay, Wait))
+    assert 160 < stays < 240 and 70 < waits < 130
+    for goal, other in drawn:
+        assert goal is other or (isinstance(goal, Stay) and goal.pads == other.pads)
+    assert (mixed.absent, without.absent) == (1, 0)
+    with pytest.raises(ValueError, match=r"are 1\.1 in all, at most 1"):
+        Mixed(goals, 0.6, 0.5)
+
+
+def test_one_of_two_pads_is_named() -> None:
+    goal, referents = Place(GRAMMAR, radius=0.04), Referents((0,), (1, 0))
+    assert reached(goal, referents, state(at((0.5, 0.2, HALF))))
+    assert not reached(goal, referents, state(at((0.5, 0.0, HALF))))

@@ -18,7 +18,7 @@ from vla.config.conditions import conditions
 from vla.config.experiment import plain
 from vla.io.documents import read_yaml
 from vla.spec import FIRST_SEED
-from vla.tasks.language import Grammar, HeldOut, paraphrase
+from vla.tasks.language import Grammar, HeldOut, Silence, paraphrase
 from vla.tasks.tabletop.scene import COLOURS, PADS
 
 GRAMMAR = Grammar(
@@ -202,3 +202,36 @@ def test_what_cannot_be_done_is_about_a_block_that_is_not_there() -> None:
     environment.close()
     with pytest.raises(InstantiationException, match=r"task\.blocks must be from 2 to 5"):
         make_tabletop("task/goal=stay", "task.blocks=6")
+
+
+def test_the_standard_benchmark_also_asks_for_nothing_and_for_what_cannot_be_done() -> None:
+    alone = make_tabletop("task/randomize=wide")
+    standard = make_tabletop("experiment=standard", "task.goal.impossible=0.3", "task.goal.silent=0.2")
+    training = {draw["language"]["instruction"] for draw in draws("pick_place", "wide", 0, 50)}
+    kinds: dict[str, int] = {}
+    with alone.blind(), standard.blind():
+        for seed in range(FIRST_SEED, FIRST_SEED + 30):
+            one, other = alone.reset(seed), standard.reset(seed)
+            kinds[standard.task] = kinds.get(standard.task, 0) + 1
+            assert (one.state == other.state).all() and alone.draws["placement"] == standard.draws["placement"]
+            if standard.task == "pick_place":
+                assert alone.draws == standard.draws
+            elif standard.task == "stay":
+                compiled = standard.dm_env.task.compiled
+                assert not any(colour in other.instruction for colour in compiled.block_names[: compiled.present])
+                assert any(colour in other.instruction for colour in COLOURS)
+                assert standard.draws["language"]["held_out"] in ("words", "phrasings")
+                assert other.instruction not in training
+            else:
+                assert other.instruction == "" and standard.task == "wait"
+    assert set(kinds) == {"pick_place", "stay", "wait"}
+    alone.close()
+    standard.close()
+
+
+def test_what_cannot_be_done_is_said_as_the_goal_says_it() -> None:
+    grammar = GRAMMAR.renamed({"block": "absent"})
+    assert grammar.phrasings == ("{put} the {absent} block there", "the {absent} block, please")
+    assert grammar.held_out_phrasings == ("there goes the {absent} block",) and grammar.slots == {"absent"}
+    assert (grammar.words, grammar.held_out_colours) == (GRAMMAR.words, GRAMMAR.held_out_colours)
+    assert Silence().say({"block": "red"}, None, np.random.RandomState(0)) == "" and Silence().held_out_kinds == ()

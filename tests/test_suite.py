@@ -50,9 +50,31 @@ def test_the_table_and_the_picture_show_every_condition(tmp_path: Path, figures:
     assert "light_hard" in told and "50.0" in told and "29.9-70.1" in told and "0.002" in told
     # ten lost, none won, and of two comparisons the clearer one counts twice
     assert "-50.0" in told and "0.0039" in told and "worse" in told
+    assert told.count("pick_place") == 0
     plot_conditions(reports, tmp_path / "suite.png")
     (axes,) = figures[0].axes
     assert points(axes) == [(1.0, 1.0), (0.75, 0.13), (0.5, -0.13)]
     assert spans(axes) == [(0.839, 1.0), (0.531, 0.888), (0.299, 0.701)]
     assert {"seen", "light", "wide", "hard", "success, 95 % CI"} <= texts(axes)
     assert Image.open(tmp_path / "suite.png").width > 500
+
+
+def test_the_table_tells_who_obeys_and_who_stays_where_both_are_asked_for() -> None:
+    tasks = ("pick_place", "pick_place", "stay")
+    seen = Report(
+        tuple(
+            Result(index, name, task=task)
+            for index, (task, name) in enumerate(zip(tasks, ("success", "dropped", "success"), strict=True))
+        )
+    )
+    stays = Report(tuple(Result(index, "did_not_stay", task="stay") for index in range(3)))
+    console = Console(file=io.StringIO(), width=120)
+    console.print(conditions_table({"seen": seen, "impossible": stays}, {}))
+    told = [line.split("│")[1:6] for line in console.file.getvalue().splitlines() if "│" in line]  # type: ignore[attr-defined]
+    rows = [[cell.strip() for cell in line[:4]] for line in told]
+    assert rows == [
+        ["seen", "2", "3", "66.7"],
+        ["pick_place", "1", "2", "50.0"],
+        ["stay", "1", "1", "100.0"],
+        ["impossible", "0", "3", "0.0"],
+    ]

@@ -225,13 +225,14 @@ class Episode:
 
     seed: int
     task: str  # as in `Environment`
-    instruction: str
+    instruction: str  # the first one
     outcome: str  # "success" or the name of the failure
     milestones: frozenset[str]  # as in `Environment`
     draws: dict[str, Any]  # randomisation axis → drawn values, JSON-able
     observations: list[Observation]  # N, each one before the action of the same index
     actions: Array  # (N, D) float32, labels for imitation
     executed: Array  # (N, D) float32, as sent to the robot: differ where the expert is perturbed, or only labels
+    completed: tuple[int, int] | None = None  # instructions completed, of how many; None if there is only one
 
     @property
     def success(self) -> bool:
@@ -281,6 +282,17 @@ class Multitask(Protocol):
     def task_of(self, seed: int) -> str:
         """Return the task of the episode of `seed`, one of `tasks`, each of which returns within a few seeds."""
         ...
+
+
+@runtime_checkable
+class InARow(Protocol):
+    """Environment that gives several instructions in an episode, each when the one before is completed.
+
+    It succeeds when all are completed, and fails as soon as one does.
+    """
+
+    instructions: int  # of the current episode
+    completed: int  # so far
 
 
 @runtime_checkable
@@ -350,7 +362,8 @@ class Agent(Protocol):
     info: dict[str, Any]  # about the last action, for recorders: "clean" (D,), "probabilities" (D, K)
 
     def reset(self, instruction: str, seed: int) -> None:
-        """Start an episode without history; `seed` initialises the random generator of the agent, if it has one."""
+        """Start an episode, or a new instruction within it, without history; `seed` initialises the random generator of
+        the agent, if it has one."""
         ...
 
     def act(self, observation: Observation) -> Array:

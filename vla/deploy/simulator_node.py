@@ -20,7 +20,7 @@ from std_srvs.srv import Trigger
 from vla.deploy import messages
 from vla.deploy.joint_limiter import Robot
 from vla.deploy.settings import Timing, Topics
-from vla.spec import LONGEST_INSTRUCTION, Array, Drivable, Environment
+from vla.spec import LONGEST_INSTRUCTION, Array, Drivable, Environment, InARow
 
 
 class SimulatorNode(Node):
@@ -33,7 +33,7 @@ class SimulatorNode(Node):
         """Args: a `Drivable` environment; its arm; topics; rates; seed of the first episode.
 
         Raises:
-            ValueError: the environment has no robot or is not `Drivable`.
+            ValueError: the environment has no robot, is not `Drivable`, or gives several instructions in a row.
         """
         model = environment.spec.require_robot("deploy=simulator")
         if not isinstance(environment, Drivable):
@@ -67,6 +67,8 @@ class SimulatorNode(Node):
         """Start the next episode."""
         self.seed += 1
         self.instruction = self.environment.reset(self.seed).instruction
+        if isinstance(self.environment, InARow) and self.environment.instructions > 1:
+            raise ValueError("deploy=simulator waits for one instruction per episode: set task.goal.length=1")
         self._commanded_at: float | None
         self._target, self._commanded_at = self._hold_command(), None
         self._running, self._ticks = False, 0

@@ -14,18 +14,28 @@ from vla.rollouts.evaluate import Report
 
 # Suffix of a condition's name → colour, and vertical offset within the row.
 LEVELS = {"": (GREEN, 0.0), "wide": (BLUE, -0.13), "hard": (RED, 0.13)}
+TASKS = 40  # maximum number of tasks, over all conditions, that are tabulated
 COMPARED = ("difference", "95 % CI", "p", "p Holm", "verdict")  # heads of `comparison_texts`
 
 
 def conditions_table(reports: Mapping[str, Report], compared: Mapping[str, Comparison]) -> Table:
-    """Tabulate success and its interval per condition, and its comparison with the first condition."""
+    """Tabulate success and its interval per condition, and its comparison with the first condition.
+
+    Rows below a condition are about each of its tasks, if it has several and the table stays short.
+    """
+    detailed = sum(len(report.tasks) for report in reports.values()) <= TASKS
     table = Table("condition", "success", "of", "%", "95 % CI", *COMPARED)
     for name, report in reports.items():
-        low, high = report.interval
-        rate = f"{100 * report.success:.1f}", f"{100 * low:.1f}-{100 * high:.1f}"
-        found = comparison_texts(compared[name]) if name in compared else ()
-        table.add_row(name, str(report.successes), str(report.episodes), *rate, *found)
+        table.add_row(name, *_rate(report), *(comparison_texts(compared[name]) if name in compared else ()))
+        for task, part in report.tasks.items() if detailed and len(report.tasks) > 1 else ():
+            table.add_row(f"  {task}", *_rate(part))
     return table
+
+
+def _rate(report: Report) -> tuple[str, str, str, str]:
+    """Format successes, episodes, success rate and its interval."""
+    low, high = (f"{100 * bound:.1f}" for bound in report.interval)
+    return str(report.successes), str(report.episodes), f"{100 * report.success:.1f}", f"{low}-{high}"
 
 
 def comparison_texts(compared: Comparison) -> tuple[str, str, str, str, str]:

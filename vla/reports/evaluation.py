@@ -72,6 +72,8 @@ def write_report(
 def summary(report: Report) -> dict[str, Any]:
     """Summarise a report for JSON: rate, interval, outcomes, milestones, and the same per task if there are several.
 
+    With several instructions per episode also the rates of so many completed in a row, and their mean number.
+
     With tiers also the same per tier, and the mean over tiers.
     """
     low, high = report.interval
@@ -87,10 +89,20 @@ def summary(report: Report) -> dict[str, Any]:
         "errors": len(report.errors),
         "taxonomy": report.taxonomy,
         "milestones": {name: _milestone(report, count) for name, count in report.milestones.items()},
+        **_in_a_row(report),
         "tasks": {task: summary(part) for task, part in tasks.items()},
         **({"tiers": {tier: summary(part) for tier, part in tiers.items()}} if tiers else {}),
         **({"mean_over_tiers": dict(zip(("rate", "ci_low", "ci_high"), mean, strict=True))} if mean else {}),
         **({"anytime": True} if report.anytime else {}),
+    }
+
+
+def _in_a_row(report: Report) -> dict[str, Any]:
+    if (mean := report.mean_in_a_row) is None:
+        return {}
+    return {
+        "in_a_row": {name: _milestone(report, count) for name, count in report.in_a_row.items()},
+        "mean_in_a_row": dict(zip(("number", "ci_low", "ci_high"), mean, strict=True)),
     }
 
 

@@ -65,6 +65,7 @@ def _chosen(entries: Sequence[StoreEntry], failures: int, successes: int) -> lis
 
 def _strip(reader: RrdReader, entry: StoreEntry) -> Filmstrip:
     properties: dict[str, Any] = {}
+    texts: dict[int, str] = {}  # step → text from there on
     frames: dict[str, dict[int, Any]] = {}  # camera → step → blob
     events: list[tuple[int, str]] = []
     content = [PROPERTIES, INSTRUCTION, CAMERAS, EVENTS]
@@ -76,14 +77,18 @@ def _strip(reader: RrdReader, entry: StoreEntry) -> Filmstrip:
                 blobs = zip(batch.column("step").to_pylist(), batch.column("EncodedImage:blob"), strict=True)
                 frames.setdefault(camera, {}).update(blobs)
         elif chunk.entity_path == EVENTS:
-            texts = [text for (text,) in batch.column("TextLog:text").to_pylist()]
-            events += zip(batch.column("step").to_pylist(), texts, strict=True)
+            told = [text for (text,) in batch.column("TextLog:text").to_pylist()]
+            events += zip(batch.column("step").to_pylist(), told, strict=True)
+        elif chunk.entity_path == INSTRUCTION:
+            columns = batch.to_pydict()
+            texts.update(zip(columns.get("step", [0]), (text for [text] in columns["TextDocument:text"]), strict=True))
         else:
             properties.update({name: values[0] for name, values in batch.to_pydict().items()})
     steps: list[int] = sorted(next(iter(frames.values()), {}))
     places = np.linspace(0, len(steps) - 1, min(MOMENTS, len(steps))).round().astype(int)
     chosen = [steps[int(place)] for place in places]
     pictures = {camera: [bytes(at[step][0].as_py()) for step in chosen] for camera, at in frames.items()}
-    heading = properties["TextDocument:text"][0].partition("\n")[0].removeprefix("### ")
+    headings = [texts[step].partition("\n")[0].removeprefix("### ") for step in sorted(texts)]
+    heading = "; then ".join(headings)
     seed, outcome, length = (properties[name][0] for name in ("seed", "outcome", "steps"))
     return Filmstrip(seed, outcome, heading, length, chosen, pictures, sorted(events))

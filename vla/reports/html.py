@@ -199,7 +199,7 @@ def _error_table(run: Run) -> list[tuple[str, str, str]]:
 def _rate_tables(run: Run) -> dict[str, dict[str, tuple[Interval, str, Sequence[str]]]]:
     """Return table → name → (rate, count, comparison with the first condition) of a run's page."""
     if run.report is None:
-        return {"condition": {}, "tier": {}, "task": {}, "milestone": {}}
+        return {"condition": {}, "tier": {}, "task": {}, "milestone": {}, "completed": {}}
     first, conditions = next(iter(run.reports.values())), run.report.conditions
     mean = first.mean_over_tiers
     compared = {name: each.comparison for name, each in conditions.items() if each.comparison}
@@ -225,6 +225,10 @@ def _rate_tables(run: Run) -> dict[str, dict[str, tuple[Interval, str, Sequence[
         "milestone": {
             name: ((part.rate, part.ci_low, part.ci_high), f"{part.episodes}/{run.report.episodes}", ())
             for name, part in run.report.milestones.items()
+        },
+        "completed": {
+            name: ((part.rate, part.ci_low, part.ci_high), f"{part.episodes}/{run.report.episodes}", ())
+            for name, part in run.report.in_a_row.items()
         },
     }
 

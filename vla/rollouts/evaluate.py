@@ -22,7 +22,7 @@ from vla.parallel.pool import THIS_PROCESS, Cluster, Crashed
 from vla.rollouts.comparison import Comparison, Pairs, compare_pairs, concluded
 from vla.rollouts.rollout import rollout
 from vla.rollouts.sequential import anytime_interval
-from vla.rollouts.statistics import stratified_interval, wilson_interval
+from vla.rollouts.statistics import bounded_mean_interval, stratified_interval, wilson_interval
 from vla.spec import FIRST_SEED, Agent, Environment, Episode, Recorder
 
 log = logging.getLogger(__name__)
@@ -47,6 +47,7 @@ class Result:
     task: str = ""
     milestones: tuple[str, ...] = ()  # in alphabetical order
     error: str = ""  # message, if the outcome is "error"
+    completed: tuple[int, int] | None = None  # instructions completed, of how many; None if there is only one
 
 
 @dataclass(frozen=True)
@@ -88,7 +89,7 @@ class Report:
         played = [part for part in self.tasks.values() if part.episodes]
         return stratified_interval([part._share_of(self.episodes) for part in played])[1:]
 
-    def interval_of(self, count: int) -> tuple[float, float]:
+    def interval_of(self, count: float) -> tuple[float, float]:
         """Return the 95 % confidence interval of the rate of an event that `count` completed episodes had."""
         return anytime_interval(count, self.episodes - count) if self.anytime else wilson_interval(count, self.episodes)
 
@@ -100,6 +101,32 @@ class Report:
     def milestones(self) -> dict[str, int]:
         """Milestone → number of episodes in which it was reached, sorted by name."""
         return dict(sorted(Counter(name for result in self.results for name in result.milestones).items()))
+
+    @property
+    def _chains(self) -> list[tuple[int, int]]:
+        """Instructions completed, of how many, per episode with several."""
+        return [result.completed for result in self.results if result.completed]
+
+    @property
+    def in_a_row(self) -> dict[str, int]:
+        """ "1/4" → number of episodes in which at least one of four instructions was completed, and so on.
+
+        Empty if the episodes have only one instruction.
+        """
+        length = max((length for _, length in self._chains), default=0)
+        return {f"{n}/{length}": sum(done >= n for done, _ in self._chains) for n in range(1, length + 1)}
+
+    @property
+    def mean_in_a_row(self) -> tuple[float, float, float] | None:
+        """Mean number of instructions completed, with its 95 % confidence interval; None if episodes have only one."""
+        if not self._chains:
+            return None
+        done, length = [done for done, _ in self._chains], max(length for _, length in self._chains)
+        if self.anytime:  # bets on shares of a success lose more than bets on the values would
+            low, high = (length * bound for bound in self.interval_of(sum(done) / length))
+        else:
+            low, high = bounded_mean_interval(done, length)
+        return sum(done) / len(done), low, high
 
     @property
     def taxonomy(self) -> dict[str, int]:
@@ -158,12 +185,17 @@ class Report:
         return compare_pairs(pairs_of(together), anytime)
 
     def __str__(self) -> str:
-        """Format failures, errors, milestones, several tasks, tiers and, last, the success rate with its interval."""
+        """Format failures, errors, milestones, several instructions, several tasks, tiers and, last, the success rate
+        with its interval."""
         lines = [f"{outcome} {count}" for outcome, count in self.taxonomy.items() if outcome not in ("success", ERROR)]
         if self.errors:
             first = self.errors[0]
             lines.append(f"errors {len(self.errors)}, the first at seed {first.seed}: {first.error}")
         lines += [f"{name} {self._rate(count)}" for name, count in self.milestones.items()]
+        lines += [f"{name} completed in {self._rate(count)}" for name, count in self.in_a_row.items()]
+        if row := self.mean_in_a_row:
+            mean, low, high = (f"{value:.2f}" for value in row)
+            lines.append(f"completed in a row on average {mean} ({self._ci} {low}-{high})")
         if len(self.tasks) > 1:
             lines += [f"{task} {report._rate()}" for task, report in self.tasks.items()]
         lines += [f"{tier.replace('_', ' ')} {report._rate()}" for tier, report in self.by_tier.items()]
@@ -177,8 +209,12 @@ class Report:
         if not self.episodes:
             return "0/0 (no episode was completed)"
         count, (low, high) = (self.successes, self.interval) if count is None else (count, self.interval_of(count))
-        share, kind = count / self.episodes, "anytime-valid 95 % CI" if self.anytime else "95 % CI"
-        return f"{count}/{self.episodes} ({100 * share:.1f} %, {kind} {100 * low:.1f}-{100 * high:.1f})"
+        share = count / self.episodes
+        return f"{count}/{self.episodes} ({100 * share:.1f} %, {self._ci} {100 * low:.1f}-{100 * high:.1f})"
+
+    @property
+    def _ci(self) -> str:
+        return "anytime-valid 95 % CI" if self.anytime else "95 % CI"
 
 
 def pairs_of(together: Iterable[tuple[Result, Result]]) -> Pairs:
@@ -281,7 +317,16 @@ def play(environment: Environment, agent: Agent, seed: int, recorder: Recorder |
     # Draws may be arrays; plain values support comparison and JSON.
     draws = json.loads(json.dumps(episode.draws, default=lambda value: value.tolist()))
     steps, milestones = len(episode.observations), tuple(sorted(episode.milestones))
-    return Result(seed, episode.outcome, episode.instruction, steps, draws, episode.task, milestones)
+    return Result(
+        seed,
+        episode.outcome,
+        episode.instruction,
+        steps,
+        draws,
+        episode.task,
+        milestones,
+        completed=episode.completed,
+    )
 
 
 class _TolerantRecorder:

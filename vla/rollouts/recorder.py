@@ -97,13 +97,20 @@ class _Writer:
         self._stream, self._spec = stream, spec
 
     def facts(self, episode: Episode) -> None:
-        """Write name, properties, instruction and draws."""
+        """Write name, properties, draws, and the instruction, or each one from the step at which it was given."""
         steps = len(episode.observations)
         self._stream.send_recording_name(f"{episode.outcome}: {episode.instruction}")
         self._stream.send_property("episode", rr.AnyValues(outcome=episode.outcome, seed=episode.seed, steps=steps))
         end = f"{'✔' if episode.success else '✘'} **{episode.outcome}** after {steps} steps, seed {episode.seed}"
         draws = "\n".join(f"- **{axis}** {draw}" for axis, draw in episode.draws.items())
-        self._static("instruction", rr.TextDocument(f"### {episode.instruction}\n\n{end}", media_type="text/markdown"))
+        said = [seen.instruction for seen in episode.observations]
+        changes = [step for step in range(steps) if step == 0 or said[step] != said[step - 1]]
+        if len(changes) > 1:
+            texts = [f"### {said[step]}\n\n{end}" for step in changes]
+            columns = rr.TextDocument.columns(text=texts, media_type=["text/markdown"] * len(texts))
+            self._columns("instruction", np.array(changes), columns)
+        else:
+            self._static("instruction", rr.TextDocument(f"### {said[0]}\n\n{end}", media_type="text/markdown"))
         self._static("draws", rr.TextDocument(draws, media_type="text/markdown"))
 
     def events(self, events: Sequence[tuple[int, str]]) -> None:

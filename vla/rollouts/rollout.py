@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from vla.spec import Agent, Environment, Episode, Recorder
+from vla.spec import Agent, Environment, Episode, InARow, Recorder
 
 
 def rollout(environment: Environment, agent: Agent, seed: int, recorder: Recorder | None = None) -> Episode:
     """Run the episode of `seed` to its end.
 
     The label for imitation is `agent.info["clean"]` if present, else the executed action. What the agent drew,
-    `agent.info["draws"]`, is added to the draws of the environment.
+    `agent.info["draws"]`, is added to the draws of the environment. A new instruction resets the agent.
 
     Raises:
         ValueError: the agent returned an action of the wrong shape, or one that is not finite.
@@ -23,6 +23,8 @@ def rollout(environment: Environment, agent: Agent, seed: int, recorder: Recorde
     observations, clean, executed = [], [], []
     components = len(environment.spec.action)
     while not environment.done:
+        if observations and observation.instruction != observations[-1].instruction:
+            agent.reset(observation.instruction, seed)
         action = np.asarray(agent.act(observation), dtype=np.float32)
         if action.shape != (components,) or not np.isfinite(action).all():
             raise ValueError(f"{type(agent).__name__} must return {components} finite numbers, got {action}")
@@ -42,10 +44,16 @@ def rollout(environment: Environment, agent: Agent, seed: int, recorder: Recorde
         observations=observations,
         actions=np.asarray(clean, dtype=np.float32),
         executed=np.asarray(executed, dtype=np.float32),
+        completed=_completed(environment),
     )
     if recorder is not None:
         recorder.end(episode)
     return episode
+
+
+def _completed(environment: Environment) -> tuple[int, int] | None:
+    several = isinstance(environment, InARow) and environment.instructions > 1
+    return (environment.completed, environment.instructions) if several else None
 
 
 def replay(environment: Environment, episode: Episode, recorder: Recorder | None = None) -> int | None:

@@ -30,7 +30,7 @@ LEVEL = 0.05  # largest probability of a false statement
 ON_SUCCESS = np.cos((2 * np.arange(BETS) + 1) * np.pi / (4 * BETS)) ** 2
 
 
-def log_capital(mean: float, ones: Array | int, zeros: Array | int, halves: Array | int = 0) -> Array:
+def log_capital(mean: float, ones: Array | float, zeros: Array | float, halves: Array | int = 0) -> Array:
     """Return the logarithm of the capital after bets against the hypothesis that observations have this mean.
 
     Args:
@@ -46,8 +46,12 @@ def log_capital(mean: float, ones: Array | int, zeros: Array | int, halves: Arra
     return np.asarray(largest + np.log(np.exp(growth - largest[..., None]).mean(-1)))
 
 
-def anytime_interval(ones: int, zeros: int, halves: int = 0, level: float = LEVEL) -> tuple[float, float]:
-    """Return the confidence interval of the mean of observations of 0, 1/2 and 1; (0, 1) without observations."""
+def anytime_interval(ones: float, zeros: float, halves: int = 0, level: float = LEVEL) -> tuple[float, float]:
+    """Return the confidence interval of the mean of observations of 0, 1/2 and 1; (0, 1) without observations.
+
+    It also holds for observations in between, each counted as its share of a one and the rest as one of a zero: by the
+    inequality of arithmetic and geometric means, bets on them win at least as much.
+    """
     seen, limit = ones + zeros + halves, log(1 / level)
     if seen == 0:
         return 0.0, 1.0

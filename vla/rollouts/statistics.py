@@ -46,6 +46,24 @@ def stratified_interval(strata: Sequence[tuple[int, int, float]]) -> tuple[float
     return rate, *wilson_interval(rate * alike, alike)
 
 
+def bounded_mean_interval(values: Sequence[float], largest: float) -> tuple[float, float]:
+    """Return the 95 % confidence interval of the mean of values from 0 to `largest`, (0, `largest`) without any.
+
+    Wilson's interval for as many trials as would give the mean the variance that it has; half a zero and half a
+    `largest` are added in estimating that variance, else equal values would seem certain. If all values are 0 or
+    `largest` it is Wilson's interval of their share.
+    """
+    shares = np.asarray(values, float) / largest
+    count, total = len(shares), float(shares.sum())
+    if not count:
+        return 0.0, largest
+    smooth = (total + 0.5) / (count + 1)
+    variance = (float(np.square(shares).sum()) + 0.5) / (count + 1) - smooth**2
+    alike = count * smooth * (1 - smooth) / variance
+    low, high = wilson_interval(total / count * alike, alike)
+    return largest * low, largest * high
+
+
 def mean_interval(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the 95 % confidence intervals of the means of (E, D) non-negative values, as two arrays (D,).
 

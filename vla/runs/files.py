@@ -83,6 +83,17 @@ class Mean:
     ci_high: Share
 
 
+@dataclass(frozen=True)
+class MeanInARow:
+    """Mean number of instructions completed in a row, with its confidence interval."""
+
+    __pydantic_config__ = STRICT
+
+    number: NonNegative
+    ci_low: NonNegative
+    ci_high: NonNegative
+
+
 @dataclass(frozen=True, kw_only=True)
 class Summary:
     """Success statistics, written by `vla.reports.evaluation.summary`."""
@@ -98,6 +109,8 @@ class Summary:
     taxonomy: dict[str, Natural]
     milestones: dict[str, Milestone]
     tasks: dict[str, Summary]
+    in_a_row: dict[str, Milestone] = field(default_factory=dict)  # "1/4" → at least one of four instructions
+    mean_in_a_row: MeanInARow | None = None
     tiers: dict[str, Summary] = field(default_factory=dict)
     mean_over_tiers: Mean | None = None
     anytime: bool = False  # intervals are valid whatever the reason to stop playing

@@ -52,6 +52,18 @@ class Grammar:
             raise ValueError("the held-out part of task.goal.language is empty")
         self.slots = {slot for phrasing in (*phrasings, *held_out_phrasings) for slot in _slots(phrasing)} - {*words}
 
+    def renamed(self, slots: Mapping[str, str]) -> Grammar:
+        """Return the grammar with other names for some slots, old → new, which are replaced in that order."""
+
+        def rename(phrasings: Sequence[str]) -> list[str]:
+            renamed = list(phrasings)
+            for old, new in slots.items():
+                renamed = [phrasing.replace(f"{{{old}}}", f"{{{new}}}") for phrasing in renamed]
+            return renamed
+
+        phrasings = rename(self.phrasings), self.words, rename(self.held_out_phrasings), self.held_out_words
+        return Grammar(*phrasings, self.held_out_colours)
+
     @property
     def held_out_kinds(self) -> tuple[HeldOut, ...]:
         """Kinds of held-out instructions that this grammar can generate."""
@@ -68,6 +80,19 @@ class Grammar:
             slot: words[slot][random_state.randint(len(words[slot]))] for slot in sorted(_slots(phrasing) & set(words))
         }
         return phrasing.format(**chosen, **slots)
+
+
+class Silence(Grammar):
+    """The empty instruction, of which nothing can be held out."""
+
+    def __init__(self) -> None:
+        self.phrasings = self.held_out_phrasings = ("",)
+        self.words, self.held_out_words, self.held_out_colours, self.slots = {}, {}, (), set()
+
+    @property
+    def held_out_kinds(self) -> tuple[HeldOut, ...]:
+        """No kinds."""
+        return ()
 
 
 def paraphrase(instruction: str, words: Mapping[str, str], names: Iterable[str]) -> str:

@@ -12,9 +12,11 @@ import mujoco
 import numpy as np
 
 from vla.io.types import Count, ImageSize, Names, Point, Positive
-from vla.spec import Array, Observation, Shape, Spec
+from vla.spec import FIRST_SEED, Array, Observation, Shape, Spec
 from vla.tasks.gl import require_backend
 from vla.tasks.rendering.renderer import Renderer, Rendering, View
+from vla.tasks.tabletop.expert import Waypoint
+from vla.tasks.tabletop.goals.chain import Chain
 from vla.tasks.tabletop.goals.goal import Goal
 from vla.tasks.tabletop.goals.mixed import Mixed
 from vla.tasks.tabletop.panda import Panda
@@ -32,13 +34,19 @@ QUANTILES = np.array([NormalDist().inv_cdf((index + 0.5) / 256) for index in ran
 
 
 class Tabletop:
-    """`TabletopTask` as an `Environment` with camera observations, also `Drawable`, `Drivable` and `Eventful`."""
+    """`TabletopTask` as an `Environment` with camera observations, also `Drawable`, `Drivable`, `Eventful` and
+    `InARow`.
+
+    An episode of a chain below `FIRST_SEED` is one of its instructions, drawn from the seed: the scripted expert
+    carries out those before it, unseen, and the episode begins where it stopped. A demonstration thus has one
+    instruction, and starts where a policy is when it is given a new one.
+    """
 
     viewpoint: tuple[Point, Point] = ((1.2, -0.7, 0.75), (0.38, 0.0, 0.2))
 
     def __init__(
         self,
-        goal: Goal | Mixed,
+        goal: Goal | Mixed | Chain,
         randomize: Mapping[str, Randomizer | None],
         renderer: Rendering,
         blocks: Count,
@@ -52,13 +60,13 @@ class Tabletop:
         """Build and compile the scene.
 
         Args:
-            goal: goal, or mixture of goals.
+            goal: goal, mixture of goals, or chain of goals.
             randomize: axis name → randomizer, or None to disable the axis.
             renderer: renderer of the images.
             blocks: maximum number of blocks on the table; the axis `distractors` draws the number.
             image_size: height and width of every camera's images [px].
             cameras: "front", "wrist" or both.
-            time_limit: maximum length of an episode per block to be moved [s].
+            time_limit: maximum time for an instruction, per block to be moved [s].
             meshes: robot meshes with few faces ("light") or all of them ("full", much slower on a CPU).
             shadows: whether the lamp casts shadows.
             robot: an arm from a file; None: the Panda.
@@ -111,12 +119,30 @@ class Tabletop:
         """Start the episode of `seed`."""
         self._task.seed = seed
         self.dm_env.reset()
+        if self._task.name == Chain.name and seed < FIRST_SEED:
+            self._skip_to(int(self._task.streams(seed, "start").randint(len(self._task.requests))))
         self._changed = True  # in the model, for the renderer
         # Separate streams, so that a replay without images has the same joint noise.
         self._joint_noise, self._image_noise = self._task.streams(seed, "joint noise"), np.random.default_rng([seed, 1])
-        self.task, self.draws = self._task.goal.name, self._task.draws
+        self.task, self.draws = self._task.name, self._task.draws
         self._update_outcome(done=False)
         return self.look()
+
+    def _skip_to(self, number: int) -> None:
+        """Let the scripted expert carry out the instructions before one, which then is the only one of the episode.
+
+        If it fails at one of them, the episode is about that one.
+        """
+        task, physics, random_state = self._task, self.dm_env.physics, self.dm_env.random_state
+        expert = Waypoint(self.spec)
+        self._joint_noise = np.random.RandomState(0)
+        task.disturber = None  # disturbances are for who acts next
+        with self.blind():
+            while task.current < number and not task.over:
+                task.before_step(physics, expert.act(self.look()), random_state)
+                task.advance(physics, task.substeps)
+                task.after_step(physics, random_state)
+        task.isolate()
 
     def step(self, action: Array) -> Observation:
         """Apply one (7,) action, clipped to the spec's bounds, for one control period."""
@@ -141,6 +167,8 @@ class Tabletop:
     def _update_outcome(self, done: bool) -> None:
         classifier = self._task.classifier
         self.done, self.outcome, self.milestones = done, classifier.outcome, classifier.milestones
+        self.instructions = len(self._task.requests)
+        self.completed = self._task.current + classifier.success
         if self.events:
             self.milestones |= {"disturbed"}
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import mujoco
@@ -17,6 +18,7 @@ from vla.tasks.language import HeldOut, paraphrase
 from vla.tasks.streams import Streams
 from vla.tasks.tabletop.compiled_scene import CompiledScene
 from vla.tasks.tabletop.disturber import PUSH, Disturber
+from vla.tasks.tabletop.goals.chain import Chain
 from vla.tasks.tabletop.goals.goal import SKILLS, Goal, Referents, WorldState, current
 from vla.tasks.tabletop.goals.mixed import Mixed
 from vla.tasks.tabletop.outcome import OutcomeClassifier
@@ -45,12 +47,28 @@ class FastEnvironment(composer.Environment):
         self._task.advance(self._physics, self._task.substeps)
 
 
+@dataclass(frozen=True)
+class Request:
+    """What one instruction asks for."""
+
+    goal: Goal
+    referents: Referents
+    instruction: str
+    held_out: str  # part of the instruction that training never says, "names" if these are replaced, or "none"
+
+
 class TabletopTask(composer.Task):
-    """Manipulation of blocks on a table by instruction."""
+    """Manipulation of blocks on a table by one instruction, or by several in a row.
+
+    Attributes:
+        requests: what the instructions of the episode ask for, in their order.
+        current: index of the one to carry out now.
+        goal: of the current request, like `referents`, `instruction` and `classifier`.
+    """
 
     def __init__(
         self,
-        goal: Goal | Mixed,
+        goal: Goal | Mixed | Chain,
         randomize: Mapping[str, Randomizer | None],
         scene: Scene,
         low: Array,
@@ -58,12 +76,12 @@ class TabletopTask(composer.Task):
         time_limit: float,
     ) -> None:
         """Args:
-        goal: goal, or mixture of goals.
+        goal: goal, mixture of goals, or chain of goals.
         randomize: axis name → randomizer, or None to disable the axis.
         scene: the world.
         low: lower bounds (7,) of an action.
         high: upper bounds (7,) of an action.
-        time_limit: length of an episode per block to be moved [s].
+        time_limit: time for an instruction, per block to be moved [s].
         """
         self.goals, self.randomize, self.scene = goal, randomize, scene
         self._time_limit = time_limit
@@ -98,61 +116,96 @@ class TabletopTask(composer.Task):
         self.compiled.restore()
         axes = {name: axis for name, axis in self.randomize.items() if axis is not None}
         draws = {name: axis(self.compiled, self.streams(seed, name)) for name, axis in axes.items()}
-        self.goal = self.goals.draw(self.streams(seed, "goal"))
-        self.compiled.present = max(self.compiled.present, self.goal.blocks)
-        self.compiled.finish(self.goal.pads)
+        goal = self.goals.draw(self.streams(seed, "goal"))
+        self.compiled.present = max(self.compiled.present, goal.blocks)
+        self._pads = goal.pads
+        self.compiled.finish(goal.pads)
         physics.forward()
-        held_out = self._held_out(seed)
-        self.referents = self._choose(held_out, self.streams(seed, "named"))
-        slots = self._slots(seed)
-        self.instruction = self.goal.language.say(slots, held_out, self.streams(seed, "language"))
-        language = {"instruction": self.instruction, "held_out": held_out or "none"}
-        if self.compiled.paraphrases and seed >= FIRST_SEED:
-            self.instruction = paraphrase(self.instruction, self.compiled.paraphrases, slots.values())
-            language = {"instruction": self.instruction, "held_out": "names"}
-        self.draws = {"named": self._named(), **draws, "language": language}
+        self.name, self.requests = goal.name, self._requests(goal, seed)
         data = self.compiled.data
         self.controller.reset(data.qpos[self.compiled.joints])
         self._command = np.append(self.controller.joints, self.compiled.grip)
         data.ctrl[:] = self.compiled.controls(self._command[None])[0]
         self._late: deque[Array] = deque()  # controls delayed by the latency
         self._delay = round(self.compiled.latency / physics.timestep())
+        self._start()
+        self._axes = draws
+        self.draws = self._described()
+
+    def _requests(self, goal: Goal | Chain, seed: int) -> list[Request]:
+        """Draw what the instructions of the episode ask for."""
+        if isinstance(goal, Chain):
+            links = goal.plan(self.compiled.present, self.streams(seed, "chain"))
+            return [self._request(*link, seed, f" {number}") for number, link in enumerate(links, start=1)]
+        return [self._request(goal, None, seed)]
+
+    def _request(self, goal: Goal, referents: Referents | None, seed: int, stream: str = "") -> Request:
+        """Draw an instruction and, unless given, what it names; `stream` is added to the names of random streams."""
+        held_out = self._held_out(goal, self.streams(seed, f"novelty{stream}"), seed)
+        if referents is None:
+            referents = self._choose(goal, held_out, self.streams(seed, "named"))
+        words = self._slots(goal, referents, seed)
+        said = goal.language.say(words, held_out, self.streams(seed, f"language{stream}"))
+        if self.compiled.paraphrases and seed >= FIRST_SEED and said:
+            return Request(goal, referents, paraphrase(said, self.compiled.paraphrases, words.values()), "names")
+        return Request(goal, referents, said, held_out or "none")
+
+    def _start(self) -> None:
+        """Start the episode with its first request."""
+        self._steps, drawn = 0, self.compiled.disturbance
+        self.disturber, self._shove = Disturber(drawn, self.compiled) if drawn else None, np.zeros(3)
+        self._begin(0)
+
+    def _begin(self, number: int) -> None:
+        """Start the time of a request, with the places where the blocks are now."""
+        self.current, request = number, self.requests[number]
+        self.goal, self.referents, self.instruction = request.goal, request.referents, request.instruction
         self._cached: tuple[float, WorldState] | None = None  # simulation time [s] and state
         self._starts, self._lifts = self.compiled.block_centres(), np.zeros(self.compiled.present)
         self.classifier = OutcomeClassifier(self.goal.hold_steps)
-        drawn = self.compiled.disturbance
-        self.disturber, self._shove = Disturber(drawn, self.compiled) if drawn else None, np.zeros(3)
         self._periods, self._most_periods = 0, round(self._time_limit * self.goal.moves * CONTROL_HZ)
 
-    def _held_out(self, seed: int) -> HeldOut | None:
-        """Draw which part of the instruction is held out; None in training and in the rest of an evaluation."""
-        if seed < FIRST_SEED:
-            return None
-        random_state = self.streams(seed, "novelty")  # the name seeds the stream
-        if random_state.uniform() >= self.compiled.held_out:
-            return None
-        present = set(self.compiled.block_names[: self.compiled.present])
-        possible = present & set(self.goal.language.held_out_colours)
-        kinds = [kind for kind in self.goal.language.held_out_kinds if kind != "combinations" or possible]
-        return kinds[random_state.randint(len(kinds))]
+    def isolate(self) -> None:
+        """Make the current request the only one of the episode, which begins with it."""
+        self.name, self.requests = self.goal.name, [self.requests[self.current]]
+        self._start()
+        self.draws = self._described()
 
-    def _choose(self, held_out: HeldOut | None, random_state: np.random.RandomState) -> Referents:
+    def _described(self) -> dict[str, Any]:
+        """Return the draws of the episode."""
+        first, *others = self.requests
+        language: dict[str, Any] = {"instruction": first.instruction, "held_out": first.held_out}
+        if others:
+            language["then"] = [request.instruction for request in others]
+        return {"named": self._named(), **self._axes, "language": language}
+
+    def _held_out(self, goal: Goal, random_state: np.random.RandomState, seed: int) -> HeldOut | None:
+        """Draw which part of the instruction is held out; None in training and in the rest of an evaluation."""
+        if seed < FIRST_SEED or random_state.uniform() >= self.compiled.held_out:
+            return None
+        present = set() if goal.absent else set(self.compiled.block_names[: self.compiled.present])
+        possible = present & set(goal.language.held_out_colours)
+        kinds = [kind for kind in goal.language.held_out_kinds if kind != "combinations" or possible]
+        return kinds[random_state.randint(len(kinds))] if kinds else None
+
+    def _choose(self, goal: Goal, held_out: HeldOut | None, random_state: np.random.RandomState) -> Referents:
         """Draw the named blocks and pads; the first block has a colour that the instruction may name."""
-        colours = self.goal.language.held_out_colours
+        colours = goal.language.held_out_colours
         order = [int(index) for index in random_state.permutation(self.compiled.present)]
         # The sort is stable: without held-out colours it changes nothing.
         order.sort(key=lambda index: (self.compiled.block_names[index] in colours) != (held_out == "combinations"))
         order = order[self.compiled.skip :] + order[: self.compiled.skip]
-        pads = [int(index) for index in random_state.permutation(self.goal.pads)]
-        return Referents(tuple(order[: self.goal.named]), tuple(pads))
+        pads = [int(index) for index in random_state.permutation(goal.pads)]
+        return Referents(tuple(order[: goal.named]), tuple(pads))
 
-    def _slots(self, seed: int) -> dict[str, str]:
+    def _slots(self, goal: Goal, referents: Referents, seed: int) -> dict[str, str]:
         """Return the words that fill the goal's slots of an instruction."""
-        blocks = zip(("block", "other"), self.referents.blocks, strict=False)
-        pads = zip(("pad", "rest"), self.referents.pads, strict=False)
+        blocks = zip(("block", "other"), referents.blocks, strict=False)
+        pads = zip(("pad", "rest"), referents.pads, strict=False)
         slots = {slot: self.compiled.block_names[index] for slot, index in blocks}
-        if self.goal.absent:
-            missing = [name for name in COLOURS if name not in self.compiled.block_names[: self.compiled.present]]
+        if goal.absent:
+            unnamed = {*self.compiled.block_names[: self.compiled.present], *goal.language.held_out_colours}
+            missing = [name for name in COLOURS if name not in unnamed]
             slots["absent"] = missing[self.streams(seed, "absent").randint(len(missing))]
         return slots | {slot: list(PADS)[index] for slot, index in pads}
 
@@ -223,13 +276,17 @@ class TabletopTask(composer.Task):
                 mujoco.mj_step1(model, data)
 
     def after_step(self, physics: mjcf.Physics, random_state: np.random.RandomState) -> None:
-        """Update the outcome after a control period."""
+        """Update the outcome after a control period; the next request, if there is one, follows a success."""
         self._periods += 1
+        self._steps += 1
         self._lifts = np.maximum(self._lifts, (self.compiled.block_centres() - self._starts)[:, 2])
         state = self.world_state()
         subgoals = self.goal.subgoals(state, self.referents)
         self.classifier.update(state, subgoals, self.referents.blocks)
-        if self.disturber and not self.over and self.disturber.update(self._periods, state, current(subgoals)):
+        if self.classifier.success and self.current + 1 < len(self.requests):
+            self._begin(self.current + 1)
+            subgoals = self.goal.subgoals(state, self.referents)
+        if self.disturber and not self.over and self.disturber.update(self._steps, state, current(subgoals)):
             mujoco.mj_step1(physics.model.ptr, physics.data.ptr)  # poses and contacts after the move
             self._cached = None
 
@@ -254,7 +311,7 @@ class TabletopTask(composer.Task):
             lifts=self._lifts,
             held=np.array([len(touching) == 2 for touching in fingers]),
             touched=np.array([bool(touching) for touching in fingers]),
-            pads=compiled.data.mocap_pos[compiled.zones[: self.goal.pads]].copy(),
+            pads=compiled.data.mocap_pos[compiled.zones[: self._pads]].copy(),
             tool=compiled.data.site_xpos[compiled.tcp].copy(),
             arm_speed=float(np.abs(compiled.data.qvel[compiled.velocities]).max()),
         )
@@ -287,7 +344,7 @@ class TabletopTask(composer.Task):
         }
 
     def get_reward(self, physics: mjcf.Physics) -> float:
-        """Return 1 after the goal was reached and held."""
+        """Return 1 after the goal, the last one of several, was reached and held."""
         return float(self.classifier.success)
 
     @property
@@ -297,7 +354,7 @@ class TabletopTask(composer.Task):
 
     @property
     def over(self) -> bool:
-        """Whether the goal was reached and held, or the time limit is reached."""
+        """Whether the goal was reached and held, or its time is up."""
         return self.classifier.success or self._periods >= self._most_periods
 
     def should_terminate_episode(self, physics: mjcf.Physics) -> bool:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import re
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
@@ -54,6 +54,39 @@ class Referents:
 
     blocks: tuple[int, ...]
     pads: tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class Arrangement:
+    """Where instructions that were carried out left the blocks; one that is nowhere here lies free on the table."""
+
+    on_pads: Mapping[int, int] = field(default_factory=dict)  # block → pad
+    on_blocks: Mapping[int, int] = field(default_factory=dict)  # block → block below
+    held: int | None = None  # block in the gripper
+
+    def allows(self, block: int) -> bool:
+        """Return whether the gripper can take a block, or has it: it holds no other, and none stands on it."""
+        return self.held in (None, block) and block not in self.on_blocks.values()
+
+    def lifted(self, block: int) -> Arrangement:
+        """Return the arrangement with a block in the gripper."""
+        return Arrangement(_without(self.on_pads, block), _without(self.on_blocks, block), block)
+
+    def on_pad(self, block: int, pad: int) -> Arrangement | None:
+        """Return the arrangement with a block moved to a pad, and let go; None if that is not free."""
+        if pad in self.on_pads.values():
+            return None
+        return Arrangement({**self.on_pads, block: pad}, _without(self.on_blocks, block))
+
+    def on_block(self, block: int, below: int) -> Arrangement | None:
+        """Return the arrangement with a block put on another, and let go; None if that one is not free."""
+        if below in self.on_blocks or below in self.on_blocks.values():
+            return None
+        return Arrangement(_without(self.on_pads, block), {**self.on_blocks, block: below})
+
+
+def _without(places: Mapping[int, int], block: int) -> dict[int, int]:
+    return {other: place for other, place in places.items() if other != block}
 
 
 @dataclass(frozen=True)
@@ -106,6 +139,13 @@ class Goal(ABC):
     @abstractmethod
     def subgoals(self, state: WorldState, referents: Referents) -> Sequence[Subgoal]:
         """Return the subgoals in order; the goal is reached while all are done."""
+
+    def after(self, arrangement: Arrangement, referents: Referents) -> Arrangement | None:
+        """Return what reaching the goal makes of an arrangement, or None if it cannot be reached from there.
+
+        A goal that does not define this takes no part in chains.
+        """
+        return None
 
 
 def placed(state: WorldState, block: int, pad: int, radius: float) -> bool:

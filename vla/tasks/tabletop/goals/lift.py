@@ -6,7 +6,7 @@ import numpy as np
 
 from vla.io.types import Count, Positive
 from vla.tasks.language import Grammar
-from vla.tasks.tabletop.goals.goal import Goal, Referents, Subgoal, WorldState
+from vla.tasks.tabletop.goals.goal import Arrangement, Goal, Referents, Subgoal, WorldState
 
 
 class Lift(Goal):
@@ -24,3 +24,9 @@ class Lift(Goal):
         destination = np.array([*state.positions[block, :2], start + self.height + 0.03])
         done = state.held[block] and state.positions[block, 2] - start > self.height
         return [Subgoal(block, destination, "hold", bool(done))]
+
+    def after(self, arrangement: Arrangement, referents: Referents) -> Arrangement | None:
+        """See `Goal`."""
+        (block,) = referents.blocks
+        possible = arrangement.held is None and arrangement.allows(block)
+        return arrangement.lifted(block) if possible else None

@@ -6,24 +6,38 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from vla.io.types import Share
 from vla.tasks.tabletop.goals.goal import Goal
+from vla.tasks.tabletop.goals.stay import Stay, Wait
 
 
 class Mixed:
-    """A mixture of goals, one drawn per episode; `blocks` and `absent` are the maxima over the goals."""
+    """A mixture of goals, one drawn per episode; `blocks` and `absent` are the maxima over the goals.
 
-    def __init__(self, goals: Mapping[str, Goal | None]) -> None:
-        """Args: name → goal, or None to omit it.
+    In a share of the episodes the instruction of the drawn goal names a block that is not on the table, and in another
+    share there is none: the robot must then leave everything in place.
+    """
+
+    def __init__(self, goals: Mapping[str, Goal | None], impossible: Share, silent: Share) -> None:
+        """Args: name → goal, or None to omit it; share of the episodes with an absent block; share of those with an
+        empty instruction.
 
         Raises:
-            ValueError: no goal remains.
+            ValueError: no goal remains, or the shares exceed one.
         """
         self.goals = {name: goal for name, goal in goals.items() if goal is not None}
         if not self.goals:
             raise ValueError("task.goal.goals names no goal")
+        if impossible + silent > 1:
+            raise ValueError(f"task.goal.impossible and task.goal.silent are {impossible + silent:g} in all, at most 1")
+        self.impossible, self.silent = impossible, silent
         self.blocks = max(goal.blocks for goal in self.goals.values())
-        self.absent = max(goal.absent for goal in self.goals.values())
+        self.absent = max([goal.absent for goal in self.goals.values()] + [Stay.absent] * bool(impossible))
 
     def draw(self, random_state: np.random.RandomState) -> Goal:
-        """Draw one of the goals."""
-        return self.goals[str(random_state.choice(list(self.goals)))]
+        """Draw one of the goals; which does not depend on the two shares."""
+        goal = self.goals[str(random_state.choice(list(self.goals)))]
+        lot = random_state.uniform()
+        if lot < self.impossible:
+            return Stay.instead_of(goal)
+        return Wait(goal.pads) if lot < self.impossible + self.silent else goal

@@ -17,6 +17,6 @@ class PickPlace(Goal):
 
     def subgoals(self, state: WorldState, referents: Referents) -> list[Subgoal]:
         """Place the block on the pad's centre."""
-        (block,), (pad,) = referents.blocks, referents.pads
+        (block,), (pad, *_) = referents.blocks, referents.pads
         done = placed(state, block, pad, self.radius)
         return [Subgoal(block, state.on_table(block, state.pads[pad]), "place", done)]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from vla.io.types import Count, Positive
 from vla.tasks.language import Grammar
-from vla.tasks.tabletop.goals.goal import AT_REST, Goal, Referents, Subgoal, WorldState
+from vla.tasks.tabletop.goals.goal import AT_REST, Arrangement, Goal, Referents, Subgoal, WorldState
 
 
 class Push(Goal):
@@ -24,3 +24,9 @@ class Push(Goal):
         there = state.away(block, state.pads[pad]) < self.radius and state.speeds[block] < AT_REST
         done = bool(there and state.lifts[block] < self.highest)
         return [Subgoal(block, state.on_table(block, state.pads[pad]), "push", done)]
+
+    def after(self, arrangement: Arrangement, referents: Referents) -> Arrangement | None:
+        """See `Goal`: the block must stand on the table, and the gripper be empty."""
+        (block,), (pad, _) = referents.blocks, referents.pads
+        possible = arrangement.held is None and arrangement.allows(block) and block not in arrangement.on_blocks
+        return arrangement.on_pad(block, pad) if possible else None

@@ -6,7 +6,7 @@ import numpy as np
 
 from vla.io.types import Count
 from vla.tasks.language import Grammar
-from vla.tasks.tabletop.goals.goal import AT_REST, Goal, Referents, Subgoal, WorldState
+from vla.tasks.tabletop.goals.goal import AT_REST, Arrangement, Goal, Referents, Subgoal, WorldState
 
 UP = np.array([0.0, 0.0, 1.0])
 SAG = 0.006  # tolerance of a stacked block's height [m]
@@ -30,3 +30,8 @@ class Stack(Goal):
         level = abs(state.positions[upper, 2] - destination[2]) < SAG
         done = bool(free and level and state.away(upper, top) < state.extents[lower, 0])
         return [Subgoal(upper, destination, "place", done, tolerance=0.007)]
+
+    def after(self, arrangement: Arrangement, referents: Referents) -> Arrangement | None:
+        """See `Goal`: towers have two blocks."""
+        upper, lower = referents.blocks
+        return arrangement.on_block(upper, lower) if arrangement.allows(upper) else None

@@ -1,11 +1,11 @@
-"""The goal of not acting on an impossible instruction."""
+"""The goals of not acting: on an impossible instruction, and without one."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from vla.io.types import Count, Positive
-from vla.tasks.language import Grammar
+from vla.tasks.language import Grammar, Silence
 from vla.tasks.tabletop.goals.goal import Goal, Referents, Subgoal, WorldState
 
 AT_REST = 0.05  # speed of the fastest joint below which the arm is at rest [rad/s]
@@ -16,10 +16,17 @@ class Stay(Goal):
 
     absent = 1
 
-    def __init__(self, language: Grammar, unmoved: Positive, hold_steps: Count = 15) -> None:
-        """Args: grammar; maximum displacement of any block [m]; consecutive steps for which the arm must rest."""
+    def __init__(self, language: Grammar, pads: Count = 1, unmoved: Positive = 0.01, hold_steps: Count = 15) -> None:
+        """Args: grammar; number of pads on the table; maximum displacement of any block [m]; consecutive steps for
+        which the arm must rest."""
+        self.pads = pads
         super().__init__(language, hold_steps)
         self.unmoved = unmoved
+
+    @classmethod
+    def instead_of(cls, goal: Goal) -> Stay:
+        """Return the goal for the instructions of another one, but for the first block, which is absent."""
+        return cls(goal.language.renamed({"block": "absent", "other": "block"}), goal.pads)
 
     def subgoals(self, state: WorldState, referents: Referents) -> list[Subgoal]:
         """Keep every block in place and the arm at rest."""
@@ -27,3 +34,13 @@ class Stay(Goal):
         moved = np.linalg.norm(state.positions - state.starts, axis=1)
         done = state.arm_speed < AT_REST and bool((moved < self.unmoved).all())
         return [Subgoal(block, state.positions[block], "stay", done)]
+
+
+class Wait(Stay):
+    """Leave everything in place, because the instruction is empty."""
+
+    absent = 0
+
+    def __init__(self, pads: Count = 1) -> None:
+        """Args: number of pads on the table."""
+        super().__init__(Silence(), pads)

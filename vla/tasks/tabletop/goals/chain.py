@@ -1,0 +1,91 @@
+"""Several goals one after the other, without a reset in between."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from itertools import permutations
+from typing import Annotated, TypeVar
+
+import numpy as np
+from annotated_types import Ge, Le
+
+from vla.tasks.tabletop.goals.goal import Arrangement, Goal, Referents
+
+T = TypeVar("T")
+Link = tuple[Goal, Referents]
+
+
+class Chain:
+    """Several instructions in a row, each of which is given when the one before is completed.
+
+    They are drawn at the start of the episode, so that they do not depend on who acts. Each is possible where those
+    before it, if carried out as they say, leave the blocks: no block is put where another one is or is taken from
+    below another one, and what was lifted is what comes next.
+
+    Attributes:
+        blocks: minimum number of blocks on the table.
+        absent: minimum number of colours that no block has.
+        pads: number of pads on the table.
+    """
+
+    name, absent = "chain", 0
+
+    def __init__(self, goals: Mapping[str, Goal | None], length: Annotated[int, Ge(1), Le(9)]) -> None:
+        """Args: name → goal, or None to omit it; number of instructions.
+
+        Raises:
+            ValueError: no goal remains, one cannot be part of a chain, or there are not enough possible instructions.
+        """
+        self.goals = {name: goal for name, goal in goals.items() if goal is not None}
+        self.length = length
+        if not self.goals:
+            raise ValueError("task.goal.goals names no goal")
+        for name, goal in self.goals.items():
+            if type(goal).after is Goal.after:
+                raise ValueError(f"task.goal.goals.{name} cannot be part of a chain: it does not define `after`")
+            if goal.language.held_out_colours:
+                raise ValueError(
+                    f"task.goal.goals.{name}.language.held_out_colours: a chain names blocks of all colours"
+                )
+        self.blocks = max(goal.blocks for goal in self.goals.values())
+        self.pads = max(goal.pads for goal in self.goals.values())
+        self.plan(self.blocks, np.random.RandomState(0))
+
+    def draw(self, random_state: np.random.RandomState) -> Chain:
+        """Return the chain: its instructions are drawn by `plan`, once the number of blocks is known."""
+        return self
+
+    def plan(self, blocks: int, random_state: np.random.RandomState) -> list[Link]:
+        """Draw the goals with what they name, from so many blocks: every goal that is possible is equally likely.
+
+        Raises:
+            ValueError: there is no such chain.
+        """
+        links = self._continued([], Arrangement(), blocks, random_state)
+        if links is None:
+            raise ValueError(
+                f"{', '.join(self.goals)} give no chain of {self.length} instructions with {blocks} blocks: lower "
+                "task.goal.length or add goals"
+            )
+        return links
+
+    def _continued(
+        self, links: list[Link], arrangement: Arrangement, blocks: int, random_state: np.random.RandomState
+    ) -> list[Link] | None:
+        """Return the links with those that follow, or None if there is no way to go on."""
+        if len(links) == self.length:
+            return links
+        for goal in _shuffled(list(self.goals.values()), random_state):
+            named = permutations(range(blocks), goal.named)
+            pads = list(permutations(range(goal.pads)))
+            for referents in _shuffled([Referents(one, other) for one in named for other in pads], random_state):
+                after = goal.after(arrangement, referents)
+                if after is not None:
+                    found = self._continued([*links, (goal, referents)], after, blocks, random_state)
+                    if found is not None:
+                        return found
+        return None
+
+
+def _shuffled(values: Sequence[T], random_state: np.random.RandomState) -> list[T]:
+    return [values[index] for index in random_state.permutation(len(values))]
