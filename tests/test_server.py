@@ -7,6 +7,7 @@ import logging
 import os
 import re
 import signal
+import ssl
 import threading
 import time
 from collections.abc import Callable, Sequence
@@ -20,11 +21,12 @@ from urllib.request import urlopen
 import msgpack
 import numpy as np
 import pytest
+import trustme
 from command_line import SMALL, here
 from composing import composed
 from fake_batch import as_policy, make_bc, make_rt1
 from toy import SPEC, ToyEnvironment
-from websockets.exceptions import ConnectionClosed, InvalidStatus
+from websockets.exceptions import ConnectionClosed, InvalidMessage, InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 
 from vla.config.experiment import Experiment
@@ -301,6 +303,27 @@ def test_only_so_many_come_in_and_only_with_the_key() -> None:
             with pytest.raises(ValueError, match="failed: 1 clients are connected"):
                 remote(url, api_key="open")
         remote(url, api_key="open").close()
+
+
+def test_with_a_certificate_only_clients_of_tls_are_served(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    authority, policy, observation = trustme.CA(), as_policy(make_bc()), observations(1)[0]
+    certificate = authority.issue_cert("127.0.0.1")
+    certificate.cert_chain_pems[0].write_to_path(tmp_path / "certificate.pem")
+    certificate.private_key_pem.write_to_path(tmp_path / "key.pem")
+    authority.cert_pem.write_to_path(tmp_path / "authority.pem")
+    files = {"certificate": str(tmp_path / "certificate.pem"), "private_key": str(tmp_path / "key.pem")}
+    expected = policy.session().plan(observation)
+    with serving(policy, **files) as url:
+        assert url.startswith("wss://")
+        with pytest.raises(ssl.SSLCertVerificationError), client(url):
+            pass  # nobody vouches for the server
+        with pytest.raises(InvalidMessage), client(url.replace("wss://", "ws://")):
+            pass
+        monkeypatch.setenv("SSL_CERT_FILE", str(tmp_path / "authority.pem"))
+        agent = remote(url)
+        agent.reset(observation.instruction, 0)
+        np.testing.assert_array_equal(agent.act(observation), expected[0])
+        agent.close()
 
 
 def test_of_many_that_come_at_once_only_so_many_stay() -> None:
