@@ -26,16 +26,14 @@ from vla.tasks.rendering.decimate import decimate
 from vla.tasks.rendering.elements import Elements, elements_of, unsupported
 from vla.tasks.rendering.geometry import Geometry
 from vla.tasks.rendering.renderer import Renderer, View
+from vla.tasks.rendering.shadows import RIM, STATE, Shadows
 from vla.tasks.rendering.textures import Textures
 
 log = logging.getLogger(__name__)
 BEHIND = 0.3  # factor on the alpha of a plane seen from behind, as in MuJoCo
-SLOPE, UNITS = 1.5, 4.0  # offset of shadow maps against surfaces that shade themselves, as in MuJoCo
 ALIGNMENT = 256  # of a camera's block in its buffer [bytes], enough for every machine
 BACKEND: Any = {"backend": "egl"}
-RIM = 2  # texels of a shadow map, both sides together, that stay empty: shadows at its edge would never end
 PACKAGES = "libegl1, libgl1 and libgl1-mesa-dri"
-STATE = moderngl.DEPTH_TEST | moderngl.CULL_FACE
 
 
 @dataclass(frozen=True)
@@ -129,16 +127,10 @@ class FastRenderer:
             colour, depth = gl.renderbuffer(size, 4, samples=samples), gl.depth_renderbuffer(size, samples=samples)
             self._drawn = gl.framebuffer(colour, depth)
         model = self._model
-        edge = int(model.vis.quality.shadowsize)
         self._lights = lights.drawn(model)
-        self._lamps = [int(light) for light in self._lights if model.light_castshadow[light] and edge]
-        self._shadows = []
-        for _ in self._lamps:
-            depth = gl.depth_texture((edge, edge))
-            depth.compare_func = "<="
-            depth.repeat_x = depth.repeat_y = False
-            depth.filter = (moderngl.LINEAR,) * 2 if self._settings.soft else (moderngl.NEAREST,) * 2
-            self._shadows.append(gl.framebuffer(depth_attachment=depth))
+        casting = model.light_castshadow if model.vis.quality.shadowsize else np.zeros(model.nlight, bool)
+        self._lamps = [int(light) for light in self._lights if casting[light]]
+        self._shadows = Shadows(gl, model, self._lamps, self._settings.soft)
 
     def _make_tables(self) -> None:
         model, gl = self._model, self._gl
@@ -162,12 +154,11 @@ class FastRenderer:
             kind: gl.program(**shaders.scene_program(1 + len(self._lights), numbers, spots, kind, pixel, settings.soft))
             for kind in kinds
         }
-        self._shadow_program = gl.program(**shaders.shadow_program())
         units = {"poses": self._pose_texture, "table": self._table_texture}
-        units |= {f"shadow{number}": shadow.depth_attachment for number, shadow in enumerate(self._shadows)}
+        units |= {f"shadow{number}": depth for number, depth in enumerate(self._shadows.maps)}
         for unit, (name, texture) in enumerate(units.items()):
             texture.use(unit)
-            for program in (*self._programs.values(), self._shadow_program):
+            for program in (*self._programs.values(), self._shadows.program):
                 if name in program:
                     program[name] = unit
         self._skin = len(units)  # the unit of the texture of what is being drawn
@@ -181,7 +172,7 @@ class FastRenderer:
 
     def _make_buffers(self) -> None:
         gl = self._gl
-        self._seen, self._casting = Buffers(gl), Buffers(gl)
+        self._seen = Buffers(gl)
         names = "in_position", "in_normal", "in_coordinate", "in_element"
         self._scene = {}
         for kind, program in self._programs.items():
@@ -189,8 +180,6 @@ class FastRenderer:
             form = " ".join(f"{n}f" if name else f"{4 * n}x" for n, name in zip((3, 3, 3, 1), taken, strict=True))
             content = [(self._seen.vertices, form, *(name for name in taken if name))]
             self._scene[kind] = gl.vertex_array(program, content, self._seen.indices)
-        content = [(self._casting.vertices, "3f 1f", "in_position", "in_element")]
-        self._caster = gl.vertex_array(self._shadow_program, content, self._casting.indices)
 
     def update(self, textures: Collection[int] = ()) -> None:
         """Upload what has changed in the model; `textures` are the ids of those whose pixels have."""
@@ -222,11 +211,7 @@ class FastRenderer:
         order = list(self._runs)
         solid, self._transparent = order[: self._geometry.solid], order[self._geometry.solid :]
         self._opaque = _merged([self._runs[element] for element in solid if element != sky])
-        casting = sorted((block for block in blocks if block.element != sky), key=lambda block: not block.closed)
-        self._casting.update([block.casting for block in casting])
-        self._casters = [
-            sum(block.casting.triangles.size for block in casting if block.closed is kind) for kind in (True, False)
-        ]
+        self._shadows.update([block for block in blocks if block.element != sky])
 
     def _texture_of(self, element: int) -> int:
         texture = self._sky if element == len(self._elements.kind) else int(self._elements.texture[element])
@@ -258,7 +243,7 @@ class FastRenderer:
         with self._gl:
             self._upload_poses(data)
             self._upload_cameras(data)
-            self._cast_shadows(data)
+            self._shadows.cast(self._poses, data.light_xpos[self._lamps], self._projections)
             self._drawn.use()
             self._gl.enable_only(STATE)
             self._gl.front_face = "cw"  # in pictures that are upside down
@@ -300,28 +285,6 @@ class FastRenderer:
         head = shaders.CAMERA + 16 * len(self._lamps) + 16
         blocks[:, head : head + 3] = -cameras.axes[:, :, 2]  # the direction of the headlight
         self._camera_buffer.write(blocks)
-
-    def _cast_shadows(self, data: mujoco.MjData) -> None:
-        """Draw the depth of the scene from every lamp with shadows."""
-        gl = self._gl
-        gl.front_face = "ccw"
-        gl.polygon_offset = SLOPE + 2.0 * self._settings.soft, UNITS  # averages reach across texels
-        closed, still_open = self._casters
-        for lamp, projection, shadow in zip(self._lamps, self._projections, self._shadows, strict=True):
-            edge = shadow.size[0]
-            shadow.use()
-            shadow.viewport = 0, 0, edge, edge
-            shadow.clear(depth=1.0)
-            shadow.viewport = RIM // 2, RIM // 2, edge - RIM, edge - RIM
-            self._shadow_program["projection"].write(projection.T.astype(np.float32).tobytes())
-            self._shadow_program["lamp"].write(np.float32(data.light_xpos[lamp]).tobytes())
-            if closed:  # their front faces are nearer to a lamp outside than the others
-                gl.enable_only(STATE)
-                self._caster.render(moderngl.TRIANGLES, vertices=closed)
-            if still_open:
-                gl.enable_only(moderngl.DEPTH_TEST)
-                self._caster.render(moderngl.TRIANGLES, vertices=still_open, first=closed)
-        gl.polygon_offset = 0.0, 0.0
 
     def _sky_seen(self) -> list[bool]:
         """Return whether a camera may see the sky beside the planes."""

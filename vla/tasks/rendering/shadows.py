@@ -1,0 +1,100 @@
+"""Shadow maps: the depth of the scene from every lamp, drawn once for all cameras."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import pairwise
+from typing import Any
+
+import moderngl
+import mujoco
+import numpy as np
+
+from vla.spec import Array
+from vla.tasks.rendering import shaders
+from vla.tasks.rendering.buffers import Buffers
+from vla.tasks.rendering.geometry import Block
+
+SLOPE, UNITS = 1.5, 4.0  # offset of shadow maps against surfaces that shade themselves, as in MuJoCo
+RIM = 2  # texels of a shadow map, both sides together, that stay empty: shadows at its edge would never end
+STATE = moderngl.DEPTH_TEST | moderngl.CULL_FACE
+Span = tuple[int, int]  # first index of triangles, and number of indices
+
+
+class Shadows:
+    """Shadow maps of the lamps of a model.
+
+    What stands still is drawn again only when it or a lamp has been moved. Every frame copies its map, and adds the
+    rest.
+
+    Attributes:
+        maps: depth texture of each lamp.
+        program: of the shaders.
+    """
+
+    def __init__(self, gl: Any, model: mujoco.MjModel, lamps: Sequence[int], soft: int) -> None:
+        """Args: the context; the model; ids of the lights; texels over which the edges of shadows are averaged."""
+        self._gl, self._lamps, self._soft = gl, list(lamps), soft
+        self._edge = int(model.vis.quality.shadowsize)
+        self._still, self._drawn = ([self._target() for _ in self._lamps] for _ in range(2))
+        self.maps = [target.depth_attachment for target in self._drawn]
+        self.program = gl.program(**shaders.shadow_program())
+        self._buffers = Buffers(gl)
+        content = [(self._buffers.vertices, "3f 1f", "in_position", "in_element")]
+        self._casters = gl.vertex_array(self.program, content, self._buffers.indices)
+        fixed = (model.body_weldid == 0) & (model.body_mocapid < 0)
+        self._fixed = np.append(fixed[model.geom_bodyid], fixed[model.site_bodyid])  # by element
+        self._state: bytes | None = None  # that the maps of what stands still were drawn in
+
+    def _target(self) -> Any:
+        """Make the framebuffer of a map, with a colour that nobody writes: without one moderngl copies nothing."""
+        gl, size = self._gl, (self._edge, self._edge)
+        depth = gl.depth_texture(size)
+        depth.compare_func = "<="
+        depth.repeat_x = depth.repeat_y = False
+        depth.filter = (moderngl.LINEAR,) * 2 if self._soft else (moderngl.NEAREST,) * 2
+        target = gl.framebuffer([gl.renderbuffer(size, 1)], depth)
+        target.color_mask = False, False, False, False
+        return target
+
+    def update(self, blocks: Sequence[Block]) -> None:
+        """Upload the triangles that cast shadows."""
+        kinds = [(fixed, closed) for fixed in (True, False) for closed in (True, False)]
+        groups = [[block for block in blocks if (self._fixed[block.element], block.closed) == kind] for kind in kinds]
+        self._buffers.update([block.casting for group in groups for block in group])
+        ends = np.cumsum([0, *(sum(block.casting.triangles.size for block in group) for group in groups)]).tolist()
+        self._spans: list[Span] = [(first, end - first) for first, end in pairwise(ends)]
+        self._state = None
+
+    def cast(self, poses: Array, lamps: Array, projections: Sequence[Array]) -> None:
+        """Draw the maps.
+
+        Args:
+            poses: of the elements (E, 3, 4).
+            lamps: positions of the lamps (lamps, 3) [m].
+            projections: of the world into the maps, (4, 4) each.
+        """
+        gl = self._gl
+        state = b"".join(array.tobytes() for array in (poses[: len(self._fixed)][self._fixed], lamps, *projections))
+        stale, self._state = state != self._state, state
+        gl.front_face = "ccw"
+        gl.polygon_offset = SLOPE + 2.0 * self._soft, UNITS  # averages reach across texels
+        for lamp, projection, still, drawn in zip(lamps, projections, self._still, self._drawn, strict=True):
+            self.program["projection"].write(projection.T.astype(np.float32).tobytes())
+            self.program["lamp"].write(lamp.astype(np.float32).tobytes())
+            if stale:
+                still.viewport = 0, 0, self._edge, self._edge
+                still.clear(depth=1.0)
+                self._draw(still, *self._spans[:2])
+            gl.copy_framebuffer(drawn, still)
+            self._draw(drawn, *self._spans[2:])
+        gl.polygon_offset = 0.0, 0.0
+
+    def _draw(self, target: Any, closed: Span, still_open: Span) -> None:
+        """Draw triangles that enclose a volume, whose front faces are nearer to a lamp outside, and the others."""
+        target.use()
+        target.viewport = RIM // 2, RIM // 2, self._edge - RIM, self._edge - RIM
+        for state, (first, count) in ((STATE, closed), (moderngl.DEPTH_TEST, still_open)):
+            if count:
+                self._gl.enable_only(state)
+                self._casters.render(moderngl.TRIANGLES, vertices=count, first=first)
