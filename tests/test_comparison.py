@@ -1,4 +1,5 @@
-"""Differences of success rates: published values, and what intervals and tests promise by exact enumeration."""
+"""Differences of success rates and of amounts: values of other programs, and what intervals and tests
+promise by exact enumeration."""
 
 from __future__ import annotations
 
@@ -6,15 +7,17 @@ import itertools
 
 import numpy as np
 import pytest
-from scipy.stats import fisher_exact, multinomial
+from scipy.stats import fisher_exact, multinomial, quantile_test
 
 from vla.rollouts.comparison import (
     Comparison,
     Pairs,
+    compare_amounts,
     compare_pairs,
     compare_samples,
     concluded,
     fisher,
+    median_interval,
     newcombe,
     newcombe_paired,
 )
@@ -24,10 +27,12 @@ def a_comparison(p: float, difference: float = 0.1, low: float = -0.1, differ: i
     return Comparison(difference, low, 0.5, p, 100, differ, differ)
 
 
-def test_intervals_equal_the_published_ones() -> None:
-    # Newcombe 1998, page 2638: of 50 pairs 36 both, 12 and 2 one alone; page 877: 56 of 70 against 48 of 80
-    np.testing.assert_allclose(newcombe_paired(Pairs(36, 2, 12, 0)), (0.0569, 0.3404), atol=5e-5)
-    np.testing.assert_allclose(newcombe(48, 80, 56, 70), (0.0524, 0.3339), atol=5e-5)
+def test_intervals_equal_those_of_other_programs() -> None:
+    # Newcombe_square_and_add_CI_paired_2x2(rbind(c(59, 6), c(16, 80))) in the tests of R's contingencytables
+    np.testing.assert_allclose(newcombe_paired(Pairs(59, 16, 6, 80)), (-0.1186, -0.0046), atol=5e-5)
+    # confint_proportions_2indep(…, method="newcomb") of statsmodels 0.15.0
+    np.testing.assert_allclose(newcombe(48, 80, 56, 70), (0.052431, 0.333873), atol=1e-6)
+    np.testing.assert_allclose(newcombe(3, 10, 19, 20), (0.294207, 0.846558), atol=1e-6)
     assert newcombe_paired(Pairs(0, 0, 0, 0)) == (-1, 1)
 
 
@@ -82,6 +87,26 @@ def test_together_they_rarely_find_what_is_not_there() -> None:
         tests = {n: compare_pairs(Pairs(60, int(k), int(40 - k), 0)) for n, k in enumerate(lost)}
         wrong += any(each.verdict in ("better", "worse") for each in concluded(tests, 0.02).values())
     assert wrong <= 0.05 * 300
+
+
+def test_the_interval_of_a_median_is_scipys() -> None:
+    random = np.random.default_rng(0)
+    for count in (6, 7, 20, 51):
+        values = random.normal(size=count)
+        assert median_interval(values) == quantile_test(values).confidence_interval(0.95)
+    assert median_interval([1.0] * 5) is None
+
+
+def test_amounts_are_compared_by_their_signs() -> None:
+    found = compare_amounts([5.0] * 12, [4.0] * 9 + [5.0] * 2 + [6.0])
+    assert found is not None and (found.only_first, found.only_second, found.episodes) == (9, 1, 12)
+    # nine less and one more: 2 · (1 + 10) / 2^10; two are equal
+    assert (found.difference, found.p) == (-1.0, pytest.approx(22 / 1024))
+    assert (found.ci_low, found.ci_high) == (-1.0, 0.0)
+    assert found.conclude(found.p, None).verdict == "less" and found.conclude(0.1, None).verdict == "open"
+    later = compare_amounts([5.0] * 12, [4.0] * 9 + [5.0] * 2 + [6.0], anytime=True)
+    assert later is not None and later.p > found.p and later.ci_high >= found.ci_high
+    assert compare_amounts([1.0], [2.0]) is None
 
 
 def test_the_verdict_is_a_difference_or_its_absence_or_nothing() -> None:

@@ -233,6 +233,7 @@ class Episode:
     actions: Array  # (N, D) float32, labels for imitation
     executed: Array  # (N, D) float32, as sent to the robot: differ where the expert is perturbed, or only labels
     completed: tuple[int, int] | None = None  # instructions completed, of how many; None if there is only one
+    tool: Array | None = None  # (N + 1, 3) its positions [m], the last one at the end; None if the world has none
 
     @property
     def success(self) -> bool:
@@ -293,6 +294,16 @@ class InARow(Protocol):
 
     instructions: int  # of the current episode
     completed: int  # so far
+
+
+@runtime_checkable
+class Traceable(Protocol):
+    """Environment that tells where the tool is: reports have the length of its path and how smooth that is."""
+
+    @property
+    def tool(self) -> Array:
+        """(3,) true position of the tool centre point, or another point of the tool, in a fixed frame [m]."""
+        ...
 
 
 @runtime_checkable

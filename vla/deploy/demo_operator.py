@@ -25,6 +25,7 @@ from vla.deploy.settings import PolicySettings
 from vla.io.documents import STRICT, parse_json
 from vla.io.types import Seed
 from vla.rollouts.evaluate import Result
+from vla.rollouts.motion import Motion
 from vla.spec import LONGEST_INSTRUCTION, Name
 
 log = logging.getLogger(__name__)
@@ -79,11 +80,11 @@ class DemoOperator:
         self.begin_episode()
         started = time.monotonic()
         self.wait(lambda: not self._playing() or self.stopped.is_set(), EPISODE, "the end of an episode")
-        seconds = round(10 * (time.monotonic() - started))
+        seconds = time.monotonic() - started
         episode = self._episode
         assert episode is not None
-        details = {"task": episode.task, "milestones": episode.milestones}
-        return Result(episode.seed, episode.outcome, episode.instruction, seconds, **details)
+        details = {"task": episode.task, "milestones": episode.milestones, "motion": Motion(round(seconds, 1))}
+        return Result(episode.seed, episode.outcome, episode.instruction, round(10 * seconds), **details)
 
     def begin_episode(self) -> None:
         """Deactivate the agent, reset the simulator, activate the agent and send the instruction."""

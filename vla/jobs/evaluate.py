@@ -21,10 +21,18 @@ from vla.config.conditions import conditions
 from vla.config.experiment import Experiment
 from vla.io.files import writing
 from vla.policy import latency
-from vla.reports.conditions import conditions_table, plot_conditions
+from vla.reports.conditions import Courses, conditions_table, course_table, plot_conditions
 from vla.reports.evaluation import plot_report, write_report
 from vla.reports.html import PAGE, optional, write_page
-from vla.rollouts.evaluate import IN_DISTRIBUTION, AgentFactory, Report, compare_conditions, evaluate, keep_recordings
+from vla.rollouts.evaluate import (
+    IN_DISTRIBUTION,
+    AgentFactory,
+    Report,
+    compare_conditions,
+    compare_courses,
+    evaluate,
+    keep_recordings,
+)
 from vla.rollouts.memory import make_impaired
 from vla.rollouts.realtime import Network, make_distant
 from vla.rollouts.statements import AgainstBar, AgainstCondition, AgainstRun, Statement
@@ -191,7 +199,7 @@ def _write(
     """Write all results of an evaluation that started at `started` [s]."""
     output, report = experiment.output, reports[IN_DISTRIBUTION]
     others = {name: each for name, each in reports.items() if name != IN_DISTRIBUTION}
-    compared = compare_conditions(reports, experiment["evaluate"]["margin"])
+    compared, courses = compare_conditions(reports, experiment["evaluate"]["margin"]), compare_courses(reports)
     facts = _facts(experiment, checkpoint, rounds, time.monotonic() - started)
     facts["statements"] = [each.say(report) for each in statements]
     save_config(output, experiment.config, experiment.changes)
@@ -203,9 +211,12 @@ def _write(
     if others:
         plot_conditions(reports, output / "suite.png")
         show(conditions_table(reports, compared))
+        rows: Courses = {(name,): course for name, course in courses.items() if course}
+        if rows:
+            show(course_table(rows, ["condition"]))
     used = str(checkpoint) if checkpoint else None
     # Last, because its existence marks the evaluation as finished.
-    write_report(report, output / "report.json", used, experiment.config, facts, others, compared)
+    write_report(report, output / "report.json", used, experiment.config, facts, others, compared, courses)
     with optional(output / PAGE):
         write_page(output)
     log.info(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import combinations
 from pathlib import Path
 from typing import Any
@@ -11,20 +11,31 @@ from typing import Any
 from rich.table import Table
 
 from vla.config.differences import at
-from vla.reports.conditions import COMPARED, comparison_texts
+from vla.reports.conditions import COMPARED, Courses, comparison_texts
 from vla.rollouts.comparison import Comparison, compare_pairs, compare_samples, concluded
-from vla.rollouts.evaluate import ERROR, IN_DISTRIBUTION, Report, Result, pairs_of
+from vla.rollouts.evaluate import (
+    ERROR,
+    IN_DISTRIBUTION,
+    Report,
+    Result,
+    concluded_courses,
+    course_of,
+    pairs_of,
+)
 from vla.runs.folder import Run, require_run
+
+CASE = ("second run", "minus first", "condition")  # heads of what was compared
 
 
 @dataclass(frozen=True)
 class RunComparison:
-    """Comparison of two runs under a condition."""
+    """Comparison of two runs under a condition, in success and in the course of episodes that both played."""
 
     one: str
     other: str
     condition: str
     found: Comparison
+    course: Mapping[str, Comparison] = field(default_factory=dict)  # milestone or field of `Motion` → the same
 
 
 def read_runs(folders: Sequence[Path]) -> dict[str, Run]:
@@ -52,43 +63,51 @@ def _names(folders: Sequence[Path]) -> list[str]:
 def compare_runs(runs: Mapping[str, Run], margin: float) -> list[RunComparison]:
     """Compare every two runs under each condition: on their common episodes, or without any on different ones.
 
-    Runs in different worlds are not compared. Verdicts take all comparisons into account.
+    Runs in different worlds are not compared. Verdicts take all comparisons into account, those on the course of
+    episodes separately.
 
     Args:
         runs: by name.
         margin: what counts as not worse, 0…1.
     """
     found = [
-        RunComparison(one, other, condition, compared)
+        RunComparison(one, other, condition, *compared)
         for one, other in combinations(runs, 2)
         for condition in runs[one].reports
         if (compared := _compared(runs[one], runs[other], condition))
     ]
     verdicts = concluded({number: each.found for number, each in enumerate(found)}, margin)
-    return [replace(each, found=verdicts[number]) for number, each in enumerate(found)]
+    courses = concluded_courses({number: each.course for number, each in enumerate(found)})
+    return [replace(each, found=verdicts[number], course=courses[number]) for number, each in enumerate(found)]
 
 
 def runs_table(compared: Sequence[RunComparison]) -> Table:
     """Tabulate comparisons of runs."""
-    table = Table("second run", "minus first", "condition", "episodes", *COMPARED)
+    table = Table(*CASE, "episodes", *COMPARED)
     for each in compared:
         table.add_row(each.other, each.one, each.condition, str(each.found.episodes), *comparison_texts(each.found))
     return table
 
 
-def _compared(one: Run, other: Run, condition: str) -> Comparison | None:
-    """Compare two runs under a condition; None if they were evaluated in different worlds."""
+def course_rows(compared: Sequence[RunComparison]) -> Courses:
+    """Return second run, first run and condition → comparisons of the course of episodes."""
+    return {(each.other, each.one, each.condition): each.course for each in compared if each.course}
+
+
+def _compared(one: Run, other: Run, condition: str) -> tuple[Comparison, dict[str, Comparison]] | None:
+    """Compare two runs under a condition, see `RunComparison`; None if they were evaluated in different worlds."""
     first, second = (_by_seed(run, condition) for run in (one, other))
     # The same seed gives another episode under another goal or level of randomisation.
     seeds = [seed for seed, (_, scene) in first.items() if seed in second and scene == second[seed][1]]
     anytime = any(run.reports[condition].anytime for run in (one, other) if condition in run.reports)
     if seeds:
-        return compare_pairs(pairs_of((first[seed][0], second[seed][0]) for seed in seeds), anytime)
+        together = [(first[seed][0], second[seed][0]) for seed in seeds]
+        return compare_pairs(pairs_of(together), anytime), course_of(together, anytime)
     alike = _scenes(one, condition) == _scenes(other, condition) and not first.keys() & second.keys()
     if not (first and second and alike) or anytime:
         return None
     a, b = one.reports[condition], other.reports[condition]
-    return compare_samples(a.successes, a.episodes, b.successes, b.episodes)
+    return compare_samples(a.successes, a.episodes, b.successes, b.episodes), {}
 
 
 def _by_seed(run: Run, condition: str) -> dict[int, tuple[Result, Any]]:

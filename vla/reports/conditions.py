@@ -1,21 +1,27 @@
-"""Table and plot of one policy under several conditions on the same seeds."""
+"""Tables and plot of one policy under several conditions on the same seeds."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from matplotlib.figure import Figure
+from rich.markup import escape
 from rich.table import Table
 
 from vla.reports.style import BLUE, GREEN, GREY, RED, error_bars, save
 from vla.rollouts.comparison import Comparison
 from vla.rollouts.evaluate import Report
+from vla.rollouts.motion import AMOUNTS
+from vla.rollouts.sequential import LEVEL
 
 # Suffix of a condition's name → colour, and vertical offset within the row.
 LEVELS = {"": (GREEN, 0.0), "wide": (BLUE, -0.13), "hard": (RED, 0.13)}
 TASKS = 40  # maximum number of tasks, over all conditions, that are tabulated
 COMPARED = ("difference", "95 % CI", "p", "p Holm", "verdict")  # heads of `comparison_texts`
+DECIDED = "p Holm of at most 0.05"
+
+Courses = Mapping[tuple[str, ...], Mapping[str, Comparison]]  # words that begin a row → comparisons by name
 
 
 def conditions_table(reports: Mapping[str, Report], compared: Mapping[str, Comparison]) -> Table:
@@ -45,6 +51,40 @@ def comparison_texts(compared: Comparison) -> tuple[str, str, str, str, str]:
     )
     together = "" if compared.p_holm is None else f"{compared.p_holm:.2g}"
     return difference, f"{low} to {high}", f"{compared.p:.2g}", together, compared.verdict
+
+
+def course_table(rows: Courses, heads: Sequence[str]) -> Table:
+    """Tabulate differences in milestones and motion, as `course_of` returns them; `heads` are those of the words."""
+    names = course_names(rows)
+    table = Table(
+        *heads,
+        *(escape(course_head(name)) for name in names),
+        caption=f"differences in the course of episodes; * {DECIDED}",
+    )
+    for words, course in rows.items():
+        texts = [course_texts(name, course[name]) if name in course else ("", "", False) for name in names]
+        table.add_row(*words, *(f"{difference} *" if decided else difference for difference, _, decided in texts))
+    return table
+
+
+def course_names(rows: Courses) -> list[str]:
+    """Return what was compared: fields of `Motion`, then milestones."""
+    found = {name for course in rows.values() for name in course}
+    return [*(name for name in AMOUNTS if name in found), *sorted(found - {*AMOUNTS})]
+
+
+def course_head(name: str) -> str:
+    """Return the head of a column of differences, with the unit."""
+    return AMOUNTS.get(name) or f"{name.replace('_', ' ')} [points]"
+
+
+def course_texts(name: str, compared: Comparison) -> tuple[str, str, bool]:
+    """Format a difference and its interval, and tell whether it is decided."""
+    factor, digits = (1, "+.2g") if name in AMOUNTS else (100, "+.1f")
+    difference, low, high = (
+        f"{factor * share:{digits}}" for share in (compared.difference, compared.ci_low, compared.ci_high)
+    )
+    return difference, f"{low} to {high}", compared.p_holm is not None and compared.p_holm <= LEVEL
 
 
 def plot_conditions(reports: Mapping[str, Report], path: Path) -> None:

@@ -38,6 +38,7 @@ def write_report(
     facts: Mapping[str, Any] | None = None,
     conditions: Mapping[str, Report] | None = None,
     compared: Mapping[str, Comparison] | None = None,
+    courses: Mapping[str, Mapping[str, Comparison]] | None = None,
 ) -> None:
     """Write a report as JSON atomically.
 
@@ -49,6 +50,7 @@ def write_report(
         facts: further entries, such as chosen options, parameters and latency.
         conditions: condition → report on the same seeds.
         compared: condition → comparison of its success with the first.
+        courses: condition → comparisons of its milestones and motion with the first.
     """
     content = {
         **summary(report),
@@ -59,7 +61,10 @@ def write_report(
             name: {
                 **summary(other),
                 "comparison": asdict(compared[name]) if compared else None,
+                "course": {key: asdict(each) for key, each in (courses or {}).get(name, {}).items()},
                 "outcomes": [result.outcome for result in other.results],
+                "reached": [result.milestones for result in other.results],
+                "motions": [result.motion and asdict(result.motion) for result in other.results],
             }
             for name, other in (conditions or {}).items()
         },
@@ -70,7 +75,8 @@ def write_report(
 
 
 def summary(report: Report) -> dict[str, Any]:
-    """Summarise a report for JSON: rate, interval, outcomes, milestones, and the same per task if there are several.
+    """Summarise a report for JSON: rate, interval, outcomes, milestones, motion, and the same per task if there
+    are several.
 
     With several instructions per episode also the rates of so many completed in a row, and their mean number.
 
@@ -89,6 +95,7 @@ def summary(report: Report) -> dict[str, Any]:
         "errors": len(report.errors),
         "taxonomy": report.taxonomy,
         "milestones": {name: _milestone(report, count) for name, count in report.milestones.items()},
+        "motion": {name: asdict(median) for name, median in report.medians.items()},
         **_in_a_row(report),
         "tasks": {task: summary(part) for task, part in tasks.items()},
         **({"tiers": {tier: summary(part) for tier, part in tiers.items()}} if tiers else {}),

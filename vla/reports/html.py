@@ -20,12 +20,13 @@ from markupsafe import Markup
 from vla.config.differences import ABSENT, at, differences
 from vla.data.index import listed
 from vla.io.files import write_text
-from vla.reports.comparison import RunComparison
-from vla.reports.conditions import comparison_texts
+from vla.reports.comparison import CASE, RunComparison, course_rows
+from vla.reports.conditions import Courses, comparison_texts, course_head, course_names, course_texts
 from vla.reports.posteriors import draw_posteriors
 from vla.reports.style import BLUE, GREEN, GREY, RED, Interval
 from vla.reports.training_curves import colours, draw_run, draw_runs
-from vla.rollouts.evaluate import IN_DISTRIBUTION, Report
+from vla.rollouts.evaluate import IN_DISTRIBUTION, Median, Report
+from vla.rollouts.motion import AMOUNTS
 from vla.runs.folder import Run, read_run
 from vla.spec import READABLE
 
@@ -37,6 +38,10 @@ ERRORS = "errors.png"  # of an open-loop evaluation
 FAILURES, SUCCESSES = 6, 3  # filmstrips on a run's page
 NAMED = 5  # maximum number of tasks in a title
 COMPARED = 3  # failures per run on a comparison
+
+
+# Heads of the columns, and rows of words and cells, which are difference, interval and whether that is decided.
+CourseTable = tuple[list[str], list[tuple[Sequence[str], list[tuple[str, str, bool] | None]]]]
 
 
 @dataclass(frozen=True)
@@ -76,6 +81,8 @@ def write_page(folder: Path) -> Path:
         facts=_facts(run),
         all_steps=at(run.config, "trainer.max_steps", None),
         tables=_rate_tables(run),
+        medians=_medians(run),
+        course=_course({(name,): part.course for name, part in run.report.conditions.items()} if run.report else {}),
         errors=_error_table(run),
         curves=draw_run(run.metrics),
         strips=_filmstrips(run, FAILURES, SUCCESSES),
@@ -109,6 +116,8 @@ def write_comparison(runs: Mapping[str, Run], compared: Sequence[RunComparison],
         posteriors=draw_posteriors(reports, compared, colours(len(runs))) if len(reports) == len(runs) else None,
         curves=draw_runs({name: run.metrics for name, run in runs.items()}),
         pairs=[(each, comparison_texts(each.found)) for each in compared],
+        course=_course(course_rows(compared)),
+        case=CASE,
         anytime=any(report.anytime for run in runs.values() for report in run.reports.values()),
         differences=_config_differences(runs),
         strips={name: strips for name, run in runs.items() if (strips := _filmstrips(run, COMPARED, 0))},
@@ -231,6 +240,19 @@ def _rate_tables(run: Run) -> dict[str, dict[str, tuple[Interval, str, Sequence[
             for name, part in run.report.in_a_row.items()
         },
     }
+
+
+def _medians(run: Run) -> list[tuple[str, Median]]:
+    return [(AMOUNTS[name], median) for name, median in run.report.motion.items()] if run.report else []
+
+
+def _course(rows: Courses) -> CourseTable:
+    names = course_names(rows)
+    return [course_head(name) for name in names], [
+        (words, [course_texts(name, course[name]) if name in course else None for name in names])
+        for words, course in rows.items()
+        if course
+    ]
 
 
 def _interval(report: Report) -> Interval:

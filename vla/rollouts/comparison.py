@@ -1,16 +1,21 @@
-"""Differences of two success rates: exact tests, intervals, and the adjustment for several comparisons."""
+"""Differences of success and of other amounts: exact tests, intervals, and the adjustment for several comparisons."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from bisect import bisect
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from math import hypot, sqrt
 from typing import NamedTuple, TypeVar
 
+import numpy as np
+
 from vla.rollouts.sequential import LEVEL, anytime_difference, anytime_p
 from vla.rollouts.statistics import wilson_interval
+from vla.spec import Array
 
 Key = TypeVar("Key")
+Amounts = Sequence[float] | Array
 
 
 class Pairs(NamedTuple):
@@ -24,24 +29,28 @@ class Pairs(NamedTuple):
 
 @dataclass(frozen=True)
 class Comparison:
-    """Success rate of a second policy or condition minus that of a first one."""
+    """Rate of a second policy or condition minus that of a first one, or the median of what an amount differs by."""
 
-    difference: float  # -1…1
+    difference: float  # a rate's is from -1 to 1
     ci_low: float  # of its 95 % confidence interval
     ci_high: float
-    p: float  # two-sided, for equal success
+    p: float  # two-sided, for equal rates, or for an amount that is as often larger as smaller
     episodes: int  # number of pairs; without pairs, of all episodes
-    only_first: int | None = None  # pairs in which only the first succeeded; None without pairs
+    only_first: int | None = None  # pairs in which only the first succeeded, or had more; None without pairs
     only_second: int | None = None
     p_holm: float | None = None  # adjusted for all comparisons made together, see `concluded`
     verdict: str = ""
 
-    def conclude(self, p_holm: float, margin: float) -> Comparison:
+    def conclude(self, p_holm: float, margin: float | None) -> Comparison:
         """Return a copy with an adjusted p-value and a verdict: a difference, none worse than `margin`, or neither.
 
         Not worse than a margin means that the lower end of the interval is above it (the test of non-inferiority at
-        2.5 %, not adjusted for the number of comparisons).
+        2.5 %, not adjusted for the number of comparisons). Without a margin a difference is neither better nor worse.
         """
+        if margin is None:
+            more = (self.only_second or 0) > (self.only_first or 0)  # the median may be 0
+            verdict = "open" if p_holm > LEVEL else "more" if more else "less"
+            return replace(self, p_holm=p_holm, verdict=verdict)
         points, bounded = f"{100 * margin:g} points", self.ci_low > -margin
         if p_holm > LEVEL:
             verdict = f"not worse by {points}" if bounded else "open"
@@ -75,7 +84,40 @@ def compare_samples(won_first: int, first: int, won_second: int, second: int) ->
     return Comparison(won_second / second - won_first / first, low, high, p, first + second)
 
 
-def concluded(comparisons: Mapping[Key, Comparison], margin: float) -> dict[Key, Comparison]:
+def compare_amounts(first: Amounts, second: Amounts, anytime: bool = False) -> Comparison | None:
+    """Compare an amount in pairs of episodes: the median difference, its interval, and the exact sign test.
+
+    The sign test is McNemar's with "had more" for "succeeded alone"; pairs without a difference do not count in it. It
+    assumes nothing about the distribution. With `anytime` it is valid whatever the reason to stop playing.
+
+    Args:
+        first: amounts of the first policy or condition.
+        second: those of the second one in the same episodes.
+
+    Returns:
+        None if there are too few pairs to find any difference.
+    """
+    differences = np.subtract(second, first)
+    if (interval := median_interval(differences, anytime)) is None:
+        return None
+    less, more = int((differences < 0).sum()), int((differences > 0).sum())
+    p = (anytime_p if anytime else mcnemar)(less, more)
+    return Comparison(float(np.median(differences)), *interval, p, len(differences), less, more)
+
+
+def median_interval(values: Amounts, anytime: bool = False) -> tuple[float, float] | None:
+    """Return the 95 % confidence interval of the median, between two of the values; None with too few of them.
+
+    It contains the medians that the sign test does not exclude (W. R. Thompson, "On confidence ranges for the median
+    and other expectation distributions", Annals of Mathematical Statistics 7, 1936).
+    """
+    ordered, test = np.sort(values), anytime_p if anytime else mcnemar
+    count = len(ordered)
+    outside = bisect(range(count // 2 + 1), LEVEL, key=lambda below: test(below, count - below))
+    return (float(ordered[outside - 1]), float(ordered[-outside])) if outside else None
+
+
+def concluded(comparisons: Mapping[Key, Comparison], margin: float | None) -> dict[Key, Comparison]:
     """Return the comparisons with verdicts that together find a false difference with a probability of at most 5 %.
 
     S. Holm, "A simple sequentially rejective multiple test procedure", Scandinavian Journal of Statistics 6 (1979).
@@ -84,7 +126,7 @@ def concluded(comparisons: Mapping[Key, Comparison], margin: float) -> dict[Key,
 
     Args:
         comparisons: those made together.
-        margin: what counts as not worse, 0…1.
+        margin: what counts as not worse, 0…1; None if it is not about success.
     """
     left = sum(
         each.only_first is None or each.only_first + (each.only_second or 0) > 0 for each in comparisons.values()

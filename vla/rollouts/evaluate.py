@@ -1,4 +1,4 @@
-"""Evaluation of a policy on unseen seeds: success rate, failures and milestones.
+"""Evaluation of a policy on unseen seeds: success rate, failures, milestones and motion.
 
 An episode is a function of its seed alone, so a report does not depend on the cluster or the number of workers.
 """
@@ -16,10 +16,12 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from vla.parallel.pool import THIS_PROCESS, Cluster, Crashed
-from vla.rollouts.comparison import Comparison, Pairs, compare_pairs, concluded
+from vla.rollouts.comparison import Comparison, Key, Pairs, compare_amounts, compare_pairs, concluded, median_interval
+from vla.rollouts.motion import AMOUNTS, Motion, motion_of
 from vla.rollouts.rollout import rollout
 from vla.rollouts.sequential import anytime_interval
 from vla.rollouts.statistics import bounded_mean_interval, stratified_interval, wilson_interval
@@ -48,6 +50,21 @@ class Result:
     milestones: tuple[str, ...] = ()  # in alphabetical order
     error: str = ""  # message, if the outcome is "error"
     completed: tuple[int, int] | None = None  # instructions completed, of how many; None if there is only one
+    motion: Motion | None = None  # None if the outcome is "error", or in reports of before it was measured
+
+
+@dataclass(frozen=True)
+class Median:
+    """Median over episodes, with its 95 % confidence interval."""
+
+    median: float
+    ci_low: float | None  # None with too few episodes
+    ci_high: float | None
+    episodes: int
+
+    def __str__(self) -> str:
+        """Format both with three digits."""
+        return f"{self.median:.3g}" + ("" if self.ci_low is None else f" ({self.ci_low:.3g}-{self.ci_high:.3g})")
 
 
 @dataclass(frozen=True)
@@ -101,6 +118,24 @@ class Report:
     def milestones(self) -> dict[str, int]:
         """Milestone → number of episodes in which it was reached, sorted by name."""
         return dict(sorted(Counter(name for result in self.results for name in result.milestones).items()))
+
+    @property
+    def amounts(self) -> dict[str, list[float]]:
+        """Field of `Motion` → its values in successful episodes, without fields that nobody measured."""
+        motions = [result.motion for result in self.results if succeeded(result)]
+        values = {name: [getattr(motion, name, None) for motion in motions] for name in AMOUNTS}
+        known = {name: [value for value in each if value is not None] for name, each in values.items()}
+        return {name: each for name, each in known.items() if each}
+
+    @property
+    def medians(self) -> dict[str, Median]:
+        """Field of `Motion` → its median in successful episodes, see `amounts`."""
+        return {
+            name: Median(
+                float(np.median(values)), *(median_interval(values, self.anytime) or (None, None)), len(values)
+            )
+            for name, values in self.amounts.items()
+        }
 
     @property
     def _chains(self) -> list[tuple[int, int]]:
@@ -176,22 +211,30 @@ class Report:
         Raises:
             ValueError: the reports have different seeds.
         """
-        anytime = self.anytime or other.anytime
+        return compare_pairs(pairs_of(self._together(other)), self.anytime or other.anytime)
+
+    def compare_course(self, other: Report) -> dict[str, Comparison]:
+        """Compare milestones and motion of another report with those of this one, see `compare` and `course_of`."""
+        return course_of(self._together(other), self.anytime or other.anytime)
+
+    def _together(self, other: Report) -> list[tuple[Result, Result]]:
         together = list(zip(self.results, other.results, strict=False))
         if any(one.seed != two.seed for one, two in together) or (
-            len(self.results) != len(other.results) and not anytime
+            len(self.results) != len(other.results) and not (self.anytime or other.anytime)
         ):
             raise ValueError("only reports on the same seeds can be compared")
-        return compare_pairs(pairs_of(together), anytime)
+        return together
 
     def __str__(self) -> str:
-        """Format failures, errors, milestones, several instructions, several tasks, tiers and, last, the success rate
-        with its interval."""
+        """Format failures, errors, milestones, motion, several instructions, several tasks, tiers and, last, the
+        success rate with its interval."""
         lines = [f"{outcome} {count}" for outcome, count in self.taxonomy.items() if outcome not in ("success", ERROR)]
         if self.errors:
             first = self.errors[0]
             lines.append(f"errors {len(self.errors)}, the first at seed {first.seed}: {first.error}")
         lines += [f"{name} {self._rate(count)}" for name, count in self.milestones.items()]
+        if medians := [f"{AMOUNTS[name]} {median}" for name, median in self.medians.items()]:
+            lines.append(f"medians of the successes, {self._ci}: {', '.join(medians)}")
         lines += [f"{name} completed in {self._rate(count)}" for name, count in self.in_a_row.items()]
         if row := self.mean_in_a_row:
             mean, low, high = (f"{value:.2f}" for value in row)
@@ -217,14 +260,36 @@ class Report:
         return "anytime-valid 95 % CI" if self.anytime else "95 % CI"
 
 
-def pairs_of(together: Iterable[tuple[Result, Result]]) -> Pairs:
-    """Count the outcomes of pairs of episodes, without those of which one was not completed."""
-    counts = Counter(
-        (one.outcome == "success", two.outcome == "success")
-        for one, two in together
-        if ERROR not in (one.outcome, two.outcome)
-    )
+def succeeded(result: Result) -> bool:
+    """Return whether an episode was a success."""
+    return result.outcome == "success"
+
+
+def pairs_of(together: Iterable[tuple[Result, Result]], happened: Callable[[Result], bool] = succeeded) -> Pairs:
+    """Count what happened in pairs of episodes, without those of which one was not completed."""
+    counts = Counter((happened(one), happened(two)) for one, two in together if ERROR not in (one.outcome, two.outcome))
     return Pairs(counts[True, True], counts[True, False], counts[False, True], counts[False, False])
+
+
+def course_of(together: Sequence[tuple[Result, Result]], anytime: bool) -> dict[str, Comparison]:
+    """Compare, in pairs of episodes, motion where both succeeded, and how often each milestone was reached.
+
+    Returns:
+        Field of `Motion` or milestone → comparison, without fields of which too few pairs are known.
+    """
+    found = {}
+    for name in AMOUNTS:
+        pairs = [
+            (getattr(one.motion, name), getattr(two.motion, name))
+            for one, two in together
+            if succeeded(one) and succeeded(two) and one.motion and two.motion
+        ]
+        known = np.array([pair for pair in pairs if None not in pair], float).reshape(-1, 2)
+        if compared := compare_amounts(known[:, 0], known[:, 1], anytime):
+            found[name] = compared
+    for name in sorted({name for pair in together for result in pair for name in result.milestones}):
+        found[name] = compare_pairs(pairs_of(together, lambda result, name=name: name in result.milestones), anytime)
+    return found
 
 
 def compare_conditions(reports: Mapping[str, Report], margin: float) -> dict[str, Comparison]:
@@ -236,6 +301,22 @@ def compare_conditions(reports: Mapping[str, Report], margin: float) -> dict[str
     """
     (_, first), *others = reports.items()
     return concluded({name: first.compare(report) for name, report in others}, margin)
+
+
+def compare_courses(reports: Mapping[str, Report]) -> dict[str, dict[str, Comparison]]:
+    """Return condition → comparisons of milestones and motion with those of the first condition, which has none.
+
+    Verdicts take all of them into account, but not the comparisons of success.
+    """
+    (_, first), *others = reports.items()
+    return concluded_courses({name: first.compare_course(report) for name, report in others})
+
+
+def concluded_courses(courses: Mapping[Key, Mapping[str, Comparison]]) -> dict[Key, dict[str, Comparison]]:
+    """Return what `course_of` found in several cases, with verdicts that take all of it into account."""
+    flat = {(case, name): compared for case, course in courses.items() for name, compared in course.items()}
+    found = concluded(flat, None)
+    return {case: {name: found[case, name] for name in course} for case, course in courses.items()}
 
 
 def evaluate(
@@ -317,6 +398,7 @@ def play(environment: Environment, agent: Agent, seed: int, recorder: Recorder |
     # Draws may be arrays; plain values support comparison and JSON.
     draws = json.loads(json.dumps(episode.draws, default=lambda value: value.tolist()))
     steps, milestones = len(episode.observations), tuple(sorted(episode.milestones))
+    motion = motion_of(episode, environment.spec.control_hz)
     return Result(
         seed,
         episode.outcome,
@@ -326,6 +408,7 @@ def play(environment: Environment, agent: Agent, seed: int, recorder: Recorder |
         episode.task,
         milestones,
         completed=episode.completed,
+        motion=motion,
     )
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from vla.spec import Agent, Environment, Episode, InARow, Recorder
+from vla.spec import Agent, Environment, Episode, InARow, Recorder, Traceable
 
 
 def rollout(environment: Environment, agent: Agent, seed: int, recorder: Recorder | None = None) -> Episode:
@@ -21,7 +21,8 @@ def rollout(environment: Environment, agent: Agent, seed: int, recorder: Recorde
     if recorder is not None:
         recorder.start(f"seed {seed}", environment)
     observations, clean, executed = [], [], []
-    components = len(environment.spec.action)
+    components, traced = len(environment.spec.action), environment if isinstance(environment, Traceable) else None
+    tool = [traced.tool] if traced else []
     while not environment.done:
         if observations and observation.instruction != observations[-1].instruction:
             agent.reset(observation.instruction, seed)
@@ -34,6 +35,8 @@ def rollout(environment: Environment, agent: Agent, seed: int, recorder: Recorde
         if recorder is not None:
             recorder.step(observation, action, agent.info)
         observation = environment.step(action)
+        if traced:
+            tool.append(traced.tool)
     episode = Episode(
         seed=seed,
         task=environment.task,
@@ -45,6 +48,7 @@ def rollout(environment: Environment, agent: Agent, seed: int, recorder: Recorde
         actions=np.asarray(clean, dtype=np.float32),
         executed=np.asarray(executed, dtype=np.float32),
         completed=_completed(environment),
+        tool=np.array(tool) if traced else None,
     )
     if recorder is not None:
         recorder.end(episode)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
+from itertools import repeat
 from typing import Annotated, Any
 
 from pydantic import ConfigDict, StringConstraints
@@ -10,7 +12,8 @@ from pydantic import ConfigDict, StringConstraints
 from vla.io.documents import STRICT
 from vla.io.types import Count, Natural, NonNegative, Positive, Share
 from vla.rollouts.comparison import Comparison
-from vla.rollouts.evaluate import Result
+from vla.rollouts.evaluate import Median, Result
+from vla.rollouts.motion import Motion
 
 Node = dict[str, Any]
 CheckpointName = Annotated[str, StringConstraints(pattern=r"^\w[\w.-]*\.ckpt$")]  # in the run's own folder
@@ -109,6 +112,7 @@ class Summary:
     taxonomy: dict[str, Natural]
     milestones: dict[str, Milestone]
     tasks: dict[str, Summary]
+    motion: dict[str, Median] = field(default_factory=dict)  # field of `vla.rollouts.motion.Motion` → over successes
     in_a_row: dict[str, Milestone] = field(default_factory=dict)  # "1/4" → at least one of four instructions
     mean_in_a_row: MeanInARow | None = None
     tiers: dict[str, Summary] = field(default_factory=dict)
@@ -152,6 +156,18 @@ class Condition(Summary):
 
     outcomes: list[str]  # with `anytime`, of the first seeds
     comparison: Comparison | None = None  # with the training condition
+    course: dict[str, Comparison] = field(default_factory=dict)  # milestone or field of `Motion` → the same
+    # Per episode, as `outcomes`; empty in reports of before they were kept.
+    reached: list[tuple[str, ...]] = field(default_factory=list)  # milestones
+    motions: list[Motion | None] = field(default_factory=list)
+
+    def results(self, seeds: Sequence[int]) -> tuple[Result, ...]:
+        """Return what is known of the episodes of these seeds."""
+        reached, motions = self.reached or repeat(()), self.motions or repeat(None)
+        return tuple(
+            Result(seed, outcome, milestones=milestones, motion=motion)
+            for seed, outcome, milestones, motion in zip(seeds, self.outcomes, reached, motions, strict=False)
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -177,3 +193,5 @@ class ReportFile(Summary):
             played = len(condition.outcomes)
             if played > len(self.seeds) or (played < len(self.seeds) and not condition.anytime):
                 raise ValueError(f"conditions.{name} has {played} outcomes of {len(self.seeds)} seeds")
+            if any(len(each) not in (0, played) for each in (condition.reached, condition.motions)):
+                raise ValueError(f"conditions.{name} has other episodes in reached or motions than in outcomes")

@@ -19,7 +19,7 @@ import yaml
 from vla.config.differences import at
 from vla.io.documents import read_bounded, read_json, read_yaml
 from vla.io.files import write_text
-from vla.rollouts.evaluate import IN_DISTRIBUTION, Report, Result
+from vla.rollouts.evaluate import IN_DISTRIBUTION, Report
 from vla.runs.files import Change, ErrorsFile, Node, ReportFile, Training
 from vla.spec import Array
 
@@ -64,11 +64,11 @@ class Run:
 
     @cached_property
     def reports(self) -> dict[str, Report]:
-        """Condition → report, the training condition first; reports of the others have only seeds and outcomes."""
+        """Condition → report, the training condition first; reports of the others have no draws and instructions."""
         if not self.report:
             return {}
         others = {
-            name: Report(tuple(map(Result, self.report.seeds, part.outcomes)), anytime=part.anytime)
+            name: Report(part.results(self.report.seeds), anytime=part.anytime)
             for name, part in self.report.conditions.items()
         }
         tiers = {tier: [*part.tasks] for tier, part in self.report.tiers.items()}

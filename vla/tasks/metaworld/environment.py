@@ -97,6 +97,7 @@ class MetaWorld:
         self.done, self.outcome, self.task = True, "timeout", ""
         self.milestones: frozenset[str] = frozenset()
         self.draws: dict[str, Any] = {}
+        self.tool: Array = np.zeros(3)
 
     def task_of(self, seed: int) -> str:
         """Return the task of the episode of `seed`."""
@@ -148,6 +149,7 @@ class MetaWorld:
 
     def _look(self, observation: Array) -> Observation:
         pictures = () if self._blind else self._scene.pictures()
+        self.tool = observation[:3].copy()  # position of the hand
         truth = {
             "object": observation[OBJECT],
             "goal": observation[GOAL],

@@ -177,6 +177,12 @@ class Tabletop:
         """Control step and description of every disturbance so far in this episode."""
         return self._task.events
 
+    @property
+    def tool(self) -> Array:
+        """(3,) true position of the tool centre point in the world frame [m]."""
+        compiled = self._task.compiled
+        return compiled.data.site_xpos[compiled.tcp].copy()
+
     def _state(self) -> Array:
         """Measure (2 J + 1,) float32: joint positions [rad], their velocities [rad/s] and the gripper's opening [m]."""
         compiled, noise = self._task.compiled, self._task.compiled.noise
