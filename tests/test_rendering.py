@@ -7,6 +7,8 @@ import hashlib
 import subprocess
 import sys
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +26,7 @@ from vla.config.substitutes import options, with_substitutes
 from vla.spec import Array
 from vla.tasks import gl
 from vla.tasks.rendering import shapes
+from vla.tasks.rendering.context import Context
 from vla.tasks.rendering.fast import Fast, FastRenderer
 from vla.tasks.rendering.reference import Reference, ReferenceRenderer
 from vla.tasks.rendering.renderer import Renderer, View
@@ -228,6 +231,25 @@ def test_another_process_draws_the_same_bytes(tmp_path: Path) -> None:
     assert done.stdout.split()[-1] == hashlib.sha256(content).hexdigest(), done.stderr[-500:]
 
 
+def test_renderers_share_a_context_and_draw_by_turns() -> None:
+    scenes, alone = [], []
+    for lights, settings in (("spot", {}), ("directional", {"samples": 4}), ("several", {"soft": 1})):
+        model, data = gallery(lights)
+        with closing(fast(**settings).open(model, View((0,), SIZE, SIZE))) as renderer:
+            alone.append(renderer.render(data)[0])
+        scenes.append((settings, model, data))
+    renderers = [fast(**settings).open(model, View((0,), SIZE, SIZE)) for settings, model, _ in scenes]
+    with ThreadPoolExecutor() as pool:
+        for left in (3, 3, 2):  # the last one is closed, and the others go on
+            for renderer in renderers[left:]:
+                renderer.close()
+            for renderer, (_, _, data), expected in zip(renderers[:left], scenes, alone, strict=False):
+                assert np.array_equal(renderer.render(data)[0], expected)
+                assert np.array_equal(pool.submit(renderer.render, data).result()[0], expected)
+    for renderer in renderers[:2]:
+        renderer.close()
+
+
 def test_a_store_belongs_to_a_renderer() -> None:
     folders, names = zip(*(collected_with(renderer) for renderer in ("fast", "mujoco")), strict=True)
     assert len(set(folders)) == 2
@@ -254,6 +276,7 @@ def test_without_egl_the_error_names_the_other_renderer(monkeypatch: pytest.Monk
         raise Exception("libEGL.so not found")
 
     monkeypatch.setattr(moderngl, "create_standalone_context", refuse)
+    monkeypatch.setattr("vla.tasks.rendering.fast.shared_context", Context)  # that of this process exists already
     model, _ = gallery("spot")
     with pytest.raises(RuntimeError, match=r"lacks \(libEGL.so not found\): .*, or choose task/renderer=mujoco"):
         fast().open(model, View((0,), 8, 8))

@@ -10,7 +10,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Collection
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import moderngl
 import mujoco
@@ -22,6 +22,7 @@ from vla.tasks.gl import has_egl
 from vla.tasks.rendering import lights, shaders, shapes
 from vla.tasks.rendering.buffers import Buffers
 from vla.tasks.rendering.cameras import Cameras
+from vla.tasks.rendering.context import Context, shared_context
 from vla.tasks.rendering.decimate import decimate
 from vla.tasks.rendering.elements import Elements, elements_of, unsupported
 from vla.tasks.rendering.geometry import Geometry
@@ -32,7 +33,6 @@ from vla.tasks.rendering.textures import Textures
 log = logging.getLogger(__name__)
 BEHIND = 0.3  # factor on the alpha of a plane seen from behind, as in MuJoCo
 ALIGNMENT = 256  # of a camera's block in its buffer [bytes], enough for every machine
-BACKEND: Any = {"backend": "egl"}
 PACKAGES = "libegl1, libgl1 and libgl1-mesa-dri"
 
 
@@ -71,27 +71,27 @@ class Fast:
         return f"the fast renderer needs EGL, which this machine lacks (packages {PACKAGES})", "mujoco"
 
     def open(self, model: mujoco.MjModel, view: View) -> Renderer:
-        """Make a renderer of `model`, with a GL context in this thread.
+        """Make a renderer of `model`.
 
         Raises:
             RuntimeError: this machine has no EGL. Nothing else draws in its place, because a store names its renderer.
         """
         try:
-            gl = moderngl.create_standalone_context(**BACKEND)
+            context = shared_context()
         except Exception as error:  # moderngl raises plain exceptions
             raise RuntimeError(
                 f"the fast renderer needs EGL, which this machine lacks ({error}): install the packages "
                 f"{PACKAGES}, or choose task/renderer=mujoco"
             ) from error
-        return FastRenderer(gl, model, view, self)
+        return FastRenderer(context, model, view, self)
 
 
 class FastRenderer:
     """Pictures of one model by OpenGL 3.3."""
 
-    def __init__(self, gl: moderngl.Context, model: mujoco.MjModel, view: View, settings: Fast) -> None:
-        """Args: the context, which the renderer owns; the model; what to draw of it; settings."""
-        self._gl: Any = gl  # its type annotations are too narrow
+    def __init__(self, context: Context, model: mujoco.MjModel, view: View, settings: Fast) -> None:
+        """Args: the context; the model; what to draw of it; settings."""
+        self._context, self._gl = context, context.gl
         self._model, self._view, self._settings = model, view, settings
         self._cameras = Cameras(model, view)
         missing = unsupported(model, view)
@@ -101,13 +101,12 @@ class FastRenderer:
         sky = np.flatnonzero(model.tex_type == mujoco.mjtTexture.mjTEXTURE_SKYBOX)
         self._sky = int(sky[0]) if len(sky) else -1
         self._geometry = Geometry(model, self._mesh)
-        with gl:
+        with context.used_by(self):
             self._make_targets()
             self._make_tables()
-            self._textures = Textures(gl, model)
+            self._textures = Textures(context.gl, model)
             self._make_programs()
             self._make_buffers()
-            gl.depth_func = "<="
         self.update()
 
     def _mesh(self, mesh: int) -> shapes.Shape:
@@ -156,8 +155,9 @@ class FastRenderer:
         }
         units = {"poses": self._pose_texture, "table": self._table_texture}
         units |= {f"shadow{number}": depth for number, depth in enumerate(self._shadows.maps)}
-        for unit, (name, texture) in enumerate(units.items()):
-            texture.use(unit)
+        self._units = list(units.values())
+        self._bind()
+        for unit, name in enumerate(units):
             for program in (*self._programs.values(), self._shadows.program):
                 if name in program:
                     program[name] = unit
@@ -169,6 +169,11 @@ class FastRenderer:
         rows = -(-4 * floats // ALIGNMENT) * ALIGNMENT // 4
         self._blocks = np.zeros((len(self._cameras.ids), rows), np.float32)
         self._camera_buffer = gl.buffer(reserve=self._blocks.nbytes)
+
+    def _bind(self) -> None:
+        """Bind the textures that all programs read to their units."""
+        for unit, texture in enumerate(self._units):
+            texture.use(unit)
 
     def _make_buffers(self) -> None:
         gl = self._gl
@@ -183,7 +188,9 @@ class FastRenderer:
 
     def update(self, textures: Collection[int] = ()) -> None:
         """Upload what has changed in the model; `textures` are the ids of those whose pixels have."""
-        with self._gl:
+        with self._context.used_by(self) as changed:
+            if changed:
+                self._bind()
             self._textures.upload(set(textures))
             elements = self._elements = elements_of(self._model, self._view)
             self._planes = np.flatnonzero(elements.seen & (elements.kind == mujoco.mjtGeom.mjGEOM_PLANE))
@@ -240,7 +247,9 @@ class FastRenderer:
 
     def render(self, data: mujoco.MjData) -> tuple[Array, Array]:
         """Draw colours (cameras, H, W, 3) uint8 and depth (cameras, H, W) float32 [m]."""
-        with self._gl:
+        with self._context.used_by(self) as changed:
+            if changed:
+                self._bind()
             self._upload_poses(data)
             self._upload_cameras(data)
             self._shadows.cast(self._poses, data.light_xpos[self._lamps], self._projections)
@@ -362,8 +371,10 @@ class FastRenderer:
         return depth
 
     def close(self) -> None:
-        """Free the GL context and all that is in it."""
-        self._gl.release()
+        """Free all that the renderer has in the GL context."""
+        context = self._context
+        vars(self).clear()
+        context.clean()
 
 
 def _merged(runs: Collection[Run]) -> list[Run]:

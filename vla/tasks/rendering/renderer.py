@@ -23,7 +23,7 @@ class View:
 
 
 class Renderer(Protocol):
-    """Off-screen renderer of one model; its GL context is bound to the thread that created it."""
+    """Off-screen renderer of one model; it may be bound to the thread that made it."""
 
     def update(self, textures: Collection[int] = ()) -> None:
         """Take over changes of the model since the last call: call it after every change, such as at resets.
@@ -43,7 +43,7 @@ class Renderer(Protocol):
         ...
 
     def close(self) -> None:
-        """Free the GL context."""
+        """Free what the renderer has in GL."""
         ...
 
 
@@ -51,5 +51,5 @@ class Rendering(Protocol):
     """A choice of renderer with its settings, before there is a model."""
 
     def open(self, model: mujoco.MjModel, view: View) -> Renderer:
-        """Make a renderer of `model`, with a GL context in this thread."""
+        """Make a renderer of `model`."""
         ...
