@@ -44,10 +44,10 @@ def test_reports_on_different_seeds_are_not_compared() -> None:
 def test_the_table_and_the_picture_show_every_condition(tmp_path: Path, figures: list[Figure]) -> None:
     hard, wide = (a_report("1" * count + "0" * (20 - count)) for count in (10, 15))
     reports = {"seen": a_report("1" * 20), "light_hard": hard, "light_wide": wide}
-    console = Console(file=io.StringIO(), width=120)
+    console = Console(file=io.StringIO(), width=80)
     console.print(conditions_table(reports, compare_conditions(reports, 0.02)))
     told = console.file.getvalue()  # type: ignore[attr-defined]
-    assert "light_hard" in told and "50.0" in told and "29.9-70.1" in told and "0.002" in told
+    assert "light_hard" in told and "50.0" in told and "29.9-70.1" in told
     # ten lost, none won, and of two comparisons the clearer one counts twice
     assert "-50.0" in told and "0.0039" in told and "worse" in told
     assert told.count("pick_place") == 0
@@ -70,11 +70,10 @@ def test_the_table_tells_who_obeys_and_who_stays_where_both_are_asked_for() -> N
     stays = Report(tuple(Result(index, "did_not_stay", task="stay") for index in range(3)))
     console = Console(file=io.StringIO(), width=120)
     console.print(conditions_table({"seen": seen, "impossible": stays}, {}))
-    told = [line.split("│")[1:6] for line in console.file.getvalue().splitlines() if "│" in line]  # type: ignore[attr-defined]
-    rows = [[cell.strip() for cell in line[:4]] for line in told]
-    assert rows == [
-        ["seen", "2", "3", "66.7"],
-        ["pick_place", "1", "2", "50.0"],
-        ["stay", "1", "1", "100.0"],
-        ["impossible", "0", "3", "0.0"],
+    told = [line.split()[:3] for line in console.file.getvalue().splitlines() if "/" in line]  # type: ignore[attr-defined]
+    assert told == [
+        ["seen", "2/3", "66.7"],
+        ["pick_place", "1/2", "50.0"],
+        ["stay", "1/1", "100.0"],
+        ["impossible", "0/3", "0.0"],
     ]

@@ -11,7 +11,7 @@ from typing import Any
 from rich.table import Table
 
 from vla.config.differences import at
-from vla.reports.conditions import COMPARED, Courses, comparison_texts
+from vla.reports.conditions import COMPARED, NARROW, Courses, short_texts
 from vla.rollouts.comparison import Comparison, compare_pairs, compare_samples, concluded
 from vla.rollouts.evaluate import (
     ERROR,
@@ -83,9 +83,9 @@ def compare_runs(runs: Mapping[str, Run], margin: float) -> list[RunComparison]:
 
 def runs_table(compared: Sequence[RunComparison]) -> Table:
     """Tabulate comparisons of runs."""
-    table = Table(*CASE, "episodes", *COMPARED)
+    table = Table(*CASE, "episodes", *COMPARED, **NARROW)
     for each in compared:
-        table.add_row(each.other, each.one, each.condition, str(each.found.episodes), *comparison_texts(each.found))
+        table.add_row(each.other, each.one, each.condition, str(each.found.episodes), *short_texts(each.found))
     return table
 
 

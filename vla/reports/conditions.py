@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from matplotlib.figure import Figure
+from rich.box import SIMPLE_HEAD
 from rich.markup import escape
 from rich.table import Table
 
@@ -18,7 +20,8 @@ from vla.rollouts.sequential import LEVEL
 # Suffix of a condition's name → colour, and vertical offset within the row.
 LEVELS = {"": (GREEN, 0.0), "wide": (BLUE, -0.13), "hard": (RED, 0.13)}
 TASKS = 40  # maximum number of tasks, over all conditions, that are tabulated
-COMPARED = ("difference", "95 % CI", "p", "p Holm", "verdict")  # heads of `comparison_texts`
+COMPARED = ("points (95 % CI)", "p Holm", "verdict")  # heads of `short_texts`
+NARROW: dict[str, Any] = {"box": SIMPLE_HEAD, "collapse_padding": True, "pad_edge": False}  # fits 80 columns
 DECIDED = "p Holm of at most 0.05"
 
 Courses = Mapping[tuple[str, ...], Mapping[str, Comparison]]  # words that begin a row → comparisons by name
@@ -30,18 +33,18 @@ def conditions_table(reports: Mapping[str, Report], compared: Mapping[str, Compa
     Rows below a condition are about each of its tasks, if it has several and the table stays short.
     """
     detailed = sum(len(report.tasks) for report in reports.values()) <= TASKS
-    table = Table("condition", "success", "of", "%", "95 % CI", *COMPARED)
+    table = Table("condition", "success", "% (95 % CI)", *COMPARED, **NARROW)
     for name, report in reports.items():
-        table.add_row(name, *_rate(report), *(comparison_texts(compared[name]) if name in compared else ()))
+        table.add_row(name, *_rate(report), *(short_texts(compared[name]) if name in compared else ()))
         for task, part in report.tasks.items() if detailed and len(report.tasks) > 1 else ():
             table.add_row(f"  {task}", *_rate(part))
     return table
 
 
-def _rate(report: Report) -> tuple[str, str, str, str]:
-    """Format successes, episodes, success rate and its interval."""
+def _rate(report: Report) -> tuple[str, str]:
+    """Format successes of episodes, and the success rate with its interval."""
     low, high = (f"{100 * bound:.1f}" for bound in report.interval)
-    return str(report.successes), str(report.episodes), f"{100 * report.success:.1f}", f"{low}-{high}"
+    return f"{report.successes}/{report.episodes}", f"{100 * report.success:.1f} ({low}-{high})"
 
 
 def comparison_texts(compared: Comparison) -> tuple[str, str, str, str, str]:
@@ -53,12 +56,19 @@ def comparison_texts(compared: Comparison) -> tuple[str, str, str, str, str]:
     return difference, f"{low} to {high}", f"{compared.p:.2g}", together, compared.verdict
 
 
+def short_texts(compared: Comparison) -> tuple[str, str, str]:
+    """Format the difference with its interval in percentage points, the adjusted p-value, and the verdict."""
+    difference, interval, _, together, verdict = comparison_texts(compared)
+    return f"{difference} ({interval})", together, verdict
+
+
 def course_table(rows: Courses, heads: Sequence[str]) -> Table:
     """Tabulate differences in milestones and motion, as `course_of` returns them; `heads` are those of the words."""
     names = course_names(rows)
     table = Table(
         *heads,
         *(escape(course_head(name)) for name in names),
+        **NARROW,
         caption=f"differences in the course of episodes; * {DECIDED}",
     )
     for words, course in rows.items():
