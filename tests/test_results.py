@@ -28,7 +28,7 @@ def test_what_was_written_is_read(tmp_path: Path) -> None:
     save_choice(folder, "best.ckpt")
     run = read_run(folder)
     assert run.training == Training(12, 40, 3.0, "done", 2.0, "best.ckpt")
-    assert (chosen_checkpoint(folder), run.model, run.tasks) == ("best.ckpt", "BC", [])
+    assert (chosen_checkpoint(folder), run.policy, run.tasks) == ("best.ckpt", "BC", [])
     assert wall_time(folder / "checkpoints/best.ckpt", 1.0) == 6.0
     assert run.changes == [Change("model.width", 16, 32)] and run.config["task"] == CONFIG["task"]
     assert run.report is not None and run.report.successes == 1
@@ -91,7 +91,7 @@ def test_a_configuration_with_other_things_in_it_is_shown_as_it_is(config: dict[
     report = folder / "report.json"
     report.write_text(json.dumps({**json.loads(report.read_text()), "config": config}))
     page = compared([folder, other], tmp_path).read_text()
-    assert "model" in page
+    assert "policy" in page
 
 
 def test_a_row_that_a_killed_process_left_half_is_skipped(tmp_path: Path) -> None:

@@ -428,5 +428,6 @@ def test_whoever_acts_is_evaluated_by_the_same_job(tmp_path: Path) -> None:
     here(tmp_path, "agent=expert", *common, "task.time_limit=10", "output=expert")
     report = json.loads((tmp_path / "expert/report.json").read_text())
     assert (report["model"], report["successes"]) == ("expert", 1)
+    assert "<h1>expert · pick place</h1>" in (tmp_path / "expert/report.html").read_text()
     refused = here(tmp_path, "agent=expert", "job=train", ok=False).stderr
     assert refused == "error: job=train takes no agent: agent=OPTION goes with job=evaluate and deploy\n"

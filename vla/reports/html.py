@@ -112,7 +112,7 @@ def write_comparison(runs: Mapping[str, Run], compared: Sequence[RunComparison],
         "comparison.html",
         title=f"{len(runs)} runs" if len(runs) > 1 else next(iter(runs)),
         lines=lines,
-        heads=(["run"], ["model", "parameters [M]", "action [ms]", "steps", "time"], ""),
+        heads=(["run"], ["policy", "parameters [M]", "action [ms]", "steps", "time"], ""),
         posteriors=draw_posteriors(reports, compared, colours(len(runs))) if len(reports) == len(runs) else None,
         curves=draw_runs({name: run.metrics for name, run in runs.items()}),
         pairs=[(each, comparison_texts(each.found)) for each in compared],
@@ -167,7 +167,7 @@ def _write(path: Path, template: str, **content: Any) -> Path:
 
 def _title(run: Run) -> str:
     tasks = ", ".join(run.tasks) if len(run.tasks) <= NAMED else f"{len(run.tasks)} tasks"
-    return " · ".join(part for part in (run.model, tasks.replace("_", " ")) if part) or run.folder.resolve().name
+    return " · ".join(part for part in (run.policy, tasks.replace("_", " ")) if part) or run.folder.resolve().name
 
 
 def _facts(run: Run) -> dict[str, str]:
@@ -262,7 +262,7 @@ def _interval(report: Report) -> Interval:
 def _costs(run: Run) -> list[str]:
     logged = max((steps[-1] + 1 for steps, _ in run.metrics.values()), default=ABSENT)
     return [
-        run.model or ABSENT,
+        run.policy or ABSENT,
         ABSENT if run.parameters is None else f"{run.parameters / 1e6:.2f}",
         f"{run.report.latency_ms:.1f}" if run.report and run.report.latency_ms else ABSENT,
         str(run.training.steps if run.training else logged),

@@ -47,8 +47,10 @@ class Run:
     errors: ErrorsFile | None
 
     @property
-    def model(self) -> str:
-        """Name of the model's class, or an empty string."""
+    def policy(self) -> str:
+        """Name of the model's class, or of another agent's option; an empty string if unknown."""
+        if at(self.config, "agent", None):
+            return str(at(self.config, "chosen.agent", "")).replace("_", " ")
         return str(at(self.config, "model._target_", "")).rpartition(".")[2]
 
     @property
