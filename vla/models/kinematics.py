@@ -22,8 +22,9 @@ class ForwardKinematics(nn.Module):
     def __init__(self, chain: tuple[tuple[float, ...], ...]) -> None:
         super().__init__()
         rows = torch.tensor(chain, dtype=torch.float64)
-        links = torch.eye(4, dtype=torch.float64).repeat(len(rows), 1, 1)
-        links[:, :3, :3], links[:, :3, 3] = _rotation(rows[:, 3:]), rows[:, :3]
+        # Not torch.eye, which imports PyTorch's compiler where the tensors of a checkpoint's model are counted.
+        links = torch.zeros(len(rows), 4, 4, dtype=torch.float64)
+        links[:, :3, :3], links[:, :3, 3], links[:, 3, 3] = _rotation(rows[:, 3:]), rows[:, :3], 1
         self.register_buffer("links", links.float(), persistent=False)
 
     def forward(self, joints: Tensor) -> Tensor:

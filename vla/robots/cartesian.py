@@ -64,18 +64,18 @@ def vector_from_rotation(rotation: Array) -> Array:
     return np.array([x * scale, y * scale, z * scale])
 
 
-def solve(arm: Kinematics, target: Array, joints: Array) -> Array:
+def solve(arm: Kinematics, target: Array, joints: Array, start: tuple[Array, Array] | None = None) -> Array:
     """Find joints near `joints` (J,) that bring the tool centre point to the (4, 4) pose `target`.
 
     By damped least squares (Nakamura and Hanafusa, "Inverse kinematic solutions with singularity robustness for robot
     manipulator control", 1986), with the home posture in their null space. Unreachable poses are approached as far as
-    the joint limits allow.
+    the joint limits allow. `start` is the result of `arm.forward(joints)`, where it is known.
     """
     joints = joints.copy()
-    for _ in range(ITERATIONS):
-        pose, jacobian = arm.forward(joints)
+    for iteration in range(ITERATIONS):
+        pose, jacobian = start if start and not iteration else arm.forward(joints)
         error = np.concatenate([target[:3, 3] - pose[:3, 3], vector_from_rotation(target[:3, :3] @ pose[:3, :3].T)])
-        if np.abs(error).max() < TOLERANCE:
+        if all(abs(component) < TOLERANCE for component in error.tolist()):
             break
         inverse = jacobian.T @ np.linalg.inv(jacobian @ jacobian.T + _DAMPING)
         posture = POSTURE_GAIN * (arm.home - joints)
@@ -104,13 +104,15 @@ class CartesianController:
     def __init__(self, arm: Kinematics, period: float, low: ArrayLike, high: ArrayLike) -> None:
         """Args: the arm; control period [s]; corners (3,) of the box for the tool point in the base frame [m]."""
         self.arm, self.period, self.low, self.high = arm, period, np.asarray(low), np.asarray(high)
-        self.joints = arm.home.copy()  # (J,) last commanded [rad]
-        self.pose = arm.forward(self.joints)[0]  # (4, 4) last commanded
+        self.reset(arm.home)
 
     def reset(self, joints: Array) -> None:
         """Set the last commanded joints (J,) [rad], for example to the measured ones."""
-        self.joints = np.array(joints, dtype=float)
-        self.pose = self.arm.forward(self.joints)[0]
+        self._command(np.array(joints, dtype=float))
+
+    def _command(self, joints: Array) -> None:
+        self.joints = joints  # (J,) last commanded [rad]
+        self.pose, self._jacobian = self.arm.forward(joints)  # (4, 4) and (6, J) there
 
     def step(self, motion: Array) -> Array:
         """Return joint targets (J,) [rad] one period ahead, within position and speed limits.
@@ -122,9 +124,8 @@ class CartesianController:
         target[:3, 3] = np.clip(self.pose[:3, 3] + motion[:3], self.low, self.high)
         target[:3, :3] = rotation_from_vector(motion[3:6]) @ self.pose[:3, :3]
         reach = self.arm.speed * self.period
-        solution = solve(self.arm, target, self.joints)
-        self.joints = self.joints + np.clip(solution - self.joints, -reach, reach)
-        self.pose = self.arm.forward(self.joints)[0]
+        solution = solve(self.arm, target, self.joints, (self.pose, self._jacobian))
+        self._command(self.joints + np.minimum(np.maximum(solution - self.joints, -reach), reach))
         return self.joints
 
     def motion_between(self, before: Array, after: Array) -> Array:

@@ -18,7 +18,7 @@ class Cameras:
 
     def __init__(self, model: mujoco.MjModel, view: View) -> None:
         """Args: the model; what to draw of it."""
-        self._model, self._view, self.ids = model, view, list(view.cameras)
+        self._model, self._view, self.ids = model, view, np.array(view.cameras)
         self._near, self._far = lights.clip_range(model)
 
     def update(self) -> None:
@@ -33,31 +33,29 @@ class Cameras:
         self.eyes, self.axes = data.cam_xpos[self.ids], data.cam_xmat[self.ids].reshape(-1, 3, 3)
         return self._lenses @ lights.inverse_pose(self.eyes, self.axes.swapaxes(1, 2))
 
-    def behind(self, planes: Array) -> Array:
-        """Return (cameras, P) bool: which planes of poses (P, 3, 4) the cameras see from behind."""
-        return ((self.eyes[:, None] - planes[:, :, 3]) * planes[:, :, 2]).sum(axis=2) < 0
+    def behind(self, number: int, plane: Array) -> bool:
+        """Return whether a camera sees a plane of pose (3, 4) from behind."""
+        return _dot((self.eyes[number] - plane[:, 3]).tolist(), plane[:, 2].tolist()) < 0
 
-    def filled(self, plane: Array, half: Array) -> list[bool]:
+    def filled(self, number: int, plane: Array, half: Array) -> bool:
         """Return whether all corners of a camera's picture show the front of a plane, which then hides the sky.
 
         Args:
+            number: of the camera.
             plane: pose (3, 4).
             half: half the extent (2,) [m], 0 for infinity.
         """
-        turn = plane[:, :3]
-        starts, ways = (self.eyes - plane[:, 3]) @ turn, turn.T @ self.axes @ self._corners
-        rays = ways.swapaxes(1, 2).tolist()  # faster than arrays for so few numbers
-        return [
-            all(self._meets(start, ray, half) for ray in four)
-            for start, four in zip(starts.tolist(), rays, strict=True)
-        ]
-
-    def _meets(self, start: list[float], ray: list[float], half: Array) -> bool:
-        """Return whether a ray from the eye to the far clipping plane meets the rectangle in z = 0 of its frame."""
-        if not (start[2] > 0 and self._near * -ray[2] < self._far * start[2] < self._far * -ray[2]):
-            return False
-        share = -start[2] / ray[2]
-        return all(size <= 0 or abs(at + share * way) <= size for at, way, size in zip(start, ray, half, strict=False))
+        x, y, normal, _ = plane.T.tolist()  # plain numbers are faster than arrays of so few
+        start, limits = (self.eyes[number] - plane[:, 3]).tolist(), [*zip((x, y), half.tolist(), strict=True)]
+        height = _dot(start, normal)
+        for ray in (self.axes[number] @ self._corners[number]).T.tolist():  # from the eye to the far clipping plane
+            fall = -_dot(ray, normal)
+            if not (height > 0 and self._near * fall < self._far * height < self._far * fall):
+                return False
+            there = [at + height / fall * way for at, way in zip(start, ray, strict=True)]
+            if any(0 < size < abs(_dot(there, axis)) for axis, size in limits):
+                return False
+        return True
 
     def _lens(self, camera: int) -> Array:
         """Return a camera's projection (4, 4)."""
@@ -72,3 +70,7 @@ class Cameras:
             return lights.frustum(-low[0], high[0], -high[1], low[1], near, far)
         half = near * np.tan(np.radians(fovy / 2))
         return lights.frustum(-aspect * half, aspect * half, -half, half, near, far)
+
+
+def _dot(one: list[float], other: list[float]) -> float:
+    return one[0] * other[0] + one[1] * other[1] + one[2] * other[2]

@@ -45,6 +45,15 @@ class Run:
     count: int  # of the indices
 
 
+@dataclass(frozen=True)
+class Sight:
+    """What a camera sees of sky and planes."""
+
+    state: bytes  # of camera and planes
+    sky: bool  # it may see the sky beside the planes
+    behind: list[int]  # planes that it sees from behind
+
+
 class Fast:
     """The choice of the fast renderer."""
 
@@ -193,12 +202,13 @@ class FastRenderer:
                 self._bind()
             self._textures.upload(set(textures))
             elements = self._elements = elements_of(self._model, self._view)
-            self._planes = np.flatnonzero(elements.seen & (elements.kind == mujoco.mjtGeom.mjGEOM_PLANE))
+            self._planes = np.flatnonzero(elements.seen & (elements.kind == mujoco.mjtGeom.mjGEOM_PLANE)).tolist()
             self._geometry.update(elements, self._sky >= 0)
             self._place_blocks()
             self._cameras.update()
             self._light_places: bytes | None = None
-            self._floors = [int(plane) for plane in self._planes if elements.opaque[plane]] if self._sky >= 0 else []
+            self._floors = [plane for plane in self._planes if elements.opaque[plane]]
+            self._sights = [Sight(b"", False, [])] * len(self._cameras.ids)
             sites = np.linalg.norm(elements.size[self._model.ngeom :], axis=1)
             self._bounds = np.append(self._model.geom_rbound, sites)  # radius of each element [m]
             table = self._new_table(elements)
@@ -252,13 +262,14 @@ class FastRenderer:
                 self._bind()
             self._upload_poses(data)
             self._upload_cameras(data)
-            self._shadows.cast(self._poses, data.light_xpos[self._lamps], self._projections)
+            self._shadows.cast(self._poses)
             self._drawn.use()
             self._gl.enable_only(STATE)
             self._gl.front_face = "cw"  # in pictures that are upside down
             self._drawn.clear(depth=1.0)
-            for number, (sky, behind) in enumerate(zip(self._sky_seen(), self._behind(), strict=True)):
-                self._draw(number, sky, behind)
+            self._look_at_planes()
+            for number, sight in enumerate(self._sights):
+                self._draw(number, sight)
             return self._read()
 
     def _upload_poses(self, data: mujoco.MjData) -> None:
@@ -280,8 +291,9 @@ class FastRenderer:
         table[1:, 3, :3], table[1:, 4, :3] = data.light_xpos[self._lights], data.light_xdir[self._lights]
         inner = 0.5 * (1 - RIM / max(1, self._model.vis.quality.shadowsize))
         onto_texture = np.array([[inner, 0, 0, 0.5], [0, inner, 0, 0.5], [0, 0, 0.5, 0.5], [0, 0, 0, 1]])
-        self._projections = [lights.shadow_projection(self._model, data, lamp) for lamp in self._lamps]
-        columns = [(onto_texture @ projection).T.ravel() for projection in self._projections]
+        projections = [lights.shadow_projection(self._model, data, lamp) for lamp in self._lamps]
+        self._shadows.aim(data.light_xpos[self._lamps], projections)
+        columns = [(onto_texture @ projection).T.ravel() for projection in projections]
         content = np.concatenate([*columns, table.ravel()])
         self._blocks[:, shaders.CAMERA : shaders.CAMERA + content.size] = content
 
@@ -295,30 +307,30 @@ class FastRenderer:
         blocks[:, head : head + 3] = -cameras.axes[:, :, 2]  # the direction of the headlight
         self._camera_buffer.write(blocks)
 
-    def _sky_seen(self) -> list[bool]:
-        """Return whether a camera may see the sky beside the planes."""
-        seen = [self._sky >= 0] * len(self._cameras.ids)
-        for plane in self._floors:
-            filled = self._cameras.filled(self._poses[plane], self._elements.size[plane, :2])
-            seen = [sky and not full for sky, full in zip(seen, filled, strict=True)]
-        return seen
+    def _look_at_planes(self) -> None:
+        """Note the sight of every camera that has moved, or whose planes have."""
+        cameras, planes = self._cameras, self._poses[self._planes]
+        for number, places in enumerate(zip(cameras.eyes, cameras.axes, strict=True)):
+            state = b"".join(array.tobytes() for array in (planes, *places))
+            if state != self._sights[number].state:
+                half = self._elements.size
+                sky = self._sky >= 0 and not any(
+                    cameras.filled(number, self._poses[plane], half[plane, :2]) for plane in self._floors
+                )
+                behind = [plane for plane in self._planes if cameras.behind(number, self._poses[plane])]
+                self._sights[number] = Sight(state, sky, behind)
 
-    def _behind(self) -> list[list[int]]:
-        """Return the planes that a camera sees from behind."""
-        behind = self._cameras.behind(self._poses[self._planes])
-        return [self._planes[planes].tolist() for planes in behind]
-
-    def _draw(self, number: int, sky: bool, behind: list[int]) -> None:
+    def _draw(self, number: int, sight: Sight) -> None:
         """Draw a camera's picture: what is opaque and the sky, then what is transparent and planes from behind."""
         view, size = self._view, self._blocks[number].nbytes
         self._camera_buffer.bind_to_uniform_block(0, offset=number * size, size=size)
         self._gl.viewport = 0, number * view.height, view.width, view.height
         for run in self._opaque:
             self._draw_run(run)
-        if sky:
+        if sight.sky:
             self._draw_run(self._runs[len(self._elements.kind)])
-        if self._transparent or behind:
-            self._draw_transparent(self._cameras.eyes[number], behind)
+        if self._transparent or sight.behind:
+            self._draw_transparent(self._cameras.eyes[number], sight.behind)
 
     def _draw_transparent(self, eye: Array, behind: list[int]) -> None:
         """Blend transparent elements and planes seen from behind, as MuJoCo does: from near to far, and back again."""
@@ -326,7 +338,7 @@ class FastRenderer:
             element: float(np.linalg.norm(self._poses[element, :, 3] - eye) - self._bounds[element])
             for element in {*self._transparent, *behind}
         }
-        distance |= {int(plane): np.inf for plane in self._planes if plane in distance}
+        distance |= {plane: np.inf for plane in self._planes if plane in distance}
         order = sorted(distance, key=lambda element: (distance[element], element))
         gl = self._gl
         gl.enable(moderngl.BLEND)

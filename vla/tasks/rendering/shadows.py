@@ -43,8 +43,9 @@ class Shadows:
         content = [(self._buffers.vertices, "3f 1f", "in_position", "in_element")]
         self._casters = gl.vertex_array(self.program, content, self._buffers.indices)
         fixed = (model.body_weldid == 0) & (model.body_mocapid < 0)
-        self._fixed = np.append(fixed[model.geom_bodyid], fixed[model.site_bodyid])  # by element
-        self._state: bytes | None = None  # that the maps of what stands still were drawn in
+        self._fixed = np.flatnonzero(np.append(fixed[model.geom_bodyid], fixed[model.site_bodyid]))  # elements
+        self._state: bytes | None = None  # of what stands still, in which its maps were drawn
+        self._written = -1  # number of the lamp whose uniforms the program has
 
     def _target(self) -> Any:
         """Make the framebuffer of a map, with a colour that nobody writes: without one moderngl copies nothing."""
@@ -59,29 +60,34 @@ class Shadows:
 
     def update(self, blocks: Sequence[Block]) -> None:
         """Upload the triangles that cast shadows."""
-        kinds = [(fixed, closed) for fixed in (True, False) for closed in (True, False)]
-        groups = [[block for block in blocks if (self._fixed[block.element], block.closed) == kind] for kind in kinds]
+        fixed = set(self._fixed.tolist())
+        kinds = [(still, closed) for still in (True, False) for closed in (True, False)]
+        groups = [[block for block in blocks if (block.element in fixed, block.closed) == kind] for kind in kinds]
         self._buffers.update([block.casting for group in groups for block in group])
         ends = np.cumsum([0, *(sum(block.casting.triangles.size for block in group) for group in groups)]).tolist()
         self._spans: list[Span] = [(first, end - first) for first, end in pairwise(ends)]
         self._state = None
 
-    def cast(self, poses: Array, lamps: Array, projections: Sequence[Array]) -> None:
-        """Draw the maps.
+    def aim(self, lamps: Array, projections: Sequence[Array]) -> None:
+        """Take over positions of the lamps (lamps, 3) [m], and projections (4, 4) of the world into their maps."""
+        self._uniforms = [
+            {"projection": projection.T.astype(np.float32).tobytes(), "lamp": lamp.astype(np.float32).tobytes()}
+            for projection, lamp in zip(projections, lamps, strict=True)
+        ]
+        self._state, self._written = None, -1
 
-        Args:
-            poses: of the elements (E, 3, 4).
-            lamps: positions of the lamps (lamps, 3) [m].
-            projections: of the world into the maps, (4, 4) each.
-        """
+    def cast(self, poses: Array) -> None:
+        """Draw the maps; `poses` are those of the elements (E, 3, 4)."""
         gl = self._gl
-        state = b"".join(array.tobytes() for array in (poses[: len(self._fixed)][self._fixed], lamps, *projections))
+        state = poses[self._fixed].tobytes()
         stale, self._state = state != self._state, state
         gl.front_face = "ccw"
         gl.polygon_offset = SLOPE + 2.0 * self._soft, UNITS  # averages reach across texels
-        for lamp, projection, still, drawn in zip(lamps, projections, self._still, self._drawn, strict=True):
-            self.program["projection"].write(projection.T.astype(np.float32).tobytes())
-            self.program["lamp"].write(lamp.astype(np.float32).tobytes())
+        for number, (still, drawn) in enumerate(zip(self._still, self._drawn, strict=True)):
+            if number != self._written:
+                for name, content in self._uniforms[number].items():
+                    self.program[name].write(content)
+                self._written = number
             if stale:
                 still.viewport = 0, 0, self._edge, self._edge
                 still.clear(depth=1.0)

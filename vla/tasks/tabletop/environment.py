@@ -7,7 +7,6 @@ from contextlib import contextmanager
 from statistics import NormalDist
 from typing import Any, Literal
 
-import dm_env
 import mujoco
 import numpy as np
 
@@ -133,23 +132,27 @@ class Tabletop:
 
         If it fails at one of them, the episode is about that one.
         """
-        task, physics, random_state = self._task, self.dm_env.physics, self.dm_env.random_state
-        expert = Waypoint(self.spec)
+        task, expert = self._task, Waypoint(self.spec)
         self._joint_noise = np.random.RandomState(0)
         task.disturber = None  # disturbances are for who acts next
         with self.blind():
             while task.current < number and not task.over:
-                task.before_step(physics, expert.act(self.look()), random_state)
-                task.advance(physics, task.substeps)
-                task.after_step(physics, random_state)
+                self._execute(expert.act(self.look()))
         task.isolate()
+
+    def _execute(self, action: Array) -> None:
+        """Go through one control period, as `dm_env.step` does with checks and observations of its own."""
+        task, physics, random_state = self._task, self.dm_env.physics, self.dm_env.random_state
+        task.before_step(physics, action, random_state)
+        task.advance(physics, task.substeps)
+        task.after_step(physics, random_state)
 
     def step(self, action: Array) -> Observation:
         """Apply one (7,) action, clipped to the spec's bounds, for one control period."""
         if self.done:
             raise ValueError("the episode is over; call reset(seed) before step(action)")
-        timestep: dm_env.TimeStep = self.dm_env.step(action)
-        self._update_outcome(timestep.last())
+        self._execute(action)
+        self._update_outcome(self._task.over)
         return self.look()
 
     def drive(self, joints: Array, opening: float, seconds: float) -> None:

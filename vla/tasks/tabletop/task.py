@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -126,8 +125,8 @@ class TabletopTask(composer.Task):
         self.controller.reset(data.qpos[self.compiled.joints])
         self._command = np.append(self.controller.joints, self.compiled.grip)
         data.ctrl[:] = self.compiled.controls(self._command[None])[0]
-        self._late: deque[Array] = deque()  # controls delayed by the latency
-        self._delay = round(self.compiled.latency / physics.timestep())
+        delay = round(self.compiled.latency / physics.timestep())
+        self._late = np.tile(data.ctrl, (delay, 1))  # controls of the last steps of physics that are still to come
         self._start()
         self._axes = draws
         self.draws = self._described()
@@ -254,9 +253,10 @@ class TabletopTask(composer.Task):
         self._shove += np.clip(self.disturber.offset - self._shove, -furthest, furthest)
         if self._shove.any():
             kinematics = self.scene.robot.kinematics
-            target = kinematics.forward(joints)[0]
+            start = kinematics.forward(joints)
+            target = start[0].copy()
             target[:3, 3] = np.clip(target[:3, 3] + self._shove, *WORKSPACE)
-            joints = solve(kinematics, target, joints)
+            joints = solve(kinematics, target, joints, start)
         return joints, 1.0 if self.disturber.opens else opening
 
     def advance(self, physics: mjcf.Physics, substeps: int) -> None:
@@ -266,12 +266,13 @@ class TabletopTask(composer.Task):
         targets = commands.copy()
         targets[:, :-1] += self.scene.robot.lead / physics.timestep() * self._increment[:-1]
         self._command = commands[-1]
+        controls = np.concatenate([self._late, self.compiled.controls(targets)])
+        self._late = controls[substeps:]
         model, data = physics.model.ptr, physics.data.ptr
+        ctrl = data.ctrl
         with physics.check_invalid_state():
-            for controls in self.compiled.controls(targets):
-                self._late.append(controls)
-                if len(self._late) > self._delay:
-                    data.ctrl[:] = self._late.popleft()
+            for now in controls[:substeps]:
+                ctrl[:] = now
                 mujoco.mj_step2(model, data)
                 mujoco.mj_step1(model, data)
 
