@@ -82,6 +82,7 @@ class ControlLoop:
         Observer(spec)  # raises an error if the state has more than joint states contain
         self._controller = controller_for(spec, safety.workspace)
         self._grip = spec.action.index(GRIPPER) if GRIPPER in {*spec.action} - {*model.joints} else None
+        self.grips = self._grip is not None
         self._motion = [index for index in range(len(spec.action)) if index != self._grip]
         if len(robot.joints) != len(model.joints):
             raise ValueError(
@@ -107,6 +108,8 @@ class ControlLoop:
         self._pending: tuple[float, float, Array] | None = None  # requested at, observed at, commanded then
         self._next_inference = -np.inf
         self._opening: float | None = 1.0
+        self.acting = False  # True if the last command is an action of the policy
+        self._committed: tuple[float, list[Command]] | None = None  # since when, commands of the ticks from then on
         self.observed_at = -np.inf  # time stamp of the last observation
         self.resumed = True  # True if the last observation is the first since the loop started to run
         self._last_observed = -np.inf  # as `observed_at`, but reset whenever the loop stops running
@@ -136,7 +139,7 @@ class ControlLoop:
             self.stop("the instruction is empty")
             return False
         self.instruction, self._instructed_at = instruction.strip(), now
-        self._schedule, self._next_inference = [], -np.inf
+        self._schedule, self._next_inference, self._committed = [], -np.inf, None
         if self.state is State.STOPPED and self._timed_out:
             self.resume(now)
         return self.state not in (State.STOPPED, State.FAULT)
@@ -173,6 +176,7 @@ class ControlLoop:
         if self._observer.moved(STILL_FOR) > STILL:
             raise ValueError("the arm still moves: let it rest first")
         self.limiter.start(measured.joints)
+        self._committed = None
         self._commanded.clear()
         self._record(now)
         self.handed_over, self._opening, self._off_track_since = False, None, None
@@ -241,7 +245,7 @@ class ControlLoop:
         if not self._follows_positions and (measured := self._observer.newest) is not None:
             self.limiter.position = np.array(measured.joints, float)
         ends = observed + period * np.arange(1, len(actions) + 1)
-        self._schedule = list(zip(ends.tolist(), goals, openings, strict=True))
+        self._schedule, self._committed = list(zip(ends.tolist(), goals, openings, strict=True)), None
         self._next_inference = float(ends[-1])
         return None
 
@@ -259,7 +263,13 @@ class ControlLoop:
         self._supervise(now)
         if not self._commanded:
             return None
-        if self.state is State.RUNNING and self._schedule:
+        self.acting = self.state is State.RUNNING and bool(self._schedule)
+        if self._committed is not None:
+            since, ahead = self._committed
+            planned = ahead[min(round((now - since) / self.tick), len(ahead) - 1)]
+            self.limiter.position, self.limiter.velocity = planned.position.copy(), planned.velocity.copy()
+            self._opening = planned.opening
+        elif self.acting:
             while len(self._schedule) > 1 and self._schedule[0][0] <= now:
                 self._schedule.pop(0)
             end, goal, self._opening = self._schedule[0]
@@ -284,6 +294,20 @@ class ControlLoop:
             limiter.brake()
             commands.append(Command(limiter.position.copy(), limiter.velocity.copy(), self._opening))
         return commands
+
+    def commit(self, command: Command, now: float) -> list[Command] | None:
+        """Return this tick's command and those after it, which the next ticks keep to until something changes.
+
+        For an arm that executes trajectories of its own. None if nothing has changed since the last one.
+        """
+        if self._committed is not None:
+            return None
+        self._committed = (now, [command, *self.horizon(now)])
+        return self._committed[1]
+
+    def limit(self, robot: Robot) -> None:
+        """Replace the limits."""
+        self.limiter.robot, self._committed = robot, None
 
     # Supervision.
 
@@ -349,6 +373,8 @@ class ControlLoop:
             self.hold(reason)
 
     def _set_state(self, state: State, reason: str) -> None:
+        if state is not self.state:
+            self._committed = None
         if state is not self.state and state is not State.RUNNING:
             self._observer.cameras.fresh, self._schedule = 0, []
             self._next_inference = self._last_observed = -np.inf
