@@ -26,10 +26,6 @@ DEFINITIONS = {
             "GripperCommand command\n---\nfloat64 position\nfloat64 effort\nbool stalled\nbool reached_goal\n---\n"
             "float64 position"
         ),
-        "action/ParallelGripperCommand.action": (
-            "sensor_msgs/JointState command\n---\nsensor_msgs/JointState state\nbool stalled\nbool reached_goal\n---\n"
-            "sensor_msgs/JointState state"
-        ),
         "action/FollowJointTrajectory.action": (
             "trajectory_msgs/JointTrajectory trajectory\n---\nint32 error_code\nint32 SUCCESSFUL = 0\n"
             "int32 INVALID_GOAL = -1\nint32 INVALID_JOINTS = -2\nint32 OLD_HEADER_TIMESTAMP = -3\n"
@@ -51,7 +47,6 @@ DEFINITIONS = {
 USED = (
     "action_msgs",
     "builtin_interfaces",
-    "sensor_msgs",
     "service_msgs",
     "std_msgs",
     "trajectory_msgs",
@@ -62,8 +57,8 @@ PREFIX = Path(sys.prefix)
 
 def make(folder: Path) -> None:
     """Generate and compile the packages; `folder` is to be on the path of Python modules."""
-    for package, definitions in DEFINITIONS.items():
-        _compile(folder, package, _generate(folder / "source", folder, package, definitions))
+    sources = [_generate(folder / "source", folder, *package) for package in DEFINITIONS.items()]
+    _compile(folder, [file for of_package in sources for file in of_package])
 
 
 def _generate(source: Path, modules: Path, package: str, definitions: dict[str, str]) -> list[Path]:
@@ -120,41 +115,30 @@ def _generate(source: Path, modules: Path, package: str, definitions: dict[str, 
     return made
 
 
-def _compile(modules: Path, package: str, sources: list[Path]) -> None:
-    """Compile the library of a package, all sources of a language at once: their headers take longer than they do."""
-    source, include = modules / "source", PREFIX / "include"
+def _compile(modules: Path, sources: list[Path]) -> None:
+    """Compile the library, all sources of a language at once: their headers take longer than they do."""
+    source, include, library = modules / "source", PREFIX / "include", modules / "messages.so"
     headers = [source, source / SUPPORTS[1], include, *(folder for folder in include.iterdir() if folder.is_dir())]
     headers += [Path(sysconfig.get_path("include")), Path(np.get_include())]
-    flags = ["-O0", "-w", "-fPIC", f'-DROS_PACKAGE_NAME="{package}"', *(f"-I{folder}" for folder in headers)]
+    flags = ["-O0", "-w", "-fPIC", *(f"-I{folder}" for folder in headers)]
     alone = [file for file in sources if file.stem.endswith("__description")]  # their names for themselves clash
-    together = [file for file in sources if file not in alone and file.suffix in (".c", ".cpp")]
+    groups = [[file for file in sources if file.suffix == suffix and file not in alone] for suffix in (".c", ".cpp")]
     objects = []
-    for number, files in enumerate([*([file] for file in alone), *_by_language(together)]):
-        joined = source / f"{package}{number}{files[0].suffix}"
+    for number, files in enumerate([*([file] for file in alone), *groups]):
+        joined = source / f"{number}{files[0].suffix}"
         joined.write_text("".join(f'#include "{file}"\n' for file in files))
         objects.append(joined.with_suffix(".o"))
         subprocess.run(["gcc", *flags, "-c", joined, "-o", objects[-1]], check=True)
     parts = ("rosidl_generator_c", "rosidl_generator_py", "rosidl_typesupport_c", *SUPPORTS)
     needs = [f"{used}__{part}" for used in USED for part in parts]
-    needs += [
-        "rosidl_runtime_c",
-        "rosidl_typesupport_c",
-        *SUPPORTS,
-        "rosidl_typesupport_fastrtps_cpp",
-        "rmw",
-        "rcutils",
-        "fastcdr",
-    ]
-    folder = modules / package
-    names = [f"lib{package}__{support}.so" for support in SUPPORTS]
-    for name, content in (
-        (names[0], [*objects, f"-L{PREFIX / 'lib'}", *(f"-l{need}" for need in needs)]),
-        (names[1], [folder / names[0]]),
-        (f"{package}_s__rosidl_typesupport_c.so", [folder / name for name in names]),
-    ):
-        linked = ["-shared", "-o", folder / name, "-Wl,--no-as-needed,-rpath,$ORIGIN", f"-Wl,-soname,{name}"]
-        subprocess.run(["g++", *linked, *content], check=True)
-
-
-def _by_language(files: list[Path]) -> list[list[Path]]:
-    return [[file for file in files if file.suffix == suffix] for suffix in (".c", ".cpp")]
+    needs += ["rosidl_runtime_c", "rosidl_typesupport_c", *SUPPORTS, "rosidl_typesupport_fastrtps_cpp"]
+    needs += ["rmw", "rcutils", "fastcdr", "stdc++"]
+    link = ["gcc", "-shared", "-Wl,--no-as-needed,-rpath,$ORIGIN"]
+    subprocess.run(
+        [*link, "-o", library, *objects, f"-L{PREFIX / 'lib'}", *(f"-l{need}" for need in needs)], check=True
+    )
+    for package in DEFINITIONS:
+        supports = [modules / package / f"lib{package}__{support}.so" for support in SUPPORTS]
+        module = modules / package / f"{package}_s__rosidl_typesupport_c.so"
+        for name, content in ((supports[0], [library]), (supports[1], [library]), (module, supports)):
+            subprocess.run([*link, "-o", name, f"-Wl,-soname,{name.name}", *content], check=True)

@@ -17,6 +17,7 @@ from action_servers import Controller, TrajectoryController
 from arm import FORWARD, ROBOT, SAFETY, SPEC
 from defaults import defaults_of
 from lifecycle_msgs.msg import Transition
+from sensor_msgs.msg import JointState
 from std_srvs.srv import SetBool
 from world import TOPICS, World
 
@@ -27,7 +28,7 @@ from vla.deploy.control_loop import State
 from vla.deploy.ros import Network
 from vla.deploy.ros2 import PolicyDeployment
 from vla.deploy.settings import FrankaGripper, GripperCommand
-from vla.robots.panda import HOME
+from vla.robots.panda import HOME, forward
 
 pytestmark = [
     pytest.mark.realtime,
@@ -83,9 +84,10 @@ def test_an_arm_follows_trajectories_that_replace_each_other(make_world: Callabl
         assert not any(goal.trajectory.points[-1].velocities)
         assert (np.abs(speeds(goal)) <= 0.25 * np.array(ROBOT.speed) + 1e-9).all()
         assert (np.abs(np.diff(speeds(goal), axis=0)) <= 0.2 * np.array(ROBOT.acceleration) * 0.02 + 1e-9).all()
-    commanded = np.array([command.position[:7] for command in world.commands])
-    steps = np.diff(commanded, axis=0) / 0.02
-    assert (np.abs(np.diff(steps, axis=0)) <= 0.2 * np.array(ROBOT.acceleration) * 0.02 * 2 + 1e-6).all()
+    for before, after in itertools.pairwise(controller.goals):
+        ahead = np.array([point.positions for point in before.trajectory.points])
+        off = np.abs(ahead - after.trajectory.points[0].positions).max(1).min()
+        assert off <= 2 * 0.2 * max(ROBOT.acceleration) * 0.02**2 + 1e-9  # it goes on where the arm is
     assert world.commands[-1].name == [*ROBOT.joints, *ROBOT.fingers]
 
 
@@ -119,9 +121,9 @@ def test_a_server_that_fails_stops_the_policy_with_its_name_and_the_reason(make_
         world.live(5.0, until=lambda: world.state is State.FAULT)
         assert world.agent.loop is not None and re.match(saying, world.agent.loop.reason), world.agent.loop.reason
         assert "to continue: deactivate and activate" in world.agent.loop.reason
-        world.live(0.3)
-        resting = world.joints
         world.live(0.2)
+        resting = world.joints
+        world.live(0.1)
         np.testing.assert_array_equal(world.joints, resting)
         assert world.change(Transition.TRANSITION_DEACTIVATE)
         controller.accepts = True
@@ -139,7 +141,10 @@ def test_a_server_that_fails_stops_the_policy_with_its_name_and_the_reason(make_
     controller.end("abort", error_code=-4, error_string="panda_joint2 is 0.3 rad off")
     fails("the action server /commands aborted a goal: PATH_TOLERANCE_VIOLATED, panda_joint2 is 0.3 rad off")
     goes_on()
-    controller.end("abort", **controller.replaced)  # by a goal of another client
+    for _ in range(20):  # goals of another client: the next own one may be under way and replace them
+        if controller.running:
+            controller.end("abort", **controller.replaced)
+        world.live(0.1, until=lambda: world.state is State.FAULT)
     fails("the action server /commands aborted a goal: INVALID_GOAL, Current goal cancelled due to new incoming")
     goes_on()
     controller.accepts = False
@@ -154,9 +159,6 @@ def test_a_server_that_fails_stops_the_policy_with_its_name_and_the_reason(make_
 
 GRIPPERS = {
     "GripperCommand": GripperCommand(**defaults_of("deploy/gripper/gripper_command")),
-    "ParallelGripperCommand": GripperCommand(
-        **defaults_of("deploy/gripper/gripper_command", action="ParallelGripperCommand")
-    ),
     "franka": FrankaGripper(**defaults_of("deploy/gripper/franka")),
 }
 
@@ -170,8 +172,9 @@ def test_a_gripper_is_told_once_per_change_and_a_grasp_is_no_error(make_world: C
         close, open_ = Controller(world.node, Grasp, "/gripper/grasp"), Controller(world.node, Move, "/gripper/move")
         grasped, fault = {"success": False}, {"success": False, "error": "libfranka: connection lost"}
     else:
-        kind = getattr(__import__("control_msgs.action", fromlist=[name]), name)
-        close = open_ = Controller(world.node, kind, "/gripper")
+        from control_msgs.action import GripperCommand as Kind
+
+        close = open_ = Controller(world.node, Kind, "/gripper")
         grasped, fault = {"stalled": True}, {"stalled": False}
 
     def policy(opening: float) -> None:
@@ -186,14 +189,14 @@ def test_a_gripper_is_told_once_per_change_and_a_grasp_is_no_error(make_world: C
     world.start()
     goal = told(open_)
     assert len(open_.goals) == 1 and world.state is State.RUNNING
-    assert (goal.width if name == "franka" else np.sum(goal.command.position)) == GRIPPERS[name].open
+    assert (goal.width if name == "franka" else goal.command.position) == GRIPPERS[name].open
     open_.end("succeed", **({"success": True} if name == "franka" else {"reached_goal": True}))
     for opening in (0.5, 0.3, 0.5, 0.3):  # once it is clearly closed
         policy(opening)
-        world.live(0.25)
+        world.live(0.2)
     goal = told(close)
     assert len({*map(id, [*open_.goals, *close.goals])}) == 2
-    assert (goal.width if name == "franka" else np.sum(goal.command.position)) == 0.0
+    assert (goal.width if name == "franka" else goal.command.position) == 0.0
     close.end("abort", **grasped)
     world.live(0.3)
     assert world.state is State.RUNNING
@@ -222,11 +225,12 @@ def test_a_gripper_that_changes_its_mind_cancels_first(make_world: Callable[...,
 
 def test_a_dry_run_sends_no_goal(make_world: Callable[..., World]) -> None:
     world = make_world(FOLLOW, "--ros-args", "-p", "dry_run:=true", gripper=GRIPPERS["GripperCommand"])
+    would: list[JointState] = []
+    world.node.create_subscription(JointState, "/vla_agent/dry_run/commands", would.append, 100)
     controller = controlled(world)
-    world.start()
-    world.live(0.5)
+    world.start(lambda: would)
+    world.live(0.3)
     assert world.state is State.RUNNING and controller.goals == [] and world.commands == []
-    assert world.agent.count_publishers("/vla_agent/dry_run/commands") == 1
 
 
 def test_what_goals_command_is_recorded_and_imported(make_world: Callable[..., World], tmp_path: Path) -> None:
@@ -234,14 +238,14 @@ def test_what_goals_command_is_recorded_and_imported(make_world: Callable[..., W
     controlled(world)
     recorder = BagRecorder(world.node, tmp_path / "bag")
     world.start()
-    world.live(1.5)
+    world.live(1.2)
     recorder.close()
     topics = replace(TOPICS, commands="/vla_agent/commands", gripper=None)
     imported = BagDemonstrations(tmp_path / "bag", "all", topics, "/vla_agent/status", ROBOT, "centre", spec=SPEC)
     (episode,) = map(imported.episode, range(len(imported)))
-    moved = [action for action in episode.actions if action[0] > 0.005]
-    assert len(moved) > 5
-    np.testing.assert_allclose(np.mean(moved, 0), FORWARD[0], atol=2e-3)
+    places = [forward(np.array(command.position[:7]))[0][0, 3] for command in world.commands]
+    assert len(episode.actions) > 5 and np.abs(episode.actions[:, 1:6]).max() < 1e-3
+    assert 0.5 * np.ptp(places) < episode.actions[:, 0].sum() < np.ptp(places) + 1e-3 and np.ptp(places) > 0.02
 
 
 @pytest.mark.parametrize(

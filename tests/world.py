@@ -164,12 +164,12 @@ class World:
         request = ChangeState.Request(transition=Transition(id=transition))
         return bool(self.ask(ChangeState, "change_state", request).success)
 
-    def start(self) -> None:
-        """Configure, activate, connect, and send the instruction."""
+    def start(self, commanded: Callable[[], Any] | None = None) -> None:
+        """Configure, activate, connect, and send the instruction once something is commanded."""
         assert self.change(Transition.TRANSITION_CONFIGURE) and self.change(Transition.TRANSITION_ACTIVATE)
         publishers = [*self.images.values(), self.states, self.words]
         self.spin(lambda: all(publisher.get_subscription_count() for publisher in publishers))
-        self.live(2.0, until=lambda: self.commands)
+        self.live(2.0, until=commanded or (lambda: self.commands))
         self.words.publish(String(data="put the red block on the pad"))
         self.live(2.0, until=lambda: self.policy.seen[-1].instruction)
         self.live(0.1)

@@ -157,10 +157,9 @@ class GripperGoals:
         node: Any,
         settings: GripperCommand | FrankaGripper,
         server: str,
-        fingers: list[str],
         fail: Callable[[str], None],
     ) -> None:
-        """Args: the node; what the gripper takes; name of its server; names of the fingers; as of `GoalSender`.
+        """Args: the node; what the gripper takes; name of its server; as of `GoalSender`.
 
         Raises:
             ValueError: a package of messages is not installed.
@@ -182,11 +181,10 @@ class GripperGoals:
             (kind,) = (action_class(*names) for names in settings.actions)
             # A stall is what a grasp looks like.
             only = sender(kind, server, lambda result, _: "" if result.stalled else "it does not reach its position")
-            positions = {True: settings.open, False: settings.closed}
-            self._goals = {
-                wanted: (only, _gripper_goal(kind, fingers, position, settings.effort))
-                for wanted, position in positions.items()
-            }
+            self._goals = {wanted: (only, kind.Goal()) for wanted in (True, False)}
+            for wanted, position in ((True, settings.open), (False, settings.closed)):
+                command = self._goals[wanted][1].command
+                command.position, command.max_effort = position, settings.effort
         self.senders = {sender.name: sender for sender, _ in self._goals.values()}
         self.reset()
 
@@ -214,12 +212,3 @@ class GripperGoals:
             sender, goal = self._goals[self._wanted]
             self._sent = self._wanted
             sender.send(goal)
-
-
-def _gripper_goal(kind: Any, fingers: list[str], position: float, effort: float) -> Any:
-    goal = kind.Goal()
-    if hasattr(goal.command, "max_effort"):
-        goal.command.position, goal.command.max_effort = position, effort
-    else:
-        goal.command.name, goal.command.position, goal.command.effort = fingers[:1], [position], [effort]
-    return goal

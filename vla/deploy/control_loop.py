@@ -110,6 +110,7 @@ class ControlLoop:
         self._opening: float | None = 1.0
         self.acting = False  # True if the last command is an action of the policy
         self._committed: tuple[float, list[Command]] | None = None  # since when, commands of the ticks from then on
+        self._keeps = False  # True if the arm is to keep to them
         self.observed_at = -np.inf  # time stamp of the last observation
         self.resumed = True  # True if the last observation is the first since the loop started to run
         self._last_observed = -np.inf  # as `observed_at`, but reset whenever the loop stops running
@@ -139,7 +140,7 @@ class ControlLoop:
             self.stop("the instruction is empty")
             return False
         self.instruction, self._instructed_at = instruction.strip(), now
-        self._schedule, self._next_inference, self._committed = [], -np.inf, None
+        self._schedule, self._next_inference, self._keeps = [], -np.inf, False
         if self.state is State.STOPPED and self._timed_out:
             self.resume(now)
         return self.state not in (State.STOPPED, State.FAULT)
@@ -176,7 +177,7 @@ class ControlLoop:
         if self._observer.moved(STILL_FOR) > STILL:
             raise ValueError("the arm still moves: let it rest first")
         self.limiter.start(measured.joints)
-        self._committed = None
+        self._committed, self._keeps = None, False
         self._commanded.clear()
         self._record(now)
         self.handed_over, self._opening, self._off_track_since = False, None, None
@@ -245,7 +246,7 @@ class ControlLoop:
         if not self._follows_positions and (measured := self._observer.newest) is not None:
             self.limiter.position = np.array(measured.joints, float)
         ends = observed + period * np.arange(1, len(actions) + 1)
-        self._schedule, self._committed = list(zip(ends.tolist(), goals, openings, strict=True)), None
+        self._schedule, self._keeps = list(zip(ends.tolist(), goals, openings, strict=True)), False
         self._next_inference = float(ends[-1])
         return None
 
@@ -265,19 +266,21 @@ class ControlLoop:
             return None
         self.acting = self.state is State.RUNNING and bool(self._schedule)
         if self._committed is not None:
-            since, ahead = self._committed
-            planned = ahead[min(round((now - since) / self.tick), len(ahead) - 1)]
-            self.limiter.position, self.limiter.velocity = planned.position.copy(), planned.velocity.copy()
-            self._opening = planned.opening
-        elif self.acting:
-            while len(self._schedule) > 1 and self._schedule[0][0] <= now:
-                self._schedule.pop(0)
-            end, goal, self._opening = self._schedule[0]
-            self.limiter.step(goal, end - now)
-        else:
-            self.limiter.brake()
+            self._catch_up(*self._committed, now)
+        if not self._keeps:
+            self._move(now)
         self._record(now)
         return Command(self.limiter.position.copy(), self.limiter.velocity.copy(), self._opening)
+
+    def _move(self, now: float) -> None:
+        """Take this tick's step along the schedule, or brake."""
+        if not self.acting:
+            self.limiter.brake()
+            return
+        while len(self._schedule) > 1 and self._schedule[0][0] <= now:
+            self._schedule.pop(0)
+        end, goal, self._opening = self._schedule[0]
+        self.limiter.step(goal, end - now)
 
     def horizon(self, now: float) -> list[Command]:
         """Return the commands after this tick's if no further input arrives; the last one is at rest."""
@@ -300,14 +303,22 @@ class ControlLoop:
 
         For an arm that executes trajectories of its own. None if nothing has changed since the last one.
         """
-        if self._committed is not None:
+        if self._keeps:
             return None
-        self._committed = (now, [command, *self.horizon(now)])
-        return self._committed[1]
+        ahead = [command, *self.horizon(now)]
+        self._committed, self._keeps = (now, ahead), True
+        return ahead
+
+    def _catch_up(self, since: float, ahead: list[Command], now: float) -> None:
+        """Move to where an arm that executes `ahead` is to be after this tick; before it, if something has changed."""
+        ticks = round((now - since) / self.tick) - (not self._keeps)
+        planned = ahead[min(max(ticks, 0), len(ahead) - 1)]
+        self.limiter.position, self.limiter.velocity = planned.position.copy(), planned.velocity.copy()
+        self._opening = planned.opening
 
     def limit(self, robot: Robot) -> None:
         """Replace the limits."""
-        self.limiter.robot, self._committed = robot, None
+        self.limiter.robot, self._keeps = robot, False
 
     # Supervision.
 
@@ -374,7 +385,7 @@ class ControlLoop:
 
     def _set_state(self, state: State, reason: str) -> None:
         if state is not self.state:
-            self._committed = None
+            self._keeps = False
         if state is not self.state and state is not State.RUNNING:
             self._observer.cameras.fresh, self._schedule = 0, []
             self._next_inference = self._last_observed = -np.inf

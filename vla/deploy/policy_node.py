@@ -176,7 +176,7 @@ class PolicyNode(GuardedLifecycleNode):
             kind, complaint = action_class(*TRAJECTORY_ACTION), actions.trajectory_complaint
             self._arm_goals = GoalSender(self, kind, topics.commands, complaint, self._fail)
         if gripper is not None and topics.gripper is not None and not self._dry_run:
-            self._gripper_goals = GripperGoals(self, gripper, topics.gripper, loop.robot.fingers, self._fail)
+            self._gripper_goals = GripperGoals(self, gripper, topics.gripper, self._fail)
 
     @property
     def _senders(self) -> list[GoalSender]:

@@ -54,9 +54,8 @@ class Timing:
 
 @dataclass(frozen=True)
 class GripperCommand:
-    """A gripper that takes GripperCommand or ParallelGripperCommand of control_msgs."""
+    """A gripper that takes GripperCommand of control_msgs."""
 
-    action: Literal["GripperCommand", "ParallelGripperCommand"]
     open: float  # position of the joint [m] or [rad]
     closed: float
     effort: Positive  # largest [N] or [Nm]
@@ -64,7 +63,7 @@ class GripperCommand:
     @property
     def actions(self) -> list[tuple[str, str]]:
         """Packages and names of the actions."""
-        return [("control_msgs", self.action)]
+        return [("control_msgs", "GripperCommand")]
 
 
 @dataclass(frozen=True)
