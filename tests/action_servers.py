@@ -18,12 +18,12 @@ class Controller:
     def __init__(self, node: Any, kind: Any, name: str) -> None:
         self.goals: list[Any] = []
         self.ended: list[str] = []  # how goals ended, in this order
-        self.accepts = True
+        self.accepts, self.takes = True, 0.0  # goals, after so long [s]
         self._kind = kind
         self._running: tuple[Any, Future] | None = None
         self.server = ActionServer(
             *(node, kind, name, self._execute),
-            goal_callback=lambda goal: GoalResponse.ACCEPT if self.accepts else GoalResponse.REJECT,
+            goal_callback=self._on_goal,
             cancel_callback=lambda handle: CancelResponse.ACCEPT,
         )
 
@@ -31,6 +31,10 @@ class Controller:
     def running(self) -> bool:
         """Whether a goal is executed."""
         return self._running is not None
+
+    def _on_goal(self, goal: Any) -> GoalResponse:
+        time.sleep(self.takes)
+        return GoalResponse.ACCEPT if self.accepts else GoalResponse.REJECT
 
     async def _execute(self, handle: Any) -> Any:
         if self._running is not None:
