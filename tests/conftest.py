@@ -7,6 +7,7 @@ import gc
 import os
 import shutil
 import signal
+import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from tempfile import mkdtemp
@@ -122,6 +123,17 @@ def made_once(factory: pytest.TempPathFactory, name: str, make: Callable[[Path],
             make(folder)
             Path(f"{folder}.made").touch()
     return folder
+
+
+@pytest.fixture(scope="session")
+def action_packages(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """The packages control_msgs and franka_msgs of ROS 2 can be imported."""
+    import action_messages
+
+    folder = str(made_once(tmp_path_factory, "action_messages", action_messages.make))
+    sys.path.append(folder)
+    yield
+    sys.path.remove(folder)
 
 
 @pytest.fixture(scope="session")

@@ -5,13 +5,18 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
 from conftest import make_tabletop
+from defaults import defaults_of
 from rerun.chunk import RrdReader
 
+from vla.deploy.joint_limiter import Robot
+from vla.deploy.ros import Network
+from vla.deploy.ros2 import SimulatorDeployment
+from vla.deploy.settings import Timing, Topics
 from vla.reports.evaluation import summary, write_report
 from vla.reports.filmstrips import read_filmstrips
 from vla.reports.html import write_page
@@ -208,3 +213,22 @@ def test_disturbances_are_of_the_episode_not_of_an_instruction() -> None:
             assert len(environment.events) <= 1 and began == sorted(began)  # none is forgotten
     assert happened >= 2 and environment.completed == 3
     environment.close()
+
+
+def test_a_simulator_that_plays_single_instructions_refuses_a_chain(chain: Tabletop, tmp_path: Path) -> None:
+    parts: dict[str, Any] = {
+        "robot": Robot(**defaults_of("deploy/robot/simulated")),
+        "topics": Topics(**defaults_of("deploy/topics/isaac")),
+        "timing": Timing(10.0, 10.0, 0.0, 0.5, False, 1.0),
+    }
+    nothing: Any = None
+    deployment = SimulatorDeployment(
+        **parts,
+        network=Network.named("loopback"),
+        seed=FIRST,
+        policy=nothing,
+        environment=lambda: chain,
+        output=tmp_path,
+    )
+    with pytest.raises(ValueError, match=r"^deploy=simulator waits for one instruction .*: set task\.goal\.length=1$"):
+        deployment.run()

@@ -344,6 +344,30 @@ def test_the_horizon_is_continuous_with_the_commands() -> None:
     assert np.ptp(sent, axis=0).max() > 0.1
 
 
+def test_an_arm_that_executes_trajectories_of_its_own_stays_within_the_limits(world: World) -> None:
+    """Though ticks are skipped, and with a goal for every plan and stop only."""
+    loop, random, path, sent = world.loop, np.random.default_rng(0), [world.joints.copy()], 0
+    world.answer = lambda observation: random.uniform(SPEC.low, SPEC.high, (1, 7)).astype(np.float32)
+    ahead: list[Command] = [Command(world.joints.copy(), np.zeros(7), 1.0)]
+    since = world.now
+    for number, command in enumerate(world.ticks(3.0)):
+        if (new := loop.commit(command, world.now)) is not None:
+            ahead, since, sent = new, world.now, sent + 1
+        np.testing.assert_array_equal(
+            command.position, ahead[min(round((world.now - since) * 50), len(ahead) - 1)].position
+        )
+        path.append(command.position)
+        if number % 7 == 3:  # the next tick is skipped, and the arm moves on
+            world.now += 0.02
+            path.append(ahead[min(round((world.now - since) * 50), len(ahead) - 1)].position)
+        if number == 120:
+            loop.stop("enough")
+    speeds = np.diff(path, axis=0) * 50
+    assert np.abs(speeds).max() > 0.1 and (np.abs(speeds) <= ROBOT.max_speed + 1e-9).all()
+    assert (np.abs(np.diff(speeds, axis=0)) <= ROBOT.max_acceleration * 0.02 + 1e-9).all()
+    assert sent < 50 and loop.limiter.resting
+
+
 def test_a_new_instruction_reaches_the_policy_with_the_next_frame(world: World) -> None:
     received: list[str] = []
 

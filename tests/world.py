@@ -37,7 +37,8 @@ from vla.spec import Array, Observation
 
 TOPICS = Topics({"front": "/front", "wrist": "/wrist"}, "/joint_states", "/words", "/commands", "/gripper", None)
 KINDS = {"joint_state": JointState, "trajectory": JointTrajectory, "forward": Float64MultiArray}
-TWIST = {"twist": TwistStamped}
+TOPIC = {"follow_joint_trajectory": "/vla_agent/commands"}  # of the commands, where it is not /commands
+OTHERS = {"twist": TwistStamped, "follow_joint_trajectory": JointState}
 
 
 class Forward:
@@ -66,7 +67,9 @@ class Forward:
 class World:
     """Cameras, an arm that follows its commands, and an operator; the policy node runs in the same thread."""
 
-    def __init__(self, domain: int, command: Any, arguments: list[str], compressed: bool = False) -> None:
+    def __init__(
+        self, domain: int, command: Any, arguments: list[str], compressed: bool = False, gripper: Any = None
+    ) -> None:
         Network.named("loopback").apply()
         self.contexts = [Context(), Context()]
         for context, given in zip(self.contexts, (arguments, None), strict=True):
@@ -80,7 +83,7 @@ class World:
             network=Network.named("loopback"),
             topics=replace(TOPICS, images=topics),
             safety=SAFETY,
-            **defaults_of("deploy/ros2", command=command),
+            **defaults_of("deploy/ros2", command=command, gripper=gripper),
             policy=nothing,
             environment=nothing,
             output=Path(),
@@ -95,7 +98,9 @@ class World:
         self.states = self.node.create_publisher(JointState, "/joint_states", 1)
         self.words = self.node.create_publisher(String, "/words", 1)
         self.commands: list[Any] = []
-        self.node.create_subscription({**KINDS, **TWIST}[command], "/commands", self.commands.append, 100)
+        kind, topic = {**KINDS, **OTHERS}[command], TOPIC.get(command, "/commands")
+        self.node.create_subscription(kind, topic, self.commands.append, 100)
+        self.follow: Callable[[Array], Array] | None = None  # joints → joints: moves the arm in place of its commands
         self.statuses: list[DiagnosticStatus] = []
         self.node.create_subscription(DiagnosticStatus, "/vla_agent/status", self.statuses.append, 100)
         self.joints = HOME.copy()
@@ -124,7 +129,9 @@ class World:
                 self.simulated += 0.02
                 self.clock.publish(Clock(clock=self._now()))
             if self.measures:
-                if self.commands and isinstance(self.commands[-1], TwistStamped):
+                if self.follow is not None:
+                    self.joints = self.follow(self.joints)
+                elif self.commands and isinstance(self.commands[-1], TwistStamped):
                     self.joints = self.joints + 0.02 * rates(self.commands[-1], self.joints)
                 elif self.commands:
                     self.joints = positions(self.commands[-1])[0]
@@ -157,12 +164,12 @@ class World:
         request = ChangeState.Request(transition=Transition(id=transition))
         return bool(self.ask(ChangeState, "change_state", request).success)
 
-    def start(self) -> None:
-        """Configure, activate, connect, and send the instruction."""
+    def start(self, commanded: Callable[[], Any] | None = None) -> None:
+        """Configure, activate, connect, and send the instruction once something is commanded."""
         assert self.change(Transition.TRANSITION_CONFIGURE) and self.change(Transition.TRANSITION_ACTIVATE)
         publishers = [*self.images.values(), self.states, self.words]
         self.spin(lambda: all(publisher.get_subscription_count() for publisher in publishers))
-        self.live(2.0, until=lambda: self.commands)
+        self.live(2.0, until=commanded or (lambda: self.commands))
         self.words.publish(String(data="put the red block on the pad"))
         self.live(2.0, until=lambda: self.policy.seen[-1].instruction)
         self.live(0.1)

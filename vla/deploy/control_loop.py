@@ -82,6 +82,7 @@ class ControlLoop:
         Observer(spec)  # raises an error if the state has more than joint states contain
         self._controller = controller_for(spec, safety.workspace)
         self._grip = spec.action.index(GRIPPER) if GRIPPER in {*spec.action} - {*model.joints} else None
+        self.grips = self._grip is not None
         self._motion = [index for index in range(len(spec.action)) if index != self._grip]
         if len(robot.joints) != len(model.joints):
             raise ValueError(
@@ -107,6 +108,9 @@ class ControlLoop:
         self._pending: tuple[float, float, Array] | None = None  # requested at, observed at, commanded then
         self._next_inference = -np.inf
         self._opening: float | None = 1.0
+        self.acting = False  # True if the last command is an action of the policy
+        self._committed: tuple[float, list[Command]] | None = None  # since when, commands of the ticks from then on
+        self._keeps = False  # True if the arm is to keep to them
         self.observed_at = -np.inf  # time stamp of the last observation
         self.resumed = True  # True if the last observation is the first since the loop started to run
         self._last_observed = -np.inf  # as `observed_at`, but reset whenever the loop stops running
@@ -136,7 +140,7 @@ class ControlLoop:
             self.stop("the instruction is empty")
             return False
         self.instruction, self._instructed_at = instruction.strip(), now
-        self._schedule, self._next_inference = [], -np.inf
+        self._schedule, self._next_inference, self._keeps = [], -np.inf, False
         if self.state is State.STOPPED and self._timed_out:
             self.resume(now)
         return self.state not in (State.STOPPED, State.FAULT)
@@ -173,6 +177,7 @@ class ControlLoop:
         if self._observer.moved(STILL_FOR) > STILL:
             raise ValueError("the arm still moves: let it rest first")
         self.limiter.start(measured.joints)
+        self._committed, self._keeps = None, False
         self._commanded.clear()
         self._record(now)
         self.handed_over, self._opening, self._off_track_since = False, None, None
@@ -241,7 +246,7 @@ class ControlLoop:
         if not self._follows_positions and (measured := self._observer.newest) is not None:
             self.limiter.position = np.array(measured.joints, float)
         ends = observed + period * np.arange(1, len(actions) + 1)
-        self._schedule = list(zip(ends.tolist(), goals, openings, strict=True))
+        self._schedule, self._keeps = list(zip(ends.tolist(), goals, openings, strict=True)), False
         self._next_inference = float(ends[-1])
         return None
 
@@ -259,15 +264,23 @@ class ControlLoop:
         self._supervise(now)
         if not self._commanded:
             return None
-        if self.state is State.RUNNING and self._schedule:
-            while len(self._schedule) > 1 and self._schedule[0][0] <= now:
-                self._schedule.pop(0)
-            end, goal, self._opening = self._schedule[0]
-            self.limiter.step(goal, end - now)
-        else:
-            self.limiter.brake()
+        self.acting = self.state is State.RUNNING and bool(self._schedule)
+        if self._committed is not None:
+            self._catch_up(*self._committed, now)
+        if not self._keeps:
+            self._move(now)
         self._record(now)
         return Command(self.limiter.position.copy(), self.limiter.velocity.copy(), self._opening)
+
+    def _move(self, now: float) -> None:
+        """Take this tick's step along the schedule, or brake."""
+        if not self.acting:
+            self.limiter.brake()
+            return
+        while len(self._schedule) > 1 and self._schedule[0][0] <= now:
+            self._schedule.pop(0)
+        end, goal, self._opening = self._schedule[0]
+        self.limiter.step(goal, end - now)
 
     def horizon(self, now: float) -> list[Command]:
         """Return the commands after this tick's if no further input arrives; the last one is at rest."""
@@ -284,6 +297,28 @@ class ControlLoop:
             limiter.brake()
             commands.append(Command(limiter.position.copy(), limiter.velocity.copy(), self._opening))
         return commands
+
+    def commit(self, command: Command, now: float) -> list[Command] | None:
+        """Return this tick's command and those after it, which the next ticks keep to until something changes.
+
+        For an arm that executes trajectories of its own. None if nothing has changed since the last one.
+        """
+        if self._keeps:
+            return None
+        ahead = [command, *self.horizon(now)]
+        self._committed, self._keeps = (now, ahead), True
+        return ahead
+
+    def _catch_up(self, since: float, ahead: list[Command], now: float) -> None:
+        """Move to where an arm that executes `ahead` is to be after this tick; before it, if something has changed."""
+        ticks = round((now - since) / self.tick) - (not self._keeps)
+        planned = ahead[min(max(ticks, 0), len(ahead) - 1)]
+        self.limiter.position, self.limiter.velocity = planned.position.copy(), planned.velocity.copy()
+        self._opening = planned.opening
+
+    def limit(self, robot: Robot) -> None:
+        """Replace the limits."""
+        self.limiter.robot, self._keeps = robot, False
 
     # Supervision.
 
@@ -349,6 +384,8 @@ class ControlLoop:
             self.hold(reason)
 
     def _set_state(self, state: State, reason: str) -> None:
+        if state is not self.state:
+            self._keeps = False
         if state is not self.state and state is not State.RUNNING:
             self._observer.cameras.fresh, self._schedule = 0, []
             self._next_inference = self._last_observed = -np.inf

@@ -25,12 +25,14 @@ from std_msgs.msg import Float64MultiArray, String
 from std_srvs.srv import SetBool, Trigger
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
-from vla.deploy import messages
+from vla.deploy import actions, messages
+from vla.deploy.actions import GoalSender, GripperGoals
 from vla.deploy.control_loop import Command, ControlLoop, State
 from vla.deploy.joint_limiter import Robot
 from vla.deploy.lifecycle_node import GuardedLifecycleNode
 from vla.deploy.observer import age_of
-from vla.deploy.settings import COMPRESSED, PolicySettings
+from vla.deploy.ros import action_class
+from vla.deploy.settings import COMPRESSED, FOLLOW, TRAJECTORY_ACTION, PolicySettings
 from vla.io import images
 from vla.policy import Policy
 from vla.robots.controllers import acts_on_joints
@@ -51,6 +53,7 @@ COMMANDS = {
     "trajectory": JointTrajectory,
     "forward": Float64MultiArray,
     "twist": TwistStamped,
+    FOLLOW: JointState,  # tells recordings what the goals say
 }
 
 
@@ -71,6 +74,8 @@ class PolicyNode(GuardedLifecycleNode):
         self._reported: tuple[State | None, str] = (None, "")
         self._ignored = ""  # message about an instruction that is ignored after a stop or a fault
         self._dropped = 0
+        self._arm_goals: GoalSender | None = None
+        self._gripper_goals: GripperGoals | None = None
         try:
             self._declare()
         except ParameterException as error:  # in the arguments after --ros-args
@@ -101,8 +106,7 @@ class PolicyNode(GuardedLifecycleNode):
                 return SetParametersResult(successful=False, reason=f"clean up before changing {parameter.name}")
             if self._timers and parameter.value > self.get_parameter(parameter.name).value:
                 return SetParametersResult(successful=False, reason=f"deactivate before raising {parameter.name}")
-            limiter = self.loop.limiter
-            limiter.robot = replace(limiter.robot, **{parameter.name: parameter.value})
+            self.loop.limit(replace(self.loop.robot, **{parameter.name: parameter.value}))
         return SetParametersResult(successful=True)
 
     # Lifecycle.
@@ -118,6 +122,7 @@ class PolicyNode(GuardedLifecycleNode):
         self._command_type = self.get_parameter("command").value
         if self._command_type not in COMMANDS:
             raise ValueError(f"command is '{self._command_type}', expected one of {', '.join(COMMANDS)}")
+        self.settings.require_messages(self._command_type)
         self._crop = self.get_parameter("image_crop").value
         if self._crop not in get_args(images.Crop):
             raise ValueError(f"image_crop is '{self._crop}', expected one of {', '.join(get_args(images.Crop))}")
@@ -138,9 +143,7 @@ class PolicyNode(GuardedLifecycleNode):
         for topic in filter(None, {topics.joint_states, topics.finger_states}):
             self.add_subscription(JointState, topic, self._on_joint_state, best_effort)
         self.add_subscription(String, topics.instruction, self._on_instruction, QoSProfile(depth=1))
-        commands, gripper = topics.commands, topics.gripper
-        if dry_run:
-            commands, gripper = "~/dry_run/commands", gripper and "~/dry_run/gripper"
+        commands, gripper = self._topics_of_commands()
         self._commands = self.add_publisher(COMMANDS[self._command_type], commands, while_active=True)
         self._gripper = self.add_publisher(Float64MultiArray, gripper, while_active=True) if gripper else None
         self._status = self.add_publisher(DiagnosticStatus, "~/status")
@@ -150,9 +153,40 @@ class PolicyNode(GuardedLifecycleNode):
         self.add_service(Trigger, "~/stop", self._on_stop)
         self.add_service(Trigger, "~/resume", self._on_resume)
         self.add_service(SetBool, "~/hand_over", self._on_hand_over)
+        self._connect_actions(loop)
         self._pool = ThreadPoolExecutor(1, thread_name_prefix="policy")
         self._latencies, self._stamps, self._sizes, self._dropped = {}, {}, {}, 0
         self.loop = loop
+
+    def _topics_of_commands(self) -> tuple[str, str | None]:
+        """Return the topics of the commands and of the finger positions: of an action, copies for recordings."""
+        topics, below = self.settings.topics, "~/dry_run" if self._dry_run else "~"
+        own = self._dry_run or self._command_type == FOLLOW
+        own_gripper = self._dry_run or self.settings.gripper is not None
+        commands = f"{below}/commands" if own else topics.commands
+        return commands, topics.gripper and (f"{below}/gripper" if own_gripper else topics.gripper)
+
+    def _connect_actions(self, loop: ControlLoop) -> None:
+        """Create the clients of the actions; a dry run has none."""
+        topics, gripper = self.settings.topics, self.settings.gripper
+        if gripper is not None and (topics.gripper is None or not loop.grips):
+            missing = "its action server in deploy.topics.gripper" if loop.grips else "a policy that moves a gripper"
+            raise ValueError(f"deploy/gripper needs {missing}")
+        if self._command_type == FOLLOW and not self._dry_run:
+            kind, complaint = action_class(*TRAJECTORY_ACTION), actions.trajectory_complaint
+            self._arm_goals = GoalSender(self, kind, topics.commands, complaint, self._fail)
+        if gripper is not None and topics.gripper is not None and not self._dry_run:
+            self._gripper_goals = GripperGoals(self, gripper, topics.gripper, self._fail)
+
+    @property
+    def _senders(self) -> list[GoalSender]:
+        gripper = self._gripper_goals.senders.values() if self._gripper_goals is not None else ()
+        return [*([self._arm_goals] if self._arm_goals is not None else []), *gripper]
+
+    def _fail(self, reason: str) -> None:
+        """Stop because of an action; the first reason counts."""
+        if self.loop is not None and self.loop.state is not State.FAULT:
+            self.loop.fail(reason)
 
     def _warm_up(self) -> None:
         """Run three inferences on noise: the first ones are slow."""
@@ -166,6 +200,7 @@ class PolicyNode(GuardedLifecycleNode):
         """Take over the arm at its measured pose."""
         assert self.loop is not None
         self._require_only_commander()
+        self._require_servers()
         self.loop.restart()
         self._inference, self._last_tick = None, None
         self._timers = [
@@ -177,6 +212,13 @@ class PolicyNode(GuardedLifecycleNode):
         others = self.count_publishers(self._commands.topic_name) - 1
         if others > 0:
             raise ValueError(f"{others} other publisher(s) on {self._commands.topic_name}: stop them first")
+
+    def _require_servers(self) -> None:
+        for sender in self._senders:
+            sender.require_server()
+            sender.reset()
+        if self._gripper_goals is not None:
+            self._gripper_goals.reset()
 
     def brake(self) -> None:
         """Publish commands until the arm is at rest, then stop the timers."""
@@ -196,10 +238,16 @@ class PolicyNode(GuardedLifecycleNode):
             if loop.limiter.resting:
                 break
             time.sleep(loop.tick)
+        time.sleep(2 * loop.tick if self._senders else 0.0)  # a server is a little behind
+        for sender in self._senders:
+            sender.cancel()
 
     def clean_up(self) -> None:
         """Shut the inference thread down and drop the control loop."""
         self._pool.shutdown(cancel_futures=True)
+        for sender in self._senders:
+            sender.destroy()
+        self._arm_goals, self._gripper_goals = None, None
         self.loop = None
 
     def on_callback_error(self, reason: str) -> None:
@@ -286,6 +334,7 @@ class PolicyNode(GuardedLifecycleNode):
                 loop.hand_over()
             elif not request.data and loop.handed_over:
                 self._require_only_commander()
+                self._require_servers()
                 loop.take_back(time.monotonic())
             response.success = True
         except ValueError as error:
@@ -304,6 +353,9 @@ class PolicyNode(GuardedLifecycleNode):
         if self._last_tick is not None:
             self._record("tick", now - self._last_tick)
         self._last_tick = now
+        if not self.loop or not self.loop.handed_over:
+            for sender in self._senders:
+                sender.check()
         self._advance()
         self._send()
 
@@ -343,14 +395,18 @@ class PolicyNode(GuardedLifecycleNode):
     def _publish(self, command: Command, now: float) -> None:
         assert self.loop is not None
         robot = self.loop.robot
-        if self._command_type == "joint_state":
+        if self._gripper_goals is not None and self.loop.acting and command.opening is not None:
+            self._gripper_goals.command(command.opening)
+        if self._arm_goals is not None and (ahead := self.loop.commit(command, now)) is not None:
+            goal = self._arm_goals.kind.Goal()
+            self._fill_trajectory(goal.trajectory, ahead)
+            self._arm_goals.send(goal)
+        if self._command_type in ("joint_state", FOLLOW):
             message = messages.fill_joint_state(JointState(), robot, command)
             message.header.stamp = self.get_clock().now().to_msg()
         elif self._command_type == "trajectory":
             ahead = [command, *self.loop.horizon(now)]  # the next trajectory replaces all points after the first
-            message = messages.fill_trajectory(
-                JointTrajectory(), JointTrajectoryPoint, Duration, robot, ahead, self.loop.tick
-            )
+            message = self._fill_trajectory(JointTrajectory(), ahead)
         elif self._command_type == "twist":
             frame = self.settings.twist_frame or self.policy.spec.require_robot("deployment").frame
             message = messages.fill_twist(TwistStamped(), frame, velocity_of(command.position, command.velocity))
@@ -361,6 +417,10 @@ class PolicyNode(GuardedLifecycleNode):
         fingers = messages.finger_positions(robot, command)
         if self._gripper is not None and fingers:
             self._gripper.publish(Float64MultiArray(data=fingers))
+
+    def _fill_trajectory(self, message: Any, ahead: list[Command]) -> Any:
+        assert self.loop is not None
+        return messages.fill_trajectory(message, JointTrajectoryPoint, Duration, self.loop.robot, ahead, self.loop.tick)
 
     def _record(self, name: str, seconds: float) -> None:
         self._latencies.setdefault(name, deque(maxlen=500)).append(seconds)

@@ -10,6 +10,7 @@ import sys
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from importlib import import_module
 from pathlib import Path
 from threading import Event
 from types import FrameType
@@ -114,6 +115,22 @@ def ros(network: Network, log_folder: Path | None = None) -> Iterator[Event]:
         rclpy.try_shutdown()
         for number, handler in before.items():
             signal.signal(number, handler)
+
+
+def action_class(package: str, name: str) -> Any:
+    """Return the class of an action.
+
+    Raises:
+        ValueError: its package is not installed.
+    """
+    try:
+        return getattr(import_module(f"{package}.action"), name)
+    except (ImportError, AttributeError) as error:
+        apt = f"apt install ros-jazzy-{package.replace('_', '-')}"
+        source = "build franka_ros2" if package == "franka_msgs" else apt
+        raise ValueError(
+            f"{package}/action/{name} is not installed: {source}, and source its setup.bash before the start ({error})"
+        ) from error
 
 
 @contextmanager

@@ -42,8 +42,9 @@ class PolicyDeployment(PolicySettings):
         """Run until interrupted, then brake and hold.
 
         Raises:
-            ValueError: there is no policy, or it does not fit the robot.
+            ValueError: there is no policy, or it does not fit the robot, or messages are not installed.
         """
+        self.require_messages(self.command)
         policy = self.policy()
         with ros(self.network, self.output) as stopped:
             from vla.deploy.lifecycle_node import SUCCESS

@@ -1,0 +1,281 @@
+"""Arms and grippers that listen to actions: real rclpy, with servers that answer as the real ones."""
+
+from __future__ import annotations
+
+import itertools
+import os
+import sys
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from action_servers import Controller, TrajectoryController
+from arm import FORWARD, ROBOT, SAFETY, SPEC
+from defaults import defaults_of
+from lifecycle_msgs.msg import Transition
+from sensor_msgs.msg import JointState
+from std_msgs.msg import String
+from std_srvs.srv import SetBool
+from world import TOPICS, World
+
+from vla.deploy import actions
+from vla.deploy.bag import BagRecorder
+from vla.deploy.bag_import import BagDemonstrations
+from vla.deploy.control_loop import State
+from vla.deploy.ros import Network
+from vla.deploy.ros2 import PolicyDeployment
+from vla.deploy.settings import FrankaGripper, GripperCommand
+from vla.robots.panda import HOME, forward
+
+pytestmark = [
+    pytest.mark.realtime,
+    pytest.mark.usefixtures("action_packages"),
+    pytest.mark.filterwarnings("ignore:coroutine"),  # goals that a server still executes at the end of a test
+]
+
+WORKER = int(os.environ.get("PYTEST_XDIST_WORKER", "gw0").removeprefix("gw"))
+domains = itertools.count(11 + 20 * (WORKER % 5))
+FOLLOW = "follow_joint_trajectory"
+
+
+@pytest.fixture
+def make_world() -> Iterator[Callable[..., World]]:
+    """A world on a domain of its own."""
+    worlds: list[World] = []
+
+    def make(command: str = FOLLOW, *arguments: str, gripper: Any = None) -> World:
+        worlds.append(World(next(domains), command, list(arguments), gripper=gripper))
+        return worlds[-1]
+
+    yield make
+    for world in worlds:
+        world.close()
+
+
+def controlled(world: World) -> TrajectoryController:
+    """Give the world's arm a trajectory controller."""
+    from control_msgs.action import FollowJointTrajectory
+
+    controller = TrajectoryController(world.node, FollowJointTrajectory, "/commands")
+    world.follow = controller.follow
+    return controller
+
+
+def speeds(goal: Any) -> np.ndarray:
+    return np.diff([point.positions for point in goal.trajectory.points], axis=0) / 0.02
+
+
+def test_an_arm_follows_trajectories_that_replace_each_other(make_world: Callable[..., World]) -> None:
+    world = make_world(FOLLOW, "--ros-args", "-p", "speed_share:=0.25", "-p", "acceleration_share:=0.2")
+    controller = controlled(world)
+    world.start()
+    assert list(controller.goals[0].trajectory.joint_names) == ROBOT.joints
+    np.testing.assert_allclose(controller.goals[0].trajectory.points[0].positions, HOME)
+    seen = len(world.policy.seen)
+    controller.goals.clear()
+    world.live(1.0)
+    assert world.state is State.RUNNING and "abort" in controller.ended
+    assert 3 < len(controller.goals) <= len(world.policy.seen) - seen + 2  # one per plan
+    assert np.abs(world.joints - HOME).max() > 0.02
+    for goal in controller.goals:
+        assert not any(goal.trajectory.points[-1].velocities)
+        assert (np.abs(speeds(goal)) <= 0.25 * np.array(ROBOT.speed) + 1e-9).all()
+        assert (np.abs(np.diff(speeds(goal), axis=0)) <= 0.2 * np.array(ROBOT.acceleration) * 0.02 + 1e-9).all()
+    for before, after in itertools.pairwise(controller.goals):
+        ahead = np.array([point.positions for point in before.trajectory.points])
+        off = np.abs(ahead - after.trajectory.points[0].positions).max(1).min()
+        assert off <= 2 * 0.2 * max(ROBOT.acceleration) * 0.02**2 + 1e-9  # it goes on where the arm is
+    assert world.commands[-1].name == [*ROBOT.joints, *ROBOT.fingers]
+
+
+def test_hand_over_cancels_what_is_executed_and_the_arm_is_taken_back_where_it_was_left(
+    make_world: Callable[..., World],
+) -> None:
+    world = make_world()
+    controller = controlled(world)
+    world.start()
+    world.live(0.3)
+    assert world.ask(SetBool, "hand_over", SetBool.Request(data=True)).success
+    world.live(0.5)
+    assert not any(controller.goals[-1].trajectory.points[-1].velocities) and not controller.running
+    count, world.joints = len(controller.goals), world.joints + 0.1
+    world.live(0.6)
+    assert len(controller.goals) == count and world.state is State.HANDED_OVER
+    left = world.joints
+    assert world.ask(SetBool, "hand_over", SetBool.Request(data=False)).success
+    world.live(5.0, until=lambda: len(controller.goals) > count)
+    np.testing.assert_allclose(controller.goals[count].trajectory.points[0].positions, left)
+    assert world.becomes(State.RUNNING)
+
+
+def test_a_server_that_fails_stops_the_policy_with_its_name_and_the_reason(
+    make_world: Callable[..., World], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A violated tolerance, another client's goal, a rejection, silence, and an end."""
+    world = make_world()
+    controller = controlled(world)
+    world.start()
+
+    def fails(saying: str) -> None:
+        world.live(5.0, until=lambda: world.state is State.FAULT)
+        assert world.agent.loop is not None
+        reason = world.agent.loop.reason
+        assert reason.startswith(saying) and "to continue: deactivate and activate" in reason, reason
+        world.live(0.2)
+        resting = world.joints
+        world.live(0.1)
+        np.testing.assert_array_equal(world.joints, resting)
+        assert world.change(Transition.TRANSITION_DEACTIVATE)
+        controller.accepts = True
+
+    def goes_on() -> None:
+        assert world.change(Transition.TRANSITION_ACTIVATE)
+        world.words.publish(String(data="put the red block on the pad"))
+        assert world.becomes(State.RUNNING)
+        world.live(0.3, until=lambda: controller.running)
+
+    world.live(1.0, until=lambda: controller.running)
+    controller.end("abort", error_code=-4, error_string="panda_joint2 is 0.3 rad off")
+    fails("the action server /commands aborted a goal: PATH_TOLERANCE_VIOLATED, panda_joint2 is 0.3 rad off")
+    goes_on()
+    for _ in range(20):  # goals of another client: the next own one may be under way and replace them
+        if controller.running:
+            controller.end("abort", **controller.replaced)
+        world.live(0.1, until=lambda: world.state is State.FAULT)
+    fails("the action server /commands aborted a goal: INVALID_GOAL, Current goal cancelled due to new incoming")
+    goes_on()
+    controller.accepts = False
+    fails("the action server /commands rejected a goal")
+    goes_on()
+    monkeypatch.setattr(actions, "ANSWER", 0.02)
+    controller.takes = 0.1
+    fails("the action server /commands has not answered a goal for 0.02 s")
+    monkeypatch.setattr(actions, "ANSWER", 1.0)
+    controller.takes = 0.0
+    goes_on()
+    controller.server.destroy()
+    fails("the action server /commands has vanished")
+    monkeypatch.setattr(actions, "PATIENCE", 0.1)
+    assert not world.change(Transition.TRANSITION_ACTIVATE)
+
+
+GRIPPERS = {
+    "GripperCommand": GripperCommand(**defaults_of("deploy/gripper/gripper_command")),
+    "franka": FrankaGripper(**defaults_of("deploy/gripper/franka")),
+}
+
+
+@pytest.mark.parametrize("name", GRIPPERS)
+def test_a_gripper_is_told_once_per_change_and_a_grasp_is_no_error(make_world: Callable[..., World], name: str) -> None:
+    world = make_world("joint_state", gripper=GRIPPERS[name])
+    if name == "franka":
+        from franka_msgs.action import Grasp, Move
+
+        close, open_ = Controller(world.node, Grasp, "/gripper/grasp"), Controller(world.node, Move, "/gripper/move")
+        grasped, fault = {"success": False}, {"success": False, "error": "libfranka: connection lost"}
+    else:
+        from control_msgs.action import GripperCommand as Kind
+
+        close = open_ = Controller(world.node, Kind, "/gripper")
+        grasped, fault = {"stalled": True}, {"stalled": False}
+
+    def policy(opening: float) -> None:
+        world.policy.action = lambda: np.append(FORWARD[:, :6], [[opening]], 1).astype(np.float32)
+
+    def told(controller: Controller) -> Any:
+        world.live(2.0, until=lambda: controller.running)
+        world.live(0.2)
+        assert controller.running
+        return controller.goals[-1]
+
+    world.start()
+    goal = told(open_)
+    assert len(open_.goals) == 1 and world.state is State.RUNNING
+    assert (goal.width if name == "franka" else goal.command.position) == GRIPPERS[name].open
+    open_.end("succeed", **({"success": True} if name == "franka" else {"reached_goal": True}))
+    for opening in (0.5, 0.3, 0.5, 0.3):  # once it is clearly closed
+        policy(opening)
+        world.live(0.2)
+    goal = told(close)
+    assert len({*map(id, [*open_.goals, *close.goals])}) == 2
+    assert (goal.width if name == "franka" else goal.command.position) == 0.0
+    close.end("abort", **grasped)
+    world.live(0.3)
+    assert world.state is State.RUNNING
+    policy(1.0)
+    told(open_)
+    open_.end("abort", **fault)
+    assert world.becomes(State.FAULT)
+    assert world.agent.loop is not None and "aborted a goal: " in world.agent.loop.reason
+    assert world.agent.loop.reason.startswith(f"the action server /gripper{'/move' if name == 'franka' else ''}")
+
+
+def test_a_gripper_that_changes_its_mind_cancels_first(make_world: Callable[..., World]) -> None:
+    from franka_msgs.action import Grasp, Move
+
+    world = make_world("joint_state", gripper=GRIPPERS["franka"])
+    grasp, move = Controller(world.node, Grasp, "/gripper/grasp"), Controller(world.node, Move, "/gripper/move")
+    world.start()
+    world.live(1.0, until=lambda: move.running)
+    world.policy.action = lambda: np.append(FORWARD[:, :6], [[0.0]], 1).astype(np.float32)
+    world.live(0.6)
+    assert move.running and not grasp.goals
+    move.obey()
+    world.live(1.0, until=lambda: grasp.running)
+    assert grasp.running and grasp.goals[0].force == 20.0 and grasp.goals[0].epsilon.outer == 0.08
+
+
+def test_a_dry_run_sends_no_goal(make_world: Callable[..., World]) -> None:
+    world = make_world(FOLLOW, "--ros-args", "-p", "dry_run:=true", gripper=GRIPPERS["GripperCommand"])
+    would: list[JointState] = []
+    world.node.create_subscription(JointState, "/vla_agent/dry_run/commands", would.append, 100)
+    controller = controlled(world)
+    world.start(lambda: would)
+    world.live(0.3)
+    assert world.state is State.RUNNING and controller.goals == [] and world.commands == []
+
+
+def test_what_goals_command_is_recorded_and_imported(make_world: Callable[..., World], tmp_path: Path) -> None:
+    world = make_world()
+    controlled(world)
+    recorder = BagRecorder(world.node, tmp_path / "bag")
+    world.start()
+    world.live(1.2)
+    recorder.close()
+    topics = replace(TOPICS, commands="/vla_agent/commands", gripper=None)
+    imported = BagDemonstrations(tmp_path / "bag", "all", topics, "/vla_agent/status", ROBOT, "centre", spec=SPEC)
+    (episode,) = map(imported.episode, range(len(imported)))
+    places = [forward(np.array(command.position[:7]))[0][0, 3] for command in world.commands]
+    assert len(episode.actions) > 5 and np.abs(episode.actions[:, 1:6]).max() < 1e-3
+    assert 0.5 * np.ptp(places) < episode.actions[:, 0].sum() < np.ptp(places) + 1e-3 and np.ptp(places) > 0.02
+
+
+@pytest.mark.parametrize(
+    ("changed", "says"),
+    [
+        ({"command": FOLLOW}, "control_msgs/action/FollowJointTrajectory is not installed: apt install ros-jazzy-cont"),
+        ({"gripper": GRIPPERS["franka"]}, "franka_msgs/action/Grasp is not installed: build franka_ros2, and source"),
+    ],
+)
+def test_missing_messages_are_named_before_anything_else(
+    monkeypatch: pytest.MonkeyPatch, changed: dict[str, Any], says: str
+) -> None:
+    for module in ("control_msgs", "franka_msgs"):
+        monkeypatch.setitem(sys.modules, module, None)
+        monkeypatch.setitem(sys.modules, f"{module}.action", None)
+
+    def unexpected() -> Any:
+        raise AssertionError("something else was done")
+
+    options = {"command": "joint_state", "gripper": None, **changed}
+    deployment = PolicyDeployment(
+        **defaults_of("deploy/ros2", **options),
+        **{"robot": ROBOT, "network": Network.named("loopback"), "topics": TOPICS, "safety": SAFETY},
+        **{"policy": unexpected, "environment": unexpected, "output": Path()},
+    )
+    with pytest.raises(ValueError, match=says) as refused:
+        deployment.run()
+    assert "\n" not in str(refused.value)
