@@ -11,8 +11,8 @@ from fake_batch import make_batch, make_bc, with_text
 from toy import ARM, ARM_SPEC
 
 from vla.models.kinematics import ForwardKinematics
-from vla.robots.chain import frame_positions
-from vla.robots.panda import CHAIN, JOINT_HIGH, JOINT_LOW, forward
+from vla.robots.chain import forward_of, frame_positions
+from vla.robots.panda import CHAIN, HOME, JOINT_HIGH, JOINT_LOW, forward
 from vla.spec import Spec
 
 
@@ -44,6 +44,13 @@ def test_a_model_is_told_only_where_the_chain_is_known() -> None:
     assert torch.equal(without.robot_state(batch), batch["state"][..., pose])
     assert torch.equal(told.robot_state(batch)[..., :8], without.robot_state(batch))
     assert torch.equal(told.robot_state(batch)[..., 8:], ForwardKinematics(CHAIN)(batch["state"][..., :7]))
+
+
+def test_the_kinematics_of_a_chain_are_those_of_the_panda() -> None:
+    of_chain, joints = forward_of(CHAIN), HOME + np.random.default_rng(0).uniform(-0.4, 0.4, (5, 7))
+    for each in joints:
+        for found, expected in zip(of_chain(each), forward(each), strict=True):
+            np.testing.assert_allclose(found, expected, atol=1e-9)
 
 
 def test_a_chain_travels_and_one_that_is_not_known_is_no_difference() -> None:

@@ -4,17 +4,21 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
+from arm import SAFETY
 from composing import composed
 from conftest import make_tabletop
 from defaults import defaults_of
 
 from vla.config.build import require_no_paths
 from vla.config.experiment import plain
+from vla.deploy.control_loop import ControlLoop
+from vla.deploy.joint_limiter import Robot
 from vla.robots.chain import frame_positions
 from vla.rollouts.rollout import rollout
 from vla.spec import Spec
@@ -139,6 +143,35 @@ def test_the_spec_describes_the_compiled_arm(jaco: Tabletop) -> None:
         np.testing.assert_allclose(jacobian[:3, index], moved, atol=1e-6)
     assert Spec.from_dict(jaco.spec.to_dict()) == jaco.spec
     assert jaco.spec.state_units == ("rad",) * 6 + ("rad/s",) * 6 + ("m",)
+
+
+def test_a_cartesian_policy_moves_the_arm_that_it_was_trained_with(jaco: Tabletop) -> None:
+    """The loop of a deployment: the tool goes where the simulator's own kinematics say."""
+    spec, arm = replace(jaco.spec, cameras=("front",), depth=()), jaco.dm_env.task.scene.robot.kinematics
+    limits = {"low": [-9.0] * 6, "high": [9.0] * 6, "speed": [2.0] * 6, "acceleration": [50.0] * 6}
+    shares = {"speed_share": 1.0, "acceleration_share": 1.0}
+    robot = Robot(
+        **defaults_of(
+            "deploy/robot/simulated", joints=list(spec.require_robot("this").joints), fingers=[], **limits, **shares
+        )
+    )
+    loop = ControlLoop(spec, robot, replace(SAFETY, workspace=((-2.0,) * 3, (2.0,) * 3)), 50.0)
+    now, joints = 100.0, arm.home.copy()
+    start = arm.forward(joints)[0].copy()
+    loop.on_instruction("move", now)
+    for tick in range(100):
+        now += 0.02
+        loop.on_joint_state(joints, np.zeros(6), 0.08, now)
+        if tick % 5 == 0:
+            loop.on_image("front", np.zeros((*spec.image_size, 3), np.uint8), now)
+        if loop.next_observation(now) is not None:
+            loop.set_plan(np.array([[0.0, 0.005, 0, 0, 0, 0, 1]], np.float32), now)
+        if (command := loop.command(now)) is not None:
+            joints = command.position
+    moved = arm.forward(joints)[0]
+    assert moved[1, 3] - start[1, 3] > 0.05
+    np.testing.assert_allclose(moved[[0, 2], 3], start[[0, 2], 3], atol=3e-3)
+    np.testing.assert_allclose(moved[:3, :3], start[:3, :3], atol=0.02)
 
 
 def test_every_axis_of_randomisation_is_applied(jaco: Tabletop) -> None:

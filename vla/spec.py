@@ -52,6 +52,7 @@ class RobotModel:
     # (J + 1, 7) pose of each joint frame, and of the tool frame, in the frame before: offset [m], quaternion wxyz.
     # Joints rotate about z. Empty if unknown.
     chain: Annotated[tuple[Numbers, ...], MaxLen(101)] = ()
+    home: Numbers = ()  # (J,) posture that the arm keeps close to while its tool moves [rad]; empty if unknown
 
     @property
     def components(self) -> tuple[str, ...]:
@@ -143,11 +144,11 @@ class Spec:
     def require(self, other: Spec, what: str, against: str) -> None:
         """Raise a ValueError naming the first field in which the spec of `what` (self) differs from `against`.
 
-        A chain that is unknown to one of them is no difference.
+        A chain or home that is unknown to one of them is no difference.
         """
         mine, theirs = _fields(self), _fields(other)
         for name, value in mine.items():
-            unknown = name == "robot.chain" and () in (value, theirs.get(name))
+            unknown = name in ("robot.chain", "robot.home") and () in (value, theirs.get(name))
             if value != theirs.get(name) and not unknown:
                 raise ValueError(
                     f"{what} has {name} = {str(value)[:200]}, but {against} has {str(theirs.get(name))[:200]}"
@@ -191,6 +192,8 @@ def _contradictions_of_robot(robot: RobotModel, spec: Spec) -> Iterator[str]:
         yield f"robot has {len(robot.velocities)} velocities and {len(robot.joints)} joints"
     if robot.chain and [len(frame) for frame in robot.chain] != [7] * (len(robot.joints) + 1):
         yield f"chain is not 7 numbers for each of {len(robot.joints)} joints and the tool"
+    if len(robot.home) not in (0, len(robot.joints)):
+        yield f"home has {len(robot.home)} positions for {len(robot.joints)} joints"
 
 
 @dataclass(frozen=True)

@@ -15,6 +15,7 @@ import numpy as np
 from vla.deploy.joint_limiter import JointLimiter, Robot
 from vla.deploy.observer import HISTORY, Measured, Observer
 from vla.io.types import Count, Point, Positive
+from vla.robots.cartesian import CartesianController
 from vla.robots.controllers import GRIPPER, controller_for
 from vla.spec import Array, Observation, Spec
 
@@ -80,14 +81,15 @@ class ControlLoop:
         """
         model = spec.require_robot("deployment")
         Observer(spec)  # raises an error if the state has more than joint states contain
-        self._controller = controller_for(spec, safety.workspace)
-        self._grip = spec.action.index(GRIPPER) if GRIPPER in {*spec.action} - {*model.joints} else None
-        self.grips = self._grip is not None
-        self._motion = [index for index in range(len(spec.action)) if index != self._grip]
         if len(robot.joints) != len(model.joints):
             raise ValueError(
                 f"the policy was trained with {len(model.joints)} joints, the robot has {len(robot.joints)}"
             )
+        limits = robot.min_position, robot.max_position, np.array(robot.speed)
+        self._controller = controller_for(spec, safety.workspace, limits)
+        self._grip = spec.action.index(GRIPPER) if GRIPPER in {*spec.action} - {*model.joints} else None
+        self.grips = self._grip is not None
+        self._motion = [index for index in range(len(spec.action)) if index != self._grip]
         if command_hz < spec.control_hz:
             raise ValueError(f"command_hz is {command_hz}, below the {spec.control_hz} actions/s of the policy")
         self.spec, self.safety, self.tick = spec, safety, 1 / command_hz
@@ -315,6 +317,11 @@ class ControlLoop:
         planned = ahead[min(max(ticks, 0), len(ahead) - 1)]
         self.limiter.position, self.limiter.velocity = planned.position.copy(), planned.velocity.copy()
         self._opening = planned.opening
+
+    def tool_velocity(self, command: Command) -> Array:
+        """Return the (6,) velocity of the tool [m/s], [rad/s] in the base frame, of a Cartesian policy's command."""
+        assert isinstance(self._controller, CartesianController)
+        return self._controller.velocity_of(command.position, command.velocity)
 
     def limit(self, robot: Robot) -> None:
         """Replace the limits."""

@@ -36,7 +36,6 @@ from vla.deploy.settings import COMPRESSED, FOLLOW, TRAJECTORY_ACTION, PolicySet
 from vla.io import images
 from vla.policy import Policy
 from vla.robots.controllers import acts_on_joints
-from vla.robots.panda import velocity_of
 from vla.spec import LONGEST_INSTRUCTION, Array, Observation
 
 LEVELS = {
@@ -409,7 +408,7 @@ class PolicyNode(GuardedLifecycleNode):
             message = self._fill_trajectory(JointTrajectory(), ahead)
         elif self._command_type == "twist":
             frame = self.settings.twist_frame or self.policy.spec.require_robot("deployment").frame
-            message = messages.fill_twist(TwistStamped(), frame, velocity_of(command.position, command.velocity))
+            message = messages.fill_twist(TwistStamped(), frame, self.loop.tool_velocity(command))
             message.header.stamp = self.get_clock().now().to_msg()
         else:
             message = Float64MultiArray(data=command.position.tolist())

@@ -13,7 +13,8 @@ import numpy as np
 
 from vla.io.types import Point
 from vla.robots import panda
-from vla.robots.cartesian import CartesianController
+from vla.robots.cartesian import CartesianController, Kinematics
+from vla.robots.chain import forward_of
 from vla.spec import Array, RobotModel, Spec
 
 GRIPPER = "gripper"  # action component that opens the gripper at 1 and closes it at 0, unless it is a joint
@@ -64,36 +65,45 @@ class JointController:
         return motion
 
 
-def controller_for(spec: Spec, workspace: tuple[Point, Point] | None) -> Controller:
-    """Build the controller for the actions in `spec`: joint positions of any arm, or Cartesian motion of the Panda.
+def controller_for(
+    spec: Spec, workspace: tuple[Point, Point] | None, limits: tuple[Array, Array, Array] | None = None
+) -> Controller:
+    """Build the controller for the actions in `spec`: joint positions, or Cartesian motion.
 
     Args:
         spec: of the policy.
         workspace: opposite corners of the box for the tool point of Cartesian motion, in the base frame [m].
+        limits: (J,) smallest and largest positions [rad] and speeds [rad/s] of an arm other than the Panda; None: none.
 
     Raises:
-        ValueError: the arm or the actions are of another kind, or the box cannot be kept.
+        ValueError: the kinematics are not known, the actions are of another kind, or the box cannot be kept.
     """
     model = spec.require_robot("deployment")
     if acts_on_joints(spec):
         return _joint_controller(spec, model, workspace)
-    differs, joints = "", len(panda.CHAIN) - 1
-    if len(model.joints) != joints:
-        differs = f"has {len(model.joints)} joints, the Panda {joints}"
-    elif model.chain and not np.allclose(model.chain, panda.CHAIN):
-        differs = "has another kinematic chain than the Panda"
-    if differs:
-        raise ValueError(
-            f"the policy's arm {differs}: another arm needs actions that are its joint positions, or a controller in "
-            "vla/robots/controllers.py"
-        )
+    arm = _kinematics(model, limits)
     found = list(zip(spec.action, spec.units, strict=True))
     expected = [*CartesianController.motion, (GRIPPER, "1")]
     if found != expected:
         raise ValueError(f"the policy's action is {_listed(found)}, expected {_listed(expected)}")
     if workspace is None:
         raise ValueError("deploy.safety.workspace=null: Cartesian motion needs a box for the tool point")
-    return CartesianController(panda.PANDA, 1 / spec.control_hz, *workspace)
+    return CartesianController(arm, 1 / spec.control_hz, *workspace)
+
+
+def _kinematics(model: RobotModel, limits: tuple[Array, Array, Array] | None) -> Kinematics:
+    """Return the kinematics of the Panda, or those of another arm's chain."""
+    count = len(model.joints)
+    if count == len(panda.CHAIN) - 1 and (not model.chain or np.allclose(model.chain, panda.CHAIN)):
+        return panda.PANDA
+    if not model.chain or not model.home:
+        raise ValueError(
+            f"the policy's arm of {count} joints is not the Panda, and the checkpoint lacks its "
+            f"{'home posture' if model.chain else 'kinematic chain'}: train with task/robot=file, or with actions that "
+            "are joint positions"
+        )
+    low, high, speed = limits or np.full((3, count), np.inf) * [[-1], [1], [1]]
+    return Kinematics(forward_of(model.chain), np.array(model.home), low, high, speed)
 
 
 def acts_on_joints(spec: Spec) -> bool:

@@ -76,15 +76,4 @@ def forward(joints: Array) -> tuple[Array, Array]:
     return pose, np.array([ay * z - az * y, az * x - ax * z, ax * y - ay * x, ax, ay, az])
 
 
-def velocity_of(joints: Array, velocities: Array) -> Array:
-    """Return the (6,) velocity of the tool centre point [m/s], [rad/s] in the base frame.
-
-    Args:
-        joints: (7,) [rad].
-        velocities: of the joints (7,) [rad/s].
-    """
-    velocity: Array = forward(joints)[1] @ velocities
-    return velocity
-
-
 PANDA = Kinematics(forward, HOME, LOWEST, HIGHEST, JOINT_SPEED)

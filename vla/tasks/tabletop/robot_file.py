@@ -111,7 +111,7 @@ class RobotFile(Robot):
         self._measure_gripper(np.array(home))
         self.kinematics = self._kinematics(np.array(home), speed)
         velocities = tuple(f"{joint}_velocity" for joint in joints)
-        self.arm = RobotModel(tuple(joints), "world", velocities, "gripper", self._chain())
+        self.arm = RobotModel(tuple(joints), "world", velocities, "gripper", self._chain(), tuple(home))
 
     def draw(self, meshes: Literal["light", "full"]) -> None:
         """Choose how meshes look: hulls of few vertices ("light"), or as they are ("full")."""
