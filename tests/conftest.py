@@ -36,7 +36,10 @@ without_triton()
 
 def compose_faster() -> None:
     """Hydra makes a config of all choices for every file, in case its defaults refer to one: a quarter of its time."""
+    import warm
     from hydra._internal import defaults_list
+
+    warm.read_yaml_faster()
 
     choices = defaults_list._create_interpolation_map
 
