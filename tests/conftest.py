@@ -86,12 +86,10 @@ def figures(monkeypatch: pytest.MonkeyPatch) -> list[Figure]:
 
 def make_tabletop(*overrides: str) -> Tabletop:
     """The environment that `overrides` of the default configuration compose to."""
-    from hydra import compose, initialize_config_dir
+    from composing import composed
     from hydra.utils import instantiate
 
-    with initialize_config_dir(str(CONF), version_base="1.3"):
-        config: Any = compose("config", overrides=list(overrides))
-    environment: Tabletop = instantiate(config.task, _convert_="all")
+    environment: Tabletop = instantiate(composed(*overrides).task, _convert_="all")
     return environment
 
 
