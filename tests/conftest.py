@@ -37,7 +37,10 @@ without_triton()
 
 def compose_faster() -> None:
     """Hydra makes a config of all choices for every file, in case its defaults refer to one: a quarter of its time."""
+    import warm
     from hydra._internal import defaults_list
+
+    warm.read_yaml_faster()
 
     choices = defaults_list._create_interpolation_map
 
@@ -84,12 +87,10 @@ def figures(monkeypatch: pytest.MonkeyPatch) -> list[Figure]:
 
 def make_tabletop(*overrides: str) -> Tabletop:
     """The environment that `overrides` of the default configuration compose to."""
-    from hydra import compose, initialize_config_dir
+    from composing import composed
     from hydra.utils import instantiate
 
-    with initialize_config_dir(str(CONF), version_base="1.3"):
-        config: Any = compose("config", overrides=list(overrides))
-    environment: Tabletop = instantiate(config.task, _convert_="all")
+    environment: Tabletop = instantiate(composed(*overrides).task, _convert_="all")
     return environment
 
 

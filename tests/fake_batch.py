@@ -92,6 +92,7 @@ def make_rt1(
     keypoints: int = 8,
     auxiliary: float = 1.0,
     dropout: float = 0.0,
+    layers: int = 2,
 ) -> RT1:
     """A small RT-1 without random shifts."""
     return RT1(
@@ -106,7 +107,7 @@ def make_rt1(
         auxiliary=auxiliary,
         text_width=16,
         width=32,
-        layers=2,
+        layers=layers,
         heads=2,
         key_width=16,
         dropout=dropout,
@@ -118,7 +119,11 @@ def make_rt1(
 
 
 def make_decoder(
-    history: int = 2, chunk: int = 1, auxiliary: float = 1.0, tokenizer: ActionTokenizer | None = None
+    history: int = 2,
+    chunk: int = 1,
+    auxiliary: float = 1.0,
+    tokenizer: ActionTokenizer | None = None,
+    layers: int = 2,
 ) -> Decoder:
     """A small decoder without dropout and random shifts."""
     return Decoder(
@@ -135,7 +140,7 @@ def make_decoder(
             auxiliary=auxiliary,
             text_width=16,
             width=32,
-            layers=2,
+            layers=layers,
             heads=2,
             feedforward=64,
             shift=(0, 0),
@@ -167,7 +172,12 @@ def make_act(chunk: int = 4, execute: int = 2, auxiliary: float = 1.0, kl_weight
 
 
 def make_denoising(
-    kind: type[DenoisingModel], chunk: int = 4, execute: int = 2, auxiliary: float = 1.0
+    kind: type[DenoisingModel],
+    chunk: int = 4,
+    execute: int = 2,
+    auxiliary: float = 1.0,
+    layers: int = 2,
+    steps: int = 10,
 ) -> DenoisingModel:
     """A small model that starts from noise, without random shifts."""
     return kind(
@@ -178,10 +188,10 @@ def make_denoising(
         keypoints=8,
         text_width=16,
         width=32,
-        layers=2,
+        layers=layers,
         heads=2,
         copies=8,
-        steps=10,
+        steps=steps,
         temperature=0.5,
         shift=(0, 0),
         auxiliary=auxiliary,

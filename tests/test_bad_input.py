@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from command_line import SMALL, here, vla
+from command_line import SMALL, here
 from composing import check, composed
 
 from vla.config.build import build
@@ -115,11 +115,9 @@ def test_a_phrasing_that_is_no_phrasing_is_refused(phrasing: str) -> None:
         build(plain(cfg.task), "task")
 
 
-@pytest.mark.parametrize("launcher", ["basic", "joblib"])
-def test_a_grid_whose_cells_want_several_processes_is_refused(tmp_path: Path, launcher: str) -> None:
+def test_a_grid_whose_cells_want_several_processes_is_refused(tmp_path: Path) -> None:
     several = ("trainer=ddp", "trainer.accelerator=cpu", "trainer.devices=2", "seed=0")
-    run = here if launcher == "basic" else vla  # which starts processes
-    done = run(tmp_path, "-m", f"hydra/launcher={launcher}", *several, ok=False)
+    done = here(tmp_path, "-m", *several, ok=False)
     assert "trainer.devices=1" in done.stderr and "submitit_slurm" in done.stderr and "Traceback" not in done.stderr
 
 

@@ -45,13 +45,14 @@ def require_equal(one: Path, other: Path, start: Learner) -> None:
         assert (other_way - way).norm() < 0.002 * way.norm()
 
 
-@pytest.mark.parametrize("pair", ["ddp,rt1_tiny", "fsdp,rt1_tiny"])
+@pytest.mark.parametrize("pair", PAIRS)
 def test_two_processes_learn_what_one_learns_from_batches_twice_as_large(
     folder: Path, together: Path, pair: str, tmp_path: Path
 ) -> None:
-    found = train(folder, tmp_path, "trainer=cpu", "model=rt1_tiny", "data.batch_size=16")
+    model = f"model={pair.partition(',')[2]}"
+    found = train(folder, tmp_path, "trainer=cpu", model, "data.batch_size=16")
     assert torch.load(together / pair / "found.pt", weights_only=True) == pytest.approx(found, rel=1e-3)
-    require_equal(tmp_path / LAST, together / pair / LAST, untrained(folder, "model=rt1_tiny"))
+    require_equal(tmp_path / LAST, together / pair / LAST, untrained(folder, model))
 
 
 @pytest.mark.parametrize("pair", PAIRS)
@@ -63,10 +64,10 @@ def test_what_several_processes_leave_is_a_checkpoint_like_any_other(together: P
 
 
 def test_training_goes_on_with_another_number_of_processes(folder: Path, together: Path, tmp_path: Path) -> None:
-    longer = ("trainer=cpu", "model=rt1_tiny", "data.batch_size=16", "trainer.max_steps=6")
-    train(folder, tmp_path / "on", *longer, checkpoint=together / "fsdp,rt1_tiny" / LAST)
+    longer = ("trainer=cpu", "model=decoder", "data.batch_size=16", "trainer.max_steps=6")
+    train(folder, tmp_path / "on", *longer, checkpoint=together / "fsdp,decoder" / LAST)
     train(folder, tmp_path / "whole", *longer)
-    start = untrained(folder, "model=rt1_tiny")
+    start = untrained(folder, "model=decoder")
     require_equal(tmp_path / "whole" / LAST, tmp_path / "on" / LAST, start)
 
 

@@ -33,14 +33,13 @@ def perturbed(spec: Spec, **changes: Any) -> Perturbed:
 
 
 @pytest.mark.parametrize("goal", GOALS)
-@pytest.mark.parametrize("led_astray", [False, True])
-def test_the_expert_solves_every_goal(goal: str, led_astray: bool) -> None:
+def test_the_expert_solves_every_goal_even_when_it_is_led_astray(goal: str) -> None:
     environment = make_tabletop(f"task/goal={goal}")
-    expert = perturbed(environment.spec) if led_astray else Waypoint(environment.spec)
     with environment.blind():
-        episodes = [rollout(environment, expert, seed) for seed in range(12)]
+        assert all(rollout(environment, Waypoint(environment.spec), seed).success for seed in range(6))
+        led_astray = perturbed(environment.spec)
+        assert sum(rollout(environment, led_astray, seed).success for seed in range(8)) >= 7
     environment.close()
-    assert sum(episode.success for episode in episodes) >= (11 if led_astray else 12)
 
 
 @pytest.mark.parametrize("goal", GOALS)
@@ -48,9 +47,9 @@ def test_wide_randomisation_is_within_the_experts_reach(goal: str) -> None:
     environment = make_tabletop(f"task/goal={goal}", "task/randomize=wide")
     expert = Waypoint(environment.spec)
     with environment.blind():
-        outcomes = [rollout(environment, expert, seed).outcome for seed in range(10)]
+        outcomes = [rollout(environment, expert, seed).outcome for seed in range(8)]
     environment.close()
-    assert outcomes.count("success") >= 9
+    assert outcomes.count("success") >= 7
 
 
 def test_the_clean_action_is_recorded_where_another_one_is_executed(tabletop: Tabletop) -> None:

@@ -26,13 +26,6 @@ from vla.models.tokenizers.fast import Fast
 RANGE = np.subtract(SPEC.high, SPEC.low)
 
 
-def make_flow() -> Model:
-    """Return a model with short programs."""
-    model = make_denoising(Flow)
-    model.steps = 2
-    return model
-
-
 def as_onnx(model: Model, folder: Path, **options: Any) -> OnnxPolicy:
     return OnnxPolicy(**defaults_of("policy/onnx", **{"folder": folder, **options}), model=model, spec=SPEC)
 
@@ -40,7 +33,7 @@ def as_onnx(model: Model, folder: Path, **options: Any) -> OnnxPolicy:
 @pytest.fixture(scope="module")
 def flow(tmp_path_factory: pytest.TempPathFactory) -> tuple[Model, Path]:
     """A model, and the folder of its programs."""
-    model, folder = make_flow(), tmp_path_factory.mktemp("flow")
+    model, folder = make_denoising(Flow, layers=1, steps=2), tmp_path_factory.mktemp("flow")
     as_onnx(model, folder)
     return model, folder
 
@@ -48,7 +41,7 @@ def flow(tmp_path_factory: pytest.TempPathFactory) -> tuple[Model, Path]:
 @pytest.fixture
 def rt1(tmp_path: Path) -> tuple[Model, Path]:
     """A model, and where its programs go."""
-    return make_rt1(keypoints=0, chunk=2), tmp_path
+    return make_rt1(keypoints=0, chunk=2, layers=1), tmp_path
 
 
 @pytest.mark.parametrize("kind", ["rt1", "flow"])
@@ -93,27 +86,20 @@ def test_programs_are_exported_once_for_the_same_weights_and_options(
     assert len({programs, *exported}) == 3
 
 
-def test_quantised_programs_act_about_like_the_model(tmp_path: Path) -> None:
-    torch.manual_seed(0)
-    model, seen = make_rt1(), observations(4)
-    exact, quantised = act(as_policy(model), seen), act(as_onnx(model, tmp_path, quantize=True), seen)
-    assert 1e-5 < (np.abs(quantised - exact) / RANGE).max() < 0.02
-
-
-def test_a_checkpoint_acts_through_its_programs(home: Path, tmp_path: Path) -> None:
+def test_a_checkpoint_acts_through_its_programs_quantised_ones_about_like_the_model(home: Path, tmp_path: Path) -> None:
     def policy(*overrides: str) -> Any:
         return Experiment.of(composed(f"checkpoint={home}/run/checkpoints/last.ckpt", *overrides)).make_policy()()
 
-    model, onnx = policy(), policy("policy=onnx", f"policy.folder={tmp_path}")
-    random = np.random.default_rng(0)
-    for _ in range(3):
-        seen = model.spec.random_observation(random)
-        assert onnx.plan(seen) == pytest.approx(model.plan(seen), abs=1e-5)
+    model, onnx = policy(), policy("policy=onnx", "policy.quantize=true", f"policy.folder={tmp_path}")
+    span, random = np.subtract(model.spec.high, model.spec.low), np.random.default_rng(0)
+    seen = [model.spec.random_observation(random) for _ in range(3)]
+    apart = max((np.abs(onnx.plan(each) - model.plan(each)) / span).max() for each in seen)
+    assert 1e-7 < apart < 0.02
     assert onnx.compiled  # a server plans for one client at a time
 
 
 def test_a_model_that_cannot_be_exported_is_named(tmp_path: Path) -> None:
     tokenizer = Fast(spec=SPEC, **defaults_of("tokenizer/fast", chunk=4))
     with pytest.raises(ValueError, match="Decoder with Fast cannot be exported"):
-        as_onnx(make_decoder(chunk=4, tokenizer=tokenizer), tmp_path)
+        as_onnx(make_decoder(chunk=4, tokenizer=tokenizer, layers=1), tmp_path)
     assert [path for path in tmp_path.iterdir() if path.is_dir()] == []

@@ -20,7 +20,7 @@ import torch
 import toy
 from clusters import PLACES, address_in, dask
 from collecting import content
-from command_line import vla
+from command_line import here, vla
 from composing import CONF, check, composed
 from conftest import made_once
 from hydra.errors import ConfigCompositionException
@@ -72,7 +72,7 @@ def home(installed: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def importable(installed: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """Within, this process finds the package as well, and trusts nothing."""
+    """Within, this process finds the package as well, and trusts nothing; commands need no processes of their own."""
     monkeypatch.syspath_prepend(installed)
     monkeypatch.setenv(packages.TRUSTED, "")
     caches = (packages.option_folders, packages.can_be_trusted)
@@ -93,29 +93,29 @@ def test_the_page_shows_what_the_package_holds() -> None:
         assert block in sources
 
 
-def test_installing_it_adds_its_options(home: Path) -> None:
+def test_installing_it_adds_its_options(home: Path, importable: None) -> None:
     assert COMMANDS[0] == "--help"
-    listed = vla(home, COMMANDS[0]).stdout
+    listed = here(home, COMMANDS[0]).stdout
     for group in ("task", "expert", "model", "tokenizer", "recorder", "deploy", "experiment"):
         assert re.search(rf"^\W*{group}: .*\bmine\b", listed, re.MULTILINE), group
-    assert f"_target_: {MODEL}" in vla(home, "model=mine", "--cfg", "job").stdout
+    assert f"_target_: {MODEL}" in here(home, "model=mine", "--cfg", "job").stdout
 
 
 def test_a_job_with_a_group_of_its_own_is_two_options_and_a_module(home: Path, importable: None) -> None:
-    listed = vla(home, "--help").stdout
+    listed = here(home, "--help").stdout
     assert "\n  survey      Measure the start of some episodes.\n" in listed and "\nmetric: distance\n" in listed
     asked = ("job=survey", "task=mine", "survey.episodes=3")
     world = import_module("mypackage.world").Square(16, 30)
     starts = [world.reset(seed) for seed in range(3)]
     away = [np.linalg.norm(start.truth["target"] - start.state) for start in starts]
-    assert vla(home, *asked, "output=surveyed").stdout == f"mean {1000 * np.mean(away):.3f}\n"
+    assert here(home, *asked, "output=surveyed").stdout == f"mean {1000 * np.mean(away):.3f}\n"
     for wrong, words in (
         ("metric.unit=0", "metric.unit must be a number, more than 0, got 0"),
         ("survey.episodes=0", "survey.episodes must be a whole number, at least 1, got 0"),
         ("+survey.length=3", "survey.length is unknown: survey takes episodes, seed"),
         ("~metric", "job=mypackage.survey needs metric=OPTION"),
     ):
-        assert words in vla(home, *asked, wrong, ok=False).stderr
+        assert words in here(home, *asked, wrong, ok=False).stderr
     with pytest.raises(ValueError, match=r"job names mypackage\.survey, which is not trusted: add trust=\[mypackage\]"):
         jobs.find("mypackage.survey")
 
@@ -158,74 +158,74 @@ def test_its_parts_do_the_main_job(home: Path) -> None:
     assert [json.loads(lines[-1]) for lines in recordings] == [each["outcome"] for each in report["per_episode"]]
 
 
-def test_each_stage_is_a_job_of_its_own(home: Path) -> None:
+def test_each_stage_is_a_job_of_its_own(home: Path, importable: None) -> None:
     """And gives what the main job gave, with another number of workers."""
     mine = ("experiment=mine", *TINY, "cluster.workers=1", "collect.folder=alone", "output=staged")
-    vla(home, "job=collect", *mine)
+    here(home, "job=collect", *mine)
     assert content(home / "alone") == content(home / "episodes")
-    vla(home, "job=train", *mine)
+    here(home, "job=train", *mine)
     assert not (home / "staged/report.json").exists()
-    vla(home, "job=evaluate", *mine)
+    here(home, "job=evaluate", *mine)
     whole, staged = (json.loads((home / folder / "report.json").read_text()) for folder in ("run", "staged"))
     assert staged["per_episode"] == whole["per_episode"]
 
 
-def test_its_demonstrations_are_described_replayed_and_exported(home: Path) -> None:
+def test_its_demonstrations_are_described_replayed_and_exported(home: Path, importable: None) -> None:
     shutil.copytree(
         home / "episodes", home / "copy"
     )  # the card that is written into it is none of the others' business
     replay = ("job=inspect", "inspect.folder=copy", "inspect.episode=0", "output=replay")
-    assert "12 intact" in vla(home, "job=inspect", "inspect.folder=copy").stdout
+    assert "12 intact" in here(home, "job=inspect", "inspect.folder=copy").stdout
     assert "dx | m" in (home / "copy/card.md").read_text()
-    assert "add trust=[mypackage]" in vla(home, *replay, ok=False).stderr
-    assert "bit for bit" in vla(home, *replay, "trust=[mypackage]").stdout
+    assert "add trust=[mypackage]" in here(home, *replay, ok=False).stderr
+    assert "bit for bit" in here(home, *replay, "trust=[mypackage]").stdout
     assert (home / "replay/episode-0.rrd").stat().st_size > 1000
-    vla(home, "job=export", "experiment=mine", *TINY, "collect.folder=copy", "export.folder=files")
+    here(home, "job=export", "experiment=mine", *TINY, "collect.folder=copy", "export.folder=files")
     state = json.loads((home / "files/episode_00000/step_0000/robot_state.json").read_text())
     assert {"x", "y"} <= {*state} and (home / "files/episode_00000/step_0000/rgb_image.png").is_file()
 
 
-def test_its_runs_are_compared_and_swept(home: Path) -> None:
+def test_its_runs_are_compared_and_swept(home: Path, importable: None) -> None:
     small = (*TINY, "cluster.workers=1", "validate.episodes=0", "evaluate.episodes=2", "collect.folder=episodes")
-    vla(home, "-m", "hydra.sweep.dir=grid", "experiment=mine", *small, "learner.lr=0.1,0.2")
+    here(home, "-m", "hydra.sweep.dir=grid", "experiment=mine", *small, "learner.lr=0.1,0.2")
     head, _, *lines = (home / "grid/sweep.md").read_text().splitlines()
     reports = [json.loads((home / f"grid/{cell}/report.json").read_text()) for cell in (0, 1)]
     assert {(report["model"], report["episodes"]) for report in reports} == {("mine", 2)}
     assert head.startswith("| learner.lr | ") and [line.split(" | ")[0] for line in lines] == ["| 0.1", "| 0.2"]
     assert all(f" | {100 * report['success']:.1f} (" in line for report, line in zip(reports, lines, strict=True))
-    vla(home, "job=report", "report.runs=[run,grid/1]", "output=compared")
+    here(home, "job=report", "report.runs=[run,grid/1]", "output=compared")
     page = (home / "compared/comparison.html").read_text()
     assert all(f'href="../{run}/report.html"' in page for run in ("run", "grid/1"))
 
 
 def test_workers_of_a_cluster_collect_the_same_bytes(home: Path, installed: Path, tmp_path: Path) -> None:
     command = next(command for command in COMMANDS if "cluster=dask" in command)
-    here = ("--host", "127.0.0.1", "--dashboard-address", "127.0.0.1:0")
+    local = ("--host", "127.0.0.1", "--dashboard-address", "127.0.0.1:0")
     file = tmp_path / "scheduler.json"
-    with dask("scheduler", *here, "--port", "0", "--scheduler-file", str(file)):
+    with dask("scheduler", *local, "--port", "0", "--scheduler-file", str(file)):
         address = address_in(file)
-        with dask("worker", address, *here, "--nthreads", "1", "--no-nanny", PYTHONPATH=os.environ["PYTHONPATH"]):
+        with dask("worker", address, *local, "--nthreads", "1", "--no-nanny", PYTHONPATH=os.environ["PYTHONPATH"]):
             arguments = shlex.split(command.replace("tcp://HOST:8786", address))
             tiny = [item for item in TINY if not item.startswith("cluster.")]
             vla(home, *arguments, *tiny, "collect.folder=remote")
     assert content(home / "remote") == content(home / "episodes")
 
 
-def test_a_checkpoint_is_refused_until_the_package_is_trusted(home: Path) -> None:
+def test_a_checkpoint_is_refused_until_the_package_is_trusted(home: Path, importable: None) -> None:
     report = json.loads((home / "run/report.json").read_text())
     evaluating, deploying = (shlex.split(each.replace("FILE", report["checkpoint"])) for each in COMMANDS[3:])
     *untrusting, trusting = evaluating
     assert trusting == deploying[-1] == "trust=[mypackage]"
     numbers = ("evaluate.episodes=3", "cluster.workers=1", "output=again")
-    refused = vla(home, *untrusting, *numbers, ok=False).stderr
+    refused = here(home, *untrusting, *numbers, ok=False).stderr
     assert refused.splitlines()[-1] == (
         f"error: {report['checkpoint']} names mypackage.world.Square, which is not trusted: "
         "add trust=[mypackage] if you trust its source"
     )
     assert "Traceback" not in refused and not (home / "again").exists()
-    vla(home, *evaluating, *numbers)
+    here(home, *evaluating, *numbers)
     assert json.loads((home / "again/report.json").read_text())["per_episode"] == report["per_episode"]
-    vla(home, *deploying, "deploy.episodes=2", "output=deployed")
+    here(home, *deploying, "deploy.episodes=2", "output=deployed")
     assert json.loads((home / "deployed/report.json").read_text())["episodes"] == 2
 
 

@@ -8,13 +8,13 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
+import composing
 import lightning
 import numpy as np
 import reading
 import resuming
 import torch
 from fake_batch import make_rt1
-from hydra import compose, initialize_config_dir
 
 from vla.config.experiment import Experiment
 from vla.data.episodes import EpisodeStore
@@ -22,8 +22,7 @@ from vla.models.learner import Learner
 from vla.runs.folder import LAST
 from vla.training.trainer import make_trainer, quiet_lightning
 
-PAIRS = ("ddp,rt1_tiny", "fsdp,rt1_tiny", "fsdp,decoder")  # trainer, model
-CONF = Path(__file__).parents[1] / "conf"
+PAIRS = ("ddp,rt1_tiny", "fsdp,decoder")  # trainer, model
 SMALL = (
     "collect.episodes=30",
     "data.validation_fraction=0.2",
@@ -37,13 +36,13 @@ SMALL = (
     "model.text.forget=0",  # processes would not forget the same
     "model.shift=[0,0]",
     "model.history=1",  # padding would count per process
+    "tokenizer.smoothing=0",  # or a decoder would draw what it is told
 )
 
 
 def composed(*overrides: str) -> Experiment:
     """An experiment of few and small steps."""
-    with initialize_config_dir(str(CONF), version_base="1.3"):
-        return Experiment.of(compose("config", overrides=["output=out", *SMALL, *overrides]))
+    return Experiment.of(composing.composed(*SMALL, *overrides))
 
 
 def untrained(store: Path, *overrides: str) -> Learner:
