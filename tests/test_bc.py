@@ -30,10 +30,10 @@ def test_shapes(make: Callable[[], Model]) -> None:
     assert model.loss(batch)["loss"].shape == ()
 
 
-@every_model
-def test_overfits_one_batch(make: Callable[[], Model]) -> None:
+@pytest.mark.parametrize("name", ["bc chunk", "rt1 chunk"])
+def test_overfits_one_batch(name: str) -> None:
     torch.manual_seed(0)
-    model = make()
+    model = MODELS[name]()
     assert overfit(model, with_text(model, make_batch(model.history, model.chunk))) < 0.02
 
 

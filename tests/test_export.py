@@ -120,11 +120,12 @@ def written(folder: Path) -> int:
 
 EXPORT = """
 if __name__ == "__main__":  # worker processes import this file
+    import sys
     from pathlib import Path
     from vla.config.build import build
     from vla.data.episodes import EpisodeStore
     from vla.parallel.pool import LocalCluster
-    build({config}, "export").export(EpisodeStore(Path({store!r}), {episodes}), LocalCluster(2))
+    build({config}, "export").export(EpisodeStore(Path({store!r}), {episodes}), LocalCluster(int(sys.argv[1])))
 """
 
 
@@ -137,13 +138,14 @@ def test_killed_twice_at_random_an_export_goes_on_and_ends_up_the_same(
     killed, script = tmp_path / "killed", tmp_path / "export.py"
     config = composed(name, killed)
     script.write_text(EXPORT.format(config=config, store=str(store.folder), episodes=episodes))
-    for share in sorted(np.random.default_rng().uniform(0, 1, 2)):
+    files = written(whole)
+    for workers, share in zip("21", sorted(np.random.default_rng().uniform(0, 1, 2)), strict=True):
         environment = {**os.environ, "PYTHONPATH": TESTS}
         process = subprocess.Popen(
-            [sys.executable, str(script)], env=environment, stdout=subprocess.DEVNULL, start_new_session=True
+            [sys.executable, str(script), workers], env=environment, stdout=subprocess.DEVNULL, start_new_session=True
         )
-        while process.poll() is None and written(killed) < share * written(whole):
-            time.sleep(0.002)
+        while process.poll() is None and written(killed) < share * files:
+            time.sleep(0.01)
         os.killpg(process.pid, signal.SIGKILL)  # with its workers, which would otherwise write on for a moment
         process.wait()
     exporter(name, killed).export(store)

@@ -6,6 +6,7 @@ import ast
 import subprocess
 import sys
 from collections.abc import Iterator
+from functools import cache
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
@@ -87,6 +88,7 @@ def imports_at_once(path: Path) -> Iterator[str]:
             yield from imports(statement)
 
 
+@cache
 def references(module: str, source: str) -> set[str]:
     """Modules that `module` imports anywhere, for type checkers included, or names in a string to import them later."""
     tree = ast.parse(source)

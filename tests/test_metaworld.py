@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from command_line import vla
+from command_line import here
 from composing import composed
 
 from vla.config.experiment import Experiment
@@ -215,7 +215,7 @@ def test_disturbed_demonstrations_are_clean_labels_in_equal_shares(tmp_path: Pat
 
 
 def test_it_is_collected_learnt_and_reported_by_tier(tmp_path: Path) -> None:
-    printed = vla(
+    printed = here(
         tmp_path,
         *("task=metaworld", "task.tasks=[handle-press,coffee-push]", "task.image_size=[32,32]", "task.steps=80"),
         *("collect.episodes=2", "cluster.workers=1", "trainer=cpu", "trainer.max_steps=2", "validate.episodes=0"),
