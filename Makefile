@@ -23,8 +23,8 @@ test: setup
 	.venv/bin/ruff format --check
 	.venv/bin/ruff check
 	.venv/bin/pyrefly check
-	.venv/bin/pytest -n 2 --dist worksteal -m "not realtime"
-	.venv/bin/pytest -m realtime $$(grep -l realtime tests/test_*.py)
+	.venv/bin/pytest -n 3 --dist worksteal -m "not realtime"
+	.venv/bin/pytest -n 2 -m realtime $$(grep -l realtime tests/test_*.py)
 
 setup: .venv/.installed
 

@@ -37,7 +37,7 @@ pytestmark = [
 ]
 
 WORKER = int(os.environ.get("PYTEST_XDIST_WORKER", "gw0").removeprefix("gw"))
-domains = itertools.count(11 + 20 * (WORKER % 5))
+domains = itertools.count(1 + 33 * (WORKER % 3))
 FOLLOW = "follow_joint_trajectory"
 
 
