@@ -136,8 +136,9 @@ def test_an_ablation_ends_in_a_table(folder: Path) -> None:
     few = (*SMALL, "collect.episodes=5", "variant=no_history", "seed=0", "evaluate.episodes=1")
     run(folder, "-m experiment=ablation", *few, "hydra.sweep.dir=ablation")
     lines = (folder / "ablation/sweep.md").read_text().splitlines()
-    assert "| variant | seen [%] | instructions [%] | distractors [%] | backgrounds [%] |" in lines[0]
-    assert [line.split()[1] for line in lines[2:]] == ["no_history"]
+    # What cells differ in stands before it: see test_packages.
+    assert lines[0].startswith("| seen [%] | instructions [%] | distractors [%] | backgrounds [%] |")
+    assert len(lines) == 3
 
 
 def test_cells_run_as_jobs_of_a_queue(folder: Path) -> None:
