@@ -59,7 +59,9 @@ def test_a_right_config_passes() -> None:
 
 
 def test_fields_that_a_dataclass_inherits_from_another_module_are_checked() -> None:
-    with pytest.raises(ValueError, match="one of joint_state, trajectory, forward, twist, got 'fly'"):
+    with pytest.raises(
+        ValueError, match="one of joint_state, trajectory, forward, twist, follow_joint_trajectory, got 'fly'"
+    ):
         check(composed("job=deploy", "deploy=ros2", "deploy.command=fly"))
 
 
