@@ -24,7 +24,7 @@ test: setup
 	.venv/bin/ruff check
 	.venv/bin/pyrefly check
 	.venv/bin/pytest -n 3 --dist worksteal -m "not realtime"
-	.venv/bin/pytest -n 2 -m realtime $$(grep -l realtime tests/test_*.py)
+	.venv/bin/pytest -n 2 --dist worksteal -m realtime $$(grep -l realtime tests/test_*.py)
 
 setup: .venv/.installed
 
