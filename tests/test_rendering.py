@@ -142,6 +142,29 @@ def test_geoms_come_and_go() -> None:
     assert depths == pytest.approx([0.8, 0, 0, 0.8], abs=1e-3)  # what is transparent has no depth, as in MuJoCo
 
 
+def test_things_leave_and_enter_a_picture() -> None:
+    text = """<mujoco><asset><texture type="skybox" builtin="gradient" rgb1="0 0 1" rgb2="0 1 0" width="8" height="48"/>
+      </asset><worldbody><geom type="plane" size="1 1 .1" rgba="1 1 1 1"/><body mocap="true" pos="0 0 .3">
+      <geom type="capsule" size=".1 .3" rgba="1 0 0 1"/></body><camera pos="0 -1 1" xyaxes="1 0 0 0 .7 .7" fovy="20"/>
+      <camera pos="0 -3 1" xyaxes="1 0 0 0 0 1" projection="orthographic" fovy="2"/></worldbody></mujoco>"""
+    model = mujoco.MjModel.from_xml_string(text)
+    data, view = mujoco.MjData(model), View((0, 1), SIZE, SIZE)
+    counts = []
+    with closing(fast().open(model, view)) as first, closing(Reference().open(model, view)) as second:
+        for x in (0.0, 0.25, 0.3, 0.95, 1.05, 9.0, 0.25):
+            data.mocap_pos[0, 0] = x
+            mujoco.mj_forward(model, data)
+            rgb, reference = first.render(data)[0], second.render(data)[0]
+            red, expected = (picture[..., 0] > 2 * picture[..., 1].astype(int) for picture in (rgb, reference))
+            assert (red != expected).sum() < 0.02 * red.size
+            sky, blue = (picture[..., 2] > 2 * picture[..., 0].astype(int) for picture in (rgb, reference))
+            np.testing.assert_array_equal(sky.sum(axis=(1, 2)) > 0, blue.sum(axis=(1, 2)) > 0)
+            counts.append(red.sum(axis=(1, 2)).tolist())
+    near, far = zip(*counts, strict=True)
+    assert near[0] > near[2] > near[5] == 0 and far[0] > far[3] > far[4] > far[5] == 0
+    assert counts[1] == counts[-1] and (sky.sum(axis=(1, 2)) > 0).tolist() == [False, True]
+
+
 @pytest.mark.parametrize(
     ("lights", "floor"), [("directional", "2 2 .1"), ("spot", "2 2 .1"), ("several", "2 2 .1"), ("headlight", "0 3 .1")]
 )

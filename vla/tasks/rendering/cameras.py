@@ -1,4 +1,4 @@
-"""Cameras of a model: their projections, and which planes they see."""
+"""Cameras of a model: their projections, and what they see."""
 
 from __future__ import annotations
 
@@ -24,6 +24,9 @@ class Cameras:
     def update(self) -> None:
         """Take over the model's present lenses."""
         self._lenses = np.stack([UPSIDE_DOWN @ self._lens(camera) for camera in self.ids])
+        across, up, deep, ahead = self._lenses.swapaxes(0, 1)
+        sides = np.stack([ahead + across, ahead - across, ahead + up, ahead - up, ahead + deep], axis=1)
+        self._sides = sides / np.linalg.norm(sides[:, :, :3], axis=2, keepdims=True)  # of the frustums, looking inwards
         far = np.linalg.inv(self._lenses) @ CORNERS
         self._corners = far[:, :3] / far[:, 3:]  # (cameras, 3, 4), in the cameras' frames [m]
         self._corners[self._lenses[:, 3, 3] != 0] = np.nan  # without perspective, nothing runs from eye to corner
@@ -31,7 +34,14 @@ class Cameras:
     def place(self, data: mujoco.MjData) -> Array:
         """Move the cameras to where they are in a state; return projections of the world (cameras, 4, 4)."""
         self.eyes, self.axes = data.cam_xpos[self.ids], data.cam_xmat[self.ids].reshape(-1, 3, 3)
-        return self._lenses @ lights.inverse_pose(self.eyes, self.axes.swapaxes(1, 2))
+        views = lights.inverse_pose(self.eyes, self.axes.swapaxes(1, 2))
+        self._sides_there = self._sides @ views
+        return self._lenses @ views
+
+    def may_see(self, centres: Array, radii: Array) -> Array:
+        """Return which spheres at `centres` (N, 3), of `radii` (N,) [m], reach into a picture: (cameras, N) bool."""
+        distances = self._sides_there[:, :, :3] @ centres.T + self._sides_there[:, :, 3:]
+        return (distances > -radii).all(axis=1)
 
     def behind(self, number: int, plane: Array) -> bool:
         """Return whether a camera sees a plane of pose (3, 4) from behind."""

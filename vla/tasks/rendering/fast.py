@@ -1,8 +1,8 @@
 """A renderer that draws the scene once: few draw calls on one framebuffer for all cameras.
 
 All geometry is in one buffer, and each vertex names its element. Poses and appearance are textures with a row per
-element. A frame uploads the poses, draws one shadow map per lamp for all cameras, then each camera's picture with one
-call per texture, and reads all of them back at once.
+element. A frame uploads the poses, draws one shadow map per lamp for all cameras, then each camera's picture with few
+calls per texture, and reads all of them back at once. The sky is drawn where their depth shows a gap.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Collection
 from dataclasses import dataclass
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import moderngl
 import mujoco
@@ -33,6 +33,8 @@ from vla.tasks.rendering.textures import Textures
 log = logging.getLogger(__name__)
 BEHIND = 0.3  # factor on the alpha of a plane seen from behind, as in MuJoCo
 ALIGNMENT = 256  # of a camera's block in its buffer [bytes], enough for every machine
+GAP = 120  # most indices of elements out of sight that are drawn because another call takes longer
+MARGIN = 1.01  # factor on the radius of elements, against rounding
 PACKAGES = "libegl1, libgl1 and libgl1-mesa-dri"
 
 
@@ -227,7 +229,11 @@ class FastRenderer:
         }
         order = list(self._runs)
         solid, self._transparent = order[: self._geometry.solid], order[self._geometry.solid :]
-        self._opaque = _merged([self._runs[element] for element in solid if element != sky])
+        self._opaque = np.array([element for element in solid if element != sky], int)
+        radius = {block.element: float(np.linalg.norm(block.seen.vertices[:, :3], axis=1).max()) for block in blocks}
+        radius |= dict.fromkeys(self._planes, np.inf)  # they may move along with a camera
+        self._radii = MARGIN * np.array([radius[element] for element in self._opaque])
+        self._merged: dict[bytes, list[Run]] = {}  # whether each opaque element is in sight → what to draw
         self._shadows.update([block for block in blocks if block.element != sky])
 
     def _texture_of(self, element: int) -> int:
@@ -268,9 +274,10 @@ class FastRenderer:
             self._gl.front_face = "cw"  # in pictures that are upside down
             self._drawn.clear(depth=1.0)
             self._look_at_planes()
-            for number, sight in enumerate(self._sights):
-                self._draw(number, sight)
-            return self._read()
+            self._draw_opaque()
+            depth = self._draw_skies()
+            self._draw_transparent()
+            return self._read_colours(), self._metres(depth)
 
     def _upload_poses(self, data: mujoco.MjData) -> None:
         geoms, sites = self._model.ngeom, self._model.nsite
@@ -320,20 +327,45 @@ class FastRenderer:
                 behind = [plane for plane in self._planes if cameras.behind(number, self._poses[plane])]
                 self._sights[number] = Sight(state, sky, behind)
 
-    def _draw(self, number: int, sight: Sight) -> None:
-        """Draw a camera's picture: what is opaque and the sky, then what is transparent and planes from behind."""
+    def _aim(self, number: int) -> None:
+        """Choose the camera that the next calls draw for."""
         view, size = self._view, self._blocks[number].nbytes
         self._camera_buffer.bind_to_uniform_block(0, offset=number * size, size=size)
         self._gl.viewport = 0, number * view.height, view.width, view.height
-        for run in self._opaque:
-            self._draw_run(run)
-        if sight.sky:
-            self._draw_run(self._runs[len(self._elements.kind)])
-        if self._transparent or sight.behind:
-            self._draw_transparent(self._cameras.eyes[number], sight.behind)
 
-    def _draw_transparent(self, eye: Array, behind: list[int]) -> None:
-        """Blend transparent elements and planes seen from behind, as MuJoCo does: from near to far, and back again."""
+    def _draw_opaque(self) -> None:
+        """Draw the opaque elements that the cameras may see."""
+        seen = self._cameras.may_see(self._poses[self._opaque, :, 3], self._radii)
+        for number, mask in enumerate(seen):
+            self._aim(number)
+            runs = self._merged.get(key := mask.tobytes())
+            if runs is None:
+                runs = self._merged[key] = _merged([self._runs[element] for element in self._opaque[mask].tolist()])
+            for run in runs:
+                self._draw_run(run)
+
+    def _draw_skies(self) -> Array:
+        """Draw the sky for the cameras that see it; return the depth buffer as `_read_depth` does."""
+        numbers = [number for number, sight in enumerate(self._sights) if sight.sky]
+        if self._drawn is self._target:  # otherwise gaps may be smaller than a pixel
+            depth = self._read_depth()
+            numbers = [number for number in numbers if depth[number].max() >= 1]
+            if not numbers:
+                return depth
+        for number in numbers:
+            self._aim(number)
+            self._draw_run(self._runs[len(self._elements.kind)])
+        return self._read_depth()
+
+    def _draw_transparent(self) -> None:
+        """Blend transparent elements and planes seen from behind."""
+        for number, sight in enumerate(self._sights):
+            if self._transparent or sight.behind:
+                self._aim(number)
+                self._blend(self._cameras.eyes[number], sight.behind)
+
+    def _blend(self, eye: Array, behind: list[int]) -> None:
+        """Blend a camera's transparent elements as MuJoCo does: from near to far, and back again."""
         distance = {
             element: float(np.linalg.norm(self._poses[element, :, 3] - eye) - self._bounds[element])
             for element in {*self._transparent, *behind}
@@ -361,15 +393,25 @@ class FastRenderer:
             if "unshadowed" in program:
                 program["unshadowed"] = float(value)
 
-    def _read(self) -> tuple[Array, Array]:
+    def _read_depth(self) -> Array:
+        """Read the depth buffer (cameras, H, W) float32, 0 at the near plane and 1 at the far one."""
         view = self._view
-        shape = len(view.cameras), view.height, view.width
-        rgb, depth = np.empty((*shape, 3), np.uint8), np.empty(shape, np.float32)
+        depth = np.empty((len(view.cameras), view.height, view.width), np.float32)
+        self._resolved().read_into(depth, attachment=-1, components=1, dtype="f4", alignment=1)
+        return depth
+
+    def _read_colours(self) -> Array:
+        view = self._view
+        rgb = np.empty((len(view.cameras), view.height, view.width, 3), np.uint8)
+        self._resolved().read_into(rgb, components=3, alignment=1)
+        return rgb
+
+    def _resolved(self) -> Any:
+        """Return the framebuffer to read, with one sample per pixel."""
         if self._drawn is not self._target:
             self._gl.copy_framebuffer(self._target, self._drawn)
-        self._target.read_into(rgb, components=3, alignment=1)
-        self._target.read_into(depth, attachment=-1, components=1, dtype="f4", alignment=1)
-        return rgb, self._metres(depth)
+            self._drawn.use()
+        return self._target
 
     def _metres(self, reading: Array) -> Array:
         """Convert readings of the depth buffer, 0 at the near plane and 1 at the far one, to depth [m], in place."""
@@ -390,11 +432,12 @@ class FastRenderer:
 
 
 def _merged(runs: Collection[Run]) -> list[Run]:
-    """Join neighbouring runs with the same texture."""
+    """Join runs with the same texture that follow each other with a small gap, if any."""
     merged: list[Run] = []
     for run in runs:
-        if merged and merged[-1].texture == run.texture:
-            last = merged.pop()
-            run = Run(run.texture, last.start, last.count + run.count)
+        last = merged[-1] if merged else None
+        if last and last.texture == run.texture and run.start - last.start - last.count <= GAP:
+            merged.pop()
+            run = Run(run.texture, last.start, run.start + run.count - last.start)
         merged.append(run)
     return merged
