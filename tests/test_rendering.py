@@ -196,7 +196,7 @@ def test_every_shape_texture_light_and_camera(lights: str, floor: str) -> None:
     ],
 )
 def test_shapes_that_enclose_a_volume_are_told_from_others(shape: shapes.Shape, closed: bool) -> None:
-    assert shapes.closed(*shape.outline()) == closed
+    assert shape.outline.closed == closed
 
 
 def test_open_shapes_cast_shadows_with_both_sides() -> None:

@@ -6,8 +6,9 @@ open a renderer.
 
 from __future__ import annotations
 
+import ctypes
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import cache
 from threading import Lock
@@ -16,6 +17,7 @@ from typing import Any
 import moderngl
 
 BACKEND: Any = {"backend": "egl"}  # moderngl's type annotations are too narrow
+RENDERBUFFER, DEPTH_COMPONENT32F = 0x8D41, 0x8CAC  # constants of OpenGL
 
 
 class Context:
@@ -39,11 +41,29 @@ class Context:
             changed, self._user = self._user != id(renderer), id(renderer)
             yield changed
 
+    def depth_renderbuffer(self, size: tuple[int, int]) -> Any:
+        """Make a depth buffer (width, height) of floats in the current context, which takes no conversion to read.
+
+        Those of moderngl are of integers, so its storage is replaced.
+        """
+        buffer, integer = self.gl.depth_renderbuffer(size), ctypes.c_uint
+        _function("glBindRenderbuffer", integer, integer)(RENDERBUFFER, buffer.glo)
+        storage = _function("glRenderbufferStorage", integer, integer, ctypes.c_int, ctypes.c_int)
+        storage(RENDERBUFFER, DEPTH_COMPONENT32F, *size)
+        return buffer
+
     def clean(self) -> None:
         """Free the objects that nobody refers to any more."""
         with self._lock, self.gl:
             self.gl.gc()
             self._user = 0
+
+
+def _function(name: str, *types: Any) -> Callable[..., None]:
+    """Return a function of OpenGL that moderngl does not offer."""
+    egl = ctypes.CDLL("libEGL.so.1")
+    egl.eglGetProcAddress.restype = ctypes.c_void_p
+    return ctypes.CFUNCTYPE(None, *types)(egl.eglGetProcAddress(name.encode()))
 
 
 def shared_context() -> Context:

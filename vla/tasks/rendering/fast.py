@@ -130,10 +130,10 @@ class FastRenderer:
         """Make the framebuffer, the cameras' pictures one above the other, and the shadow maps."""
         gl, view = self._gl, self._view
         size = view.width, view.height * len(view.cameras)
-        self._target = gl.framebuffer(gl.renderbuffer(size, 4), gl.depth_renderbuffer(size))
-        self._drawn = self._target
         samples = min(self._settings.samples, gl.max_samples)
-        if samples:
+        depth = gl.depth_renderbuffer(size) if samples else self._context.depth_renderbuffer(size)
+        self._drawn = self._target = gl.framebuffer(gl.renderbuffer(size, 4), depth)
+        if samples:  # they are averaged into buffers of the same formats
             colour, depth = gl.renderbuffer(size, 4, samples=samples), gl.depth_renderbuffer(size, samples=samples)
             self._drawn = gl.framebuffer(colour, depth)
         model = self._model
@@ -230,7 +230,7 @@ class FastRenderer:
         order = list(self._runs)
         solid, self._transparent = order[: self._geometry.solid], order[self._geometry.solid :]
         self._opaque = np.array([element for element in solid if element != sky], int)
-        radius = {block.element: float(np.linalg.norm(block.seen.vertices[:, :3], axis=1).max()) for block in blocks}
+        radius = {block.element: block.radius for block in blocks}
         radius |= dict.fromkeys(self._planes, np.inf)  # they may move along with a camera
         self._radii = MARGIN * np.array([radius[element] for element in self._opaque])
         self._merged: dict[bytes, list[Run]] = {}  # whether each opaque element is in sight → what to draw

@@ -36,6 +36,7 @@ class Block:
     seen: Part  # with vertices of position, normal, texture coordinates or direction, element: 10 floats
     casting: Part  # with vertices of position and element, 4 floats, shared by all triangles at the same place
     closed: bool  # whether the triangles enclose a volume
+    radius: float  # of a sphere around the element's origin with everything in it [m]
 
 
 class Geometry:
@@ -136,7 +137,9 @@ class Geometry:
 def _packed(element: int, key: tuple[Any, ...], shape: Shape, coordinates: Array) -> Block:
     number = np.full((len(shape.position), 1), element)
     vertices = np.concatenate([shape.position, shape.normal, coordinates, number], axis=1, dtype=np.float32)
-    position, triangles = shape.outline()
-    outline = np.concatenate([position, number[: len(position)]], axis=1, dtype=np.float32)
+    outline = shape.outline
+    places = np.concatenate([shape.position[outline.vertices], number[: len(outline.vertices)]], axis=1)
     seen = Part(vertices, np.ascontiguousarray(shape.triangles, np.int32))
-    return Block(element, key, seen, Part(outline, triangles), shapes.closed(position, triangles))
+    casting = Part(places.astype(np.float32), outline.triangles)
+    radius = float(np.sqrt(np.square(shape.position).sum(axis=1).max(initial=0.0)))
+    return Block(element, key, seen, casting, outline.closed, radius)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import mujoco
 import numpy as np
@@ -14,6 +15,15 @@ WELD = 1e-6  # largest distance between vertices at the same place, over the sha
 
 
 @dataclass(frozen=True)
+class Outline:
+    """A shape's triangles without repetition of vertices at the same place."""
+
+    vertices: Array  # (W,) one vertex of the shape for each place
+    triangles: Array  # (T, 3) int32, indices of places, none without an area
+    closed: bool  # whether the triangles enclose a volume
+
+
+@dataclass(frozen=True)
 class Shape:
     """Triangles with normals and texture coordinates."""
 
@@ -22,23 +32,28 @@ class Shape:
     texcoord: Array  # (V, 2), 0…1 over the shape
     raw: Array  # (V, 3) position before scaling, the direction in a cube texture
     triangles: Array  # (T, 3) int32, indices of vertices, counterclockwise from outside
+    source: Shape | None = None  # of which this one was stretched
 
     def scaled(self, size: Array) -> Shape:
         """Return the shape stretched by `size` (3,)."""
         normal = self.normal / size
         normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-        return Shape(self.position * size, normal, self.texcoord, self.raw, self.triangles)
+        return Shape(self.position * size, normal, self.texcoord, self.raw, self.triangles, self)
 
-    def outline(self) -> tuple[Array, Array]:
-        """Return positions (W, 3) float32 without repetition, and the triangles (T, 3) int32 between them."""
+    @cached_property
+    def outline(self) -> Outline:
+        """The outline, which stretching does not change."""
+        if self.source is not None:
+            return self.source.outline
         steps = np.rint(self.position / (WELD * max(np.abs(self.position).max(initial=0.0), 1e-9)))
         _, first, inverse = np.unique(steps, axis=0, return_index=True, return_inverse=True)
         triangles = inverse.reshape(-1)[self.triangles].astype(np.int32)
         one, two, three = triangles.T
-        return self.position[first].astype(np.float32), triangles[(one != two) & (two != three) & (three != one)]
+        triangles = triangles[(one != two) & (two != three) & (three != one)]
+        return Outline(first, triangles, _closed(self.position[first].astype(np.float32), triangles))
 
 
-def closed(position: Array, triangles: Array) -> bool:
+def _closed(position: Array, triangles: Array) -> bool:
     """Return whether triangles (T, 3) between positions (W, 3) enclose a volume, and look away from it.
 
     Every edge must be as often in one direction as in the other.
