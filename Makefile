@@ -19,12 +19,13 @@ test: export OMP_NUM_THREADS = 1
 test: export MKL_NUM_THREADS = 1
 test: export OPENBLAS_NUM_THREADS = 1
 test: export LP_NUM_THREADS = 0
+test: export PYTHONDONTWRITEBYTECODE = # every program would compile all modules again
 test: setup
 	.venv/bin/ruff format --check
 	.venv/bin/ruff check
 	.venv/bin/pyrefly check
 	.venv/bin/pytest -n 3 --dist worksteal -m "not realtime"
-	.venv/bin/pytest -n 2 --dist worksteal -m realtime $$(grep -l realtime tests/test_*.py)
+	.venv/bin/pytest -n 2 --dist worksteal -m realtime $$(grep -l mark.realtime tests/test_*.py)
 
 setup: .venv/.installed
 

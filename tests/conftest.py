@@ -12,9 +12,9 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from tempfile import mkdtemp
 from typing import TYPE_CHECKING, Any
-from unittest.mock import patch
 
 import pytest
+import warm
 from filelock import FileLock
 
 from vla.parallel.processes import THREAD_SETTINGS, without_triton
@@ -35,32 +35,22 @@ has_egl()  # once, for the programs that tests start
 without_triton()
 
 
-def compose_faster() -> None:
-    """Hydra makes a config of all choices for every file, in case its defaults refer to one: a quarter of its time."""
-    import warm
-    from hydra._internal import defaults_list
-
-    warm.read_yaml_faster()
-
-    choices = defaults_list._create_interpolation_map
-
-    def if_needed(overrides: Any, entries: list[Any], self_added: bool) -> Any:
-        return choices(overrides, entries, self_added) if any(each.is_interpolation() for each in entries) else None
-
-    patch.object(defaults_list, "_create_interpolation_map", if_needed).start()
-
-
-compose_faster()
+warm.compose_faster()
 
 # What a shell runs in the background ignores interrupts, and so would the programs that tests start and interrupt.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Compiled graphs are kept in a folder of this run, not in one that other processors and versions have filled."""
+    """Compiled graphs are kept in a folder of this run, not in one that other processors and versions have filled.
+
+    Programs start from one process, which all workers share.
+    """
     if "TORCHINDUCTOR_CACHE_DIR" not in os.environ:
         folder = os.environ["TORCHINDUCTOR_CACHE_DIR"] = mkdtemp(prefix="compiled-by-tests-")  # workers inherit it
         config.add_cleanup(lambda: shutil.rmtree(folder, ignore_errors=True))
+    if "PYTEST_XDIST_WORKER" not in os.environ:
+        warm.start()
 
 
 def pytest_collection_finish() -> None:

@@ -276,7 +276,14 @@ def test_training_goes_on_as_what_it_was(home: Path) -> None:
 
 def test_a_policy_is_trained_further_for_another_goal(home: Path, tmp_path: Path) -> None:
     shutil.copy(home / "run/checkpoints/last.ckpt", tmp_path / "policy.ckpt")
-    arguments = (*SMALL, f"pretrained={tmp_path}/policy.ckpt", "task/goal=push", "job=train", "collect.folder=pushed")
+    arguments = (
+        *SMALL,
+        f"pretrained={tmp_path}/policy.ckpt",
+        "task/goal=push",
+        "job=train",
+        "collect.folder=pushed",
+        "collect.episodes=5",
+    )
     done = here(home, *arguments, "learner.lr=1e-12", "trainer.max_steps=1", "output=tuned")
     assert f"starting from {tmp_path}/policy.ckpt" in done.stdout
     before, after = (read_checkpoint(path) for path in (tmp_path / "policy.ckpt", home / "tuned/checkpoints/last.ckpt"))

@@ -1,5 +1,5 @@
 """Programs in processes of their own that begin with the heavy libraries loaded, which else takes most of their time: a
-process that has imported them and done nothing else forks for every one.
+process that has imported them and done nothing else forks for every one. All workers of a test run share it.
 
 MuJoCo is not among them: importing it opens the display, which does not survive a fork.
 """
@@ -11,21 +11,26 @@ import gc
 import json
 import os
 import runpy
+import shutil
 import signal
 import subprocess
 import sys
 from collections.abc import Callable, Sequence
-from functools import cache
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import suppress
 from pathlib import Path
-from socket import create_server
-from tempfile import TemporaryDirectory
-from typing import Any
+from select import select
+from socket import AF_UNIX, create_server, socket
+from tempfile import TemporaryDirectory, mkdtemp
+from typing import Any, TextIO
+from unittest.mock import patch
 
 from vla.parallel.fast_exit import fast_exit
 from vla.parallel.processes import without_triton
 from vla.tasks.gl import choose_backend
 
 PATIENCE = 450  # [s]
+SOURCE = "VLA_TESTS_SOURCE"  # environment variable: the socket at which the process listens
 
 Meanwhile = Callable[[int], None]  # is given the process
 
@@ -35,6 +40,36 @@ def run(
 ) -> subprocess.CompletedProcess[str]:
     """What `python -m PROGRAM` with these arguments does in a folder, whatever is done to it `meanwhile`."""
     return _done(folder, program, arguments, [{}], meanwhile)[0]
+
+
+class Started:
+    """`python -m PROGRAM` while it runs, with what tests need of `subprocess.Popen`."""
+
+    def __init__(self, folder: Path, program: str, *arguments: str, environment: dict[str, str]) -> None:
+        """Run it in a folder, with these additions to the environment."""
+        process: Future[int] = Future()
+        thread = ThreadPoolExecutor(1)
+        self._done = thread.submit(_done, folder, program, arguments, [environment], process.set_result)
+        thread.shutdown(wait=False)
+        self._process = process.result(PATIENCE)
+
+    def send_signal(self, number: int) -> None:
+        """Send a signal, unless it has ended."""
+        if not self._done.done():
+            os.kill(self._process, number)
+
+    def kill(self) -> None:
+        """Kill it."""
+        self.send_signal(signal.SIGKILL)
+
+    def wait(self, timeout: float | None = None) -> int:
+        """How it ended, within some seconds."""
+        return self._done.result(timeout)[0].returncode
+
+    def printed(self, timeout: float | None = None) -> str:
+        """What it printed until its end, within some seconds: errors first."""
+        (done,) = self._done.result(timeout)
+        return done.stderr + done.stdout
 
 
 def run_together(folder: Path, program: str, *arguments: str) -> None:
@@ -66,27 +101,39 @@ def _done(
             }
             for each, environment in zip(files, environments, strict=True)
         ]
-        source = _source()
-        assert source.stdin is not None and source.stdout is not None
-        print(json.dumps(orders), file=source.stdin, flush=True)
-        processes = json.loads(source.stdout.readline())
-        try:
-            if meanwhile:
-                meanwhile(*processes)
-        finally:
-            codes = json.loads(source.stdout.readline())
+        with _source() as source:
+            print(json.dumps(orders), file=source, flush=True)
+            processes = json.loads(source.readline())
+            try:
+                if meanwhile:
+                    meanwhile(*processes)
+            finally:
+                codes = json.loads(source.readline())
         texts = [[Path(file).read_text(encoding="utf-8") for file in each] for each in files]
     command = ["python", "-m", program, *arguments]
     return [subprocess.CompletedProcess(command, code, *each) for code, each in zip(codes, texts, strict=True)]
 
 
-@cache
-def _source() -> subprocess.Popen[str]:
-    process = subprocess.Popen(
-        [sys.executable, __file__], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, start_new_session=True
-    )
+def start() -> None:
+    """Start the process, which loads the libraries when it is first needed and ends with this one."""
+    folder = mkdtemp(prefix="started-by-tests-")
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    os.environ[SOURCE] = f"{folder}/socket"
+    with socket(AF_UNIX) as server:
+        server.bind(os.environ[SOURCE])
+        server.listen()
+        command = [sys.executable, __file__, str(server.fileno())]
+        process = subprocess.Popen(command, stdin=subprocess.PIPE, pass_fds=[server.fileno()], start_new_session=True)
     atexit.register(process.kill)
-    return process
+
+
+def _source() -> TextIO:
+    """A connection to the process."""
+    if SOURCE not in os.environ:
+        start()
+    with socket(AF_UNIX) as connection:
+        connection.connect(os.environ[SOURCE])
+        return connection.makefile("rw", encoding="utf-8")  # which keeps it open
 
 
 def _become(order: dict[str, Any]) -> None:
@@ -119,18 +166,42 @@ def _codes(processes: list[int]) -> list[int]:
     return [codes[process] for process in processes]
 
 
-def read_yaml_faster() -> None:
-    """Let OmegaConf read files with libyaml, which saves two fifths of composing."""
+def compose_faster() -> None:
+    """Leave out what takes Hydra and OmegaConf half of their time and changes nothing.
+
+    OmegaConf reads files without libyaml, and tells every node its parent after each merge, whether it has one already
+    or not. Hydra makes a config of all choices for every file, in case its defaults refer to one.
+    """
     import yaml
+    from hydra._internal import defaults_list
+    from omegaconf.base import Box
+
+    choices, tell = defaults_list._create_interpolation_map, Box._re_parent
+
+    def if_needed(overrides: Any, entries: list[Any], self_added: bool) -> Any:
+        return choices(overrides, entries, self_added) if any(each.is_interpolation() for each in entries) else None
+
+    def if_new(box: Box) -> None:
+        content: Any = box.__dict__["_content"]
+        if not isinstance(content, dict | list):
+            tell(box)
+            return
+        for node in content.values() if isinstance(content, dict) else content:
+            if node.__dict__["_parent"] is not box:
+                node._set_parent(box)
+            if isinstance(node, Box):
+                if_new(node)
 
     yaml.SafeLoader = yaml.CSafeLoader
+    patch.object(defaults_list, "_create_interpolation_map", if_needed).start()
+    patch.object(Box, "_re_parent", if_new).start()
 
 
-def main() -> None:
-    """Load the libraries; then, for every line of standard input, fork and tell the processes, then how they ended."""
+def load() -> None:
+    """Import the heavy libraries."""
     choose_backend()
     without_triton()
-    read_yaml_faster()
+    compose_faster()
     import lightning
     import matplotlib.figure
     import pyarrow
@@ -142,18 +213,38 @@ def main() -> None:
     del lightning, matplotlib, pyarrow, rerun, torch
     gc.collect()
     gc.freeze()  # or each process looks through all this again and again, and copies it to do so
-    for line in sys.stdin:
-        processes = []
-        for order in json.loads(line):
-            process = os.fork()
-            if process == 0:
-                _become(order)
+
+
+def serve(connection: TextIO) -> None:
+    """Fork for every order in a line, and tell the processes, then how they ended."""
+    processes = []
+    for order in json.loads(connection.readline()):
+        process = os.fork()
+        if process == 0:
+            _become(order)
+            return
+        processes.append(process)
+    print(json.dumps(processes), file=connection, flush=True)
+    print(json.dumps(_codes(processes)), file=connection, flush=True)
+
+
+def main(server: socket) -> None:
+    """Serve every connection in a process of its own, until the process that started this one has ended."""
+    loaded = False
+    while sys.stdin not in select([server, sys.stdin], [], [])[0]:
+        connection, _ = server.accept()
+        if not loaded:
+            load()
+            loaded = True
+        with connection:
+            if os.fork() == 0:
+                serve(connection.makefile("rw", encoding="utf-8"))
                 return
-            processes.append(process)
-        print(json.dumps(processes), flush=True)
-        print(json.dumps(_codes(processes)), flush=True)
+        with suppress(ChildProcessError):  # none is left
+            while os.waitpid(-1, os.WNOHANG)[0]:
+                pass
 
 
 if __name__ == "__main__":
     with fast_exit():
-        main()
+        main(socket(fileno=int(sys.argv[1])))
