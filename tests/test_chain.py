@@ -149,7 +149,7 @@ def test_a_demonstration_has_one_instruction_and_begins_where_those_before_it_en
             assert {seen.instruction for seen in episode.observations} == {episode.draws["language"]["instruction"]}
             assert "then" not in episode.draws["language"]
             assert replay(chain, episode) is None
-            starts.append(chain.dm_env.task.compiled.data.time - len(episode.observations) / 10)
+            starts.append(chain.simulation.compiled.data.time - len(episode.observations) / 10)
     assert min(starts) == pytest.approx(0) and max(starts) > 1  # [s] of the instructions before
 
 

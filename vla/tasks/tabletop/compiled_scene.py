@@ -25,7 +25,6 @@ class Noise:
 
 
 Kind = Literal["push", "drop", "move_block", "move_target"]
-KINDS: tuple[Kind, ...] = ("push", "drop", "move_block", "move_target")
 
 
 @dataclass(frozen=True)
