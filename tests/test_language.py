@@ -18,7 +18,8 @@ from vla.config.check import conditions
 from vla.config.experiment import plain
 from vla.io.documents import read_yaml
 from vla.spec import FIRST_SEED
-from vla.tasks.language import Grammar, HeldOut, Silence, paraphrase
+from vla.tasks.language import Grammar, HeldOut, Silence
+from vla.tasks.tabletop.randomize.language import paraphrase
 from vla.tasks.tabletop.scene import COLOURS, PADS
 
 GRAMMAR = Grammar(

@@ -28,7 +28,6 @@ from vla.reports.training_curves import colours, draw_run, draw_runs
 from vla.rollouts.evaluate import IN_DISTRIBUTION, Report
 from vla.rollouts.motion import AMOUNTS
 from vla.runs.folder import Run, read_run
-from vla.spec import READABLE
 
 log = logging.getLogger(__name__)
 
@@ -200,10 +199,8 @@ def _error_table(run: Run) -> list[tuple[str, str, str]]:
     """Return component, error with its interval, and error of a constant action."""
     rows = []
     for each in run.errors.components if run.errors else ():
-        factor, unit = READABLE.get(each.unit, (1.0, each.unit))
-        high = "∞" if each.ci_high is None else f"{factor * each.ci_high:.3g}"
-        interval = f"{factor * each.error:.3g} ({factor * each.ci_low:.3g}-{high}) {unit}"
-        rows.append((each.name, interval, f"{factor * each.constant:.3g} {unit}"))
+        unit, error, interval, constant = each.readable()
+        rows.append((each.name, f"{error} ({interval}) {unit}", f"{constant} {unit}"))
     return rows
 
 

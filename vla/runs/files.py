@@ -15,6 +15,7 @@ from vla.io.types import Count, Natural, NonNegative, Positive, Share
 from vla.rollouts.comparison import Comparison
 from vla.rollouts.evaluate import IN_DISTRIBUTION, Report, Result
 from vla.rollouts.motion import Motion
+from vla.spec import READABLE
 
 Node = dict[str, Any]
 LENIENT = ConfigDict(strict=True, extra="ignore", allow_inf_nan=False)  # what follows from the rest is not read
@@ -77,6 +78,12 @@ class ComponentError:
     ci_low: NonNegative
     ci_high: NonNegative | None  # None: unbounded
     constant: NonNegative  # error of the mean action of the training episodes
+
+    def readable(self) -> tuple[str, str, str, str]:
+        """Format unit, error, its interval and the constant error, in units for display."""
+        factor, unit = READABLE.get(self.unit, (1.0, self.unit))
+        high = "∞" if self.ci_high is None else f"{factor * self.ci_high:.3g}"
+        return unit, f"{factor * self.error:.3g}", f"{factor * self.ci_low:.3g}-{high}", f"{factor * self.constant:.3g}"
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -11,7 +11,7 @@ import numpy as np
 
 from vla.robots.cartesian import CartesianController, solve
 from vla.spec import FIRST_SEED, Array
-from vla.tasks.language import HeldOut, paraphrase
+from vla.tasks.language import HeldOut
 from vla.tasks.streams import Streams
 from vla.tasks.tabletop.compiled_scene import CompiledScene
 from vla.tasks.tabletop.disturber import PUSH, Disturber
@@ -19,6 +19,7 @@ from vla.tasks.tabletop.goals.chain import Chain
 from vla.tasks.tabletop.goals.goal import SKILLS, Goal, Referents, WorldState, current
 from vla.tasks.tabletop.goals.mixed import Mixed
 from vla.tasks.tabletop.outcome import OutcomeClassifier
+from vla.tasks.tabletop.randomize.language import paraphrase
 from vla.tasks.tabletop.randomize.randomizer import Randomizer
 from vla.tasks.tabletop.scene import COLOURS, PADS, Scene
 
@@ -28,7 +29,7 @@ WORKSPACE = ((0.25, -0.40, 0.008), (0.75, 0.40, 0.50))  # corners of the box tha
 
 @dataclass(frozen=True)
 class Request:
-    """What one instruction asks for."""
+    """Goal, named objects and words of one instruction."""
 
     goal: Goal
     referents: Referents
@@ -326,5 +327,5 @@ class Simulation:
 
     @property
     def over(self) -> bool:
-        """Whether the goal was reached and held, or its time is up."""
+        """True if the goal was reached and held, or its time is up."""
         return self.classifier.success or self._periods >= self._most_periods
