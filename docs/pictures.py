@@ -145,7 +145,7 @@ def arm(option: str, picture: Path) -> None:
     }
     environment: Any = make_environment(compose_task("tabletop", robot=option, renderer="smooth", **options))
     expert, observation = Waypoint(environment.spec), environment.reset(FIRST_SEED)
-    compiled = environment.dm_env.task.compiled
+    compiled = environment.simulation.compiled
     camera = compiled.cameras["front"]
     compiled.model.cam_pos[camera] = ARM_VIEW
     compiled.model.cam_quat[camera] = quaternion(look_at(ARM_VIEW, ARM_TARGET, (0, 0, 1)))

@@ -40,10 +40,10 @@ if TYPE_CHECKING:
 
 GRAMMAR = Grammar(["move {block}"], {}, ["{block}"], {"move": ["shift"]})
 GOALS: dict[str, Goal | None] = {
-    "lift": Lift(GRAMMAR, height=0.1),
-    "place": Place(GRAMMAR, radius=0.04),
-    "push": Push(GRAMMAR, radius=0.04),
-    "stack": Stack(GRAMMAR),
+    "lift": Lift(language=GRAMMAR, height=0.1),
+    "place": Place(language=GRAMMAR, radius=0.04),
+    "push": Push(language=GRAMMAR, radius=0.04),
+    "stack": Stack(language=GRAMMAR),
 }
 FIRST, SECOND = FIRST_SEED + 2, FIRST_SEED + 3
 
@@ -105,10 +105,10 @@ def test_a_chain_that_cannot_be_is_refused() -> None:
     with pytest.raises(ValueError, match=r"give no chain of 2 instructions with 2 blocks: lower task\.goal\.length"):
         Chain({"lift": GOALS["lift"]}, length=2)
     with pytest.raises(ValueError, match=r"task\.goal\.goals\.pick cannot be part of a chain"):
-        Chain({"pick": PickPlace(GRAMMAR, radius=0.04)}, length=2)
+        Chain({"pick": PickPlace(language=GRAMMAR, radius=0.04)}, length=2)
     coloured = Grammar(["move {block}"], {}, ["{block}"], {"move": ["shift"]}, held_out_colours=["red"])
     with pytest.raises(ValueError, match="names blocks of all colours"):
-        Chain({"lift": Lift(coloured, height=0.1), "place": GOALS["place"]}, length=2)
+        Chain({"lift": Lift(language=coloured, height=0.1), "place": GOALS["place"]}, length=2)
 
 
 def test_the_next_instruction_comes_when_one_is_completed(chain: Tabletop, tmp_path: Path) -> None:
@@ -149,7 +149,7 @@ def test_a_demonstration_has_one_instruction_and_begins_where_those_before_it_en
             assert {seen.instruction for seen in episode.observations} == {episode.draws["language"]["instruction"]}
             assert "then" not in episode.draws["language"]
             assert replay(chain, episode) is None
-            starts.append(chain.dm_env.task.compiled.data.time - len(episode.observations) / 10)
+            starts.append(chain.simulation.compiled.data.time - len(episode.observations) / 10)
     assert min(starts) == pytest.approx(0) and max(starts) > 1  # [s] of the instructions before
 
 

@@ -15,7 +15,7 @@ from hydra import compose, initialize_config_dir
 from hydra.utils import get_class
 from omegaconf import OmegaConf
 
-from vla.config.conditions import conditions
+from vla.config.check import conditions
 from vla.config.experiment import plain
 
 AXES = CONF / "task/randomize"  # a group for each, with levels of the same names

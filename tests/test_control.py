@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 @pytest.mark.parametrize("seed", range(5))
 def test_forward_kinematics_and_jacobian_equal_mujocos(tabletop: Tabletop, seed: int) -> None:
-    compiled = tabletop.dm_env.task.compiled
+    compiled = tabletop.simulation.compiled
     data = mujoco.MjData(compiled.model)
     joints = np.random.default_rng(seed).uniform(JOINT_LOW, JOINT_HIGH)
     data.qpos[compiled.joints] = joints

@@ -7,7 +7,7 @@ import json
 import math
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 import pytest
@@ -16,12 +16,13 @@ from conftest import make_tabletop
 from vla.reports.filmstrips import read_filmstrips
 from vla.rollouts.recorder import RerunRecorder
 from vla.rollouts.rollout import replay, rollout
-from vla.tasks.tabletop.compiled_scene import KINDS, Kind
+from vla.tasks.tabletop.compiled_scene import Kind
 from vla.tasks.tabletop.environment import Tabletop
 from vla.tasks.tabletop.expert import Waypoint
 from vla.tasks.tabletop.goals.goal import WorldState
 from vla.tasks.tabletop.randomize.disturbance import Disturbances
 
+KINDS: tuple[Kind, ...] = get_args(Kind)
 STILL = np.array([0, 0, 0, 0, 0, 0, 1.0])
 
 
@@ -35,7 +36,7 @@ def world() -> Iterator[Tabletop]:
 
 def only(environment: Tabletop, **changes: Any) -> None:
     """Change what may happen."""
-    axes: Any = environment.dm_env.task.randomize
+    axes: Any = environment.simulation.randomize
     once: dict[str, Any] = {"times": (1, 1), "delay": (1, 1), "start": (3, 3)}
     axes["disturbance"] = dataclasses.replace(axes["disturbance"], **once, **changes)
 
@@ -45,10 +46,10 @@ def played(environment: Tabletop, seed: int) -> tuple[list[WorldState], dict[str
     expert = Waypoint(environment.spec)
     with environment.blind():
         observation = environment.reset(seed)
-        states = [environment.dm_env.task.world_state()]
+        states = [environment.simulation.world_state()]
         while not environment.done:
             observation = environment.step(expert.act(observation))
-            states.append(environment.dm_env.task.world_state())
+            states.append(environment.simulation.world_state())
     assert environment.outcome == "success"
     return states, environment.draws["disturbance"]
 
@@ -59,7 +60,7 @@ def test_a_moved_target_is_free_and_counts_where_it_is(world: Tabletop) -> None:
         states, drawn = played(world, seed)
         [(step, told)] = world.events
         before, after = states[step - 1], states[step]
-        (named,) = world.dm_env.task.referents.blocks
+        (named,) = world.simulation.referents.blocks
         assert "pad" in told and world.milestones == {"grasped", "disturbed"}
         assert before.held[named] and before.positions[named, 2] > 0.03
         assert math.dist(before.pads[0], after.pads[0]) == pytest.approx(drawn["distance"], abs=1e-5)
@@ -75,7 +76,7 @@ def test_a_moved_block_is_free_and_is_found(world: Tabletop) -> None:
         states, drawn = played(world, seed)
         [(step, _)] = world.events
         before, after = states[step - 1], states[step]
-        (named,) = world.dm_env.task.referents.blocks
+        (named,) = world.simulation.referents.blocks
         assert math.dist(before.positions[named], after.positions[named]) == pytest.approx(drawn["distance"], abs=1e-3)
         neighbours = [*np.delete(after.positions, named, axis=0), *after.pads]
         assert min(after.away(named, place) for place in neighbours) > 0.07
@@ -88,7 +89,7 @@ def test_a_dropped_block_falls_and_is_grasped_again(world: Tabletop) -> None:
     for seed in range(3):
         states, _ = played(world, seed)
         [(step, _)] = world.events
-        (named,) = world.dm_env.task.referents.blocks
+        (named,) = world.simulation.referents.blocks
         held = [bool(state.held[named]) for state in states]
         assert held[step] and not any(held[step + 2 : step + 4])
         again += any(held[step + 4 :])
@@ -97,7 +98,7 @@ def test_a_dropped_block_falls_and_is_grasped_again(world: Tabletop) -> None:
 
 def test_a_push_displaces_the_arm_whatever_is_commanded(world: Tabletop) -> None:
     only(world, kinds=["push"], push=(0.1, 0.1))
-    task = world.dm_env.task
+    task = world.simulation
     with world.blind():
         for action in (STILL, np.array([0.04, 0.04, 0.04, 0, 0, 0, 1.0])):
             world.reset(5)
@@ -115,7 +116,7 @@ def test_a_push_displaces_the_arm_whatever_is_commanded(world: Tabletop) -> None
 
 def test_an_arm_that_is_driven_is_pushed_and_returns(world: Tabletop) -> None:
     only(world, kinds=["push"], push=(0.1, 0.1))
-    task = world.dm_env.task
+    task = world.simulation
     with world.blind():
         world.reset(5)
         joints, at = task.compiled.data.qpos[task.compiled.joints].copy(), []
@@ -133,7 +134,7 @@ def test_a_disturbed_episode_is_replayed_bit_for_bit_and_differs_from_an_undistu
     world: Tabletop, kind: Kind
 ) -> None:
     only(world, kinds=[kind])
-    axes: Any = world.dm_env.task.randomize
+    axes: Any = world.simulation.randomize
     with world.blind():
         episode = rollout(world, Waypoint(world.spec), 2)
         events, draws = world.events, world.draws
@@ -149,9 +150,10 @@ def test_a_disturbed_episode_is_replayed_bit_for_bit_and_differs_from_an_undistu
 
 def test_draws_are_plain_and_keep_kind_time_and_direction_from_level_to_level(world: Tabletop) -> None:
     only(world, kinds=KINDS)
-    axis: Any = world.dm_env.task.randomize["disturbance"]
+    axes: Any = world.simulation.randomize
+    axis = axes["disturbance"]
     stronger: Disturbances = dataclasses.replace(axis, push=(0.3, 0.4), move=(0.3, 0.4))
-    compiled, found = world.dm_env.task.compiled, []
+    compiled, found = world.simulation.compiled, []
     for seed in range(40):
         first, second = (one(compiled, np.random.RandomState(seed)) for one in (axis, stronger))
         assert json.loads(json.dumps(first)) == first and first["times"] == 1
@@ -160,10 +162,10 @@ def test_draws_are_plain_and_keep_kind_time_and_direction_from_level_to_level(wo
     assert set(found) == set(KINDS)
     never = dataclasses.replace(axis, times=(0, 0))
     with world.blind():
-        world.dm_env.task.randomize["disturbance"] = never
+        axes["disturbance"] = never
         world.reset(0)
     assert world.draws["disturbance"]["kind"] == "none" and compiled.disturbance is None
-    world.dm_env.task.randomize["disturbance"] = axis
+    axes["disturbance"] = axis
 
 
 def test_impossible_instructions_stay_possible_to_follow() -> None:

@@ -43,7 +43,7 @@ LIBRARIES = {
     "dm_control": ("vla.tasks",),
     "moderngl": ("vla.tasks.rendering",),
     "fast_simplification": ("vla.tasks.rendering.decimate",),
-    "dm_env": ("vla.tasks", "vla.envs"),
+    "dm_env": ("vla.envs",),
     "gymnasium": ("vla.envs", "vla.tasks.gymnasium"),
     "lightning": ("vla.models.learner", "vla.data.datamodule", "vla.training", "vla.runs", "vla.jobs"),
     "rerun": ("vla.rollouts.recorder", "vla.reports.filmstrips", "vla.deploy.view"),

@@ -14,11 +14,12 @@ from hydra.errors import InstantiationException
 from hydra.utils import instantiate
 from matplotlib.colors import XKCD_COLORS, rgb_to_hsv, to_rgb
 
-from vla.config.conditions import conditions
+from vla.config.check import conditions
 from vla.config.experiment import plain
 from vla.io.documents import read_yaml
 from vla.spec import FIRST_SEED
-from vla.tasks.language import Grammar, HeldOut, Silence, paraphrase
+from vla.tasks.language import Grammar, HeldOut, Silence
+from vla.tasks.tabletop.randomize.language import paraphrase
 from vla.tasks.tabletop.scene import COLOURS, PADS
 
 GRAMMAR = Grammar(
@@ -105,7 +106,7 @@ def test_every_unheard_name_means_one_thing_of_the_scene() -> None:
 def test_an_unheard_instruction_is_the_plain_one_with_other_names() -> None:
     node = conditions(plain(composed("evaluate=unheard").evaluate))["unheard"]["randomize"]["phrasing"]
     environment = make_tabletop("task/goal=mixed", "task/randomize=none")
-    task = environment.dm_env.task
+    task = environment.simulation
     axes = {"heard": task.randomize, "unheard": {**task.randomize, "phrasing": instantiate(node)}}
 
     def reset(seed: int, name: str) -> dict[str, Any]:
@@ -164,15 +165,15 @@ def test_who_is_named_does_not_depend_on_how_it_is_said() -> None:
         for seed in range(FIRST_SEED, FIRST_SEED + 10):
             environment.reset(seed)
             new = environment.draws
-            phrasing, environment.dm_env.task.randomize = (
-                environment.dm_env.task.randomize,
+            phrasing, environment.simulation.randomize = (
+                environment.simulation.randomize,
                 {
-                    **environment.dm_env.task.randomize,
+                    **environment.simulation.randomize,
                     "phrasing": None,
                 },
             )
             environment.reset(seed)
-            environment.dm_env.task.randomize = phrasing
+            environment.simulation.randomize = phrasing
             assert environment.draws["named"] == new["named"]
             assert environment.draws["language"] != new["language"]
     environment.close()
@@ -196,7 +197,7 @@ def test_what_cannot_be_done_is_about_a_block_that_is_not_there() -> None:
     with environment.blind():
         for seed in range(20):
             instruction = environment.reset(seed).instruction
-            compiled = environment.dm_env.task.compiled
+            compiled = environment.simulation.compiled
             assert not any(colour in instruction for colour in compiled.block_names[: compiled.present])
             assert any(colour in instruction for colour in COLOURS)
     environment.close()
@@ -217,7 +218,7 @@ def test_the_standard_benchmark_also_asks_for_nothing_and_for_what_cannot_be_don
             if standard.task == "pick_place":
                 assert alone.draws == standard.draws
             elif standard.task == "stay":
-                compiled = standard.dm_env.task.compiled
+                compiled = standard.simulation.compiled
                 assert not any(colour in other.instruction for colour in compiled.block_names[: compiled.present])
                 assert any(colour in other.instruction for colour in COLOURS)
                 assert standard.draws["language"]["held_out"] in ("words", "phrasings")

@@ -82,7 +82,7 @@ def test_conditions_are_compared_in_motion_and_milestones(tmp_path: Path) -> Non
     write_report(first, tmp_path / "report.json", None, {}, None, {"slow": slow}, compared, courses)
     read = read_run(tmp_path)
     assert [each.motion for each in read.reports["slow"].results] == [each.motion for each in slow.results]
-    assert read.report is not None and read.report.motion == first.medians
+    assert read.report is not None and read.reports["seen"].medians == first.medians
     assert read.report.conditions["slow"].course == found
     page = write_page(tmp_path).read_text()
     assert "<b>+0.5</b>" in page and "log jerk" in page and "<b>-100.0</b>" in page

@@ -30,7 +30,7 @@ def hard() -> Any:
 
 def seen(environment: Tabletop, seed: int, **axes: Any) -> tuple[Array, dict[str, Any]]:
     """Both cameras' first images and the draws, with some axes replaced."""
-    task = environment.dm_env.task
+    task = environment.simulation
     kept, task.randomize = task.randomize, {**task.randomize, **axes}
     try:
         images = environment.reset(seed).rgb
@@ -85,7 +85,7 @@ def test_blocks_and_pads_keep_their_distance(tabletop: Tabletop) -> None:
 
 
 def test_what_is_not_there_is_nowhere_to_be_seen(hard: Tabletop) -> None:
-    compiled = hard.dm_env.task.compiled
+    compiled = hard.simulation.compiled
     two, _ = seen(hard, 3, distractors=Distractors((2, 2)))
     assert len(compiled.block_centres()) == 3
     one, draws = seen(hard, 3, distractors=Distractors((1, 1)))
@@ -103,9 +103,9 @@ def test_every_shape_stands_on_the_table_and_weighs_what_its_volume_says() -> No
     expected = {"cube": 8.0, "cylinder": 2 * np.pi, "tall": 8 * 1.25, "flat": 8 * 0.75}
     with environment.blind():
         for name, volume in expected.items():
-            environment.dm_env.task.randomize = {"shape": Shapes([name])}
+            environment.simulation.randomize = {"shape": Shapes([name])}
             environment.reset(0)
-            compiled = environment.dm_env.task.compiled
+            compiled = environment.simulation.compiled
             masses = compiled.model.body_mass[compiled.block_bodies[:3]]
             np.testing.assert_allclose(masses, 600.0 * volume * 0.02**3)
             start = compiled.block_centres()
@@ -118,10 +118,10 @@ def test_every_shape_stands_on_the_table_and_weighs_what_its_volume_says() -> No
 def test_a_shape_that_is_drawn_after_the_mass_keeps_the_factor() -> None:
     environment = make_tabletop("task/randomize=none")
     mass, shape = Masses((2.0, 2.0)), Shapes(["tall"])
-    environment.dm_env.task.randomize = {"mass": mass, "shape": shape}
+    environment.simulation.randomize = {"mass": mass, "shape": shape}
     with environment.blind():
         environment.reset(0)
-    compiled = environment.dm_env.task.compiled
+    compiled = environment.simulation.compiled
     np.testing.assert_allclose(compiled.model.body_mass[compiled.block_bodies[:3]], 2 * 600.0 * 8 * 1.25 * 0.02**3)
     environment.close()
 
@@ -130,7 +130,7 @@ def test_commands_reach_the_motors_late(tabletop: Tabletop) -> None:
     from vla.tasks.tabletop.randomize.robot import Latency
 
     up = np.array([0, 0, 0.04, 0, 0, 0, 1.0])
-    task = tabletop.dm_env.task
+    task = tabletop.simulation
     kept, heights = task.randomize, []
     with tabletop.blind():
         for seconds in (0.0, 0.1):
@@ -150,7 +150,7 @@ def test_sensor_noise_is_the_same_in_a_replay_without_images() -> None:
     with environment.blind():
         blind = [environment.reset(2).state, environment.step(action).state]
     np.testing.assert_array_equal(looking, blind)
-    compiled = environment.dm_env.task.compiled
+    compiled = environment.simulation.compiled
     assert 0 < np.abs(blind[-1][:7] - compiled.data.qpos[compiled.joints]).max() < 0.05
     environment.close()
 
@@ -158,7 +158,7 @@ def test_sensor_noise_is_the_same_in_a_replay_without_images() -> None:
 def test_noise_of_images_is_normal_and_new_in_every_image() -> None:
     environment = make_tabletop("task/randomize=hard", "task.image_size=[64,64]")
     environment.reset(2)
-    compiled = environment.dm_env.task.compiled
+    compiled = environment.simulation.compiled
     clean = environment.renderer.render(compiled.data)[0].astype(float)
     inside = (clean > 60) & (clean < 195)  # where nothing is cut off
     first, second = (np.stack(list(environment.look().rgb.values())) - clean for _ in range(2))
@@ -179,7 +179,7 @@ def test_streams_differ_between_axes_and_seeds() -> None:
 
 
 def test_bad_axes_are_explained(tabletop: Tabletop) -> None:
-    compiled = tabletop.dm_env.task.compiled
+    compiled = tabletop.simulation.compiled
     with pytest.raises(ValueError, match=r"unknown colours \['mauve'\]"):
         Colours(["mauve"], jitter=0.0)
     with pytest.raises(ValueError, match=r"unknown shapes \['ball'\]"):

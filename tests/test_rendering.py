@@ -58,7 +58,7 @@ def wide() -> Iterator[tuple[Tabletop, Renderer, ReferenceRenderer]]:
     environment = make_tabletop("task/randomize=wide", "task.blocks=6")
     with environment.blind():
         environment.reset(0)  # compiles the model
-    model, view = environment._task.compiled.model, View((0, 1), SIZE, SIZE, geom_groups=(2,))
+    model, view = environment.simulation.compiled.model, View((0, 1), SIZE, SIZE, geom_groups=(2,))
     first, second = fast().open(model, view), Reference().open(model, view)
     yield environment, first, second
     for each in (first, second, environment):
@@ -68,7 +68,7 @@ def wide() -> Iterator[tuple[Tabletop, Renderer, ReferenceRenderer]]:
 def start(environment: Tabletop, seed: int, *renderers: Renderer) -> mujoco.MjData:
     with environment.blind():
         environment.reset(seed)
-    compiled = environment._task.compiled
+    compiled = environment.simulation.compiled
     for renderer in renderers:
         renderer.update(range(compiled.model.ntex))
     return compiled.data
@@ -91,7 +91,7 @@ def test_pictures_of_a_hundred_scenes_equal_mujocos(wide: tuple[Tabletop, Render
 
 def test_no_object_is_missing(wide: tuple[Tabletop, Renderer, ReferenceRenderer]) -> None:
     environment, first, second = wide
-    model = environment._task.compiled.model
+    model = environment.simulation.compiled.model
     head = model.vis.headlight
     before = [np.array(values) for values in (head.ambient, head.diffuse, model.light_active)]
     for seed in range(20):
@@ -118,7 +118,7 @@ def test_changes_of_a_model_are_taken_over(wide: tuple[Tabletop, Renderer, Refer
     environment, first, _ = wide
     for seed in (3, 50, 7):
         data = start(environment, seed, first)
-        new = fast().open(environment._task.compiled.model, View((0, 1), SIZE, SIZE, geom_groups=(2,)))
+        new = fast().open(environment.simulation.compiled.model, View((0, 1), SIZE, SIZE, geom_groups=(2,)))
         for ours, theirs in zip(first.render(data), new.render(data), strict=True):
             np.testing.assert_array_equal(ours, theirs)
         new.close()

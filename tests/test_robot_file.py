@@ -6,7 +6,7 @@ import json
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 import pytest
@@ -23,6 +23,7 @@ from vla.robots.chain import frame_positions
 from vla.rollouts.rollout import rollout
 from vla.spec import Spec
 from vla.tasks.tabletop.expert import Waypoint
+from vla.tasks.tabletop.robot_file import RobotFile
 
 if TYPE_CHECKING:
     from vla.tasks.tabletop.environment import Tabletop
@@ -124,7 +125,7 @@ def test_the_expert_acts_with_an_arm_from_a_file(tmp_path: Path, kind: str) -> N
     environment = make(file)
     robot: Any = environment.spec.robot
     assert robot.joints == tuple(f"j{index}" for index in range(6))
-    assert environment.dm_env.task.scene.robot.widest == pytest.approx(0.08, abs=2e-3)
+    assert environment.simulation.scene.robot.widest == pytest.approx(0.08, abs=2e-3)
     assert successes(environment, range(4)) == 4
     assert environment.reset(0).rgb["wrist"].std() > 5
     environment.close()
@@ -133,7 +134,7 @@ def test_the_expert_acts_with_an_arm_from_a_file(tmp_path: Path, kind: str) -> N
 def test_the_spec_describes_the_compiled_arm(jaco: Tabletop) -> None:
     """The chain leads to the tool, the Jacobian is its derivative, and the spec survives a file."""
     robot: Any = jaco.spec.robot
-    kinematics = jaco.dm_env.task.scene.robot.kinematics
+    kinematics = jaco.simulation.scene.robot.kinematics
     joints = kinematics.home + np.array([0.3, -0.2, 0.1, 0.4, -0.3, 0.2])
     pose, jacobian = kinematics.forward(joints)
     jacobian = jacobian.copy()
@@ -147,7 +148,7 @@ def test_the_spec_describes_the_compiled_arm(jaco: Tabletop) -> None:
 
 def test_a_cartesian_policy_moves_the_arm_that_it_was_trained_with(jaco: Tabletop) -> None:
     """The loop of a deployment: the tool goes where the simulator's own kinematics say."""
-    spec, arm = replace(jaco.spec, cameras=("front",), depth=()), jaco.dm_env.task.scene.robot.kinematics
+    spec, arm = replace(jaco.spec, cameras=("front",), depth=()), jaco.simulation.scene.robot.kinematics
     limits = {"low": [-9.0] * 6, "high": [9.0] * 6, "speed": [2.0] * 6, "acceleration": [50.0] * 6}
     shares = {"speed_share": 1.0, "acceleration_share": 1.0}
     robot = Robot(
@@ -179,11 +180,11 @@ def test_every_axis_of_randomisation_is_applied(jaco: Tabletop) -> None:
     nominal = None
     for seed in range(5):
         observation = jaco.reset(seed)
-        compiled = jaco.dm_env.task.compiled
+        compiled, robot = jaco.simulation.compiled, cast(RobotFile, jaco.simulation.compiled.robot)
         drawn: Any = jaco.draws["arm"]
         assert observation.truth is not None
         assert np.linalg.norm(observation.truth["tcp"] - drawn["tcp"]) < 2e-3
-        opening = np.clip(drawn["opening"], compiled.robot.narrowest, compiled.robot.widest)
+        opening = np.clip(drawn["opening"], robot.narrowest, robot.widest)
         assert abs(observation.state[-1] - opening) < 5e-3 + 4 * jaco.draws["sensor"]["gripper"]
         colours = compiled.model.geom_rgba[compiled.robot_geoms, :3].copy()
         assert nominal is None or np.abs(colours - nominal).max() > 0.01

@@ -330,7 +330,7 @@ class Eventful(Protocol):
 
     @property
     def events(self) -> Sequence[tuple[int, str]]:
-        """What has happened in this episode: index of the last observation before it or the first one that shows it."""
+        """Events so far: index of the last observation before one, or the first that shows it, and its description."""
         ...
 
 

@@ -151,7 +151,7 @@ def _require_own_parts(parsed: Sequence[Override], groups: Sequence[str]) -> Non
         if group in groups:
             raise ValueError(
                 f"{override.input_line} cannot be combined with a checkpoint, whose weights belong to the {group} "
-                "they were trained with: omit one of the two; task/randomize=wide and evaluate=suite can be combined"
+                "they were trained with: omit one of the two; options of task and evaluate can be combined"
             )
 
 

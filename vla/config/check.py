@@ -14,7 +14,6 @@ from omegaconf import DictConfig, OmegaConf
 
 from vla.config.annotations import fits, locate
 from vla.config.build import GROUPS, Group, arguments, check_node, check_value, makes, require_known
-from vla.config.conditions import conditions
 from vla.io.types import Count, Natural, Seed, Shift, Text, unique
 from vla.spec import FIRST_SEED
 
@@ -119,6 +118,28 @@ def _check_changes(cfg: DictConfig, training: bool) -> None:
         changed["improve.changes"] = cast("dict[str, Any]", OmegaConf.to_container(cfg.improve.changes, resolve=True))
     for name, changes in changed.items():
         check_node(f"task ({name})", with_changes(task, changes), makes(GROUPS["task"]))
+
+
+def conditions(evaluate: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+    """Return condition → overrides of the task node: `evaluate.conditions`, then each part of `evaluate.one_by_one`.
+
+    A part at a level is named `part_level`, such as light_hard, or `part` if all levels are equal.
+
+    Args:
+        evaluate: the plain node, whose `one_by_one` is level → argument of the task → part → value.
+    """
+    named: dict[str, dict[str, Any]] = dict(evaluate["conditions"])
+    levels: dict[tuple[str, str], dict[str, Any]] = {}
+    for level, overrides in evaluate["one_by_one"].items():
+        for argument, parts in overrides.items():
+            for part, value in parts.items():
+                levels.setdefault((argument, part), {})[level] = value
+    for (argument, part), values in levels.items():
+        if len(values) > 1 and len({repr(value) for value in values.values()}) == 1:
+            values = {"": next(iter(values.values()))}
+        for level, value in values.items():
+            named[f"{part}_{level}" if level else part] = {argument: {part: value}}
+    return named
 
 
 def with_changes(node: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:

@@ -77,7 +77,7 @@ class Experiment:
 
     @property
     def playable(self) -> bool:
-        """Whether agents can act in the world of the task; else it is known from recordings only."""
+        """True if agents can act in the world of the task; else it is known from recordings only."""
         return not issubclass(locate("task._target_", self["task"]["_target_"]), SpecOnly)
 
     def world(self) -> Environment | SpecOnly:
@@ -230,7 +230,7 @@ def make_expert(expert: Node, environment: Environment) -> Agent:
 
     agent: Agent = build(expert, "expert", spec=environment.spec)
     if isinstance(agent, ImportedDemonstrations):
-        raise ValueError("recorded demonstrations cannot act: this job needs another expert, such as expert=waypoint")
+        raise ValueError("recorded demonstrations cannot act: this job needs the expert of a world that can be played")
     return agent
 
 

@@ -16,8 +16,7 @@ from typing import Any
 from rich import print as show
 
 from vla.config.build import Group, build
-from vla.config.check import Job, with_changes
-from vla.config.conditions import conditions
+from vla.config.check import Job, conditions, with_changes
 from vla.config.experiment import Experiment
 from vla.io.files import writing
 from vla.policy import latency

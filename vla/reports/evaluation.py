@@ -74,7 +74,7 @@ def write_report(
     write_text(path, json.dumps(content, indent=1, allow_nan=False, ensure_ascii=False) + "\n")
 
 
-def summary(report: Report) -> dict[str, Any]:
+def summary(report: Report, of_tier: bool = False) -> dict[str, Any]:
     """Summarise a report for JSON: rate, interval, outcomes, milestones, motion, and the same per task if there
     are several.
 
@@ -83,9 +83,7 @@ def summary(report: Report) -> dict[str, Any]:
     With tiers also the same per tier, and the mean over tiers.
     """
     low, high = report.interval
-    tasks = report.tasks if len(report.tasks) > 1 or report.tiers else {}
-    tiers = report.by_tier if len(report.tiers) > 1 else {}
-    mean = report.mean_over_tiers
+    tiers, mean = {} if of_tier else report.by_tier, report.mean_over_tiers
     return {
         "success": report.success,
         "ci_low": low,
@@ -97,8 +95,8 @@ def summary(report: Report) -> dict[str, Any]:
         "milestones": {name: _milestone(report, count) for name, count in report.milestones.items()},
         "motion": {name: asdict(median) for name, median in report.medians.items()},
         **_in_a_row(report),
-        "tasks": {task: summary(part) for task, part in tasks.items()},
-        **({"tiers": {tier: summary(part) for tier, part in tiers.items()}} if tiers else {}),
+        "tasks": {task: summary(part) for task, part in report.by_task.items()},
+        **({"tiers": {tier: summary(part, True) for tier, part in tiers.items()}} if tiers else {}),
         **({"mean_over_tiers": dict(zip(("rate", "ci_low", "ci_high"), mean, strict=True))} if mean else {}),
         **({"anytime": True} if report.anytime else {}),
     }

@@ -25,10 +25,9 @@ from vla.reports.conditions import Courses, comparison_texts, course_head, cours
 from vla.reports.posteriors import draw_posteriors
 from vla.reports.style import BLUE, GREEN, GREY, RED, Interval
 from vla.reports.training_curves import colours, draw_run, draw_runs
-from vla.rollouts.evaluate import IN_DISTRIBUTION, Median, Report
+from vla.rollouts.evaluate import IN_DISTRIBUTION, Report
 from vla.rollouts.motion import AMOUNTS
 from vla.runs.folder import Run, read_run
-from vla.spec import READABLE
 
 log = logging.getLogger(__name__)
 
@@ -39,6 +38,7 @@ FAILURES, SUCCESSES = 6, 3  # filmstrips on a run's page
 NAMED = 5  # maximum number of tasks in a title
 COMPARED = 3  # failures per run on a comparison
 
+Rate = tuple[Interval, str, Sequence[str]]  # count of episodes, and comparison with the first condition
 
 # Heads of the columns, and rows of words and cells, which are difference, interval and whether that is decided.
 CourseTable = tuple[list[str], list[tuple[Sequence[str], list[tuple[str, str, bool] | None]]]]
@@ -81,7 +81,8 @@ def write_page(folder: Path) -> Path:
         facts=_facts(run),
         all_steps=at(run.config, "trainer.max_steps", None),
         tables=_rate_tables(run),
-        medians=_medians(run),
+        report=run.reports.get(IN_DISTRIBUTION),
+        amounts=AMOUNTS,
         course=_course({(name,): part.course for name, part in run.report.conditions.items()} if run.report else {}),
         errors=_error_table(run),
         curves=draw_run(run.metrics),
@@ -198,52 +199,35 @@ def _error_table(run: Run) -> list[tuple[str, str, str]]:
     """Return component, error with its interval, and error of a constant action."""
     rows = []
     for each in run.errors.components if run.errors else ():
-        factor, unit = READABLE.get(each.unit, (1.0, each.unit))
-        high = "∞" if each.ci_high is None else f"{factor * each.ci_high:.3g}"
-        interval = f"{factor * each.error:.3g} ({factor * each.ci_low:.3g}-{high}) {unit}"
-        rows.append((each.name, interval, f"{factor * each.constant:.3g} {unit}"))
+        unit, error, interval, constant = each.readable()
+        rows.append((each.name, f"{error} ({interval}) {unit}", f"{constant} {unit}"))
     return rows
 
 
-def _rate_tables(run: Run) -> dict[str, dict[str, tuple[Interval, str, Sequence[str]]]]:
-    """Return table → name → (rate, count, comparison with the first condition) of a run's page."""
+def _rate_tables(run: Run) -> dict[str, dict[str, Rate]]:
+    """Return table → name → row of a run's page."""
     if run.report is None:
         return {"condition": {}, "tier": {}, "task": {}, "milestone": {}, "completed": {}}
-    first, conditions = next(iter(run.reports.values())), run.report.conditions
+    first, conditions = run.reports[IN_DISTRIBUTION], run.report.conditions
     mean = first.mean_over_tiers
-    compared = {name: each.comparison for name, each in conditions.items() if each.comparison}
+    compared = {name: comparison_texts(each.comparison) for name, each in conditions.items() if each.comparison}
     return {
-        "condition": {
-            name: (
-                _interval(report),
-                f"{report.successes}/{report.episodes}",
-                comparison_texts(compared[name]) if name in compared else (),
-            )
-            for name, report in run.reports.items()
-        },
+        "condition": {name: (*_rate(report)[:2], compared.get(name, ())) for name, report in run.reports.items()},
         "tier": {
-            **{
-                name: (_interval(part), f"{part.successes}/{part.episodes}", ()) for name, part in first.by_tier.items()
-            },
+            **{name: _rate(part) for name, part in first.by_tier.items()},
             **({"mean over tiers": (mean, "", ())} if mean else {}),
         },
-        "task": {
-            name: ((part.success, part.ci_low, part.ci_high), f"{part.successes}/{part.episodes}", ())
-            for name, part in run.report.tasks.items()
-        },
-        "milestone": {
-            name: ((part.rate, part.ci_low, part.ci_high), f"{part.episodes}/{run.report.episodes}", ())
-            for name, part in run.report.milestones.items()
-        },
-        "completed": {
-            name: ((part.rate, part.ci_low, part.ci_high), f"{part.episodes}/{run.report.episodes}", ())
-            for name, part in run.report.in_a_row.items()
-        },
+        "task": {name: _rate(part) for name, part in first.by_task.items()},
+        "milestone": {name: _rate(first, count) for name, count in first.milestones.items()},
+        "completed": {name: _rate(first, count) for name, count in first.in_a_row.items()},
     }
 
 
-def _medians(run: Run) -> list[tuple[str, Median]]:
-    return [(AMOUNTS[name], median) for name, median in run.report.motion.items()] if run.report else []
+def _rate(report: Report, count: int | None = None) -> Rate:
+    """Return the rate of an event that `count` completed episodes had, by default that of success."""
+    interval = report.interval if count is None else report.interval_of(count)
+    count = report.successes if count is None else count
+    return (count / max(report.episodes, 1), *interval), f"{count}/{report.episodes}", ()
 
 
 def _course(rows: Courses) -> CourseTable:
@@ -253,10 +237,6 @@ def _course(rows: Courses) -> CourseTable:
         for words, course in rows.items()
         if course
     ]
-
-
-def _interval(report: Report) -> Interval:
-    return report.success, *report.interval
 
 
 def _costs(run: Run) -> list[str]:

@@ -17,7 +17,6 @@ from vla.io.files import write_text
 from vla.reports.style import BLUE, GREEN, GREY, save
 from vla.rollouts.open_loop import OpenLoop
 from vla.runs.files import ComponentError
-from vla.spec import READABLE
 
 COLUMNS = 4  # panels of components per row
 
@@ -62,10 +61,7 @@ def errors_table(result: OpenLoop) -> Table:
     title = f"mean absolute errors on {len(result.seeds)} held-out episodes, open loop"
     table = Table("component", "unit", "error", "95 % CI", "of a constant action", title=title)
     for each in components(result):
-        factor, unit = READABLE.get(each.unit, (1.0, each.unit))
-        high = "∞" if each.ci_high is None else f"{factor * each.ci_high:.3g}"
-        interval = f"{factor * each.ci_low:.3g}-{high}"
-        table.add_row(each.name, unit, f"{factor * each.error:.3g}", interval, f"{factor * each.constant:.3g}")
+        table.add_row(each.name, *each.readable())
     return table
 
 

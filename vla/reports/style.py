@@ -1,4 +1,4 @@
-"""What all plots share: colours, error bars, files, and pictures within a page."""
+"""Style of all plots: colours, error bars, files, and pictures within a page."""
 
 from __future__ import annotations
 

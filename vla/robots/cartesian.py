@@ -26,7 +26,7 @@ TOLERANCE = 1e-4  # [m] and [rad]
 
 @dataclass(frozen=True, eq=False)
 class Kinematics:
-    """What inverse kinematics needs to know of an arm."""
+    """Facts of an arm that inverse kinematics needs."""
 
     # Joints (J,) → pose (4, 4) of the tool in the base frame [m], and its Jacobian (6, J), linear rows [m/rad] before
     # angular rows.

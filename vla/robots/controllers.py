@@ -1,4 +1,4 @@
-"""Which controller executes the actions of a policy on its arm.
+"""Controllers that execute the actions of a policy on its arm.
 
 Shapes: J joints.
 """

@@ -175,6 +175,11 @@ class Report:
         return {name: self._part([name]) for name in names}
 
     @property
+    def by_task(self) -> dict[str, Report]:
+        """The same where there are several, or tiers of them; otherwise empty."""
+        return self.tasks if len(self.tasks) > 1 or self.tiers else {}
+
+    @property
     def by_tier(self) -> dict[str, Report]:
         """Tier → report of its episodes; without tiers of which no episode was completed."""
         parts = {tier: self._part(tasks, {tier: tasks}) for tier, tasks in self.tiers.items()}

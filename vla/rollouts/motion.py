@@ -1,4 +1,4 @@
-"""How an episode was carried out: its time, the length of the tool's path, and how smooth that is."""
+"""Time of an episode, length of the tool's path, and its smoothness."""
 
 from __future__ import annotations
 

@@ -79,7 +79,7 @@ class Link(Protocol):
 
     @property
     def busy(self) -> bool:
-        """Whether an answer is awaited."""
+        """True while an answer is awaited."""
         ...
 
     def reset(self, seed: int) -> None:
@@ -195,7 +195,7 @@ class BackgroundLink:
 
     @property
     def busy(self) -> bool:
-        """Whether an answer is awaited."""
+        """True while an answer is awaited."""
         return self._answer is not None
 
     def reset(self, seed: int) -> None:

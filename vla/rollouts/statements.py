@@ -1,4 +1,4 @@
-"""What an evaluation is to decide: whether success is above a bar, and how it compares with that of another run."""
+"""Statements that an evaluation is to decide: success is above a bar, or differs from that of another run."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class Statement(Protocol):
 
 @dataclass(frozen=True)
 class AgainstBar:
-    """Whether the success rate is above or below `bar`, between 0 and 1."""
+    """Comparison of the success rate with a `bar`, between 0 and 1."""
 
     bar: float
 
@@ -44,7 +44,7 @@ class AgainstBar:
 
 @dataclass(frozen=True)
 class AgainstRun:
-    """Whether success differs from that of another run on the same episodes, or by less than `margin`."""
+    """Difference from the success of another run on the same episodes, or a bound on it, `margin`."""
 
     run: str
     results: Mapping[int, Result]  # seed → result of the other run
@@ -88,7 +88,7 @@ class AgainstRun:
 
 @dataclass(frozen=True)
 class AgainstCondition:
-    """Whether success under a condition differs from that of the `first` condition, or by less than `margin`."""
+    """Difference of success under a condition from the `first` condition, or a bound on it, `margin`."""
 
     first: Report
     margin: float

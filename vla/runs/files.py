@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from itertools import repeat
 from typing import Annotated, Any
 
@@ -12,10 +13,12 @@ from pydantic import ConfigDict, StringConstraints
 from vla.io.documents import STRICT
 from vla.io.types import Count, Natural, NonNegative, Positive, Share
 from vla.rollouts.comparison import Comparison
-from vla.rollouts.evaluate import Median, Result
+from vla.rollouts.evaluate import IN_DISTRIBUTION, Report, Result
 from vla.rollouts.motion import Motion
+from vla.spec import READABLE
 
 Node = dict[str, Any]
+LENIENT = ConfigDict(strict=True, extra="ignore", allow_inf_nan=False)  # what follows from the rest is not read
 CheckpointName = Annotated[str, StringConstraints(pattern=r"^\w[\w.-]*\.ckpt$")]  # in the run's own folder
 
 
@@ -64,63 +67,6 @@ class Round:
 
 
 @dataclass(frozen=True)
-class Milestone:
-    """Rate of a milestone, regardless of the outcome."""
-
-    __pydantic_config__ = STRICT
-
-    rate: Share
-    ci_low: Share
-    ci_high: Share
-    episodes: Natural  # that reached it
-
-
-@dataclass(frozen=True)
-class Mean:
-    """Mean of several success rates, with its confidence interval."""
-
-    __pydantic_config__ = STRICT
-
-    rate: Share
-    ci_low: Share
-    ci_high: Share
-
-
-@dataclass(frozen=True)
-class MeanInARow:
-    """Mean number of instructions completed in a row, with its confidence interval."""
-
-    __pydantic_config__ = STRICT
-
-    number: NonNegative
-    ci_low: NonNegative
-    ci_high: NonNegative
-
-
-@dataclass(frozen=True, kw_only=True)
-class Summary:
-    """Success statistics, written by `vla.reports.evaluation.summary`."""
-
-    __pydantic_config__ = ConfigDict(strict=True, extra="ignore", allow_inf_nan=False)
-
-    success: Share
-    ci_low: Share
-    ci_high: Share
-    episodes: Natural
-    successes: Natural
-    errors: Natural
-    taxonomy: dict[str, Natural]
-    milestones: dict[str, Milestone]
-    tasks: dict[str, Summary]
-    motion: dict[str, Median] = field(default_factory=dict)  # field of `vla.rollouts.motion.Motion` → over successes
-    in_a_row: dict[str, Milestone] = field(default_factory=dict)  # "1/4" → at least one of four instructions
-    mean_in_a_row: MeanInARow | None = None
-    tiers: dict[str, Summary] = field(default_factory=dict)
-    mean_over_tiers: Mean | None = None
-    anytime: bool = False  # intervals are valid whatever the reason to stop playing
-
-
-@dataclass(frozen=True)
 class ComponentError:
     """Mean absolute error of an action component over episodes, with its confidence interval."""
 
@@ -133,12 +79,18 @@ class ComponentError:
     ci_high: NonNegative | None  # None: unbounded
     constant: NonNegative  # error of the mean action of the training episodes
 
+    def readable(self) -> tuple[str, str, str, str]:
+        """Format unit, error, its interval and the constant error, in units for display."""
+        factor, unit = READABLE.get(self.unit, (1.0, self.unit))
+        high = "∞" if self.ci_high is None else f"{factor * self.ci_high:.3g}"
+        return unit, f"{factor * self.error:.3g}", f"{factor * self.ci_low:.3g}-{high}", f"{factor * self.constant:.3g}"
+
 
 @dataclass(frozen=True, kw_only=True)
 class ErrorsFile:
     """errors.json, written by `vla.reports.open_loop.write_errors`."""
 
-    __pydantic_config__ = ConfigDict(strict=True, extra="ignore", allow_inf_nan=False)
+    __pydantic_config__ = LENIENT
 
     seeds: list[Natural]
     components: list[ComponentError]
@@ -151,8 +103,10 @@ class ErrorsFile:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Condition(Summary):
-    """Success statistics under another condition, on the same seeds."""
+class Condition:
+    """Episodes under another condition, on the same seeds."""
+
+    __pydantic_config__ = LENIENT
 
     outcomes: list[str]  # with `anytime`, of the first seeds
     comparison: Comparison | None = None  # with the training condition
@@ -160,25 +114,40 @@ class Condition(Summary):
     # Per episode, as `outcomes`; empty in reports of before they were kept.
     reached: list[tuple[str, ...]] = field(default_factory=list)  # milestones
     motions: list[Motion | None] = field(default_factory=list)
+    anytime: bool = False  # intervals are valid whatever the reason to stop playing
 
-    def results(self, seeds: Sequence[int]) -> tuple[Result, ...]:
-        """Return what is known of the episodes of these seeds."""
+    def report(self, seeds: Sequence[int]) -> Report:
+        """Return the report on episodes of these seeds, without draws and instructions."""
         reached, motions = self.reached or repeat(()), self.motions or repeat(None)
-        return tuple(
+        results = (
             Result(seed, outcome, milestones=milestones, motion=motion)
             for seed, outcome, milestones, motion in zip(seeds, self.outcomes, reached, motions, strict=False)
         )
+        return Report(tuple(results), anytime=self.anytime)
+
+
+@dataclass(frozen=True)
+class Tier:
+    """Tier of a benchmark."""
+
+    __pydantic_config__ = LENIENT
+
+    tasks: Node  # by name
 
 
 @dataclass(frozen=True, kw_only=True)
-class ReportFile(Summary):
-    """report.json, written by `vla.reports.evaluation.write_report`, without the names of chosen options."""
+class ReportFile:
+    """report.json, written by `vla.reports.evaluation.write_report`, without what follows from its episodes."""
+
+    __pydantic_config__ = LENIENT
 
     seeds: list[int]
     checkpoint: str | None
     conditions: dict[str, Condition]
     config: Node
     per_episode: list[Result]
+    tiers: dict[str, Tier] = field(default_factory=dict)
+    anytime: bool = False  # as of a condition
     parameters: Count | None = None
     latency_ms: Positive | None = None
     wall_time_s: NonNegative | None = None
@@ -195,3 +164,11 @@ class ReportFile(Summary):
                 raise ValueError(f"conditions.{name} has {played} outcomes of {len(self.seeds)} seeds")
             if any(len(each) not in (0, played) for each in (condition.reached, condition.motions)):
                 raise ValueError(f"conditions.{name} has other episodes in reached or motions than in outcomes")
+
+    @cached_property
+    def reports(self) -> dict[str, Report]:
+        """Condition → report, the training condition first."""
+        first = Report(
+            tuple(self.per_episode), {tier: [*part.tasks] for tier, part in self.tiers.items()}, self.anytime
+        )
+        return {IN_DISTRIBUTION: first, **{name: part.report(self.seeds) for name, part in self.conditions.items()}}

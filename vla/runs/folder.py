@@ -8,7 +8,7 @@ import json
 import logging
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, replace
-from functools import cached_property, partial
+from functools import partial
 from math import isfinite
 from pathlib import Path
 from typing import Any, TypeVar
@@ -64,17 +64,10 @@ class Run:
         known = self.training or self.report or self.errors
         return known.parameters if known else None
 
-    @cached_property
+    @property
     def reports(self) -> dict[str, Report]:
-        """Condition → report, the training condition first; reports of the others have no draws and instructions."""
-        if not self.report:
-            return {}
-        others = {
-            name: Report(part.results(self.report.seeds), anytime=part.anytime)
-            for name, part in self.report.conditions.items()
-        }
-        tiers = {tier: [*part.tasks] for tier, part in self.report.tiers.items()}
-        return {IN_DISTRIBUTION: Report(tuple(self.report.per_episode), tiers, self.report.anytime), **others}
+        """Condition → report, the training condition first; empty without an evaluation."""
+        return self.report.reports if self.report else {}
 
 
 def read_run(folder: Path) -> Run:

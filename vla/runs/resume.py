@@ -15,6 +15,7 @@ from filelock import FileLock, Timeout
 from vla.config.adopt import require_identity
 from vla.config.differences import differences
 from vla.models.checkpoint import read_header
+from vla.rollouts.evaluate import IN_DISTRIBUTION
 from vla.runs.folder import CHECKPOINTS, ERRORS, LAST, REPORT, chosen_checkpoint, read_report
 
 log = logging.getLogger(__name__)
@@ -68,12 +69,10 @@ def cached_success(folder: Path, config: Mapping[str, Any], checkpoint: Path) ->
         return None
     if (folder / REPORT).stat().st_mtime < checkpoint.stat().st_mtime:  # the training continued afterwards
         return None
-    if any(part.errors for part in (report, *report.conditions.values())):
-        return None
-    if differences(report.config, config):
+    if any(part.errors for part in report.reports.values()) or differences(report.config, config):
         return None
     log.info("evaluation is already finished: %s", folder / REPORT)
-    return report.success
+    return report.reports[IN_DISTRIBUTION].success
 
 
 def interrupted_run(runs: Path) -> Path:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from vla.rollouts.evaluate import ERROR
+from vla.rollouts.evaluate import ERROR, IN_DISTRIBUTION
 from vla.rollouts.statistics import pooled_interval
 from vla.runs.cells import FAILURE, cells, overrides_of, varied_keys
 from vla.runs.folder import REPORT, read_run
@@ -68,7 +68,7 @@ def read_rows(folder: Path) -> list[SweepRow]:
         row = rows.setdefault(tuple(choices.values()), SweepRow(choices, file.parameters))
         row.cells.append(run.folder)
         row.latencies.append(file.latency_ms)
-        row.rates.append(file.success)
+        row.rates.append(run.reports[IN_DISTRIBUTION].success)
         for condition, report in run.reports.items():
             ended = {result.seed: result.outcome == "success" for result in report.results if result.outcome != ERROR}
             row.played.setdefault(condition, []).append(ended)

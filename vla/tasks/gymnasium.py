@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from importlib import import_module
 from typing import Annotated, Any
 
@@ -17,13 +16,14 @@ from PIL import Image
 
 from vla.io.types import Count, ImageSize, Names, Positive, Text
 from vla.spec import Array, Observation, Spec
+from vla.tasks.blind import Blindable
 from vla.tasks.gl import choose_backend
 
 OBSERVATION, INFO, RENDER = "observation", "info", "render"
 PATHS = (f"{OBSERVATION}.", f"{INFO}.")
 
 
-class Gymnasium:
+class Gymnasium(Blindable):
     """A gymnasium environment, of whose observation and `info` a mapping takes images, state, truth and success.
 
     A value is named by a dotted path: `observation.pixels.top` is the entry `top` of the entry `pixels` of the
@@ -71,7 +71,6 @@ class Gymnasium:
         self._environment = _make(package, id, options or {}, steps, render=RENDER in images.values())
         self._images, self._success, self._truth, self._instruction = images, success, truth, instruction
         self._size, self._state = (image_size[0], image_size[1]), tuple(state)
-        self._blind = False
         self.task, self.milestones = id, frozenset[str]()
         self.done, self.outcome = True, "timeout"
         self.draws: dict[str, Any] = {}
@@ -114,15 +113,6 @@ class Gymnasium:
         self.outcome = "success" if success else "failure" if terminated else "timeout"
         self.done = success or terminated or truncated
         return self._observe(values)
-
-    @contextmanager
-    def blind(self) -> Iterator[None]:
-        """Return no images within this context; only those of `render()` become cheaper."""
-        self._blind = True
-        try:
-            yield
-        finally:
-            self._blind = False
 
     def close(self) -> None:
         """Close the environment."""

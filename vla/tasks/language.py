@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from string import Formatter
 from typing import Annotated, Literal
 
@@ -93,23 +92,6 @@ class Silence(Grammar):
     def held_out_kinds(self) -> tuple[HeldOut, ...]:
         """No kinds."""
         return ()
-
-
-def paraphrase(instruction: str, words: Mapping[str, str], names: Iterable[str]) -> str:
-    """Replace phrases of an instruction, the longest first, so that none of the `names` remains.
-
-    Args:
-        words: phrase → what replaces it.
-        names: what the instruction names, such as colours.
-
-    Raises:
-        ValueError: nothing is replaced, or a name remains.
-    """
-    phrases = sorted(words, key=len, reverse=True)
-    replaced = re.sub(rf"\b({'|'.join(map(re.escape, phrases))})\b", lambda found: words[found[0]], instruction)
-    if replaced == instruction or set(names) & set(re.findall(r"\w+", replaced)):
-        raise ValueError(f"task.randomize.phrasing.words has no other words for all that is named in {instruction!r}")
-    return replaced
 
 
 def _slots(phrasing: str) -> set[str]:

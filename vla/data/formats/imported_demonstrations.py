@@ -23,7 +23,7 @@ STILL = 0.02  # distance between the quantiles, as a fraction of the range, belo
 
 @dataclass(frozen=True)
 class Recording:
-    """What a recording holds, from which `conf/task/recorded.yaml` takes the spec."""
+    """Content of a recording, from which `conf/task/recorded.yaml` takes the spec."""
 
     cameras: tuple[str, ...]
     control_hz: float

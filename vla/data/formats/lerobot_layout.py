@@ -81,7 +81,7 @@ class Feature:
 
     @property
     def is_depth(self) -> bool:
-        """Whether the images are depth."""
+        """True if the images are depth."""
         return True in (self._about("is_depth_map"), self._about("video.is_depth_map"))
 
     @property

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -11,6 +10,7 @@ from annotated_types import Ge, Le, Predicate
 
 from vla.io.types import Count, ImageSize, Names, Natural, Share, Text
 from vla.spec import Array, Observation, Spec
+from vla.tasks.blind import Blindable
 from vla.tasks.metaworld.package import tasks_of
 from vla.tasks.metaworld.scene import Scene
 from vla.tasks.rendering.renderer import Rendering
@@ -32,7 +32,7 @@ def within(window: Sequence[float]) -> bool:
 Window = Annotated[tuple[Share, Share, Share, Share], Predicate(within)]
 
 
-class MetaWorld:
+class MetaWorld(Blindable):
     """Fifty tasks of a Sawyer arm, one of them per episode: the seed determines which, in turn.
 
     Success is the first step that Meta-World calls one; an episode ends with it, or when its steps are used up. The
@@ -93,7 +93,6 @@ class MetaWorld:
         self._sentences, self._steps, self._most = sentences, steps, scenes
         self._drawing = renderer, self.spec.cameras, self.spec.image_size, window, shadows
         self._scenes: dict[str, Scene] = {}
-        self._blind = False
         self.done, self.outcome, self.task = True, "timeout", ""
         self.milestones: frozenset[str] = frozenset()
         self.draws: dict[str, Any] = {}
@@ -121,15 +120,6 @@ class MetaWorld:
         self._taken += 1
         self.done = solved or self._taken == self._steps
         return self._look(observation)
-
-    @contextmanager
-    def blind(self) -> Iterator[None]:
-        """Disable images in observations within this context, which makes steps several times faster."""
-        self._blind = True
-        try:
-            yield
-        finally:
-            self._blind = False
 
     def close(self) -> None:
         """Free physics and GL."""

@@ -25,12 +25,11 @@ class Noise:
 
 
 Kind = Literal["push", "drop", "move_block", "move_target"]
-KINDS: tuple[Kind, ...] = ("push", "drop", "move_block", "move_target")
 
 
 @dataclass(frozen=True)
 class Disturbance:
-    """What happens in the course of an episode, in numbers drawn at its start; see `vla.tasks.tabletop.disturber`."""
+    """Disturbance of an episode, in numbers drawn at its start; see `vla.tasks.tabletop.disturber`."""
 
     kind: Kind
     times: int  # how often

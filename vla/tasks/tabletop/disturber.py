@@ -1,4 +1,4 @@
-"""What happens in the course of an episode without the agent: pushes, drops, and moves of objects.
+"""Disturbances in the course of an episode: pushes, drops, and moves of objects, which the agent does not cause.
 
 It follows from the draws of the episode and from the states that it goes through, so a replay of the agent's actions
 reproduces it. The agent learns of it through its observations alone.

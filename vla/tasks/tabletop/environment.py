@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from statistics import NormalDist
 from typing import Any, Literal
 
@@ -12,6 +11,7 @@ import numpy as np
 
 from vla.io.types import Count, ImageSize, Names, Point, Positive
 from vla.spec import FIRST_SEED, Array, Observation, Shape, Spec
+from vla.tasks.blind import Blindable
 from vla.tasks.gl import require_backend
 from vla.tasks.rendering.renderer import Renderer, Rendering, View
 from vla.tasks.tabletop.expert import Waypoint
@@ -23,7 +23,7 @@ from vla.tasks.tabletop.randomize.randomizer import Randomizer
 from vla.tasks.tabletop.robot import Robot
 from vla.tasks.tabletop.robot_file import RobotFile
 from vla.tasks.tabletop.scene import COLOURS, Scene
-from vla.tasks.tabletop.task import CONTROL_HZ, FastEnvironment, TabletopTask
+from vla.tasks.tabletop.simulation import CONTROL_HZ, Simulation
 
 TRANSLATION = 0.04  # largest translation per step [m]
 ROTATION = 0.25  # largest rotation per step [rad]
@@ -32,8 +32,8 @@ MILLIMETRES = 1000.0  # of a metre
 QUANTILES = np.array([NormalDist().inv_cdf((index + 0.5) / 256) for index in range(256)])  # of the normal distribution
 
 
-class Tabletop:
-    """`TabletopTask` as an `Environment` with camera observations, also `Drawable`, `Drivable`, `Eventful` and
+class Tabletop(Blindable):
+    """`Simulation` as an `Environment` with camera observations, also `Drawable`, `Drivable`, `Eventful` and
     `InARow`.
 
     An episode of a chain below `FIRST_SEED` is one of its instructions, drawn from the seed: the scripted expert
@@ -100,30 +100,30 @@ class Tabletop:
             truth=(("tcp", 3), ("block", 3), ("destination", 3), ("faces", 2)),
             robot=arm,
         )
-        task = TabletopTask(goal, randomize, Scene(chosen, blocks=blocks, shadows=shadows), low, high, time_limit)
-        self.dm_env = FastEnvironment(task)
-        self._task = task
-        unknown = sorted(set(cameras) - set(task.compiled.cameras))
-        if unknown or not cameras:
-            raise ValueError(f"unknown cameras {unknown}; task.cameras may list {sorted(task.compiled.cameras)}")
+        scene = Scene(chosen, blocks=blocks, shadows=shadows)
+        self.simulation = Simulation(goal, randomize, scene, low, high, time_limit)
+        known = self.simulation.compiled.cameras
+        if unknown := sorted(set(cameras) - set(known)):
+            raise ValueError(f"unknown cameras {unknown}; task.cameras may list {sorted(known)}")
         self.done, self.outcome, self.task = True, "timeout", ""
         self.milestones: frozenset[str] = frozenset()
         self.draws: dict[str, Any] = {}
         self._choice = renderer
         self._rendering: Renderer | None = None
-        self._blind = False
         self._changed = True
 
     def reset(self, seed: int) -> Observation:
         """Start the episode of `seed`."""
-        self._task.seed = seed
-        self.dm_env.reset()
-        if self._task.name == Chain.name and seed < FIRST_SEED:
-            self._skip_to(int(self._task.streams(seed, "start").randint(len(self._task.requests))))
+        self.simulation.reset(seed)
+        if self.simulation.name == Chain.name and seed < FIRST_SEED:
+            self._skip_to(int(self.simulation.streams(seed, "start").randint(len(self.simulation.requests))))
         self._changed = True  # in the model, for the renderer
         # Separate streams, so that a replay without images has the same joint noise.
-        self._joint_noise, self._image_noise = self._task.streams(seed, "joint noise"), np.random.default_rng([seed, 1])
-        self.task, self.draws = self._task.name, self._task.draws
+        self._joint_noise, self._image_noise = (
+            self.simulation.streams(seed, "joint noise"),
+            np.random.default_rng([seed, 1]),
+        )
+        self.task, self.draws = self.simulation.name, self.simulation.draws
         self._update_outcome(done=False)
         return self.look()
 
@@ -132,63 +132,54 @@ class Tabletop:
 
         If it fails at one of them, the episode is about that one.
         """
-        task, expert = self._task, Waypoint(self.spec)
+        task, expert = self.simulation, Waypoint(self.spec)
         self._joint_noise = np.random.RandomState(0)
         task.disturber = None  # disturbances are for who acts next
         with self.blind():
             while task.current < number and not task.over:
-                self._execute(expert.act(self.look()))
+                task.step(expert.act(self.look()))
         task.isolate()
-
-    def _execute(self, action: Array) -> None:
-        """Go through one control period, as `dm_env.step` does with checks and observations of its own."""
-        task, physics, random_state = self._task, self.dm_env.physics, self.dm_env.random_state
-        task.before_step(physics, action, random_state)
-        task.advance(physics, task.substeps)
-        task.after_step(physics, random_state)
 
     def step(self, action: Array) -> Observation:
         """Apply one (7,) action, clipped to the spec's bounds, for one control period."""
         if self.done:
             raise ValueError("the episode is over; call reset(seed) before step(action)")
-        self._execute(action)
-        self._update_outcome(self._task.over)
+        self.simulation.step(action)
+        self._update_outcome(self.simulation.over)
         return self.look()
 
     def drive(self, joints: Array, opening: float, seconds: float) -> None:
         """Move towards joint targets (J,) [rad] and a gripper opening 0…1 for `seconds`; call `judge` once per control
         period."""
-        physics = self.dm_env.physics
-        substeps = round(seconds / physics.timestep())
-        self._task.follow(physics, joints, opening, substeps)
+        self.simulation.follow(joints, opening, seconds)
 
     def judge(self) -> None:
         """Update the outcome after one control period of driving; this may end the episode."""
-        self._task.after_step(self.dm_env.physics, self.dm_env.random_state)
-        self._update_outcome(self._task.over)
+        self.simulation.judge()
+        self._update_outcome(self.simulation.over)
 
     def _update_outcome(self, done: bool) -> None:
-        classifier = self._task.classifier
+        classifier = self.simulation.classifier
         self.done, self.outcome, self.milestones = done, classifier.outcome, classifier.milestones
-        self.instructions = len(self._task.requests)
-        self.completed = self._task.current + classifier.success
+        self.instructions = len(self.simulation.requests)
+        self.completed = self.simulation.current + classifier.success
         if self.events:
             self.milestones |= {"disturbed"}
 
     @property
     def events(self) -> list[tuple[int, str]]:
         """Control step and description of every disturbance so far in this episode."""
-        return self._task.events
+        return self.simulation.events
 
     @property
     def tool(self) -> Array:
         """(3,) true position of the tool centre point in the world frame [m]."""
-        compiled = self._task.compiled
+        compiled = self.simulation.compiled
         return compiled.data.site_xpos[compiled.tcp].copy()
 
     def _state(self) -> Array:
         """Measure (2 J + 1,) float32: joint positions [rad], their velocities [rad/s] and the gripper's opening [m]."""
-        compiled, noise = self._task.compiled, self._task.compiled.noise
+        compiled, noise = self.simulation.compiled, self.simulation.compiled.noise
         joints, velocities = compiled.data.qpos[compiled.joints], compiled.data.qvel[compiled.velocities]
         opening = compiled.opening()
         if noise.joints or noise.gripper:
@@ -198,50 +189,41 @@ class Tabletop:
 
     def shapes(self) -> list[Shape]:
         """Return the visible shapes of the current episode."""
-        return self._task.compiled.shapes()
+        return self.simulation.compiled.shapes()
 
     def poses(self) -> dict[str, Array]:
         """Return body name → (7,) position [m] and quaternion wxyz in the world frame."""
-        return self._task.compiled.poses()
+        return self.simulation.compiled.poses()
 
     def floor(self) -> dict[str, Callable[[], object]]:
         """Return name → minimal work of a control step, as calls for the benchmark to time."""
-        compiled = self._task.compiled
+        compiled = self.simulation.compiled
         return {
-            "physics": lambda: mujoco.mj_step(compiled.model, compiled.data, self._task.substeps),
+            "physics": lambda: mujoco.mj_step(compiled.model, compiled.data, self.simulation.substeps),
             "rendering": lambda: self.renderer.render(compiled.data),
         }
-
-    @contextmanager
-    def blind(self) -> Iterator[None]:
-        """Disable images in observations within this context, which makes steps several times faster."""
-        self._blind = True
-        try:
-            yield
-        finally:
-            self._blind = False
 
     def close(self) -> None:
         """Free physics and GL."""
         if self._rendering is not None:
             self._rendering.close()
             self._rendering = None
-        self.dm_env.close()
+        self.simulation.close()
 
     @property
     def renderer(self) -> Renderer:
         """The renderer, created on first use, because blind environments need no GL."""
         if self._rendering is None:
-            compiled, (height, width) = self._task.compiled, self.spec.image_size
+            compiled, (height, width) = self.simulation.compiled, self.spec.image_size
             cameras = [compiled.cameras[name] for name in self.spec.cameras]
             self._rendering = self._choice.open(compiled.model, View(cameras, height, width, geom_groups=(VISIBLE,)))
         return self._rendering
 
     def look(self) -> Observation:
         """Return the current observation."""
-        compiled = self._task.compiled
+        compiled = self.simulation.compiled
         if self._blind:
-            return Observation({}, self._state(), self._task.instruction, {}, self._task.truth())
+            return Observation({}, self._state(), self.simulation.instruction, {}, self.simulation.truth())
         if self._changed:
             self.renderer.update(compiled.stale_textures)
             compiled.stale_textures.clear()
@@ -252,14 +234,14 @@ class Tabletop:
         rgb = dict(zip(self.spec.cameras, pictures, strict=True))
         millimetres = np.rint(metres * np.float32(MILLIMETRES)).astype(np.uint16)
         depth = dict(zip(self.spec.cameras, millimetres, strict=True))
-        return Observation(rgb, self._state(), self._task.instruction, depth, self._task.truth())
+        return Observation(rgb, self._state(), self.simulation.instruction, depth, self.simulation.truth())
 
     def _grainy(self, pictures: Array) -> Array:
         """Add normal noise to pictures (cameras, H, W, 3), in whole grey levels up to 127.
 
         A random byte chooses one of 256 equally probable values, which takes an eighth of the time of normal numbers.
         """
-        levels = np.rint(self._task.compiled.noise.image * QUANTILES).clip(-127, 127).astype(np.int8)
+        levels = np.rint(self.simulation.compiled.noise.image * QUANTILES).clip(-127, 127).astype(np.int8)
         grain = self._image_noise.bytes(pictures.size).translate(levels.tobytes())
         noise = np.frombuffer(grain, np.int8).reshape(pictures.shape)
         return np.add(pictures, noise, dtype=np.int16).clip(0, 255).astype(np.uint8)

@@ -68,7 +68,7 @@ class OutcomeClassifier:
 
     @property
     def success(self) -> bool:
-        """Whether the goal held for `hold_steps`."""
+        """True if the goal held for `hold_steps`."""
         return self._held_for >= self._hold_steps
 
     @property

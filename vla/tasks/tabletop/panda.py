@@ -1,4 +1,4 @@
-"""The Franka Panda with its parallel gripper, as a dm_control entity."""
+"""The Franka Panda with its parallel gripper."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any, Literal
 
 import mujoco
 import numpy as np
-from dm_control import composer, mjcf
+from dm_control import mjcf
 
 from vla.robots.panda import (
     CHAIN,
@@ -105,7 +105,7 @@ def read_corners(path: Path) -> Array:
     return np.unique(np.fromfile(path, triangle, offset=84)["corners"].reshape(-1, 3), axis=0)
 
 
-class Panda(composer.Entity, Robot):
+class Panda(Robot):
     """Seven position-servoed joints with gravity compensation and a gripper whose fingers share one servo."""
 
     prefix = "panda/"
@@ -116,13 +116,13 @@ class Panda(composer.Entity, Robot):
     closed, opened = np.zeros(1), np.array([FINGER_TRAVEL])
     travel, finger_speed, widest = FINGER_TRAVEL, FINGER_SPEED, MAX_OPENING
 
-    def _build(self, meshes: Literal["light", "full"] = "light") -> None:
+    def __init__(self, meshes: Literal["light", "full"] = "light") -> None:
         """Args: meshes: visual meshes, "light" (1 200 faces) or "full" (134 000). Collision meshes are the same."""
-        self._mjcf_root = mjcf.RootElement(model="panda")
-        self._mjcf_root.compiler.angle = "radian"
+        self.root = mjcf.RootElement(model="panda")
+        self.root.compiler.angle = "radian"
         self._meshes = meshes
         self._add_assets()
-        body = self._mjcf_root.worldbody.add("body", name="link0")
+        body = self.root.worldbody.add("body", name="link0")
         body.add(
             "inertial", mass=0.629769, pos=(-0.041018, -0.00014, 0.049974), diaginertia=(0.00315, 0.00388, 0.004285)
         )
@@ -135,13 +135,13 @@ class Panda(composer.Entity, Robot):
         folder = mesh_folder()
         names = [*(f"link{index}" for index in range(8)), "hand", "finger"]
         for name in names:
-            self._mjcf_root.asset.add("mesh", name=name, file=str(folder / "collision" / f"{name}.stl"))
+            self.root.asset.add("mesh", name=name, file=str(folder / "collision" / f"{name}.stl"))
             if self._meshes == "light":
                 # Convex hulls of the collision meshes; with shadows, every face is rendered twice per camera.
                 corners = spread(read_corners(folder / "collision" / f"{name}.stl"), CORNERS)
-                self._mjcf_root.asset.add("mesh", name=f"{name}_seen", vertex=corners.ravel())
+                self.root.asset.add("mesh", name=f"{name}_seen", vertex=corners.ravel())
             else:
-                self._mjcf_root.asset.add("mesh", name=f"{name}_seen", file=str(folder / "visual" / f"{name}.stl"))
+                self.root.asset.add("mesh", name=f"{name}_seen", file=str(folder / "visual" / f"{name}.stl"))
 
     def _add_mesh(self, body: mjcf.Element, mesh: str, rgba: tuple[float, ...], collide: bool = True) -> None:
         body.add("geom", type="mesh", mesh=f"{mesh}_seen", group=2, rgba=rgba, mass=0, **NO_CONTACT)
@@ -155,7 +155,7 @@ class Panda(composer.Entity, Robot):
         joint = body.add(
             "joint", name=f"joint{index + 1}", axis=(0, 0, 1), range=limits, limited=True, armature=ARMATURE
         )
-        self._mjcf_root.actuator.add(
+        self.root.actuator.add(
             "position",
             name=f"joint{index + 1}",
             joint=joint,
@@ -203,13 +203,13 @@ class Panda(composer.Entity, Robot):
                 **FINGERTIP_CONTACT,
                 **ROBOT_CONTACT,
             )
-        tendon = self._mjcf_root.tendon.add("fixed", name="fingers")
+        tendon = self.root.tendon.add("fixed", name="fingers")
         for joint in fingers:
             tendon.add("joint", joint=joint, coef=0.5)
-        self._mjcf_root.equality.add(
+        self.root.equality.add(
             "joint", joint1=fingers[0], joint2=fingers[1], solref=(0.005, 1), solimp=(0.95, 0.99, 0.001)
         )
-        self._mjcf_root.actuator.add(
+        self.root.actuator.add(
             "position",
             name="fingers",
             tendon=tendon,
@@ -226,8 +226,3 @@ class Panda(composer.Entity, Robot):
     def opening(self, model: mujoco.MjModel, data: mujoco.MjData) -> float:
         """Return the sum of both fingers' positions [m]."""
         return float(sum(data.joint(finger).qpos[0] for finger in self.fingers))
-
-    @property
-    def mjcf_model(self) -> mjcf.RootElement:
-        """The model's root element."""
-        return self._mjcf_root

@@ -1,9 +1,10 @@
-"""What scene and task need to know of an arm with a gripper, whatever it is made of."""
+"""Interface of an arm with a gripper for scene and simulation, and constants that all arms share."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -60,6 +61,7 @@ class Robot:
     Elements have their names in the compiled scene; a camera `wrist` is among them.
     """
 
+    root: Any = None  # `mjcf.RootElement` to attach to a scene, unless `compile` does
     prefix: str  # of the names of all its elements
     arm: RobotModel  # for the spec
     kinematics: Kinematics

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from dm_control import composer, mjcf
+from dm_control import mjcf
 
 from vla.tasks.tabletop.robot import CameraPose, Robot, look_at
 
@@ -33,13 +33,13 @@ BLOCK_CONTACT = {"contype": 1, "conaffinity": 3}
 FRONT = CameraPose(position=(1.02, 0.0, 0.52), target=(0.5, 0.0, 0.05), fovy=45.0)  # in the base frame
 
 
-class Block(composer.Entity):
+class Block:
     """A coloured block, a cube before randomisation."""
 
-    def _build(self, name: str) -> None:
-        self._root = mjcf.RootElement(model=name)
-        self._root.compiler.angle = "radian"
-        self.geom = self._root.worldbody.add(
+    def __init__(self, name: str) -> None:
+        self.root = mjcf.RootElement(model=name)
+        self.root.compiler.angle = "radian"
+        self.geom = self.root.worldbody.add(
             "geom",
             name="cube",
             type="box",
@@ -51,16 +51,11 @@ class Block(composer.Entity):
             **BLOCK_CONTACT,
         )
 
-    @property
-    def mjcf_model(self) -> mjcf.RootElement:
-        """The model's root element."""
-        return self._root
 
-
-class Scene(composer.Entity):
+class Scene:
     """The complete scene; `CompiledScene` indexes its compiled model."""
 
-    def _build(self, robot: Robot, blocks: int = 4, shadows: bool = True) -> None:
+    def __init__(self, robot: Robot, blocks: int = 4, shadows: bool = True) -> None:
         """Args: the robot; number of blocks; whether the lamp casts shadows."""
         self._root = mjcf.RootElement(model="tabletop")
         self._root.compiler.angle = "radian"
@@ -69,18 +64,12 @@ class Scene(composer.Entity):
         self._add_table()
         self._add_lights(shadows)
         self.robot = robot
-        if isinstance(robot, composer.Entity):
-            self.attach(robot)
+        if robot.root is not None:
+            self._root.attach(robot.root)
         self._add_camera()
         self.blocks = [Block(name=f"block{index}") for index in range(blocks)]
         for block in self.blocks:
-            frame = self.attach(block)
-            frame.add("freejoint")
-
-    @property
-    def mjcf_model(self) -> mjcf.RootElement:
-        """The model's root element."""
-        return self._root
+            self._root.attach(block.root).add("freejoint")
 
     def compile(self) -> mjcf.Physics:
         """Compile the scene with its robot."""

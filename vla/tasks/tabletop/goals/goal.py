@@ -10,6 +10,7 @@ from typing import Literal
 
 import numpy as np
 
+from vla.io.types import Count
 from vla.spec import Array
 from vla.tasks.language import Grammar
 
@@ -58,7 +59,7 @@ class Referents:
 
 @dataclass(frozen=True)
 class Arrangement:
-    """Where instructions that were carried out left the blocks; one that is nowhere here lies free on the table."""
+    """Places of the blocks after instructions were carried out; a block without a place lies free on the table."""
 
     on_pads: Mapping[int, int] = field(default_factory=dict)  # block → pad
     on_blocks: Mapping[int, int] = field(default_factory=dict)  # block → block below
@@ -121,7 +122,7 @@ class Goal(ABC):
 
     named, moves, blocks, absent, pads = 1, 1, 2, 0, 1
 
-    def __init__(self, language: Grammar, hold_steps: int) -> None:
+    def __init__(self, language: Grammar, hold_steps: Count = 3) -> None:
         known = ["block", "other"][: self.named] + ["pad", "rest"][: self.pads] + ["absent"] * bool(self.absent)
         if unknown := sorted(language.slots - set(known)):
             raise ValueError(f"task.goal.language has the slots {unknown}, but {type(self).__name__} fills {known}")

@@ -4,17 +4,16 @@ from __future__ import annotations
 
 import numpy as np
 
-from vla.io.types import Count, Positive
-from vla.tasks.language import Grammar
+from vla.io.types import Inherited, Positive
 from vla.tasks.tabletop.goals.goal import Arrangement, Goal, Referents, Subgoal, WorldState
 
 
 class Lift(Goal):
     """Lift the named block and keep it up."""
 
-    def __init__(self, language: Grammar, height: Positive, hold_steps: Count = 3) -> None:
-        """Args: grammar; required height above the start [m]; consecutive steps at that height."""
-        super().__init__(language, hold_steps)
+    def __init__(self, height: Positive, **inherited: Inherited) -> None:
+        """Args: required height above the start [m]."""
+        super().__init__(**inherited)
         self.height = height
 
     def subgoals(self, state: WorldState, referents: Referents) -> list[Subgoal]:

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-from vla.io.types import Count, Positive
-from vla.tasks.language import Grammar
+from vla.io.types import Inherited, Positive
 from vla.tasks.tabletop.goals.goal import Goal, Referents, Subgoal, WorldState, placed
 
 
 class PickPlace(Goal):
     """Put the named block on the pad and let go of it."""
 
-    def __init__(self, language: Grammar, radius: Positive, hold_steps: Count = 3) -> None:
-        """Args: grammar; maximum distance between the centres of block and pad [m]; consecutive steps at rest."""
-        super().__init__(language, hold_steps)
+    def __init__(self, radius: Positive, **inherited: Inherited) -> None:
+        """Args: maximum distance between the centres of block and pad [m]."""
+        super().__init__(**inherited)
         self.radius = radius
 
     def subgoals(self, state: WorldState, referents: Referents) -> list[Subgoal]:

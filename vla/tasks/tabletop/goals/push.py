@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from vla.io.types import Count, Positive
-from vla.tasks.language import Grammar
+from vla.io.types import Inherited, Positive
 from vla.tasks.tabletop.goals.goal import AT_REST, Arrangement, Goal, Referents, Subgoal, WorldState
 
 
@@ -12,10 +11,10 @@ class Push(Goal):
 
     pads = 2
 
-    def __init__(self, language: Grammar, radius: Positive, highest: Positive = 0.02, hold_steps: Count = 3) -> None:
-        """Args: grammar; maximum distance between the centres of block and pad [m]; maximum height above the table
-        during the episode [m]; consecutive steps at rest."""
-        super().__init__(language, hold_steps)
+    def __init__(self, radius: Positive, highest: Positive = 0.02, **inherited: Inherited) -> None:
+        """Args: maximum distance between the centres of block and pad, and maximum height above the table during the
+        episode [m]."""
+        super().__init__(**inherited)
         self.radius, self.highest = radius, highest
 
     def subgoals(self, state: WorldState, referents: Referents) -> list[Subgoal]:

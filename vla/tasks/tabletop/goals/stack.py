@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from vla.io.types import Count
-from vla.tasks.language import Grammar
 from vla.tasks.tabletop.goals.goal import AT_REST, Arrangement, Goal, Referents, Subgoal, WorldState
 
 UP = np.array([0.0, 0.0, 1.0])
@@ -16,10 +14,6 @@ class Stack(Goal):
     """Put one named block on top of another and let go of it."""
 
     named, blocks = 2, 3  # with two blocks the lower one would be unambiguous
-
-    def __init__(self, language: Grammar, hold_steps: Count = 3) -> None:
-        """Args: grammar; consecutive steps for which the upper block must rest."""
-        super().__init__(language, hold_steps)
 
     def subgoals(self, state: WorldState, referents: Referents) -> list[Subgoal]:
         """Place the upper block centred on top of the lower one."""

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import re
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Annotated, Any
 
@@ -48,3 +49,20 @@ class TargetChoice:
         """Set the number; nothing is drawn."""
         scene.skip = self.skip
         return {"skip": self.skip}
+
+
+def paraphrase(instruction: str, words: Mapping[str, str], names: Iterable[str]) -> str:
+    """Replace phrases of an instruction, the longest first, so that none of the `names` remains.
+
+    Args:
+        words: phrase → what replaces it.
+        names: what the instruction names, such as colours.
+
+    Raises:
+        ValueError: nothing is replaced, or a name remains.
+    """
+    phrases = sorted(words, key=len, reverse=True)
+    replaced = re.sub(rf"\b({'|'.join(map(re.escape, phrases))})\b", lambda found: words[found[0]], instruction)
+    if replaced == instruction or set(names) & set(re.findall(r"\w+", replaced)):
+        raise ValueError(f"task.randomize.phrasing.words has no other words for all that is named in {instruction!r}")
+    return replaced

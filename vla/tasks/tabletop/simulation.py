@@ -1,4 +1,4 @@
-"""The dm_control task: episodes sampled from a seed, stepped by actions, with a classified outcome."""
+"""Simulation of the tabletop: episodes sampled from a seed, stepped by actions, with a classified outcome."""
 
 from __future__ import annotations
 
@@ -8,12 +8,10 @@ from typing import Any
 
 import mujoco
 import numpy as np
-from dm_control import composer, mjcf
-from dm_env import specs
 
 from vla.robots.cartesian import CartesianController, solve
 from vla.spec import FIRST_SEED, Array
-from vla.tasks.language import HeldOut, paraphrase
+from vla.tasks.language import HeldOut
 from vla.tasks.streams import Streams
 from vla.tasks.tabletop.compiled_scene import CompiledScene
 from vla.tasks.tabletop.disturber import PUSH, Disturber
@@ -21,6 +19,7 @@ from vla.tasks.tabletop.goals.chain import Chain
 from vla.tasks.tabletop.goals.goal import SKILLS, Goal, Referents, WorldState, current
 from vla.tasks.tabletop.goals.mixed import Mixed
 from vla.tasks.tabletop.outcome import OutcomeClassifier
+from vla.tasks.tabletop.randomize.language import paraphrase
 from vla.tasks.tabletop.randomize.randomizer import Randomizer
 from vla.tasks.tabletop.scene import COLOURS, PADS, Scene
 
@@ -28,27 +27,9 @@ CONTROL_HZ = 10.0
 WORKSPACE = ((0.25, -0.40, 0.008), (0.75, 0.40, 0.50))  # corners of the box that bounds the tool point [m]
 
 
-class FastEnvironment(composer.Environment):
-    """Composer's environment with all substeps in one loop: its hooks per substep take longer than MuJoCo itself."""
-
-    def __init__(self, task: TabletopTask) -> None:
-        # Every reset writes into the compiled model instead of compiling again.
-        super().__init__(task, recompile_mjcf_every_episode=False)
-
-    def _recompile_physics(self) -> None:
-        # MuJoCo compiles what dm_control cannot read.
-        if physics := getattr(self, "_physics", None):
-            physics.free()
-        self._physics = self._task.scene.compile()
-        self._physics.legacy_step = self._legacy_step
-
-    def _substep(self, action: Array) -> None:
-        self._task.advance(self._physics, self._task.substeps)
-
-
 @dataclass(frozen=True)
 class Request:
-    """What one instruction asks for."""
+    """Goal, named objects and words of one instruction."""
 
     goal: Goal
     referents: Referents
@@ -56,7 +37,7 @@ class Request:
     held_out: str  # part of the instruction that training never says, "names" if these are replaced, or "none"
 
 
-class TabletopTask(composer.Task):
+class Simulation:
     """Manipulation of blocks on a table by one instruction, or by several in a row.
 
     Attributes:
@@ -85,33 +66,26 @@ class TabletopTask(composer.Task):
         self.goals, self.randomize, self.scene = goal, randomize, scene
         self._time_limit = time_limit
         self._low, self._high = low, high
-        self.control_timestep = 1 / CONTROL_HZ
-        self.substeps = round(self.control_timestep / self.physics_timestep)
-        self.controller = CartesianController(scene.robot.kinematics, self.control_timestep, *WORKSPACE)
-        self.seed: int | None = None  # of the next episode; None: drawn from composer's random state
+        self._physics = scene.compile()
+        self.compiled = CompiledScene(scene, self._physics)
+        self.substeps = round(1 / CONTROL_HZ / self._physics.timestep())
+        self.controller = CartesianController(scene.robot.kinematics, 1 / CONTROL_HZ, *WORKSPACE)
         self.draws: dict[str, Any] = {}
         self.instruction = ""
         self.disturber: Disturber | None = None
         self.streams = Streams()
 
-    @property
-    def root_entity(self) -> Scene:
-        """The scene."""
-        return self.scene
+    def reset(self, seed: int) -> None:
+        """Start the episode of `seed`."""
+        with self._physics.reset_context():
+            self._sample(seed)
 
-    @property
-    def physics_steps_per_control_step(self) -> int:
-        """One for composer; `FastEnvironment` runs the real substeps."""
-        return 1
+    def close(self) -> None:
+        """Free the physics."""
+        self._physics.free()
 
-    def after_compile(self, physics: mjcf.Physics, random_state: np.random.RandomState) -> None:
-        """Index the scene's elements in the compiled model."""
-        self.compiled = CompiledScene(self.scene, physics)
-
-    def initialize_episode(self, physics: mjcf.Physics, random_state: np.random.RandomState) -> None:
+    def _sample(self, seed: int) -> None:
         """Randomise the compiled model in place, then draw goal and instruction."""
-        seed = int(random_state.randint(FIRST_SEED)) if self.seed is None else self.seed
-        self.seed = None
         self.compiled.restore()
         axes = {name: axis for name, axis in self.randomize.items() if axis is not None}
         draws = {name: axis(self.compiled, self.streams(seed, name)) for name, axis in axes.items()}
@@ -119,13 +93,13 @@ class TabletopTask(composer.Task):
         self.compiled.present = max(self.compiled.present, goal.blocks)
         self._pads = goal.pads
         self.compiled.finish(goal.pads)
-        physics.forward()
+        self._physics.forward()
         self.name, self.requests = goal.name, self._requests(goal, seed)
         data = self.compiled.data
         self.controller.reset(data.qpos[self.compiled.joints])
         self._command = np.append(self.controller.joints, self.compiled.grip)
         data.ctrl[:] = self.compiled.controls(self._command[None])[0]
-        delay = round(self.compiled.latency / physics.timestep())
+        delay = round(self.compiled.latency / self._physics.timestep())
         self._late = np.tile(data.ctrl, (delay, 1))  # controls of the last steps of physics that are still to come
         self._start()
         self._axes = draws
@@ -222,8 +196,8 @@ class TabletopTask(composer.Task):
             "half_size": round(float(self.compiled.extents[index, 0]), 5),
         }
 
-    def before_step(self, physics: mjcf.Physics, action: Array, random_state: np.random.RandomState) -> None:
-        """Convert the action to joint targets, interpolated linearly over the control period."""
+    def step(self, action: Array) -> None:
+        """Go through one control period, with targets interpolated linearly to those of the (7,) action."""
         action = np.clip(action, self._low, self._high)
         if self.disturber:
             action = self.disturber.overrule(action)
@@ -231,20 +205,21 @@ class TabletopTask(composer.Task):
         furthest = robot.finger_speed / CONTROL_HZ
         goal = np.append(self.controller.step(action[:6]), action[6] * robot.travel)
         goal[-1] = grip + np.clip(goal[-1] - grip, -furthest, furthest)
-        self._increment = (goal - self._command) / self.substeps
+        self._advance(goal, self.substeps)
+        self.judge()
 
-    def follow(self, physics: mjcf.Physics, joints: Array, opening: float, substeps: int) -> None:
-        """Step physics while interpolating the targets linearly to `joints` (J,) [rad] and an opening 0…1.
+    def follow(self, joints: Array, opening: float, seconds: float) -> None:
+        """Step physics for `seconds` with targets interpolated linearly to `joints` (J,) [rad] and an opening 0…1.
 
         An arm that is pushed returns afterwards, because its driver does not know.
         """
+        substeps, timestep = round(seconds / self._physics.timestep()), self._physics.timestep()
         if self.disturber:
-            joints, opening = self._disturbed(joints, opening, substeps * physics.timestep())
+            joints, opening = self._disturbed(joints, opening, substeps * timestep)
         robot, grip = self.scene.robot, self._command[-1]
-        furthest = robot.finger_speed * substeps * physics.timestep()
+        furthest = robot.finger_speed * substeps * timestep
         finger = grip + np.clip(opening * robot.travel - grip, -furthest, furthest)
-        self._increment = (np.append(joints, finger) - self._command) / substeps
-        self.advance(physics, substeps)
+        self._advance(np.append(joints, finger), substeps)
 
     def _disturbed(self, joints: Array, opening: float, seconds: float) -> tuple[Array, float]:
         """Return joint targets and opening under the disturbance; the tool is pushed no faster than by an action."""
@@ -259,24 +234,25 @@ class TabletopTask(composer.Task):
             joints = solve(kinematics, target, joints, start)
         return joints, 1.0 if self.disturber.opens else opening
 
-    def advance(self, physics: mjcf.Physics, substeps: int) -> None:
-        """Step physics while interpolating the targets; a lead compensates the servo's damping, so the arm does not
+    def _advance(self, goal: Array, substeps: int) -> None:
+        """Step physics with targets interpolated to `goal`; a lead compensates the servo's damping, so the arm does not
         lag."""
-        commands = self._command + np.arange(1, substeps + 1)[:, None] * self._increment
+        increment = (goal - self._command) / substeps
+        commands = self._command + np.arange(1, substeps + 1)[:, None] * increment
         targets = commands.copy()
-        targets[:, :-1] += self.scene.robot.lead / physics.timestep() * self._increment[:-1]
+        targets[:, :-1] += self.scene.robot.lead / self._physics.timestep() * increment[:-1]
         self._command = commands[-1]
         controls = np.concatenate([self._late, self.compiled.controls(targets)])
         self._late = controls[substeps:]
-        model, data = physics.model.ptr, physics.data.ptr
+        model, data = self.compiled.model, self.compiled.data
         ctrl = data.ctrl
-        with physics.check_invalid_state():
+        with self._physics.check_invalid_state():
             for now in controls[:substeps]:
                 ctrl[:] = now
                 mujoco.mj_step2(model, data)
                 mujoco.mj_step1(model, data)
 
-    def after_step(self, physics: mjcf.Physics, random_state: np.random.RandomState) -> None:
+    def judge(self) -> None:
         """Update the outcome after a control period; the next request, if there is one, follows a success."""
         self._periods += 1
         self._steps += 1
@@ -288,7 +264,7 @@ class TabletopTask(composer.Task):
             self._begin(self.current + 1)
             subgoals = self.goal.subgoals(state, self.referents)
         if self.disturber and not self.over and self.disturber.update(self._steps, state, current(subgoals)):
-            mujoco.mj_step1(physics.model.ptr, physics.data.ptr)  # poses and contacts after the move
+            mujoco.mj_step1(self.compiled.model, self.compiled.data)  # poses and contacts after the move
             self._cached = None
 
     def world_state(self) -> WorldState:
@@ -344,10 +320,6 @@ class TabletopTask(composer.Task):
             "widest": np.array([self.scene.robot.widest]),  # opening of the gripper
         }
 
-    def get_reward(self, physics: mjcf.Physics) -> float:
-        """Return 1 after the goal, the last one of several, was reached and held."""
-        return float(self.classifier.success)
-
     @property
     def events(self) -> list[tuple[int, str]]:
         """Control step and description of every disturbance so far."""
@@ -355,13 +327,5 @@ class TabletopTask(composer.Task):
 
     @property
     def over(self) -> bool:
-        """Whether the goal was reached and held, or its time is up."""
+        """True if the goal was reached and held, or its time is up."""
         return self.classifier.success or self._periods >= self._most_periods
-
-    def should_terminate_episode(self, physics: mjcf.Physics) -> bool:
-        """Return `over`."""
-        return self.over
-
-    def action_spec(self, physics: mjcf.Physics) -> specs.BoundedArray:
-        """Return the bounds of the seven components."""
-        return specs.BoundedArray((7,), np.float32, self._low, self._high, name="dx\tdy\tdz\trx\try\trz\tgripper")
