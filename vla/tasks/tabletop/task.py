@@ -342,6 +342,7 @@ class TabletopTask(composer.Task):
             "skill": np.array([float(SKILLS.index(now.skill))]),
             "tolerance": np.array([now.tolerance]),
             "widest": np.array([self.scene.robot.widest]),  # opening of the gripper
+            "tip": np.array(self.scene.robot.tip),  # (3,) as of `Robot`
         }
 
     def get_reward(self, physics: mjcf.Physics) -> float:
