@@ -162,7 +162,10 @@ def _play(experiment: Experiment, checkpoint: Path | None, statements: Sequence[
         needs.append(recordings)
     others: dict[str, AgentFactory] = {
         **{f"without_{sense}": partial(make_impaired, make_agent, sense) for sense in asked["without"]},
-        **{name: partial(make_distant, make_agent, network) for name, network in _networks(experiment).items()},
+        **{
+            name: partial(make_distant, make_agent, network, by_clock=asked["by_clock"])
+            for name, network in _networks(experiment).items()
+        },
     }
     named = {IN_DISTRIBUTION: {}, **conditions(asked), **{name: {} for name in others}}
     different = sum(name in others or with_changes(task, changes) != task for name, changes in named.items())
