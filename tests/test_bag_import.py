@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+import resource
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -13,10 +14,11 @@ import composing
 import numpy as np
 import pytest
 from arm import ROBOT, SPEC
-from rosbags.rosbag2 import StoragePlugin
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 
 from vla.config.build import build
 from vla.config.experiment import plain
+from vla.deploy import bag as bag_files
 from vla.deploy.bag_import import BagDemonstrations
 from vla.deploy.settings import Topics
 from vla.spec import Episode
@@ -212,3 +214,28 @@ def test_a_damaged_bag_is_imported_or_refused_in_a_sentence(tmp_path: Path, name
             assert str(whole) in str(error) and "\n" not in str(error) and len(str(error)) < 1000
             refused += 1
     assert refused > 5
+
+
+@pytest.mark.parametrize("mode", [CompressionMode.STORAGE, CompressionMode.MESSAGE, CompressionMode.FILE])
+def test_a_small_bag_that_unpacks_to_a_huge_size_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, mode: CompressionMode
+) -> None:
+    """What it may take is bounded while a bag is open, and only then."""
+    storage = StoragePlugin.MCAP if mode is CompressionMode.STORAGE else StoragePlugin.SQLITE3
+    writer = Writer(tmp_path / "bag", version=9, storage_plugin=storage)
+    writer.set_compression(mode, CompressionFormat.ZSTD)
+    text = bags.make("std_msgs/msg/String", data="\0" * (48 << 20))
+    with writer:
+        connection = writer.add_connection("/words", text.__msgtype__, typestore=bags.TYPES)
+        writer.write(connection, bags.START, bags.TYPES.serialize_cdr(text, text.__msgtype__))
+    assert sum(file.stat().st_size for file in (tmp_path / "bag").iterdir()) < 1 << 20
+    monkeypatch.setattr(bag_files, "MAX_MEMORY", 16 << 20)
+    monkeypatch.setattr(bag_files, "MAX_FILE_SIZE", 16 << 20)
+    limits = (resource.RLIMIT_DATA, resource.RLIMIT_FSIZE)
+    before = [resource.getrlimit(limit) for limit in limits]
+    with (
+        pytest.raises(ValueError, match=r"bag (needs more than 0 GiB of memory|is damaged or not a bag: .*too large)"),
+        bag_files.opened(tmp_path / "bag") as reader,
+    ):
+        list(bag_files.messages_of(reader, reader.connections, tmp_path / "bag"))
+    assert [resource.getrlimit(limit) for limit in limits] == before

@@ -52,6 +52,26 @@ def test_wide_randomisation_is_within_the_experts_reach(goal: str) -> None:
     assert outcomes.count("success") >= 7
 
 
+def test_wide_fingers_push_with_their_upright_side_and_are_not_led_astray_while_they_touch() -> None:
+    """In episodes in which the wedge of these fingers lifted the block or pressed it down."""
+    environment = make_tabletop("task/robot=jaco", "task/goal=push")
+    forward, aside, below = environment.dm_env.task.scene.robot.tip
+    assert forward < aside < 0.05 and 0 < below < 0.02
+    stubborn = perturbed(environment.spec, unturned=1.0, start=0.0)
+    with environment.blind():
+        episodes = [rollout(environment, stubborn, seed) for seed in (6, 7, 9, 12)]
+    environment.close()
+    assert all(episode.success for episode in episodes)
+    for episode in episodes:
+        strays = np.abs(episode.executed - episode.actions)[:, :3].max(axis=1) > 0.03
+        for observation in (episode.observations[step] for step in np.flatnonzero(np.diff(strays.astype(int)) == 1)):
+            truth: Any = observation.truth
+            # Whoever begins to stray is above the block, or beside it.
+            away = np.hypot(*(truth["commanded"][:2, 3] - truth["block"][:2]))
+            assert away > truth["half_size"][0] or truth["commanded"][2, 3] > 0.04
+    assert any((np.abs(episode.executed[:, 5]) > 0.05).any() for episode in episodes)
+
+
 def test_the_clean_action_is_recorded_where_another_one_is_executed(tabletop: Tabletop) -> None:
     expert = perturbed(tabletop.spec, start=1.0, noise=0.0, rate=0.0, start_steps=[4, 4])
     with tabletop.blind():

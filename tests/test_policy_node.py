@@ -12,16 +12,19 @@ import pytest
 from arm import ROBOT, SPEC
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticStatus
+from fake_batch import as_policy, make_bc
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import GetState
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import Image, JointState
 from std_msgs.msg import Float64MultiArray, String
 from std_srvs.srv import SetBool, Trigger
+from test_server import remote, serving
 from world import KINDS, World, positions
 
 from vla.deploy import messages
 from vla.deploy.control_loop import State
+from vla.deploy.server import Keys
 from vla.robots.panda import HOME, forward
 
 pytestmark = pytest.mark.realtime
@@ -83,6 +86,23 @@ def test_a_missing_camera_holds_the_arm_until_its_images_return(world: World) ->
     assert "wrist" in world.statuses[-1].message and world.statuses[-1].level == DiagnosticStatus.WARN
     world.cameras = ["front", "wrist"]
     assert world.becomes(State.RUNNING)
+
+
+def test_a_policy_server_that_goes_away_leaves_the_arm_at_rest(
+    make_world: Callable[..., World], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    cameras = {camera: f"observation/{camera}" for camera in SPEC.cameras}
+    policy, world = as_policy(make_bc(spec=SPEC), spec=SPEC), make_world()
+    with serving(policy, keys=Keys(cameras, ["observation/state"], "prompt")) as url:
+        agent = remote(url, images=cameras, spec=SPEC)
+        monkeypatch.setattr(world.policy, "plan", lambda seen: world.policy.seen.append(seen) or agent.plan(seen))
+        world.start()
+        world.live(0.5)
+        assert world.state is State.RUNNING and np.ptp([each.position for each in world.commands], axis=0).max() > 0.01
+    assert world.becomes(State.FAULT)
+    world.live(0.4)
+    assert world.commands[-1].position == world.commands[-5].position
+    assert f"the policy server at {url} failed: it closed the connection" in world.statuses[-1].message
 
 
 @pytest.mark.parametrize(

@@ -46,9 +46,12 @@ class Counting:
         return (self.calls + np.arange(self._chunk)[:, None] / 100 + np.zeros(3)).astype(np.float32)
 
 
-def acted(network: Network, chunk: int, execute: int, steps: int, seed: int = 0) -> list[float]:
-    """The moves of `steps` steps."""
-    agent = Distant(Counting(chunk, execute), network, SPEC)
+def acted(
+    network: Network, chunk: int, execute: int, steps: int, seed: int = 0, hz: float | None = None
+) -> list[float]:
+    """The moves of `steps` steps; with `hz` they follow the clock."""
+    spec = replace(SPEC, control_hz=hz or SPEC.control_hz)
+    agent = Distant(Counting(chunk, execute), network, spec, by_clock=hz is not None)
     agent.reset("", seed)
     observation = SPEC.random_observation(np.random.default_rng(0))
     actions = [agent.act(observation) for _ in range(steps)]
@@ -108,6 +111,16 @@ def test_an_evaluation_without_latency_is_that_of_the_policy_and_with_latency_re
     ]
     np.testing.assert_array_equal(late[0].executed, late[1].executed)
     assert not np.array_equal(late[0].executed, expected.executed)
+
+
+def test_by_the_clock_a_chunk_goes_on_while_the_next_one_is_under_way() -> None:
+    assert acted(network_of(0.0), 3, 3, 1, hz=1000.0) == [1.0]
+    # The first answer is waited for; whatever is sent afterwards is lost, and the arm holds.
+    assert acted(network_of(0.001, loss=1.0), 3, 2, 40, hz=1000.0) == [1.0, 1.01, 1.02, *[0.0] * 37]
+    # An answer that takes longer than the episode.
+    assert acted(network_of(1.0), 3, 1, 5, hz=1000.0) == [1.0, 1.01, 1.02, 0.0, 0.0]
+    moves = acted(network_of(0.02), 4, 2, 60, hz=100.0)
+    assert moves[0] == 1.0 and max(moves) > 2 and not np.isin([2.0, 3.0], moves).any()  # what is past is skipped
 
 
 def test_latency_costs_steps_and_then_success() -> None:

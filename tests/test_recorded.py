@@ -18,13 +18,18 @@ import torch
 from arm import ROBOT, SAFETY
 from command_line import SMALL, here
 from exporting import exporter
+from fake_batch import as_policy, make_bc
 from finished_runs import compared
+from test_server import serving
 
 from vla.config.build import build
 from vla.config.experiment import plain
+from vla.data.datamodule import held_out
 from vla.data.episodes import EpisodeStore
 from vla.data.formats.imported_demonstrations import action_bounds
+from vla.data.verification import find_episode
 from vla.deploy.control_loop import ControlLoop
+from vla.deploy.server import Keys
 from vla.io.images import resize
 from vla.reports.open_loop import components
 from vla.robots.controllers import controller_for
@@ -214,6 +219,48 @@ def test_a_policy_is_trained_and_its_errors_measured_without_a_simulator(dataset
     assert "was trained on other episodes than the 6" in fewer.stderr
     assert "learner.lr" not in compared([tmp_path / "run", tmp_path / "again"], tmp_path).read_text()
     assert torch.load(checkpoint, weights_only=True)["spec"]["action"] == list(NAMES)
+
+
+def test_a_served_policy_is_compared_with_the_episodes_that_a_training_holds_out(dataset: Path, tmp_path: Path) -> None:
+    recording = ("task=recorded", f"expert.folder={dataset}", "task.image_size=[24,32]")
+    spec = build(composed(dataset, "task.image_size=[24,32]")["task"], "task").spec
+    policy = as_policy(make_bc(spec=spec), spec=spec)
+    cameras = {camera: f"observation.images.{camera}" for camera in spec.cameras}
+    images = [f"+agent.images.{camera}={key}" for camera, key in cameras.items()]
+    with serving(policy, keys=Keys(cameras, ["observation/state"], "prompt")) as url:
+        asked = ("agent=remote", f"agent.url={url}", *images, "output=theirs")
+        said = here(tmp_path, *recording, *asked).stdout
+        assert "remote" in (tmp_path / "theirs/report.html").read_text() and "not a success rate" in said
+        errors = json.loads((tmp_path / "theirs/errors.json").read_text())
+        assert errors["checkpoint"] is None and errors["model"] == "remote"
+    folder = next(tmp_path.glob("outputs/episodes/*"))
+    unseen = [entry.seed for entry in EpisodeStore(folder).episodes if held_out(entry.seed, 0.2)]
+    expected = open_loop(policy.session(), spec, [episode_at(folder, seed) for seed in unseen], np.zeros(3))
+    assert errors["seeds"] == unseen
+    np.testing.assert_allclose([each["error"] for each in errors["components"]], expected.errors.mean(0), rtol=1e-6)
+    assert (
+        "agent._target_ must name a class of kind Agent" in here(tmp_path, *recording, "agent=expert", ok=False).stderr
+    )
+
+
+def episode_at(folder: Path, seed: int) -> Episode:
+    return find_episode(EpisodeStore(folder), seed)[1]
+
+
+@pytest.mark.parametrize("format", ["lerobot", "mcap", "files", "packed"])
+def test_imported_episodes_are_exported_as_others_are(dataset: Path, tmp_path: Path, format: str) -> None:
+    recording = ("task=recorded", f"expert.folder={dataset}", "task.image_size=[24,32]", "collect.folder=store")
+    if format == "mcap":
+        topics = [f"+export.topics.images.{camera}=/{camera}" for camera in SPEC.cameras]
+        numbers = {"low": -3, "high": 3, "speed": 2, "acceleration": 9}
+        robot = [f"export.robot.{name}={[value] * 3}" for name, value in numbers.items()]
+        robot += ["export.robot.joints=[a,b,c]", "export.robot.fingers=[]"]
+        recording += ("task.joints=all", "task.units=deg", *topics, *robot)
+    here(tmp_path, "job=export", f"export={format}", *recording, "export.folder=new", "output=run", "cluster.workers=1")
+    assert any(file.is_file() for file in (tmp_path / "new").rglob("*"))
+    if format == "lerobot":
+        again = build(composed(tmp_path / "new", "task.image_size=[24,32]")["task"], "task").spec
+        assert (again.action, again.state, again.control_hz) == (NAMES, NAMES, 30.0)
 
 
 class Behind:

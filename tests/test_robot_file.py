@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 import pytest
 from arm import SAFETY
+from command_line import here
 from composing import composed
 from conftest import make_tabletop
 from defaults import defaults_of
@@ -92,11 +93,15 @@ def urdf() -> str:
     return f'<robot name="arm">{"".join(parts)}</robot>'
 
 
+def chosen(file: Path) -> list[str]:
+    """Arguments of the command line that choose the arm in `file`."""
+    values = {f"task.robot.{name}": json.dumps(value).replace('"', "") for name, value in ARM.items()}
+    return ["task/robot=file", f"task.robot.file={file}", *(f"{key}={value}" for key, value in values.items())]
+
+
 def make(file: Path) -> Tabletop:
     """The tabletop with the arm in `file`, as the command line makes it."""
-    values = {f"task.robot.{name}": json.dumps(value).replace('"', "") for name, value in ARM.items()}
-    chosen = ("task/robot=file", f"task.robot.file={file}", *(f"{key}={value}" for key, value in values.items()))
-    return make_tabletop("task.image_size=[64,64]", *chosen)
+    return make_tabletop("task.image_size=[64,64]", *chosen(file))
 
 
 @pytest.fixture(scope="module")
@@ -129,6 +134,18 @@ def test_the_expert_acts_with_an_arm_from_a_file(tmp_path: Path, kind: str) -> N
     assert successes(environment, range(4)) == 4
     assert environment.reset(0).rgb["wrist"].std() > 5
     environment.close()
+
+
+def test_a_stored_episode_is_replayed_with_the_arm_that_the_command_names(tmp_path: Path) -> None:
+    """A store chooses no files on this machine."""
+    (tmp_path / "arm.xml").write_text(mjcf())
+    arm, store = chosen(tmp_path / "arm.xml"), ("collect.folder=store", "collect.episodes=1", "expert=clean")
+    here(tmp_path, "job=collect", "task.image_size=[16,16]", "cluster.workers=1", "output=run", *store, *arm)
+    replay = ("job=inspect", "inspect.folder=store", "inspect.episode=0", "output=replay")
+    refused = here(tmp_path, *replay, ok=False).stderr
+    assert "names a path in task.robot.file" in refused and "task/robot=OPTION gives yours" in refused
+    assert "through the same states, bit for bit" in here(tmp_path, *replay, *arm).stdout
+    assert "the episode store store" in here(tmp_path, *replay, "task/robot=jaco", ok=False).stderr
 
 
 def test_the_spec_describes_the_compiled_arm(jaco: Tabletop) -> None:

@@ -14,13 +14,14 @@ import numpy as np
 import pytest
 from arm import ROBOT
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
+from exporting import stored
 from PIL import Image as Picture
 from rerun.chunk import RrdReader
 from sensor_msgs.msg import Image, JointState
 from std_msgs.msg import String
 
 from vla.deploy import messages
-from vla.deploy.view import View
+from vla.deploy.view import View, expected_pictures
 from vla.robots.panda import CHAIN
 from vla.spec import RobotModel, Shell
 from vla.tasks.tabletop.arm import Arm
@@ -38,11 +39,13 @@ def status(words: str) -> DiagnosticStatus:
 def drawn(tmp_path: Path) -> Callable[..., dict[str, list[Any]]]:
     """Draws (topic, message) pairs; gives entity → its chunks of data."""
 
-    def draw(*received: tuple[str, Any], shell: Shell | None = None) -> dict[str, list[Any]]:
+    def draw(
+        *received: tuple[str, Any], shell: Shell | None = None, expected: dict[str, np.ndarray] | None = None
+    ) -> dict[str, list[Any]]:
         ignore = SimpleNamespace(
             get_topic_names_and_types=list, create_timer=lambda *arguments: None, destroy_timer=lambda timer: None
         )
-        view = View(ignore, tmp_path / "view.rrd", shell)
+        view = View(ignore, tmp_path / "view.rrd", shell, expected)
         for topic, message in received:
             package, kind = type(message).__module__.split(".")[0], type(message).__name__
             callback = view.callback_for(topic, f"{package}/msg/{kind}")
@@ -88,6 +91,28 @@ def test_a_small_image_is_drawn_without_loss(drawn: Callable[..., dict[str, list
     blob = bytes(values(chunks["/camera/front"], "blob")[0])
     np.testing.assert_array_equal(np.array(Picture.open(io.BytesIO(blob))), pixels)
     assert values(chunks["/camera/large"], "media_type") == ["image/jpeg"]
+
+
+def test_what_is_expected_lies_over_what_a_camera_sees(drawn: Callable[..., dict[str, list[Any]]]) -> None:
+    """The live image is cropped and resized as the policy node does it."""
+    expected, live = np.full((96, 96, 3), 200, np.uint8), np.zeros((480, 640, 3), np.uint8)
+    live[:, 80:-80] = 100  # the part that is cropped
+    seen = ("/front", messages.fill_image(Image(), live, "front"))
+    chunks = drawn(seen, ("/wrist", messages.fill_image(Image(), live, "wrist")), expected={"/front": expected})
+    blob = bytes(values(chunks["/expected/front"], "blob")[0])
+    np.testing.assert_array_equal(np.array(Picture.open(io.BytesIO(blob))), np.full((96, 96, 3), 150))
+    assert "/expected/wrist" not in chunks and "/camera/wrist" in chunks
+
+
+def test_the_expected_picture_is_what_episodes_begin_with(tmp_path: Path) -> None:
+    store, episodes = stored(tmp_path / "store", seeds=range(3))
+    camera = store.spec.cameras[0]
+    first = np.median([episode.observations[0].rgb[camera] for episode in episodes], axis=0)
+    pictures = expected_pictures(store.folder, [f"{camera}=/live"])
+    np.testing.assert_array_equal(pictures["/live"], first.astype(np.uint8))
+    for wrong in ("eye=/live", camera):
+        with pytest.raises(ValueError, match=f"name a topic for cameras of .*, which has {camera}"):
+            expected_pictures(store.folder, [wrong])
 
 
 def described(joints: list[str], fingers: list[str], chain: Any) -> tuple[str, String]:

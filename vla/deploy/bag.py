@@ -32,8 +32,8 @@ POLICY_INPUTS = (
     "/isaac/franka/joint_states",
     "/user/command",
 )
-MAX_MEMORY = 2 << 30  # of the process that plays a bag [bytes]
-MAX_FILE_SIZE = 8 << 30  # of a decompressed bag [bytes]
+MAX_MEMORY = 4 << 30  # for reading a bag, beyond what the process has [bytes]
+MAX_FILE_SIZE = 8 << 30  # of a file that is decompressed to disk [bytes]
 
 
 class BagRecorder(TopicListener):
@@ -116,7 +116,7 @@ def message_types() -> Any:
 
 @contextmanager
 def opened(folder: Path) -> Iterator[Any]:
-    """Open a reader of the bag in a folder.
+    """Open a reader of the bag in a folder; within the context, memory and the size of files are limited.
 
     Raises:
         ValueError: the folder is not a bag, or it is damaged.
@@ -129,13 +129,14 @@ def opened(folder: Path) -> Iterator[Any]:
     read_yaml(description, dict[str, Any])  # rosbags limits neither its size nor its depth
     for path in folder.iterdir():
         require_file(path)
-    with damage(folder):
-        reader = Reader(folder)
-        reader.open()
-    try:
-        yield reader
-    finally:
-        reader.close()
+    with _limits():
+        with damage(folder):
+            reader = Reader(folder)
+            reader.open()
+        try:
+            yield reader
+        finally:
+            reader.close()
 
 
 def messages_of(
@@ -157,6 +158,8 @@ def damage(folder: Path) -> Iterator[None]:
     """Turn the exceptions of rosbags and ROS, which can be of any type, into a ValueError about the bag."""
     try:
         yield
+    except MemoryError as error:
+        raise ValueError(f"{folder} needs more than {MAX_MEMORY >> 30} GiB of memory once it is unpacked") from error
     except Exception as error:
         why = shorten(" ".join(str(error).split()), 200) or type(error).__name__
         raise ValueError(f"{folder} is damaged or not a bag: {why}") from error
@@ -172,11 +175,22 @@ def _stamped_now(node: Any, message: bytes, kind: Any) -> Any:
     return decoded
 
 
-def _limit_memory() -> None:
-    """Limit memory and file size: a small compressed file can decompress to any size."""
-    for limit, most in ((resource.RLIMIT_DATA, MAX_MEMORY), (resource.RLIMIT_FSIZE, MAX_FILE_SIZE)):
-        _, hard = resource.getrlimit(limit)
-        resource.setrlimit(limit, (most if hard == resource.RLIM_INFINITY else min(most, hard), hard))
+@contextmanager
+def _limits() -> Iterator[None]:
+    """Limit memory and the size of files: a small compressed bag can unpack to any size."""
+    statm = Path("/proc/self/statm")  # pages; the sixth number is the data segment and the stack
+    used = int(statm.read_text().split()[5]) * resource.getpagesize() if statm.is_file() else 0
+    most = {resource.RLIMIT_DATA: used + MAX_MEMORY, resource.RLIMIT_FSIZE: MAX_FILE_SIZE}
+    before = {limit: resource.getrlimit(limit) for limit in most}
+    for limit, size in most.items():
+        resource.setrlimit(
+            limit, (min([size, *(each for each in before[limit] if each != resource.RLIM_INFINITY)]), before[limit][1])
+        )
+    try:
+        yield
+    finally:
+        for limit, sizes in before.items():
+            resource.setrlimit(limit, sizes)
 
 
 def main() -> None:
@@ -192,7 +206,6 @@ def main() -> None:
         parser.error("--speed must be above 0")
     with command_node("vla_bag", options.network) as (node, stopped):
         if options.do == "play":
-            _limit_memory()
             print(f"{play(node, options.folder, options.topics, stopped, options.speed)} messages")
         else:
             recorder = BagRecorder(node, options.folder)

@@ -369,7 +369,8 @@ def _image(key: str, value: Any) -> Array:
 def _vector(key: str, value: Any) -> Array:
     """Return numbers as (N,) float32."""
     try:
-        vector = np.asarray(value, np.float32).reshape(-1)
+        with np.errstate(over="ignore"):
+            vector = np.asarray(value, np.float32).reshape(-1)
     except (ValueError, TypeError) as error:
         raise ValueError(f"{key} is no vector of numbers") from error
     if not np.isfinite(vector).all():

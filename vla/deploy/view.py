@@ -2,6 +2,7 @@
 
 python -m vla.deploy.view                   opens the viewer
 python -m vla.deploy.view --save FILE.rrd   writes a recording until interrupted
+python -m vla.deploy.view --expected STORE  also lays what the cameras saw in training over what they see
 
 The arm is drawn as the agent describes it: as lines between its joints, or with the surface named by --shell.
 """
@@ -13,7 +14,7 @@ import os
 import pkgutil
 import re
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -22,13 +23,15 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
+from vla.data.episodes import EpisodeStore
 from vla.deploy import messages
 from vla.deploy.ros import NETWORKS, command_node, spin
 from vla.deploy.topic_listener import TopicListener
 from vla.io.files import atomic_path
+from vla.io.images import resize
 from vla.robots.chain import frame_positions
 from vla.rollouts.recorder import CURVES, draw_poses, draw_shapes, encoded
-from vla.spec import Shell
+from vla.spec import Array, Shell
 
 SMALL = 256 * 256  # images of at most so many pixels are logged as PNG: JPEG artefacts would hide small objects
 POSE_PERIOD = 0.1  # between two poses of the arm [s]
@@ -36,6 +39,8 @@ REPEATED = 2.0  # equal instructions at shorter intervals are logged once, as `r
 EYE, LOOK_AT = (1.2, -0.9, 0.8), (0.25, 0.0, 0.35)  # initial camera of the 3-D view [m]
 ARM_TOPIC = "/vla_agent/arm"  # of the agent, in any namespace
 THICKNESS = 0.02  # radius of the lines between joints [m]
+CAMERAS = ("front=/isaac/camera/image_raw", "wrist=/isaac/wrist_camera/image_raw")  # as in deploy/topics=isaac
+LOOKS = 32  # episodes whose first images make up an expected picture
 NUMBER = re.compile(r"\d+(\.\d+)?")
 LEVELS = (rr.TextLogLevel.INFO, rr.TextLogLevel.WARN, rr.TextLogLevel.ERROR)  # of a DiagnosticStatus
 
@@ -46,12 +51,20 @@ class View(TopicListener):
     Instructions and states are logged when they change.
     """
 
-    def __init__(self, node: Any, save: Path | None = None, shell: Shell | None = None) -> None:
+    def __init__(
+        self,
+        node: Any,
+        save: Path | None = None,
+        shell: Shell | None = None,
+        expected: Mapping[str, Array] | None = None,
+    ) -> None:
         """Args:
         node: the node that subscribes, which the caller spins.
         save: a .rrd file; None opens the viewer.
         shell: the surface of the arms with its chain; others, and all without it, are drawn as lines.
+        expected: topic of a camera → picture (H, W, 3) uint8 that is laid over its images.
         """
+        self._expected = dict(expected or {})
         self._stream = rr.RecordingStream("vla_deploy", recording_id=os.urandom(6).hex())
         self._file, self._cameras = ExitStack(), list[str]()
         if save is None:
@@ -117,7 +130,12 @@ class View(TopicListener):
         small = pixels.shape[0] * pixels.shape[1] <= SMALL
         blob = encoded(pixels, "PNG", compress_level=1) if small else encoded(pixels, "JPEG", quality=90)
         kind = "image/png" if small else "image/jpeg"
-        return self._stream.log(f"camera{topic}", rr.EncodedImage(contents=blob, media_type=kind))
+        self._stream.log(f"camera{topic}", rr.EncodedImage(contents=blob, media_type=kind))
+        if (picture := self._expected.get(topic)) is not None:
+            both = resize(pixels, (picture.shape[0], picture.shape[1]), "centre").astype(np.uint16) + picture
+            blob = encoded((both // 2).astype(np.uint8), "PNG", compress_level=1)
+            self._stream.log(f"expected{topic}", rr.EncodedImage(contents=blob, media_type="image/png"))
+        return None
 
     def _describe(self, topic: str, message: Any) -> None:
         """Draw another arm from now on."""
@@ -192,6 +210,11 @@ class View(TopicListener):
         eye = rrb.EyeControls3D(position=EYE, look_target=LOOK_AT, eye_up=(0, 0, 1))
         arm = rrb.Spatial3DView(origin="/world", name="arm", eye_controls=eye)
         views = [rrb.Spatial2DView(origin=f"camera{topic}", name=topic) for topic in self._cameras]
+        views += [
+            rrb.Spatial2DView(origin=f"expected{topic}", name=f"{topic} over training")
+            for topic in self._cameras
+            if topic in self._expected
+        ]
         columns = rrb.TextLogColumns(text_log_columns=["LogLevel", "Body"])
         texts = rrb.TextLogView(origin="/words", name="instructions and states", columns=columns)
         legend = rrb.PlotLegend(visible=False)
@@ -215,16 +238,47 @@ def _shell(name: str) -> Shell:
     return shell
 
 
+def expected_pictures(folder: Path, cameras: Iterable[str]) -> dict[str, Array]:
+    """Return topic → what a camera sees at the start of the episodes of a store, (H, W, 3) uint8.
+
+    The median over episodes keeps what is always at the same place, such as the table.
+
+    Args:
+        folder: of the store.
+        cameras: as in "front=/front/image_raw".
+
+    Raises:
+        ValueError: there is no such store, or no such camera in it.
+    """
+    store = EpisodeStore(folder)
+    store.require_episodes()
+    pictures = {}
+    for camera, _, topic in (each.partition("=") for each in cameras):
+        if camera not in store.spec.cameras or not topic:
+            known = ", ".join(store.spec.cameras)
+            raise ValueError(f"--cameras {camera}={topic}: name a topic for cameras of {folder}, which has {known}")
+        rows = store.rows(f"rgb_{camera}")
+        first = [rows[entry.start : entry.start + 1][0] for entry in store.episodes[:LOOKS]]
+        pictures[topic] = np.median(first, axis=0).astype(np.uint8)
+    return pictures
+
+
 def main() -> None:
     """Log until interrupted."""
     parser = argparse.ArgumentParser(prog="python -m vla.deploy.view", description=__doc__.splitlines()[0])
     parser.add_argument("--save", type=Path, metavar="FILE.rrd", help="write a recording instead of opening the viewer")
     parser.add_argument("--network", choices=NETWORKS, default="loopback")
     parser.add_argument("--shell", metavar="CLASS", help="surface of the arm, such as vla.tasks.tabletop.arm.Arm")
+    parser.add_argument(
+        "--expected", type=Path, metavar="STORE", help="episodes whose pictures the cameras should give"
+    )
+    parser.add_argument("--cameras", nargs="+", default=CAMERAS, metavar="CAMERA=TOPIC", help="for --expected")
     options = parser.parse_args()
     os.environ.setdefault("MUJOCO_GL", "disabled")  # no rendering in this process
     with command_node("vla_view", options.network) as (node, stopped):
-        view = View(node, options.save, _shell(options.shell) if options.shell else None)
+        shell = _shell(options.shell) if options.shell else None
+        expected = expected_pictures(options.expected, options.cameras) if options.expected else None
+        view = View(node, options.save, shell, expected)
         spin(node, stopped)
         view.close()
 

@@ -58,21 +58,21 @@ def run(experiment: Experiment) -> float | None:
     output = experiment.output
     _statements(experiment)  # that they can be made, before any work
     _networks(experiment)
-    if experiment["agent"]:
-        return _evaluated(experiment, None)
     if not experiment.playable and experiment["evaluate"]["conditions"]:
         raise ValueError("evaluate.conditions change a world, and a recording has none: omit them")
+    if experiment["agent"] and experiment.playable:
+        return _evaluated(experiment, None)
     # Both modules import Lightning, which takes seconds.
-    if (checkpoint := experiment.checkpoint) is None:
+    if (checkpoint := experiment.checkpoint) is None and not experiment["agent"]:
         from vla.jobs.train import train
 
-        checkpoint = train(experiment)
-    if checkpoint is None:
-        return None
+        if (checkpoint := train(experiment)) is None:
+            return None
     if not experiment.playable:
         from vla.jobs.open_loop import evaluate_open_loop
 
         return evaluate_open_loop(experiment, checkpoint)
+    assert checkpoint is not None
     if checkpoint.resolve().parent == (output / CHECKPOINTS).resolve():
         return evaluate_trained(experiment, checkpoint)
     return _evaluated(experiment, checkpoint)
@@ -161,7 +161,10 @@ def _play(experiment: Experiment, checkpoint: Path | None, statements: Sequence[
         needs.append(recordings)
     others: dict[str, AgentFactory] = {
         **{f"without_{sense}": partial(make_impaired, make_agent, sense) for sense in asked["without"]},
-        **{name: partial(make_distant, make_agent, network) for name, network in _networks(experiment).items()},
+        **{
+            name: partial(make_distant, make_agent, network, by_clock=asked["by_clock"])
+            for name, network in _networks(experiment).items()
+        },
     }
     named = {IN_DISTRIBUTION: {}, **conditions(asked), **{name: {} for name in others}}
     different = sum(name in others or with_changes(task, changes) != task for name, changes in named.items())

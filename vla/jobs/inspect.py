@@ -43,7 +43,7 @@ def run(experiment: Experiment) -> None:
     if seed is None:
         inspect_store(**asked)
     else:
-        replay_episode(experiment.output, Path(asked["folder"]), seed)
+        replay_episode(experiment.output, Path(asked["folder"]), seed, experiment["task"].get("robot"))
 
 
 def inspect_store(
@@ -85,17 +85,25 @@ def _chosen(
     return new
 
 
-def replay_episode(output: Path, folder: Path, seed: int) -> None:
+def replay_episode(output: Path, folder: Path, seed: int, robot: dict[str, Any] | None = None) -> None:
     """Write `episode-SEED.rrd`: a stored episode in the 3-D scene of a replay of its actions.
 
+    Args:
+        output: folder of the recording.
+        folder: of the store.
+        seed: of the episode.
+        robot: node that replaces the one of the store's task, which may not name files.
+
     Raises:
-        ValueError: there is no such episode, or its store does not contain its task.
+        ValueError: there is no such episode, or its store does not contain its task, or another robot's.
     """
     store = EpisodeStore(folder, damaged=True)
     config, episode = find_episode(store, seed)
     if "task" not in config:
         raise ValueError(f"{folder} does not contain the task of seed {seed}, so there is no scene to replay it in")
-    require_no_paths(config, ("task",), folder)
+    if robot:
+        config["task"]["robot"] = robot
+    require_no_paths(config, ("task",), folder, ["task.robot"] if robot else [])
     environment = make_environment(config["task"])
     store.spec.require(environment.spec, f"the episode store {folder}", "its task as it is built now")
     with environment.blind():

@@ -14,6 +14,7 @@ from rich.progress import track
 from vla.config.experiment import Experiment
 from vla.data.datamodule import digest_of, held_out
 from vla.data.episodes import EpisodeStore
+from vla.data.index import Entry
 from vla.data.verification import episode_of
 from vla.io.files import writing
 from vla.jobs.collect import demonstrations
@@ -27,28 +28,35 @@ from vla.runs.folder import ERRORS, save_config, wall_time
 log = logging.getLogger(__name__)
 
 
-def evaluate_open_loop(experiment: Experiment, checkpoint: Path) -> float:
+def evaluate_open_loop(experiment: Experiment, checkpoint: Path | None) -> float:
     """Measure the errors, write the reports, and return minus the relative error, which sweeps maximise.
+
+    Without a checkpoint the agent of the config is shown the episodes that a training would hold out.
 
     Raises:
         ValueError: the checkpoint was trained on other episodes, or on all of them.
     """
     started, output = time.monotonic(), experiment.output
     store = _store(experiment)
-    policy = experiment.make_policy(checkpoint)()
-    policy.spec.without_truth.require(store.spec.without_truth, f"the checkpoint {checkpoint}", f"{store.folder}")
-    result = _measure(experiment, store, checkpoint, policy)
-    facts = {
-        **experiment["chosen"],
-        "parameters": sum(p.numel() for p in policy.model.parameters()),
-        "latency_ms": latency(policy),
-        "wall_time_s": wall_time(checkpoint, time.monotonic() - started),
-    }
+    facts = dict(experiment["chosen"])
+    if checkpoint is None:
+        make_agent: Any = experiment.make_agent()
+        policy = make_agent(experiment.world())
+        unseen = _held_out(store, experiment["data"]["validation_fraction"], "none of them is held out of a training")
+    else:
+        policy = experiment.make_policy(checkpoint)()
+        policy.spec.without_truth.require(store.spec.without_truth, f"the checkpoint {checkpoint}", f"{store.folder}")
+        unseen = _unseen(store, checkpoint)
+        facts |= {"parameters": sum(p.numel() for p in policy.model.parameters()), "latency_ms": latency(policy)}
+    result = _measure(experiment, store, unseen, policy)
+    seconds = time.monotonic() - started
+    facts |= {"wall_time_s": wall_time(checkpoint, seconds)} if checkpoint else {"wall_time_s": seconds}
+    facts |= {} if checkpoint else {"model": facts["agent"]}
     with writing(output / ERRORS):
         save_config(output, experiment.config, experiment.changes)
         plot_errors(result, output / "errors.png")
         # Last, because its existence marks the evaluation as finished.
-        write_errors(result, output / ERRORS, str(checkpoint), experiment.config, facts)
+        write_errors(result, output / ERRORS, str(checkpoint) if checkpoint else None, experiment.config, facts)
         with optional(output / PAGE):
             write_page(output)
     show(errors_table(result))
@@ -64,18 +72,30 @@ def _store(experiment: Experiment) -> EpisodeStore:
     return demonstrations(experiment)
 
 
-def _measure(experiment: Experiment, store: EpisodeStore, checkpoint: Path, policy: Any) -> OpenLoop:
+def _unseen(store: EpisodeStore, checkpoint: Path) -> list[Entry]:
+    """Return the episodes that the training of a checkpoint held out."""
     header, entries = read_header(checkpoint), store.episodes
     if header.windows != digest_of(entries):
         raise ValueError(
             f"{checkpoint} was trained on other episodes than the {len(entries)} in {store.folder}, so which of them "
             "were held out is unknown: name the recording, its options and collect.episodes as in training"
         )
-    fraction = header.config["data"]["validation_fraction"]
-    unseen = [entry for entry in entries if held_out(entry.seed, fraction)][: experiment["evaluate"]["episodes"]]
+    return _held_out(store, header.config["data"]["validation_fraction"], f"{checkpoint} was trained on all of them")
+
+
+def _held_out(store: EpisodeStore, fraction: float, otherwise: str) -> list[Entry]:
+    unseen = [entry for entry in store.episodes if held_out(entry.seed, fraction)]
     if not unseen:
-        raise ValueError(f"{checkpoint} was trained on all episodes: train with data.validation_fraction above 0")
-    actions = store.rows("action")
-    seen = [actions[entry.span] for entry in entries if not held_out(entry.seed, fraction)]
-    episodes = (episode_of(store, entry) for entry in track(unseen, "evaluating"))
+        raise ValueError(
+            f"there are {len(store.episodes)} episodes in {store.folder}, but {otherwise}: record more, or set "
+            "data.validation_fraction above 0, in the training as well"
+        )
+    return unseen
+
+
+def _measure(experiment: Experiment, store: EpisodeStore, unseen: list[Entry], policy: Any) -> OpenLoop:
+    actions, known = store.rows("action"), {entry.seed for entry in unseen}
+    seen = [actions[entry.span] for entry in store.episodes if entry.seed not in known]
+    shown = unseen[: experiment["evaluate"]["episodes"]]
+    episodes = (episode_of(store, entry) for entry in track(shown, "evaluating"))
     return open_loop(policy, store.spec, episodes, np.concatenate(seen).mean(0))

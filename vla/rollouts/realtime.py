@@ -39,6 +39,12 @@ class Network:
     loss: Rate
     ensemble: NonNegative | None
 
+    def draw(self, random: np.random.Generator) -> tuple[float, bool]:
+        """Return the time from an observation to its answer [s], and whether that is lost."""
+        late, lost = random.random(2)
+        lost = bool(lost < self.loss)
+        return self.latency + self.jitter * (1.0 if lost else late), lost
+
 
 class Schedule:
     """The actions of the chunks so far, by the number of the step at which they are due; steps are executed actions."""
@@ -167,10 +173,7 @@ class SimulatedLink:
 
     def send(self, observation: Observation) -> None:
         """Compute the chunk, and draw when it arrives; a server computes one that is lost on its way back, too."""
-        late, lost = self._random.random(2)
-        network = self._network
-        self._lost = bool(lost < network.loss)
-        seconds = network.latency + network.jitter * (1.0 if self._lost else late)
+        seconds, self._lost = self._network.draw(self._random)
         steps = math.ceil(seconds * self._hz - 1e-9)
         self._due = self._now + (max(steps, 1) if self._lost else steps)
         self._actions, self.busy = self._plan(observation), True
@@ -186,12 +189,14 @@ class SimulatedLink:
 class BackgroundLink:
     """A policy that plans in a thread, while control steps follow the clock; late ones are not made up for."""
 
-    def __init__(self, plan: Plan, control_hz: float) -> None:
-        """Args: the policy; steps per second [Hz]."""
+    def __init__(self, plan: Plan, control_hz: float, network: Network | None = None) -> None:
+        """Args: the policy; steps per second [Hz]; a network in front of it whose delays pass by the clock."""
         self._plan, self._period = plan, 1 / control_hz
+        self._network = network or Network(latency=0.0, jitter=0.0, loss=0.0, ensemble=None)
         self._thread = ThreadPoolExecutor(1, "policy")
-        self._answer: Future[Array] | None = None
+        self._answer: Future[tuple[Array, bool]] | None = None
         self._next = 0.0
+        self.reset(0)
 
     @property
     def busy(self) -> bool:
@@ -203,6 +208,7 @@ class BackgroundLink:
         if self._answer is not None:
             self._answer.exception()
         self._answer, self._next = None, 0.0
+        self._random = np.random.default_rng([seed, 3])
 
     def tick(self) -> None:
         """Wait for the next control step."""
@@ -212,14 +218,23 @@ class BackgroundLink:
 
     def send(self, observation: Observation) -> None:
         """Let the thread plan."""
-        self._answer = self._thread.submit(self._plan, observation)
+        self._answer = self._thread.submit(self._ask, observation)
+
+    def _ask(self, observation: Observation) -> tuple[Array, bool]:
+        """Return the chunk when it arrives, and whether it is lost."""
+        began = time.monotonic()
+        seconds, lost = self._network.draw(self._random)
+        actions = self._plan(observation)
+        time.sleep(max(0.0, began + seconds - time.monotonic()))
+        return actions, lost
 
     def receive(self, wait: bool) -> Array | None:
         """Return the chunk if it is there; raises what the policy raised."""
         if self._answer is None or not (wait or self._answer.done()):
             return None
         answer, self._answer = self._answer, None
-        return answer.result()
+        actions, lost = answer.result()
+        return None if lost and not wait else actions
 
     def close(self) -> None:
         """End the thread once the policy is idle."""
@@ -229,24 +244,30 @@ class BackgroundLink:
 class Distant:
     """An agent at the other end of a simulated network; one that does not plan chunks has chunks of one action."""
 
-    def __init__(self, agent: Agent, network: Network, spec: Spec) -> None:
-        """Args: the agent, the network, and the spec of the environment."""
+    def __init__(self, agent: Agent, network: Network, spec: Spec, by_clock: bool = False) -> None:
+        """Args: the agent, the network, the spec of the environment, and whether time passes by the clock."""
         self._agent = agent
         plan: Plan = getattr(agent, "plan", lambda observation: agent.act(observation)[None])
-        link = SimulatedLink(plan, network, spec.control_hz)
+        link: Link
+        if by_clock:
+            link = BackgroundLink(plan, spec.control_hz, network)
+        else:
+            link = SimulatedLink(plan, network, spec.control_hz)
         self._real_time = RealTime(spec, link, lambda: getattr(agent, "execute", None) or 1, network.ensemble)
         self.info: dict[str, Any] = {}
 
     def reset(self, instruction: str, seed: int) -> None:
         """Start an episode."""
+        self._real_time.reset(seed)  # first, because it waits until the policy is idle
         self._agent.reset(instruction, seed)
-        self._real_time.reset(seed)
 
     def act(self, observation: Observation) -> Array:
         """Return the action (D,) to execute now."""
         return self._real_time.act(observation)
 
 
-def make_distant(make_agent: Callable[[Environment], Agent], network: Network, environment: Environment) -> Distant:
+def make_distant(
+    make_agent: Callable[[Environment], Agent], network: Network, environment: Environment, by_clock: bool = False
+) -> Distant:
     """Build an agent at the other end of a network for an environment."""
-    return Distant(make_agent(environment), network, environment.spec)
+    return Distant(make_agent(environment), network, environment.spec, by_clock)

@@ -78,11 +78,14 @@ class Perturbation:
         self._angle = self._random.uniform(-MAX_TURN, MAX_TURN)
         self._gripper = self._wide if self._random.uniform() >= self.closed else self._shut
 
-    def __call__(self, clean: Array, truth: dict[str, Array]) -> Array:
-        """Return the (D,) action to execute instead of `clean`, not yet clipped to the bounds of the spec."""
+    def __call__(self, clean: Array, truth: dict[str, Array], must_turn: bool = False, steady: bool = False) -> Array:
+        """Return the (D,) action to execute instead of `clean`, not yet clipped to the bounds of the spec.
+
+        With `must_turn` the gripper also turns in episodes without turns; with `steady` no excursion begins.
+        """
         tool, opens = truth[self.tool], bool((clean[self._grip] >= (self._shut + self._wide) / 2).all())
         grasps, self._open = self._open and not opens, opens
-        if self._left == 0 and self._random.uniform() < self.rate:
+        if self._left == 0 and self._random.uniform() < self.rate and not steady:
             self._begin(self.steps)
         elif self._left == 0 and grasps and self._random.uniform() < self.missed:
             angle = self._random.uniform(-np.pi, np.pi)
@@ -95,7 +98,7 @@ class Perturbation:
             action[self._turn], action[self._grip] = self._angle, self._gripper
             return action
         action[self._motions] *= self._pace * (1 + self.noise * self._random.standard_normal(len(self._motions)))
-        action[self._turn] *= self._turns
+        action[self._turn] *= self._turns or must_turn
         return action
 
 
@@ -131,5 +134,6 @@ class Perturbed:
             return clean
         if observation.truth is None:
             raise ValueError("expert.perturb needs the simulator's truth, which this observation lacks")
-        executed = self._perturb(clean, observation.truth)
+        needs = {name: self._expert.info[name] for name in ("must_turn", "steady") if name in self._expert.info}
+        executed = self._perturb(clean, observation.truth, **needs)
         return np.clip(executed, self._spec.low, self._spec.high).astype(np.float32)

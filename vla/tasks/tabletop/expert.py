@@ -20,8 +20,7 @@ FUNNEL = 2.5  # height gained per metre of horizontal distance, so that approach
 # The loosest values that work: a policy with an error of a centimetre must not stall.
 GRASP_XY, GRASP_Z = 0.012, 0.012  # position tolerances at which the gripper closes [m]
 PLACE_Z = 0.012  # height tolerance at which the gripper opens [m]
-FINGERTIP = 0.012  # half the width of the closed fingertips [m]
-LOW = 0.012  # lowest tool height at which a fingertip clears the table [m]
+ABOVE = 0.004  # least height of a fingertip above the table [m]
 LANE = 0.010  # lateral tolerance of the fingertips in a push [m]
 PUSH_AT = 1.1  # contact height of a push relative to half the block's height, so that the block does not tip
 PUSH = 0.015  # largest motion of a push per step [m]
@@ -57,6 +56,7 @@ class Waypoint:
         """
         if observation.truth is None:
             raise ValueError("the scripted expert needs the simulator's truth, which this observation lacks")
+        self.info = {}
         action = self._decide(observation.truth, float(observation.state[self._gripper]))
         return np.clip(action, self._low, self._high).astype(np.float32)
 
@@ -102,27 +102,38 @@ class Waypoint:
         return self._action(truth, _rising_first(offset), 0.0, 1.0 if opens else 0.0)
 
     def _push(self, truth: dict[str, Array]) -> Array:
-        """Move behind the block, opposite its destination, and push it with closed fingers."""
+        """Move behind the block, opposite its destination, and push it with closed fingers.
+
+        Wide fingers close to a wedge, which presses a block down or lifts it. They push with their narrow, upright
+        side, leave the block sideways before they rise, and are not led astray while they touch it.
+        """
         tool, block, (half, _, half_height) = truth["commanded"][:3, 3], truth["block"], truth["half_size"]
+        fingertip, breadth, below = truth["tip"]
         way = (truth["destination"] - block)[:2]
         distance = float(np.hypot(*way))
         ahead = way / max(distance, 1e-6)
         aside = np.array([-ahead[1], ahead[0]])
         along, across = (tool - block)[:2] @ ahead, (tool - block)[:2] @ aside
-        near = np.hypot(along, across) < half + FINGERTIP
-        if near and tool[2] < block[2] + half_height + FINGERTIP and tool[2] > LOW + half_height:
-            return self._action(
-                truth, np.array([0.0, 0.0, HOVER]), 0.0, 1.0
-            )  # the fingers enclose the block: release it and rise
-        height = max(LOW, min(PUSH_AT * half, 0.9 * half_height))
-        behind = np.sqrt(2) * half + FINGERTIP + 0.006  # for any yaw of the block
+        away, top, low = np.hypot(along, across), block[2] + half_height, below + ABOVE
+        yaw, touches = 0.0, False
+        if breadth > fingertip:
+            touches = bool(away < np.sqrt(2) * half + fingertip and tool[2] - below < top)
+            yaw, self.info = _yaw_to_way(truth, ahead), {"must_turn": True, "steady": touches}
+        elif away < half + fingertip and low + half_height < tool[2] < top + fingertip:
+            # The fingers enclose the block: release it and rise.
+            return self._action(truth, np.array([0.0, 0.0, HOVER]), 0.0, 1.0)
+        height = max(low, min(PUSH_AT * half, 0.9 * half_height))
+        behind = np.sqrt(2) * half + fingertip + 0.006  # for any yaw of the block
         if tool[2] < height + 0.012 and -behind - 0.03 < along < -half and abs(across) < LANE:
             offset = np.append(min(distance, PUSH) * ahead - across * aside, height - tool[2])
+            return self._action(truth, offset, yaw, 0.0)
+        if touches:
+            offset = np.append((tool - block)[:2] / max(away, 1e-6) * PUSH, 0.0)
             return self._action(truth, offset, 0.0, 0.0)
         offset = np.append(block[:2] - (behind + 0.004) * ahead, height) - tool
         away = float(np.hypot(offset[0], offset[1]))
         offset[2] += min(FUNNEL * max(away - LANE / 2, 0.0), HOVER)
-        return self._action(truth, _rising_first(offset), 0.0, 0.0)
+        return self._action(truth, _rising_first(offset), yaw, 0.0)
 
     def _action(self, truth: dict[str, Array], offset: Array, yaw: float, gripper: float) -> Array:
         """Return the action that moves by `offset`, scaled uniformly to the bounds of a step, and turns by `yaw`."""
@@ -143,6 +154,13 @@ def _placed(truth: dict[str, Array]) -> bool:
     """Return whether the block is close enough to its destination."""
     offset = truth["destination"] - truth["block"]
     return bool(np.hypot(offset[0], offset[1]) < 1.5 * truth["tolerance"][0] and abs(offset[2]) < PLACE_Z)
+
+
+def _yaw_to_way(truth: dict[str, Array], ahead: Array) -> float:
+    """Return the turn [rad] after which the tool's x axis is parallel to a horizontal direction (2,)."""
+    rotation, half_turn = truth["commanded"][:3, :3], np.pi
+    turn = np.arctan2(ahead[1], ahead[0]) - np.arctan2(rotation[1, 0], rotation[0, 0])
+    return float((turn + half_turn / 2) % half_turn - half_turn / 2)
 
 
 def _yaw_to_faces(truth: dict[str, Array]) -> float:

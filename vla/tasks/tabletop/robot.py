@@ -76,6 +76,9 @@ class Robot:
     finger_speed: float  # largest change of the command per second
     widest: float  # opening of an open gripper [m]
     fingertips: Sequence[Sequence[str]]  # geoms of either side
+    tip: Sequence[
+        float
+    ]  # half extents of the closed fingertips along x and y, and how far they reach below the tool [m]
     tool: str  # site
 
     def compile(self, scene: mjcf.RootElement) -> mjcf.Physics:

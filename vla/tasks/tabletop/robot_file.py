@@ -200,6 +200,7 @@ class RobotFile(Robot):
         self._commands, self.narrowest, self.widest = commands[::-1], *self._openings[[0, -1]].tolist()
         tool, tips = data.site(self.tool), [data.geom(name).xpos for side in self.fingertips for name in side]
         middle = tool.xmat.reshape(3, 3).T @ (np.mean(tips, axis=0) - tool.xpos)
+        self.tip = self._extents(data)
         if np.linalg.norm(middle) > ASIDE:
             raise ValueError(
                 f"task.robot.offset: the middle between the fingertips is at {np.round(middle, 2).tolist()} m from the "
@@ -210,6 +211,17 @@ class RobotFile(Robot):
                 f"task.robot.open and task.robot.closed leave the fingertips {1000 * self.widest:.0f} and "
                 f"{1000 * self.narrowest:.0f} mm apart, which holds no block"
             )
+
+    def _extents(self, data: mujoco.MjData) -> tuple[float, float, float]:
+        """Return the extents of the fingertips in the frame of the tool, as of `Robot.tip`."""
+        tool, model = data.site(self.tool), self._model
+        corners = []
+        for geom in (model.geom(name).id for side in self.fingertips for name in side):
+            points = robot_spec.corners(model, geom)
+            corners.append(data.geom_xpos[geom] + points @ data.geom_xmat[geom].reshape(3, 3).T)
+        inside = (np.concatenate(corners) - tool.xpos) @ tool.xmat.reshape(3, 3)
+        forward, aside, down = np.abs(inside[:, 0]).max(), np.abs(inside[:, 1]).max(), inside[:, 2].max()
+        return float(forward), float(aside), float(down)
 
     def grip(self, opening: float) -> tuple[Array, float]:
         """Interpolate in the table of the gripper."""

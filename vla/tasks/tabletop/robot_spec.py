@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Sequence
 from difflib import get_close_matches
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -272,6 +273,15 @@ def _add_hull(spec: mujoco.MjSpec, model: mujoco.MjModel, mesh: str, name: str) 
     corners = spread(points @ turn.reshape(3, 3).T + model.mesh_pos[index], CORNERS)
     spec.add_mesh(name=name, uservert=corners.ravel())
     return True
+
+
+def corners(model: mujoco.MjModel, geom: int) -> Array:
+    """Return points (N, 3) in the frame of a geom whose hull contains it [m]: vertices of a mesh, else of a box."""
+    mesh = model.geom_dataid[geom]
+    if model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_MESH:
+        start = model.mesh_vertadr[mesh]
+        return np.asarray(model.mesh_vert[start : start + model.mesh_vertnum[mesh]], float)
+    return model.geom_aabb[geom, :3] + np.array([*product((-1, 1), repeat=3)]) * model.geom_aabb[geom, 3:]
 
 
 def quaternion(rotation: Array) -> Array:
