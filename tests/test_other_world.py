@@ -135,7 +135,8 @@ def test_a_store_is_verified_and_described(folder: Path) -> None:
     require_whole(findings)
     assert store_table(findings).row_count > 10
     card = write_card(findings).read_text()
-    assert "east | m" in card and "frame" not in card.split("## One step")[1].split("## What")[0]
+    step = card.split("## One step")[1].split("## Draws")[0]
+    assert "east | m" in step and "frame" not in step and "Depth" not in step
 
 
 def test_resets_are_shown() -> None:

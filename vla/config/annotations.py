@@ -21,6 +21,7 @@ from annotated_types import Ge, Gt, Le, Lt, MaxLen, MinLen, Predicate
 from pydantic import BeforeValidator, ConfigDict, TypeAdapter, ValidationError
 
 from vla.config.packages import can_be_trusted, is_trusted
+from vla.io.documents import mappings
 
 # Configs also come from checkpoints and stores of other people. A `_target_` may name a class of this package, one of
 # those that `conf/` uses, or one that the user trusts.
@@ -95,16 +96,12 @@ def is_node(value: Any) -> bool:
 
 def targets(value: Any) -> list[Any]:
     """Return every `_target_` in a plain value."""
-    own = [value["_target_"]] if is_node(value) else []
-    parts = value.values() if isinstance(value, dict) else value if isinstance(value, list) else ()
-    return own + [target for part in parts for target in targets(part)]
+    return [part["_target_"] for part in mappings(value) if is_node(part)]
 
 
 def packages(value: Any) -> list[Any]:
     """Return every package that a node in a plain value has imported: its argument `package`."""
-    own = [value["package"]] if is_node(value) and "package" in value else []
-    parts = value.values() if isinstance(value, dict) else value if isinstance(value, list) else ()
-    return own + [package for part in parts for package in packages(part)]
+    return [part["package"] for part in mappings(value) if is_node(part) and "package" in part]
 
 
 def require_trusted_package(source: object, package: Any) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 from typing import Any, TypeVar, cast
@@ -90,6 +91,14 @@ def require_resolved(value: Any, name: str) -> None:
             pending += [(part, depth + 1) for part in parts]
         elif item is not None and not isinstance(item, (bool, int, float)):
             raise ValueError(f"{name} holds a {type(item).__name__}, which is no plain data")
+
+
+def mappings(value: Any) -> Iterator[dict[Any, Any]]:
+    """Yield all mappings in a plain value, every one before those within it."""
+    if isinstance(value, dict):
+        yield value
+    for part in value.values() if isinstance(value, dict) else value if isinstance(value, list) else ():
+        yield from mappings(part)
 
 
 def problems(error: ValidationError, most: int = 3) -> str:

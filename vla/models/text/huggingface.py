@@ -16,7 +16,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from vla.io.documents import parse_json, read_bounded
+from vla.io.documents import mappings, parse_json, read_bounded
 from vla.models.packaged import PackagedFile
 from vla.models.text.ngrams import TextEncoder
 from vla.models.vision.hub import fetch
@@ -287,7 +287,7 @@ def _saved_tokenizer(text: str) -> Any:
     from tokenizers import Tokenizer
 
     normalizer = parse_json(text, dict[str, Any], "its tokenizer").get("normalizer")
-    insertions = [each for each in _nodes(normalizer) if each.get("type") in ("Replace", "Prepend")]
+    insertions = [each for each in mappings(normalizer) if each.get("type") in ("Replace", "Prepend")]
     inserted = [str(each.get("content") or each.get("prepend") or "") for each in insertions]
     if len(inserted) > INSERTIONS or any(len(each) > INSERTED for each in inserted):
         raise ValueError(
@@ -298,13 +298,6 @@ def _saved_tokenizer(text: str) -> Any:
     if max(padding.get("length") or 0, padding.get("pad_to_multiple_of") or 0) > LONGEST:
         raise ValueError(f"its tokenizer pads texts to more than {LONGEST} tokens")
     return tokenizer
-
-
-def _nodes(value: Any) -> list[dict[str, Any]]:
-    """Return all mappings in a plain value."""
-    own = [value] if isinstance(value, dict) else []
-    parts = value.values() if isinstance(value, dict) else value if isinstance(value, list) else ()
-    return own + [node for part in parts for node in _nodes(part)]
 
 
 def _standalone_tokenizer(tokenizer: Any, config: Any) -> Any:
