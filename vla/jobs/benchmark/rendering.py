@@ -16,12 +16,13 @@ FRAMES = 10  # of a renderer before it is the next one's turn
 def renderings(experiment: Experiment) -> dict[str, Measure]:
     """Measure the time of a step's images by every renderer, in turns and on the same scenes.
 
-    The floor is the fastest one. Nothing is measured of a world that is not `Floored` or has no such renderer.
+    The floor is the fastest one. A renderer with settings of the user's is "chosen", beside the others. Nothing is
+    measured of a world that is not `Floored` or has no such renderer.
     """
     own, choice = experiment["task"].get("renderer"), options("task/renderer")
     if own is None or own["_target_"] not in [node["_target_"] for node in choice.values()]:
         return {}
-    nodes = {name: own if node["_target_"] == own["_target_"] else node for name, node in choice.items()}
+    nodes = choice if own in choice.values() else {**choice, "chosen": own}
     worlds = {name: experiment.make_environment({"renderer": node})() for name, node in nodes.items()}
     seconds: defaultdict[str, float] = defaultdict(float)
     rounds = experiment["benchmark"]["episodes"]
