@@ -163,6 +163,24 @@ def test_a_slow_server_is_not_waited_for(monkeypatch: pytest.MonkeyPatch) -> Non
         agent.close()
 
 
+def test_pings_are_answered_while_the_policy_computes(monkeypatch: pytest.MonkeyPatch) -> None:
+    policy, gate, plan = as_policy(make_bc()), threading.Event(), server._plan
+
+    def gated(sessions: Sequence[Any], observations: Sequence[Observation]) -> list[Array]:
+        assert gate.wait(60)
+        return plan(sessions, observations)
+
+    monkeypatch.setattr(server, "_plan", gated)
+    (seen,) = observations(1)
+    with serving(policy) as url, client(url) as connection:
+        connection.recv()
+        connection.send(pack(message(seen)))
+        assert connection.ping().wait(30)
+        assert urlopen(f"{url.replace('ws://', 'http://')}/healthz").read() == b"OK\n"
+        gate.set()
+        np.testing.assert_array_equal(received(connection)["actions"], policy.session().plan(seen))
+
+
 def test_clients_have_histories_of_their_own_and_share_passes() -> None:
     policy = as_policy(make_rt1())
     streams = [observations(5, seed) for seed in range(3)]
