@@ -1,4 +1,4 @@
-"""What happened in a bag: joint states, commands, instructions, and who moved the arm when.
+"""Events of a bag: joint states, commands, instructions, and who moved the arm when.
 
 All times are seconds since the first message. Shapes: J joints, N samples.
 """

@@ -39,7 +39,7 @@ FINGERS_AGE = 0.5  # oldest state of fingers that come in messages of their own 
 
 @dataclass(frozen=True)
 class ArmDescription:
-    """What a view needs to know of an arm; the JSON text of `/vla_agent/arm`."""
+    """Facts of an arm that a view needs; the JSON text of `/vla_agent/arm`."""
 
     __pydantic_config__ = STRICT
 

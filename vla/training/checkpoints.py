@@ -1,4 +1,4 @@
-"""When a training saves, and how: periodically, on interruption, atomically."""
+"""Checkpoints of a training: saved periodically, on interruption, atomically."""
 
 from __future__ import annotations
 

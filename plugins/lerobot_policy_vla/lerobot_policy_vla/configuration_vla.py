@@ -1,4 +1,4 @@
-"""Which checkpoint, and what it sees."""
+"""Configuration of the policy: its checkpoint, and the features that it reads."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What happens before and after the policy: nothing but moves between devices, for it normalises by itself."""
+"""Steps before and after the policy: only moves between devices, because the policy normalises by itself."""
 
 from __future__ import annotations
 

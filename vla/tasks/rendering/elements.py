@@ -1,4 +1,4 @@
-"""What is drawn of a model: geoms and sites as one table of elements."""
+"""Drawn elements of a model: geoms and sites as one table."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class Elements:
 
     @property
     def opaque(self) -> Array:
-        """Which elements (E,) are drawn without blending."""
+        """Mask (E,) of the elements that are drawn without blending."""
         return self.seen & (self.rgba[:, 3] >= OPAQUE)
 
 

@@ -49,7 +49,7 @@ class Run:
 
 @dataclass(frozen=True)
 class Sight:
-    """What a camera sees of sky and planes."""
+    """Visibility of sky and planes for a camera."""
 
     state: bytes  # of camera and planes
     sky: bool  # it may see the sky beside the planes

@@ -13,7 +13,7 @@ from vla.spec import Array
 
 @dataclass(frozen=True)
 class View:
-    """What to draw of a model, and how large."""
+    """Cameras and elements of a model to draw, and the size of the images."""
 
     cameras: Sequence[int]  # ids in the model, in the order of the pictures
     height: int  # of every picture [px]
