@@ -7,6 +7,7 @@ import logging
 import os
 import re
 import signal
+import socket
 import ssl
 import threading
 import time
@@ -300,6 +301,35 @@ def test_who_sends_nonsense_is_told_why_and_disturbs_nobody() -> None:
             large.send(pack({"observation/image": np.zeros(2_000_000, np.uint8)}))
             with pytest.raises(ConnectionClosed, match="1009"):
                 large.recv()
+        good.send(pack(WHOLE))
+        np.testing.assert_array_equal(received(good)["actions"], expected)
+
+
+OTHER = {
+    "post": b"POST /act HTTP/1.1\r\nHost: here\r\nContent-Length: 2\r\n\r\n{}",
+    "http/2": b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n",  # gRPC
+    "tls": b"\x16\x03\x01\x02\x00\x01\x00\x01\xfc\x03\x03" + bytes(32),
+    "noise": b"\xc1" * 4096,
+}
+
+
+def test_who_speaks_another_protocol_is_told_which_one_is_spoken_here() -> None:
+    policy = as_policy(make_bc())
+    expected = policy.session().plan(observations(1)[0])
+    with serving(policy) as url, client(url) as good:
+        good.recv()
+        host, port = url.removeprefix("ws://").split(":")
+        for data in OTHER.values():
+            with socket.create_connection((host, int(port)), timeout=10) as bad:
+                bad.sendall(data)
+                with bad.makefile("rb") as answer:
+                    assert answer.read().endswith(b"connect to it by WebSocket with openpi's protocol\n")
+        with socket.create_connection((host, int(port)), timeout=10) as slow:
+            for part in (b"G", b"ET /healthz HTTP/1.1\r\nHost: here\r\n\r\n"):  # in two packets
+                slow.sendall(part)
+                time.sleep(0.05)
+            with slow.makefile("rb") as answer:
+                assert answer.read().endswith(b"OK\n")
         good.send(pack(WHOLE))
         np.testing.assert_array_equal(received(good)["actions"], expected)
 

@@ -41,6 +41,11 @@ if TYPE_CHECKING:
     from vla.policy import Policy
 
 LARGEST_IMAGE = 4096  # pixels in a row or column
+WEBSOCKET = b"GET "  # how every WebSocket connection begins (RFC 6455, section 4.1)
+SENTENCE = b"this is a policy server: connect to it by WebSocket with openpi's protocol\n"
+NO_WEBSOCKET = b"HTTP/1.1 405 Method Not Allowed\r\nAllow: GET\r\nConnection: close\r\n" + (
+    b"Content-Type: text/plain\r\nContent-Length: %d\r\n\r\n%s" % (len(SENTENCE), SENTENCE)
+)
 INVALID, INTERNAL = 1007, 1011  # WebSocket close codes: invalid data, error in the server
 
 log = logging.getLogger(__name__)
@@ -172,7 +177,7 @@ class Service:
             context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
             context.load_cert_chain(settings.certificate, settings.private_key)
         limits = {"compression": None, "max_size": settings.largest_message, "max_queue": 1}
-        request = {"process_request": self._answer_request, "ssl": context}
+        request = {"process_request": self._answer_request, "create_connection": _connection(), "ssl": context}
         with ThreadPoolExecutor(1, "inference") as thread:
             await asyncio.get_running_loop().run_in_executor(thread, self._warm_up)
             async with serve(self._talk, settings.host, settings.port, **limits, **request) as server:
@@ -330,6 +335,25 @@ def _plan(sessions: Sequence[Policy], observations: Sequence[Observation]) -> li
     from vla.policy import plan_together
 
     return plan_together(sessions, observations)
+
+
+def _connection() -> type[ServerConnection]:
+    """Return a connection that answers a client of another protocol, which websockets would leave without a word."""
+    from websockets.asyncio.server import ServerConnection
+
+    class Connection(ServerConnection):
+        _known = False  # the protocol
+
+        def data_received(self, data: bytes) -> None:
+            if not self._known and not data.startswith(WEBSOCKET[: len(data)]):
+                log.warning("refused a client at %s: it does not speak WebSocket", self.remote_address[0])
+                self.transport.write(NO_WEBSOCKET)
+                self.transport.close()
+                return
+            self._known = True
+            super().data_received(data)
+
+    return Connection
 
 
 def _is_loopback(host: str) -> bool:
