@@ -230,7 +230,7 @@ def test_pictures_of_another_kind_are_refused_by_name(home: Path, tmp_path: Path
 def test_a_recording_does_not_act(home: Path) -> None:
     options = defaults_of("expert/lerobot", folder=str(home / "dataset"))
     node = {"_target_": "vla.data.formats.lerobot_import.LeRobotDemonstrations", **options}
-    with pytest.raises(ValueError, match="cannot act: this job needs another expert"):
+    with pytest.raises(ValueError, match="cannot act: this job needs the expert of a world that can be played"):
         make_expert(node, make_arm())
 
 
