@@ -158,15 +158,17 @@ def test_what_is_missing_is_left_out(tmp_path: Path) -> None:
 
 
 def test_axes_of_success_end_at_one_and_small_numbers_keep_their_digits(tmp_path: Path) -> None:
-    curves = "step,val/success,val/error_gripper\n9,0.5,0.01001\n19,1.0,0.01003\n"
+    curves = "step,val/success,val/error_gripper,pace/waiting\n9,0.5,0.01001,5e-5\n19,1.0,0.01003,7e-5\n"
     panels = draw_run(read_run(a_run(tmp_path / "run", curves=curves)).metrics)
-    ticks = {title: re.findall(r">([\d.]+)</text>", panel) for title, panel in panels.items()}
-    assert "1.0" in ticks["success"] and max(float(tick) for tick in ticks["success"] if "." in tick) == 1
-    assert {"0.01001", "0.01003"} <= {tick.rstrip("0") for tick in ticks["error gripper"]}
-    labels = re.findall(r'text-anchor: end[^>]* x="([\d.-]+)"[^>]*>([\d.]+)<', "".join(panels.values()))
-    assert len(labels) > 8
-    for right, label in labels:  # each begins within the picture: at 9 px a digit is more than 5 wide
-        assert float(right) > 5 * len(label), label
+    minus = "\N{MINUS SIGN}"
+    tick = rf'text-anchor: end[^>]* x="([\d.-]+)"[^>]*>([\d.e{minus}]+)<'
+    labels = {title: re.findall(tick, panel) for title, panel in panels.items()}
+    ticks = {title: {label.replace(minus, "-") for _, label in found} for title, found in labels.items()}
+    assert {"0.01001", "0.01003"} <= ticks["error gripper"] and {"5e-05", "7e-05"} <= ticks["pace/waiting"]
+    assert max(map(float, ticks["success"])) == 1
+    for found in labels.values():
+        for right, label in found:  # each begins within the picture: at 9 px a digit is more than 5 wide
+            assert float(right) > 5 * len(label), label
 
 
 def test_every_family_of_metrics_is_one_panel(tmp_path: Path) -> None:

@@ -85,10 +85,9 @@ def _draw(title: str, lines: Lines) -> str:
             axes.plot(steps, values, color=colour, label=label, clip_on=title != "success", **look)
         if title.endswith("loss") and _spans_decades(lines):
             axes.set_yscale("log", subs=[2, 5])
-            axes.yaxis.set_major_formatter("{x:g}")
             axes.yaxis.set_minor_formatter("{x:g}")
-        else:
-            axes.ticklabel_format(useOffset=False)
+        for axis in (axes.xaxis, axes.yaxis):
+            axis.set_major_formatter("{x:g}")  # without a common factor, for which there is no room
         if title == "success":
             axes.set_ylim(0, 1)
         if any(label for label, _, _, _ in lines):
