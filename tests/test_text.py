@@ -21,6 +21,7 @@ from vla.config.build import check_node
 from vla.models.text.both import Both
 from vla.models.text.huggingface import HuggingFace
 from vla.models.text.ngrams import NGrams
+from vla.models.text.tensor_cache import TensorCache
 
 SENTENCES = ["Lift the red block", "put the small green block onto the blue pad", ""]
 
@@ -113,6 +114,26 @@ def test_n_grams_are_short(name: str) -> None:
     node: Any = OmegaConf.to_container(OmegaConf.load(CONF / "model/text/ngrams.yaml"))
     with pytest.raises(ValueError, match=rf"text\.{name} must be a whole number, at least 1, at most \d\d, got"):
         check_node("text", {**node, name: 2**31 - 1}, object)
+
+
+def test_a_cache_holds_what_was_used_last_within_its_bytes() -> None:
+    cache, made = TensorCache(20_000), list[str]()
+
+    def get(text: str, length: int) -> torch.Tensor:
+        return cache.get(text, lambda: made.append(text) or torch.zeros(length), length)
+
+    for text in ("a", "b", "a", "c", "a"):
+        assert get(text, 1000).shape == (1000,)
+    assert made == ["a", "b", "c"]
+    for number in range(100):
+        get(str(number), 1000)
+        get("a", 1000)
+        assert 0 < cache.size <= 20_000
+    assert made.count("a") == 1
+    get("huge", 10_000)
+    get("x" * 10_000, 1)
+    assert cache.size <= 20_000
+    assert get("a", 1).shape == (1,)
 
 
 def test_both_are_n_grams_beside_a_sentence_encoder(tmp_path: Path) -> None:

@@ -32,7 +32,7 @@ POLICY_INPUTS = (
     "/isaac/franka/joint_states",
     "/user/command",
 )
-MAX_MEMORY = 4 << 30  # for reading a bag, beyond what the process has [bytes]
+MAX_MEMORY = 2 << 30  # for reading a bag, beyond what the process has [bytes]
 MAX_FILE_SIZE = 8 << 30  # of a file that is decompressed to disk [bytes]
 
 

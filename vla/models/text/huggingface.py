@@ -8,7 +8,6 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterator
 from contextlib import contextmanager
-from functools import lru_cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -19,12 +18,13 @@ from torch import Tensor, nn
 from vla.io.documents import mappings, parse_json, read_bounded
 from vla.models.packaged import PackagedFile
 from vla.models.text.ngrams import TextEncoder
+from vla.models.text.tensor_cache import TensorCache
 from vla.models.vision.hub import fetch
 
 log = logging.getLogger(__name__)
 
 FILES = ("config.json", "tokenizer.json", "tokenizer_config.json", "model*.safetensors", "model.safetensors.index.json")
-CACHED = 8192  # sentence vectors
+CACHE_BYTES = 64 << 20  # of sentence vectors; 16 000 sentences of 1024 components
 LONGEST = 1 << 16  # tokens of a padded text
 INSERTIONS, INSERTED = 4, 8  # replacements of a normalizer, and characters of one: a text grows by 8^4 at most
 
@@ -68,7 +68,7 @@ class SentenceEncoder:
 
     def __init__(self, network: Any, tokenizer: Any) -> None:
         self.network, self.tokenizer = network.eval().requires_grad_(False), tokenizer
-        self.embed = lru_cache(CACHED)(self._embed)
+        self._vectors = TensorCache(CACHE_BYTES)
 
     def __deepcopy__(self, memo: Any) -> SentenceEncoder:
         return self
@@ -132,9 +132,12 @@ class SentenceEncoder:
             "weights": self.network.state_dict(),
         }
 
+    def embed(self, sentence: str) -> Tensor:
+        """Return the sentence vector of a text tower, or else the mean over all tokens, (E,) float32."""
+        return self._vectors.get(sentence, lambda: self._embed(sentence))
+
     @torch.no_grad()
     def _embed(self, sentence: str) -> Tensor:
-        """Return the sentence vector of a text tower, or else the mean over all tokens, (E,) float32."""
         ids = torch.tensor([self.tokenizer.encode(sentence).ids or [0]])  # (1, L), also for an empty sentence
         output = self.network(input_ids=ids)
         family = _family(self.network.config)

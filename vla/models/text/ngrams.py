@@ -8,7 +8,7 @@ from __future__ import annotations
 import re
 import zlib
 from abc import ABC, abstractmethod
-from functools import lru_cache
+from functools import partial
 from typing import Annotated
 
 import torch
@@ -16,9 +16,10 @@ from annotated_types import Ge, Le
 from torch import Tensor, nn
 
 from vla.io.types import Rate
+from vla.models.text.tensor_cache import TensorCache
 
 PADDING = 0
-CACHED = 4096  # sentences, whose hashes take about 1.5 kB each, and 20 kB at most unless n-grams are longer than usual
+CACHE = TensorCache(64 << 20)  # of the hashes of sentences, about 1.5 kB each
 INITIAL_STD = 0.1  # of embeddings; small, so that untrained n-grams have little effect
 
 
@@ -74,7 +75,8 @@ class NGrams(TextEncoder):
 
     def tokenize(self, sentences: list[str]) -> Tensor:
         """Return (B, L) int64 hashes of the n-grams of B lower-cased sentences, padded with 0."""
-        rows = [_hashes(sentence, self.vocabulary, self.words, self.characters) for sentence in sentences]
+        sizes = self.vocabulary, self.words, self.characters
+        rows = [CACHE.get(sentence, partial(_hashes, sentence, *sizes), *sizes) for sentence in sentences]
         return nn.utils.rnn.pad_sequence(rows, batch_first=True, padding_value=PADDING)
 
     def forward(self, tokens: Tensor) -> Tensor:
@@ -86,7 +88,6 @@ class NGrams(TextEncoder):
         return vector
 
 
-@lru_cache(CACHED)
 def _hashes(sentence: str, vocabulary: int, words: int, characters: int) -> Tensor:
     """Return the (L,) int64 hashes of the n-grams of a sentence."""
     found = re.findall(r"\w+", sentence.lower())
