@@ -22,6 +22,8 @@ from vla.models.diffusion import Diffusion
 from vla.models.model import Model
 from vla.models.rt1 import RT1
 
+pytestmark = pytest.mark.usefixtures("faster_exports")
+
 
 @pytest.mark.parametrize(  # models with short programs
     "make",
@@ -29,7 +31,7 @@ from vla.models.rt1 import RT1
         lambda: make_bc(chunk=2),
         lambda: make_rt1(proprioception=True, layers=1),
         lambda: make_decoder(layers=1),
-        lambda: make_denoising(Diffusion, layers=1, steps=2),
+        lambda: make_denoising(Diffusion, layers=1, steps=1),
     ],
     ids=["bc", "rt1 with kept tokens", "decoder", "diffusion"],
 )

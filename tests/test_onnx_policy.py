@@ -23,6 +23,7 @@ from vla.models.flow import Flow
 from vla.models.model import Model
 from vla.models.tokenizers.fast import Fast
 
+pytestmark = pytest.mark.usefixtures("faster_exports")
 RANGE = np.subtract(SPEC.high, SPEC.low)
 
 

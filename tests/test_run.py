@@ -319,10 +319,10 @@ def test_a_damaged_store_is_named_and_left_alone(home: Path, tmp_path: Path) -> 
 
 
 def test_a_model_that_memory_cannot_hold_is_refused_in_one_sentence(home: Path) -> None:
-    huge = ("model.width=16384", "model.chunk=1024", "tokenizer.bins=65536")  # 30 TB in the last layer
+    huge = ("model.width=2048", "model.chunk=1024", "tokenizer.bins=65536")  # 4 TB in the last layer
     done = here(home, *SMALL, "job=train", *huge, "output=huge", ok=False)
     assert done.stderr.startswith("error: training needs more memory than available: lower data.batch_size (now 8)")
-    assert "model.width (now 16384)" in done.stderr and len(done.stderr.splitlines()) == 1
+    assert "model.width (now 2048)" in done.stderr and len(done.stderr.splitlines()) == 1
 
 
 def test_training_that_fails_says_so_in_its_page(home: Path) -> None:

@@ -218,7 +218,7 @@ def _joined(batches: Sequence[Batch]) -> Batch:
 def latency(policy: Policy) -> float:
     """Measure the time from an observation to its action with a full history [ms].
 
-    It is the smallest of five medians over twenty plans, because other load only adds time.
+    It is the smallest of five medians over five plans, because other load only adds time.
     """
     observation = policy.spec.random_observation(np.random.default_rng(0))
     for _ in range(policy.model.history):
@@ -226,7 +226,7 @@ def latency(policy: Policy) -> float:
     medians = []
     for _ in range(5):
         seconds = []
-        for _ in range(20):
+        for _ in range(5):
             started = time.perf_counter()
             policy.plan(observation)
             seconds.append(time.perf_counter() - started)

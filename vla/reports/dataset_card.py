@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure, SubFigure
-from matplotlib.layout_engine import ConstrainedLayoutEngine
 from rich.markup import escape
 from rich.table import Table
 
@@ -172,30 +171,33 @@ def _page(findings: StoreReport) -> Figure:
     rows = max(1, -(-len(draws) // COLUMNS))
     heights = [TITLE + sheet.height + GAP, OUTCOMES, ACTIONS, DRAWS * rows]
     width, height = max(sheet.width, WIDTH), sum(heights)
-    layout = ConstrainedLayoutEngine(w_pad=0.12, h_pad=0.07)
-    figure = Figure(figsize=(width / DPI, height / DPI), dpi=DPI, layout=layout)
+    figure = Figure(figsize=(width / DPI, height / DPI), dpi=DPI)
     figure.text(18 / width, 1 - 34 / height, _summary(findings), fontsize=15, fontweight="bold")
     figure.figimage(np.array(sheet), 0, height - TITLE - sheet.height)  # pixel for pixel
     _, outcomes, actions, drawn = figure.subfigures(4, 1, squeeze=False, height_ratios=heights)[:, 0]
     _plot_episodes(outcomes, findings)
     _plot_actions(actions, findings)
-    _title(drawn, "Draws; triples in red, green and blue")
     for index, (name, values) in enumerate(draws.items()):
         axes = drawn.add_subplot(rows, COLUMNS, index + 1)
         axes.set_title(name, fontsize=9)
         _plot_draw(axes, values)
+    parts = (
+        (outcomes, OUTCOMES, 0.14, "Episodes"),
+        (actions, ACTIONS, 0.16, "Action labels, and executed actions as an outline; number of steps"),
+        (drawn, DRAWS * rows, 0.28, "Draws; triples in red, green and blue"),
+    )
+    for part, size, gap, title in parts:
+        # Fixed margins: a layout engine takes as long as drawing the page twice.
+        edges = {"left": 55 / width, "right": 1 - 25 / width, "bottom": 28 / size, "top": 1 - 65 / size}
+        part.subplots_adjust(**edges, wspace=gap, hspace=0.62)
+        part.text(18 / width, 1 - 12 / size, title, va="top", fontsize=11, fontweight="bold")
     for axes in figure.axes:
         axes.tick_params(labelsize=8)
     return figure
 
 
-def _title(figure: SubFigure, text: str) -> None:
-    figure.suptitle(text, x=0.012, ha="left", fontsize=11, fontweight="bold")
-
-
 def _plot_episodes(figure: SubFigure, findings: StoreReport) -> None:
     """Plot outcomes, episode lengths and instructions."""
-    _title(figure, "Episodes")
     outcomes, lengths, instructions = figure.subplots(1, 3, width_ratios=[2, 3, 4])
     _plot_counts(outcomes, findings.outcomes, [GREEN if name == "success" else RED for name in findings.outcomes])
     outcomes.set_title("outcomes of all seeds", fontsize=10)
@@ -208,7 +210,6 @@ def _plot_episodes(figure: SubFigure, findings: StoreReport) -> None:
 
 def _plot_actions(figure: SubFigure, findings: StoreReport) -> None:
     """Plot a histogram per component of the action labels and of the executed actions."""
-    _title(figure, "Action labels, and executed actions as an outline; number of steps")
     spec = findings.store.spec
     for index, axes in enumerate(np.atleast_1d(figure.subplots(1, len(spec.action), sharey=True))):
         bins = np.linspace(spec.low[index], spec.high[index], 42)

@@ -12,7 +12,6 @@ import numpy as np
 from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.layout_engine import ConstrainedLayoutEngine
 from PIL import Image, ImageDraw, ImageFont
 from rich.table import Table
 
@@ -121,10 +120,17 @@ def plot_report(report: Report, path: Path) -> None:
     played = [result for result in report.results if result.outcome != ERROR]
     shown = sorted(factors(played).items(), key=lambda factor: -association(factor[1], played))[:PANELS]
     rows = 1 + -(-len(shown) // 4)
-    figure = Figure(figsize=(13, 3.1 * rows), layout=ConstrainedLayoutEngine(h_pad=0.12))
-    figure.suptitle(str(report).splitlines()[-1], fontsize=15, fontweight="bold")
-    grid = figure.add_gridspec(rows, 4)
-    _plot_outcomes(figure.add_subplot(grid[0, :2]), report)
+    figure = Figure(figsize=(13, 3.1 * rows))
+    inch = 1 / (3.1 * rows)
+    figure.suptitle(str(report).splitlines()[-1], y=1 - 0.15 * inch, va="top", fontsize=15, fontweight="bold")
+    edges = {"right": 0.985, "bottom": 0.5 * inch, "top": 1 - 0.8 * inch}
+    grid = figure.add_gridspec(rows, 4, **edges, wspace=0.24, hspace=0.4)
+    outcomes = figure.add_subplot(grid[0, :2])
+    _plot_outcomes(outcomes, report)
+    # Only the left margin depends on what is drawn; a layout engine takes as long as drawing the figure twice.
+    names = outcomes.bbox.x0 - outcomes.yaxis.get_tightbbox().x0
+    grid.update(left=max(0.01 + names / figure.bbox.width, 0.06))
+    outcomes.set_position(grid[0, :2].get_position(figure))
     _plot_lengths(figure.add_subplot(grid[0, 2:]), played)
     for index, (name, values) in enumerate(shown):
         axes = figure.add_subplot(grid[1 + index // 4, index % 4])
