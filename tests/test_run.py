@@ -351,8 +351,9 @@ def test_training_that_is_interrupted_saves_and_goes_on(home: Path) -> None:
         assert f"Training was interrupted after {said[1]} steps" in page.read_text()
         return int(said[1])
 
-    endless = ("trainer.max_steps=100000", "trainer.limit_val_batches=0", "learner.schedule=constant", "recorder=none")
-    steps = interrupted(signal.SIGTERM, *SMALL, *endless, f"output={run.relative_to(home)}")
+    endless = ("trainer.max_steps=100000", "trainer.limit_val_batches=0", "trainer.val_check_interval=1000")
+    rest = ("learner.schedule=constant", "recorder=none", f"output={run.relative_to(home)}")
+    steps = interrupted(signal.SIGTERM, *SMALL, *endless, *rest)
     more = interrupted(signal.SIGINT, "resume=last")
     assert more > steps
     done = vla(home, "resume=last", f"trainer.max_steps={more + 2}")

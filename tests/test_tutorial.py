@@ -27,7 +27,7 @@ def small(command: str) -> list[str]:
 
 def test_the_tutorial_ends_with_a_policy_for_its_own_goal(tmp_path: Path) -> None:
     for part in ("vla", "conf"):
-        shutil.copytree(ROOT / part, tmp_path / part, ignore=shutil.ignore_patterns("__pycache__"))
+        shutil.copytree(ROOT / part, tmp_path / part)
     for name, text in FILES:
         assert not (tmp_path / name).exists()
         (tmp_path / name).write_text(text, encoding="utf-8")
