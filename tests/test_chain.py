@@ -25,7 +25,6 @@ from vla.rollouts.recorder import RerunRecorder, recording_name
 from vla.rollouts.rollout import replay, rollout
 from vla.rollouts.statistics import bounded_mean_interval, wilson_interval
 from vla.spec import FIRST_SEED, Array, Observation
-from vla.tasks.language import Grammar
 from vla.tasks.tabletop.expert import Waypoint
 from vla.tasks.tabletop.goals.chain import Chain
 from vla.tasks.tabletop.goals.goal import Arrangement, Goal
@@ -34,6 +33,7 @@ from vla.tasks.tabletop.goals.pick_place import PickPlace
 from vla.tasks.tabletop.goals.place import Place
 from vla.tasks.tabletop.goals.push import Push
 from vla.tasks.tabletop.goals.stack import Stack
+from vla.tasks.tabletop.language import Grammar
 
 if TYPE_CHECKING:
     from vla.tasks.tabletop.environment import Tabletop

@@ -22,7 +22,7 @@ from vla.config.experiment import plain
 from vla.run import sentence
 
 GRAMMAR = {
-    "_target_": "vla.tasks.language.Grammar",
+    "_target_": "vla.tasks.tabletop.language.Grammar",
     "phrasings": ["lift {block}"],
     "words": {},
     "held_out_phrasings": ["{block} up"],

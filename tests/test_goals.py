@@ -9,7 +9,6 @@ import pytest
 from tabletop_states import HALF, state
 
 from vla.spec import Array
-from vla.tasks.language import Grammar
 from vla.tasks.tabletop.goals.goal import Goal, Referents, WorldState
 from vla.tasks.tabletop.goals.lift import Lift
 from vla.tasks.tabletop.goals.mixed import Mixed
@@ -19,6 +18,7 @@ from vla.tasks.tabletop.goals.place import Place
 from vla.tasks.tabletop.goals.push import Push
 from vla.tasks.tabletop.goals.stack import Stack
 from vla.tasks.tabletop.goals.stay import Stay, Wait
+from vla.tasks.tabletop.language import Grammar
 
 GRAMMAR = Grammar(["move {block}"], {}, ["{block}"], {"move": ["shift"]})
 

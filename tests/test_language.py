@@ -18,7 +18,7 @@ from vla.config.check import conditions
 from vla.config.experiment import plain
 from vla.io.documents import read_yaml
 from vla.spec import FIRST_SEED
-from vla.tasks.language import Grammar, HeldOut, Silence
+from vla.tasks.tabletop.language import Grammar, HeldOut, Silence
 from vla.tasks.tabletop.randomize.language import paraphrase
 from vla.tasks.tabletop.scene import COLOURS, PADS
 

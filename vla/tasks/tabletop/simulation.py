@@ -11,13 +11,13 @@ import numpy as np
 
 from vla.robots.cartesian import CartesianController, solve
 from vla.spec import FIRST_SEED, Array
-from vla.tasks.language import HeldOut
 from vla.tasks.streams import Streams
 from vla.tasks.tabletop.compiled_scene import CompiledScene
 from vla.tasks.tabletop.disturber import PUSH, Disturber
 from vla.tasks.tabletop.goals.chain import Chain
 from vla.tasks.tabletop.goals.goal import SKILLS, Goal, Referents, WorldState, current
 from vla.tasks.tabletop.goals.mixed import Mixed
+from vla.tasks.tabletop.language import HeldOut
 from vla.tasks.tabletop.outcome import OutcomeClassifier
 from vla.tasks.tabletop.randomize.language import paraphrase
 from vla.tasks.tabletop.randomize.randomizer import Randomizer

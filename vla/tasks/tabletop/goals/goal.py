@@ -12,7 +12,7 @@ import numpy as np
 
 from vla.io.types import Count
 from vla.spec import Array
-from vla.tasks.language import Grammar
+from vla.tasks.tabletop.language import Grammar
 
 AT_REST = 0.02  # speed below which a block is at rest [m/s]
 

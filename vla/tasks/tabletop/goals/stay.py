@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from vla.io.types import Count, Positive
-from vla.tasks.language import Grammar, Silence
 from vla.tasks.tabletop.goals.goal import Goal, Referents, Subgoal, WorldState
+from vla.tasks.tabletop.language import Grammar, Silence
 
 AT_REST = 0.05  # speed of the fastest joint below which the arm is at rest [rad/s]
 

@@ -11,8 +11,8 @@ import numpy as np
 from annotated_types import MinLen
 
 from vla.io.types import Natural, Share
-from vla.tasks.language import Words
 from vla.tasks.tabletop.compiled_scene import CompiledScene
+from vla.tasks.tabletop.language import Words
 
 
 @dataclass(frozen=True)
