@@ -72,6 +72,19 @@ def test_the_step_is_named_whose_loss_was_the_first_that_was_not_finite(tmp_path
     assert sorted(path.name for path in tmp_path.iterdir()) == ["1.ckpt", "2.ckpt"]
 
 
+def test_training_leaves_no_setting_behind_that_changes_what_a_policy_computes() -> None:
+    flash = torch.backends.cuda.flash_sdp_enabled
+    during = []
+
+    class Watch(lightning.Callback):
+        def on_train_batch_start(self, *arguments: Any) -> None:
+            during.append(flash())
+
+    torch.backends.cuda.enable_flash_sdp(True)
+    make_trainer(1, Watch()).fit(make_learner(), loader(make_batch(1), 1))
+    assert during == [False] and flash()
+
+
 def test_schedules() -> None:
     def rates(schedule: Any) -> list[float]:
         seen: list[float] = []

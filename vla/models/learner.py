@@ -53,6 +53,7 @@ class Learner(LightningModule):
         self.model, self._spec, self._config = model, spec, config
         self._lr, self._weight_decay, self._warmup, self._schedule = lr, weight_decay, warmup_steps, schedule
         self._compile, self.ema = compile, ema
+        self._before: tuple[bool, str] | None = None  # flash attention and precision outside training
         self._non_finite_step: Tensor | None = None  # () on the device of the loss
         self.errors = nn.ModuleList(MeanMetric() for _ in spec.action)
 
@@ -70,10 +71,19 @@ class Learner(LightningModule):
 
     def on_fit_start(self) -> None:
         """Disable flash attention on a CPU, as its bfloat16 backward is very slow; enable TensorFloat-32 on a GPU."""
+        self._before = torch.backends.cuda.flash_sdp_enabled(), torch.get_float32_matmul_precision()
         if self.device.type == "cpu":
             torch.backends.cuda.enable_flash_sdp(False)
         else:
             torch.set_float32_matmul_precision("high")
+
+    def teardown(self, stage: str) -> None:
+        """Undo what `on_fit_start` set: an evaluation in this process gives what one in another process gives."""
+        if self._before is not None:
+            flash, precision = self._before
+            torch.backends.cuda.enable_flash_sdp(flash)
+            torch.set_float32_matmul_precision(precision)
+            self._before = None
 
     @torch.no_grad()
     def on_train_start(self) -> None:
