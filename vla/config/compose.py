@@ -43,18 +43,23 @@ def compose_task(task: str, **overrides: Any) -> Node:
     Args:
         task: an option of the group `task`.
         overrides: GROUP=OPTION for a group below it, such as goal="lift" or **{"randomize/light": "wide"}, and
-            KEY=VALUE for an argument, such as image_size=(64, 64) or **{"goal.radius": 0.03}.
+            KEY=VALUE for an argument, such as image_size=(64, 64) or **{"goal.radius": 0.03}. As on the command line, a
+            mapping is merged, and an optional argument that the task's files do not list begins with a plus.
 
     Raises:
-        hydra.errors.HydraException: an option or key does not exist.
+        hydra.errors.HydraException: an option does not exist.
+        omegaconf.errors.OmegaConfBaseException: a key does not exist.
     """
     with _hydra() as loader:
-        groups = {name for name in overrides if loader.get_group_options(f"task/{name}")}
-        given = [
-            f"task{'/' if name in groups else '.'}{name}={json.dumps(value, ensure_ascii=False)}"
-            for name, value in overrides.items()
-        ]
-        return plain(hydra.compose("config", [f"task={task}", *given]).task)
+        groups = {name: option for name, option in overrides.items() if loader.get_group_options(f"task/{name}")}
+        chosen = [f"task/{name}={json.dumps(option, ensure_ascii=False)}" for name, option in groups.items()]
+        config = hydra.compose("config", [f"task={task}", *chosen])
+        for name, value in overrides.items():
+            if name not in groups:
+                listed = json.loads(json.dumps(value))  # tuples as lists
+                key, new = name.removeprefix("+"), name.startswith("+")
+                OmegaConf.update(config.task, key, listed, merge=True, force_add=new)
+        return plain(config.task)
 
 
 @contextmanager
