@@ -467,12 +467,19 @@ def test_whoever_acts_is_evaluated_by_the_same_job(tmp_path: Path) -> None:
     expected = play(environment, policy.session(), FIRST_SEED)
     environment.close()
     keys = Keys({"front": "observation/image", "wrist": "observation/wrist_image"}, ["observation/state"], "prompt")
-    with serving(policy, keys=keys) as url:
-        here(tmp_path, "agent=remote", f"agent.url={url}", *common, "output=remote")
+    with serving(policy, keys=keys, connections=1) as url:  # each condition closes its own
+        network = "{_target_: vla.rollouts.realtime.Network, latency: 0.1, jitter: 0, loss: 0, ensemble: null}"
+        conditions = (
+            "evaluate.without=[images]",
+            f"+evaluate.networks.near={network}",
+            "+evaluate.conditions.dark={shadows: true}",
+        )
+        here(tmp_path, "agent=remote", f"agent.url={url}", *common, *conditions, "output=remote")
     report = json.loads((tmp_path / "remote/report.json").read_text())
     (played,) = report["per_episode"]
     assert (played["outcome"], played["steps"], played["draws"]) == (expected.outcome, 10, expected.draws)
     assert (report["model"], report["checkpoint"], report["errors"]) == ("remote", None, 0)
+    assert {*report["conditions"]} == {"without_images", "near", "dark"}
     here(tmp_path, "agent=expert", *common, "task.time_limit=10", "output=expert")
     report = json.loads((tmp_path / "expert/report.json").read_text())
     assert (report["model"], report["successes"]) == ("expert", 1)

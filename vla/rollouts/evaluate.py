@@ -22,7 +22,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from vla.parallel.pool import THIS_PROCESS, Cluster, Crashed
 from vla.rollouts.comparison import Comparison, Key, Pairs, compare_amounts, compare_pairs, concluded, median_interval
 from vla.rollouts.motion import AMOUNTS, Motion, motion_of
-from vla.rollouts.rollout import rollout
+from vla.rollouts.rollout import close_agent, rollout
 from vla.rollouts.sequential import anytime_interval
 from vla.rollouts.statistics import bounded_mean_interval, stratified_interval, wilson_interval
 from vla.spec import FIRST_SEED, Agent, Environment, Episode, Recorder
@@ -447,5 +447,6 @@ class _RolloutWorker:
         return play(self._environment, self._agent, seed, self._recorder)
 
     def close(self) -> None:
-        """Close the environment."""
+        """Close the environment and the agent."""
         self._environment.close()
+        close_agent(self._agent)

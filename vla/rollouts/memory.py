@@ -11,6 +11,7 @@ import numpy as np
 
 from vla.data.episodes import EpisodeStore
 from vla.io.types import Count
+from vla.rollouts.rollout import close_agent
 from vla.spec import Agent, Array, Environment, Observation, Spec
 
 Sense = Literal["images", "instruction"]
@@ -42,6 +43,10 @@ class Impaired:
         action = self._agent.act(observation)
         self.info = self._agent.info
         return action
+
+    def close(self) -> None:
+        """Close the agent."""
+        close_agent(self._agent)
 
 
 def make_impaired(make_agent: Callable[[Environment], Agent], lacks: Sense, environment: Environment) -> Impaired:

@@ -18,6 +18,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from vla.io.types import NonNegative, Rate
+from vla.rollouts.rollout import close_agent
 from vla.spec import Agent, Array, Environment, Observation, Spec
 
 Plan = Callable[[Observation], Array]  # returns a chunk (k, D)
@@ -248,11 +249,8 @@ class Distant:
         """Args: the agent, the network, the spec of the environment, and whether time passes by the clock."""
         self._agent = agent
         plan: Plan = getattr(agent, "plan", lambda observation: agent.act(observation)[None])
-        link: Link
-        if by_clock:
-            link = BackgroundLink(plan, spec.control_hz, network)
-        else:
-            link = SimulatedLink(plan, network, spec.control_hz)
+        self._thread = BackgroundLink(plan, spec.control_hz, network) if by_clock else None
+        link: Link = self._thread or SimulatedLink(plan, network, spec.control_hz)
         self._real_time = RealTime(spec, link, lambda: getattr(agent, "execute", None) or 1, network.ensemble)
         self.info: dict[str, Any] = {}
 
@@ -264,6 +262,12 @@ class Distant:
     def act(self, observation: Observation) -> Array:
         """Return the action (D,) to execute now."""
         return self._real_time.act(observation)
+
+    def close(self) -> None:
+        """End the thread once the agent is idle, and close the agent."""
+        if self._thread is not None:
+            self._thread.close()
+        close_agent(self._agent)
 
 
 def make_distant(

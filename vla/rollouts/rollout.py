@@ -82,3 +82,9 @@ def replay(environment: Environment, episode: Episode, recorder: Recorder | None
         return same.index(False)
     ended = len(same) == len(episode.executed) and environment.done and environment.outcome == episode.outcome
     return None if ended else len(same)
+
+
+def close_agent(agent: Agent) -> None:
+    """Close what an agent holds, such as a connection or a thread; most agents hold nothing and have no `close`."""
+    if callable(close := getattr(agent, "close", None)):
+        close()
