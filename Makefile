@@ -43,4 +43,4 @@ setup: .venv/.installed
 	@touch $@
 
 clean:
-	rm -rf .venv .pytest_cache .ruff_cache
+	rm -rf .venv .pytest_cache .ruff_cache .realtime.log

@@ -123,7 +123,7 @@ def plot_report(report: Report, path: Path) -> None:
     figure = Figure(figsize=(13, 3.1 * rows))
     inch = 1 / (3.1 * rows)
     figure.suptitle(str(report).splitlines()[-1], y=1 - 0.15 * inch, va="top", fontsize=15, fontweight="bold")
-    edges = {"right": 0.985, "bottom": 0.5 * inch, "top": 1 - 0.8 * inch}
+    edges = {"right": 0.985, "bottom": 0.65 * inch, "top": 1 - 0.8 * inch}
     grid = figure.add_gridspec(rows, 4, **edges, wspace=0.24, hspace=0.4)
     outcomes = figure.add_subplot(grid[0, :2])
     _plot_outcomes(outcomes, report)
