@@ -329,7 +329,6 @@ def test_invalid_deployments_end_in_one_sentence(home: Path, arguments: list[str
     assert re.fullmatch(r"(\[ERROR\] .*\n)?error: .*\n", done.stderr) and words in done.stderr
 
 
-@pytest.mark.realtime
 def test_a_too_long_instruction_is_not_sent(start: Callable[..., Started]) -> None:
     said = start("vla.deploy.say", "push " * 201)
     assert said.printed(30).startswith("error: the instruction has 1005 characters")
