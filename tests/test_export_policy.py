@@ -31,7 +31,7 @@ pytestmark = pytest.mark.usefixtures("faster_exports")
         lambda: make_bc(chunk=2),
         lambda: make_rt1(proprioception=True, layers=1),
         lambda: make_decoder(layers=1),
-        lambda: make_denoising(Diffusion, layers=1, steps=1),
+        lambda: make_denoising(Diffusion, layers=1, steps=2),
     ],
     ids=["bc", "rt1 with kept tokens", "decoder", "diffusion"],
 )
