@@ -35,8 +35,8 @@ choose_backend()
 has_egl()  # once, for the programs that tests start
 without_triton()
 
-
 warm.compose_faster()
+warm.collect_rarely()
 
 # What a shell runs in the background ignores interrupts, and so would the programs that tests start and interrupt.
 signal.signal(signal.SIGINT, signal.default_int_handler)

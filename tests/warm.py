@@ -18,6 +18,7 @@ import sys
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
+from copy import copy, deepcopy
 from pathlib import Path
 from select import select
 from socket import AF_UNIX, create_server, socket
@@ -29,6 +30,7 @@ from vla.parallel.fast_exit import fast_exit
 from vla.parallel.processes import without_triton
 from vla.tasks.gl import choose_backend
 
+CONF = str(Path(__file__).parents[1] / "conf")
 PATIENCE = 450  # [s]
 SOURCE = "VLA_TESTS_SOURCE"  # environment variable: the socket at which the process listens
 
@@ -167,16 +169,30 @@ def _codes(processes: list[int]) -> list[int]:
 
 
 def compose_faster() -> None:
-    """Leave out what takes Hydra and OmegaConf half of their time and changes nothing.
+    """Leave out what takes Hydra and OmegaConf more than half of their time and changes nothing.
 
     OmegaConf reads files without libyaml, and tells every node its parent after each merge, whether it has one already
-    or not. Hydra makes a config of all choices for every file, in case its defaults refer to one.
+    or not. Hydra makes a config of all choices for every file, in case its defaults refer to one, and reads all files
+    again for every composition.
     """
     import yaml
     from hydra._internal import defaults_list
+    from hydra._internal.config_repository import ConfigRepository
+    from hydra.core.object_type import ObjectType
     from omegaconf.base import Box
 
-    choices, tell = defaults_list._create_interpolation_map, Box._re_parent
+    choices, tell, load = defaults_list._create_interpolation_map, Box._re_parent, ConfigRepository.load_config
+    loaded: dict[str, Any] = {}
+
+    def once(repository: ConfigRepository, config_path: str) -> Any:
+        source = repository._find_object_source(config_path, ObjectType.CONFIG)
+        if source is None or source.path not in (CONF, "hydra.conf"):
+            return load(repository, config_path)
+        if config_path not in loaded:
+            loaded[config_path] = load(repository, config_path)
+        found = copy(loaded[config_path])
+        found.config = deepcopy(found.config)  # which the composition changes
+        return found
 
     def if_needed(overrides: Any, entries: list[Any], self_added: bool) -> Any:
         return choices(overrides, entries, self_added) if any(each.is_interpolation() for each in entries) else None
@@ -193,12 +209,19 @@ def compose_faster() -> None:
                 if_new(node)
 
     yaml.SafeLoader = yaml.CSafeLoader
+    patch.object(ConfigRepository, "load_config", once).start()
     patch.object(defaults_list, "_create_interpolation_map", if_needed).start()
     patch.object(Box, "_re_parent", if_new).start()
 
 
+def collect_rarely() -> None:
+    """Look for garbage in cycles as rarely as the command line does."""
+    gc.set_threshold(50_000, 20, 100)
+
+
 def load() -> None:
     """Import the heavy libraries."""
+    collect_rarely()
     choose_backend()
     without_triton()
     compose_faster()

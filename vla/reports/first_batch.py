@@ -15,6 +15,8 @@ from vla.spec import READABLE, Array, Spec
 FILE = "samples.png"
 SHOWN = 6  # windows
 COLUMNS = 2  # windows side by side
+HEIGHT, TITLE, GAP = 1.5, 0.4, 0.08  # of an image, above it, between parts [inch]
+LETTER, BAR, VALUE = 0.065, 1.2, 0.7  # widths of a letter, of a bar and of a value [inch]
 
 
 def draw_samples(batch: dict[str, Any], spec: Spec, path: Path) -> None:
@@ -26,34 +28,37 @@ def draw_samples(batch: dict[str, Any], spec: Spec, path: Path) -> None:
         path: of the PNG.
     """
     sentences, actions = batch["instruction"], np.asarray(batch["action"])[:, -1, 0]  # (B, D)
-    rows, cameras = -(-len(sentences) // COLUMNS), [*batch["rgb"]]
-    figure = Figure(figsize=(5.8 * COLUMNS, 1.95 * rows), layout="constrained", facecolor="white")
-    cells = figure.subfigures(rows, COLUMNS, squeeze=False, wspace=0.03).ravel()
-    for index, (cell, sentence) in enumerate(zip(cells, sentences, strict=False)):
-        cell.suptitle(sentence, fontsize=9.5, x=0.02, ha="left", parse_math=False)
-        *images, labels = cell.subplots(1, len(cameras) + 1, width_ratios=[*(1 for _ in cameras), 1.25])
-        for axes, camera in zip(images, cameras, strict=True):
-            axes.imshow(np.asarray(batch["rgb"][camera])[index, -1])
-            axes.axis("off")
-        _plot_action(labels, actions[index], spec)
+    images = [np.asarray(frames)[:, -1] for frames in batch["rgb"].values()]  # (B, H, W, 3) each
+    widths = [HEIGHT * image.shape[2] / image.shape[1] for image in images]
+    names = LETTER * max(map(len, spec.action))
+    width = sum(widths) + names + BAR + VALUE + GAP * (len(images) + 4)
+    height = HEIGHT + TITLE + GAP
+    total = COLUMNS * width, -(-len(sentences) // COLUMNS) * height
+    figure = Figure(figsize=total, facecolor="white")
+    axes = figure.add_axes((0, 0, 1, 1))  # a single one, in inches: each takes as long to draw as all that is in it
+    for index, sentence in enumerate(sentences):
+        left, bottom = index % COLUMNS * width + GAP, total[1] - (index // COLUMNS + 1) * height + GAP
+        axes.text(left, bottom + HEIGHT + GAP, sentence, fontsize=9.5, parse_math=False)
+        for image, wide in zip(images, widths, strict=True):
+            axes.imshow(image[index], extent=(left, left + wide, bottom, bottom + HEIGHT))
+            left += wide + GAP
+        _plot_action(axes, left + names + GAP, bottom, actions[index], spec)
+    axes.set(xlim=(0, total[0]), ylim=(0, total[1]))
+    axes.axis("off")
     save(figure, path, dpi=130)
 
 
-def _plot_action(axes: Axes, action: Array, spec: Spec) -> None:
-    """Plot a bar per component (D,) within its range, with its value."""
+def _plot_action(axes: Axes, left: float, bottom: float, action: Array, spec: Spec) -> None:
+    """Plot a bar per component (D,) within its range, with its name and value, from a corner on [inch]."""
     low, high = np.array(spec.low), np.array(spec.high)
     shares = np.clip(action / np.maximum(np.abs(low), np.abs(high)), -1, 1)
-    places, least = np.arange(len(action)), np.where(low < 0, -1.0, 0.0)
-    axes.barh(places, 1 - least, left=least, color=GREY, alpha=0.12)
-    axes.barh(places, shares, color=GREEN, height=0.6)
-    for place, (value, unit) in enumerate(zip(action, spec.units, strict=True)):
+    step, zero = HEIGHT / len(action), left + BAR / 2
+    places, least = bottom + HEIGHT - step * (np.arange(len(action)) + 0.5), np.where(low < 0, -1.0, 0.0)
+    axes.barh(places, (1 - least) * BAR / 2, 0.8 * step, left=zero + least * BAR / 2, color=GREY, alpha=0.12)
+    axes.barh(places, shares * BAR / 2, 0.6 * step, left=zero, color=GREEN)
+    for place, name, value, unit in zip(places, spec.action, action, spec.units, strict=True):
         factor, readable = READABLE.get(unit, (1.0, unit))
         number = round(factor * float(value), 1) + 0.0  # never "-0.0"
         text = f"{number:.1f} {readable}" if readable else f"{number:.2g}"
-        axes.text(1.12, place, text, va="center", fontsize=7.5)
-    axes.set_yticks(places, spec.action, fontsize=7.5)
-    axes.set_xlim(-1.05, 1.75)
-    axes.invert_yaxis()
-    axes.set_xticks([])
-    axes.tick_params(left=False)
-    axes.spines[:].set_visible(False)
+        axes.text(left - GAP, place, name, ha="right", va="center", fontsize=7.5, parse_math=False)
+        axes.text(left + BAR + GAP, place, text, va="center", fontsize=7.5, parse_math=False)

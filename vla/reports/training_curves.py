@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -17,12 +18,13 @@ SIZE = (3.4, 2.3)  # of a figure [inch]
 RIGHT, BOTTOM, TOP = 0.96, 0.12, 0.96  # ends of the axes in a figure
 DECADE = 10.0  # ratio of maximum to minimum above which a loss has a logarithmic axis
 
-Lines = list[tuple[str, bool, str, Curve]]  # label or "", logged in training (not validation), colour, curve
+Points = tuple[tuple[float, ...], tuple[float, ...]]  # steps and values
+Line = tuple[str, bool, str, Points]  # label or "", logged in training (not validation), colour, curve
 
 
 def draw_run(metrics: Mapping[str, Curve]) -> dict[str, str]:
     """Return title → SVG, one per family of metrics: training and validation of one metric, or errors of one unit."""
-    families: dict[str, Lines] = {}
+    families: dict[str, list[Line]] = {}
     components: dict[str, list[str]] = {}  # of a family
     for name, curve in metrics.items():
         family, component = _family(_bare(name))
@@ -31,17 +33,18 @@ def draw_run(metrics: Mapping[str, Curve]) -> dict[str, str]:
             known.append(component)
         training = not name.startswith("val/")
         colour = GREY if training and not component else COLOURS[known.index(component) % len(COLOURS)]
-        families.setdefault(family, []).append((component, training, colour, curve))
-    return {title: _draw(title, lines) for title, lines in _ordered(families).items()}
+        families.setdefault(family, []).append((component, training, colour, _points(curve)))
+    return {title: _draw(title, tuple(lines)) for title, lines in _ordered(families).items()}
 
 
 def draw_runs(runs: Mapping[str, Mapping[str, Curve]]) -> dict[str, str]:
     """Return title → SVG, one per metric, with the curves of all runs."""
-    families: dict[str, Lines] = {}
+    families: dict[str, list[Line]] = {}
     for colour, metrics in zip(colours(len(runs)), runs.values(), strict=True):
         for name, curve in metrics.items():
-            families.setdefault(_title(_bare(name)), []).append(("", not name.startswith("val/"), colour, curve))
-    return {title: _draw(title, lines) for title, lines in _ordered(families).items()}
+            line = "", not name.startswith("val/"), colour, _points(curve)
+            families.setdefault(_title(_bare(name)), []).append(line)
+    return {title: _draw(title, tuple(lines)) for title, lines in _ordered(families).items()}
 
 
 def colours(count: int) -> list[str]:
@@ -64,7 +67,7 @@ def _family(name: str) -> tuple[str, str]:
     return (f"error [{error[2]}]", error[1]) if error else (_title(name), "")
 
 
-def _ordered(families: Mapping[str, Lines]) -> dict[str, Lines]:
+def _ordered(families: Mapping[str, list[Line]]) -> dict[str, list[Line]]:
     """Sort validated metrics first, among them the loss first; otherwise keep the order of logging."""
 
     def place(title: str) -> tuple[bool, bool]:
@@ -73,7 +76,13 @@ def _ordered(families: Mapping[str, Lines]) -> dict[str, Lines]:
     return {title: families[title] for title in sorted(families, key=place)}
 
 
-def _draw(title: str, lines: Lines) -> str:
+def _points(curve: Curve) -> Points:
+    steps, values = curve
+    return tuple(steps.tolist()), tuple(values.tolist())
+
+
+@lru_cache(maxsize=32)  # the page of a run is written after its training, and again after its evaluation
+def _draw(title: str, lines: tuple[Line, ...]) -> str:
     with svg_style(title):
         figure = Figure(figsize=SIZE)
         axes = figure.add_axes((0.0, BOTTOM, RIGHT, TOP - BOTTOM))
@@ -101,7 +110,7 @@ def _draw(title: str, lines: Lines) -> str:
         return as_svg(figure)
 
 
-def _spans_decades(lines: Lines) -> bool:
+def _spans_decades(lines: tuple[Line, ...]) -> bool:
     values = np.concatenate([values for _, _, _, (_, values) in lines])
     values = values[np.isfinite(values)]
     return bool(len(values) and values.min() > 0 and values.max() > DECADE * values.min())
