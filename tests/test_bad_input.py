@@ -48,6 +48,7 @@ def test_bad_input_ends_in_one_clear_sentence(tmp_path: Path, name: str) -> None
     errors = [line for line in done.stderr.splitlines() if line.startswith("error: ")]
     assert len(errors) == 1 and says in errors[0], done.stderr
     assert "Traceback" not in done.stderr
+    assert all([*run.iterdir()] for run in tmp_path.glob("outputs/runs/*"))  # none is left empty
 
 
 # Job → values that no experiment can have, each of which is refused by the name of its key before any work.

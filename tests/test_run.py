@@ -158,6 +158,7 @@ def test_the_same_command_in_the_same_folder_does_nothing_twice(home: Path) -> N
 def test_runs_are_compared_in_one_page(home: Path) -> None:
     here(home, "job=report", "report.runs=[run]", "output=compared")
     assert 'href="../run/report.html"' in (home / "compared/comparison.html").read_text()
+    assert not [*home.glob("outputs/runs/*")]  # the folder of a command that writes elsewhere
 
 
 def test_cells_run_at_the_same_time_and_one_that_fails_leaves_the_others_alone(home: Path) -> None:

@@ -141,9 +141,9 @@ def _devices(trainer: DictConfig) -> int:
 
 
 def _remove_unused() -> None:
-    """Remove the empty folder that Hydra created for this run, because it resumes in another folder."""
+    """Remove the folder that Hydra created for this run, if no results are in it."""
     folder = Path(HydraConfig.get().runtime.output_dir)
-    if HydraConfig.get().mode == RunMode.RUN and {path.name for path in folder.iterdir()} <= {".hydra"}:
+    if HydraConfig.get().mode == RunMode.RUN and {path.name for path in folder.glob("*")} <= {".hydra"}:
         shutil.rmtree(folder, ignore_errors=True)
 
 
@@ -180,7 +180,6 @@ def _adopted(cfg: DictConfig, overrides: list[str]) -> DictConfig:
     from vla.runs.resume import interrupted_run
 
     if cfg.resume is not None:
-        _remove_unused()
         run = interrupted_run(Path(cfg.output).parent) if cfg.resume == "last" else Path(cfg.resume)
         return resume(cfg, run, overrides)
     if cfg.pretrained is not None:
@@ -223,6 +222,8 @@ def _compose(cfg: DictConfig) -> float | None:
         if HydraConfig.get().mode == RunMode.MULTIRUN:
             _fail(error)  # a sweeper may continue with the next job
         _end(error)
+    finally:
+        _remove_unused()
 
 
 def _menu() -> str:
