@@ -403,8 +403,8 @@ def with_chain(*chain: tuple[float, ...]) -> tuple[Spec, Robot]:
             "action is x .m., y .m., ",
         ),
         ((replace(SPEC, units=("mm",) * 3 + SPEC.units[3:]), ROBOT), r"action is dx .mm., .* expected dx .m., "),
-        (six(SPEC, ROBOT), "arm of 6 joints is not the Panda, and the checkpoint lacks its kinematic chain: train"),
-        (with_chain(*CHAIN[1:], CHAIN[0]), "arm of 7 joints is not the Panda, .* lacks its home posture: train with"),
+        (with_chain(), "the kinematics of the arm of 7 joints, and the checkpoint lacks its kinematic chain: train"),
+        (with_chain(*CHAIN[1:], CHAIN[0]), "arm of 7 joints, and the checkpoint lacks its home posture: train with"),
     ],
     ids=["action", "units", "joints", "chain"],
 )

@@ -135,6 +135,14 @@ def test_latency_costs_steps_and_then_success() -> None:
     assert later.success < at_once.success and not later.errors
 
 
+def test_an_arm_that_waits_stands_still_and_keeps_its_grip() -> None:
+    """What carries the load is called otherwise in another world, and has no unit either."""
+    spec = replace(SPEC, action=("x", "y", "suction"), low=(-0.05, -0.05, -1.0))
+    acting = RealTime(spec, SimulatedLink(lambda _: np.full((1, 3), 0.03), network_of(0.2), 10.0), lambda: 1, None)
+    seen = spec.random_observation(np.random.default_rng(0))
+    np.testing.assert_allclose([acting.act(seen) for _ in range(2)], [[0.03] * 3, [0, 0, 0.03]])
+
+
 def test_an_error_of_the_policy_is_one_of_the_episode() -> None:
     def fail(observation: Observation) -> Array:
         raise ValueError("the policy server failed")

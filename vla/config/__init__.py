@@ -1,1 +1,1 @@
-"""Configs: checked, adopted from checkpoints, and built; with `run.py` the only importers of hydra and omegaconf."""
+"""Configs: checked, adopted and built. Besides, only `run.py` and the callback of sweeps use hydra and omegaconf."""

@@ -26,8 +26,8 @@ OF_MODEL = ("tokenizer", "model", "data")  # the batch size depends on the model
 REPORTED = ("expert", "data", "learner", "validate", "seed")
 CHOSEN = {"experiment": "experiment", "model": "model"}  # name in `chosen` → group
 PRESETS = ("experiment", "variant", "shift")  # groups and keys that change other groups
-LENGTHS = ("max_steps", "max_epochs", "val_check_interval", "accumulate_grad_batches", "gradient_clip_val")
-REPORTED_VALUES = {"collect": ("episodes", "seed"), "trainer": (*LENGTHS, "precision")}
+SCHEDULE = ("max_steps", "max_epochs", "val_check_interval", "accumulate_grad_batches", "gradient_clip_val")
+REPORTED_VALUES = {"collect": ("episodes", "seed"), "trainer": (*SCHEDULE, "precision")}
 OF_THIS_COMMAND = ("output", "resume", "trust")  # keys that are not taken from a resumed run
 MACHINES = ("accelerator", "devices", "num_nodes", "strategy")  # keys of the trainer that its options change in one
 IDENTITY = (  # keys that nothing changes in one, because they make another training
@@ -80,8 +80,8 @@ def finetune(cfg: DictConfig, overrides: Sequence[str]) -> DictConfig:
 def resume(cfg: DictConfig, run: Path, overrides: Sequence[str]) -> DictConfig:
     """Return the config of `run`, to continue it in its folder.
 
-    A resumed run has its saved config and, on top, what the command line names: of an option of `trainer` only
-    `MACHINES`, and nothing of `IDENTITY`, which `require_identity` refuses when training starts.
+    The command line overrides the saved config. From an option of `trainer` only the keys in `MACHINES` are taken; a
+    change of a key in `IDENTITY` is refused by `require_identity` when training starts.
 
     Raises:
         ValueError: the folder has no training, is not one of the user's own runs, or `cfg` names another policy.
@@ -113,7 +113,7 @@ def resume(cfg: DictConfig, run: Path, overrides: Sequence[str]) -> DictConfig:
 
 
 def _reported(cfg: DictConfig, saved: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the nodes of `cfg` that describe a training, as they were in that of a checkpoint, without its paths."""
+    """Return the training settings of a checkpoint for the report of `cfg`, without the paths of their author."""
     own = cast("dict[str, Any]", OmegaConf.to_container(cfg))
     nodes = {}
     for name in (name for name in REPORTED if name in saved):

@@ -81,7 +81,7 @@ class Experiment:
         return not issubclass(locate("task._target_", self["task"]["_target_"]), SpecOnly)
 
     def world(self) -> Environment | SpecOnly:
-        """Build the world of the task, closed, for what it says of itself."""
+        """Build the world of the task and close it: only its description is used, such as spec and tasks."""
         if not self.playable:
             recorded: SpecOnly = build(self["task"], "task")
             return recorded

@@ -143,7 +143,7 @@ def read_index(folder: Path, topics: Topics, robot: Robot, status: str) -> BagIn
 
 @lru_cache(maxsize=2)
 def _read(folder: Path, settings: str, status: str, state: tuple[Any, ...]) -> BagIndex:
-    """Read a bag whose files have a `state`: once for the configuration, and once for the import."""
+    """Read a bag, cached by the `state` of its files, because composition and import both need it."""
     topics, robot = json.loads(settings)
     return _Reading(folder, Topics(**topics), Robot(**robot), status).index
 

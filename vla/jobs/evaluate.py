@@ -242,5 +242,5 @@ def _facts(experiment: Experiment, checkpoint: Path | None, rounds: Sequence[Rou
 
 
 def _before_last_training(rounds: Sequence[Round]) -> float:
-    """Return the duration of all rounds but for the training of the last [s], which its own folder has."""
+    """Return the duration of all rounds [s] without the last training, which is read from its own folder."""
     return sum(each.collection_s + each.training_s for each in rounds) - (rounds[-1].training_s if rounds else 0.0)

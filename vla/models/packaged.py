@@ -58,7 +58,7 @@ class PackagedFile:
         return content
 
     def unpack(self, folder: Path, patterns: Sequence[str]) -> None:
-        """Write those files to `folder` that lie at the top of this one, a zip archive, and match a pattern.
+        """Extract the files at the top of this zip archive that match a pattern into `folder`.
 
         Raises:
             ValueError: as in `read`, or it is no archive, or larger than 1 GiB.

@@ -94,11 +94,11 @@ def controller_for(
 def _kinematics(model: RobotModel, limits: tuple[Array, Array, Array] | None) -> Kinematics:
     """Return the kinematics of the Panda, or those of another arm's chain."""
     count = len(model.joints)
-    if count == len(panda.CHAIN) - 1 and (not model.chain or np.allclose(model.chain, panda.CHAIN)):
+    if np.shape(model.chain) == np.shape(panda.CHAIN) and np.allclose(model.chain, panda.CHAIN):
         return panda.PANDA
     if not model.chain or not model.home:
         raise ValueError(
-            f"the policy's arm of {count} joints is not the Panda, and the checkpoint lacks its "
+            f"Cartesian actions need the kinematics of the arm of {count} joints, and the checkpoint lacks its "
             f"{'home posture' if model.chain else 'kinematic chain'}: train with task/robot=file, or with actions that "
             "are joint positions"
         )

@@ -157,7 +157,10 @@ def _fill_with(
 
 
 class Attempts:
-    """Episodes of the seeds in order, rolled out in advance where their tasks will need them if all before succeed."""
+    """Episodes in the order of their seeds.
+
+    They are rolled out in advance for tasks that would need more even if all pending episodes succeed.
+    """
 
     def __init__(self, pool: Pool, multitask: Multitask | None, store: EpisodeStore, first: int) -> None:
         """Args:

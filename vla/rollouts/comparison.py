@@ -29,7 +29,7 @@ class Pairs(NamedTuple):
 
 @dataclass(frozen=True)
 class Comparison:
-    """Rate of a second policy or condition minus that of a first one, or the median of what an amount differs by."""
+    """Second policy or condition minus the first: the success rate, or the median difference of an amount."""
 
     difference: float  # a rate's is from -1 to 1
     ci_low: float  # of its 95 % confidence interval

@@ -93,7 +93,7 @@ class Stopping:
 
 
 def stopping(mean: float, one: float, zero: float, enough: float, fixed: int) -> Stopping | None:
-    """Simulate `SIMULATIONS` evaluations that stop when observations of 0 and 1 have shown another mean.
+    """Simulate `SIMULATIONS` evaluations that stop as soon as observations of 0 and 1 exclude a mean.
 
     Args:
         mean: the one to exclude: a bar, or 1/2 for pairs, of which those count that differ.

@@ -1,4 +1,4 @@
-"""Chunks executed in real time: one is executed while the next is computed, and what has become too old is skipped.
+"""Asynchronous execution of chunks: one is executed while the next is computed; actions that arrive late are skipped.
 
 Time is counted in executed actions. While an arm holds because no action is there, it stays where it was observed, and
 the plan for it does not age.
@@ -110,8 +110,8 @@ class RealTime:
     """Acts at every step with the newest chunk that has arrived, and holds where there is none.
 
     An episode starts with the first answer, for which it waits. To hold is to repeat the last action, but zero in
-    components that move the arm: those that may be negative or positive, apart from grippers and positions, which are
-    also part of the state.
+    components that are motion: those with a unit that may be negative or positive, apart from positions, which are also
+    part of the state. A component without a unit, such as the command of a gripper, is repeated.
     """
 
     def __init__(self, spec: Spec, link: Link, execute: Callable[[], int], ensemble: float | None) -> None:
@@ -122,8 +122,8 @@ class RealTime:
         ensemble: as of `Schedule`: average the actions of all chunks for a step, and send every observation.
         """
         self._link, self._execute, self._ensemble = link, execute, ensemble
-        columns = zip(spec.action, spec.low, spec.high, strict=True)
-        moves = [low < 0 < high and "gripper" not in name and name not in spec.state for name, low, high in columns]
+        columns = zip(spec.action, spec.units, spec.low, spec.high, strict=True)
+        moves = [unit != "1" and low < 0 < high and name not in spec.state for name, unit, low, high in columns]
         self._kept = ~np.array(moves)
         self.reset(0)
 
