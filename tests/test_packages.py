@@ -34,7 +34,9 @@ from vla.config.compose import compose_task
 from vla.config.experiment import plain
 
 EXAMPLE = Path(__file__).parent / "example_package"
-PAGE = (Path(__file__).parents[1] / "docs/packages.md").read_text(encoding="utf-8")
+DOCS = Path(__file__).parents[1] / "docs"
+PAGE = (DOCS / "packages.md").read_text(encoding="utf-8")
+OWN_MODEL = (DOCS / "models.md").read_text(encoding="utf-8").split("## A model of your own")[1].split("\n## ")[0]
 COMMANDS = re.findall(r"^python -m vla\.run (.*)$", PAGE, re.MULTILINE)
 MODEL = "mypackage.models.Mine"
 TINY = (
@@ -85,10 +87,11 @@ def importable(installed: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Non
         del sys.modules[name]
 
 
-def test_the_page_shows_what_the_package_holds() -> None:
+@pytest.mark.parametrize(("page", "count"), [(PAGE, 7), (OWN_MODEL, 2)], ids=["packages", "models"])
+def test_the_page_shows_what_the_package_holds(page: str, count: int) -> None:
     sources = "\n".join(path.read_text(encoding="utf-8") for path in EXAMPLE.rglob("*") if path.is_file())
-    blocks = re.findall(r"^```(?:toml|yaml|python)\n(.*?)^```", PAGE, re.MULTILINE | re.DOTALL)
-    assert len(blocks) == 7
+    blocks = re.findall(r"^```(?:toml|yaml|python)\n(.*?)^```", page, re.MULTILINE | re.DOTALL)
+    assert len(blocks) == count
     for block in blocks:
         assert block in sources
 
