@@ -15,7 +15,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
 from omegaconf import DictConfig, OmegaConf, open_dict
 
-from vla.config.build import require_no_paths, require_trust, without_paths
+from vla.config.build import GROUPS, require_no_paths, require_trust, without_paths
 from vla.config.differences import at, differences
 from vla.models.checkpoint import read_header
 
@@ -31,8 +31,8 @@ REPORTED_VALUES = {"collect": ("episodes", "seed"), "trainer": (*SCHEDULE, "prec
 OF_THIS_COMMAND = ("output", "resume", "trust")  # keys that are not taken from a resumed run
 MACHINES = ("accelerator", "devices", "num_nodes", "strategy")  # keys of the trainer that its options change in one
 IDENTITY = (  # keys that nothing changes in one, because they make another training
-    *("task", "expert", "collect.episodes", "collect.seed", "collect.folder", "collect.more", "data"),
-    *("tokenizer", "model", "learner", "validate", "seed", "pretrained"),
+    *(group.name for group in GROUPS.values() if group.training == "part"),
+    *("collect.episodes", "collect.seed", "collect.folder", "collect.more", "validate", "seed", "pretrained"),
     *(f"trainer.{name}" for name in ("val_check_interval", "accumulate_grad_batches", "gradient_clip_val")),
     *(f"trainer.{name}" for name in ("precision", "devices", "num_nodes")),
 )

@@ -49,27 +49,41 @@ class Group:
     runtime: tuple[str, ...] = ()  # constructor arguments from the program, never from YAML
     optional: bool = False  # jobs run without it
     several: bool = False  # an option is a mapping of name → node
+    training: Literal["", "part", "means"] = ""  # a part of each training, which another one makes another, or a means
 
 
 # A job may declare further groups of its own.
 GROUPS = {
     group.name: group
     for group in (
-        Group("task", ("vla.spec.Environment", "vla.spec.SpecOnly")),
+        Group("task", ("vla.spec.Environment", "vla.spec.SpecOnly"), training="part"),
         Group(
-            "expert", ("vla.spec.Agent", "vla.data.formats.imported_demonstrations.ImportedDemonstrations"), ("spec",)
+            "expert",
+            ("vla.spec.Agent", "vla.data.formats.imported_demonstrations.ImportedDemonstrations"),
+            ("spec",),
+            training="part",
         ),
-        Group("cluster", ("vla.parallel.pool.Cluster",)),
+        Group("cluster", ("vla.parallel.pool.Cluster",), training="means"),
         Group(
             "data",
             ("vla.data.datamodule.WindowDataModule",),
             ("folder", "spec", "history", "chunk", "episodes", "more"),
+            training="part",
         ),
-        Group("tokenizer", ("vla.models.tokenizers.tokenizer.ActionTokenizer",), ("spec", "statistics")),
-        Group("model", ("vla.models.model.Model",), ("spec", "tokenizer")),
-        Group("learner", ("vla.models.learner.Learner",), ("model", "spec", "config")),
-        Group("trainer", ("lightning.Trainer",), ("callbacks", "logger")),
-        Group("logger", ("lightning.pytorch.loggers.Logger",), ("save_dir",), optional=True, several=True),
+        Group(
+            "tokenizer", ("vla.models.tokenizers.tokenizer.ActionTokenizer",), ("spec", "statistics"), training="part"
+        ),
+        Group("model", ("vla.models.model.Model",), ("spec", "tokenizer"), training="part"),
+        Group("learner", ("vla.models.learner.Learner",), ("model", "spec", "config"), training="part"),
+        Group("trainer", ("lightning.Trainer",), ("callbacks", "logger"), training="means"),
+        Group(
+            "logger",
+            ("lightning.pytorch.loggers.Logger",),
+            ("save_dir",),
+            optional=True,
+            several=True,
+            training="means",
+        ),
         Group("policy", ("vla.policy.Policy",), ("model", "spec")),
         Group("agent", ("vla.spec.Agent",), ("spec",), optional=True),
         Group("recorder", ("vla.spec.Recorder",), ("folder",), optional=True),

@@ -39,7 +39,7 @@ class Job:
         return {group.name: group for group in groups}
 
 
-TRAINING = ("task", "expert", "cluster", "data", "tokenizer", "model", "learner", "trainer", "logger")
+TRAINING = tuple(group.name for group in GROUPS.values() if group.training)
 
 # Nodes without a class.
 PLAIN: dict[str, Any] = {
