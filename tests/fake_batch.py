@@ -24,7 +24,7 @@ from vla.policy import Policy
 from vla.spec import Spec
 
 TINY_IMAGE = partial(FilmConv, [8, 8], [5, 3], [2, 1], chroma=True, positions=False)
-TINY_TEXT = partial(NGrams, **defaults_of("model/text/ngrams", vocabulary=64, forget=0.0))
+TINY_TEXT = partial(NGrams, **defaults_of("model/text/ngrams", vocabulary=64, dropout=0.0))
 
 
 class Motions:

@@ -27,7 +27,7 @@ SENTENCES = ["Lift the red block", "put the small green block onto the blue pad"
 
 
 def test_tokens_are_filled_up_and_the_filling_changes_nothing() -> None:
-    encoder = NGrams(width=8, **defaults_of("model/text/ngrams", forget=0.0))
+    encoder = NGrams(width=8, **defaults_of("model/text/ngrams", dropout=0.0))
     together = encoder.tokenize(SENTENCES)
     alone = encoder.tokenize(SENTENCES[:1])
     assert together.dtype == torch.int64 and together.shape[0] == 3 and alone.shape[1] < together.shape[1]
@@ -40,12 +40,12 @@ def test_tokens_are_the_same_in_every_process() -> None:
     program += "; print(encoder.tokenize(['lift the red block']).tolist())"
     elsewhere = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout
     assert elsewhere.strip() == str(
-        NGrams(width=4, **defaults_of("model/text/ngrams", forget=0.0)).tokenize(["lift the red block"]).tolist()
+        NGrams(width=4, **defaults_of("model/text/ngrams", dropout=0.0)).tokenize(["lift the red block"]).tolist()
     )
 
 
 def test_case_and_punctuation_do_not_matter_but_order_does() -> None:
-    encoder = NGrams(width=8, **defaults_of("model/text/ngrams", forget=0.0))
+    encoder = NGrams(width=8, **defaults_of("model/text/ngrams", dropout=0.0))
     plain, loud, swapped = encoder.tokenize(["red on blue", "Red on BLUE!", "blue on red"])
     assert torch.equal(plain, loud)
     assert set(plain.tolist()) != set(swapped.tolist())
@@ -82,17 +82,17 @@ def test_n_grams_of_many_goals_say_which_block_belongs_on_which_pad() -> None:
 
 
 def test_related_words_share_tokens() -> None:
-    rows = NGrams(width=8, **defaults_of("model/text/ngrams", forget=0.0)).tokenize(["blocks", "block", "pyramid"])
+    rows = NGrams(width=8, **defaults_of("model/text/ngrams", dropout=0.0)).tokenize(["blocks", "block", "pyramid"])
     blocks, block, pyramid = (set(row.tolist()) - {0} for row in rows)
     assert len(block & blocks) >= 3 and not block & pyramid
 
 
 def test_all_tokens_have_a_vector() -> None:
-    assert NGrams(width=4, **defaults_of("model/text/ngrams", vocabulary=2, forget=0.0)).tokenize(SENTENCES).max() == 1
+    assert NGrams(width=4, **defaults_of("model/text/ngrams", vocabulary=2, dropout=0.0)).tokenize(SENTENCES).max() == 1
 
 
 def test_sentences_go_without_a_share_of_their_n_grams_in_training_only() -> None:
-    encoder = NGrams(width=8, **defaults_of("model/text/ngrams", forget=0.5))
+    encoder = NGrams(width=8, **defaults_of("model/text/ngrams", dropout=0.5))
     tokens = encoder.tokenize(SENTENCES[:1])
     assert not torch.equal(encoder(tokens), encoder(tokens))
     encoder.eval()
@@ -100,7 +100,7 @@ def test_sentences_go_without_a_share_of_their_n_grams_in_training_only() -> Non
 
 
 def test_unknown_words_hardly_change_what_training_made_of_the_known_ones() -> None:
-    encoder = NGrams(width=64, **defaults_of("model/text/ngrams", forget=0.0))
+    encoder = NGrams(width=64, **defaults_of("model/text/ngrams", dropout=0.0))
     known, new = encoder.tokenize(["put the red block on the pad", "convey the red block on the pad"])
     with torch.no_grad():
         encoder.embedding.weight[known] *= 10  # as training does
@@ -138,7 +138,7 @@ def test_a_cache_holds_what_was_used_last_within_its_bytes() -> None:
 
 def test_both_are_n_grams_beside_a_sentence_encoder(tmp_path: Path) -> None:
     folder = str(write_encoder(tmp_path))
-    options = defaults_of("model/text/ngrams", vocabulary=2**24, forget=0.0)
+    options = defaults_of("model/text/ngrams", vocabulary=2**24, dropout=0.0)
     torch.manual_seed(0)
     ngrams, sentence = NGrams(width=3, **{**options, "vocabulary": 64}), HuggingFace(folder, width=4)
     large = Both(partial(NGrams, **options), partial(HuggingFace, folder), width=2)

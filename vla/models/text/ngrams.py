@@ -53,7 +53,7 @@ class NGrams(TextEncoder):
         vocabulary: number of embeddings; n-grams with the same hash share one.
         words: longest n-gram of words.
         characters: length of character n-grams, taken from every word with boundary marks.
-        forget: dropout rate of n-grams in training, which imitates unknown words.
+        dropout: rate at which n-grams are dropped in training, which imitates unknown words.
         width: length of the sentence vector.
     """
 
@@ -62,12 +62,12 @@ class NGrams(TextEncoder):
         vocabulary: Annotated[int, Ge(2), Le(2**24)],
         words: Annotated[int, Ge(1), Le(16)],
         characters: Annotated[int, Ge(1), Le(32)],
-        forget: Rate,
+        dropout: Rate,
         *,
         width: int,
     ) -> None:
         super().__init__(width)
-        self.vocabulary, self.words, self.characters, self.forget = vocabulary, words, characters, forget
+        self.vocabulary, self.words, self.characters, self.dropout = vocabulary, words, characters, dropout
         self.embedding = nn.Embedding(vocabulary, width, padding_idx=PADDING)
         with torch.no_grad():
             self.embedding.weight.mul_(INITIAL_STD)
@@ -81,8 +81,8 @@ class NGrams(TextEncoder):
 
     def forward(self, tokens: Tensor) -> Tensor:
         """Return (B, width) vectors for (B, L) tokens; 0 is ignored at any position."""
-        if self.training and self.forget:
-            tokens = tokens * (torch.rand(tokens.shape, device=tokens.device) >= self.forget)
+        if self.training and self.dropout:
+            tokens = tokens * (torch.rand(tokens.shape, device=tokens.device) >= self.dropout)
         count = (tokens != PADDING).sum(1, keepdim=True).clamp(min=1)
         vector: Tensor = self.norm(self.embedding(tokens).sum(1) / count)
         return vector
