@@ -143,7 +143,8 @@ def _devices(trainer: DictConfig) -> int:
 def _remove_unused() -> None:
     """Remove the folder that Hydra created for this run, if no results are in it."""
     folder = Path(HydraConfig.get().runtime.output_dir)
-    if HydraConfig.get().mode == RunMode.RUN and {path.name for path in folder.glob("*")} <= {".hydra"}:
+    created = HydraConfig.get().mode == RunMode.RUN and folder.resolve() != Path.cwd()
+    if created and {path.name for path in folder.glob("*")} <= {".hydra"}:
         shutil.rmtree(folder, ignore_errors=True)
 
 

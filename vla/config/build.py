@@ -49,7 +49,7 @@ class Group:
     runtime: tuple[str, ...] = ()  # constructor arguments from the program, never from YAML
     optional: bool = False  # jobs run without it
     several: bool = False  # an option is a mapping of name → node
-    training: Literal["", "part", "means"] = ""  # a part of each training, which another one makes another, or a means
+    training: Literal["", "part", "means"] = ""  # used in trainings: parts determine their result
 
 
 # A job may declare further groups of its own.
