@@ -181,7 +181,7 @@ def test_who_is_named_does_not_depend_on_how_it_is_said() -> None:
 
 def test_the_same_scene_is_asked_for_another_block() -> None:
     one = make_tabletop("task/randomize=wide")
-    other = make_tabletop("task/randomize=wide", "+task/randomize/naming=swapped")
+    other = make_tabletop("task/randomize=wide", "task/randomize/naming=swapped")
     for seed in range(FIRST_SEED, FIRST_SEED + 10):
         first, second = one.reset(seed), other.reset(seed)
         np.testing.assert_array_equal(first.rgb["front"], second.rgb["front"])

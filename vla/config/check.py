@@ -124,7 +124,8 @@ def _check_changes(cfg: DictConfig, training: bool) -> None:
 def conditions(evaluate: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
     """Return condition → overrides of the task node: `evaluate.conditions`, then each part of `evaluate.one_by_one`.
 
-    A part at a level is named `part_level`, such as light_hard, or `part` if all levels are equal.
+    A part at a level is named `part_level`, such as light_hard, or `part` if all levels are equal. A part that is null
+    at every level is left out.
 
     Args:
         evaluate: the plain node, whose `one_by_one` is level → argument of the task → part → value.
@@ -136,6 +137,8 @@ def conditions(evaluate: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
             for part, value in parts.items():
                 levels.setdefault((argument, part), {})[level] = value
     for (argument, part), values in levels.items():
+        if all(value is None for value in values.values()):
+            continue
         if len(values) > 1 and len({repr(value) for value in values.values()}) == 1:
             values = {"": next(iter(values.values()))}
         for level, value in values.items():
