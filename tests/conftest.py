@@ -18,7 +18,7 @@ import pytest
 import warm
 from filelock import FileLock
 
-from vla.parallel.processes import THREAD_SETTINGS, without_triton
+from vla.parallel.processes import THREAD_SETTINGS, collect_rarely, without_triton
 from vla.tasks.gl import choose_backend, has_egl
 
 if TYPE_CHECKING:
@@ -36,7 +36,7 @@ has_egl()  # once, for the programs that tests start
 without_triton()
 
 warm.compose_faster()
-warm.collect_rarely()
+collect_rarely()
 
 # What a shell runs in the background ignores interrupts, and so would the programs that tests start and interrupt.
 signal.signal(signal.SIGINT, signal.default_int_handler)

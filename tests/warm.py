@@ -27,7 +27,7 @@ from typing import Any, TextIO
 from unittest.mock import patch
 
 from vla.parallel.fast_exit import fast_exit
-from vla.parallel.processes import without_triton
+from vla.parallel.processes import collect_rarely, without_triton
 from vla.tasks.gl import choose_backend
 
 CONF = str(Path(__file__).parents[1] / "conf")
@@ -212,11 +212,6 @@ def compose_faster() -> None:
     patch.object(ConfigRepository, "load_config", once).start()
     patch.object(defaults_list, "_create_interpolation_map", if_needed).start()
     patch.object(Box, "_re_parent", if_new).start()
-
-
-def collect_rarely() -> None:
-    """Look for garbage in cycles as rarely as the command line does."""
-    gc.set_threshold(50_000, 20, 100)
 
 
 def load() -> None:

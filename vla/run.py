@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gc
 import os
 import re
 import shutil
@@ -30,7 +29,7 @@ from vla.config.experiment import Experiment
 from vla.config.packages import offer_options, option_folders, trust
 from vla.deploy import ros
 from vla.parallel.fast_exit import fast_exit
-from vla.parallel.processes import without_triton
+from vla.parallel.processes import collect_rarely, without_triton
 from vla.runs.cells import failures, save_failure
 
 PACKAGE = Path(__file__).resolve().parent
@@ -242,7 +241,7 @@ def _menu() -> str:
 
 def main() -> None:
     """Run the command line; errors that the user can fix end in one sentence unless HYDRA_FULL_ERROR=1."""
-    gc.set_threshold(50_000, 20, 100)  # imports create many objects and few cycles: looking for them takes a second
+    collect_rarely()
     os.environ.setdefault(TRACEBACKS, os.environ.get("HYDRA_FULL_ERROR", "0"))
     os.environ["HYDRA_FULL_ERROR"] = "1"  # otherwise Hydra prints errors itself
     sys.argv[1:], ros.arguments[:] = ros.split_arguments(sys.argv[1:])

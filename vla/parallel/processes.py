@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import logging
 import os
 import pickle
@@ -162,6 +163,11 @@ def one_thread() -> None:
     os.environ.update(THREAD_SETTINGS)  # read when a library is loaded
     if torch := sys.modules.get("torch"):  # already loaded if this process trained the policy
         torch.set_num_threads(1)
+
+
+def collect_rarely() -> None:
+    """Look for garbage in cycles rarely: imports create many objects and few cycles, and looking takes a second."""
+    gc.set_threshold(50_000, 20, 100)
 
 
 def without_triton() -> None:
