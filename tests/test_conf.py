@@ -9,14 +9,22 @@ from itertools import product
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from composing import CONF, check, composed
+from defaults import defaults_of
 from hydra import compose, initialize_config_dir
 from hydra.utils import get_class
 from omegaconf import OmegaConf
 
 from vla.config.check import conditions
 from vla.config.experiment import plain
+from vla.deploy.bag import POLICY_INPUTS
+from vla.deploy.view import CAMERAS
+from vla.robots.cartesian import LIMIT_MARGIN
+from vla.robots.panda import FINGER_TRAVEL, JOINT_HIGH, JOINT_LOW, JOINT_SPEED
+from vla.spec import FIRST_SEED
+from vla.tasks.tabletop.simulation import WORKSPACE
 
 AXES = CONF / "task/randomize"  # a group for each, with levels of the same names
 LEVELS = sorted({path.stem for path in AXES.glob("*/*.yaml")} - {"swapped"})
@@ -180,6 +188,18 @@ def nodes(value: Any) -> Iterator[dict[str, Any]]:
         yield from [value] if "_target_" in value else []
     for part in value.values() if isinstance(value, dict) else value if isinstance(value, list) else ():
         yield from nodes(part)
+
+
+def test_numbers_that_the_simulator_and_a_file_need_are_equal() -> None:
+    robot, topics = defaults_of("deploy/robot/panda"), defaults_of("deploy/topics/isaac")
+    np.testing.assert_array_equal([robot["low"], robot["high"], robot["speed"]], [JOINT_LOW, JOINT_HIGH, JOINT_SPEED])
+    assert (robot["margin"], robot["finger_travel"]) == (LIMIT_MARGIN, FINGER_TRAVEL)
+    node = composed("job=deploy", "deploy=ros2").deploy
+    np.testing.assert_array_equal(node.safety.workspace, WORKSPACE)
+    images = topics["images"]
+    assert [f"{camera}={topic}" for camera, topic in images.items()] == [*CAMERAS]
+    assert (*images.values(), topics["joint_states"], topics["instruction"]) == POLICY_INPUTS
+    assert composed().evaluate.seed == FIRST_SEED == composed("job=deploy", "deploy=simulator").deploy.seed
 
 
 @pytest.mark.parametrize("path", sorted(CONF.rglob("*.yaml")), ids=lambda path: path.relative_to(CONF).as_posix())

@@ -15,7 +15,7 @@ from command_line import SMALL, here
 from composing import check, composed
 
 from vla.config.adopt import resume
-from vla.config.experiment import Experiment
+from vla.config.experiment import Experiment, plain
 from vla.data.episodes import EpisodeStore
 from vla.data.verification import derive_store, episode_of, verify_store
 from vla.data.window_batches import WindowBatcher
@@ -25,6 +25,8 @@ from vla.parallel.pool import LocalCluster
 from vla.rollouts.collect import collect
 from vla.rollouts.rollout import replay, rollout
 from vla.rollouts.supervised import Supervised, make_supervised, require_memoryless
+from vla.runs.folder import save_config
+from vla.runs.resume import interrupted_run, training_lock
 from vla.tasks.metaworld.expert import Scripted
 from vla.tasks.perturb import Perturbed
 from vla.tasks.tabletop.expert import Waypoint
@@ -151,10 +153,35 @@ def test_the_episodes_of_a_round_may_have_another_task() -> None:
         check(composed("job=improve", "+improve.changes.time=5.0"))
 
 
-def test_rounds_are_not_resumed_as_one_training(tmp_path: Path) -> None:
-    (tmp_path / "run/round_1").mkdir(parents=True)
-    with pytest.raises(ValueError, match="goes on with its own command and output="):
-        resume(composed(f"output={tmp_path}/now"), tmp_path / "run", [])
+def test_rounds_resume_with_their_own_config(tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    saved = composed("job=improve", f"output={run}", "pretrained=policy.ckpt", "improve.steps=7", "trainer.max_steps=9")
+    save_config(run, plain(saved), [])
+    more = ["job=improve", "improve.rounds=5"]
+    resumed = resume(composed(f"output={tmp_path}/now", *more), run, more)
+    assert (resumed.job, resumed.output, resumed.pretrained) == ("improve", str(run), "policy.ckpt")
+    assert (resumed.improve.rounds, resumed.improve.steps, resumed.trainer.max_steps) == (5, 7, 9)
+
+
+def test_a_folder_with_other_rounds_is_left_alone(tmp_path: Path) -> None:
+    there = (f"output={tmp_path}", "job=improve")
+    save_config(tmp_path, plain(composed(*there)), [])
+    before = (tmp_path / "config.yaml").read_bytes()
+    with pytest.raises(ValueError, match=rf"holds a training that differs in data.seed, seed: .* resume={tmp_path}$"):
+        improve.run(Experiment.of(composed(*there, "seed=1")))
+    assert (tmp_path / "config.yaml").read_bytes() == before
+
+
+def test_the_last_interrupted_run_may_be_one_in_rounds(tmp_path: Path) -> None:
+    last = tmp_path / "run/round_1/checkpoints/last.ckpt"
+    last.parent.mkdir(parents=True)
+    last.touch()
+    assert interrupted_run(tmp_path) == tmp_path / "run"
+    with training_lock(tmp_path / "run"), pytest.raises(ValueError, match="none of the 1 trainings"):
+        interrupted_run(tmp_path)
+    (tmp_path / "run/report.json").touch()
+    with pytest.raises(ValueError, match="none of the 1 trainings"):
+        interrupted_run(tmp_path)
 
 
 def test_seeds_of_demonstrations_are_not_played_again(folder: Path) -> None:
@@ -183,7 +210,7 @@ def test_rounds_that_were_killed_go_on_to_the_same_result(home: Path) -> None:
     shutil.rmtree(first / "checkpoints")
     index = first / "episodes/index.jsonl"
     index.write_bytes(index.read_bytes().splitlines(keepends=True)[0] + b'{"seed": 500')
-    here(home, *ROUNDS, *FEW, "output=rounds", "improve.rounds=2")
+    here(home, "resume=rounds", "output=rounds", "job=improve", "improve.rounds=2")
     assert result(first) == whole
     assert [entry.seed for entry in EpisodeStore(second / "episodes").tried] == [500002, 500003]
     trained = read_checkpoint(second / "checkpoints/last.ckpt").config

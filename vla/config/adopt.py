@@ -17,6 +17,7 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 
 from vla.config.build import GROUPS, require_no_paths, require_trust, without_paths
 from vla.config.differences import at, differences
+from vla.io.documents import read_yaml
 from vla.models.checkpoint import read_header
 
 OF_POLICY = ("task", "tokenizer", "model")
@@ -28,6 +29,7 @@ CHOSEN = {"experiment": "experiment", "model": "model"}  # name in `chosen` → 
 PRESETS = ("experiment", "variant", "shift")  # groups and keys that change other groups
 SCHEDULE = ("max_steps", "max_epochs", "val_check_interval", "accumulate_grad_batches", "gradient_clip_val")
 REPORTED_VALUES = {"collect": ("episodes", "seed"), "trainer": (*SCHEDULE, "precision")}
+LAST = Path("checkpoints/last.ckpt")  # in the folder of a training
 OF_THIS_COMMAND = ("output", "resume", "trust")  # keys that are not taken from a resumed run
 MACHINES = ("accelerator", "devices", "num_nodes", "strategy")  # keys of the trainer that its options change in one
 IDENTITY = (  # keys that nothing changes in one, because they make another training
@@ -70,7 +72,7 @@ def finetune(cfg: DictConfig, overrides: Sequence[str]) -> DictConfig:
         )
     parsed = _parsed(overrides)
     _require_own_parts(parsed, ("tokenizer", "model", *PRESETS))
-    own = Path(cfg.output) / "checkpoints/last.ckpt"  # of this training; `pretrained` may have been deleted since
+    own = Path(cfg.output) / LAST  # of this training; `pretrained` may have been deleted since
     saved = read_header(own if own.exists() and not Path(cfg.pretrained).exists() else cfg.pretrained).config
     require_no_paths(saved, OF_MODEL, cfg.pretrained)
     chosen = {**cfg.chosen, "model": saved.get("chosen", {}).get("model")}
@@ -88,28 +90,42 @@ def resume(cfg: DictConfig, run: Path, overrides: Sequence[str]) -> DictConfig:
     """
     if cfg.checkpoint is not None or cfg.pretrained is not None:
         raise ValueError(f"resume={cfg.resume} continues a run unchanged: omit checkpoint= and pretrained=")
-    last = run / "checkpoints/last.ckpt"
-    if any((run / name).is_dir() for name in ("round_0", "round_1")):
-        raise ValueError(f"resume={run} names a run of rounds, which goes on with its own command and output={run}")
-    if not last.is_file():
-        raise ValueError(f"resume={run}: nothing was trained in that folder, there is no {last}")
+    file = _config_file(run)
     output = Path(cfg.output).resolve()
     if run.resolve().parent != output.parent and run.resolve() != output:
         raise ValueError(
             f"resume={run} is not among your runs in {output.parent}: a run's config names files and folders, so only "
-            f"your own are resumed. If it is yours, add output={run}; to use somebody else's weights: pretrained={last}"
+            f"your own are resumed. If it is yours, add output={run}; to use somebody else's weights: "
+            f"pretrained={run / LAST}"
         )
-    saved, parsed = read_header(last).config, _parsed(overrides)
+    saved = read_header(file).config if file.name == LAST.name else read_yaml(file, dict[str, Any])
+    parsed, known = _parsed(overrides), {*map(str, cfg), saved.get("job")}  # a job has a node of its own
     _require_own_parts(parsed, PRESETS)
-    taken = {str(name): saved[name] for name in cfg if name in saved and name not in OF_THIS_COMMAND}
-    require_trust(taken, taken, last)
+    taken = {name: node for name, node in saved.items() if name in known and name not in OF_THIS_COMMAND}
+    require_trust(taken, taken, file)
     if any(_path(override) == "trainer" for override in parsed):
         kept = {name: value for name, value in saved.get("trainer", {}).items() if name not in MACHINES}
         taken["trainer"] = kept | {name: cfg.trainer[name] for name in MACHINES if name in cfg.trainer}
         parsed = [override for override in parsed if _path(override) != "trainer"]
     resumed = _on_top(cfg, taken, parsed)
-    resumed.output, resumed.resume = str(run), str(run)
+    # Paths of rounds begin with the folder as it was written in the first command.
+    same = isinstance(saved.get("output"), str) and Path(saved["output"]).resolve() == run.resolve()
+    resumed.output, resumed.resume = saved["output"] if same else str(run), str(run)
     return resumed
+
+
+def _config_file(run: Path) -> Path:
+    """Return the file that has the config of a run: its last checkpoint, or config.yaml of one in rounds.
+
+    Raises:
+        ValueError: there is neither.
+    """
+    if (run / LAST).is_file():
+        return run / LAST
+    config = run / "config.yaml"
+    if config.is_file() and read_yaml(config, dict[str, Any]).get("job") == "improve":
+        return config
+    raise ValueError(f"resume={run}: nothing was trained in that folder, there is no {run / LAST}")
 
 
 def _reported(cfg: DictConfig, saved: Mapping[str, Any]) -> dict[str, Any]:
@@ -138,10 +154,10 @@ def require_identity(saved: Mapping[str, Any], config: Mapping[str, Any], folder
     before, now = ({key: at(each, key, None) for key in IDENTITY} for each in (saved, config))
     changed = [key for key, _, _ in differences(before, now)]
     if changed:
+        weights = f"; pretrained={folder / LAST} starts another from its weights" if (folder / LAST).exists() else ""
         raise ValueError(
             f"{folder} holds a training that differs in {', '.join(changed[:3])}{', …' if changed[3:] else ''}: choose "
-            f"another output=DIR (hydra.sweep.dir=DIR of a sweep), continue it unchanged with resume={folder}, or "
-            f"start a new one from its weights with pretrained={folder / 'checkpoints/last.ckpt'}"
+            f"another output=DIR (hydra.sweep.dir=DIR of a sweep), or continue it with resume={folder}{weights}"
         )
 
 

@@ -16,6 +16,7 @@ from pathlib import Path
 
 import torch
 
+from vla.config.adopt import require_identity
 from vla.config.check import TRAINING, Job, with_changes
 from vla.config.experiment import Experiment
 from vla.data.episodes import EpisodeStore
@@ -28,7 +29,8 @@ from vla.models.checkpoint import read_checkpoint
 from vla.rollouts.collect import collect, collection_time
 from vla.rollouts.supervised import make_supervised, require_memoryless
 from vla.runs.files import Round
-from vla.runs.folder import read_run
+from vla.runs.folder import read_run, save_config
+from vla.runs.resume import training_lock
 from vla.spec import FIRST_SEED
 
 log = logging.getLogger(__name__)
@@ -55,7 +57,13 @@ def run(experiment: Experiment) -> float:
         ValueError: the expert cannot label, seeds are not fresh, or a round of another policy lies in the folder.
     """
     seeds = _require_possible(experiment)
-    require_new(seeds, demonstrations(experiment))
+    with training_lock(experiment.output):
+        _save_config(experiment)
+        require_new(seeds, demonstrations(experiment))
+        return _improved(experiment, seeds)
+
+
+def _improved(experiment: Experiment, seeds: range) -> float:
     asked, output = experiment["improve"], experiment.output
     checkpoint, rounds, stores = experiment.pretrained, list[Round](), list[Path]()
     if checkpoint is None:
@@ -69,6 +77,18 @@ def run(experiment: Experiment) -> float:
         rounds.append(_described(folder, store))
         log.info("round %d: %s", number, rounds[-1])
     return evaluate_trained(experiment, checkpoint, rounds)
+
+
+def _save_config(experiment: Experiment) -> None:
+    """Save the config for `resume=`.
+
+    Raises:
+        ValueError: the folder has rounds of another training.
+    """
+    saved = read_run(experiment.output).config
+    if saved.get("job") == "improve":
+        require_identity(saved, experiment.config, experiment.output)
+    save_config(experiment.output, experiment.config, experiment.changes)
 
 
 def _require_possible(experiment: Experiment) -> range:

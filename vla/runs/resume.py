@@ -7,6 +7,7 @@ import os
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +22,7 @@ from vla.runs.folder import CHECKPOINTS, ERRORS, LAST, REPORT, chosen_checkpoint
 log = logging.getLogger(__name__)
 
 FOUND = "VLA_LAST"  # environment variable that passes the run found by resume=last to other processes
-LOCK = ".training"  # held by the process that trains into a folder of checkpoints
+LOCK = ".training"  # held by the process that trains into a folder
 
 LENGTHS = ("max_steps", "max_epochs", "max_time")  # of the trainer
 
@@ -89,22 +90,30 @@ def interrupted_run(runs: Path) -> Path:
 
 
 def _newest_interrupted(runs: Path) -> Path:
-    files = sorted(runs.glob(f"*/{CHECKPOINTS}/{LAST}"), key=lambda path: path.stat().st_mtime, reverse=True)
+    found = (runs.glob(f"{run}/{CHECKPOINTS}/{LAST}") for run in ("*", "*/round_*"))
+    files = sorted(chain(*found), key=lambda path: path.stat().st_mtime, reverse=True)
     for last in files:
-        if _locked(last.parent):
+        training = last.parent.parent
+        in_rounds = training.parent != runs
+        run = training.parent if in_rounds else training
+        if _locked(run if in_rounds else last.parent):
             continue
-        run, saved = last.parent.parent, read_header(last)
         reported = (run / REPORT).exists() or (run / ERRORS).exists()
-        unreported = saved.config.get("job") == "evaluate" and not reported
-        unchosen = chosen_checkpoint(run) is None  # killed between the last save and the selection
-        if not saved.finished or unchosen or unreported:
+        if not reported if in_rounds else _unfinished(run, reported):
             return run
     raise ValueError(f"resume=last: none of the {len(files)} trainings in {runs} was interrupted; resume=DIR names one")
 
 
+def _unfinished(run: Path, reported: bool) -> bool:
+    """Return whether a training was interrupted, or the evaluation that was to follow."""
+    saved = read_header(run / CHECKPOINTS / LAST)
+    unchosen = chosen_checkpoint(run) is None  # killed between the last save and the selection
+    return not saved.finished or unchosen or (saved.config.get("job") == "evaluate" and not reported)
+
+
 @contextmanager
-def training_lock(checkpoints: Path) -> Iterator[None]:
-    """Lock a folder of checkpoints against other trainings; only the first process of a training takes the lock.
+def training_lock(folder: Path) -> Iterator[None]:
+    """Lock a folder of checkpoints, or of rounds, against other trainings; only the first process takes the lock.
 
     Raises:
         ValueError: another training holds the lock.
@@ -112,13 +121,13 @@ def training_lock(checkpoints: Path) -> Iterator[None]:
     if not first_process():
         yield
         return
-    checkpoints.mkdir(parents=True, exist_ok=True)
-    lock = FileLock(checkpoints / LOCK, blocking=False)
+    folder.mkdir(parents=True, exist_ok=True)
+    lock = FileLock(folder / LOCK, blocking=False)
     try:
         lock.acquire()
     except Timeout as error:
         raise ValueError(
-            f"another process is training into {checkpoints}: wait for it, or choose another output=DIR"
+            f"another process is training into {folder}: wait for it, or choose another output=DIR"
         ) from error
     try:
         yield
@@ -126,9 +135,9 @@ def training_lock(checkpoints: Path) -> Iterator[None]:
         lock.release()
 
 
-def _locked(checkpoints: Path) -> bool:
+def _locked(folder: Path) -> bool:
     try:
-        with FileLock(checkpoints / LOCK, blocking=False):
+        with FileLock(folder / LOCK, blocking=False):
             return False
     except Timeout:
         return True
