@@ -161,3 +161,14 @@ def test_recordings_are_kept_in_one_file_failures_first(tmp_path: Path) -> None:
     kept = [entry.recording_id.rpartition("-")[0] for entry in RrdReader(target).recordings()]
     assert kept == ["failure-01000003-timeout", "success-01000000", "success-01000001"]
     assert list(tmp_path.iterdir()) == [target]
+
+
+def test_recordings_that_cannot_be_kept_are_not_made(tmp_path: Path) -> None:
+    makers = toy.make_environment, toy.make_agent, toy.make_recorder(tmp_path)
+    everything = evaluate(*makers, SEEDS[:5])
+    assert len([*tmp_path.iterdir()]) == 5
+    for file in tmp_path.iterdir():
+        file.unlink()
+    assert evaluate(*makers, SEEDS[:5], recordings=2) == everything
+    names = ["failure-01000003-timeout", "success-01000000", "success-01000001"]
+    assert sorted(file.stem for file in tmp_path.iterdir()) == names

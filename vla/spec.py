@@ -396,7 +396,7 @@ class Recorder(Protocol):
     """Observer of a rollout."""
 
     def start(self, name: str, environment: Environment) -> None:
-        """Begin an episode."""
+        """Begin an episode; one that has not ended is discarded."""
         ...
 
     def step(self, observation: Observation, action: Array, info: Mapping[str, Any]) -> None:

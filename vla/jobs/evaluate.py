@@ -178,7 +178,16 @@ def _play(experiment: Experiment, checkpoint: Path | None, statements: Sequence[
         tiers = task.get("tiers")  # of worlds that have them
         clear = partial(_all, until) if asked["until"] and until else None
         reports[name] = evaluate(
-            make_environment, others.get(name, make_agent), watching, seeds, cluster, name, needs, tiers, clear
+            make_environment,
+            others.get(name, make_agent),
+            watching,
+            seeds,
+            cluster,
+            name,
+            needs,
+            tiers,
+            clear,
+            asked["recordings"],
         )
         first = reports[IN_DISTRIBUTION]
         seeds = [result.seed for result in first.results]

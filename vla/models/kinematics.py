@@ -16,7 +16,9 @@ class ForwardKinematics(nn.Module):
             quaternion wxyz. Joints rotate about their z axis.
     """
 
-    links: Tensor
+    fixed: Tensor  # (J, 4, 4), the transform of a joint is this + cos·cosine + sin·sine
+    cosine: Tensor
+    sine: Tensor
     WIDTH = 9  # of the output
 
     def __init__(self, chain: tuple[tuple[float, ...], ...]) -> None:
@@ -25,20 +27,25 @@ class ForwardKinematics(nn.Module):
         # Not torch.eye, which imports PyTorch's compiler where the tensors of a checkpoint's model are counted.
         links = torch.zeros(len(rows), 4, 4, dtype=torch.float64)
         links[:, :3, :3], links[:, :3, 3], links[:, 3, 3] = _rotation(rows[:, 3:]), rows[:, :3], 1
-        self.register_buffer("links", links.float(), persistent=False)
+        fixed, cosine, sine = (torch.zeros(len(rows) - 1, 4, 4, dtype=torch.float64) for _ in range(3))
+        fixed[:, :, 2:] = links[:-1, :, 2:]
+        cosine[:, :, :2] = links[:-1, :, :2]
+        sine[:, :, 0], sine[:, :, 1] = links[:-1, :, 1], -links[:-1, :, 0]
+        for name, part in (("fixed", fixed), ("cosine", cosine), ("sine", sine)):
+            part[-1] = part[-1] @ links[-1]  # the tool moves with the last joint
+            self.register_buffer(name, part.float(), persistent=False)
 
     def forward(self, joints: Tensor) -> Tensor:
         """Map (…, J) joint positions [rad] to (…, 9): position [m] and x and y axes of the tool, float32."""
         # In bfloat16 the error would be millimetres.
         with torch.autocast(joints.device.type, enabled=False):
-            angles = joints.float().unsqueeze(-1)
-            cosine, sine = angles.cos(), angles.sin()
-            pose = self.links[0].expand(*joints.shape[:-1], 4, 4)
-            for index, link in enumerate(self.links[1:]):
-                x, y = pose[..., 0], pose[..., 1]
-                c, s = cosine[..., index, :], sine[..., index, :]
-                pose = torch.stack([c * x + s * y, c * y - s * x, pose[..., 2], pose[..., 3]], -1) @ link
-        return torch.cat([pose[..., :3, 3], pose[..., :3, 0], pose[..., :3, 1]], -1)
+            angles = joints.float()[..., None, None]
+            transforms = self.fixed + angles.cos() * self.cosine + angles.sin() * self.sine  # (…, J, 4, 4)
+            while (count := transforms.shape[-3]) > 1:  # all products of neighbours at once
+                pairs = transforms[..., 0 : count - 1 : 2, :, :] @ transforms[..., 1:count:2, :, :]
+                transforms = torch.cat([pairs, transforms[..., count - 1 :, :, :]], -3) if count % 2 else pairs
+        pose = transforms[..., 0, :3, :]
+        return torch.cat([pose[..., 3], pose[..., 0], pose[..., 1]], -1)
 
 
 def _rotation(quaternions: Tensor) -> Tensor:

@@ -9,7 +9,7 @@ import json
 import logging
 import traceback
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -334,8 +334,11 @@ def evaluate(
     needs: Sequence[Path] = (),
     tiers: Mapping[str, Sequence[str]] | None = None,
     until: Callable[[Report], bool] | None = None,
+    recordings: int | None = None,
 ) -> Report:
     """Play the episodes of the seeds; `name` is the label of the progress bar, `tiers` are those of the report.
+
+    With `recordings`, successes that `keep_recordings` cannot keep under this limit are not recorded.
 
     Every process of the `cluster` calls the factories once and accesses the paths `needs`. Errors of a factory end the
     evaluation; errors of an episode, or a crash of its process, are reported in its result.
@@ -349,7 +352,9 @@ def evaluate(
     """
     if not seeds or min(seeds) < FIRST_SEED:
         raise ValueError(f"evaluation needs seeds from {FIRST_SEED} on, which no policy is trained on; got {seeds}")
-    make = partial(_RolloutWorker, make_environment, make_agent, make_recorder)
+    # Failures come first, so a success is kept only if it is among as many first seeds.
+    recorded = frozenset(sorted(seeds)[:recordings])
+    make = partial(_RolloutWorker, make_environment, make_agent, make_recorder if recorded else None, recorded)
     columns = (TextColumn(name), BarColumn(), MofNCompleteColumn(), TextColumn("{task.fields[note]}"))
     results: dict[int, Result] = {}
     counted, clear, turns = 0, False, sum(map(len, (tiers or {}).values())) or 1
@@ -417,15 +422,17 @@ def play(environment: Environment, agent: Agent, seed: int, recorder: Recorder |
     )
 
 
-class _TolerantRecorder:
-    """Recorder that logs disk errors: a missing recording must not fail an episode."""
+class _SelectiveRecorder:
+    """Recorder of failures, and of successes of some seeds; it logs disk errors, which must not fail an episode."""
 
-    def __init__(self, recorder: Recorder) -> None:
-        self._recorder = recorder
+    def __init__(self, recorder: Recorder, successes: Collection[int]) -> None:
+        self._recorder, self._successes = recorder, successes
         self.start, self.step = recorder.start, recorder.step
 
     def end(self, episode: Episode) -> None:
-        """Write the recording, or log a warning."""
+        """Write the recording if it is wanted, or log a warning."""
+        if episode.success and episode.seed not in self._successes:
+            return
         try:
             self._recorder.end(episode)
         except OSError as error:
@@ -436,11 +443,15 @@ class _RolloutWorker:
     """Worker with one environment, agent and recorder."""
 
     def __init__(
-        self, make_environment: EnvironmentFactory, make_agent: AgentFactory, make_recorder: RecorderFactory | None
+        self,
+        make_environment: EnvironmentFactory,
+        make_agent: AgentFactory,
+        make_recorder: RecorderFactory | None,
+        recorded: Collection[int],
     ) -> None:
         self._environment = make_environment()
         self._agent = make_agent(self._environment)
-        self._recorder = None if make_recorder is None else _TolerantRecorder(make_recorder())
+        self._recorder = None if make_recorder is None else _SelectiveRecorder(make_recorder(), recorded)
 
     def attempt(self, seed: int) -> Result:
         """Play one episode."""

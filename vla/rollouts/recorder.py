@@ -49,7 +49,6 @@ class RerunRecorder:
         self._spec = environment.spec
         self._world = environment if isinstance(environment, Drawable) else None
         self._eventful = environment if isinstance(environment, Eventful) else None
-        self._shapes = self._world.shapes() if self._world else []
         self._steps, self._poses = 0, list[dict[str, Array]]()
         self._probabilities: dict[int, Array] = {}
 
@@ -73,8 +72,8 @@ class RerunRecorder:
         writer = _Writer(stream, spec)
         writer.facts(episode)
         writer.events(events)
-        if self._poses:
-            draw_shapes(stream, self._shapes)
+        if self._world:
+            draw_shapes(stream, self._world.shapes())
             writer.poses(self._poses)
         writer.cameras(episode.observations)
         writer.curves(episode)
