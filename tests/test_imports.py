@@ -11,6 +11,7 @@ from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
 import pytest
+from command_line import SMALL
 
 ROOT = Path(__file__).parents[1]
 MODULES = {
@@ -133,6 +134,29 @@ def test_the_entry_dispatches_with_few_modules() -> None:
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, timeout=60)
     modules = [name for name in done.stdout.split() if MODULES.get(name, ROOT / "__init__.py").name != "__init__.py"]
     assert "vla.config.check" in modules and len(modules) <= 25, sorted(modules)
+
+
+def test_training_and_deployment_need_no_simulator(home: Path) -> None:
+    train = [*SMALL, "job=train", "output=without"]
+    code = f"""
+import sys
+sys.modules.update(dict.fromkeys(["mujoco", "dm_control", "moderngl"]))  # as if they were not installed
+from vla.run import main
+sys.argv[1:] = {train}
+main()
+from vla.config.adopt import adopt
+from vla.config.check import check
+from vla.config.compose import compose
+from vla.jobs import deploy
+robot = ["job=deploy", "deploy=server", "output=served", "checkpoint=without/checkpoints/last.ckpt"]
+check(adopt(compose(*robot), robot), deploy.JOB)
+sys.argv[1:] += ["output=further", "collect.episodes=13"]
+main()
+"""
+    done = subprocess.run([sys.executable, "-c", code], cwd=home, capture_output=True, text=True, timeout=120)
+    assert (home / "without/checkpoints/last.ckpt").is_file(), done.stderr
+    assert "Tabletop, which cannot be imported" in done.stderr and "Traceback" not in done.stderr
+    assert done.stderr.count("error:") == 1 and not (home / "further/checkpoints/last.ckpt").exists()
 
 
 def test_only_worlds_of_mujoco_choose_its_backend_and_before_they_import_it() -> None:

@@ -27,6 +27,7 @@ from vla.config.check import Job, check
 from vla.config.compose import CONF
 from vla.config.experiment import Experiment
 from vla.config.packages import offer_options, option_folders, trust
+from vla.config.substitutes import with_substitutes
 from vla.deploy import ros
 from vla.parallel.fast_exit import fast_exit
 from vla.parallel.processes import collect_rarely, without_triton
@@ -159,8 +160,6 @@ def _do(cfg: DictConfig) -> float | None:
     _require_sweepable(cfg, job)  # with the trainer that a run brings
     check(cfg, job)
     if "task" in job.needs(cfg):
-        from vla.config.substitutes import with_substitutes  # not every job has a task
-
         cfg = with_substitutes(cfg, overrides)
     return jobs.run(Experiment.of(cfg, compose("config")))
 

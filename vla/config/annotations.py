@@ -52,10 +52,15 @@ WORDS: dict[Any, tuple[str, str]] = {  # type → one, several
 ENDLESS = 2**31 - 1  # an upper bound that descriptions omit
 
 
+class MissingLibrary(ValueError):
+    """A class that this machine cannot import, because a library is not installed."""
+
+
 def locate(key: str, target: Any) -> type:
     """Import the class that the `_target_` at `key` names.
 
     Raises:
+        MissingLibrary: a library is not installed.
         ValueError: the class is not allowed or does not exist.
     """
     require_trusted(key, target)
@@ -70,7 +75,9 @@ def locate(key: str, target: Any) -> type:
         found = getattr(import_module(module), name)
     except (ImportError, AttributeError) as error:
         where = "" if target.startswith(OWN) else f" on {gethostname()}, where {package} must be installed"
-        raise ValueError(f"{key} is {target}, which cannot be imported{where}: {error}") from error
+        library = isinstance(error, ModuleNotFoundError) and not f"{error.name}.".startswith(f"{package}.")
+        kind = MissingLibrary if library else ValueError
+        raise kind(f"{key} is {target}, which cannot be imported{where}: {error}") from error
     # A module's attributes include its imports, such as `os`.
     defined = isinstance(found, type) and found.__module__.partition(".")[0] in (OWN.rstrip("."), package)
     if not isinstance(found, type) or not (target in LIBRARY or defined):

@@ -23,6 +23,7 @@ from hydra.errors import InstantiationException
 from hydra.utils import instantiate
 
 from vla.config.annotations import (
+    MissingLibrary,
     describe,
     fits,
     is_node,
@@ -233,9 +234,15 @@ def _part(node: Any, key: str) -> Any:
 
 
 def _paths_in(node: Any, key: str) -> Iterator[str]:
-    """Dotted names of the arguments in a node, called `key`, that name a file or folder."""
+    """Dotted names of the arguments in a node, called `key`, that name a file or folder.
+
+    What this machine cannot import has none: the jobs that build it refuse it anyway.
+    """
     if is_node(node):
-        known = arguments(locate(f"{key}._target_", node["_target_"]))
+        try:
+            known = arguments(locate(f"{key}._target_", node["_target_"]))
+        except MissingLibrary:
+            return
         yield from (
             f"{key}.{name}"
             for name, value in node.items()

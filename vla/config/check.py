@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Mapping
+from contextlib import nullcontext, suppress
 from dataclasses import dataclass, field
 from typing import Annotated, Any, Literal, cast
 
@@ -12,7 +13,7 @@ from annotated_types import Ge, Gt, Lt, Predicate
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
-from vla.config.annotations import fits, locate
+from vla.config.annotations import MissingLibrary, fits, locate
 from vla.config.build import GROUPS, Group, arguments, check_node, check_value, makes, require_known
 from vla.io.types import Count, Natural, Seed, Shift, Text, unique
 from vla.spec import FIRST_SEED
@@ -29,6 +30,7 @@ class Job:
     adopts: bool = False  # takes checkpoint=FILE
     without_agent: tuple[str, ...] = ()  # further groups, unless an agent acts
     without_checkpoint: tuple[str, ...] = ()  # further groups, unless an agent or a checkpoint acts
+    stored: tuple[str, ...] = ()  # groups whose libraries may be missing: a complete episode store takes their place
 
     def needs(self, config: Any) -> dict[str, Group]:
         """Return name → group of everything that it builds from with a plain or composed config."""
@@ -96,7 +98,8 @@ def check(cfg: DictConfig, job: Job) -> None:
             assert isinstance(node, dict)
             nodes = {f"{name}.{each!s}": part for each, part in node.items()} if group.several else {name: node}
             for key, each in nodes.items():
-                check_node(key, each, makes(group), group.runtime)
+                with suppress(MissingLibrary) if name in job.stored else nullcontext():
+                    check_node(key, each, makes(group), group.runtime)
         elif not group.optional:
             raise ValueError(f"job={cfg.job} needs {name}=OPTION; --help lists the options")
     if "model" in groups:
@@ -113,7 +116,7 @@ def _check_changes(cfg: DictConfig, training: bool) -> None:
     changed = {}
     if cfg.job in ("evaluate", "improve"):
         changed = {f"evaluate.conditions.{name}": changes for name, changes in conditions(evaluate).items()}
-    if training and validate["changes"]:
+    if training and validate["episodes"]:
         changed["validate.changes"] = validate["changes"]
     if cfg.job == "improve" and cfg.improve.changes:
         changed["improve.changes"] = cast("dict[str, Any]", OmegaConf.to_container(cfg.improve.changes, resolve=True))

@@ -5,11 +5,12 @@ from __future__ import annotations
 import copy
 import logging
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any, cast
 
 from omegaconf import DictConfig, OmegaConf
 
-from vla.config.annotations import locate
+from vla.config.annotations import MissingLibrary, locate
 from vla.config.compose import CONF
 from vla.config.experiment import Node, plain
 
@@ -19,10 +20,11 @@ log = logging.getLogger(__name__)
 def with_substitutes(cfg: DictConfig, overrides: Sequence[str]) -> DictConfig:
     """Return `cfg` with the substitute of every part of the task that cannot be used here, and log a warning.
 
-    What follows, such as the folder of the demonstrations, names the substitute. An option that the command line names
-    stays, and so do those of a resumed run, whose demonstrations exist.
+    Everything derived from the config, such as the folder of the demonstrations, uses the substitute. An option that
+    the command line names stays, and so do all where the demonstrations exist: in a resumed run, and in job=train.
     """
-    if cfg.resume is not None or cfg.task is None:
+    stored = cfg.job == "train" and (Path(cfg.collect.folder) / "store.json").is_file()
+    if cfg.resume is not None or cfg.task is None or stored:
         return cfg
     for name, node in cfg.task.items():
         asked = any(override.startswith(f"task/{name}=") for override in overrides)
@@ -46,5 +48,9 @@ def substitute(key: str, node: Any) -> tuple[str, str] | None:
     """Return why a node's class cannot be used here, and the option that its `substitute` names; None if it can be."""
     if not isinstance(node, DictConfig | dict) or "_target_" not in node:
         return None
-    found: tuple[str, str] | None = getattr(locate(f"{key}._target_", node["_target_"]), "substitute", lambda: None)()
+    try:
+        kind: Any = locate(f"{key}._target_", node["_target_"])
+    except MissingLibrary:
+        return None
+    found: tuple[str, str] | None = getattr(kind, "substitute", lambda: None)()
     return found

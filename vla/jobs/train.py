@@ -31,7 +31,7 @@ from vla.training.trainer import explain_memory_errors, make_trainer, quiet_ligh
 
 log = logging.getLogger(__name__)
 
-JOB = Job(TRAINING)
+JOB = Job(TRAINING, stored=("task", "expert"))
 
 
 def run(experiment: Experiment) -> None:
