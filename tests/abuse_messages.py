@@ -18,7 +18,7 @@ from trials import CHECKPOINT, Trials
 
 from vla.deploy.joint_limiter import Robot
 from vla.deploy.messages import fill_image
-from vla.deploy.ros import Network, ros
+from vla.deploy.ros import RosNetwork, ros
 from vla.robots.panda import HOME
 
 SECONDS = 3.0  # that each kind of message is sent
@@ -38,7 +38,7 @@ def messages(root: Path) -> Trials:
         "deploy=ros2",
         "output=deployed",
     ]
-    with (root / "deployed.log").open("w") as log, ros(Network.named("loopback")):
+    with (root / "deployed.log").open("w") as log, ros(RosNetwork.named("loopback")):
         process = subprocess.Popen(command, cwd=root, stdout=log, stderr=subprocess.STDOUT, start_new_session=True)
         try:
             world = World(replace(ROBOT, fingers=["panda_finger_joint1", "panda_finger_joint2"]))

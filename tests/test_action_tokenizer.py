@@ -18,7 +18,7 @@ from toy import SPEC
 from vla.models.tokenizers.fast import Fast
 from vla.models.tokenizers.quantile import Quantile
 from vla.models.tokenizers.tokenization_error import describe_tokenization_error, out_of_bounds
-from vla.models.tokenizers.tokenizer import RT1, ActionTokenizer, PerComponent, Uniform
+from vla.models.tokenizers.tokenizer import ActionTokenizer, PerComponent, RT1Bins, Uniform
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,7 @@ BOUNDS = Bounds(np.array([-0.02, -0.01, 0.0]), np.array([0.03, 0.04, 1.0]))
 def tokenizers() -> list[PerComponent]:
     return [
         Uniform(spec=SPEC, statistics=BOUNDS, **defaults_of("tokenizer/uniform")),
-        RT1(spec=SPEC, **defaults_of("tokenizer/rt1")),
+        RT1Bins(spec=SPEC, **defaults_of("tokenizer/rt1")),
     ]
 
 
@@ -84,7 +84,7 @@ def test_before_a_checkpoint_is_loaded_the_allowed_range_stands_in_and_the_check
 
 
 def test_rt1_has_fixed_bounds_by_unit_and_rounds_down() -> None:
-    tokenizer = RT1(spec=replace(SPEC, units=("m", "rad", "1")), **defaults_of("tokenizer/rt1"))
+    tokenizer = RT1Bins(spec=replace(SPEC, units=("m", "rad", "1")), **defaults_of("tokenizer/rt1"))
     assert tokenizer.high.tolist() == pytest.approx([1.0, np.pi / 2, 1.0])
     # 0 lies at 127.5 of 255, a hair below the next bin at 127.9.
     action = torch.tensor([0.0, np.pi / 2 * (2 * 127.9 / 255 - 1), -1.0])
@@ -93,7 +93,7 @@ def test_rt1_has_fixed_bounds_by_unit_and_rounds_down() -> None:
 
 def test_units_without_a_bound_are_refused() -> None:
     with pytest.raises(ValueError, match="'kg'"):
-        RT1(spec=replace(SPEC, units=("m", "m", "kg")), **defaults_of("tokenizer/rt1"))
+        RT1Bins(spec=replace(SPEC, units=("m", "m", "kg")), **defaults_of("tokenizer/rt1"))
 
 
 def test_statistics_of_other_actions_are_refused() -> None:
@@ -149,14 +149,14 @@ def test_labels_that_are_not_valid_do_not_count(tokenizer: PerComponent) -> None
 
 def test_what_a_tokenizer_loses_is_told_in_the_units_of_people() -> None:
     # Bins of 1 m and 1 rad: an action of 0.25 m rounds down to 0 m and so loses 250 mm, always to the same side.
-    tokenizer = RT1(bins=3, spec=SPEC)
+    tokenizer = RT1Bins(bins=3, spec=SPEC)
     told = describe_tokenization_error(tokenizer, np.tile([0.25, 0.0, 1.0], (4, 1, 1)), SPEC)
     assert (
         told.startswith("250.000 mm (bias 250.000, at most 250.000)")
         and "1 to 1 of 3 bins used; 3 tokens per action" in told
     )
     turning = replace(SPEC, units=("m", "rad", "1"))
-    told = describe_tokenization_error(RT1(bins=3, spec=turning), np.tile([0.0, 0.25, 1.0], (4, 1, 1)), turning)
+    told = describe_tokenization_error(RT1Bins(bins=3, spec=turning), np.tile([0.0, 0.25, 1.0], (4, 1, 1)), turning)
     assert "14.324 deg (bias 14.324, at most 14.324)" in told
     fine = describe_tokenization_error(
         Uniform(spec=SPEC, statistics=BOUNDS, **defaults_of("tokenizer/uniform")), BOUNDS.chunks(1), SPEC
@@ -170,7 +170,7 @@ CHUNKS = MOTIONS.chunks(8)
 
 KINDS: dict[str, Callable[..., ActionTokenizer]] = {
     "uniform": partial(Uniform, **defaults_of("tokenizer/uniform")),
-    "rt1": partial(RT1, **defaults_of("tokenizer/rt1")),
+    "rt1": partial(RT1Bins, **defaults_of("tokenizer/rt1")),
     "quantile": partial(Quantile, **defaults_of("tokenizer/quantile")),
     "fast": partial(Fast, **defaults_of("tokenizer/fast", chunk=8)),
 }

@@ -25,7 +25,7 @@ from vla.deploy import actions
 from vla.deploy.bag import BagRecorder
 from vla.deploy.bag_import import BagDemonstrations
 from vla.deploy.control_loop import State
-from vla.deploy.ros import Network
+from vla.deploy.ros import RosNetwork
 from vla.deploy.ros2 import PolicyDeployment
 from vla.deploy.settings import FrankaGripper, GripperCommand
 from vla.robots.panda import HOME, forward
@@ -273,7 +273,7 @@ def test_missing_messages_are_named_before_anything_else(
     options = {"command": "joint_state", "gripper": None, **changed}
     deployment = PolicyDeployment(
         **defaults_of("deploy/ros2", **options),
-        **{"robot": ROBOT, "network": Network.named("loopback"), "topics": TOPICS, "safety": SAFETY},
+        **{"robot": ROBOT, "network": RosNetwork.named("loopback"), "topics": TOPICS, "safety": SAFETY},
         **{"policy": unexpected, "environment": unexpected, "output": Path()},
     )
     with pytest.raises(ValueError, match=says) as refused:

@@ -14,7 +14,7 @@ from defaults import defaults_of
 from rerun.chunk import RrdReader
 
 from vla.deploy.joint_limiter import Robot
-from vla.deploy.ros import Network
+from vla.deploy.ros import RosNetwork
 from vla.deploy.ros2 import SimulatorDeployment
 from vla.deploy.settings import Timing, Topics
 from vla.reports.evaluation import summary, write_report
@@ -38,12 +38,13 @@ from vla.tasks.tabletop.language import Grammar
 if TYPE_CHECKING:
     from vla.tasks.tabletop.environment import Tabletop
 
-GRAMMAR = Grammar(["move {block}"], {}, ["{block}"], {"move": ["shift"]})
+GRAMMAR = Grammar(["move {block}"], {}, ["{block}"], {"move": ["shift"]}, [])
+COMMON: Any = {"language": GRAMMAR, "hold_steps": 3}
 GOALS: dict[str, Goal | None] = {
-    "lift": Lift(language=GRAMMAR, height=0.1),
-    "place": Place(language=GRAMMAR, radius=0.04),
-    "push": Push(language=GRAMMAR, radius=0.04),
-    "stack": Stack(language=GRAMMAR),
+    "lift": Lift(**COMMON, height=0.1),
+    "place": Place(**COMMON, radius=0.04),
+    "push": Push(**COMMON, radius=0.04, highest=0.02),
+    "stack": Stack(**COMMON),
 }
 FIRST, SECOND = FIRST_SEED + 2, FIRST_SEED + 3
 
@@ -105,10 +106,10 @@ def test_a_chain_that_cannot_be_is_refused() -> None:
     with pytest.raises(ValueError, match=r"give no chain of 2 instructions with 2 blocks: lower task\.goal\.length"):
         Chain({"lift": GOALS["lift"]}, length=2)
     with pytest.raises(ValueError, match=r"task\.goal\.goals\.pick cannot be part of a chain"):
-        Chain({"pick": PickPlace(language=GRAMMAR, radius=0.04)}, length=2)
+        Chain({"pick": PickPlace(**COMMON, radius=0.04)}, length=2)
     coloured = Grammar(["move {block}"], {}, ["{block}"], {"move": ["shift"]}, held_out_colours=["red"])
     with pytest.raises(ValueError, match="names blocks of all colours"):
-        Chain({"lift": Lift(language=coloured, height=0.1), "place": GOALS["place"]}, length=2)
+        Chain({"lift": Lift(language=coloured, height=0.1, hold_steps=3), "place": GOALS["place"]}, length=2)
 
 
 def test_the_next_instruction_comes_when_one_is_completed(chain: Tabletop, tmp_path: Path) -> None:
@@ -224,7 +225,7 @@ def test_a_simulator_that_plays_single_instructions_refuses_a_chain(chain: Table
     nothing: Any = None
     deployment = SimulatorDeployment(
         **parts,
-        network=Network.named("loopback"),
+        network=RosNetwork.named("loopback"),
         seed=FIRST,
         policy=nothing,
         environment=lambda: chain,

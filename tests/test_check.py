@@ -27,6 +27,7 @@ GRAMMAR = {
     "words": {},
     "held_out_phrasings": ["{block} up"],
     "held_out_words": {"lift": ["raise"]},
+    "held_out_colours": [],
 }
 MASSES = {"_target_": "vla.tasks.tabletop.randomize.blocks.Masses", "factor": [0.5, 2.0]}
 WAYPOINT = {"_target_": "vla.tasks.tabletop.expert.Waypoint", "_partial_": True}

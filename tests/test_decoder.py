@@ -19,7 +19,7 @@ from vla.models.checkpoint import read_checkpoint
 from vla.models.decoder import Decoder
 from vla.models.tokenizers.fast import Fast
 from vla.models.tokenizers.quantile import Quantile
-from vla.models.tokenizers.tokenizer import RT1
+from vla.models.tokenizers.tokenizer import RT1Bins
 from vla.rollouts.rollout import rollout
 
 MOTIONS = Motions()
@@ -34,7 +34,7 @@ def make_fast(chunk: int = 4, seed: int = 0) -> Decoder:
 MODELS: dict[str, Callable[[], Decoder]] = {
     "uniform": make_decoder,
     "chunk": lambda: make_decoder(history=3, chunk=3),
-    "rt1": lambda: make_decoder(tokenizer=RT1(spec=SPEC, **defaults_of("tokenizer/rt1"))),
+    "rt1": lambda: make_decoder(tokenizer=RT1Bins(spec=SPEC, **defaults_of("tokenizer/rt1"))),
     "quantile": lambda: make_decoder(tokenizer=Quantile(bins=64, spec=SPEC, statistics=MOTIONS)),
     "fast": make_fast,
 }
@@ -195,6 +195,6 @@ def test_heads_that_do_not_divide_the_width_are_refused() -> None:
             image=TINY_IMAGE,
             text=TINY_TEXT,
             spec=SPEC,
-            tokenizer=RT1(spec=SPEC, **defaults_of("tokenizer/rt1")),
+            tokenizer=RT1Bins(spec=SPEC, **defaults_of("tokenizer/rt1")),
             **defaults_of("model/decoder", width=32, heads=5),
         )

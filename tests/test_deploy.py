@@ -35,7 +35,7 @@ from vla.data.episodes import EpisodeStore
 from vla.deploy import messages
 from vla.deploy.bag import POLICY_INPUTS
 from vla.deploy.demo_operator import DemoOperator, SimulatedEpisode
-from vla.deploy.ros import NETWORKS, Network, split_arguments
+from vla.deploy.ros import NETWORKS, RosNetwork, split_arguments
 from vla.io.images import resize
 from vla.models.checkpoint import read_header
 from vla.robots.panda import forward
@@ -73,7 +73,7 @@ class Probe:
     """Records joint states and commands, and sends instructions."""
 
     def __init__(self) -> None:
-        Network.named("loopback").apply()
+        RosNetwork.named("loopback").apply()
         self._context = Context()
         rclpy.init(context=self._context, domain_id=DOMAIN)
         self.node = rclpy.create_node("probe", context=self._context)

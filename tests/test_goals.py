@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -20,7 +21,8 @@ from vla.tasks.tabletop.goals.stack import Stack
 from vla.tasks.tabletop.goals.stay import Stay, Wait
 from vla.tasks.tabletop.language import Grammar
 
-GRAMMAR = Grammar(["move {block}"], {}, ["{block}"], {"move": ["shift"]})
+GRAMMAR = Grammar(["move {block}"], {}, ["{block}"], {"move": ["shift"]}, [])
+COMMON: Any = {"language": GRAMMAR, "hold_steps": 3}
 
 
 def reached(goal: Goal, referents: Referents, seen: WorldState) -> bool:
@@ -32,14 +34,14 @@ def at(*places: tuple[float, float, float]) -> Array:
 
 
 def test_a_block_is_lifted_while_it_is_held_high_enough() -> None:
-    goal, referents = Lift(language=GRAMMAR, height=0.1), Referents((0,), (0,))
+    goal, referents = Lift(**COMMON, height=0.1), Referents((0,), (0,))
     assert reached(goal, referents, state(at((0.4, 0.2, 0.13)), held=[True]))
     assert not reached(goal, referents, state(at((0.4, 0.2, 0.11)), held=[True]))
     assert not reached(goal, referents, state(at((0.4, 0.2, 0.13))))
 
 
 def test_a_block_is_placed_once_it_rests_on_the_pad_and_is_let_go() -> None:
-    goal, referents = PickPlace(language=GRAMMAR, radius=0.04), Referents((0,), (0,))
+    goal, referents = PickPlace(**COMMON, radius=0.04), Referents((0,), (0,))
     there = at((0.53, 0.0, HALF))
     assert reached(goal, referents, state(there))
     assert not reached(goal, referents, state(there, held=[True]))
@@ -49,7 +51,7 @@ def test_a_block_is_placed_once_it_rests_on_the_pad_and_is_let_go() -> None:
 
 
 def test_a_tower_is_one_block_resting_on_the_named_other_one() -> None:
-    goal, referents = Stack(language=GRAMMAR), Referents((1, 0), (0,))
+    goal, referents = Stack(**COMMON), Referents((1, 0), (0,))
     lower = (0.5, 0.0, HALF)
     assert reached(goal, referents, state(at(lower, (0.51, 0.0, 3 * HALF))))
     assert not reached(goal, referents, state(at(lower, (0.53, 0.0, 3 * HALF))))  # its centre is over the edge
@@ -59,7 +61,7 @@ def test_a_tower_is_one_block_resting_on_the_named_other_one() -> None:
 
 
 def test_a_block_that_was_carried_was_not_pushed() -> None:
-    goal, referents = Push(language=GRAMMAR, radius=0.04), Referents((0,), (1, 0))
+    goal, referents = Push(**COMMON, radius=0.04, highest=0.02), Referents((0,), (1, 0))
     there = at((0.5, 0.18, HALF))
     assert reached(goal, referents, state(there))
     assert not reached(goal, referents, state(there, lifts=[0.05]))
@@ -67,7 +69,7 @@ def test_a_block_that_was_carried_was_not_pushed() -> None:
 
 
 def test_two_blocks_are_placed_one_after_the_other() -> None:
-    goal, referents = PickPlaceTwo(language=GRAMMAR, radius=0.04), Referents((0, 1), (1, 0))
+    goal, referents = PickPlaceTwo(**COMMON, radius=0.04), Referents((0, 1), (1, 0))
     both = at((0.5, 0.2, HALF), (0.5, 0.0, HALF))
     assert reached(goal, referents, state(both))
     assert not reached(goal, Referents((0, 1), (0, 1)), state(both))
@@ -76,7 +78,7 @@ def test_two_blocks_are_placed_one_after_the_other() -> None:
 
 
 def test_staying_is_to_move_no_block_and_to_rest() -> None:
-    goal, referents = Stay(GRAMMAR, unmoved=0.01), Referents((1,), (0,))
+    goal, referents = Stay(GRAMMAR, pads=1), Referents((1,), (0,))
     untouched = state(at((0.4, 0.2, HALF), (0.4, 0.2, HALF)))
     assert reached(goal, referents, untouched)
     assert not reached(goal, referents, replace(untouched, arm_speed=0.2))
@@ -84,9 +86,7 @@ def test_staying_is_to_move_no_block_and_to_rest() -> None:
 
 
 def test_a_mixture_draws_all_of_its_goals_and_needs_the_room_of_the_largest() -> None:
-    mixed = Mixed(
-        {"lift": Lift(language=GRAMMAR, height=0.1), "stack": Stack(language=GRAMMAR), "push": None}, 0.0, 0.0
-    )
+    mixed = Mixed({"lift": Lift(**COMMON, height=0.1), "stack": Stack(**COMMON), "push": None}, 0.0, 0.0)
     drawn = {type(mixed.draw(np.random.RandomState(seed))) for seed in range(20)}
     assert drawn == {Lift, Stack} and mixed.blocks == 3
     with pytest.raises(ValueError, match="names no goal"):
@@ -95,8 +95,8 @@ def test_a_mixture_draws_all_of_its_goals_and_needs_the_room_of_the_largest() ->
 
 def test_a_share_of_a_mixture_demands_to_leave_everything_in_place_and_the_rest_stays_what_it_was() -> None:
     goals: dict[str, Goal | None] = {
-        "lift": Lift(language=GRAMMAR, height=0.1),
-        "place": Place(language=GRAMMAR, radius=0.04),
+        "lift": Lift(**COMMON, height=0.1),
+        "place": Place(**COMMON, radius=0.04),
     }
     mixed, without = Mixed(goals, 0.2, 0.1), Mixed(goals, 0.0, 0.0)
     drawn = [[each.draw(np.random.RandomState(seed)) for each in (mixed, without)] for seed in range(1000)]
@@ -110,6 +110,6 @@ def test_a_share_of_a_mixture_demands_to_leave_everything_in_place_and_the_rest_
 
 
 def test_one_of_two_pads_is_named() -> None:
-    goal, referents = Place(language=GRAMMAR, radius=0.04), Referents((0,), (1, 0))
+    goal, referents = Place(**COMMON, radius=0.04), Referents((0,), (1, 0))
     assert reached(goal, referents, state(at((0.5, 0.2, HALF))))
     assert not reached(goal, referents, state(at((0.5, 0.0, HALF))))

@@ -105,8 +105,8 @@ def test_a_task_is_composed_as_on_the_command_line_and_hydra_is_left_as_it_was()
         assert GlobalHydra.instance().hydra is before
         said = ["task/goal=lift", "task/randomize=wide", "task/randomize/light=hard"]
         assert node == compose("config", [*said, "task.goal.height=0.1", "task.image_size=[64,48]"]).task
-        more = {"+goal.language.held_out_colours": ["green"], "goal.language.words": {"lift": ["take"]}}
-        said = ["+task.goal.language.held_out_colours=[green]", "task.goal.language.words={lift: [take]}"]
+        more = {"goal.language.held_out_colours": ["green"], "goal.language.words": {"lift": ["take"]}}
+        said = ["task.goal.language.held_out_colours=[green]", "task.goal.language.words={lift: [take]}"]
         assert compose_task("tabletop", goal="lift", **more) == compose("config", ["task/goal=lift", *said]).task
     assert not GlobalHydra.instance().is_initialized()
     with pytest.raises(Exception, match="pick_place"):

@@ -48,9 +48,9 @@ def test_what_is_held_out_is_new_in_one_way_at_a_time() -> None:
 
 def test_a_held_out_part_that_training_uses_is_refused() -> None:
     with pytest.raises(ValueError, match=r"what training also uses: \['put'\]"):
-        Grammar(["{put} {block}"], {"put": ["put"]}, ["{block}"], {"put": ["put"]})
+        Grammar(["{put} {block}"], {"put": ["put"]}, ["{block}"], {"put": ["put"]}, [])
     with pytest.raises(ValueError, match="empty"):
-        Grammar(["{put} {block}"], {"put": ["put"]}, [], {"put": ["set"]})
+        Grammar(["{put} {block}"], {"put": ["put"]}, [], {"put": ["set"]}, [])
 
 
 def test_other_words_replace_all_that_is_named_or_nothing_is_said() -> None:

@@ -201,7 +201,7 @@ def test_its_runs_are_compared_and_swept(home: Path, importable: None) -> None:
     assert all(f'href="../{run}/report.html"' in page for run in ("run", "grid/1"))
 
 
-def test_workers_of_a_cluster_collect_the_same_bytes(home: Path, installed: Path, tmp_path: Path) -> None:
+def test_workers_of_a_cluster_give_the_same_results(home: Path, importable: None, tmp_path: Path) -> None:
     command = next(command for command in COMMANDS if "cluster=dask" in command)
     local = ("--host", "127.0.0.1", "--dashboard-address", "127.0.0.1:0")
     file = tmp_path / "scheduler.json"
@@ -211,7 +211,11 @@ def test_workers_of_a_cluster_collect_the_same_bytes(home: Path, installed: Path
             arguments = shlex.split(command.replace("tcp://HOST:8786", address))
             tiny = [item for item in TINY if not item.startswith("cluster.")]
             vla(home, *arguments, *tiny, "collect.folder=remote")
+            report = json.loads((home / "run/report.json").read_text())
+            evaluating = (f"checkpoint={report['checkpoint']}", "trust=[mypackage]", "evaluate.episodes=3")
+            here(home, *evaluating, *(item for item in arguments if item.startswith("cluster")), "output=evaluated")
     assert content(home / "remote") == content(home / "episodes")
+    assert json.loads((home / "evaluated/report.json").read_text())["per_episode"] == report["per_episode"]
 
 
 def test_a_checkpoint_is_refused_until_the_package_is_trusted(home: Path, importable: None) -> None:

@@ -187,6 +187,6 @@ def test_bad_axes_are_explained(tabletop: Tabletop) -> None:
     with pytest.raises(ValueError, match="4 blocks need as many colours"):
         Colours(["red"], jitter=0.0)(compiled, np.random.RandomState(0))
     with pytest.raises(ValueError, match="no room"):
-        Placement((0.5, 0.51), (0.0, 0.01), yaw=(0.0, 0.0))(compiled, np.random.RandomState(0))
+        Placement((0.5, 0.51), (0.0, 0.01), yaw=(0.0, 0.0), clearance=0.03)(compiled, np.random.RandomState(0))
     with pytest.raises(ValueError, match=r"5 distractors need task\.blocks=6, it is 4"):
         Distractors((1, 5))(compiled, np.random.RandomState(0))

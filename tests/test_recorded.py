@@ -183,7 +183,7 @@ def test_cameras_of_another_rate_are_named(dataset: Path, tmp_path: Path) -> Non
         (["task.action=[elbow]"], r"error: task.action names elbow, the recording has joint1.pos"),
         (["task.units={elbow: rad}"], "error: task.units names elbow, the components are joint1.pos"),
         (["validate.episodes=3"], "validate.episodes=3: nothing can be played in a recording"),
-        (["job=preview"], "task=recorded has no simulator, so nothing can be played in it"),
+        (["job=preview"], "the task has no simulator, only recordings, so nothing can be played in it"),
     ],
 )
 def test_what_a_recording_cannot_do_is_said(dataset: Path, tmp_path: Path, overrides: list[str], says: str) -> None:

@@ -14,7 +14,7 @@ from toy import SPEC
 
 from vla.models.rt1 import RT1, attention_mask
 from vla.models.text.ngrams import NGrams
-from vla.models.tokenizers.tokenizer import RT1 as RT1Tokenizer
+from vla.models.tokenizers.tokenizer import RT1Bins
 from vla.models.vision.timm_encoders import FilmEfficientNet
 
 
@@ -102,7 +102,7 @@ def test_every_frame_of_the_window_is_learned_from() -> None:
 def test_the_tokens_of_the_cameras_stand_side_by_side(cameras: tuple[str, ...]) -> None:
     image = partial(FilmEfficientNet, "efficientnet_b0", pretrained=False, channels=16)
     spec = replace(SPEC, cameras=cameras)
-    tokenizer = RT1Tokenizer(spec=spec, **defaults_of("tokenizer/rt1"))
+    tokenizer = RT1Bins(spec=spec, **defaults_of("tokenizer/rt1"))
     model = RT1(
         image=image,
         text=TINY_TEXT,
@@ -134,7 +134,7 @@ def test_the_paper_network_has_its_size_and_its_81_positions() -> None:
         image=image,
         text=partial(NGrams, **defaults_of("model/text/ngrams")),
         spec=spec,
-        tokenizer=RT1Tokenizer(spec=spec, **defaults_of("tokenizer/rt1")),
+        tokenizer=RT1Bins(spec=spec, **defaults_of("tokenizer/rt1")),
         **defaults_of("model/rt1"),
     ).eval()
     language = parameters_of(model.text)  # a frozen encoder in the paper

@@ -29,7 +29,7 @@ from trajectory_msgs.msg import JointTrajectory
 from vla.deploy import messages
 from vla.deploy.control_loop import State
 from vla.deploy.policy_node import PolicyNode
-from vla.deploy.ros import Network
+from vla.deploy.ros import RosNetwork
 from vla.deploy.ros2 import PolicyDeployment
 from vla.deploy.settings import Topics
 from vla.robots.panda import HOME, forward
@@ -70,7 +70,7 @@ class World:
     def __init__(
         self, domain: int, command: Any, arguments: list[str], compressed: bool = False, gripper: Any = None
     ) -> None:
-        Network.named("loopback").apply()
+        RosNetwork.named("loopback").apply()
         self.contexts = [Context(), Context()]
         for context, given in zip(self.contexts, (arguments, None), strict=True):
             rclpy.init(args=given, context=context, domain_id=domain)
@@ -80,7 +80,7 @@ class World:
         topics = {camera: f"/{camera}{'/compressed' if compressed else ''}" for camera in SPEC.cameras}
         self.settings = PolicyDeployment(
             robot=ROBOT,
-            network=Network.named("loopback"),
+            network=RosNetwork.named("loopback"),
             topics=replace(TOPICS, images=topics),
             safety=SAFETY,
             **defaults_of("deploy/ros2", command=command, gripper=gripper),

@@ -74,7 +74,10 @@ def _unmatched(group: str) -> str:
     parent, _, name = group.rpartition("/")
     if not parent:
         return f"there is no group {group}; --help lists them"
-    return f"the option chosen for {parent} has no {name}: {group}=OPTION goes with another {parent}; --help lists them"
+    return (
+        f"the option chosen for {parent} has no {name}: choose another {parent}, or add a new part with "
+        f"+{group}=OPTION; --help lists them"
+    )
 
 
 def _unknown_key(error: OmegaConfBaseException) -> str:

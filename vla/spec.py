@@ -112,8 +112,8 @@ class Spec:
         """
         if self.robot is None:
             raise ValueError(
-                f"{what} needs a robot, and the spec has none (robot=None): its state is {', '.join(self.state)}; "
-                "task.joints names the joints of a recording"
+                f"{what} needs a robot, and the spec has none (robot=None): its state is {', '.join(self.state)}; a "
+                "world gives one in its spec, a recording by task.joints"
             )
         return self.robot
 
@@ -234,7 +234,7 @@ class Episode:
     draws: dict[str, Any]  # randomisation axis → drawn values, JSON-able
     observations: list[Observation]  # N, each one before the action of the same index
     actions: Array  # (N, D) float32, labels for imitation
-    executed: Array  # (N, D) float32, as sent to the robot: differ where the expert is perturbed, or only labels
+    executed: Array  # (N, D) float32, as sent to the robot; differs if the expert is perturbed or only labels
     completed: tuple[int, int] | None = None  # instructions completed, of how many; None if there is only one
     tool: Array | None = None  # (N + 1, 3) its positions [m], the last one at the end; None if the world has none
 

@@ -213,8 +213,8 @@ def make_environment(task: Node) -> Environment:
     environment = build(task, "task")
     if isinstance(environment, SpecOnly):
         raise ValueError(
-            "task=recorded has no simulator, so nothing can be played in it: job=collect, train, evaluate, export and "
-            "inspect work with recordings, and so do deploy=server and deploy=ros2"
+            "the task has no simulator, only recordings, so nothing can be played in it: job=collect, train, evaluate, "
+            "export and inspect work with recordings, and so do deploy=server and deploy=ros2"
         )
     found: Environment = environment
     return found

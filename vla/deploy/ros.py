@@ -38,7 +38,7 @@ Range = Literal["SYSTEM_DEFAULT", "LOCALHOST", "SUBNET", "OFF"]
 NETWORKS: dict[str, Range] = {"loopback": "SYSTEM_DEFAULT", "localhost": "LOCALHOST", "site": "SUBNET"}
 
 
-class Network:
+class RosNetwork:
     """The part of the network that ROS communicates with."""
 
     def __init__(
@@ -53,7 +53,7 @@ class Network:
         self.profile = str(LOOPBACK) if profile == "loopback" else profile
 
     @classmethod
-    def named(cls, name: str) -> Network:
+    def named(cls, name: str) -> RosNetwork:
         """Return an option of `deploy/network`, for commands that do not compose a config."""
         return cls(NETWORKS[name], "loopback" if name == "loopback" else None, domain=None)
 
@@ -76,7 +76,7 @@ class Network:
 
 
 @contextmanager
-def ros(network: Network, log_folder: Path | None = None) -> Iterator[Event]:
+def ros(network: RosNetwork, log_folder: Path | None = None) -> Iterator[Event]:
     """Run ROS; yields an event that SIGINT and SIGTERM set.
 
     The handlers of ROS would shut it down before a node can publish its last command.
@@ -148,7 +148,7 @@ def command_node(name: str, network: str) -> Iterator[tuple[Any, Event]]:
 
     Yields the node, and the event of `ros`.
     """
-    with plain_errors(), ros(Network.named(network)) as stopped:
+    with plain_errors(), ros(RosNetwork.named(network)) as stopped:
         from rclpy import create_node
 
         node = create_node(name)

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from vla.deploy.joint_limiter import Robot
-from vla.deploy.ros import Network, ros, spin
+from vla.deploy.ros import RosNetwork, ros, spin
 from vla.deploy.settings import PolicySettings, Timing, Topics
 from vla.io.types import Seed
 
@@ -32,7 +32,7 @@ class PolicyDeployment(PolicySettings):
         output: folder of the ROS logs.
     """
 
-    network: Network
+    network: RosNetwork
     autostart: bool
     policy: Callable[[], Policy]
     environment: Callable[[], Environment]
@@ -76,7 +76,7 @@ class SimulatorDeployment:
     """
 
     robot: Robot
-    network: Network
+    network: RosNetwork
     topics: Topics
     timing: Timing
     seed: Seed

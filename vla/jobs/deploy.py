@@ -10,6 +10,7 @@ from vla.config.check import Job
 from vla.config.experiment import Experiment
 from vla.policy import Policy
 from vla.reports.evaluation import plot_report, write_report
+from vla.runs.folder import REPORT
 
 JOB = Job(("tokenizer", "model", "policy", "agent", "deploy"), adopts=True)
 
@@ -19,7 +20,7 @@ def run(experiment: Experiment) -> None:
     report = deployment(experiment).run()
     if report is not None:
         output = experiment.output
-        write_report(report, output / "report.json", experiment["checkpoint"], experiment.config)
+        write_report(report, output / REPORT, experiment["checkpoint"], experiment.config)
         plot_report(report, output / "report.png")
         print(report)
 

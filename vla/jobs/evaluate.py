@@ -36,7 +36,7 @@ from vla.rollouts.memory import make_impaired
 from vla.rollouts.realtime import Network, make_distant
 from vla.rollouts.statements import AgainstBar, AgainstCondition, AgainstRun, Statement
 from vla.runs.files import Round
-from vla.runs.folder import CHECKPOINTS, require_run, save_config, wall_time
+from vla.runs.folder import CHECKPOINTS, REPORT, require_run, save_config, wall_time
 from vla.runs.resume import cached_success, training_lock
 
 log = logging.getLogger(__name__)
@@ -93,13 +93,13 @@ def _evaluated(experiment: Experiment, checkpoint: Path | None, rounds: Sequence
     reports = _play(experiment, checkpoint, statements)
     report = reports[IN_DISTRIBUTION]
     try:
-        with writing(output / "report.json"):
+        with writing(output / REPORT):
             _write(experiment, checkpoint, reports, statements, rounds, started)
     finally:
         print("\n".join([*(each.say(report) for each in statements), str(report)]))
     errors = [error for each in reports.values() for error in each.errors]
     if errors:
-        raise ValueError(f"{len(errors)} episodes ended in an error, see {output / 'report.json'}")
+        raise ValueError(f"{len(errors)} episodes ended in an error, see {output / REPORT}")
     return report.success
 
 
@@ -147,8 +147,8 @@ def _networks(experiment: Experiment) -> dict[str, Network]:
 def _play(experiment: Experiment, checkpoint: Path | None, statements: Sequence[Statement]) -> dict[str, Report]:
     """Return condition → report on the same seeds; only the first, the training condition, is recorded.
 
-    Without a checkpoint the agent of the config acts. With `evaluate.until` the first condition is played until all
-    statements are clear, and every other one, on the seeds of the first, until its difference from the first is.
+    Without a checkpoint the agent of the config acts. With `evaluate.until` the first condition stops when all
+    statements are clear. Every other one has the seeds of the first, and stops when its difference from it is clear.
     """
     asked, task = experiment["evaluate"], experiment["task"]
     seeds: Sequence[int] = range(asked["seed"], asked["seed"] + asked["episodes"])
@@ -227,7 +227,7 @@ def _write(
             show(course_table(rows, ["condition"]))
     used = str(checkpoint) if checkpoint else None
     # Last, because its existence marks the evaluation as finished.
-    write_report(report, output / "report.json", used, experiment.config, facts, others, compared, courses)
+    write_report(report, output / REPORT, used, experiment.config, facts, others, compared, courses)
     with optional(output / PAGE):
         write_page(output)
     log.info(

@@ -16,7 +16,6 @@ from vla.config.experiment import Experiment, training_policy
 from vla.data.episodes import EpisodeStore
 from vla.io.files import writing
 from vla.jobs.collect import demonstration_spec, demonstrations
-from vla.models.chunk_policy import ChunkModel
 from vla.models.learner import Learner
 from vla.models.model import Model
 from vla.models.tokenizers.tokenization_error import describe_tokenization_error, out_of_bounds
@@ -118,7 +117,7 @@ def _endless(experiment: Experiment) -> bool:
 def _log_tokenization_error(model: Model, store: EpisodeStore) -> None:
     """Log the tokenisation error and the share of actions beyond the tokenizer's bounds."""
     chunks = store.statistics.chunks(model.chunk)
-    if not isinstance(model, ChunkModel):
+    if model.uses_tokens:
         error = describe_tokenization_error(model.tokenizer, chunks, store.spec)
         log.info("%s: %s", type(model.tokenizer).__name__, error)
     if outside := out_of_bounds(model.tokenizer, chunks):

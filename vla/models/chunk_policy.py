@@ -29,6 +29,7 @@ class ChunkModel(OneFrameModel):
     """
 
     TRUTH_INPUT = 2
+    uses_tokens = False
 
     def __init__(self, execute: Steps, **inherited: Inherited) -> None:
         super().__init__(**inherited)

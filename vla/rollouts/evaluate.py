@@ -343,9 +343,9 @@ def evaluate(
     Every process of the `cluster` calls the factories once and accesses the paths `needs`. Errors of a factory end the
     evaluation; errors of an episode, or a crash of its process, are reported in its result.
 
-    With `until` it ends before the last seed as soon as that is true of a report of the first seeds, in their order;
-    with tiers, of whole rounds of their tasks, which take turns. Episodes of later seeds do not count even if they were
-    played, so that the report does not depend on the number of workers.
+    With `until` it ends as soon as that accepts the report on the first n seeds, in their order; with tiers, n is a
+    multiple of the number of tasks, which take turns. Episodes of later seeds do not count even if they were played, so
+    that the report does not depend on the number of workers.
 
     Raises:
         ValueError: there are no seeds, seeds are in the range of collection, or the cluster raises one.

@@ -49,8 +49,8 @@ def log_capital(mean: float, ones: Array | float, zeros: Array | float, halves: 
 def anytime_interval(ones: float, zeros: float, halves: int = 0, level: float = LEVEL) -> tuple[float, float]:
     """Return the confidence interval of the mean of observations of 0, 1/2 and 1; (0, 1) without observations.
 
-    It also holds for observations in between, each counted as its share of a one and the rest as one of a zero: by the
-    inequality of arithmetic and geometric means, bets on them win at least as much.
+    An observation x between 0 and 1 may be counted as x ones and 1 - x zeros: by the inequality of arithmetic and
+    geometric means, bets on it win at least as much.
     """
     seen, limit = ones + zeros + halves, log(1 / level)
     if seen == 0:

@@ -41,8 +41,8 @@ class Perturbation:
     steps: CountRange  # length of a further excursion [steps]
     noise: Annotated[float, Ge(0), Le(2)]  # standard deviation of the noise on every motion, relative to the motion
     closed: Share  # probability that an excursion closes the gripper
-    unturned: Share  # probability that an episode executes no turns, so that blocks are also grasped by their edges
-    missed: Share  # probability of a missed grasp: the gripper closes a few centimetres beside the block
+    unturned: Share  # probability that an episode executes no turns, so that objects are also grasped by their edges
+    missed: Share  # probability of a missed grasp: the gripper closes a few centimetres beside the object
     # Range of the speed of an episode, relative to the expert's. Slow episodes contain more states of the last
     # centimetres, where imprecise policies stall.
     pace: PositiveRange

@@ -28,7 +28,7 @@ Rate = Annotated[float, Ge(-1), Le(1.001)]
 
 
 @dataclass(frozen=True)
-class State:
+class ClosedLoopState:
     """State of `ClosedLoop` in a checkpoint."""
 
     __pydantic_config__ = STRICT
@@ -115,7 +115,7 @@ class ClosedLoop(Callback):
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Restore the state; a ValueError if it is of another kind."""
-        state = parse_plain(state_dict, State, "the state of the validation")
+        state = parse_plain(state_dict, ClosedLoopState, "the state of the validation")
         self.success = state.success
         # The best is void in another folder or with other episodes.
         if self._path.exists() and state.seeds == list(self._seeds):

@@ -8,7 +8,7 @@ from torch import Tensor, nn
 
 from vla.io.types import Bins, Inherited
 from vla.models.model import Batch, TokenModel, mlp, pixels
-from vla.models.tokenizers.tokenizer import EvenBins, Statistics
+from vla.models.tokenizers.tokenizer import ActionStatistics, EvenBins
 from vla.spec import Spec
 
 
@@ -21,7 +21,7 @@ class Few(EvenBins):
         statistics: of the data, not needed.
     """
 
-    def __init__(self, bins: Bins, *, spec: Spec, statistics: Statistics | None = None) -> None:
+    def __init__(self, bins: Bins, *, spec: Spec, statistics: ActionStatistics | None = None) -> None:
         super().__init__(spec, np.array(spec.low), np.array(spec.high), bins)
 
     def encode(self, action: Tensor) -> Tensor:

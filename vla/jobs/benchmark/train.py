@@ -88,7 +88,7 @@ def _precisions(asked: Sequence[str] | None, on_processor: bool) -> Sequence[str
     return list(PRECISIONS)
 
 
-class Round(NamedTuple):
+class Timing(NamedTuple):
     """Durations of the timed steps of a round [s], and its memory."""
 
     seconds: float
@@ -125,7 +125,7 @@ class Trial(lightning.Callback):
         lightning.seed_everything(experiment["seed"], verbose=False)
         self._learner = self._experiment.fitted_learner(store)
         self._start = copy.deepcopy(self._learner.state_dict())
-        self._rounds: list[Round] = []
+        self._rounds: list[Timing] = []
 
     @property
     def rate(self) -> float:
@@ -133,7 +133,7 @@ class Trial(lightning.Callback):
         return self._flops * self.steps / min(min(each.seconds, each.alone) for each in self._rounds)
 
     @property
-    def best(self) -> Round:
+    def best(self) -> Timing:
         """Fastest round."""
         return min(self._rounds, key=lambda each: each.seconds)
 
@@ -151,7 +151,7 @@ class Trial(lightning.Callback):
                 raise KeyboardInterrupt
         profiler: SimpleProfiler = trainer.profiler  # type: ignore[attr-defined]
         waiting = sum(profiler.recorded_durations[WAITING][WARM_UP : WARM_UP + self.steps])
-        self._rounds.append(Round(self._marks[1] - self._marks[0], waiting, self._alone, self._memory))
+        self._rounds.append(Timing(self._marks[1] - self._marks[0], waiting, self._alone, self._memory))
         self.loss = torch.stack(self._losses[WARM_UP + self.steps // 2 :]).mean().item()
         self._learner.zero_grad()
 

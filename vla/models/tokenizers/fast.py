@@ -18,7 +18,7 @@ from torch import Tensor
 
 from vla.io.documents import parse_plain
 from vla.io.types import Bins, Positive, Steps, ascending
-from vla.models.tokenizers.tokenizer import MIN_SPAN, ActionTokenizer, Statistics, data_bounds
+from vla.models.tokenizers.tokenizer import MIN_SPAN, ActionStatistics, ActionTokenizer, data_bounds
 from vla.spec import Spec
 
 FIRST_CODE_POINT = 0x100  # of the smallest coefficient; below 0xD800 every code point is a character
@@ -58,7 +58,7 @@ class Fast(ActionTokenizer):
         chunk: Steps,
         *,
         spec: Spec,
-        statistics: Statistics | None = None,
+        statistics: ActionStatistics | None = None,
     ) -> None:
         low, high = data_bounds(spec, statistics)
         super().__init__(spec, low, high, bins)

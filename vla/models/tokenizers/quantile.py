@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from vla.io.types import Bins
-from vla.models.tokenizers.tokenizer import PerComponent, Statistics, data_bounds
+from vla.models.tokenizers.tokenizer import ActionStatistics, PerComponent, data_bounds
 from vla.spec import Spec
 
 
@@ -29,7 +29,7 @@ class Quantile(PerComponent):
     edges: Tensor  # (D, K - 1) between neighbouring bins, ascending; those of unused bins lie outside the bounds
     centres: Tensor  # (D, K) actions of the tokens
 
-    def __init__(self, bins: Bins, *, spec: Spec, statistics: Statistics | None = None) -> None:
+    def __init__(self, bins: Bins, *, spec: Spec, statistics: ActionStatistics | None = None) -> None:
         low, high = data_bounds(spec, statistics)
         super().__init__(spec, low, high, bins)
         sample = np.linspace(low, high, 2 * bins + 1) if statistics is None else statistics.chunks(1)[:, 0]

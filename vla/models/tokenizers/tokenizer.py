@@ -28,7 +28,7 @@ RT1_BOUNDS = {"m": 1.0, "rad": math.pi / 2, "1": 1.0}
 MIN_SPAN = 0.05
 
 
-class Statistics(Protocol):
+class ActionStatistics(Protocol):
     """Statistics of a dataset that tokenizers are fitted on: bounds of its actions and a sample of its chunks."""
 
     @property
@@ -199,7 +199,7 @@ class Uniform(EvenBins):
         reach: Count,
         *,
         spec: Spec,
-        statistics: Statistics | None = None,
+        statistics: ActionStatistics | None = None,
     ) -> None:
         super().__init__(spec, *data_bounds(spec, statistics, margin), bins)
         self.smoothing, self.reach = smoothing, reach
@@ -234,7 +234,7 @@ class Uniform(EvenBins):
         return torch.arange(self.bins, device=logits.device, dtype=torch.float32)
 
 
-class RT1(EvenBins):
+class RT1Bins(EvenBins):
     """The tokenizer of RT-1: fixed bounds per unit (1 m, π/2 rad, 1), rounding down, one-hot targets, most likely bin.
 
     It exists for faithful reproduction: small motions use few bins, and rounding down biases every action.
@@ -245,7 +245,7 @@ class RT1(EvenBins):
         statistics: unused, as in the signature of every tokenizer.
     """
 
-    def __init__(self, bins: Bins, *, spec: Spec, statistics: Statistics | None = None) -> None:
+    def __init__(self, bins: Bins, *, spec: Spec, statistics: ActionStatistics | None = None) -> None:
         unknown = sorted(set(spec.units) - set(RT1_BOUNDS))
         if unknown:
             raise ValueError(f"tokenizer=rt1 supports the units {sorted(RT1_BOUNDS)}, the spec has {unknown}")
@@ -258,7 +258,7 @@ class RT1(EvenBins):
         return (self._position(action) + 1e-3).floor().long()
 
 
-def data_bounds(spec: Spec, statistics: Statistics | None, margin: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
+def data_bounds(spec: Spec, statistics: ActionStatistics | None, margin: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
     """Return (D,) bounds: the data extended by `margin` times its range, or without data the allowed range.
 
     Raises:

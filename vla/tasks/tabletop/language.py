@@ -27,7 +27,7 @@ class Grammar:
         words: Mapping[str, Words],
         held_out_phrasings: Phrasings,
         held_out_words: Mapping[str, Words],
-        held_out_colours: Sequence[str] = (),
+        held_out_colours: Sequence[str],
     ) -> None:
         """Args:
         phrasings: training phrasings.

@@ -18,9 +18,9 @@ Link = tuple[Goal, Referents]
 class Chain:
     """Several instructions in a row, each of which is given when the one before is completed.
 
-    They are drawn at the start of the episode, so that they do not depend on who acts. Each is possible where those
-    before it, if carried out as they say, leave the blocks: no block is put where another one is or is taken from
-    below another one, and what was lifted is what comes next.
+    They are drawn at the start of the episode, so that they do not depend on who acts. Each is feasible once the
+    earlier ones are carried out: no block is put where another one is or is taken from below another one, and what
+    was lifted is what comes next.
 
     Attributes:
         blocks: minimum number of blocks on the table.

@@ -122,7 +122,7 @@ class Goal(ABC):
 
     named, moves, blocks, absent, pads = 1, 1, 2, 0, 1
 
-    def __init__(self, language: Grammar, hold_steps: Count = 3) -> None:
+    def __init__(self, language: Grammar, hold_steps: Count) -> None:
         known = ["block", "other"][: self.named] + ["pad", "rest"][: self.pads] + ["absent"] * bool(self.absent)
         if unknown := sorted(language.slots - set(known)):
             raise ValueError(f"task.goal.language has the slots {unknown}, but {type(self).__name__} fills {known}")

@@ -11,7 +11,7 @@ class Push(Goal):
 
     pads = 2
 
-    def __init__(self, radius: Positive, highest: Positive = 0.02, **inherited: Inherited) -> None:
+    def __init__(self, radius: Positive, highest: Positive, **inherited: Inherited) -> None:
         """Args: maximum distance between the centres of block and pad, and maximum height above the table during the
         episode [m]."""
         super().__init__(**inherited)

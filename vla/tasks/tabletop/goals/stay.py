@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from vla.io.types import Count, Positive
+from vla.io.types import Count
 from vla.tasks.tabletop.goals.goal import Goal, Referents, Subgoal, WorldState
 from vla.tasks.tabletop.language import Grammar, Silence
 
 AT_REST = 0.05  # speed of the fastest joint below which the arm is at rest [rad/s]
+REST_STEPS = 15  # consecutive control steps for which it must rest
+UNMOVED = 0.01  # largest displacement of a block that counts as none [m]
 
 
 class Stay(Goal):
@@ -16,12 +18,10 @@ class Stay(Goal):
 
     absent = 1
 
-    def __init__(self, language: Grammar, pads: Count = 1, unmoved: Positive = 0.01, hold_steps: Count = 15) -> None:
-        """Args: grammar; number of pads on the table; maximum displacement of any block [m]; consecutive steps for
-        which the arm must rest."""
+    def __init__(self, language: Grammar, pads: Count) -> None:
+        """Args: grammar; number of pads on the table."""
         self.pads = pads
-        super().__init__(language, hold_steps)
-        self.unmoved = unmoved
+        super().__init__(language, REST_STEPS)
 
     @classmethod
     def instead_of(cls, goal: Goal) -> Stay:
@@ -32,7 +32,7 @@ class Stay(Goal):
         """Keep every block in place and the arm at rest."""
         (block,) = referents.blocks
         moved = np.linalg.norm(state.positions - state.starts, axis=1)
-        done = state.arm_speed < AT_REST and bool((moved < self.unmoved).all())
+        done = state.arm_speed < AT_REST and bool((moved < UNMOVED).all())
         return [Subgoal(block, state.positions[block], "stay", done)]
 
 
@@ -41,6 +41,6 @@ class Wait(Stay):
 
     absent = 0
 
-    def __init__(self, pads: Count = 1) -> None:
+    def __init__(self, pads: Count) -> None:
         """Args: number of pads on the table."""
         super().__init__(Silence(), pads)

@@ -129,7 +129,7 @@ class Placement:
     x: Places  # range of the centres [m]
     y: Places
     yaw: Angles  # range of the blocks' yaw [rad]
-    clearance: NonNegative = 0.03  # minimum gap between outlines [m]
+    clearance: NonNegative  # minimum gap between outlines [m]
 
     def __call__(self, scene: CompiledScene, random_state: np.random.RandomState) -> dict[str, Any]:
         """Draw a place for every pad and block in turn, also for those that will be absent.

@@ -35,7 +35,7 @@ class Arm:
 
 
 @dataclass(frozen=True)
-class Robot:
+class RobotColour:
     """Colours of the robot's shell."""
 
     shade: NonNegativeRange  # range of the factor on its brightness

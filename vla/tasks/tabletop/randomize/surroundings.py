@@ -44,7 +44,7 @@ class Cameras:
     position: Length  # maximum shift along each axis [m]
     rotation: Angle  # maximum rotation about each axis [rad]
     fovy: Annotated[float, Ge(0), Le(30)]  # maximum change of the field of view [degrees]
-    wrist: Share = 0.25  # share of all three for the wrist camera, which is mounted rigidly
+    wrist: Share  # share of all three for the wrist camera, which is mounted rigidly
 
     def __call__(self, scene: CompiledScene, random_state: np.random.RandomState) -> dict[str, Any]:
         """Draw a mounting error per camera."""
