@@ -47,15 +47,6 @@ class Run:
     count: int  # of the indices
 
 
-@dataclass(frozen=True)
-class Sight:
-    """Visibility of sky and planes for a camera."""
-
-    state: bytes  # of camera and planes
-    sky: bool  # it may see the sky beside the planes
-    behind: list[int]  # planes that it sees from behind
-
-
 class Fast:
     """The choice of the fast renderer."""
 
@@ -210,7 +201,6 @@ class FastRenderer:
             self._cameras.update()
             self._light_places: bytes | None = None
             self._floors = [plane for plane in self._planes if elements.opaque[plane]]
-            self._sights = [Sight(b"", False, [])] * len(self._cameras.ids)
             sites = np.linalg.norm(elements.size[self._model.ngeom :], axis=1)
             self._bounds = np.append(self._model.geom_rbound, sites)  # radius of each element [m]
             table = self._new_table(elements)
@@ -273,7 +263,6 @@ class FastRenderer:
             self._gl.enable_only(STATE)
             self._gl.front_face = "cw"  # in pictures that are upside down
             self._drawn.clear(depth=1.0)
-            self._look_at_planes()
             self._draw_opaque()
             depth = self._draw_skies()
             self._draw_transparent()
@@ -314,19 +303,6 @@ class FastRenderer:
         blocks[:, head : head + 3] = -cameras.axes[:, :, 2]  # the direction of the headlight
         self._camera_buffer.write(blocks)
 
-    def _look_at_planes(self) -> None:
-        """Note the sight of every camera that has moved, or whose planes have."""
-        cameras, planes = self._cameras, self._poses[self._planes]
-        for number, places in enumerate(zip(cameras.eyes, cameras.axes, strict=True)):
-            state = b"".join(array.tobytes() for array in (planes, *places))
-            if state != self._sights[number].state:
-                half = self._elements.size
-                sky = self._sky >= 0 and not any(
-                    cameras.filled(number, self._poses[plane], half[plane, :2]) for plane in self._floors
-                )
-                behind = [plane for plane in self._planes if cameras.behind(number, self._poses[plane])]
-                self._sights[number] = Sight(state, sky, behind)
-
     def _aim(self, number: int) -> None:
         """Choose the camera that the next calls draw for."""
         view, size = self._view, self._blocks[number].nbytes
@@ -346,23 +322,30 @@ class FastRenderer:
 
     def _draw_skies(self) -> Array:
         """Draw the sky for the cameras that see it; return the depth buffer as `_read_depth` does."""
-        numbers = [number for number, sight in enumerate(self._sights) if sight.sky]
-        if self._drawn is self._target:  # otherwise gaps may be smaller than a pixel
+        if self._drawn is self._target:
             depth = self._read_depth()
-            numbers = [number for number in numbers if depth[number].max() >= 1]
+            numbers = [number for number, seen in enumerate(depth) if self._sky >= 0 and seen.max() >= 1]
             if not numbers:
                 return depth
+        else:  # gaps may be smaller than a pixel
+            numbers = [number for number in range(len(self._cameras.ids)) if self._sky >= 0 and self._sees_sky(number)]
         for number in numbers:
             self._aim(number)
             self._draw_run(self._runs[len(self._elements.kind)])
         return self._read_depth()
 
+    def _sees_sky(self, number: int) -> bool:
+        """Return whether a camera may see the sky beside the opaque planes."""
+        half = self._elements.size[:, :2]
+        return not any(self._cameras.filled(number, self._poses[plane], half[plane]) for plane in self._floors)
+
     def _draw_transparent(self) -> None:
         """Blend transparent elements and planes seen from behind."""
-        for number, sight in enumerate(self._sights):
-            if self._transparent or sight.behind:
+        for number in range(len(self._cameras.ids)):
+            behind = [plane for plane in self._planes if self._cameras.behind(number, self._poses[plane])]
+            if self._transparent or behind:
                 self._aim(number)
-                self._blend(self._cameras.eyes[number], sight.behind)
+                self._blend(self._cameras.eyes[number], behind)
 
     def _blend(self, eye: Array, behind: list[int]) -> None:
         """Blend a camera's transparent elements as MuJoCo does: from near to far, and back again."""
