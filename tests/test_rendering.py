@@ -36,7 +36,7 @@ SIZE = 64
 EDGE = 0.02  # difference of depth to a neighbour at the edge of an object [m]
 
 
-def fast(samples: Any = 0, soft: int = 0, light: Any = "auto", faces: int | None = None) -> Fast:
+def fast(samples: Any = 1, soft: int = 0, light: Any = "auto", faces: int | None = None) -> Fast:
     return Fast(samples=samples, soft=soft, light=light, faces=faces)
 
 

@@ -10,7 +10,6 @@ from vla.tasks.rendering import lights
 from vla.tasks.rendering.renderer import View
 
 UPSIDE_DOWN = np.diag([1.0, -1.0, 1.0, 1.0])  # the first row of the framebuffer becomes the top of the picture
-CORNERS = np.array([[-1, -1, 1, 1], [-1, 1, -1, 1], [1, 1, 1, 1], [1, 1, 1, 1]], float)  # of a picture, far away
 
 
 class Cameras:
@@ -27,9 +26,6 @@ class Cameras:
         across, up, deep, ahead = self._lenses.swapaxes(0, 1)
         sides = np.stack([ahead + across, ahead - across, ahead + up, ahead - up, ahead + deep], axis=1)
         self._sides = sides / np.linalg.norm(sides[:, :, :3], axis=2, keepdims=True)  # of the frustums, looking inwards
-        far = np.linalg.inv(self._lenses) @ CORNERS
-        self._corners = far[:, :3] / far[:, 3:]  # (cameras, 3, 4), in the cameras' frames [m]
-        self._corners[self._lenses[:, 3, 3] != 0] = np.nan  # without perspective, nothing runs from eye to corner
 
     def place(self, data: mujoco.MjData) -> Array:
         """Move the cameras to where they are in a state; return projections of the world (cameras, 4, 4)."""
@@ -46,26 +42,6 @@ class Cameras:
     def behind(self, number: int, plane: Array) -> bool:
         """Return whether a camera sees a plane of pose (3, 4) from behind."""
         return _dot((self.eyes[number] - plane[:, 3]).tolist(), plane[:, 2].tolist()) < 0
-
-    def filled(self, number: int, plane: Array, half: Array) -> bool:
-        """Return whether all corners of a camera's picture show the front of a plane, which then hides the sky.
-
-        Args:
-            number: of the camera.
-            plane: pose (3, 4).
-            half: half the extent (2,) [m], 0 for infinity.
-        """
-        x, y, normal, _ = plane.T.tolist()  # plain numbers are faster than arrays of so few
-        start, limits = (self.eyes[number] - plane[:, 3]).tolist(), [*zip((x, y), half.tolist(), strict=True)]
-        height = _dot(start, normal)
-        for ray in (self.axes[number] @ self._corners[number]).T.tolist():  # from the eye to the far clipping plane
-            fall = -_dot(ray, normal)
-            if not (height > 0 and self._near * fall < self._far * height < self._far * fall):
-                return False
-            there = [at + height / fall * way for at, way in zip(start, ray, strict=True)]
-            if any(0 < size < abs(_dot(there, axis)) for axis, size in limits):
-                return False
-        return True
 
     def _lens(self, camera: int) -> Array:
         """Return a camera's projection (4, 4)."""

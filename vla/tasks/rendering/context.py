@@ -17,7 +17,9 @@ from typing import Any
 import moderngl
 
 BACKEND: Any = {"backend": "egl"}  # moderngl's type annotations are too narrow
-RENDERBUFFER, DEPTH_COMPONENT32F = 0x8D41, 0x8CAC  # constants of OpenGL
+# Constants of OpenGL.
+RENDERBUFFER, DEPTH_COMPONENT32F = 0x8D41, 0x8CAC
+READ_FRAMEBUFFER, COLOR_ATTACHMENT0, COLOR_BUFFER_BIT, LINEAR = 0x8CA8, 0x8CE0, 0x4000, 0x2601
 
 
 class Context:
@@ -52,6 +54,15 @@ class Context:
         storage(RENDERBUFFER, DEPTH_COMPONENT32F, *size)
         return buffer
 
+    def halve(self, source: Any, target: Any) -> None:
+        """Average every 2 by 2 pixels of a framebuffer into one of another, which has half as many rows and columns."""
+        integer = ctypes.c_uint
+        target.use()
+        _function("glBindFramebuffer", integer, integer)(READ_FRAMEBUFFER, source.glo)
+        _function("glReadBuffer", integer)(COLOR_ATTACHMENT0)  # reading depth chose none
+        blit = _function("glBlitFramebuffer", *[ctypes.c_int] * 8, integer, integer)
+        blit(0, 0, *source.size, 0, 0, *target.size, COLOR_BUFFER_BIT, LINEAR)
+
     def clean(self) -> None:
         """Free the objects that nobody refers to any more."""
         with self._lock, self.gl:
@@ -59,6 +70,7 @@ class Context:
             self._user = 0
 
 
+@cache
 def _function(name: str, *types: Any) -> Callable[..., None]:
     """Return a function of OpenGL that moderngl does not offer."""
     egl = ctypes.CDLL("libEGL.so.1")

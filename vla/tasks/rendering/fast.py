@@ -10,7 +10,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Collection
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import moderngl
 import mujoco
@@ -52,13 +52,13 @@ class Fast:
 
     def __init__(
         self,
-        samples: Literal[0, 2, 4],
+        samples: Literal[1, 4],
         soft: Annotated[int, Ge(0), Le(4)],
         light: Literal["auto", "vertex", "pixel"],
         faces: Annotated[int, Ge(100)] | None,
     ) -> None:
         """Args:
-        samples: per pixel, for smooth edges; 0 is fastest.
+        samples: per pixel, which are averaged; 4 draws twice as many rows and columns, for smooth edges.
         soft: texels around the nearest one over which the edges of shadows are averaged.
         light: whether light is computed at vertices, as in MuJoCo, or pixels; auto: pixels for spot lights only.
         faces: most faces of a mesh, heavier ones are decimated for pictures; None keeps all.
@@ -120,13 +120,11 @@ class FastRenderer:
     def _make_targets(self) -> None:
         """Make the framebuffer, the cameras' pictures one above the other, and the shadow maps."""
         gl, view = self._gl, self._view
-        size = view.width, view.height * len(view.cameras)
-        samples = min(self._settings.samples, gl.max_samples)
-        depth = gl.depth_renderbuffer(size) if samples else self._context.depth_renderbuffer(size)
-        self._drawn = self._target = gl.framebuffer(gl.renderbuffer(size, 4), depth)
-        if samples:  # they are averaged into buffers of the same formats
-            colour, depth = gl.renderbuffer(size, 4, samples=samples), gl.depth_renderbuffer(size, samples=samples)
-            self._drawn = gl.framebuffer(colour, depth)
+        width, height = view.width, view.height * len(view.cameras)
+        self._fine = 2 if self._settings.samples == 4 else 1  # rows and columns per pixel
+        size = self._fine * width, self._fine * height
+        self._drawn = gl.framebuffer(gl.renderbuffer(size, 4), self._context.depth_renderbuffer(size))
+        self._averaged = gl.framebuffer(gl.renderbuffer((width, height), 4)) if self._fine == 2 else self._drawn
         model = self._model
         self._lights = lights.drawn(model)
         casting = model.light_castshadow if model.vis.quality.shadowsize else np.zeros(model.nlight, bool)
@@ -200,7 +198,6 @@ class FastRenderer:
             self._place_blocks()
             self._cameras.update()
             self._light_places: bytes | None = None
-            self._floors = [plane for plane in self._planes if elements.opaque[plane]]
             sites = np.linalg.norm(elements.size[self._model.ngeom :], axis=1)
             self._bounds = np.append(self._model.geom_rbound, sites)  # radius of each element [m]
             table = self._new_table(elements)
@@ -266,7 +263,7 @@ class FastRenderer:
             self._draw_opaque()
             depth = self._draw_skies()
             self._draw_transparent()
-            return self._read_colours(), self._metres(depth)
+            return self._read_colours(), self._metres(np.ascontiguousarray(depth[:, :: self._fine, :: self._fine]))
 
     def _upload_poses(self, data: mujoco.MjData) -> None:
         geoms, sites = self._model.ngeom, self._model.nsite
@@ -305,9 +302,9 @@ class FastRenderer:
 
     def _aim(self, number: int) -> None:
         """Choose the camera that the next calls draw for."""
-        view, size = self._view, self._blocks[number].nbytes
+        size, width, height = self._blocks[number].nbytes, self._fine * self._view.width, self._fine * self._view.height
         self._camera_buffer.bind_to_uniform_block(0, offset=number * size, size=size)
-        self._gl.viewport = 0, number * view.height, view.width, view.height
+        self._gl.viewport = 0, number * height, width, height
 
     def _draw_opaque(self) -> None:
         """Draw the opaque elements that the cameras may see."""
@@ -322,22 +319,12 @@ class FastRenderer:
 
     def _draw_skies(self) -> Array:
         """Draw the sky for the cameras that see it; return the depth buffer as `_read_depth` does."""
-        if self._drawn is self._target:
-            depth = self._read_depth()
-            numbers = [number for number, seen in enumerate(depth) if self._sky >= 0 and seen.max() >= 1]
-            if not numbers:
-                return depth
-        else:  # gaps may be smaller than a pixel
-            numbers = [number for number in range(len(self._cameras.ids)) if self._sky >= 0 and self._sees_sky(number)]
+        depth = self._read_depth()
+        numbers = [number for number, seen in enumerate(depth) if self._sky >= 0 and seen.max() >= 1]
         for number in numbers:
             self._aim(number)
             self._draw_run(self._runs[len(self._elements.kind)])
-        return self._read_depth()
-
-    def _sees_sky(self, number: int) -> bool:
-        """Return whether a camera may see the sky beside the opaque planes."""
-        half = self._elements.size[:, :2]
-        return not any(self._cameras.filled(number, self._poses[plane], half[plane]) for plane in self._floors)
+        return self._read_depth() if numbers else depth
 
     def _draw_transparent(self) -> None:
         """Blend transparent elements and planes seen from behind."""
@@ -377,24 +364,19 @@ class FastRenderer:
                 program["unshadowed"] = float(value)
 
     def _read_depth(self) -> Array:
-        """Read the depth buffer (cameras, H, W) float32, 0 at the near plane and 1 at the far one."""
+        """Read the depth buffer (cameras, rows, columns) float32, 0 at the near plane and 1 at the far one."""
         view = self._view
-        depth = np.empty((len(view.cameras), view.height, view.width), np.float32)
-        self._resolved().read_into(depth, attachment=-1, components=1, dtype="f4", alignment=1)
+        depth = np.empty((len(view.cameras), self._fine * view.height, self._fine * view.width), np.float32)
+        self._drawn.read_into(depth, attachment=-1, components=1, dtype="f4", alignment=1)
         return depth
 
     def _read_colours(self) -> Array:
         view = self._view
         rgb = np.empty((len(view.cameras), view.height, view.width, 3), np.uint8)
-        self._resolved().read_into(rgb, components=3, alignment=1)
+        if self._averaged is not self._drawn:
+            self._context.halve(self._drawn, self._averaged)
+        self._averaged.read_into(rgb, components=3, alignment=1)
         return rgb
-
-    def _resolved(self) -> Any:
-        """Return the framebuffer to read, with one sample per pixel."""
-        if self._drawn is not self._target:
-            self._gl.copy_framebuffer(self._target, self._drawn)
-            self._drawn.use()
-        return self._target
 
     def _metres(self, reading: Array) -> Array:
         """Convert readings of the depth buffer, 0 at the near plane and 1 at the far one, to depth [m], in place."""
