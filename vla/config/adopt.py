@@ -90,7 +90,7 @@ def resume(cfg: DictConfig, run: Path, overrides: Sequence[str]) -> DictConfig:
     """
     if cfg.checkpoint is not None or cfg.pretrained is not None:
         raise ValueError(f"resume={cfg.resume} continues a run unchanged: omit checkpoint= and pretrained=")
-    file = _config_file(run)
+    file, saved = _saved(run)
     output = Path(cfg.output).resolve()
     if run.resolve().parent != output.parent and run.resolve() != output:
         raise ValueError(
@@ -98,7 +98,6 @@ def resume(cfg: DictConfig, run: Path, overrides: Sequence[str]) -> DictConfig:
             f"your own are resumed. If it is yours, add output={run}; to use somebody else's weights: "
             f"pretrained={run / LAST}"
         )
-    saved = read_header(file).config if file.name == LAST.name else read_yaml(file, dict[str, Any])
     parsed, known = _parsed(overrides), {*map(str, cfg), saved.get("job")}  # a job has a node of its own
     _require_own_parts(parsed, PRESETS)
     taken = {name: node for name, node in saved.items() if name in known and name not in OF_THIS_COMMAND}
@@ -114,17 +113,17 @@ def resume(cfg: DictConfig, run: Path, overrides: Sequence[str]) -> DictConfig:
     return resumed
 
 
-def _config_file(run: Path) -> Path:
-    """Return the file that has the config of a run: its last checkpoint, or config.yaml of one in rounds.
+def _saved(run: Path) -> tuple[Path, Mapping[str, Any]]:
+    """Return the config of a run and the file that has it: its last checkpoint, or config.yaml of one in rounds.
 
     Raises:
         ValueError: there is neither.
     """
     if (run / LAST).is_file():
-        return run / LAST
-    config = run / "config.yaml"
-    if config.is_file() and read_yaml(config, dict[str, Any]).get("job") == "improve":
-        return config
+        return run / LAST, read_header(run / LAST).config
+    file = run / "config.yaml"
+    if file.is_file() and (config := read_yaml(file, dict[str, Any])).get("job") == "improve":
+        return file, config
     raise ValueError(f"resume={run}: nothing was trained in that folder, there is no {run / LAST}")
 
 
