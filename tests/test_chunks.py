@@ -170,3 +170,12 @@ def test_a_width_without_room_for_pairs_is_refused(kind: type[Any]) -> None:
 def test_more_cannot_be_executed_than_is_predicted() -> None:
     with pytest.raises(ValueError, match=r"model\.execute=5 is more than the model\.chunk=4"):
         make_act(chunk=4, execute=5)
+
+
+@every_model
+def test_images_that_it_does_not_look_at_make_no_difference(make: Callable[..., ChunkModel]) -> None:
+    policy = as_policy(make(chunk=4, execute=2))
+    everything, sparse = (rollout(ToyEnvironment(), policy, 3, all_images=every) for every in (True, False))
+    assert np.array_equal(everything.executed, sparse.executed) and len(sparse.executed) == 40
+    assert [bool(observation.rgb) for observation in sparse.observations] == [True, False] * 20
+    assert all(observation.rgb for observation in everything.observations)

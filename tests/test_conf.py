@@ -39,6 +39,7 @@ pytestmark = pytest.mark.usefixtures("recording")
 
 # Options that are only for some options of another group.
 TOGETHER = {
+    ("evaluate", "lerobot"): ["task=metaworld"],
     ("tokenizer", "fast"): ["model=decoder"],
     ("job", "deploy"): ["deploy=ros2"],
     ("task/robot", "file"): [

@@ -15,7 +15,7 @@ from vla.parallel.pool import LocalCluster
 from vla.reports.evaluation import summary
 from vla.rollouts.evaluate import FIRST_SEED, Report, Result, evaluate, keep_recordings
 from vla.rollouts.statistics import wilson_interval
-from vla.spec import Environment
+from vla.spec import Environment, Observation
 
 SEEDS = range(FIRST_SEED, FIRST_SEED + 10)
 
@@ -163,12 +163,27 @@ def test_recordings_are_kept_in_one_file_failures_first(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == [target]
 
 
-def test_recordings_that_cannot_be_kept_are_not_made(tmp_path: Path) -> None:
+def test_only_recordings_that_are_kept_are_made(tmp_path: Path) -> None:
     makers = toy.make_environment, toy.make_agent, toy.make_recorder(tmp_path)
     everything = evaluate(*makers, SEEDS[:5])
     assert len([*tmp_path.iterdir()]) == 5
     for file in tmp_path.iterdir():
         file.unlink()
     assert evaluate(*makers, SEEDS[:5], recordings=2) == everything
-    names = ["failure-01000003-timeout", "success-01000000", "success-01000001"]
+    names = ["failure-01000003-timeout", "success-01000000"]
     assert sorted(file.stem for file in tmp_path.iterdir()) == names
+
+
+def test_what_ends_differently_when_played_again_has_no_recording(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    class Fickle(toy.RecordableEnvironment):
+        def reset(self, seed: int) -> Observation:
+            observation = super().reset(seed)
+            if self._resets > 2:
+                self._seed = 3  # which fails
+            return observation
+
+    report = evaluate(Fickle, toy.make_agent, toy.make_recorder(tmp_path), SEEDS[:2], recordings=2)
+    assert report.successes == 2 and "seed 1000000 has no recording" in caplog.text
+    assert keep_recordings(report, tmp_path, tmp_path / "rollouts.rrd", limit=2) == 0

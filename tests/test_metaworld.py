@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from command_line import here
 from composing import composed
+from PIL import Image
 
 from vla.config.experiment import Experiment
 from vla.data.episodes import EpisodeStore
@@ -166,6 +167,21 @@ def test_the_camera_and_the_scene_are_lerobots() -> None:
     likeness = np.corrcoef(edges[0].ravel(), edges[1].ravel())[0, 1]
     turned = np.corrcoef(edges[0].ravel(), edges[1][::-1].ravel())[0, 1]
     assert likeness > 0.8 > 0.2 > turned
+
+
+def test_images_are_lerobots_where_they_are_asked_for() -> None:
+    picture, _ = lerobots_picture("soccer", 7)
+    top, left, bottom, right = window = (0.25, 0.25, 0.875, 0.875)
+    changes = experiment("evaluate=lerobot")["evaluate"]["conditions"]["lerobot"]
+    shown = experiment("task.tasks=[soccer]", "task.image_size=[96,96]", f"task.window={list(window)}")
+    environment = shown.make_environment(changes)()
+    environment.reset(7)
+    ours = environment.step(np.zeros(4)).rgb["corner2"]
+    environment.close()
+    cut = 480 * left, 480 * top, 480 * right, 480 * bottom
+    theirs = Image.fromarray(np.ascontiguousarray(picture)).resize((96, 96), Image.Resampling.BOX, cut)
+    apart = np.abs(np.asarray(theirs).astype(int) - ours)
+    assert apart.mean() < 1 and np.percentile(apart, 99) < 16  # corners of the net and the ball
 
 
 def test_a_window_is_a_part_of_the_whole_picture() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+from contextlib import nullcontext
 from typing import Any
 
 import numpy as np
@@ -169,6 +170,19 @@ def test_noise_of_images_is_normal_and_new_in_every_image() -> None:
         assert abs(noise.mean()) < 0.1 * deviation and noise.std() == pytest.approx(deviation, rel=0.06)
         assert (np.abs(noise) < deviation).mean() == pytest.approx(0.683, abs=0.06)
     assert abs(np.corrcoef(first[inside], second[inside])[0, 1]) < 0.1
+
+
+def test_images_are_the_same_after_steps_without_any() -> None:
+    environment = make_tabletop("task/randomize=hard", "task.image_size=[64,64]")
+    seen = []
+    for context in (nullcontext, environment.blind):
+        environment.reset(2)
+        with context():
+            environment.step(np.zeros(7))
+        seen.append(environment.step(np.zeros(7)).rgb)
+    environment.close()
+    for name in environment.spec.cameras:
+        np.testing.assert_array_equal(seen[0][name], seen[1][name])
 
 
 def test_streams_differ_between_axes_and_seeds() -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pytest
 from toy import ToyEnvironment, ToyExpert
 
 from vla.rollouts.rollout import replay, rollout
@@ -31,3 +32,20 @@ def test_another_end_differs_even_if_all_joints_are_the_same() -> None:
     longer = [*EPISODE.observations, EPISODE.observations[-1]]
     executed = np.concatenate([EPISODE.executed, EPISODE.executed[-1:]])
     assert replay(ToyEnvironment(), replace(EPISODE, observations=longer, executed=executed)) == STEPS
+
+
+class InTwo(ToyEnvironment):
+    """Gives a second instruction at some time, for which a policy must look."""
+
+    instructions, completed = 2, 0
+
+
+@pytest.mark.parametrize(("world", "planned"), [(InTwo, True), (ToyEnvironment, False)])
+def test_images_are_left_out_only_where_no_one_could_need_them(world: type[ToyEnvironment], planned: bool) -> None:
+    class Planning(ToyExpert):
+        @property
+        def planned(self) -> bool:
+            return planned
+
+    episode = rollout(world(), Planning(), 1, all_images=False)
+    assert all(observation.rgb for observation in episode.observations)

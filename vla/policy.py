@@ -86,13 +86,20 @@ class Policy:
         Raises:
             ValueError: the observation does not match the spec.
         """
-        self._observe(observation)
+        self._follow(observation.instruction)
+        if not self.planned:
+            self._observe(observation)
         if not self._chunk:
             actions, probabilities = self._predict()
             infos = [{}] * len(actions) if probabilities is None else [{"probabilities": p} for p in probabilities]
             self._chunk.extend(list(zip(actions, infos, strict=True))[: self.execute])
         action, self.info = self._chunk.popleft()
         return action
+
+    @property
+    def planned(self) -> bool:
+        """Whether the next action is chosen already, and its observation is not part of a history."""
+        return bool(self._chunk) and self.model.history == 1
 
     def plan(self, observation: Observation) -> Array:
         """Return a chunk of actions, (k, D) float32, clipped to the spec; the caller executes the first `execute`.

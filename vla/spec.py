@@ -263,7 +263,7 @@ class Environment(Protocol):
         ...
 
     def blind(self) -> AbstractContextManager[None]:
-        """Return a context in which observations carry no images, which makes a replay cheap."""
+        """Return a context in which observations carry no images, which makes steps cheap; later images are the same."""
         ...
 
     def close(self) -> None:
@@ -382,6 +382,16 @@ class Agent(Protocol):
 
     def act(self, observation: Observation) -> Array:
         """Return the (D,) float32 action to execute now."""
+        ...
+
+
+@runtime_checkable
+class Planner(Agent, Protocol):
+    """Agent that executes several actions of a plan before it looks again."""
+
+    @property
+    def planned(self) -> bool:
+        """Whether the next action is chosen already, whatever the images show; a new instruction discards it."""
         ...
 
 

@@ -22,7 +22,7 @@ from vla.io.files import writing
 from vla.policy import latency
 from vla.reports.conditions import Courses, conditions_table, course_table, plot_conditions
 from vla.reports.evaluation import plot_report, write_report
-from vla.reports.html import PAGE, optional, write_page
+from vla.reports.html import PAGE, RECORDING, optional, write_page
 from vla.rollouts.evaluate import (
     IN_DISTRIBUTION,
     AgentFactory,
@@ -214,10 +214,10 @@ def _write(
     facts = _facts(experiment, checkpoint, rounds, time.monotonic() - started)
     facts["statements"] = [each.say(report) for each in statements]
     save_config(output, experiment.config, experiment.changes)
+    recording = output / RECORDING
     if experiment["recorder"]:
-        recording, limit = output / "rollouts.rrd", experiment["evaluate"]["recordings"]
         with optional(recording):
-            keep_recordings(report, output / "recordings", recording, limit)
+            keep_recordings(report, output / "recordings", recording, experiment["evaluate"]["recordings"])
     plot_report(report, output / "report.png")
     if others:
         plot_conditions(reports, output / "suite.png")
@@ -230,9 +230,7 @@ def _write(
     write_report(report, output / REPORT, used, experiment.config, facts, others, compared, courses)
     with optional(output / PAGE):
         write_page(output)
-    log.info(
-        "wrote %s, report.json, report.png%s", output / PAGE, " and rollouts.rrd" if experiment["recorder"] else ""
-    )
+    log.info("wrote %s, report.json, report.png%s", output / PAGE, f" and {RECORDING}" if recording.exists() else "")
 
 
 def _facts(experiment: Experiment, checkpoint: Path | None, rounds: Sequence[Round], seconds: float) -> dict[str, Any]:

@@ -158,6 +158,9 @@ class _DaskFuture:
                 ) from error
             self._pool.require_workers()
 
+    def cancel(self) -> None:
+        self.future.cancel()
+
 
 _cached = threading.local()  # worker of this thread, to which its GL context is bound, and the pool it belongs to
 

@@ -38,6 +38,10 @@ class Future(Protocol):
         """Wait for the result; raises the error of the worker factory or of the attempt, or `WorkersLost`."""
         ...
 
+    def cancel(self) -> object:
+        """Drop the item if nobody has begun with it."""
+        ...
+
 
 class Pool(Protocol):
     """Workers that process items in parallel."""
@@ -112,6 +116,9 @@ class _LazyResult:
 
     def result(self) -> Any:
         return self._worker.attempt(self._item)
+
+    def cancel(self) -> None:
+        """Do nothing: without `result` nobody begins."""
 
 
 class ProcessPool:

@@ -9,7 +9,7 @@ import json
 import logging
 import traceback
 from collections import Counter
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from vla.parallel.pool import THIS_PROCESS, Cluster, Crashed
+from vla.parallel.pool import THIS_PROCESS, Cluster, Crashed, Pool
 from vla.rollouts.comparison import Comparison, Key, Pairs, compare_amounts, compare_pairs, concluded, median_interval
 from vla.rollouts.motion import AMOUNTS, Motion, motion_of
 from vla.rollouts.rollout import close_agent, rollout
@@ -338,7 +338,8 @@ def evaluate(
 ) -> Report:
     """Play the episodes of the seeds; `name` is the label of the progress bar, `tiers` are those of the report.
 
-    With `recordings`, successes that `keep_recordings` cannot keep under this limit are not recorded.
+    `recordings` is the limit of `keep_recordings`. Which episodes it keeps is known at the end only: those are played
+    once more and recorded.
 
     Every process of the `cluster` calls the factories once and accesses the paths `needs`. Errors of a factory end the
     evaluation; errors of an episode, or a crash of its process, are reported in its result.
@@ -352,15 +353,14 @@ def evaluate(
     """
     if not seeds or min(seeds) < FIRST_SEED:
         raise ValueError(f"evaluation needs seeds from {FIRST_SEED} on, which no policy is trained on; got {seeds}")
-    # Failures come first, so a success is kept only if it is among as many first seeds.
-    recorded = frozenset(sorted(seeds)[:recordings])
-    make = partial(_RolloutWorker, make_environment, make_agent, make_recorder if recorded else None, recorded)
+    make = partial(_RolloutWorker, make_environment, make_agent, make_recorder)
+    at_once = make_recorder is not None and recordings is None
     columns = (TextColumn(name), BarColumn(), MofNCompleteColumn(), TextColumn("{task.fields[note]}"))
     results: dict[int, Result] = {}
     counted, clear, turns = 0, False, sum(map(len, (tiers or {}).values())) or 1
     with cluster.pool(make, needs) as pool, Progress(*columns, TimeRemainingColumn()) as bar:
         task = bar.add_task("", total=len(seeds), note="")
-        seed_of = {pool.submit(seed): seed for seed in seeds}
+        seed_of = {pool.submit((seed, at_once)): seed for seed in seeds}
         for future in pool.as_completed(seed_of):
             seed = seed_of[future]
             try:
@@ -375,8 +375,32 @@ def evaluate(
                 if until is not None and counted % turns == 0:
                     clear = until(Report(tuple(results[seed] for seed in seeds[:counted]), anytime=True))
             if clear:
+                for later in seed_of:
+                    later.cancel()
                 break
-    return Report(tuple(results[seed] for seed in seeds[:counted]), tiers or {}, anytime=until is not None)
+        report = Report(tuple(results[seed] for seed in seeds[:counted]), tiers or {}, anytime=until is not None)
+        if make_recorder is not None and recordings:
+            _record(pool, _kept(report, recordings))
+    return report
+
+
+def _kept(report: Report, limit: int | None) -> list[Result]:
+    """Return the episodes whose recordings are kept: failures first, in the order of their seeds."""
+    completed = [result for result in report.results if result.outcome != ERROR]
+    return sorted(completed, key=lambda result: (result.outcome == "success", result.seed))[:limit]
+
+
+def _record(pool: Pool, results: Sequence[Result]) -> None:
+    """Play episodes once more and record them; log a warning for those that end differently."""
+    expected = {pool.submit((result.seed, True)): result for result in results}
+    for future in pool.as_completed(expected):
+        result = expected[future]
+        try:
+            again = future.result().outcome
+        except Crashed as crash:
+            again = str(crash)
+        if again != result.outcome:
+            log.warning("seed %d has no recording: when played again it ended with %s", result.seed, again)
 
 
 def keep_recordings(report: Report, folder: Path, target: Path, limit: int | None) -> int:
@@ -386,21 +410,21 @@ def keep_recordings(report: Report, folder: Path, target: Path, limit: int | Non
     """
     from vla.rollouts.recorder import merge, recording_name  # imports the viewer's library
 
-    names = sorted(recording_name(result.seed, result.outcome) for result in report.results)
+    names = [recording_name(result.seed, result.outcome) for result in _kept(report, limit)]
     files = [file for name in names if (file := folder / f"{name}.rrd").exists()]
-    if files[:limit]:
-        merge(files[:limit], target)
+    if files:
+        merge(files, target)
     for file in folder.glob("*.rrd"):
         file.unlink()
     with suppress(OSError):
         folder.rmdir()
-    return len(files[:limit])
+    return len(files)
 
 
 def play(environment: Environment, agent: Agent, seed: int, recorder: Recorder | None = None) -> Result:
     """Play one episode; errors become results, so that one seed ends neither an evaluation nor a training."""
     try:
-        episode = rollout(environment, agent, seed, recorder)
+        episode = rollout(environment, agent, seed, recorder, all_images=recorder is not None)
     except Exception as problem:
         where = traceback.extract_tb(problem.__traceback__)[-1]
         what = f"{type(problem).__name__}: {problem} ({Path(where.filename).name}:{where.lineno})"
@@ -422,17 +446,15 @@ def play(environment: Environment, agent: Agent, seed: int, recorder: Recorder |
     )
 
 
-class _SelectiveRecorder:
-    """Recorder of failures, and of successes of some seeds; it logs disk errors, which must not fail an episode."""
+class _LenientRecorder:
+    """Recorder that logs disk errors, which must not fail an episode."""
 
-    def __init__(self, recorder: Recorder, successes: Collection[int]) -> None:
-        self._recorder, self._successes = recorder, successes
+    def __init__(self, recorder: Recorder) -> None:
+        self._recorder = recorder
         self.start, self.step = recorder.start, recorder.step
 
     def end(self, episode: Episode) -> None:
-        """Write the recording if it is wanted, or log a warning."""
-        if episode.success and episode.seed not in self._successes:
-            return
+        """Write the recording, or log a warning."""
         try:
             self._recorder.end(episode)
         except OSError as error:
@@ -447,15 +469,15 @@ class _RolloutWorker:
         make_environment: EnvironmentFactory,
         make_agent: AgentFactory,
         make_recorder: RecorderFactory | None,
-        recorded: Collection[int],
     ) -> None:
         self._environment = make_environment()
         self._agent = make_agent(self._environment)
-        self._recorder = None if make_recorder is None else _SelectiveRecorder(make_recorder(), recorded)
+        self._recorder = None if make_recorder is None else _LenientRecorder(make_recorder())
 
-    def attempt(self, seed: int) -> Result:
-        """Play one episode."""
-        return play(self._environment, self._agent, seed, self._recorder)
+    def attempt(self, item: tuple[int, bool]) -> Result:
+        """Play the episode of a seed, and record it if the second part of the item says so."""
+        seed, recorded = item
+        return play(self._environment, self._agent, seed, self._recorder if recorded else None)
 
     def close(self) -> None:
         """Close the environment and the agent."""

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
+
 import numpy as np
 
-from vla.spec import Agent, Environment, Episode, InARow, Recorder, Traceable
+from vla.spec import Agent, Array, Environment, Episode, InARow, Observation, Planner, Recorder, Traceable
 
 
-def rollout(environment: Environment, agent: Agent, seed: int, recorder: Recorder | None = None) -> Episode:
-    """Run the episode of `seed` to its end.
+def rollout(
+    environment: Environment, agent: Agent, seed: int, recorder: Recorder | None = None, all_images: bool = True
+) -> Episode:
+    """Run the episode of `seed` to its end; without `all_images` it lacks those that the agent does not look at.
 
     The label for imitation is `agent.info["clean"]` if present, else the executed action. What the agent drew,
     `agent.info["draws"]`, is added to the draws of the environment. A new instruction resets the agent.
@@ -34,7 +38,7 @@ def rollout(environment: Environment, agent: Agent, seed: int, recorder: Recorde
         executed.append(action)
         if recorder is not None:
             recorder.step(observation, action, agent.info)
-        observation = environment.step(action)
+        observation = environment.step(action) if all_images else _step(environment, agent, action)
         if traced:
             tool.append(traced.tool)
     episode = Episode(
@@ -47,7 +51,7 @@ def rollout(environment: Environment, agent: Agent, seed: int, recorder: Recorde
         observations=observations,
         actions=np.asarray(clean, dtype=np.float32),
         executed=np.asarray(executed, dtype=np.float32),
-        completed=_completed(environment),
+        completed=_progress(environment),
         tool=np.array(tool) if traced else None,
     )
     if recorder is not None:
@@ -55,7 +59,15 @@ def rollout(environment: Environment, agent: Agent, seed: int, recorder: Recorde
     return episode
 
 
-def _completed(environment: Environment) -> tuple[int, int] | None:
+def _step(environment: Environment, agent: Agent, action: Array) -> Observation:
+    """Apply an action; return an observation without images if the agent has chosen the next action already."""
+    planned = isinstance(agent, Planner) and agent.planned
+    with environment.blind() if planned and _progress(environment) is None else nullcontext():
+        return environment.step(action)
+
+
+def _progress(environment: Environment) -> tuple[int, int] | None:
+    """Return how many instructions are completed, of how many; None if there is only one."""
     several = isinstance(environment, InARow) and environment.instructions > 1
     return (environment.completed, environment.instructions) if several else None
 

@@ -49,7 +49,9 @@ class MetaWorld(Blindable):
         image_size: ImageSize,
         cameras: Names,
         window: Window | None,
+        drawn: Annotated[int, Ge(16), Le(4096)] | None,
         shadows: Natural,
+        reflections: bool,
         steps: Annotated[int, Ge(1), Le(MOST_STEPS)],
         scenes: Count,
     ) -> None:
@@ -64,7 +66,10 @@ class MetaWorld(Blindable):
             cameras: names of cameras, such as "corner2", which is moved and turned as LeRobot does.
             window: top, left, bottom and right of LeRobot's picture that "corner2" shows, as shares of its height and
                 width; None: all of it.
+            drawn: height and width at which all of a camera's picture is drawn; it is cut to the window, then averaged
+                to `image_size` [px]. None: images are drawn in their own size.
             shadows: edge of the shadow map [texels]; 0: no shadows.
+            reflections: whether surfaces reflect, where the renderer can.
             steps: largest number of steps of an episode.
             scenes: largest number of compiled tasks that are kept, each with some 80 MB.
 
@@ -91,7 +96,7 @@ class MetaWorld(Blindable):
             truth=(("object", 3), ("goal", 3)),
         )
         self._sentences, self._steps, self._most = sentences, steps, scenes
-        self._drawing = renderer, self.spec.cameras, self.spec.image_size, window, shadows
+        self._drawing = renderer, self.spec.cameras, self.spec.image_size, window, drawn, shadows, reflections
         self._scenes: dict[str, Scene] = {}
         self.done, self.outcome, self.task = True, "timeout", ""
         self.milestones: frozenset[str] = frozenset()

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import mujoco
 import numpy as np
+from PIL import Image
 
 from vla.spec import Array
 from vla.tasks.metaworld.package import simulator
@@ -26,7 +27,9 @@ class Scene:
         cameras: Sequence[str],
         image_size: tuple[int, int],
         window: Sequence[float] | None,
+        drawn: int | None,
         shadows: int,
+        reflections: bool,
     ) -> None:
         """Args:
         task: name of the task.
@@ -34,7 +37,9 @@ class Scene:
         cameras: names in the model.
         image_size: height and width of the pictures [px].
         window: top, left, bottom and right of what LeRobot's camera shows, as shares of its picture; None: all.
+        drawn: height and width at which all of a camera's picture is drawn, to be averaged down [px]; None: as needed.
         shadows: edge of the shadow map [texels]; 0: no shadows.
+        reflections: whether surfaces reflect, where the renderer can.
 
         Raises:
             ValueError: there is no such task or camera.
@@ -52,8 +57,11 @@ class Scene:
         if window is not None:
             _show_window(model, camera, *window)
         model.vis.quality.shadowsize = shadows
-        model.mat_reflectance[:] = 0  # the renderers leave reflections out
-        self._view = View([known.index(name) for name in cameras], *image_size, site_groups=(0, 1, 2))
+        if not reflections:
+            model.mat_reflectance[:] = 0
+        self._image_size = image_size
+        size = image_size if drawn is None else _part(drawn, window or (0.0, 0.0, 1.0, 1.0))
+        self._view = View([known.index(name) for name in cameras], *size, site_groups=(0, 1, 2))
         self._choice = renderer
         self._renderer: Renderer | None = None
         self._changed = True
@@ -84,7 +92,10 @@ class Scene:
             self._renderer.update()
         self._changed = False
         pictures, _ = self._renderer.render(self.simulator.data)
-        return pictures
+        if pictures.shape[1:3] == self._image_size:
+            return pictures
+        size = self._image_size[::-1]
+        return np.stack([np.asarray(Image.fromarray(one).resize(size, Image.Resampling.BOX)) for one in pictures])
 
     def close(self) -> None:
         """Free physics and GL."""
@@ -92,6 +103,12 @@ class Scene:
             self._renderer.close()
             self._renderer = None
         self.simulator.close()
+
+
+def _part(drawn: int, window: Sequence[float]) -> tuple[int, int]:
+    """Return the height and width of a window of a picture of `drawn` rows and columns [px]."""
+    top, left, bottom, right = window
+    return round(drawn * (bottom - top)), round(drawn * (right - left))
 
 
 def _show_window(model: mujoco.MjModel, camera: int, top: float, left: float, bottom: float, right: float) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from statistics import NormalDist
 from typing import Any, Literal
@@ -223,6 +224,8 @@ class Tabletop(Blindable):
         """Return the current observation."""
         compiled = self.simulation.compiled
         if self._blind:
+            if compiled.noise.image:  # images that follow are those that they would be otherwise
+                self._image_noise.bytes(3 * len(self.spec.cameras) * math.prod(self.spec.image_size))
             return Observation({}, self._state(), self.simulation.instruction, {}, self.simulation.truth())
         if self._changed:
             self.renderer.update(compiled.stale_textures)
