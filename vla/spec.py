@@ -263,7 +263,10 @@ class Environment(Protocol):
         ...
 
     def blind(self) -> AbstractContextManager[None]:
-        """Return a context in which observations carry no images, which makes steps cheap; later images are the same."""
+        """Return a context in which observations carry no images, which makes steps cheap.
+
+        Images after it are those that they would be without it.
+        """
         ...
 
     def close(self) -> None:
