@@ -8,7 +8,7 @@ import numpy as np
 from vla.spec import Array
 
 ROWS = 6  # of a light: ambient, diffuse, specular, position, direction, attenuation
-DIRECTIONAL, SPOT = int(mujoco.mjtLightType.mjLIGHT_DIRECTIONAL), int(mujoco.mjtLightType.mjLIGHT_SPOT)
+SPOT, DIRECTIONAL = 0, 1  # mjtLightType, a name that MuJoCo 3.3.0 lacks, with which `reference` works
 GLOBAL = 0.3  # ambient light of a model without lights
 WIDEST = 160.0  # field of view of a spot light's shadow map [degrees]
 
