@@ -71,7 +71,7 @@ def measures(experiment: Experiment) -> dict[str, Measure]:
 def _timed_parts(
     environment: Environment, expert: Agent, calls: Mapping[str, Callable[[], object]], count: int
 ) -> tuple[list[Episode], dict[str, float]]:
-    """Return episodes, and the time [s] of: "full" rollouts, "blind" ones, "replay", and each call once per step.
+    """Return episodes, and the time [s] of: "full" rollouts, "blind" ones, "replay", and each call in every state.
 
     The parts of one episode follow each other, so that what else runs on the machine slows all parts alike.
     """
@@ -81,17 +81,15 @@ def _timed_parts(
         episode, seconds = timed(partial(rollout, environment, expert, seed))
         episodes.append(episode)
         taken["full"] += seconds
-        for name, call in calls.items():
-            taken[name] += timed(partial(_repeat, call, len(episode.actions)))[1]
+        environment.reset(seed)
         with environment.blind():
+            for action in episode.executed:
+                for name, call in calls.items():
+                    taken[name] += timed(call)[1]
+                environment.step(action)
             taken["blind"] += timed(partial(rollout, environment, expert, seed))[1]
             taken["replay"] += timed(partial(replay, environment, episode))[1]
     return episodes, taken
-
-
-def _repeat(call: Callable[[], object], times: int) -> None:
-    for _ in range(times):
-        call()
 
 
 def _keep(store: EpisodeStore, episodes: list[Episode]) -> None:

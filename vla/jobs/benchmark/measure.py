@@ -14,7 +14,7 @@ class Floored(Protocol):
     """A world that can run the unavoidable part of a control step by itself."""
 
     def floor(self) -> dict[str, Callable[[], object]]:
-        """Return "physics" and "rendering" → a function that does this part of one control step."""
+        """Return "physics" and "rendering" → a function that does this part of a control step, and changes no state."""
         ...
 
 
