@@ -9,6 +9,7 @@ import pytest
 from toy import ToyEnvironment, ToyExpert
 
 from vla.rollouts.rollout import replay, rollout
+from vla.spec import Observation
 
 EPISODE = rollout(ToyEnvironment(), ToyExpert(), 1)
 STEPS = len(EPISODE.executed)
@@ -34,18 +35,20 @@ def test_another_end_differs_even_if_all_joints_are_the_same() -> None:
     assert replay(ToyEnvironment(), replace(EPISODE, observations=longer, executed=executed)) == STEPS
 
 
-class InTwo(ToyEnvironment):
-    """Gives a second instruction at some time, for which a policy must look."""
+class Planning(ToyExpert):
+    """Looks once in a hundred steps, and when there is a new instruction."""
 
-    instructions, completed = 2, 0
+    planned = True
 
 
-@pytest.mark.parametrize(("world", "planned"), [(InTwo, True), (ToyEnvironment, False)])
-def test_images_are_left_out_only_where_no_one_could_need_them(world: type[ToyEnvironment], planned: bool) -> None:
-    class Planning(ToyExpert):
-        @property
-        def planned(self) -> bool:
-            return planned
+class Changing(ToyEnvironment):
+    """Asks for something else after five steps."""
 
+    def _look(self) -> Observation:
+        return replace(super()._look(), instruction="go" if self._steps < 5 else "go on")
+
+
+@pytest.mark.parametrize(("world", "seen"), [(ToyEnvironment, 1), (Changing, STEPS)])
+def test_images_are_left_out_only_where_no_one_could_need_them(world: type[ToyEnvironment], seen: int) -> None:
     episode = rollout(world(), Planning(), 1, all_images=False)
-    assert all(observation.rgb for observation in episode.observations)
+    assert [bool(observation.rgb) for observation in episode.observations] == [True] * seen + [False] * (STEPS - seen)

@@ -353,8 +353,8 @@ def evaluate(
     """
     if not seeds or min(seeds) < FIRST_SEED:
         raise ValueError(f"evaluation needs seeds from {FIRST_SEED} on, which no policy is trained on; got {seeds}")
-    make = partial(_RolloutWorker, make_environment, make_agent, make_recorder)
-    at_once = make_recorder is not None and recordings is None
+    make = partial(_RolloutWorker, make_environment, make_agent, None if recordings == 0 else make_recorder)
+    at_once = recordings is None
     columns = (TextColumn(name), BarColumn(), MofNCompleteColumn(), TextColumn("{task.fields[note]}"))
     results: dict[int, Result] = {}
     counted, clear, turns = 0, False, sum(map(len, (tiers or {}).values())) or 1

@@ -6,13 +6,16 @@ from contextlib import nullcontext
 
 import numpy as np
 
-from vla.spec import Agent, Array, Environment, Episode, InARow, Observation, Planner, Recorder, Traceable
+from vla.spec import Agent, Environment, Episode, InARow, Planner, Recorder, Traceable
 
 
 def rollout(
     environment: Environment, agent: Agent, seed: int, recorder: Recorder | None = None, all_images: bool = True
 ) -> Episode:
-    """Run the episode of `seed` to its end; without `all_images` it lacks those that the agent does not look at.
+    """Run the episode of `seed` to its end.
+
+    Without `all_images` its observations lack those that the agent does not look at. If the instruction changes, which
+    makes it look, the episode starts again with all of them.
 
     The label for imitation is `agent.info["clean"]` if present, else the executed action. What the agent drew,
     `agent.info["draws"]`, is added to the draws of the environment. A new instruction resets the agent.
@@ -27,8 +30,11 @@ def rollout(
     observations, clean, executed = [], [], []
     components, traced = len(environment.spec.action), environment if isinstance(environment, Traceable) else None
     tool = [traced.tool] if traced else []
+    blind = False
     while not environment.done:
         if observations and observation.instruction != observations[-1].instruction:
+            if blind:
+                return rollout(environment, agent, seed, recorder)
             agent.reset(observation.instruction, seed)
         action = np.asarray(agent.act(observation), dtype=np.float32)
         if action.shape != (components,) or not np.isfinite(action).all():
@@ -38,7 +44,9 @@ def rollout(
         executed.append(action)
         if recorder is not None:
             recorder.step(observation, action, agent.info)
-        observation = environment.step(action) if all_images else _step(environment, agent, action)
+        blind = not all_images and isinstance(agent, Planner) and agent.planned
+        with environment.blind() if blind else nullcontext():
+            observation = environment.step(action)
         if traced:
             tool.append(traced.tool)
     episode = Episode(
@@ -51,7 +59,7 @@ def rollout(
         observations=observations,
         actions=np.asarray(clean, dtype=np.float32),
         executed=np.asarray(executed, dtype=np.float32),
-        completed=_progress(environment),
+        completed=_completed(environment),
         tool=np.array(tool) if traced else None,
     )
     if recorder is not None:
@@ -59,15 +67,7 @@ def rollout(
     return episode
 
 
-def _step(environment: Environment, agent: Agent, action: Array) -> Observation:
-    """Apply an action; return an observation without images if the agent has chosen the next action already."""
-    planned = isinstance(agent, Planner) and agent.planned
-    with environment.blind() if planned and _progress(environment) is None else nullcontext():
-        return environment.step(action)
-
-
-def _progress(environment: Environment) -> tuple[int, int] | None:
-    """Return how many instructions are completed, of how many; None if there is only one."""
+def _completed(environment: Environment) -> tuple[int, int] | None:
     several = isinstance(environment, InARow) and environment.instructions > 1
     return (environment.completed, environment.instructions) if several else None
 
