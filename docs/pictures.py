@@ -106,6 +106,28 @@ def fifty_tasks(picture: Path) -> None:
     Image.fromarray(np.concatenate(rows)).save(picture, quality=80, method=6)
 
 
+def lerobots_images(picture: Path) -> None:
+    """Save scenes of Meta-World as `experiment=metaworld` and as LeRobot show them, above what chooses them."""
+    own = {
+        "image_size": (128, 128),
+        "window": (0.25, 0.29, 0.95, 0.99),
+        "tasks": ["drawer-open", "soccer", "pick-place"],
+    }
+    lerobots = {"renderer": "mujoco", "drawn": 480, "shadows": 4096, "reflections": True}
+    sheets = []
+    for options in ({"renderer": "smooth"}, lerobots):
+        environment: Any = make_environment(compose_task("metaworld", **own, **options))
+        row = np.concatenate([environment.reset(seed).rgb["corner2"] for seed in range(3)], axis=1)
+        sheets.append(row.repeat(3, axis=0).repeat(3, axis=1))
+        environment.close()
+    captions = "experiment=metaworld", "evaluate=lerobot"
+    parts = [captioned([sheet], text) for sheet, text in zip(sheets, captions, strict=True)]
+    whole = Image.new("RGB", (parts[0].width, sum(part.height for part in parts)), "white")
+    for index, part in enumerate(parts):
+        whole.paste(part, (0, index * part.height))
+    whole.save(picture, quality=85, method=6)
+
+
 def captioned(images: list[Array], text: str) -> Image.Image:
     """Images side by side, above a line of text."""
     height, width = images[0].shape[0], sum(image.shape[1] for image in images)
@@ -162,6 +184,7 @@ def main(run: Path) -> None:
     film(run, DOCS / "rollouts.webp")
     renderers(DOCS / "renderers.webp")
     fifty_tasks(DOCS / "metaworld.webp")
+    lerobots_images(DOCS / "metaworld_images.webp")
     arm("jaco", DOCS / "jaco.webp")  # and so ur5e.webp, with the option that worlds.md describes
     with tempfile.TemporaryDirectory() as folder:
         vla("job=preview", "preview.episodes=6", f"output={folder}")
