@@ -127,7 +127,7 @@ def test_a_job_with_a_group_of_its_own_is_two_options_and_a_module(home: Path, i
 OF_ONE_WORLD = {
     *("ablation", "few", "learning_curve", "multitask", "recipe", "standard"),
     *("generalisation", "language", "levels", "paper", "suite", "tabletop", "no_excursions", "no_noise"),
-    *("unheard", "renderer", "metaworld", "metaworld_disturbed", "metaworld_improved", "few_improved"),
+    *("unheard", "renderer", "lerobot", "metaworld", "metaworld_disturbed", "metaworld_improved", "few_improved"),
 }
 
 
