@@ -172,7 +172,7 @@ def test_the_camera_and_the_scene_are_lerobots() -> None:
 def test_images_are_lerobots_where_they_are_asked_for() -> None:
     picture, _ = lerobots_picture("soccer", 7)
     changes = experiment("evaluate=lerobot")["evaluate"]["conditions"]["lerobot"]
-    for window in ((0.0, 0.0, 1.0, 1.0), (0.25, 0.25, 0.875, 0.875)):
+    for window in ((0.0, 0.0, 1.0, 1.0), (0.25, 0.29, 0.95, 0.99)):
         shown = experiment("task.tasks=[soccer]", "task.image_size=[96,96]", f"task.window={list(window)}")
         environment = shown.make_environment(changes)()
         environment.reset(7)
@@ -183,7 +183,7 @@ def test_images_are_lerobots_where_they_are_asked_for() -> None:
             (96, 96), Image.Resampling.BOX, (left, top, right, bottom)
         )
         apart = np.abs(np.asarray(theirs).astype(int) - ours)
-        assert np.percentile(apart, 99) <= 2 and apart.max() < 10
+        assert apart.max() <= 2
 
 
 def test_a_window_is_a_part_of_the_whole_picture() -> None:

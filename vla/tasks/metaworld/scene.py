@@ -15,6 +15,7 @@ from vla.tasks.rendering.renderer import Renderer, Rendering, View
 HALF_TURN = np.array([0.0, 0.0, 0.0, 1.0])  # about the optical axis, quaternion wxyz
 # LeRobot (src/lerobot/envs/metaworld.py) moves this camera, which hangs upside down, and turns its pictures.
 CAMERA, CAMERA_PLACE = "corner2", (0.75, 0.075, 0.7)  # [m]
+WHOLE = (0.0, 0.0, 1.0, 1.0)  # window of all of a picture
 
 
 class Scene:
@@ -37,7 +38,8 @@ class Scene:
         cameras: names in the model.
         image_size: height and width of the pictures [px].
         window: top, left, bottom and right of what LeRobot's camera shows, as shares of its picture; None: all.
-        drawn: height and width at which all of a camera's picture is drawn, to be averaged down [px]; None: as needed.
+        drawn: height and width at which all of a camera's picture is drawn, to be cut to the window and averaged [px];
+            None: the window is drawn in the size of the pictures.
         shadows: edge of the shadow map [texels]; 0: no shadows.
         reflections: whether surfaces reflect, where the renderer can.
 
@@ -54,14 +56,15 @@ class Scene:
         turned = np.empty(4)
         mujoco.mju_mulQuat(turned, model.cam_quat[camera].copy(), HALF_TURN)
         model.cam_quat[camera] = turned
-        if window is not None:
+        if window is not None and drawn is None:
             _show_window(model, camera, *window)
         model.vis.quality.shadowsize = shadows
         if not reflections:
             model.mat_reflectance[:] = 0
-        self._image_size = image_size
-        size = image_size if drawn is None else _part(drawn, window or (0.0, 0.0, 1.0, 1.0))
-        self._view = View([known.index(name) for name in cameras], *size, site_groups=(0, 1, 2))
+        self._image_size, self._drawn = image_size, drawn
+        self._windows = [window if window and name == CAMERA else WHOLE for name in cameras]
+        height, width = image_size if drawn is None else (drawn, drawn)
+        self._view = View([known.index(name) for name in cameras], height, width, site_groups=(0, 1, 2))
         self._choice = renderer
         self._renderer: Renderer | None = None
         self._changed = True
@@ -92,10 +95,9 @@ class Scene:
             self._renderer.update()
         self._changed = False
         pictures, _ = self._renderer.render(self.simulator.data)
-        if pictures.shape[1:3] == self._image_size:
+        if self._drawn is None:
             return pictures
-        size = self._image_size[::-1]
-        return np.stack([np.asarray(Image.fromarray(one).resize(size, Image.Resampling.BOX)) for one in pictures])
+        return np.stack([_cut(*each, self._image_size) for each in zip(pictures, self._windows, strict=True)])
 
     def close(self) -> None:
         """Free physics and GL."""
@@ -105,10 +107,11 @@ class Scene:
         self.simulator.close()
 
 
-def _part(drawn: int, window: Sequence[float]) -> tuple[int, int]:
-    """Return the height and width of a window of a picture of `drawn` rows and columns [px]."""
-    top, left, bottom, right = window
-    return round(drawn * (bottom - top)), round(drawn * (right - left))
+def _cut(picture: Array, window: Sequence[float], size: tuple[int, int]) -> Array:
+    """Return a window of a square picture (drawn, drawn, 3), averaged to a size: height and width [px]."""
+    top, left, bottom, right = (len(picture) * share for share in window)
+    image = Image.fromarray(picture).resize(size[::-1], Image.Resampling.BOX, (left, top, right, bottom))
+    return np.asarray(image)
 
 
 def _show_window(model: mujoco.MjModel, camera: int, top: float, left: float, bottom: float, right: float) -> None:
