@@ -113,7 +113,7 @@ def lerobots_images(picture: Path) -> None:
         "window": (0.25, 0.29, 0.95, 0.99),
         "tasks": ["drawer-open", "soccer", "pick-place"],
     }
-    lerobots = {"renderer": "mujoco", "drawn": 480, "shadows": 4096, "reflections": True}
+    lerobots = {"renderer": "mujoco", "drawn": 480, "shadows": 4096}
     sheets = []
     for options in ({"renderer": "smooth"}, lerobots):
         environment: Any = make_environment(compose_task("metaworld", **own, **options))

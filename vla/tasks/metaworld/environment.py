@@ -51,7 +51,6 @@ class MetaWorld(Blindable):
         window: Window | None,
         drawn: Annotated[int, Ge(16), Le(4096)] | None,
         shadows: Natural,
-        reflections: bool,
         steps: Annotated[int, Ge(1), Le(MOST_STEPS)],
         scenes: Count,
     ) -> None:
@@ -69,7 +68,6 @@ class MetaWorld(Blindable):
             drawn: height and width at which all of a camera's picture is drawn; it is cut to the window, then averaged
                 to `image_size` [px]. None: images are drawn in their own size.
             shadows: edge of the shadow map [texels]; 0: no shadows.
-            reflections: whether surfaces reflect, where the renderer can.
             steps: largest number of steps of an episode.
             scenes: largest number of compiled tasks that are kept, each with some 80 MB.
 
@@ -96,7 +94,7 @@ class MetaWorld(Blindable):
             truth=(("object", 3), ("goal", 3)),
         )
         self._sentences, self._steps, self._most = sentences, steps, scenes
-        self._drawing = renderer, self.spec.cameras, self.spec.image_size, window, drawn, shadows, reflections
+        self._drawing = renderer, self.spec.cameras, self.spec.image_size, window, drawn, shadows
         self._scenes: dict[str, Scene] = {}
         self.done, self.outcome, self.task = True, "timeout", ""
         self.milestones: frozenset[str] = frozenset()

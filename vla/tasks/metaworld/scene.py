@@ -30,7 +30,6 @@ class Scene:
         window: Sequence[float] | None,
         drawn: int | None,
         shadows: int,
-        reflections: bool,
     ) -> None:
         """Args:
         task: name of the task.
@@ -41,7 +40,6 @@ class Scene:
         drawn: height and width at which all of a camera's picture is drawn, to be cut to the window and averaged [px];
             None: the window is drawn in the size of the pictures.
         shadows: edge of the shadow map [texels]; 0: no shadows.
-        reflections: whether surfaces reflect, where the renderer can.
 
         Raises:
             ValueError: there is no such task or camera.
@@ -59,8 +57,7 @@ class Scene:
         if window is not None and drawn is None:
             _show_window(model, camera, *window)
         model.vis.quality.shadowsize = shadows
-        if not reflections:
-            model.mat_reflectance[:] = 0
+        model.mat_reflectance[:] = 0  # of the renderers none draws it, and in no task does it show from corner2
         self._image_size, self._drawn = image_size, drawn
         self._windows = [window if window and name == CAMERA else WHOLE for name in cameras]
         height, width = image_size if drawn is None else (drawn, drawn)

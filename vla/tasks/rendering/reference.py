@@ -20,7 +20,7 @@ class Reference:
 
 
 class ReferenceRenderer:
-    """MuJoCo's classic renderer."""
+    """MuJoCo's classic renderer without reflections."""
 
     def __init__(self, model: mujoco.MjModel, view: View) -> None:
         """Args: the model; what to draw of it."""
@@ -33,6 +33,7 @@ class ReferenceRenderer:
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self._context)
         self._context.readDepthMap = mujoco.mjtDepthMap.mjDEPTH_ZEROFAR
         self._scene = mujoco.MjvScene(model, maxgeom=model.ngeom + model.nsite + 50)
+        self._scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = False
         self._option = mujoco.MjvOption()
         self._option.geomgroup[:] = [group in view.geom_groups for group in range(mujoco.mjNGROUP)]
         self._option.sitegroup[:] = [group in view.site_groups for group in range(mujoco.mjNGROUP)]
