@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from annotated_types import Ge, Le, Predicate
+from annotated_types import Ge, Gt, Le, Predicate
 
 from vla.io.types import Count, ImageSize, Names, Natural, Share, Text
 from vla.spec import Array, Observation, Spec
@@ -49,6 +49,7 @@ class MetaWorld(Blindable):
         image_size: ImageSize,
         cameras: Names,
         window: Window | None,
+        close: Annotated[float, Gt(0), Le(1)],
         drawn: Annotated[int, Ge(16), Le(4096)] | None,
         shadows: Natural,
         steps: Annotated[int, Ge(1), Le(MOST_STEPS)],
@@ -62,10 +63,12 @@ class MetaWorld(Blindable):
             tiers: difficulty → tasks, for reports.
             renderer: renderer of the images.
             image_size: height and width of every camera's images [px].
-            cameras: names of cameras, such as "corner2", which is moved and turned as LeRobot does.
+            cameras: names of cameras, such as "corner2", which is moved and turned as LeRobot does, or "hand", the part
+                of "corner2" around the fingertips.
             window: top, left, bottom and right of LeRobot's picture that "corner2" shows, as shares of its height and
                 width; None: all of it.
-            drawn: height and width at which all of a camera's picture is drawn; it is cut to the window, then averaged
+            close: height and width of what "hand" shows, as shares of LeRobot's picture.
+            drawn: height and width at which all of a camera's picture is drawn; it is cut to its window, then averaged
                 to `image_size` [px]. None: images are drawn in their own size.
             shadows: edge of the shadow map [texels]; 0: no shadows.
             steps: largest number of steps of an episode.
@@ -94,7 +97,7 @@ class MetaWorld(Blindable):
             truth=(("object", 3), ("goal", 3)),
         )
         self._sentences, self._steps, self._most = sentences, steps, scenes
-        self._drawing = renderer, self.spec.cameras, self.spec.image_size, window, drawn, shadows
+        self._drawing = renderer, self.spec.cameras, self.spec.image_size, window, close, drawn, shadows
         self._scenes: dict[str, Scene] = {}
         self.done, self.outcome, self.task = True, "timeout", ""
         self.milestones: frozenset[str] = frozenset()

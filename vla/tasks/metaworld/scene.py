@@ -15,7 +15,10 @@ from vla.tasks.rendering.renderer import Renderer, Rendering, View
 HALF_TURN = np.array([0.0, 0.0, 0.0, 1.0])  # about the optical axis, quaternion wxyz
 # LeRobot (src/lerobot/envs/metaworld.py) moves this camera, which hangs upside down, and turns its pictures.
 CAMERA, CAMERA_PLACE = "corner2", (0.75, 0.075, 0.7)  # [m]
+LEROBOT = 480  # height and width of its pictures [px]
 WHOLE = (0.0, 0.0, 1.0, 1.0)  # window of all of a picture
+HAND = "hand"  # the part of CAMERA's picture around the fingertips, in place of a camera
+MIDDLE = (0.0, 0.0, -0.075)  # of that part, 3 cm below the fingertips, from the position of the hand [m]
 
 
 class Scene:
@@ -28,16 +31,18 @@ class Scene:
         cameras: Sequence[str],
         image_size: tuple[int, int],
         window: Sequence[float] | None,
+        close: float,
         drawn: int | None,
         shadows: int,
     ) -> None:
         """Args:
         task: name of the task.
         renderer: renderer of the pictures.
-        cameras: names in the model.
+        cameras: names in the model, or HAND.
         image_size: height and width of the pictures [px].
-        window: top, left, bottom and right of what LeRobot's camera shows, as shares of its picture; None: all.
-        drawn: height and width at which all of a camera's picture is drawn, to be cut to the window and averaged [px];
+        window: top, left, bottom and right of what CAMERA shows, as shares of its picture; None: all.
+        close: height and width of what HAND shows, as shares of CAMERA's picture.
+        drawn: height and width at which all of a camera's picture is drawn, to be cut to its window and averaged [px];
             None: the window is drawn in the size of the pictures.
         shadows: edge of the shadow map [texels]; 0: no shadows.
 
@@ -47,21 +52,25 @@ class Scene:
         self.simulator = simulator(task)
         model = self.model = self.simulator.model
         known = [model.camera(number).name for number in range(model.ncam)]
-        if unknown := [name for name in cameras if name not in known]:
-            raise ValueError(f"task.cameras names {', '.join(unknown)}; Meta-World has {', '.join(known)}")
+        if unknown := [name for name in cameras if name not in (*known, HAND)]:
+            raise ValueError(
+                f"task.cameras names {', '.join(unknown)}; Meta-World has {', '.join(known)}, and {HAND}, which is "
+                f"the part of {CAMERA} around the hand"
+            )
         camera = known.index(CAMERA)
         model.cam_pos[camera] = CAMERA_PLACE
         turned = np.empty(4)
         mujoco.mju_mulQuat(turned, model.cam_quat[camera].copy(), HALF_TURN)
         model.cam_quat[camera] = turned
-        if window is not None and drawn is None:
-            _show_window(model, camera, *window)
         model.vis.quality.shadowsize = shadows
         model.mat_reflectance[:] = 0  # of the renderers none draws it, and in no task does it show from corner2
         self._image_size, self._drawn = image_size, drawn
-        self._windows = [window if window and name == CAMERA else WHOLE for name in cameras]
+        self._windows = np.array([window if window and name == CAMERA else WHOLE for name in cameras], float)
+        self._hands, self._close = [number for number, name in enumerate(cameras) if name == HAND], close
         height, width = image_size if drawn is None else (drawn, drawn)
-        self._view = View([known.index(name) for name in cameras], height, width, site_groups=(0, 1, 2))
+        places = [known.index(CAMERA if name == HAND else name) for name in cameras]
+        self._view = View(places, height, width, site_groups=(0, 1, 2), aspect=1.0)
+        self._camera = camera
         self._choice = renderer
         self._renderer: Renderer | None = None
         self._changed = True
@@ -91,10 +100,22 @@ class Scene:
         elif self._changed:
             self._renderer.update()
         self._changed = False
-        pictures, _ = self._renderer.render(self.simulator.data)
+        for number in self._hands:
+            self._windows[number] = self._around_the_hand()
         if self._drawn is None:
-            return pictures
+            return self._renderer.render(self.simulator.data, self._windows)[0]
+        pictures, _ = self._renderer.render(self.simulator.data)
         return np.stack([_cut(*each, self._image_size) for each in zip(pictures, self._windows, strict=True)])
+
+    def _around_the_hand(self) -> Array:
+        """Return the window (4,) of CAMERA's picture around the fingertips, of whole pixels of LeRobot's picture."""
+        data, fovy = self.simulator.data, self.model.cam_fovy[self._camera]
+        there = self.simulator.get_endeff_pos() + MIDDLE - data.cam_xpos[self._camera]
+        across, up, behind = data.cam_xmat[self._camera].reshape(3, 3).T @ there
+        half = -behind * np.tan(np.radians(fovy / 2))  # of the whole picture, at that distance
+        corner = np.array([(1 - up / half) / 2, (1 + across / half) / 2]) - self._close / 2
+        upper, left = (np.rint(LEROBOT * corner) / LEROBOT).clip(0, 1 - self._close)
+        return np.array([upper, left, upper + self._close, left + self._close])
 
     def close(self) -> None:
         """Free physics and GL."""
@@ -109,11 +130,3 @@ def _cut(picture: Array, window: Sequence[float], size: tuple[int, int]) -> Arra
     top, left, bottom, right = (len(picture) * share for share in window)
     image = Image.fromarray(picture).resize(size[::-1], Image.Resampling.BOX, (left, top, right, bottom))
     return np.asarray(image)
-
-
-def _show_window(model: mujoco.MjModel, camera: int, top: float, left: float, bottom: float, right: float) -> None:
-    """Make a camera show a window of its square picture; numbers are shares of the picture, from its upper left."""
-    half = np.tan(np.radians(model.cam_fovy[camera] / 2))  # of the whole picture, at a distance of one
-    across, down = half * (2 * np.array([left, right]) - 1), half * (2 * np.array([top, bottom]) - 1)
-    model.cam_sensorsize[camera] = across[1] - across[0], down[1] - down[0]
-    model.cam_intrinsic[camera] = 1, 1, across.mean(), down.mean()  # focal lengths, principal point

@@ -248,13 +248,13 @@ class FastRenderer:
         table[-1, 0, 3], table[-1, 1, 3], table[-1, 2, :3] = 1, 1, 1  # the sky: not lit, always around the camera
         return table
 
-    def render(self, data: mujoco.MjData) -> tuple[Array, Array]:
+    def render(self, data: mujoco.MjData, windows: Array | None = None) -> tuple[Array, Array]:
         """Draw colours (cameras, H, W, 3) uint8 and depth (cameras, H, W) float32 [m]."""
         with self._context.used_by(self) as changed:
             if changed:
                 self._bind()
             self._upload_poses(data)
-            self._upload_cameras(data)
+            self._upload_cameras(data, windows)
             self._shadows.cast(self._poses)
             self._drawn.use()
             self._gl.enable_only(STATE)
@@ -290,11 +290,11 @@ class FastRenderer:
         content = np.concatenate([*columns, table.ravel()])
         self._blocks[:, shaders.CAMERA : shaders.CAMERA + content.size] = content
 
-    def _upload_cameras(self, data: mujoco.MjData) -> None:
+    def _upload_cameras(self, data: mujoco.MjData, windows: Array | None) -> None:
         """Write every camera's block: its projection and position, shadow projections and lights."""
         self._place_lights(data)
         blocks, cameras = self._blocks, self._cameras
-        blocks[:, :16] = cameras.place(data).swapaxes(1, 2).reshape(-1, 16)
+        blocks[:, :16] = cameras.place(data, windows).swapaxes(1, 2).reshape(-1, 16)
         blocks[:, 16:19] = cameras.eyes
         head = shaders.CAMERA + 16 * len(self._lamps) + 16
         blocks[:, head : head + 3] = -cameras.axes[:, :, 2]  # the direction of the headlight

@@ -48,14 +48,14 @@ class ReferenceRenderer:
         for texture in sorted(textures):
             mujoco.mjr_uploadTexture(self._model, self._context, texture)
 
-    def render(self, data: mujoco.MjData) -> tuple[Array, Array]:
+    def render(self, data: mujoco.MjData, windows: Array | None = None) -> tuple[Array, Array]:
         """Draw colours (cameras, H, W, 3) uint8 and depth (cameras, H, W) float32 [m]."""
         self._gl.make_current()
         view = self._view
         rgb = np.empty((len(view.cameras), view.height, view.width, 3), np.uint8)
         depth = np.empty((len(view.cameras), view.height, view.width), np.float32)
         for number, camera in enumerate(view.cameras):
-            self._draw(data, camera)
+            self._draw(data, camera, None if windows is None else windows[number])
             # OpenGL's lowest row is the first one.
             mujoco.mjr_readPixels(rgb[number], depth[number], self._rect, self._context)
         return rgb[:, ::-1], self._metres(depth[:, ::-1])
@@ -75,12 +75,24 @@ class ReferenceRenderer:
                 ids[geom.segid + 1] = geom.objid
         return ids[rgb[::-1].astype(np.int32) @ np.array([1, 256, 65536])]
 
-    def _draw(self, data: mujoco.MjData, camera: int) -> None:
+    def _draw(self, data: mujoco.MjData, camera: int, window: Array | None = None) -> None:
         self._camera.fixedcamid = camera
         mujoco.mjv_updateScene(
             self._model, data, self._option, None, self._camera, mujoco.mjtCatBit.mjCAT_ALL.value, self._scene
         )
+        if window is not None:
+            for eye in self._scene.camera:
+                self._show(eye, *window)
         mujoco.mjr_render(self._rect, self._scene, self._context)
+
+    def _show(self, eye: mujoco.MjvGLCamera, top: float, left: float, bottom: float, right: float) -> None:
+        """Narrow what an eye of the scene's camera sees to a window of it."""
+        above, height = eye.frustum_top, eye.frustum_top - eye.frustum_bottom
+        # MuJoCo calls it a width, and draws twice as much; without it the aspect of the pictures decides.
+        half = eye.frustum_width or (self._view.aspect or self._view.width / self._view.height) * height / 2
+        eye.frustum_center += half * (left + right - 1)
+        eye.frustum_width = half * (right - left)
+        eye.frustum_top, eye.frustum_bottom = above - top * height, above - bottom * height
 
     def _metres(self, reading: Array) -> Array:
         """Convert a reverse-z buffer, 1 at the near plane and 0 at the far one, to depth [m]."""

@@ -20,6 +20,7 @@ class View:
     width: int  # of every picture [px]
     geom_groups: Collection[int] = (0, 1, 2)
     site_groups: Collection[int] = ()
+    aspect: float | None = None  # width over height of all that a camera sees; None: of the pictures
 
 
 class Renderer(Protocol):
@@ -33,8 +34,13 @@ class Renderer(Protocol):
         """
         ...
 
-    def render(self, data: mujoco.MjData) -> tuple[Array, Array]:
+    def render(self, data: mujoco.MjData, windows: Array | None = None) -> tuple[Array, Array]:
         """Draw every camera's picture of a state.
+
+        Args:
+            data: the state.
+            windows: part of what each camera sees that its picture shows (cameras, 4): top, left, bottom and right as
+                shares of height and width; None: all of it.
 
         Returns:
             Colours (cameras, height, width, 3) uint8, and depth along the optical axis (cameras, height, width)
