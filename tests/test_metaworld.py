@@ -195,6 +195,23 @@ def test_a_window_is_a_part_of_the_whole_picture() -> None:
     part.close()
 
 
+def test_the_hands_picture_is_a_part_of_lerobots_that_moves_along() -> None:
+    chosen = "task.tasks=[pick-place]", "task.cameras=[corner2,hand]"
+    whole = world(chosen[0], "task.image_size=[480,480]", "task/renderer=mujoco")
+    worlds = {name: world(*chosen, f"task/renderer={name}") for name in ("fast", "mujoco")}
+    worlds["cut"] = world(*chosen, "task/renderer=mujoco", "task.drawn=480")
+    places = []
+    for steps in (0, 20):
+        fast, mujocos, cut = (played(made, 0, steps)[-1].rgb["hand"].astype(int) for made in worlds.values())
+        assert np.abs(mujocos - cut).mean() < 0.1
+        assert np.abs(fast - mujocos).mean() < 4
+        parts = np.lib.stride_tricks.sliding_window_view(played(whole, 0, steps)[-1].rgb["corner2"], (96, 96, 3))
+        places += np.argwhere([[np.array_equal(part[0], cut) for part in row] for row in parts]).tolist()
+    assert len(places) == 2 and places[0] != places[1]
+    for made in (whole, *worlds.values()):
+        made.close()
+
+
 @pytest.mark.parametrize(
     ("override", "words"),
     [
