@@ -30,6 +30,7 @@ HEIGHT = 2080  # of the page, as far as it is shown [px]
 STEP = 12  # at which the rollout is shown: about to grasp
 FILM_SIZE, FILM_EPISODES, FILM_PAUSE = 320, 5, 8  # of the moving picture: pixels, episodes, frames after each
 ARM_VIEW, ARM_TARGET, ARM_STEPS = (1.1, -0.75, 0.6), (0.3, 0.0, 0.2), (4, 11, 16, 20)  # of the pictures of arms [m]
+LEROBOT_STEP = 24  # at which the images of Meta-World are shown: the hand is near the object
 SCENES, SCENE_SIZE = 3, 200  # of the picture of both renderers: scenes, edge of an image [px]
 
 
@@ -108,17 +109,25 @@ def fifty_tasks(picture: Path) -> None:
 
 def lerobots_images(picture: Path) -> None:
     """Save scenes of Meta-World as `experiment=metaworld` and as LeRobot show them, above what chooses them."""
+    from vla.tasks.metaworld.expert import Scripted
+
     own = {
-        "image_size": (128, 128),
+        "image_size": (96, 96),
+        "cameras": ["corner2", "hand"],
         "window": (0.25, 0.29, 0.95, 0.99),
         "tasks": ["drawer-open", "soccer", "pick-place"],
     }
     lerobots = {"renderer": "mujoco", "drawn": 480, "shadows": 4096}
     sheets = []
-    for options in ({"renderer": "smooth"}, lerobots):
+    for options in ({"renderer": "smooth", "shadows": 512}, lerobots):
         environment: Any = make_environment(compose_task("metaworld", **own, **options))
-        row = np.concatenate([environment.reset(seed).rgb["corner2"] for seed in range(3)], axis=1)
-        sheets.append(row.repeat(3, axis=0).repeat(3, axis=1))
+        images: list[Array] = []
+        for seed in range(3):
+            expert, observation = Scripted(spec=environment.spec), environment.reset(seed)
+            for _ in range(LEROBOT_STEP):
+                observation = environment.step(expert.act(observation))
+            images += observation.rgb.values()
+        sheets.append(np.concatenate(images, axis=1).repeat(2, axis=0).repeat(2, axis=1))
         environment.close()
     captions = "experiment=metaworld", "evaluate=lerobot"
     parts = [captioned([sheet], text) for sheet, text in zip(sheets, captions, strict=True)]
