@@ -182,6 +182,23 @@ def test_every_shape_texture_light_and_camera(lights: str, floor: str) -> None:
         assert np.median(np.abs(picture.astype(int) - other)) <= 1
 
 
+@pytest.mark.parametrize("renderer", [fast(), Reference()])
+def test_a_window_is_a_part_of_what_a_camera_sees(renderer: Fast | Reference) -> None:
+    model, data = gallery("directional")
+    cameras, top, left = range(model.ncam), [0, 12, 30, 60, 20], [10, 0, 45, 70, 20]
+    parts = [slice(y, y + 60) for y in top], [slice(x, x + 50) for x in left]
+    with closing(renderer.open(model, View(cameras, 120, 120))) as opened:
+        whole = opened.render(data)[0]
+    expected = np.stack([picture[y, x] for picture, y, x in zip(whole, *parts, strict=True)])
+    windows = np.array([[y / 120, x / 120, y / 120 + 0.5, x / 120 + 50 / 120] for y, x in zip(top, left, strict=True)])
+    with closing(renderer.open(model, View(cameras, 60, 50, aspect=1.0))) as opened:
+        first, other = opened.render(data, windows)[0], opened.render(data, windows[::-1])[0]
+        again = opened.render(data, windows)[0]
+    assert grey_levels(first, expected).max() < 0.5 and (first != expected).mean() < 0.05
+    assert grey_levels(first, other).max() > 5
+    np.testing.assert_array_equal(first, again)
+
+
 @pytest.mark.parametrize(
     ("shape", "closed"),
     [
