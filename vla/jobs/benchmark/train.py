@@ -26,6 +26,7 @@ from vla.jobs.benchmark.memory import peak, reset_peak
 from vla.jobs.bfloat16 import computes_on_cpu, has_bfloat16
 from vla.jobs.collect import demonstrations
 from vla.models.flops import matmul_flops, peak_flops, training_flops
+from vla.runs.folder import CHECKPOINTS
 from vla.training.trainer import PRECISIONS, explain_memory_errors, make_trainer, quiet_lightning
 
 log = logging.getLogger(__name__)
@@ -145,7 +146,7 @@ class Trial(lightning.Callback):
         self._learner.load_state_dict(self._start)
         data = self._data()
         with TemporaryDirectory() as folder:
-            trainer = make_trainer(self._experiment.config, Path(folder), self)
+            trainer = make_trainer(self._experiment.config, Path(folder) / CHECKPOINTS, self)
             trainer.fit(self._learner, datamodule=data)
             if trainer.received_sigterm:  # Lightning ignores it in the last hook
                 raise KeyboardInterrupt
