@@ -195,6 +195,11 @@ def test_a_window_is_a_part_of_what_a_camera_sees(renderer: Fast | Reference) ->
         first, other = opened.render(data, windows)[0], opened.render(data, windows[::-1])[0]
         again = opened.render(data, windows)[0]
     assert grey_levels(first, expected).max() < 0.5 and (first != expected).mean() < 0.05
+    with closing(renderer.open(model, View(cameras, 60, 50, aspect=1.0))) as opened:
+        everything = opened.render(data)[0]
+        np.testing.assert_array_equal(
+            everything, opened.render(data, np.tile((0.0, 0.0, 1.0, 1.0), (model.ncam, 1)))[0]
+        )
     assert grey_levels(first, other).max() > 5
     np.testing.assert_array_equal(first, again)
 

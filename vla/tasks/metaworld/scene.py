@@ -10,13 +10,12 @@ from PIL import Image
 
 from vla.spec import Array
 from vla.tasks.metaworld.package import simulator
-from vla.tasks.rendering.renderer import Renderer, Rendering, View
+from vla.tasks.rendering.renderer import WHOLE, Renderer, Rendering, View
 
 HALF_TURN = np.array([0.0, 0.0, 0.0, 1.0])  # about the optical axis, quaternion wxyz
 # LeRobot (src/lerobot/envs/metaworld.py) moves this camera, which hangs upside down, and turns its pictures.
 CAMERA, CAMERA_PLACE = "corner2", (0.75, 0.075, 0.7)  # [m]
 LEROBOT = 480  # height and width of its pictures [px]
-WHOLE = (0.0, 0.0, 1.0, 1.0)  # window of all of a picture
 HAND = "hand"  # the part of CAMERA's picture around the fingertips, in place of a camera
 MIDDLE = (0.0, 0.0, -0.075)  # of that part, 3 cm below the fingertips, from the position of the hand [m]
 
@@ -68,8 +67,9 @@ class Scene:
         self._windows = np.array([window if window and name == CAMERA else WHOLE for name in cameras], float)
         self._hands, self._close = [number for number, name in enumerate(cameras) if name == HAND], close
         height, width = image_size if drawn is None else (drawn, drawn)
-        places = [known.index(CAMERA if name == HAND else name) for name in cameras]
-        self._view = View(places, height, width, site_groups=(0, 1, 2), aspect=1.0)
+        self._places = [known.index(CAMERA if name == HAND else name) for name in cameras]
+        seen = self._places if drawn is None else sorted(set(self._places))  # all of a camera's picture once
+        self._view = View(seen, height, width, site_groups=(0, 1, 2), aspect=1.0)
         self._camera = camera
         self._choice = renderer
         self._renderer: Renderer | None = None
@@ -104,8 +104,9 @@ class Scene:
             self._windows[number] = self._around_the_hand()
         if self._drawn is None:
             return self._renderer.render(self.simulator.data, self._windows)[0]
-        pictures, _ = self._renderer.render(self.simulator.data)
-        return np.stack([_cut(*each, self._image_size) for each in zip(pictures, self._windows, strict=True)])
+        pictures = dict(zip(self._view.cameras, self._renderer.render(self.simulator.data)[0], strict=True))
+        shown = zip(self._places, self._windows, strict=True)
+        return np.stack([_cut(pictures[camera], window, self._image_size) for camera, window in shown])
 
     def _around_the_hand(self) -> Array:
         """Return the window (4,) of CAMERA's picture around the fingertips, of whole pixels of LeRobot's picture."""

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 
 import mujoco
 import numpy as np
 
 from vla.spec import Array
-from vla.tasks.rendering.renderer import View
+from vla.tasks.rendering.renderer import WHOLE, View
 
 
 class Reference:
@@ -75,11 +75,13 @@ class ReferenceRenderer:
                 ids[geom.segid + 1] = geom.objid
         return ids[rgb[::-1].astype(np.int32) @ np.array([1, 256, 65536])]
 
-    def _draw(self, data: mujoco.MjData, camera: int, window: Array | None = None) -> None:
+    def _draw(self, data: mujoco.MjData, camera: int, window: Sequence[float] | None = None) -> None:
         self._camera.fixedcamid = camera
         mujoco.mjv_updateScene(
             self._model, data, self._option, None, self._camera, mujoco.mjtCatBit.mjCAT_ALL.value, self._scene
         )
+        if window is None and self._view.aspect is not None:
+            window = WHOLE
         if window is not None:
             for eye in self._scene.camera:
                 self._show(eye, *window)
