@@ -49,7 +49,7 @@ class MetaWorld(Blindable):
         image_size: ImageSize,
         cameras: Names,
         window: Window | None,
-        close: Annotated[float, Gt(0), Le(1)],
+        hand_size: Annotated[float, Gt(0), Le(1)],
         drawn: Annotated[int, Ge(16), Le(4096)] | None,
         shadows: Natural,
         steps: Annotated[int, Ge(1), Le(MOST_STEPS)],
@@ -67,7 +67,7 @@ class MetaWorld(Blindable):
                 of "corner2" around the fingertips.
             window: top, left, bottom and right of LeRobot's picture that "corner2" shows, as shares of its height and
                 width; None: all of it.
-            close: height and width of what "hand" shows, as shares of LeRobot's picture.
+            hand_size: height and width of what "hand" shows, as shares of LeRobot's picture.
             drawn: height and width at which all of a camera's picture is drawn; it is cut to its window, then averaged
                 to `image_size` [px]. None: images are drawn in their own size.
             shadows: edge of the shadow map [texels]; 0: no shadows.
@@ -97,7 +97,7 @@ class MetaWorld(Blindable):
             truth=(("object", 3), ("goal", 3)),
         )
         self._sentences, self._steps, self._most = sentences, steps, scenes
-        self._drawing = renderer, self.spec.cameras, self.spec.image_size, window, close, drawn, shadows
+        self._drawing = renderer, self.spec.cameras, self.spec.image_size, window, hand_size, drawn, shadows
         self._scenes: dict[str, Scene] = {}
         self.done, self.outcome, self.task = True, "timeout", ""
         self.milestones: frozenset[str] = frozenset()

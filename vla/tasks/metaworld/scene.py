@@ -30,7 +30,7 @@ class Scene:
         cameras: Sequence[str],
         image_size: tuple[int, int],
         window: Sequence[float] | None,
-        close: float,
+        hand_size: float,
         drawn: int | None,
         shadows: int,
     ) -> None:
@@ -40,7 +40,7 @@ class Scene:
         cameras: names in the model, or HAND.
         image_size: height and width of the pictures [px].
         window: top, left, bottom and right of what CAMERA shows, as shares of its picture; None: all.
-        close: height and width of what HAND shows, as shares of CAMERA's picture.
+        hand_size: height and width of what HAND shows, as shares of CAMERA's picture.
         drawn: height and width at which all of a camera's picture is drawn, to be cut to its window and averaged [px];
             None: the window is drawn in the size of the pictures.
         shadows: edge of the shadow map [texels]; 0: no shadows.
@@ -65,7 +65,7 @@ class Scene:
         model.mat_reflectance[:] = 0  # of the renderers none draws it, and in no task does it show from corner2
         self._image_size, self._drawn = image_size, drawn
         self._windows = np.array([window if window and name == CAMERA else WHOLE for name in cameras], float)
-        self._hands, self._close = [number for number, name in enumerate(cameras) if name == HAND], close
+        self._hands, self._hand_size = [number for number, name in enumerate(cameras) if name == HAND], hand_size
         height, width = image_size if drawn is None else (drawn, drawn)
         self._places = [known.index(CAMERA if name == HAND else name) for name in cameras]
         seen = self._places if drawn is None else sorted(set(self._places))  # all of a camera's picture once
@@ -114,9 +114,9 @@ class Scene:
         there = self.simulator.get_endeff_pos() + MIDDLE - data.cam_xpos[self._camera]
         across, up, behind = data.cam_xmat[self._camera].reshape(3, 3).T @ there
         half = -behind * np.tan(np.radians(fovy / 2))  # of the whole picture, at that distance
-        corner = np.array([(1 - up / half) / 2, (1 + across / half) / 2]) - self._close / 2
-        upper, left = (np.rint(LEROBOT * corner) / LEROBOT).clip(0, 1 - self._close)
-        return np.array([upper, left, upper + self._close, left + self._close])
+        corner = np.array([(1 - up / half) / 2, (1 + across / half) / 2]) - self._hand_size / 2
+        upper, left = (np.rint(LEROBOT * corner) / LEROBOT).clip(0, 1 - self._hand_size)
+        return np.array([upper, left, upper + self._hand_size, left + self._hand_size])
 
     def close(self) -> None:
         """Free physics and GL."""
