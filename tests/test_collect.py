@@ -25,12 +25,11 @@ from vla.rollouts.collect import (
     COLLECTION_TIME,
     NOT_REPEATABLE,
     PATIENCE,
-    EnvironmentFactory,
-    ExpertFactory,
     Summary,
     collect,
     collection_time,
 )
+from vla.rollouts.rollout import AgentFactory, EnvironmentFactory
 from vla.spec import FIRST_SEED
 
 SCRIPT = """
@@ -51,7 +50,7 @@ def gather(
     episodes: int = EPISODES,
     workers: int = 1,
     make_environment: EnvironmentFactory = toy.make_environment,
-    make_expert: ExpertFactory = toy.make_expert,
+    make_expert: AgentFactory = toy.make_expert,
 ) -> Summary:
     store = EpisodeStore.create_or_open(folder, toy.SPEC, {})
     return collect(store, make_environment, make_expert, episodes, LocalCluster(workers), seed=0)

@@ -126,8 +126,7 @@ class Spec:
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain lists, numbers and strings, for JSON and for checkpoints loaded with `weights_only=True`."""
-        values: dict[str, Any] = _plain(asdict(self))
-        return values
+        return _plain(asdict(self))
 
     @classmethod
     def from_dict(cls, values: Any, name: str = "the spec") -> Spec:

@@ -83,8 +83,7 @@ class Experiment:
     def world(self) -> Environment | SpecOnly:
         """Build the world of the task and close it: only its description is used, such as spec and tasks."""
         if not self.playable:
-            recorded: SpecOnly = build(self["task"], "task")
-            return recorded
+            return build(self["task"], "task")
         environment = self.make_environment()()
         environment.close()
         return environment
@@ -132,8 +131,7 @@ class Experiment:
 
     def cluster(self) -> Cluster:
         """Build the cluster."""
-        made: Cluster = build(self["cluster"], "cluster")
-        return made
+        return build(self["cluster"], "cluster")
 
     def learner(self, spec: Spec, origin: Path | None = None) -> Learner:
         """Build the learner; without `origin`, fit its tokenizer afterwards with `fit_tokenizer`.
@@ -157,8 +155,7 @@ class Experiment:
         model = _model(node, spec, build(self["tokenizer"], "tokenizer", spec=spec), saved)
         if saved:
             saved.initialize(model)
-        made: Learner = build(self["learner"], "learner", model=model, spec=spec, config=self.config)
-        return made
+        return build(self["learner"], "learner", model=model, spec=spec, config=self.config)
 
     def fit_tokenizer(self, tokenizer: ActionTokenizer, store: EpisodeStore) -> None:
         """Fit a tokenizer to a store's actions."""
@@ -183,7 +180,7 @@ class Experiment:
 
     def data(self, store: EpisodeStore, history: int, chunk: int) -> WindowDataModule:
         """Build windows of `history` frames and `chunk` actions from the episodes that `collect` names."""
-        made: WindowDataModule = build(
+        return build(
             self["data"],
             "data",
             folder=store.folder,
@@ -193,7 +190,6 @@ class Experiment:
             episodes=self["collect"]["episodes"],
             more=self["collect"]["more"] or (),
         )
-        return made
 
 
 def plain(node: DictConfig) -> Node:
@@ -216,8 +212,7 @@ def make_environment(task: Node) -> Environment:
             "the task has no simulator, only recordings, so nothing can be played in it: job=collect, train, evaluate, "
             "export and inspect work with recordings, and so do deploy=server and deploy=ros2"
         )
-    found: Environment = environment
-    return found
+    return environment
 
 
 def make_expert(expert: Node, environment: Environment) -> Agent:
@@ -236,8 +231,7 @@ def make_expert(expert: Node, environment: Environment) -> Agent:
 
 def make_agent(agent: Node, environment: Environment) -> Agent:
     """Build an agent for an environment."""
-    made: Agent = build(agent, "agent", spec=environment.spec)
-    return made
+    return build(agent, "agent", spec=environment.spec)
 
 
 def make_policy(policy: Node, checkpoint: Path, environment: Environment | None = None) -> Policy:
@@ -254,15 +248,13 @@ def make_policy(policy: Node, checkpoint: Path, environment: Environment | None 
     tokenizer = build(saved.config["tokenizer"], "tokenizer", spec=saved.spec)
     model = _model(_without_pretraining(saved.config["model"]), saved.spec, tokenizer, saved)
     saved.restore(model)
-    made: Policy = build(policy, "policy", model=model, spec=saved.spec)
-    return made
+    return build(policy, "policy", model=model, spec=saved.spec)
 
 
 def training_policy(precision: str, model: Model) -> Policy:
     """Build the policy of a model in training, on the model's device and without a second compilation or an export."""
     here = {"device": next(model.parameters()).device.type, "precision": precision, "compile": False}
-    made: Policy = build({"_target_": "vla.policy.Policy", **here}, "policy", model=model, spec=model.spec)
-    return made
+    return build({"_target_": "vla.policy.Policy", **here}, "policy", model=model, spec=model.spec)
 
 
 def _model(node: Node, spec: Spec, tokenizer: ActionTokenizer, saved: Checkpoint | None) -> Model:

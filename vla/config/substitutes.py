@@ -52,5 +52,4 @@ def substitute(key: str, node: Any) -> tuple[str, str] | None:
         kind: Any = locate(f"{key}._target_", node["_target_"])
     except MissingLibrary:
         return None
-    found: tuple[str, str] | None = getattr(kind, "substitute", lambda: None)()
-    return found
+    return getattr(kind, "substitute", lambda: None)()

@@ -36,8 +36,7 @@ class Statistics:
         count = min(self.steps, max(SAMPLE // length, 1))
         rows = np.linspace(0, self.steps - 1, count).round().astype(np.int64)
         last = self.ends[self.ends.searchsorted(rows, side="right")] - 1
-        sample: Array = self.actions[np.minimum(rows[:, None] + np.arange(length), last[:, None])]
-        return sample
+        return self.actions[np.minimum(rows[:, None] + np.arange(length), last[:, None])]
 
 
 def statistics_of(entries: Sequence[Entry], actions: Array) -> Statistics:

@@ -217,8 +217,7 @@ def _config(chosen: Chosen, stores: Sequence[EpisodeStore], where: Mapping[str, 
     (config, seeds), *others = chosen.items()
     exact = not any(store.lossy(field) for store in stores for field in store.fields)
     if not others and not conditions and exact and max(seeds) - min(seeds) == len(seeds) - 1:
-        collected: dict[str, Any] = json.loads(config)
-        return collected
+        return json.loads(config)
     parts = [{"config": json.loads(config), "entries": len(seeds)} for config, seeds in chosen.items()]
     return {"parts": parts, "where": conditions}
 

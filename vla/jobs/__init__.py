@@ -39,5 +39,4 @@ def run(experiment: Experiment) -> float | None:
     """Run the job of an experiment; evaluation returns the success rate, which sweeps maximise."""
     job = find(experiment["job"])
     warn_of_bfloat16(experiment.config, job.JOB.needs(experiment.config))
-    result: float | None = job.run(experiment)
-    return result
+    return job.run(experiment)

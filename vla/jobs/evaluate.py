@@ -25,7 +25,6 @@ from vla.reports.evaluation import plot_report, write_report
 from vla.reports.html import PAGE, RECORDING, optional, write_page
 from vla.rollouts.evaluate import (
     IN_DISTRIBUTION,
-    AgentFactory,
     Report,
     compare_conditions,
     compare_courses,
@@ -34,6 +33,7 @@ from vla.rollouts.evaluate import (
 )
 from vla.rollouts.memory import make_impaired
 from vla.rollouts.realtime import Network, make_distant
+from vla.rollouts.rollout import AgentFactory
 from vla.rollouts.statements import AgainstBar, AgainstCondition, AgainstRun, Statement
 from vla.runs.files import Round
 from vla.runs.folder import CHECKPOINTS, REPORT, require_run, save_config, wall_time

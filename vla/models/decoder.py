@@ -55,8 +55,7 @@ def _attend(
     attention: nn.MultiheadAttention, query: Tensor, key: Tensor, value: Tensor, mask: Tensor | None = None
 ) -> Tensor:
     attended = F.scaled_dot_product_attention(query, key, value, mask)
-    output: Tensor = attention.out_proj(attended.transpose(1, 2).flatten(2))
-    return output
+    return attention.out_proj(attended.transpose(1, 2).flatten(2))
 
 
 def newest_last(frames: Tensor, present: Tensor) -> tuple[Tensor, Tensor]:
@@ -169,8 +168,7 @@ class Decoder(FrameModel):
             memory_key_padding_mask=padding,
             tgt_is_causal=True,
         )
-        normalized: Tensor = self.norm(hidden)
-        return normalized
+        return self.norm(hidden)
 
     def generate(self, memory: Tensor, padding: Tensor) -> tuple[Tensor, Tensor]:
         """Decode greedily; returns (B, n, K) float32 logits and (B, n) tokens.

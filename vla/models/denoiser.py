@@ -47,8 +47,7 @@ class Denoiser(nn.Module):
         """Map (B, k, D) noisy actions at (B,) times in 0 … 1 with a (B, M, E) context to (B, k, D)."""
         time_token = self.time(sinusoidal_embedding(time, self.width)).unsqueeze(1)  # (B, 1, E)
         tokens = self.action(noisy) + self.positions.weight + time_token
-        hidden: Tensor = self.head(self.transformer(tokens, context, self.mask, tgt_is_causal=True))
-        return hidden
+        return self.head(self.transformer(tokens, context, self.mask, tgt_is_causal=True))
 
 
 def sinusoidal_embedding(time: Tensor, width: int) -> Tensor:

@@ -202,8 +202,7 @@ class ProcessPool:
                     f"a worker process could not start: {end}, see its output, or run with cluster.workers=1"
                 ) from end
             self._own.process = process
-        own: WorkerProcess = self._own.process
-        return own
+        return self._own.process
 
 
 @contextmanager

@@ -160,7 +160,7 @@ def _plot_outcomes(axes: Axes, report: Report) -> None:
 
 def _plot_lengths(axes: Axes, played: Sequence[Result]) -> None:
     """Plot a histogram of the steps until success or failure."""
-    steps = [[result.steps for result in played if (result.outcome == "success") == good] for good in (True, False)]
+    steps = [[result.steps for result in played if result.success == good] for good in (True, False)]
     edges = np.histogram_bin_edges(steps[0] + steps[1] or [0], bins=30)
     axes.hist(steps, bins=list(edges), stacked=True, color=[GREEN, RED], label=["success", "failure"])
     axes.legend(frameon=False, ncols=2, loc="lower right", bbox_to_anchor=(1, 1), borderaxespad=0)
@@ -173,7 +173,7 @@ def _plot_lengths(axes: Axes, played: Sequence[Result]) -> None:
 def _plot_points(axes: Axes, values: Sequence[tuple[float, float]], played: Sequence[Result]) -> None:
     """Scatter successes and failures over a two-dimensional factor, failures on top."""
     for good, colour, marker in ((True, GREEN, "o"), (False, RED, "X")):
-        points = [value for value, result in zip(values, played, strict=True) if (result.outcome == "success") == good]
+        points = [value for value, result in zip(values, played, strict=True) if result.success == good]
         across, along = np.array(points).reshape(-1, 2).T
         axes.scatter(across, along, c=colour, marker=marker, s=22, alpha=0.75, linewidths=0)
     axes.set_aspect("equal", adjustable="datalim")
@@ -191,7 +191,7 @@ def _plot_groups(axes: Axes, values: Sequence[Any], played: Sequence[Result]) ->
         tilt = 20 if max(map(len, names)) > 9 else 0
         axes.set_xticks(places, names, fontsize=8, rotation=tilt, ha="right" if tilt else "center")
         axes.set_xlim(-0.5, len(split) - 0.5)
-    won = [sum(played[index].outcome == "success" for index in group) for group in split]
+    won = [sum(played[index].success for index in group) for group in split]
     counts = [(good, len(group)) for good, group in zip(won, split, strict=True)]
     rates, reach = error_bars((good / count, *wilson_interval(good, count)) for good, count in counts)
     axes.errorbar(places, rates, reach, fmt="o-", color=GREEN, ecolor=GREY, linewidth=0.7, capsize=3, clip_on=False)

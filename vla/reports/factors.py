@@ -97,7 +97,7 @@ def groups(values: Sequence[Any]) -> list[list[int]]:
 
 def association(values: Sequence[Any], played: Sequence[Result]) -> float:
     """Association of success with a factor: Pearson's χ² per degree of freedom, about 1 by chance."""
-    good = np.array([result.outcome == "success" for result in played], dtype=float)
+    good = np.array([result.success for result in played], dtype=float)
     rate, split = good.mean(), groups(values)
     if rate in (0.0, 1.0):
         return 0.0

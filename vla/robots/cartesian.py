@@ -130,8 +130,7 @@ class CartesianController:
 
     def velocity_of(self, joints: Array, velocities: Array) -> Array:
         """Return the (6,) velocity of the tool [m/s], [rad/s] in the base frame, from joints (J,) and theirs (J,)."""
-        velocity: Array = self.arm.forward(joints)[1] @ velocities
-        return velocity
+        return self.arm.forward(joints)[1] @ velocities
 
     def motion_between(self, before: Array, after: Array) -> Array:
         """Return the (6,) translation [m] and rotation vector [rad] of the tool between joints (J,) [rad]."""

@@ -55,8 +55,7 @@ class JointController:
 
     def step(self, motion: Array) -> Array:
         """Return the targets (J,) [rad]."""
-        targets: Array = motion[self._order] * self._factors
-        return targets
+        return motion[self._order] * self._factors
 
     def motion_between(self, before: Array, after: Array) -> Array:
         """Return the joints `after` (J,) in the order and units of the action."""

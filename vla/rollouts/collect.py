@@ -27,8 +27,8 @@ from vla.io.documents import read_json
 from vla.io.files import write_text
 from vla.parallel.pool import Cluster, Future, Pool, WorkersLost
 from vla.parallel.processes import WorkerFactory
-from vla.rollouts.rollout import replay, rollout
-from vla.spec import FIRST_SEED, Agent, Environment, Episode, Multitask
+from vla.rollouts.rollout import AgentFactory, EnvironmentFactory, replay, rollout
+from vla.spec import FIRST_SEED, Environment, Episode, Multitask
 
 log = logging.getLogger(__name__)
 
@@ -37,9 +37,6 @@ Seconds = Annotated[float, Ge(0), Le(1e9)]
 PATIENCE = 50  # consecutive failures at a task before collection is given up
 LOOK_AHEAD = 4  # pending episodes per worker: a long one must not block the others
 NOT_REPEATABLE = "not_repeatable"  # outcome of a success that the replay of its actions does not reproduce
-
-EnvironmentFactory = Callable[[], Environment]
-ExpertFactory = Callable[[Environment], Agent]
 
 
 @dataclass(frozen=True)
@@ -63,7 +60,7 @@ class Summary:
 def collect(
     store: EpisodeStore,
     make_environment: EnvironmentFactory,
-    make_expert: ExpertFactory,
+    make_expert: AgentFactory,
     episodes: int,
     cluster: Cluster,
     seed: int,
@@ -252,7 +249,7 @@ class DemonstrationWorker:
     """Worker with one environment and one expert."""
 
     def __init__(
-        self, make_environment: EnvironmentFactory, make_expert: ExpertFactory, keep_failures: bool = False
+        self, make_environment: EnvironmentFactory, make_expert: AgentFactory, keep_failures: bool = False
     ) -> None:
         self._keep_failures = keep_failures
         self._environment = make_environment()

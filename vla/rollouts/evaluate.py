@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +23,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from vla.parallel.pool import THIS_PROCESS, Cluster, Crashed, Pool
 from vla.rollouts.comparison import Comparison, Key, Pairs, compare_amounts, compare_pairs, concluded, median_interval
 from vla.rollouts.motion import AMOUNTS, Motion, motion_of
-from vla.rollouts.rollout import close_agent, rollout
+from vla.rollouts.rollout import AgentFactory, EnvironmentFactory, close_agent, rollout
 from vla.rollouts.sequential import anytime_interval
 from vla.rollouts.statistics import bounded_mean_interval, stratified_interval, wilson_interval
 from vla.spec import FIRST_SEED, Agent, Environment, Episode, Recorder
@@ -32,8 +33,6 @@ log = logging.getLogger(__name__)
 IN_DISTRIBUTION = "seen"  # name of the unchanged condition, which a policy is trained for
 ERROR = "error"  # outcome of an episode that was not completed
 
-EnvironmentFactory = Callable[[], Environment]
-AgentFactory = Callable[[Environment], Agent]
 RecorderFactory = Callable[[], Recorder]
 
 
@@ -51,6 +50,11 @@ class Result:
     error: str = ""  # message, if the outcome is "error"
     completed: tuple[int, int] | None = None  # instructions completed, of how many; None if there is only one
     motion: Motion | None = None  # None if the outcome is "error", or in reports of before it was measured
+
+    @property
+    def success(self) -> bool:
+        """Whether the outcome is "success"."""
+        return self.outcome == "success"
 
 
 @dataclass(frozen=True)
@@ -122,7 +126,7 @@ class Report:
     @property
     def amounts(self) -> dict[str, list[float]]:
         """Field of `Motion` → its values in successful episodes, without fields that nobody measured."""
-        motions = [result.motion for result in self.results if succeeded(result)]
+        motions = [result.motion for result in self.results if result.success]
         values = {name: [getattr(motion, name, None) for motion in motions] for name in AMOUNTS}
         known = {name: [value for value in each if value is not None] for name, each in values.items()}
         return {name: each for name, each in known.items() if each}
@@ -265,12 +269,9 @@ class Report:
         return "anytime-valid 95 % CI" if self.anytime else "95 % CI"
 
 
-def succeeded(result: Result) -> bool:
-    """Return whether an episode was a success."""
-    return result.outcome == "success"
-
-
-def pairs_of(together: Iterable[tuple[Result, Result]], happened: Callable[[Result], bool] = succeeded) -> Pairs:
+def pairs_of(
+    together: Iterable[tuple[Result, Result]], happened: Callable[[Result], bool] = attrgetter("success")
+) -> Pairs:
     """Count what happened in pairs of episodes, without those of which one was not completed."""
     counts = Counter((happened(one), happened(two)) for one, two in together if ERROR not in (one.outcome, two.outcome))
     return Pairs(counts[True, True], counts[True, False], counts[False, True], counts[False, False])
@@ -287,7 +288,7 @@ def course_of(together: Sequence[tuple[Result, Result]], anytime: bool) -> dict[
         pairs = [
             (getattr(one.motion, name), getattr(two.motion, name))
             for one, two in together
-            if succeeded(one) and succeeded(two) and one.motion and two.motion
+            if one.success and two.success and one.motion and two.motion
         ]
         known = np.array([pair for pair in pairs if None not in pair], float).reshape(-1, 2)
         if compared := compare_amounts(known[:, 0], known[:, 1], anytime):
@@ -387,7 +388,7 @@ def evaluate(
 def _kept(report: Report, limit: int | None) -> list[Result]:
     """Return the episodes whose recordings are kept: failures first, in the order of their seeds."""
     completed = [result for result in report.results if result.outcome != ERROR]
-    return sorted(completed, key=lambda result: (result.outcome == "success", result.seed))[:limit]
+    return sorted(completed, key=lambda result: (result.success, result.seed))[:limit]
 
 
 def _record(pool: Pool, results: Sequence[Result]) -> None:

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from contextlib import nullcontext
 
 import numpy as np
 
 from vla.spec import Agent, Environment, Episode, InARow, Planner, Recorder, Traceable
+
+EnvironmentFactory = Callable[[], Environment]
+AgentFactory = Callable[[Environment], Agent]
 
 
 def rollout(

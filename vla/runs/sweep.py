@@ -70,6 +70,6 @@ def read_rows(folder: Path) -> list[SweepRow]:
         row.latencies.append(file.latency_ms)
         row.rates.append(run.reports[IN_DISTRIBUTION].success)
         for condition, report in run.reports.items():
-            ended = {result.seed: result.outcome == "success" for result in report.results if result.outcome != ERROR}
+            ended = {result.seed: result.success for result in report.results if result.outcome != ERROR}
             row.played.setdefault(condition, []).append(ended)
     return list(rows.values())

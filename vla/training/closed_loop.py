@@ -81,7 +81,7 @@ class ClosedLoop(Callback):
         for result in results:
             if result.error:
                 log.warning("validation: seed %d could not be played: %s", result.seed, result.error)
-        successes = sum(result.outcome == "success" for result in results)
+        successes = sum(result.success for result in results)
         share = torch.tensor(successes / len(self._seeds), device=pl_module.device)
         pl_module.log("val/success", share, sync_dist=True, reduce_fx="sum")
 

@@ -119,8 +119,7 @@ class LeRobotDataset:
 
     def numbers(self, key: str, rows: slice = slice(None)) -> Array:
         """Return rows of a feature, (N, D) float32."""
-        values: Array = self._matrices[key][rows]
-        return values
+        return self._matrices[key][rows]
 
     def frames(self, number: int, camera: str, size: tuple[int, int], every: int) -> Array:
         """Return every `every`-th image of an episode, (N, H, W, 3) uint8, cropped at the centre and resized to `size`.
@@ -260,8 +259,7 @@ class LeRobotDataset:
         for video in (f"videos/{key}" for key in self._videos):
             columns |= {f"{video}/chunk_index": counts, f"{video}/file_index": counts}
             columns |= {f"{video}/from_timestamp": tables.times}
-        found: list[dict[str, Any]] = self.table("meta/episodes", columns).sort_by("episode_index").to_pylist()
-        return found
+        return self.table("meta/episodes", columns).sort_by("episode_index").to_pylist()
 
     def _read_tasks(self) -> dict[int, str]:
         """Return index → instruction; the name of the column of instructions depends on the writer."""

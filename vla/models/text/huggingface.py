@@ -141,8 +141,7 @@ class SentenceEncoder:
         ids = torch.tensor([self.tokenizer.encode(sentence).ids or [0]])  # (1, L), also for an empty sentence
         output = self.network(input_ids=ids)
         family = _family(self.network.config)
-        vector: Tensor = output[TOWERS[family][1]][0] if family in TOWERS else output.last_hidden_state[0].mean(0)
-        return vector
+        return output[TOWERS[family][1]][0] if family in TOWERS else output.last_hidden_state[0].mean(0)
 
 
 class HuggingFace(TextEncoder):
@@ -198,8 +197,7 @@ class HuggingFace(TextEncoder):
 
     def forward(self, tokens: Tensor) -> Tensor:
         """Project the (B, E) output of `tokenize` to (B, width)."""
-        vector: Tensor = self.projection(tokens)
-        return vector
+        return self.projection(tokens)
 
     def get_extra_state(self) -> dict[str, Any]:
         """Return the frozen encoder as part of the module's state."""

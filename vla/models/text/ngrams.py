@@ -84,8 +84,7 @@ class NGrams(TextEncoder):
         if self.training and self.dropout:
             tokens = tokens * (torch.rand(tokens.shape, device=tokens.device) >= self.dropout)
         count = (tokens != PADDING).sum(1, keepdim=True).clamp(min=1)
-        vector: Tensor = self.norm(self.embedding(tokens).sum(1) / count)
-        return vector
+        return self.norm(self.embedding(tokens).sum(1) / count)
 
 
 def _hashes(sentence: str, vocabulary: int, words: int, characters: int) -> Tensor:

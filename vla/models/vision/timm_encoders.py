@@ -83,8 +83,7 @@ class FilmEfficientNet(ImageEncoder):
         x = self.stem(self.normalize(images))
         for block, film in zip(self.blocks, self.films, strict=True):
             x = film(block(x), text)
-        features: Tensor = self.last_film(self.projection(self.top(x)), text)
-        return features
+        return self.last_film(self.projection(self.top(x)), text)
 
 
 class FilmBackbone(ImageEncoder):
@@ -141,8 +140,7 @@ class FilmBackbone(ImageEncoder):
         (features,) = self.backbone.forward_intermediates(
             self.normalize(x), indices=1, norm=self.normalized, output_fmt="NCHW", intermediates_only=True
         )
-        modulated: Tensor = self.film(self.projection(features), text)
-        return modulated
+        return self.film(self.projection(features), text)
 
 
 def load_backbone(name: str, pretrained: bool | str | PackagedFile, kind: str = "", size: int | None = None) -> Any:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -13,7 +14,7 @@ from vla.spec import Array, Observation, Spec
 from vla.tasks.blind import Blindable
 from vla.tasks.metaworld.package import tasks_of
 from vla.tasks.metaworld.scene import Scene
-from vla.tasks.rendering.renderer import Rendering
+from vla.tasks.rendering.renderer import RendererFactory
 
 CONTROL_HZ = 80.0  # five substeps of 2.5 ms
 REACH = 0.01  # largest displacement of the hand per step, along each axis [m]
@@ -45,7 +46,7 @@ class MetaWorld(Blindable):
         tasks: Literal["mt10", "mt25", "mt50"] | Names,
         sentences: Mapping[str, Text],
         tiers: Mapping[str, Names],
-        renderer: Rendering,
+        renderer: RendererFactory,
         image_size: ImageSize,
         cameras: Names,
         window: Window | None,
@@ -97,7 +98,16 @@ class MetaWorld(Blindable):
             truth=(("object", 3), ("goal", 3)),
         )
         self._sentences, self._steps, self._most = sentences, steps, scenes
-        self._drawing = renderer, self.spec.cameras, self.spec.image_size, window, hand_size, drawn, shadows
+        self._make_scene = partial(
+            Scene,
+            renderer=renderer,
+            cameras=self.spec.cameras,
+            image_size=self.spec.image_size,
+            window=window,
+            hand_size=hand_size,
+            drawn=drawn,
+            shadows=shadows,
+        )
         self._scenes: dict[str, Scene] = {}
         self.done, self.outcome, self.task = True, "timeout", ""
         self.milestones: frozenset[str] = frozenset()
@@ -140,7 +150,7 @@ class MetaWorld(Blindable):
         if task not in self._scenes:
             if len(self._scenes) == self._most:
                 self._scenes.popitem()[1].close()
-            self._scenes[task] = Scene(task, *self._drawing)
+            self._scenes[task] = self._make_scene(task)
         return self._scenes[task]
 
     def _look(self, observation: Array) -> Observation:

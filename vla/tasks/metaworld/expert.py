@@ -26,11 +26,11 @@ class Scripted:
             raise ValueError("expert=metaworld acts in task=metaworld only: choose the expert of this task")
         self.info: dict[str, Any] = {}
         self._names = tasks_of("mt50")
-        self._experts: dict[str, Any] = {}
+        self._expert: Any = None
 
     def reset(self, instruction: str, seed: int) -> None:
-        """Start an episode: the expert of a task is made anew, should it remember anything."""
-        self._experts.clear()
+        """Start an episode: the expert of its task is made anew, should it remember anything."""
+        self._expert = None
 
     def act(self, observation: Observation) -> Array:
         """Return the (4,) float32 action of the expert.
@@ -40,7 +40,6 @@ class Scripted:
         """
         if observation.truth is None:
             raise ValueError("expert=metaworld needs the simulator's truth, which this observation lacks")
-        name = self._names[int(observation.truth["task"][0])]
-        if name not in self._experts:
-            self._experts[name] = expert(name)
-        return action_of(np.asarray(self._experts[name].get_action(observation.truth["observation"])))
+        if self._expert is None:
+            self._expert = expert(self._names[int(observation.truth["task"][0])])
+        return action_of(np.asarray(self._expert.get_action(observation.truth["observation"])))

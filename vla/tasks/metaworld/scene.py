@@ -10,7 +10,7 @@ from PIL import Image
 
 from vla.spec import Array
 from vla.tasks.metaworld.package import simulator
-from vla.tasks.rendering.renderer import WHOLE, Renderer, Rendering, View
+from vla.tasks.rendering.renderer import WHOLE, Renderer, RendererFactory, View
 
 HALF_TURN = np.array([0.0, 0.0, 0.0, 1.0])  # about the optical axis, quaternion wxyz
 # LeRobot (src/lerobot/envs/metaworld.py) moves this camera, which hangs upside down, and turns its pictures.
@@ -26,7 +26,7 @@ class Scene:
     def __init__(
         self,
         task: str,
-        renderer: Rendering,
+        renderer: RendererFactory,
         cameras: Sequence[str],
         image_size: tuple[int, int],
         window: Sequence[float] | None,
@@ -36,7 +36,7 @@ class Scene:
     ) -> None:
         """Args:
         task: name of the task.
-        renderer: renderer of the pictures.
+        renderer: makes the renderer of the pictures.
         cameras: names in the model, or HAND.
         image_size: height and width of the pictures [px].
         window: top, left, bottom and right of what CAMERA shows, as shares of its picture; None: all.
@@ -46,7 +46,7 @@ class Scene:
         shadows: edge of the shadow map [texels]; 0: no shadows.
 
         Raises:
-            ValueError: there is no such task or camera.
+            ValueError: there is no such camera.
         """
         self.simulator = simulator(task)
         model = self.model = self.simulator.model
@@ -71,7 +71,7 @@ class Scene:
         seen = self._places if drawn is None else sorted(set(self._places))  # all of a camera's picture once
         self._view = View(seen, height, width, site_groups=(0, 1, 2), aspect=1.0)
         self._camera = camera
-        self._choice = renderer
+        self._renderers = renderer
         self._renderer: Renderer | None = None
         self._changed = True
 
@@ -96,7 +96,7 @@ class Scene:
     def pictures(self) -> Array:
         """Draw every camera's picture (cameras, H, W, 3) uint8."""
         if self._renderer is None:
-            self._renderer = self._choice.open(self.model, self._view)
+            self._renderer = self._renderers.open(self.model, self._view)
         elif self._changed:
             self._renderer.update()
         self._changed = False

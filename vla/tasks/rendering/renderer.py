@@ -55,8 +55,8 @@ class Renderer(Protocol):
         ...
 
 
-class Rendering(Protocol):
-    """A choice of renderer with its settings, before there is a model."""
+class RendererFactory(Protocol):
+    """Makes renderers of one kind with the same settings."""
 
     def open(self, model: mujoco.MjModel, view: View) -> Renderer:
         """Make a renderer of `model`."""

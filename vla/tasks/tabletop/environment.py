@@ -14,7 +14,7 @@ from vla.io.types import Count, ImageSize, Names, Point, Positive
 from vla.spec import FIRST_SEED, Array, Observation, Shape, Spec
 from vla.tasks.blind import Blindable
 from vla.tasks.gl import require_backend
-from vla.tasks.rendering.renderer import Renderer, Rendering, View
+from vla.tasks.rendering.renderer import Renderer, RendererFactory, View
 from vla.tasks.tabletop.expert import Waypoint
 from vla.tasks.tabletop.goals.chain import Chain
 from vla.tasks.tabletop.goals.goal import Goal
@@ -48,7 +48,7 @@ class Tabletop(Blindable):
         self,
         goal: Goal | Mixed | Chain,
         randomize: Mapping[str, Randomizer | None],
-        renderer: Rendering,
+        renderer: RendererFactory,
         blocks: Count,
         image_size: ImageSize,
         cameras: Names,
@@ -109,8 +109,8 @@ class Tabletop(Blindable):
         self.done, self.outcome, self.task = True, "timeout", ""
         self.milestones: frozenset[str] = frozenset()
         self.draws: dict[str, Any] = {}
-        self._choice = renderer
-        self._rendering: Renderer | None = None
+        self._renderers = renderer
+        self._renderer: Renderer | None = None
         self._changed = True
 
     def reset(self, seed: int) -> Observation:
@@ -209,19 +209,19 @@ class Tabletop(Blindable):
 
     def close(self) -> None:
         """Free physics and GL."""
-        if self._rendering is not None:
-            self._rendering.close()
-            self._rendering = None
+        if self._renderer is not None:
+            self._renderer.close()
+            self._renderer = None
         self.simulation.close()
 
     @property
     def renderer(self) -> Renderer:
         """The renderer, created on first use, because blind environments need no GL."""
-        if self._rendering is None:
+        if self._renderer is None:
             compiled, (height, width) = self.simulation.compiled, self.spec.image_size
             cameras = [compiled.cameras[name] for name in self.spec.cameras]
-            self._rendering = self._choice.open(compiled.model, View(cameras, height, width, geom_groups=(VISIBLE,)))
-        return self._rendering
+            self._renderer = self._renderers.open(compiled.model, View(cameras, height, width, geom_groups=(VISIBLE,)))
+        return self._renderer
 
     def look(self) -> Observation:
         """Return the current observation."""
