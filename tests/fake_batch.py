@@ -69,6 +69,7 @@ def make_bc(
     text: Callable[..., Any] = TINY_TEXT,
     shift: tuple[float, float] = (0, 0),
     spec: Spec = SPEC,
+    execute: int | None = None,
 ) -> BC:
     """A small BC."""
     return BC(
@@ -80,6 +81,7 @@ def make_bc(
         width=64,
         shift=shift,
         auxiliary=auxiliary,
+        execute=execute,
         spec=spec,
         tokenizer=Uniform(spec=spec, **defaults_of("tokenizer/uniform", bins=64)),
     )

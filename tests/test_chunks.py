@@ -10,7 +10,17 @@ import numpy as np
 import pytest
 import torch
 from defaults import defaults_of
-from fake_batch import TINY_IMAGE, TINY_TEXT, as_policy, make_act, make_batch, make_denoising, overfit, with_text
+from fake_batch import (
+    TINY_IMAGE,
+    TINY_TEXT,
+    as_policy,
+    make_act,
+    make_batch,
+    make_bc,
+    make_denoising,
+    overfit,
+    with_text,
+)
 from observing import observations
 from toy import SPEC, ToyEnvironment
 
@@ -18,6 +28,7 @@ from vla.models.act import ACT
 from vla.models.chunk_policy import ChunkModel
 from vla.models.diffusion import Diffusion
 from vla.models.flow import Flow
+from vla.models.one_frame import OneFrameModel
 from vla.models.tokenizers.tokenizer import Uniform
 from vla.rollouts.rollout import rollout
 
@@ -126,8 +137,8 @@ def test_plays_an_episode_that_follows_from_the_seed(make: Callable[..., ChunkMo
     assert np.array_equal(first, again) and not np.array_equal(first, other)
 
 
-@every_model
-def test_looks_again_after_the_actions_that_are_executed(make: Callable[..., ChunkModel]) -> None:
+@pytest.mark.parametrize("make", [*MODELS.values(), make_bc], ids=[*MODELS, "bc"])
+def test_looks_again_after_the_actions_that_are_executed(make: Callable[..., OneFrameModel]) -> None:
     model = make(chunk=4, execute=2)
     policy = as_policy(model)
     looks: list[int] = []

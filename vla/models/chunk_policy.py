@@ -8,36 +8,25 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from vla.io.types import Inherited, Steps
+from vla.io.types import Inherited
 from vla.models.model import Batch, mlp
 from vla.models.one_frame import OneFrameModel
 
 
 class ChunkModel(OneFrameModel):
-    """A model that predicts k continuous actions from one frame, of which a policy executes the first few.
+    """A model that predicts k continuous actions from one frame.
 
     Actions are scaled to -1 … 1 between the bounds of the tokenizer, and are not tokenized.
 
     Context tokens: one fused token, then one per camera, one for the robot state, one for the instruction. The
     auxiliary head uses the features of the fused token.
-
-    Args:
-        execute: number of the k actions that a policy executes before it predicts again.
-
-    Raises:
-        ValueError: `execute` exceeds `chunk`.
     """
 
     TRUTH_INPUT = 2
     uses_tokens = False
 
-    def __init__(self, execute: Steps, **inherited: Inherited) -> None:
+    def __init__(self, **inherited: Inherited) -> None:
         super().__init__(**inherited)
-        if execute > self.chunk:
-            raise ValueError(
-                f"model.execute={execute} is more than the model.chunk={self.chunk} actions that are predicted"
-            )
-        self.execute = execute
         hidden = self.TRUTH_INPUT * self.width
         widths = [*self.image_widths, self.robot_state_width, self.text.width]
         self.tokens = nn.ModuleList(nn.Linear(features, self.width) for features in widths)

@@ -87,7 +87,7 @@ class Model(nn.Module, ABC):
         loss mask, true for a prefix of each chunk; truth: (B, T, S) float32. For generative models optionally noise:
         (B, k, D) float32, standard normal.
 
-    A policy executes the first `execute` of the k actions, by default all of them, before it predicts again.
+    A policy executes the first `execute` of the k actions before it predicts again.
 
     Args:
         text: factory of the text encoder, called with `width`.
@@ -95,8 +95,12 @@ class Model(nn.Module, ABC):
         chunk: k, number of actions predicted for a frame.
         width: hidden width; in a transformer that of a token.
         auxiliary: loss weight of the head that predicts the simulator state, used in training only; 0 omits it.
+        execute: number of the k actions that a policy executes before it predicts again; None: all.
         spec: observation and action spaces.
         tokenizer: converts between actions and tokens, and gives the action bounds.
+
+    Raises:
+        ValueError: `execute` exceeds `chunk`.
     """
 
     history = 1  # T, number of frames in the input
@@ -113,12 +117,15 @@ class Model(nn.Module, ABC):
         chunk: Steps,
         width: Width,
         auxiliary: NonNegative,
+        execute: Steps | None = None,
         *,
         spec: Spec,
         tokenizer: ActionTokenizer,
     ) -> None:
         super().__init__()
-        self.chunk = self.execute = chunk
+        self.chunk, self.execute = chunk, chunk if execute is None else execute
+        if self.execute > chunk:
+            raise ValueError(f"model.execute={execute} is more than the model.chunk={chunk} actions that are predicted")
         self.width, self.auxiliary, self.spec, self.tokenizer = width, auxiliary, spec, tokenizer
         self.text = text(width=text_width)
         chain = spec.robot.chain if spec.robot else ()

@@ -47,6 +47,9 @@ class Network:
         return self.latency + self.jitter * (1.0 if lost else late), lost
 
 
+IDEAL = Network(latency=0.0, jitter=0.0, loss=0.0, ensemble=None)
+
+
 class Schedule:
     """The actions of the chunks so far, by the number of the step at which they are due; steps are executed actions."""
 
@@ -190,10 +193,10 @@ class SimulatedLink:
 class BackgroundLink:
     """A policy that plans in a thread, while control steps follow the clock; late ones are not made up for."""
 
-    def __init__(self, plan: Plan, control_hz: float, network: Network | None = None) -> None:
+    def __init__(self, plan: Plan, control_hz: float, network: Network = IDEAL) -> None:
         """Args: the policy; steps per second [Hz]; a network in front of it whose delays pass by the clock."""
         self._plan, self._period = plan, 1 / control_hz
-        self._network = network or Network(latency=0.0, jitter=0.0, loss=0.0, ensemble=None)
+        self._network = network
         self._thread = ThreadPoolExecutor(1, "policy")
         self._answer: Future[tuple[Array, bool]] | None = None
         self._next = 0.0

@@ -16,7 +16,7 @@ from PIL import Image, ImageOps
 
 from vla.io.array_messages import pack, unpack
 from vla.io.types import Count, Natural, NonNegative, Pixels, Positive, Text
-from vla.rollouts.realtime import BackgroundLink, Network, RealTime, SimulatedLink
+from vla.rollouts.realtime import IDEAL, BackgroundLink, RealTime, SimulatedLink
 from vla.spec import Array, Observation, Spec
 
 if TYPE_CHECKING:
@@ -93,8 +93,7 @@ class RemotePolicy:
             link = BackgroundLink(self.plan, self.spec.control_hz)
             self._open.callback(link.close)
         else:
-            none = Network(latency=0.0, jitter=0.0, loss=0.0, ensemble=None)
-            link = SimulatedLink(self.plan, none, self.spec.control_hz)
+            link = SimulatedLink(self.plan, IDEAL, self.spec.control_hz)
         self._real_time = RealTime(self.spec, link, lambda: self.execute or 1, self.ensemble)
 
     def reset(self, instruction: str, seed: int) -> None:

@@ -12,6 +12,7 @@ import numpy as np
 from vla.spec import Array
 from vla.tasks.rendering import shapes
 from vla.tasks.rendering.elements import Elements
+from vla.tasks.rendering.lights import clip_range
 from vla.tasks.rendering.shapes import Shape
 
 HORIZON = 1.05  # half the extent of an infinite plane over the distance of the far clipping plane, as in MuJoCo
@@ -45,7 +46,7 @@ class Geometry:
     def __init__(self, model: mujoco.MjModel, mesh: Callable[[int], Shape]) -> None:
         """Args: the model; a function from a mesh's id to its shape."""
         self._model, self._mesh = model, mesh
-        self._far = float(model.vis.map.zfar * model.stat.extent)
+        self._far = clip_range(model)[1]
         quality = model.vis.quality
         self._slices, self._stacks = int(quality.numslices), int(quality.numstacks)
         self._sphere, self._box = shapes.sphere(self._slices, self._stacks // 2 * 2), shapes.box()

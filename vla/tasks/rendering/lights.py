@@ -19,7 +19,7 @@ def drawn(model: mujoco.MjModel) -> Array:
 
 
 def rows(model: mujoco.MjModel) -> Array:
-    """Return (1 + lights, ROWS, 4) float32: the headlight, then the drawn lights; `point` sets where they shine."""
+    """Return (1 + lights, ROWS, 4) float32: the headlight, then the drawn lights, not yet in place."""
     lights = drawn(model)
     table = np.zeros((1 + len(lights), ROWS, 4), np.float32)
     head, active = model.vis.headlight, model.light_active[lights, None].astype(bool)

@@ -8,6 +8,7 @@ import mujoco
 import numpy as np
 
 from vla.spec import Array
+from vla.tasks.rendering.lights import clip_range
 from vla.tasks.rendering.renderer import WHOLE, View
 
 
@@ -98,8 +99,7 @@ class ReferenceRenderer:
 
     def _metres(self, reading: Array) -> Array:
         """Convert a reverse-z buffer, 1 at the near plane and 0 at the far one, to depth [m]."""
-        near = float(self._model.vis.map.znear * self._model.stat.extent)
-        far = float(self._model.vis.map.zfar * self._model.stat.extent)
+        near, far = clip_range(self._model)
         depth = near * far / (near + reading * (far - near))
         depth *= reading > 0
         return depth

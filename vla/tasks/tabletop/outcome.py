@@ -12,16 +12,8 @@ REACH = 0.035  # distance between tool point and block centre at which a block i
 PUSH = 0.07  # the same for a block to be pushed from its side [m]
 CLEAR = 0.02  # height above the table at which a held block is lifted [m]
 FALL = 0.05  # height above the table from which losing a block is a drop [m]
-OUTCOMES = (
-    *("success", "never_reached", "missed_grasp", "wrong_object", "dropped", "not_placed", "timeout"),
-    "did_not_stay",
-)
-GRASPED = (
-    "success",
-    "dropped",
-    "not_placed",
-    "timeout",
-)  # outcomes of episodes in which the named block was grasped, or reached if it is to be pushed
+# Outcomes of episodes in which the named block was grasped, or reached if it is to be pushed.
+GRASPED = ("success", "dropped", "not_placed", "timeout")
 
 
 class OutcomeClassifier:
@@ -73,7 +65,7 @@ class OutcomeClassifier:
 
     @property
     def outcome(self) -> str:
-        """One of `OUTCOMES`."""
+        """Success, or the name of the failure so far."""
         if self.success:
             return "success"
         if self._manner == "stay":
