@@ -164,8 +164,10 @@ def test_axes_of_success_end_at_one_and_small_numbers_keep_their_digits(tmp_path
     tick = rf'text-anchor: end[^>]* x="([\d.-]+)"[^>]*>([\d.e{minus}]+)<'
     labels = {title: re.findall(tick, panel) for title, panel in panels.items()}
     ticks = {title: {label.replace(minus, "-") for _, label in found} for title, found in labels.items()}
-    assert {"0.01001", "0.01003"} <= ticks["error gripper"] and {"5e-05", "7e-05"} <= ticks["pace/waiting"]
+    assert {"0.01001", "0.01003"} <= ticks["error gripper"] and {"5e-05", "7e-05"} <= ticks["waiting"]
     assert max(map(float, ticks["success"])) == 1
+    steps = re.findall(r"text-anchor: middle[^>]*>(\d+)<", panels["waiting"])
+    assert steps[0] == "0"  # although the first value is of step 9
     for found in labels.values():
         for right, label in found:  # each begins within the picture: at 9 px a digit is more than 5 wide
             assert float(right) > 5 * len(label), label

@@ -58,7 +58,7 @@ def _bare(name: str) -> str:
 
 def _title(name: str) -> str:
     """Format a metric's name as a title, with the unit of an error in brackets."""
-    return re.sub(r"^(error_.+)_(mm|deg)$", r"\1 [\2]", name).replace("_", " ")
+    return re.sub(r"^(error_.+)_(mm|deg)$", r"\1 [\2]", name).removeprefix("pace/").replace("_", " ")
 
 
 def _family(name: str) -> tuple[str, str]:
@@ -97,6 +97,7 @@ def _draw(title: str, lines: tuple[Line, ...]) -> str:
             axes.yaxis.set_minor_formatter("{x:g}")
         for axis in (axes.xaxis, axes.yaxis):
             axis.set_major_formatter("{x:g}")  # without a common factor, for which there is no room
+        axes.set_xlim(left=0)  # a metric of one step would otherwise have an axis of its surroundings
         if title == "success":
             axes.set_ylim(0, 1)
         if any(label for label, _, _, _ in lines):
