@@ -19,9 +19,11 @@ from tiny_encoder import write_encoder
 
 from vla.config.build import check_node
 from vla.models.text.both import Both
+from vla.models.text.colours import NamedColours, simplified
 from vla.models.text.huggingface import HuggingFace
 from vla.models.text.ngrams import NGrams
 from vla.models.text.tensor_cache import TensorCache
+from vla.tasks.tabletop.scene import COLOURS
 
 SENTENCES = ["Lift the red block", "put the small green block onto the blue pad", ""]
 
@@ -49,6 +51,30 @@ def test_case_and_punctuation_do_not_matter_but_order_does() -> None:
     plain, loud, swapped = encoder.tokenize(["red on blue", "Red on BLUE!", "blue on red"])
     assert torch.equal(plain, loud)
     assert set(plain.tolist()) != set(swapped.tolist())
+
+
+@pytest.mark.parametrize(
+    ("said", "meant"),
+    [
+        ("put the crimson cube on the disc", "put the red cube on the disc"),
+        ("put the navy blue brick on the sky blue pad", "put the blue brick on the blue pad"),
+        ("the jade brick", "the green brick"),
+        ("the brick on the emerald rose", "the red on the green rose"),
+        ("put the red block on the blue block", "put the red block on the blue block"),
+        ("", ""),
+    ],
+)
+def test_names_of_colours_mean_basic_terms(said: str, meant: str) -> None:
+    knowing, plain = (kind(width=8, **defaults_of("model/text/ngrams")) for kind in (NamedColours, NGrams))
+    assert torch.equal(knowing.tokenize([said]), plain.tokenize([meant]))
+    assert (said == meant) == torch.equal(plain.tokenize([said]), plain.tokenize([meant]))
+
+
+def test_every_name_of_a_block_that_training_never_has_means_its_colour() -> None:
+    names = OmegaConf.load(CONF / "task/randomize/phrasing/unheard.yaml").words
+    for colour in COLOURS:
+        for name in names[f"the {colour} block"]:
+            assert colour in simplified(name).split(), name
 
 
 SAID = {"block": "red", "other": "blue", "pad": "black", "rest": "white"}
