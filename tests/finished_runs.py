@@ -8,8 +8,9 @@ from pathlib import Path
 from vla.reports.comparison import compare_runs, read_runs
 from vla.reports.evaluation import write_report
 from vla.reports.html import write_comparison
-from vla.rollouts.evaluate import FIRST_SEED, Report, Result, compare_conditions
+from vla.rollouts.results import Report, Result, compare_conditions
 from vla.runs.folder import save_config
+from vla.spec import FIRST_SEED
 
 SAID = "lift the <script>alert('red')</script> block"
 

@@ -20,8 +20,9 @@ from vla.deploy.settings import Timing, Topics
 from vla.reports.evaluation import summary, write_report
 from vla.reports.filmstrips import read_filmstrips
 from vla.reports.html import write_page
-from vla.rollouts.evaluate import Report, Result, play
+from vla.rollouts.evaluate import play
 from vla.rollouts.recorder import RerunRecorder, recording_name
+from vla.rollouts.results import Report, Result
 from vla.rollouts.rollout import replay, rollout
 from vla.rollouts.statistics import bounded_mean_interval, wilson_interval
 from vla.spec import FIRST_SEED, Array, Observation

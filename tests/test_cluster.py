@@ -28,7 +28,9 @@ from vla.data.episodes import EpisodeStore
 from vla.parallel.dask import DaskCluster
 from vla.parallel.pool import Cluster, LocalCluster
 from vla.rollouts.collect import EnvironmentFactory, collect
-from vla.rollouts.evaluate import FIRST_SEED, Report, evaluate
+from vla.rollouts.evaluate import evaluate
+from vla.rollouts.results import Report
+from vla.spec import FIRST_SEED
 
 HERE = ("--host", "127.0.0.1", "--dashboard-address", "127.0.0.1:0")
 

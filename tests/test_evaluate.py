@@ -13,9 +13,10 @@ from rerun.chunk import RrdReader
 
 from vla.parallel.pool import LocalCluster
 from vla.reports.evaluation import summary
-from vla.rollouts.evaluate import FIRST_SEED, Report, Result, evaluate, keep_recordings
+from vla.rollouts.evaluate import evaluate, keep_recordings
+from vla.rollouts.results import Report, Result
 from vla.rollouts.statistics import wilson_interval
-from vla.spec import Environment, Observation
+from vla.spec import FIRST_SEED, Environment, Observation
 
 SEEDS = range(FIRST_SEED, FIRST_SEED + 10)
 

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from vla.reports.factors import association, factors, groups, in_words
-from vla.rollouts.evaluate import Result
+from vla.rollouts.results import Result
 
 
 @pytest.mark.parametrize(

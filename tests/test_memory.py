@@ -12,10 +12,10 @@ import toy
 from toy_recordable import RecordableEnvironment
 
 from vla.data.episodes import EpisodeStore
-from vla.rollouts.evaluate import FIRST_SEED, evaluate
+from vla.rollouts.evaluate import evaluate
 from vla.rollouts.memory import Impaired, NearestDemonstration, make_impaired
 from vla.rollouts.rollout import rollout
-from vla.spec import Array, Observation
+from vla.spec import FIRST_SEED, Array, Observation
 
 
 class Noting(toy.ToyExpert):

@@ -13,10 +13,11 @@ import toy
 
 from vla.reports.evaluation import write_report
 from vla.reports.html import write_page
-from vla.rollouts.evaluate import FIRST_SEED, Report, compare_conditions, compare_courses, evaluate
+from vla.rollouts.evaluate import evaluate
 from vla.rollouts.motion import Motion, log_dimensionless_jerk, path_length
+from vla.rollouts.results import Report, compare_conditions, compare_courses
 from vla.runs.folder import read_run
-from vla.spec import Array
+from vla.spec import FIRST_SEED, Array
 
 SEEDS = range(FIRST_SEED, FIRST_SEED + 20)
 

@@ -29,9 +29,10 @@ from vla.reports.dataset_card import store_table, write_card
 from vla.reports.evaluation import contact_sheet, plot_report, write_report
 from vla.reports.html import write_page
 from vla.reports.sweep import tabulate
-from vla.rollouts.evaluate import FIRST_SEED, evaluate, keep_recordings
+from vla.rollouts.evaluate import evaluate, keep_recordings
 from vla.rollouts.recorder import RerunRecorder
 from vla.runs.folder import save_config
+from vla.spec import FIRST_SEED
 
 TINY = {
     "bc": ("model.width=16", "model.text_width=8", "model.keypoints=4"),

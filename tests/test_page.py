@@ -26,11 +26,13 @@ from vla.reports.html import optional, write_page
 from vla.reports.posteriors import compact_letters
 from vla.reports.sweep import tabulate
 from vla.reports.training_curves import draw_run, draw_runs
-from vla.rollouts.evaluate import FIRST_SEED, Report, Result, keep_recordings
+from vla.rollouts.evaluate import keep_recordings
 from vla.rollouts.recorder import RerunRecorder
+from vla.rollouts.results import Report, Result
 from vla.rollouts.rollout import rollout
 from vla.rollouts.statistics import pooled_interval
 from vla.runs.folder import read_run, save_config, save_training
+from vla.spec import FIRST_SEED
 
 SEEN = [FIRST_SEED, FIRST_SEED + 1, FIRST_SEED + 3]  # the toy world fails at the last
 

@@ -16,8 +16,9 @@ from toy_recordable import make_environment
 
 from vla.reports.evaluation import contact_sheet, draws_table, plot_report, write_report
 from vla.reports.factors import factors
-from vla.rollouts.evaluate import FIRST_SEED, Report, Result
+from vla.rollouts.results import Report, Result
 from vla.rollouts.statistics import wilson_interval
+from vla.spec import FIRST_SEED
 
 
 def a_report(episodes: int = 60) -> Report:

@@ -15,7 +15,7 @@ from composing import composed
 from vla.config.adopt import resume
 from vla.config.experiment import plain
 from vla.reports.evaluation import write_report
-from vla.rollouts.evaluate import Report, Result
+from vla.rollouts.results import Report, Result
 from vla.runs.folder import save_choice, save_training
 from vla.runs.resume import FOUND, TrainingProgress, cached_success, interrupted_run, training_progress
 

@@ -11,7 +11,8 @@ from scipy.special import betaln
 
 from vla.parallel.pool import LocalCluster
 from vla.rollouts.comparison import Pairs, compare_pairs
-from vla.rollouts.evaluate import FIRST_SEED, Report, Result, evaluate, keep_recordings
+from vla.rollouts.evaluate import evaluate, keep_recordings
+from vla.rollouts.results import Report, Result
 from vla.rollouts.sequential import (
     anytime_difference,
     anytime_interval,
@@ -22,6 +23,7 @@ from vla.rollouts.sequential import (
 )
 from vla.rollouts.statements import AgainstBar, AgainstRun
 from vla.rollouts.statistics import wilson_interval
+from vla.spec import FIRST_SEED
 
 SEEDS = range(FIRST_SEED, FIRST_SEED + 60)
 

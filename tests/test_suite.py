@@ -12,7 +12,8 @@ from PIL import Image
 from rich.console import Console
 
 from vla.reports.conditions import conditions_table, plot_conditions
-from vla.rollouts.evaluate import FIRST_SEED, Report, Result, compare_conditions
+from vla.rollouts.results import Report, Result, compare_conditions
+from vla.spec import FIRST_SEED
 
 
 def a_report(outcomes: str) -> Report:

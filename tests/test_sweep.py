@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from vla.reports.evaluation import write_report
 from vla.reports.sweep import tabulate
 from vla.reports.sweep_plot import pareto, validated
-from vla.rollouts.evaluate import Report, Result
+from vla.rollouts.results import Report, Result
 from vla.rollouts.statistics import pooled_interval
 
 

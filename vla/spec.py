@@ -447,7 +447,7 @@ class Deployment(Protocol):
     """
 
     def run(self) -> Any:
-        """Run until finished or interrupted; returns a `vla.rollouts.evaluate.Report` if success was measured."""
+        """Run until finished or interrupted; returns a `vla.rollouts.results.Report` if success was measured."""
         ...
 
 

@@ -24,8 +24,8 @@ from std_srvs.srv import Trigger
 from vla.deploy.settings import PolicySettings
 from vla.io.documents import STRICT, parse_json
 from vla.io.types import Seed
-from vla.rollouts.evaluate import Result
 from vla.rollouts.motion import Motion
+from vla.rollouts.results import Result
 from vla.spec import LONGEST_INSTRUCTION, Name
 
 log = logging.getLogger(__name__)

@@ -16,7 +16,7 @@ from vla.deploy.ros2 import PolicyDeployment, SimulatorDeployment
 from vla.deploy.topic_listener import TopicListener
 from vla.io.types import Count
 from vla.parallel.processes import without_triton
-from vla.rollouts.evaluate import Report, Result
+from vla.rollouts.results import Report, Result
 from vla.spec import Shell
 
 if TYPE_CHECKING:

@@ -23,16 +23,10 @@ from vla.policy import latency
 from vla.reports.conditions import Courses, conditions_table, course_table, plot_conditions
 from vla.reports.evaluation import plot_report, write_report
 from vla.reports.html import PAGE, RECORDING, optional, write_page
-from vla.rollouts.evaluate import (
-    IN_DISTRIBUTION,
-    Report,
-    compare_conditions,
-    compare_courses,
-    evaluate,
-    keep_recordings,
-)
+from vla.rollouts.evaluate import evaluate, keep_recordings
 from vla.rollouts.memory import make_impaired
 from vla.rollouts.realtime import Network, make_distant
+from vla.rollouts.results import IN_DISTRIBUTION, Report, compare_conditions, compare_courses
 from vla.rollouts.rollout import AgentFactory
 from vla.rollouts.statements import AgainstBar, AgainstCondition, AgainstRun, Statement
 from vla.runs.files import Round

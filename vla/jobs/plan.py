@@ -14,7 +14,6 @@ from vla.config.check import Job
 from vla.config.experiment import Experiment
 from vla.io.types import Share, Text
 from vla.reports.comparison import compare_runs, read_runs
-from vla.rollouts.evaluate import IN_DISTRIBUTION
 from vla.rollouts.planning import (
     MOST,
     SIMULATIONS,
@@ -25,6 +24,7 @@ from vla.rollouts.planning import (
     power_of_samples,
     stopping,
 )
+from vla.rollouts.results import IN_DISTRIBUTION
 
 Between = Annotated[float, Gt(0), Lt(1)]
 

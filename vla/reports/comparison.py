@@ -13,15 +13,7 @@ from rich.table import Table
 from vla.config.differences import at
 from vla.reports.conditions import COMPARED, NARROW, Courses, short_texts
 from vla.rollouts.comparison import Comparison, compare_pairs, compare_samples, concluded
-from vla.rollouts.evaluate import (
-    ERROR,
-    IN_DISTRIBUTION,
-    Report,
-    Result,
-    concluded_courses,
-    course_of,
-    pairs_of,
-)
+from vla.rollouts.results import ERROR, IN_DISTRIBUTION, Report, Result, concluded_courses, course_of, pairs_of
 from vla.runs.folder import Run, require_run
 
 CASE = ("second run", "minus first", "condition")  # heads of what was compared

@@ -13,8 +13,8 @@ from rich.table import Table
 
 from vla.reports.style import BLUE, GREEN, GREY, RED, error_bars, save
 from vla.rollouts.comparison import Comparison
-from vla.rollouts.evaluate import Report
 from vla.rollouts.motion import AMOUNTS
+from vla.rollouts.results import Report
 from vla.rollouts.sequential import LEVEL
 
 # Suffix of a condition's name → colour, and vertical offset within the row.

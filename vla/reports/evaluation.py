@@ -20,7 +20,7 @@ from vla.io.files import write_text
 from vla.reports.factors import association, factors, groups, numeric
 from vla.reports.style import GREEN, GREY, RED, error_bars, save
 from vla.rollouts.comparison import Comparison
-from vla.rollouts.evaluate import ERROR, Report, Result
+from vla.rollouts.results import ERROR, Report, Result
 from vla.rollouts.statistics import wilson_interval
 from vla.spec import Array, Observation
 

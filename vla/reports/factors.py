@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from vla.data.draws import flat
-from vla.rollouts.evaluate import Result
+from vla.rollouts.results import Result
 
 BINS = 5  # quantile groups of a numeric factor
 GROUPS = 8  # maximum number of groups in a factor's panel

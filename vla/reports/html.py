@@ -25,8 +25,8 @@ from vla.reports.conditions import Courses, comparison_texts, course_head, cours
 from vla.reports.posteriors import draw_posteriors
 from vla.reports.style import BLUE, GREEN, GREY, RED, Interval
 from vla.reports.training_curves import colours, draw_run, draw_runs
-from vla.rollouts.evaluate import IN_DISTRIBUTION, Report
 from vla.rollouts.motion import AMOUNTS
+from vla.rollouts.results import IN_DISTRIBUTION, Report
 from vla.runs.folder import Run, read_run
 
 log = logging.getLogger(__name__)

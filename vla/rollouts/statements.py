@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 from vla.rollouts.comparison import Comparison, compare_pairs
-from vla.rollouts.evaluate import Report, Result, pairs_of
+from vla.rollouts.results import Report, Result, pairs_of
 from vla.rollouts.sequential import is_beside, is_settled
 
 

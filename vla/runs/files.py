@@ -13,8 +13,8 @@ from pydantic import ConfigDict, StringConstraints
 from vla.io.documents import STRICT
 from vla.io.types import Count, Natural, NonNegative, Positive, Share
 from vla.rollouts.comparison import Comparison
-from vla.rollouts.evaluate import IN_DISTRIBUTION, Report, Result
 from vla.rollouts.motion import Motion
+from vla.rollouts.results import IN_DISTRIBUTION, Report, Result
 from vla.spec import READABLE
 
 Node = dict[str, Any]

@@ -16,7 +16,7 @@ from filelock import FileLock, Timeout
 from vla.config.adopt import require_identity
 from vla.config.differences import differences
 from vla.models.checkpoint import read_header
-from vla.rollouts.evaluate import IN_DISTRIBUTION
+from vla.rollouts.results import IN_DISTRIBUTION
 from vla.runs.folder import CHECKPOINTS, ERRORS, LAST, REPORT, chosen_checkpoint, read_report
 
 log = logging.getLogger(__name__)

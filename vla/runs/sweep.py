@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from vla.rollouts.evaluate import ERROR, IN_DISTRIBUTION
+from vla.rollouts.results import ERROR, IN_DISTRIBUTION
 from vla.rollouts.statistics import pooled_interval
 from vla.runs.cells import FAILURE, cells, overrides_of, varied_keys
 from vla.runs.folder import REPORT, read_run

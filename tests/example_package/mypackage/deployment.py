@@ -7,7 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from vla.io.types import Count
-from vla.rollouts.evaluate import Report, play
+from vla.rollouts.evaluate import play
+from vla.rollouts.results import Report
 from vla.spec import FIRST_SEED, Agent, Environment
 
 
