@@ -46,7 +46,7 @@ def in_basic_terms(words: Sequence[str]) -> list[str]:
     while start < len(words):
         ahead = [" ".join(words[start : start + length]) for length in range(longest, 0, -1)]
         name = next((name for name in ahead if name in known), None)
-        replaced = name is not None and not replaced  # nor the next one, then
+        replaced = name is not None and not replaced  # a name after a name is a thing
         found.append(known[name] if name and replaced else words[start])
         start += len(name.split()) if name and replaced else 1
     return found
