@@ -17,6 +17,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 from urllib.error import HTTPError
+from urllib.parse import urlsplit
 from urllib.request import urlopen
 
 import msgpack
@@ -65,6 +66,16 @@ def settings(policy: Policy, **changes: Any) -> PolicyServer:
 def serving(policy: Policy, **changes: Any) -> AbstractContextManager[str]:
     """A server in a thread of its own, by its URL."""
     return Service(settings(policy, **changes), policy).in_thread()
+
+
+def certified(folder: Path) -> dict[str, str]:
+    """Options of a server with a certificate for this machine, and its authority's in authority.pem."""
+    authority = trustme.CA()
+    certificate = authority.issue_cert("127.0.0.1")
+    certificate.cert_chain_pems[0].write_to_path(folder / "certificate.pem")
+    certificate.private_key_pem.write_to_path(folder / "key.pem")
+    authority.cert_pem.write_to_path(folder / "authority.pem")
+    return {"certificate": str(folder / "certificate.pem"), "private_key": str(folder / "key.pem")}
 
 
 def client(url: str, **options: Any) -> ClientConnection:
@@ -354,13 +365,8 @@ def test_only_so_many_come_in_and_only_with_the_key() -> None:
 
 
 def test_with_a_certificate_only_clients_of_tls_are_served(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    authority, policy, observation = trustme.CA(), as_policy(make_bc()), observations(1)[0]
-    certificate = authority.issue_cert("127.0.0.1")
-    certificate.cert_chain_pems[0].write_to_path(tmp_path / "certificate.pem")
-    certificate.private_key_pem.write_to_path(tmp_path / "key.pem")
-    authority.cert_pem.write_to_path(tmp_path / "authority.pem")
-    files = {"certificate": str(tmp_path / "certificate.pem"), "private_key": str(tmp_path / "key.pem")}
-    expected = policy.session().plan(observation)
+    policy, observation = as_policy(make_bc()), observations(1)[0]
+    files, expected = certified(tmp_path), policy.session().plan(observation)
     with serving(policy, **files) as url:
         assert url.startswith("wss://")
         with pytest.raises(ssl.SSLCertVerificationError), client(url):
@@ -372,6 +378,30 @@ def test_with_a_certificate_only_clients_of_tls_are_served(tmp_path: Path, monke
         agent.reset(observation.instruction, 0)
         np.testing.assert_array_equal(agent.act(observation), expected[0])
         agent.close()
+
+
+def test_tls_sends_no_session_tickets(tmp_path: Path) -> None:
+    """A client that reads in a second thread loses its request if a ticket arrives while it is sent."""
+    files = certified(tmp_path)
+    context = ssl.create_default_context(cafile=str(tmp_path / "authority.pem"))
+    with serving(as_policy(make_bc()), **files) as url:
+        address = urlsplit(url)
+        with (
+            socket.create_connection((address.hostname, address.port)) as plain,
+            context.wrap_socket(plain, server_hostname=address.hostname) as connection,
+        ):
+            connection.sendall(b"GET /healthz HTTP/1.1\r\nHost: here\r\n\r\n")
+            assert connection.recv(4096).startswith(b"HTTP/1.1 200")
+            session = connection.session
+            assert connection.version() == "TLSv1.3" and session is not None and not session.has_ticket
+
+
+def test_an_agent_that_finds_nobody_leaves_no_thread() -> None:
+    with serving(as_policy(make_bc()), api_key="open") as url:
+        before = threading.active_count()
+        with pytest.raises(ValueError, match="API key"):
+            remote(url)
+        assert threading.active_count() == before
 
 
 def test_of_many_that_come_at_once_only_so_many_stay() -> None:

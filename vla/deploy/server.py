@@ -176,6 +176,8 @@ class Service:
         if settings.certificate is not None:
             context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
             context.load_cert_chain(settings.certificate, settings.private_key)
+            # Clients with threads, such as openpi's, lose a request in twenty beside the tickets of TLS 1.3.
+            context.num_tickets = 0
         limits = {"compression": None, "max_size": settings.largest_message, "max_queue": 1}
         request = {"process_request": self._answer_request, "create_connection": _connection(), "ssl": context}
         with ThreadPoolExecutor(1, "inference") as thread:

@@ -5,11 +5,13 @@
 
 from __future__ import annotations
 
+import asyncio
+import threading
 import time
-from collections.abc import Mapping, Sequence
-from contextlib import ExitStack
+from collections.abc import Coroutine, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 from PIL import Image, ImageOps
@@ -20,7 +22,27 @@ from vla.rollouts.realtime import IDEAL, BackgroundLink, RealTime, SimulatedLink
 from vla.spec import Array, Observation, Spec
 
 if TYPE_CHECKING:
-    from websockets.sync.client import ClientConnection
+    from websockets.asyncio.client import ClientConnection
+
+
+Result = TypeVar("Result")
+
+
+@contextmanager
+def event_loop() -> Iterator[asyncio.AbstractEventLoop]:
+    """Run an event loop in a thread of its own within the context.
+
+    The connection lives there, as Python's TLS socket loses messages when two threads read and write at a time.
+    """
+    with asyncio.Runner() as runner:
+        loop = runner.get_loop()
+        thread = threading.Thread(target=loop.run_forever, name="connection", daemon=True)
+        thread.start()
+        try:
+            yield loop
+        finally:
+            loop.call_soon_threadsafe(loop.stop)
+            thread.join()
 
 
 @dataclass(frozen=True)
@@ -83,8 +105,10 @@ class RemotePolicy:
             raise ValueError(f"agent.actions must map {', '.join(self.spec.action)}, got {', '.join(self.actions)}")
         self.info: dict[str, Any] = {}
         self._low, self._high = np.array(self.spec.low, np.float32), np.array(self.spec.high, np.float32)
-        self._open = ExitStack()
-        self._connection, self.metadata = self._connected()
+        with ExitStack() as opened:
+            self._loop = opened.enter_context(event_loop())
+            self._connection, self.metadata = self._connected(opened)
+            self._open = opened.pop_all()
         told, history = (self.metadata.get(name) for name in ("execute", "history"))
         told = told if isinstance(told, int) and told >= 1 else None
         # A policy with a history wants to see every frame.
@@ -150,10 +174,10 @@ class RemotePolicy:
             raise self._error("an action is not finite")
         return np.clip(mine.astype(np.float32), self._low, self._high)
 
-    def _connected(self) -> tuple[ClientConnection, dict[str, Any]]:
+    def _connected(self, opened: ExitStack) -> tuple[ClientConnection, dict[str, Any]]:
         try:
+            from websockets.asyncio.client import connect
             from websockets.exceptions import InvalidStatus, WebSocketException
-            from websockets.sync.client import connect
         except ImportError as error:
             raise ValueError(
                 "agent=remote needs websockets: install this package with its extra server, as in "
@@ -161,11 +185,14 @@ class RemotePolicy:
             ) from error
         times = {"open_timeout": self.timeout, "close_timeout": self.timeout}
         headers = {"Authorization": f"Api-Key {self.api_key}"} if self.api_key else None
+
+        async def connected() -> ClientConnection:
+            return await connect(self.url, compression=None, max_size=2**26, additional_headers=headers, **times)
+
         try:
-            connection = self._open.enter_context(
-                connect(self.url, compression=None, max_size=2**26, additional_headers=headers, **times)
-            )
-            metadata = self._received(connection)
+            connection = self._wait(connected())
+            opened.callback(lambda: self._wait(connection.close()))
+            metadata = self._wait(self._received(connection))
         except InvalidStatus as error:
             said = bytes(error.response.body or b"").decode(errors="replace").strip()[:200]
             raise self._error(
@@ -178,16 +205,23 @@ class RemotePolicy:
     def _ask(self, message: Mapping[str, Any]) -> dict[str, Any]:
         from websockets.exceptions import ConnectionClosed
 
+        async def answered() -> dict[str, Any]:
+            await self._connection.send(pack(message))
+            return await self._received(self._connection)
+
         try:
-            self._connection.send(pack(message))
-            return self._received(self._connection)
+            return self._wait(answered())
         except ConnectionClosed as error:
             raise self._error("it closed the connection") from error
         except TimeoutError as error:
             raise self._error(f"no answer within {self.timeout:g} s") from error
 
-    def _received(self, connection: ClientConnection) -> dict[str, Any]:
-        data = connection.recv(timeout=self.timeout)
+    def _wait(self, work: Coroutine[Any, Any, Result]) -> Result:
+        return asyncio.run_coroutine_threadsafe(work, self._loop).result()
+
+    async def _received(self, connection: ClientConnection) -> dict[str, Any]:
+        async with asyncio.timeout(self.timeout):
+            data = await connection.recv()
         if isinstance(data, str):
             raise self._error(data.strip().splitlines()[-1][:500] if data.strip() else "an empty error")
         answer = unpack(data)
