@@ -99,7 +99,7 @@ def film(run: Path, picture: Path) -> None:
 
 def fifty_tasks(picture: Path) -> None:
     """Save the first picture of every task of Meta-World, ten in a row, as WebP."""
-    options = {"image_size": (120, 120), "scenes": 1, "window": (0.1, 0.14, 1.0, 1.0), "renderer.samples": 4}
+    options = {"image_size": (120, 120), "window": (0.1, 0.14, 1.0, 1.0), "renderer.samples": 4}
     environment: Any = make_environment(compose_task("metaworld", **options))
     tasks = sorted(range(len(environment.tasks)), key=lambda seed: environment.tasks[seed])
     images = [environment.reset(seed).rgb["corner2"] for seed in tasks]

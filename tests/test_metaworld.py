@@ -9,6 +9,7 @@ from collections import Counter
 from pathlib import Path
 
 import numpy as np
+import psutil
 import pytest
 from command_line import here
 from composing import composed
@@ -61,7 +62,21 @@ def test_a_seed_is_the_same_episode_whatever_came_before() -> None:
     before = [played(environment, seed, 12) for seed in (3, 4, 5)]
     assert not same(before[0], played(environment, 6, 12))  # the same task at another place
     assert all(same(before[seed - 3], played(environment, seed, 12)) for seed in (5, 4, 3))
-    assert same(before[1], played(world("task.tasks=[coffee-push,door-open,stick-pull]", "task.scenes=1"), 4, 12))
+    environment.close()
+
+
+def test_tasks_are_compiled_again_where_memory_is_scarce(monkeypatch: pytest.MonkeyPatch) -> None:
+    compiled: list[str] = []
+    environment = world("task.tasks=[coffee-push,door-open,stick-pull]")
+    make = environment._make_scene
+    monkeypatch.setattr(environment, "_make_scene", lambda task: compiled.append(task) or make(task))
+    before = [played(environment, seed, 12) for seed in (3, 4, 5, 3)]
+    assert compiled == ["coffee-push", "door-open", "stick-pull"]
+    scarce = psutil.virtual_memory()._replace(available=0)
+    monkeypatch.setattr(psutil, "virtual_memory", lambda: scarce)
+    environment.close()
+    assert all(same(before[seed - 3], played(environment, seed, 12)) for seed in (3, 4, 3, 4, 5))
+    assert compiled[3:] == ["coffee-push", "door-open", "coffee-push", "door-open", "stick-pull"]
     environment.close()
 
 

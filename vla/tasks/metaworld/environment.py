@@ -7,9 +7,10 @@ from functools import partial
 from typing import Annotated, Any, Literal
 
 import numpy as np
+import psutil
 from annotated_types import Ge, Gt, Le, Predicate
 
-from vla.io.types import Count, ImageSize, Names, Natural, Share, Text
+from vla.io.types import ImageSize, Names, Natural, Share, Text
 from vla.spec import Array, Observation, Spec
 from vla.tasks.blind import Blindable
 from vla.tasks.metaworld.package import tasks_of
@@ -19,6 +20,7 @@ from vla.tasks.rendering.renderer import RendererFactory
 CONTROL_HZ = 80.0  # five substeps of 2.5 ms
 REACH = 0.01  # largest displacement of the hand per step, along each axis [m]
 STATE = ("hand_x", "hand_y", "hand_z", "opening")  # the first four numbers of an observation
+FREE = 0.25  # share of the machine's memory that scenes leave free
 MOST_STEPS = 500  # of an episode, after which Meta-World refuses to go on
 # Of the simulator's observation (39,).
 OBJECT, GOAL = slice(4, 7), slice(36, 39)
@@ -54,7 +56,6 @@ class MetaWorld(Blindable):
         drawn: Annotated[int, Ge(16), Le(4096)] | None,
         shadows: Natural,
         steps: Annotated[int, Ge(1), Le(MOST_STEPS)],
-        scenes: Count,
     ) -> None:
         """Compile nothing yet.
 
@@ -73,7 +74,6 @@ class MetaWorld(Blindable):
                 to `image_size` [px]. None: images are drawn in their own size.
             shadows: edge of the shadow map [texels]; 0: no shadows.
             steps: largest number of steps of an episode.
-            scenes: largest number of compiled tasks that are kept, each with some 80 MB.
 
         Raises:
             ValueError: `metaworld` is not installed, or a task is unknown or has no sentence.
@@ -97,7 +97,7 @@ class MetaWorld(Blindable):
             control_hz=CONTROL_HZ,
             truth=(("object", 3), ("goal", 3)),
         )
-        self._sentences, self._steps, self._most = sentences, steps, scenes
+        self._sentences, self._steps = sentences, steps
         self._make_scene = partial(
             Scene,
             renderer=renderer,
@@ -143,12 +143,13 @@ class MetaWorld(Blindable):
             self._scenes.popitem()[1].close()
 
     def _scene_of(self, task: str) -> Scene:
-        """Return the scene of a task; where there are too many, replace the newest.
+        """Return the scene of a task; where memory is scarce, replace the newest.
 
-        Tasks take turns, so the oldest ones are needed first.
+        A scene takes a quarter of a second and some 80 MB. Tasks take turns, so the oldest ones are needed first.
         """
         if task not in self._scenes:
-            if len(self._scenes) == self._most:
+            memory = psutil.virtual_memory()
+            if self._scenes and memory.available < FREE * memory.total:
                 self._scenes.popitem()[1].close()
             self._scenes[task] = self._make_scene(task)
         return self._scenes[task]
