@@ -16,7 +16,9 @@ import numpy as np
 import pytest
 import toy
 from collecting import EPISODES, TRIED, content, lines
+from composing import composed
 
+from vla.config.experiment import Experiment
 from vla.data.episodes import EpisodeStore
 from vla.data.index import NOT_NEEDED
 from vla.data.verification import verify_store
@@ -25,12 +27,13 @@ from vla.rollouts.collect import (
     COLLECTION_TIME,
     NOT_REPEATABLE,
     PATIENCE,
+    DemonstrationWorker,
     Summary,
     collect,
     collection_time,
 )
-from vla.rollouts.rollout import AgentFactory, EnvironmentFactory
-from vla.spec import FIRST_SEED
+from vla.rollouts.rollout import AgentFactory, EnvironmentFactory, rollout
+from vla.spec import FIRST_SEED, Episode, Observation
 
 SCRIPT = """
 import sys, toy
@@ -241,6 +244,48 @@ def test_a_success_that_cannot_be_replayed_is_a_failure(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=NOT_REPEATABLE):
         gather(tmp_path, make_environment=toy.make_forgetful_environment)
     assert EpisodeStore(tmp_path).episodes == []
+
+
+def test_an_expert_that_does_not_look_leaves_the_same_demonstrations_from_fewer_images() -> None:
+    class Counting(toy.ToyEnvironment):
+        drawn = 0
+
+        def _look(self) -> Observation:
+            self.drawn += not self._blind
+            return super()._look()
+
+    class Seeing(toy.ToyExpert):
+        looks = True
+
+    environments = Counting(), Counting()
+    blind = DemonstrationWorker(lambda: environments[0], lambda _: toy.ToyExpert())
+    seeing = DemonstrationWorker(lambda: environments[1], lambda _: Seeing())
+    for seed in (1, 3):  # a success and a failure
+        one, other = blind.attempt(seed), seeing.attempt(seed)
+        assert one.outcome == other.outcome and np.array_equal(one.actions, other.actions)
+        assert same_images(one, other)
+        counts = [environment.drawn for environment in environments]
+    steps = len(blind.attempt(1).observations)
+    assert counts == [1 + steps + 1 + 1, steps + 1 + 41]  # every reset draws one image
+
+
+@pytest.mark.parametrize("world", [("task/randomize=wide",), ("task=metaworld", "task.tasks=[push]")], ids=" ".join)
+def test_images_drawn_in_the_replay_are_those_of_the_rollout(world: tuple[str, ...]) -> None:
+    experiment = Experiment.of(composed(*world, "task.image_size=[48,64]"))
+    worker = DemonstrationWorker(experiment.make_environment(), experiment.make_expert())
+    seed, episode = next((seed, found) for seed in range(20) if (found := worker.attempt(seed)).success)
+    environment = experiment.make_environment()()
+    assert same_images(episode, rollout(environment, experiment.make_expert()(environment), seed))
+    environment.close()
+    worker.close()
+
+
+def same_images(one: Episode, other: Episode) -> bool:
+    """Whether the episodes have the same images, all of them."""
+    return all(
+        a.rgb.keys() == b.rgb.keys() and a.rgb and all(np.array_equal(a.rgb[name], b.rgb[name]) for name in a.rgb)
+        for a, b in zip(one.observations, other.observations, strict=True)
+    )
 
 
 @pytest.mark.parametrize("episodes", [1, 3])

@@ -151,6 +151,7 @@ class ToyInTurn(ToyEnvironment):
 class ToyExpert:
     """Walks to the target with a little noise; what it means to do is in `info["clean"]`."""
 
+    looks = False
     memoryless = True
 
     def __init__(self, noise: float = 0.005, lost: bool = False) -> None:

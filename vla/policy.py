@@ -87,7 +87,7 @@ class Policy:
             ValueError: the observation does not match the spec.
         """
         self._follow(observation.instruction)
-        if not self.planned:
+        if self.looks:
             self._observe(observation)
         if not self._chunk:
             actions, probabilities = self._predict()
@@ -97,9 +97,9 @@ class Policy:
         return action
 
     @property
-    def planned(self) -> bool:
-        """Whether the next action is chosen already, and its observation is not part of a history."""
-        return bool(self._chunk) and self.model.history == 1
+    def looks(self) -> bool:
+        """Whether the next action is not chosen yet, or its observation is part of a history."""
+        return not self._chunk or self.model.history > 1
 
     def plan(self, observation: Observation) -> Array:
         """Return a chunk of actions, (k, D) float32, clipped to the spec; the caller executes the first `execute`.

@@ -388,12 +388,15 @@ class Agent(Protocol):
 
 
 @runtime_checkable
-class Planner(Agent, Protocol):
-    """Agent that executes several actions of a plan before it looks again."""
+class Looking(Agent, Protocol):
+    """Agent that says when it looks at images, so that others need not be drawn."""
 
     @property
-    def planned(self) -> bool:
-        """Whether the next action is chosen already, whatever the images show; a new instruction discards it."""
+    def looks(self) -> bool:
+        """Whether the next action may depend on the images.
+
+        Not while a plan is executed, until a new instruction discards it; never for an expert on the simulator's truth.
+        """
         ...
 
 

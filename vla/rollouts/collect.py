@@ -11,7 +11,7 @@ import logging
 import time
 from collections import Counter, deque
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
+from contextlib import nullcontext, suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -28,7 +28,7 @@ from vla.io.files import write_text
 from vla.parallel.pool import Cluster, Future, Pool, WorkersLost
 from vla.parallel.processes import WorkerFactory
 from vla.rollouts.rollout import AgentFactory, EnvironmentFactory, replay, rollout
-from vla.spec import FIRST_SEED, Environment, Episode, Multitask
+from vla.spec import FIRST_SEED, Episode, Multitask
 
 log = logging.getLogger(__name__)
 
@@ -256,18 +256,21 @@ class DemonstrationWorker:
         self._expert = make_expert(self._environment)
 
     def attempt(self, seed: int) -> Episode:
-        """Roll out one seed and replay it if it succeeds; failures that are not kept lose their observations."""
-        episode = rollout(self._environment, self._expert, seed)
-        if episode.success and not _is_reproducible(self._environment, episode):
-            episode.outcome = NOT_REPEATABLE
+        """Roll out one seed, and verify a success by a replay, which must go through the same states, bit for bit.
+
+        Images that the expert does not look at are drawn in the replay; failures that are not kept never need them.
+        """
+        episode = rollout(self._environment, self._expert, seed, all_images=self._keep_failures)
+        if episode.success:
+            complete = all(observation.rgb for observation in episode.observations)
+            with self._environment.blind() if complete else nullcontext():
+                again = replay(self._environment, episode)
+            if again.differs is not None:
+                episode.outcome = NOT_REPEATABLE
+            elif not complete:
+                episode.observations = again.observations
         return episode if episode.success or self._keep_failures else replace(episode, observations=[])
 
     def close(self) -> None:
         """Close the environment."""
         self._environment.close()
-
-
-def _is_reproducible(environment: Environment, episode: Episode) -> bool:
-    """Return whether the executed actions reproduce the states, bit for bit, and the success."""
-    with environment.blind():
-        return replay(environment, episode) is None

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import nullcontext
+from typing import NamedTuple
 
 import numpy as np
 
-from vla.spec import Agent, Environment, Episode, InARow, Planner, Recorder, Traceable
+from vla.spec import Agent, Environment, Episode, InARow, Looking, Observation, Recorder, Traceable
 
 EnvironmentFactory = Callable[[], Environment]
 AgentFactory = Callable[[Environment], Agent]
@@ -18,8 +19,8 @@ def rollout(
 ) -> Episode:
     """Run the episode of `seed` to its end.
 
-    Without `all_images` its observations lack those that the agent does not look at. If the instruction changes, which
-    makes it look, the episode starts again with all of them.
+    Without `all_images` its observations lack those that the agent does not look at. If a new instruction makes it look
+    at one of them, the episode starts again with all.
 
     The label for imitation is `agent.info["clean"]` if present, else the executed action. What the agent drew,
     `agent.info["draws"]`, is added to the draws of the environment. A new instruction resets the agent.
@@ -37,9 +38,9 @@ def rollout(
     blind = False
     while not environment.done:
         if observations and observation.instruction != observations[-1].instruction:
-            if blind:
-                return rollout(environment, agent, seed, recorder)
             agent.reset(observation.instruction, seed)
+            if blind and isinstance(agent, Looking) and agent.looks:
+                return rollout(environment, agent, seed, recorder)
         action = np.asarray(agent.act(observation), dtype=np.float32)
         if action.shape != (components,) or not np.isfinite(action).all():
             raise ValueError(f"{type(agent).__name__} must return {components} finite numbers, got {action}")
@@ -48,7 +49,7 @@ def rollout(
         executed.append(action)
         if recorder is not None:
             recorder.step(observation, action, agent.info)
-        blind = not all_images and isinstance(agent, Planner) and agent.planned
+        blind = not all_images and isinstance(agent, Looking) and not agent.looks
         with environment.blind() if blind else nullcontext():
             observation = environment.step(action)
         if traced:
@@ -76,28 +77,33 @@ def _completed(environment: Environment) -> tuple[int, int] | None:
     return (environment.completed, environment.instructions) if several else None
 
 
-def replay(environment: Environment, episode: Episode, recorder: Recorder | None = None) -> int | None:
-    """Execute the actions of an episode again from its seed; records this world with the observations of the episode.
+class Replay(NamedTuple):
+    """What was seen in a replay."""
 
-    Returns the first step whose state differs in any bit, N if only the end of the episode differs, or None.
-    """
+    observations: list[Observation]
+    differs: int | None  # first step whose state differs in any bit; N: only the end of the episode does; None: nothing
+
+
+def replay(environment: Environment, episode: Episode, recorder: Recorder | None = None) -> Replay:
+    """Execute the actions of an episode again from its seed; record this world with the observations of the episode."""
     observation = environment.reset(episode.seed)
     if recorder is not None:
         recorder.start(f"seed {episode.seed}", environment)
-    same = []
+    same, seen = [], []
     for recorded, action in zip(episode.observations, episode.executed, strict=True):
         if environment.done:
             break
         same.append(np.array_equal(observation.state, recorded.state))
+        seen.append(observation)
         if recorder is not None:
             recorder.step(recorded, action, {})
         observation = environment.step(action)
     if recorder is not None:
         recorder.end(episode)
     if not all(same):
-        return same.index(False)
+        return Replay(seen, same.index(False))
     ended = len(same) == len(episode.executed) and environment.done and environment.outcome == episode.outcome
-    return None if ended else len(same)
+    return Replay(seen, None if ended else len(same))
 
 
 def close_agent(agent: Agent) -> None:

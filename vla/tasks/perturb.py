@@ -113,6 +113,7 @@ class Perturbed:
         """
         self._spec, self._expert, self._perturb = spec, expert(spec=spec), perturb
         self.memoryless = bool(getattr(self._expert, "memoryless", False))  # of the label
+        self.looks = bool(getattr(self._expert, "looks", True))
         self.info: dict[str, Any] = {}
 
     def reset(self, instruction: str, seed: int) -> None:

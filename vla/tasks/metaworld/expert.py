@@ -14,6 +14,7 @@ from vla.tasks.metaworld.package import expert, tasks_of
 class Scripted:
     """Meta-World's expert of the task at hand, a function of the simulator's observation, clipped to the bounds."""
 
+    looks = False
     memoryless = True  # of all fifty experts of Meta-World 3.0.0
 
     def __init__(self, *, spec: Spec) -> None:

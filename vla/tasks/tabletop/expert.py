@@ -31,6 +31,7 @@ CLEARANCE = 0.012  # total gap between the open fingers and a block [m]
 class Waypoint:
     """Waypoint controller that reaches, grasps, carries, pushes and releases, and recovers from any failure."""
 
+    looks = False
     memoryless = True
 
     def __init__(self, spec: Spec) -> None:
