@@ -16,9 +16,10 @@ from hydra.errors import MissingConfigException
 from omegaconf import DictConfig, OmegaConf
 
 from vla.config.adopt import adopt
-from vla.config.build import build, suggestion
+from vla.config.build import build
 from vla.config.check import digest
 from vla.config.experiment import plain
+from vla.io.suggestion import suggestion
 from vla.run import sentence
 
 GRAMMAR = {

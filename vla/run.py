@@ -22,13 +22,13 @@ from yaml import YAMLError
 
 from vla import jobs
 from vla.config.annotations import packages, targets
-from vla.config.build import suggestion
 from vla.config.check import Job, check
 from vla.config.compose import CONF
 from vla.config.experiment import Experiment
 from vla.config.packages import offer_options, option_folders, trust
 from vla.config.substitutes import with_substitutes
 from vla.deploy import ros
+from vla.io.suggestion import suggestion
 from vla.parallel.fast_exit import fast_exit
 from vla.parallel.processes import collect_rarely, without_triton
 from vla.runs.cells import failures, save_failure

@@ -25,7 +25,7 @@ OF_MODEL = ("tokenizer", "model", "data")  # the batch size depends on the model
 # What a report on a policy includes of its training: nodes, which only an open-loop evaluation builds, and values of
 # other nodes.
 REPORTED = ("expert", "data", "learner", "validate", "seed")
-CHOSEN = {"experiment": "experiment", "model": "model"}  # name in `chosen` → group
+CHOSEN = ("experiment", "model")  # groups in `chosen`
 PRESETS = ("experiment", "variant", "shift")  # groups and keys that change other groups
 SCHEDULE = ("max_steps", "max_epochs", "val_check_interval", "accumulate_grad_batches", "gradient_clip_val")
 REPORTED_VALUES = {"collect": ("episodes", "seed"), "trainer": (*SCHEDULE, "precision")}
@@ -54,7 +54,7 @@ def adopt(cfg: DictConfig, overrides: Sequence[str]) -> DictConfig:
     given = [_path(override) for override in parsed if not override.is_delete()]
     require_no_paths(saved, OF_POLICY, cfg.checkpoint, given)
     named, kept = {override.key_or_group for override in parsed}, saved.get("chosen", {})
-    chosen = {name: cfg.chosen[name] if group in named else kept.get(name) for name, group in CHOSEN.items()}
+    chosen = {group: cfg.chosen[group] if group in named else kept.get(group) for group in CHOSEN}
     reported = _reported(cfg, saved) if cfg.job == "evaluate" else {}
     return _on_top(cfg, {**{name: saved[name] for name in OF_POLICY}, **reported, "chosen": chosen}, parsed)
 

@@ -13,7 +13,6 @@ import sys
 from collections import ChainMap
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from difflib import get_close_matches
 from functools import cache, reduce
 from importlib import import_module
 from typing import Annotated, Any, Literal, get_args, get_origin
@@ -36,6 +35,7 @@ from vla.config.annotations import (
     targets,
 )
 from vla.io.documents import require_resolved
+from vla.io.suggestion import suggestion
 from vla.io.types import Count, Inherited, Natural, NonNegative, Share, Text
 
 HYDRA_KEYS = ("_target_", "_partial_")
@@ -315,9 +315,3 @@ def _parameters(target: type) -> Mapping[str, inspect.Parameter]:
                 annotation = Any
         found[name] = each.replace(annotation=annotation)
     return found
-
-
-def suggestion(name: str, known: Iterable[str]) -> str:
-    """Return `, did you mean …?`, or an empty string without a similar name."""
-    close = get_close_matches(name, list(known), n=1)
-    return f", did you mean {close[0]}?" if close else ""

@@ -8,12 +8,12 @@ all of them do.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from difflib import get_close_matches
 from fnmatch import fnmatchcase
 from typing import Any
 
 from vla.data.draws import flat, leaves
 from vla.data.index import Entry
+from vla.io.suggestion import suggestion
 
 FACTS = ("seed", "task", "instruction", "outcome", "steps")
 
@@ -38,8 +38,7 @@ class EpisodeFilter:
         known = dict.fromkeys(name for entry in entries for name in facts(entry))
         for name, condition in where.items():
             if name not in known:
-                close = get_close_matches(name, known, n=1)
-                hint = f", did you mean {close[0]}?" if close else f": there are {', '.join(known)}"
+                hint = suggestion(name, known) or f": there are {', '.join(known)}"
                 raise ValueError(f"inspect.where: no episode has {name}{hint}")
             if not (isinstance(condition, (str, bool, int, float)) or _is_range(condition) or _is_texts(condition)):
                 raise ValueError(

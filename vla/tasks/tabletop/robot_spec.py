@@ -7,7 +7,6 @@ end in one sentence.
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Sequence
-from difflib import get_close_matches
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -15,6 +14,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from vla.io.suggestion import suggestion
 from vla.robots.cartesian import DOWN
 from vla.spec import Array
 from vla.tasks.tabletop.robot import CORNERS, FINGERTIP_CONTACT, ROBOT_CONTACT, look_at, spread
@@ -70,9 +70,8 @@ def require(key: str, names: Iterable[str], known: Iterable[str], kind: str) -> 
     there = [name for name in known if name]
     for name in names:
         if name not in there:
-            close = get_close_matches(name, there, n=1)
-            hint = f", did you mean {close[0]}?" if close else ":"
             listed = ", ".join(there[:LISTED]) + (", …" if len(there) > LISTED else "")
+            hint = suggestion(name, there) or ":"
             raise ValueError(f"task.robot.{key} names {name}, which is no {kind}{hint} there are {listed or 'none'}")
 
 
