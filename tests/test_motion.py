@@ -78,6 +78,8 @@ def test_conditions_are_compared_in_motion_and_milestones(tmp_path: Path) -> Non
         **{"path_m": "open", "jerk": "open"},
     }
     assert (found["time_s"].difference, found["time_s"].episodes) == (pytest.approx(0.5), first.successes)
+    stayed = Report(tuple(replace(each, task="stay", milestones=()) for each in first.results))
+    assert "near" not in compare_courses({"seen": first, "empty": stayed})["empty"]  # another task
     # Pairs that never differ cannot find anything: of four comparisons two count.
     assert found["near"].p_holm == pytest.approx(2 * found["near"].p)
     write_report(first, tmp_path / "report.json", None, {}, None, {"slow": slow}, compared, courses)

@@ -269,7 +269,7 @@ def test_a_choice_trusts_one_class(importable: None) -> None:
     packages.trust([], [MODEL, "other.models.Mine"])
     assert packages.trusted() == [MODEL]
     assert locate("model._target_", MODEL).__name__ == "Mine"
-    for target in ("mypackage.models.Few", "mypackage.world.Square", "other.models.Mine"):
+    for target in ("mypackage.tokenizers.Few", "mypackage.world.Square", "other.models.Mine"):
         with pytest.raises(ValueError, match=rf"^node names {re.escape(target)}, which is not trusted: add trust="):
             locate("node", target)
 

@@ -17,7 +17,7 @@ from omegaconf import DictConfig, OmegaConf
 from vla.config.annotations import locate
 from vla.config.build import build
 from vla.config.check import with_changes
-from vla.config.differences import differences
+from vla.config.differences import ABSENT, at, differences
 from vla.config.packages import trusted, with_trust
 from vla.parallel.processes import without_triton
 from vla.spec import SpecOnly
@@ -52,8 +52,13 @@ class Experiment:
     def of(cls, cfg: DictConfig, default: DictConfig | None = None) -> Experiment:
         """Create the experiment of a composed config; `default` is the config without overrides."""
         chosen, standard = (OmegaConf.to_container(each, resolve=False) for each in (cfg, default or cfg))
-        changes = [{"key": key, "here": here, "default": before} for key, here, before in differences(chosen, standard)]
-        return cls(plain(cfg), changes)
+        here, there = plain(cfg), plain(default or cfg)
+        changes = [
+            {"key": key, "here": value, "default": before}
+            for key, value, before in differences(chosen, standard)
+            if not at(here, key) == at(there, key) != ABSENT  # else one is an interpolation of the same value
+        ]
+        return cls(here, changes)
 
     def __getitem__(self, key: str) -> Any:
         """Return a top-level node or value."""

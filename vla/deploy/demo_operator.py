@@ -75,14 +75,16 @@ class DemoOperator:
         self.wait(lambda: self._change.service_is_ready() and self._reset.service_is_ready(), START, "the nodes")
         self.wait(lambda: self._instruction.get_subscription_count() >= 2, START, "both nodes to subscribe")
 
-    def play(self) -> Result:
-        """Play one episode."""
+    def play(self) -> Result | None:
+        """Play one episode; return None if it was interrupted."""
         self.begin_episode()
         started = time.monotonic()
         self.wait(lambda: not self._playing() or self.stopped.is_set(), EPISODE, "the end of an episode")
         seconds = time.monotonic() - started
         episode = self._episode
         assert episode is not None
+        if not episode.done:
+            return None
         details = {"task": episode.task, "milestones": episode.milestones, "motion": Motion(round(seconds, 1))}
         return Result(episode.seed, episode.outcome, episode.instruction, round(10 * seconds), **details)
 

@@ -57,9 +57,11 @@ class Loop:
         """
         with self.running() as operator:
             results: list[Result] = []
+            log.info("playing %d episodes", self.episodes)
             while len(results) < self.episodes and not operator.stopped.is_set():
-                results.append(operator.play())
-                log.info("seed %d: %s", results[-1].seed, results[-1].outcome)
+                if result := operator.play():
+                    results.append(result)
+                    log.info("seed %d: %s", result.seed, result.outcome)
             log.info("%s", ", ".join(f"{key} {value}" for key, value in operator.status.items() if "[ms]" in key))
         return Report(tuple(results))
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 from vla.deploy.joint_limiter import Robot
 from vla.deploy.ros import RosNetwork, ros, spin
@@ -74,6 +74,8 @@ class SimulatorDeployment:
         policy, environment: factories of the policy and of the task's environment.
         output: folder of the ROS logs.
     """
+
+    needs_policy: ClassVar[bool] = False
 
     robot: Robot
     network: RosNetwork

@@ -36,7 +36,7 @@ def demonstrations(experiment: Experiment) -> EpisodeStore:
     if store is None:
         store = _fill(experiment)
     else:
-        log.info("%s: %d episodes, none of them new", store.folder, len(store.episodes))
+        log.info("%s: %d of its %d episodes, none of them new", store.folder, asked["episodes"], len(store.episodes))
     return EpisodeStore(store.folder, asked["episodes"])
 
 

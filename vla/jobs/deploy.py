@@ -26,14 +26,21 @@ def run(experiment: Experiment) -> None:
 
 
 def deployment(experiment: Experiment) -> Any:
-    """Build the deployment of an experiment."""
-    return build(
+    """Build the deployment of an experiment.
+
+    Raises:
+        ValueError: it needs a policy, and there is none.
+    """
+    built = build(
         experiment["deploy"],
         "deploy",
         policy=partial(_policy, experiment),
         environment=experiment.make_environment(),
         output=experiment.output,
     )
+    if getattr(built, "needs_policy", True) and experiment.checkpoint is None and not experiment["agent"]:
+        raise ValueError("this deployment needs a trained policy: checkpoint=FILE")
+    return built
 
 
 def _policy(experiment: Experiment) -> Policy:

@@ -31,3 +31,10 @@ class SweepTable(Callback):
             folder = Path(config.hydra.sweep.dir)
             with FileLock(folder / ".lock"):  # the last holder of the lock writes all cells
                 tabulate(folder)
+
+    def on_multirun_end(self, config: DictConfig, **kwargs: Any) -> None:
+        """Name the page of the sweep."""
+        from vla.reports.html import SWEEP  # imports matplotlib
+
+        if (page := Path(config.hydra.sweep.dir) / SWEEP).exists():
+            print(f"wrote {page}")

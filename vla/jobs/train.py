@@ -66,6 +66,7 @@ def train(experiment: Experiment) -> Path | None:
         return None
     chosen = closed_loop.selected_checkpoint(checkpoints / LAST) if closed_loop else checkpoints / LAST
     save_choice(output, chosen.name)
+    log.info("the policy is %s", chosen)
     return chosen
 
 
@@ -157,4 +158,4 @@ def _reported(
             with optional(output / PAGE):
                 save_training(output, parameters, trainer.global_step, seconds, ended, collection_s)
                 write_page(output)
-    log.info("trained %d steps in %.0f s: %s", trainer.global_step, seconds, output / CHECKPOINTS)
+    log.info("trained %d steps in %.0f s", trainer.global_step, seconds)

@@ -73,6 +73,13 @@ def compare_runs(runs: Mapping[str, Run], margin: float) -> list[RunComparison]:
     return [replace(each, found=verdicts[number], course=courses[number]) for number, each in enumerate(found)]
 
 
+def without_comparison(runs: Mapping[str, Run], compared: Sequence[RunComparison]) -> str:
+    """Return a sentence on the runs that are not compared and why, or an empty string."""
+    found = {(each.one, each.other) for each in compared}
+    pairs = [f"{one} and {other}" for one, other in combinations(runs, 2) if (one, other) not in found]
+    return f"not compared, because no episode is the same in both: {', '.join(pairs)}" if pairs else ""
+
+
 def runs_table(compared: Sequence[RunComparison]) -> Table:
     """Tabulate comparisons of runs."""
     table = Table(*CASE, "episodes", *COMPARED, **NARROW)

@@ -20,7 +20,7 @@ from markupsafe import Markup
 from vla.config.differences import ABSENT, at, differences
 from vla.data.index import listed
 from vla.io.files import write_text
-from vla.reports.comparison import CASE, RunComparison, course_rows
+from vla.reports.comparison import CASE, RunComparison, course_rows, without_comparison
 from vla.reports.conditions import Courses, comparison_texts, course_head, course_names, course_texts
 from vla.reports.posteriors import draw_posteriors
 from vla.reports.style import BLUE, GREEN, GREY, RED, Interval
@@ -117,6 +117,7 @@ def write_comparison(runs: Mapping[str, Run], compared: Sequence[RunComparison],
         posteriors=draw_posteriors(reports, compared, colours(len(runs))) if len(reports) == len(runs) else None,
         curves=draw_runs({name: run.metrics for name, run in runs.items()}),
         pairs=[(each, comparison_texts(each.found)) for each in compared],
+        apart=without_comparison(runs, compared),
         course=_course(course_rows(compared)),
         case=CASE,
         anytime=any(report.anytime for run in runs.values() for report in run.reports.values()),
@@ -182,7 +183,8 @@ def _facts(run: Run) -> dict[str, str]:
     if training:
         facts["training"] = f"{training.steps} steps in {_duration(training.seconds)}"
     if report and report.wall_time_s:
-        facts["collection, training, evaluation"] = _duration(report.wall_time_s)
+        parts = "collection, training, evaluation" if training else "evaluation, and training of the policy"
+        facts[parts] = _duration(report.wall_time_s)
     if run.metrics and (demonstrations := at(run.config, "collect.episodes")) != ABSENT:
         facts["demonstrations"] = str(demonstrations)
     if report and report.seeds:

@@ -261,7 +261,8 @@ def pairs_of(
 
 
 def course_of(together: Sequence[tuple[Result, Result]], anytime: bool) -> dict[str, Comparison]:
-    """Compare, in pairs of episodes, motion where both succeeded, and how often each milestone was reached.
+    """Compare, in pairs of episodes, motion where both succeeded, and how often each milestone was reached in the same
+    task.
 
     Returns:
         Field of `Motion` or milestone → comparison, without fields of which too few pairs are known.
@@ -276,8 +277,9 @@ def course_of(together: Sequence[tuple[Result, Result]], anytime: bool) -> dict[
         known = np.array([pair for pair in pairs if None not in pair], float).reshape(-1, 2)
         if compared := compare_amounts(known[:, 0], known[:, 1], anytime):
             found[name] = compared
-    for name in sorted({name for pair in together for result in pair for name in result.milestones}):
-        found[name] = compare_pairs(pairs_of(together, lambda result, name=name: name in result.milestones), anytime)
+    alike = [(one, two) for one, two in together if one.task == two.task]  # another task may not have the milestone
+    for name in sorted({name for pair in alike for result in pair for name in result.milestones}):
+        found[name] = compare_pairs(pairs_of(alike, lambda result, name=name: name in result.milestones), anytime)
     return found
 
 

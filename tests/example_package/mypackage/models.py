@@ -1,33 +1,12 @@
-"""A model and a tokenizer. Shapes: B batch, k action chunk, D action components, K bins, S truth scalars."""
+"""A model. Shapes: B batch, k action chunk, D action components, K bins, S truth scalars."""
 
 from __future__ import annotations
 
-import numpy as np
 import torch
 from torch import Tensor, nn
 
-from vla.io.types import Bins, Inherited
+from vla.io.types import Inherited
 from vla.models.model import Batch, TokenModel, mlp, pixels
-from vla.models.tokenizers.tokenizer import ActionStatistics, EvenBins
-from vla.spec import Spec
-
-
-class Few(EvenBins):
-    """Few bins over the range of allowed actions, whatever the data.
-
-    Args:
-        bins: K.
-        spec: gives the range.
-        statistics: of the data, not needed.
-    """
-
-    def __init__(self, bins: Bins, *, spec: Spec, statistics: ActionStatistics | None = None) -> None:
-        super().__init__(spec, np.array(spec.low), np.array(spec.high), bins)
-
-    def encode(self, action: Tensor) -> Tensor:
-        """(…, D) float actions as the nearest of the K tokens, (…, D) int64."""
-        share = (action - self.low) / (self.high - self.low)
-        return (share.clamp(0, 1) * (self.bins - 1)).round().long()
 
 
 class Mine(TokenModel):
