@@ -20,6 +20,8 @@ BAD_INPUT = {
     "misspelt option": (("model=rt2",), "rt1"),
     "wrong type": (("trainer.max_steps=many",), "trainer.max_steps"),
     "missing checkpoint": (("checkpoint=nowhere.ckpt",), "nowhere.ckpt"),
+    "a folder as checkpoint": (("checkpoint=.",), ". is a folder, a checkpoint is a file; it has none"),
+    "a deployment without a policy": (("job=deploy", "deploy=loop"), "this deployment needs a trained policy"),
     "a run that is no path": (("resume=true",), "resume=True is no path"),
     "a checkpoint that is no path": (("checkpoint=3",), "checkpoint=3 is no path"),
     "nothing interrupted": (

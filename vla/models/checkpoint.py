@@ -120,8 +120,8 @@ def _header(path: Path, content: dict[str, Any]) -> Header:
 def _load(path: Path, weights: bool) -> dict[str, Any]:
     """Read the content of a checkpoint; without `weights` tensors are memory-mapped, neither read nor verified."""
     if path.is_dir():
-        files = ", ".join(str(file) for file in sorted(path.glob("**/*.ckpt"))) or "none in it"
-        raise ValueError(f"{path} is a folder, and a checkpoint is a file: {files}")
+        files = [str(file) for pattern in ("*.ckpt", "checkpoints/*.ckpt") for file in sorted(path.glob(pattern))]
+        raise ValueError(f"{path} is a folder, a checkpoint is a file; it has {' and '.join(files) or 'none'}")
     if not path.is_file():
         raise ValueError(f"there is no checkpoint {path}: those of a run lie in outputs/runs/…/checkpoints")
     try:

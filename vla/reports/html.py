@@ -183,7 +183,8 @@ def _facts(run: Run) -> dict[str, str]:
     if training:
         facts["training"] = f"{training.steps} steps in {_duration(training.seconds)}"
     if report and report.wall_time_s:
-        parts = "collection, training, evaluation" if training else "evaluation, and training of the policy"
+        of_another = "evaluation, and training of the policy" if report.checkpoint else "evaluation"
+        parts = "collection, training, evaluation" if training else of_another
         facts[parts] = _duration(report.wall_time_s)
     if run.metrics and (demonstrations := at(run.config, "collect.episodes")) != ABSENT:
         facts["demonstrations"] = str(demonstrations)
