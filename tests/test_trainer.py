@@ -184,6 +184,23 @@ def test_an_episode_that_cannot_be_played_in_validation_costs_no_training(
     assert "validation: seed 1 could not be played: RuntimeError: the simulation diverged" in caplog.text
 
 
+def test_between_validations_no_environment_is_held(folder: Path, tmp_path: Path) -> None:
+    """Fifty compiled scenes of Meta-World would take 4 GB from the demonstrations in memory."""
+    held: list[int] = []
+
+    class Counted(toy.ToyEnvironment):
+        def __init__(self) -> None:
+            super().__init__()
+            held.append(1)
+
+        def close(self) -> None:
+            held.append(-1)
+
+    played = ClosedLoop(Counted, lambda model: toy.ToyExpert(), range(2), tmp_path / "run/checkpoints")
+    train(make_bc(), folder, tmp_path / "run", killer=played)
+    assert len(held) >= 4 and held == [1, -1] * (len(held) // 2)
+
+
 def test_damaged_training_curves_cost_no_training(
     folder: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -45,7 +46,7 @@ class ClosedLoop(Callback):
     ties go to the newest. With sharded weights nothing is played, because all processes would have to act in step.
 
     Args:
-        make_environment: factory of the environment, called once per process.
+        make_environment: factory of the environment, called for every validation: what it holds is free in between.
         make_policy: factory of a policy from the model in training.
         seeds: of the episodes, the same in every validation.
         checkpoints: folder of `best.ckpt`.
@@ -60,24 +61,25 @@ class ClosedLoop(Callback):
     ) -> None:
         self._make_environment, self._make_policy, self._seeds = make_environment, make_policy, seeds
         self._path = checkpoints / BEST
-        self._environment: Environment | None = None
+        self._plays = False
         self.success, self.best = 0.0, -1.0
 
     def on_fit_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Build the environment before training, in case this machine cannot."""
         assert isinstance(pl_module, Learner)
-        if pl_module.device_mesh is None and trainer.enable_validation:
-            self._environment = self._make_environment()
+        self._plays = pl_module.device_mesh is None and trainer.enable_validation
+        if self._plays:
+            self._make_environment().close()
 
     def on_validation_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Play the episodes; later callbacks restore the weights in training."""
         assert isinstance(pl_module, Learner)
-        if self._environment is None:
+        if not self._plays:
             return
-        policy = self._make_policy(pl_module.model)
+        policy, environment = self._make_policy(pl_module.model), self._make_environment()
         mine = self._seeds[trainer.global_rank :: trainer.world_size]
-        with torch.compiler.set_stance("force_eager"):  # a window has another shape than was compiled
-            results = [play(self._environment, policy, seed) for seed in mine]
+        with closing(environment), torch.compiler.set_stance("force_eager"):  # a window's shape is not the compiled one
+            results = [play(environment, policy, seed) for seed in mine]
         for result in results:
             if result.error:
                 log.warning("validation: seed %d could not be played: %s", result.seed, result.error)
@@ -91,12 +93,6 @@ class ClosedLoop(Callback):
         if self.success >= max(self.best, 0.0):
             self.best = self.success
             trainer.save_checkpoint(self._path, weights_only=False)
-
-    def teardown(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
-        """Close the environment."""
-        if self._environment is not None:
-            self._environment.close()
-            self._environment = None
 
     def selected_checkpoint(self, last: Path) -> Path:
         """Return `best.ckpt` if the last success rate is below the 95 % confidence interval of the best, else `last`.
