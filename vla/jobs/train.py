@@ -120,7 +120,7 @@ def _log_tokenization_error(model: Model, store: EpisodeStore) -> None:
     chunks = store.statistics.chunks(model.chunk)
     if model.uses_tokens:
         error = describe_tokenization_error(model.tokenizer, chunks, store.spec)
-        log.info("action tokens, %s: %s", type(model.tokenizer).__name__, error)
+        log.info("action tokens, %s: mean error %s", type(model.tokenizer).__name__, error)
     if outside := out_of_bounds(model.tokenizer, chunks):
         log.warning("%.2g %% of the demonstrated actions exceed the bounds of the tokenizer", 100 * outside)
 

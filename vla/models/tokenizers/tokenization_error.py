@@ -35,4 +35,4 @@ def describe_tokenization_error(tokenizer: ActionTokenizer, chunks: np.ndarray, 
         errors.append(f"{part.abs().mean(0).max():.3f} {named} (bias {bias:.3f}, at most {largest:.3f})")
     length = tokenizer.loss_mask(tokens, torch.ones(actions.shape[:2], dtype=torch.bool)).sum()
     per_action = f"{length / (len(chunks) * chunks.shape[1]):.3g} tokens per action"
-    return f"mean error {', '.join(errors)}; {tokenizer.vocabulary_usage(tokens)}; {per_action}"
+    return f"{', '.join(errors)}; {tokenizer.vocabulary_usage(tokens)}; {per_action}"
