@@ -36,7 +36,7 @@ BAD_INPUT = {
         ("job=deploy", "deploy=server", "deploy.host=0.0.0.0"),
         "set the environment variable",
     ),
-    "another world's key": (("checkpoint=x.ckpt", "task.shadows=3"), "task is set by +task.scenes=VALUE"),
+    "another world's key": (("checkpoint=x.ckpt", "task.hand_size=0.3"), "task is set by +task.hand_size=VALUE"),
     "another world's expert": (("job=preview", "expert=metaworld"), "expert=metaworld acts in task=metaworld only"),
     "another world's goal": (("task=metaworld", "task/goal=lift"), "the option chosen for task has no goal"),
     "no environment": (("job=preview", "task=gymnasium"), "task.package is missing: the options chosen need"),

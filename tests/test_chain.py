@@ -122,7 +122,7 @@ def test_the_next_instruction_comes_when_one_is_completed(chain: Tabletop, tmp_p
     assert list(dict.fromkeys(said)) == wanted == agent.heard and len(wanted) == 3
     assert episode.success and episode.completed == (3, 3) and episode.task == "chain"
     with chain.blind():
-        assert replay(chain, episode) is None
+        assert replay(chain, episode).differs is None
     file = tmp_path / f"{recording_name(FIRST, 'success')}.rrd"
     [entry] = RrdReader(file).recordings()
     [chunk] = RrdReader(file).store(store=entry).stream().filter(content=["/instruction"]).to_chunks()
@@ -150,7 +150,7 @@ def test_a_demonstration_has_one_instruction_and_begins_where_those_before_it_en
             assert episode.success and episode.completed is None and episode.task in GOALS
             assert {seen.instruction for seen in episode.observations} == {episode.draws["language"]["instruction"]}
             assert "then" not in episode.draws["language"]
-            assert replay(chain, episode) is None
+            assert replay(chain, episode).differs is None
             starts.append(chain.simulation.compiled.data.time - len(episode.observations) / 10)
     assert min(starts) == pytest.approx(0) and max(starts) > 1  # [s] of the instructions before
 

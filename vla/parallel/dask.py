@@ -142,6 +142,7 @@ class _DaskFuture:
 
     def result(self) -> Any:
         from distributed import KilledWorker
+        from distributed.comm import CommClosedError
 
         while True:
             try:
@@ -149,7 +150,7 @@ class _DaskFuture:
             except TimeoutError:
                 if self.future.status == "error":
                     raise
-            except CancelledError as error:
+            except (CancelledError, CommClosedError) as error:
                 raise self._pool.lost() from error
             except KilledWorker as error:
                 raise Crashed(
