@@ -446,7 +446,7 @@ class Deployment(Protocol):
     """Execution of a policy outside training; built as `Deployment(**yaml, policy=…, environment=…, output=…)`.
 
     `policy` and `environment` are factories of the checkpoint's policy and of its task's environment, called on demand;
-    `output` is a folder to write to.
+    `output` is a folder to write to. A class with `needs_policy = False` runs without a checkpoint.
     """
 
     def run(self) -> Any:

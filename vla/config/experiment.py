@@ -51,8 +51,10 @@ class Experiment:
     @classmethod
     def of(cls, cfg: DictConfig, default: DictConfig | None = None) -> Experiment:
         """Create the experiment of a composed config; `default` is the config without overrides."""
-        chosen, standard = (OmegaConf.to_container(each, resolve=False) for each in (cfg, default or cfg))
-        here, there = plain(cfg), plain(default or cfg)
+        if default is None:
+            return cls(plain(cfg))
+        chosen, standard = (OmegaConf.to_container(each, resolve=False) for each in (cfg, default))
+        here, there = plain(cfg), plain(default)
         changes = [
             {"key": key, "here": value, "default": before}
             for key, value, before in differences(chosen, standard)
