@@ -255,6 +255,7 @@ def test_other_scenes_under_the_same_seeds_are_not_compared(tmp_path: Path) -> N
     plain, dark = a_run(tmp_path / "plain", "ssssssss"), a_run(tmp_path / "dark", "dddddddd", light=0.1)
     told = text(compared([plain, dark], tmp_path / "new"))
     assert "plain 100.0" in told and "Differences in success" not in told
+    assert "Not compared, because no episode is the same in both: plain and dark." in told
 
 
 def test_other_seeds_of_the_same_world_are_compared_as_they_are(tmp_path: Path) -> None:
