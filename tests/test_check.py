@@ -303,7 +303,14 @@ def test_a_checkpoint_brings_its_task_tokenizer_and_model_and_task_overrides_app
     assert "light" not in adopt(cfg, ["~task.randomize.light"]).task.randomize
 
 
-KEPT = ["tokenizer=rt1", "tokenizer.bins=32", "model/image=efficientnet", "+model.x=1", "experiment=few", "variant=rt1"]
+KEPT = [
+    "tokenizer=rt1",
+    "tokenizer.bins=32",
+    "model/image=efficientnet",
+    "+model.x=1",
+    "experiment=few",
+    "variant=smaller",
+]
 
 
 @pytest.mark.parametrize("override", KEPT)

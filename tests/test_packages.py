@@ -125,10 +125,13 @@ def test_a_job_with_a_group_of_its_own_is_two_options_and_a_module(home: Path, i
 
 # Options that name a part of a world of this project: they are for this world only.
 OF_ONE_WORLD = {
-    *("ablation", "few", "learning_curve", "multitask", "recipe", "standard"),
-    *("generalisation", "language", "levels", "paper", "suite", "tabletop", "no_excursions", "no_noise"),
+    *("ablation", "few", "images_alone", "learning_curve", "multitask", "recipe", "standard"),
+    *("generalisation", "language", "levels", "paper", "suite", "tabletop"),
+    *("no_excursions", "no_noise", "coarse_images"),
     *("unheard", "renderer", "lerobot", "metaworld", "metaworld_disturbed", "metaworld_improved", "few_improved"),
 }
+# Variants that change an option of RT-1.
+OF_RT1 = {"as_published", "dropout", "smaller", "no_history", "small_embeddings", "two_tokens"}
 
 
 @pytest.mark.parametrize("group", ["experiment", "evaluate", "validate", "variant"])
@@ -138,10 +141,11 @@ def test_options_go_with_any_world_or_are_refused_for_it(
     monkeypatch.setenv(packages.TRUSTED, "mypackage")
     options = {path.stem for path in (CONF / group).glob("*.yaml")}
     for option in sorted(options - OF_ONE_WORLD):
-        check(composed("task=mine", "expert=mine", f"{group}={option}"))
+        model = ["model=rt1_tiny"] if option in OF_RT1 else []
+        check(composed("task=mine", "expert=mine", f"{group}={option}", *model))
     for option in sorted(options & OF_ONE_WORLD):
         with pytest.raises(
-            (ValueError, ConfigCompositionException), match=r"randomize|perturb|task/goal|renderer|window"
+            (ValueError, ConfigCompositionException), match=r"randomize|perturb|task/goal|renderer|window|image_size"
         ):
             check(composed("task=mine", "expert=mine", f"{group}={option}"))
 
