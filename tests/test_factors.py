@@ -57,3 +57,9 @@ def test_what_success_depends_on_is_associated_with_it() -> None:
     assert [len(group) for group in groups(found["mass: factor of block 1"])] == [4] * 5
     assert association(found["mass: factor of block 1"], played) > 3
     assert association(["a", "b"] * 10, played) == 0
+
+
+def test_a_draw_under_two_names_is_one_factor() -> None:
+    draws: list[dict[str, Any]] = [{"pad": [0.1 * n, 0.2], "pads": [[0.1 * n, 0.2], [0.3, 0.1 * n]]} for n in range(8)]
+    found = factors([Result(seed, "success", draws=each) for seed, each in enumerate(draws)])
+    assert set(found) == {"pad", "pad 2"}

@@ -18,14 +18,18 @@ GROUPS = 8  # maximum number of groups in a factor's panel
 def factors(played: Sequence[Result]) -> dict[str, list[Any]]:
     """Return title → value per episode, of every draw that all episodes have and that forms a few groups.
 
-    A pair of numbers is one factor, a point; each item of another list is a factor.
+    A pair of numbers is one factor, a point; each item of another list is a factor. Of draws that are equal in all
+    episodes the first counts.
     """
     rows = [
         {name: value for axis, draw in flat(result.draws).items() for name, value in _items(axis, draw)}
         for result in played
     ]
     names = [name for name in (rows[0] if rows else {}) if all(name in row for row in rows)]
-    columns = {name: [row[name] for row in rows] for name in names}
+    columns = dict[str, list[Any]]()
+    for name in names:
+        if (values := [row[name] for row in rows]) not in columns.values():
+            columns[name] = values
     listed = _listed(played)
     return {in_words(name, listed): values for name, values in columns.items() if 1 < len(groups(values)) <= GROUPS}
 
