@@ -309,6 +309,7 @@ def test_arguments_of_ros_are_split_off() -> None:
     [
         (["deploy=ros2"], "checkpoint=FILE"),
         (["deploy=ros2", "checkpoint=nowhere.ckpt"], "there is no checkpoint nowhere.ckpt"),
+        (["deploy=ros2", "agent=expert"], "plans no chunks of actions"),
         ([CHECKPOINT], "deploy=OPTION"),
         ([CHECKPOINT, "deploy=ros2", "deploy.command=velocity"], "joint_state, trajectory, forward"),
         ([CHECKPOINT, "deploy=ros2", "deploy.network.profile=nowhere.xml"], "nowhere.xml"),

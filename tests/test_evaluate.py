@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -12,10 +13,11 @@ import toy_recordable as toy
 from rerun.chunk import RrdReader
 
 from vla.parallel.pool import LocalCluster
-from vla.reports.evaluation import summary
+from vla.reports.evaluation import summary, write_report
 from vla.rollouts.evaluate import evaluate, keep_recordings
 from vla.rollouts.results import Report, Result
 from vla.rollouts.statistics import wilson_interval
+from vla.runs.folder import read_report
 from vla.spec import FIRST_SEED, Environment, Observation
 
 SEEDS = range(FIRST_SEED, FIRST_SEED + 10)
@@ -68,6 +70,18 @@ def test_tiers_weigh_the_same_whatever_the_number_of_their_tasks() -> None:
     assert "mean over tiers" not in str(Report(tuple(results[:20]), tiers))
 
 
+def test_a_condition_of_a_benchmark_keeps_its_interval_on_the_page(tmp_path: Path) -> None:
+    asked = [("reach", 10), ("stack", 2)]
+    played = [Result(n, "success" if n < won else "lost", task=task) for task, won in asked for n in range(10)]
+    report = Report(
+        tuple(replace(result, seed=FIRST_SEED + n) for n, result in enumerate(played)),
+        {"easy": ["reach"], "hard": ["stack"]},
+    )
+    write_report(report, tmp_path / "report.json", None, {}, conditions={"dark": report})
+    written = read_report(tmp_path)
+    assert written and written.reports["dark"].interval == written.reports["seen"].interval == report.interval
+
+
 def test_milestones_have_a_rate_of_their_own() -> None:
     reached = [("grasped",), ("grasped", "lifted"), (), ()]
     report = Report(tuple(Result(FIRST_SEED, "dropped", milestones=names) for names in reached))
@@ -108,6 +122,18 @@ def test_an_episode_that_raises_is_an_error_and_the_others_go_on() -> None:
     assert report.errors[0].seed == toy.BROKEN_SEED
     assert report.errors[0].error.startswith("ValueError: the block fell off the table (toy_recordable.py:")
     assert "errors 1, the first at seed 1000001: ValueError: the block fell" in str(report)
+
+
+@pytest.mark.parametrize("draw", [float("nan"), object()])
+def test_a_draw_that_no_report_can_hold_is_an_error_of_its_episode(draw: object) -> None:
+    class Drawing(toy.ToyEnvironment):
+        def reset(self, seed: int) -> Observation:
+            seen = super().reset(seed)
+            self.draws["wind"] = draw
+            return seen
+
+    report = evaluate(Drawing, toy.make_agent, None, SEEDS[:2])
+    assert [result.outcome for result in report.results] == ["error", "error"]
 
 
 def test_an_episode_that_kills_its_process_is_an_error_and_the_others_are_played() -> None:

@@ -135,6 +135,8 @@ def test_only_a_memoryless_expert_labels() -> None:
         ("improve.seed=999999", "reserved for evaluation"),
         ("trainer.devices=2", "trains on one device"),
         ("expert=clean", "Waypoint cannot label the states of another agent"),
+        ("evaluate.against=nowhere", "nowhere"),
+        ("evaluate.until=decided", "needs something to decide"),
     ],
 )
 def test_what_cannot_be_improved_is_refused_before_any_work(

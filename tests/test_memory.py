@@ -54,12 +54,15 @@ def test_an_expert_that_needs_neither_succeeds_as_before() -> None:
     )
 
 
-def test_the_nearest_demonstration_of_a_known_scene_is_its_own(folder: Path) -> None:
+def test_the_nearest_demonstration_of_a_known_scene_is_its_own_unless_that_is_shown(folder: Path) -> None:
     store, environment = EpisodeStore(folder), toy.make_environment()
     agent = NearestDemonstration(folder, 20, spec=environment.spec)
     for entry in store.episodes[:3]:
-        again = rollout(environment, agent, entry.seed)
-        assert again.success and np.array_equal(again.executed, store.rows("executed")[entry.span])
+        recorded, seen = store.rows("executed")[entry.span], environment.reset(entry.seed)
+        agent.reset(entry.instruction, FIRST_SEED)
+        assert np.array_equal([agent.act(seen) for _ in recorded], recorded)
+        agent.reset(entry.instruction, entry.seed)
+        assert not np.array_equal([agent.act(seen) for _ in recorded], recorded)
     # Among those with the same instruction, if there is one.
     seen = environment.reset(store.episodes[0].seed)
     other = next(entry.instruction for entry in store.episodes if entry.instruction != seen.instruction)

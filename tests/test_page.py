@@ -19,6 +19,7 @@ from PIL import Image
 from toy_recordable import ThinkingAgent, make_environment
 
 from vla.config.differences import differences
+from vla.reports.comparison import compare_runs, read_runs
 from vla.reports.evaluation import plot_report, write_report
 from vla.reports.filmstrips import MOMENTS, read_filmstrips
 from vla.reports.first_batch import draw_samples
@@ -157,6 +158,16 @@ def test_what_is_missing_is_left_out(tmp_path: Path) -> None:
     told = text(write_page(tmp_path))
     assert f"Training was interrupted after 39 steps; resume={tmp_path} continues it." in told
     assert "Rollouts" not in told
+
+
+def test_conditions_over_other_networks_are_not_compared(tmp_path: Path) -> None:
+    report = Report((Result(FIRST_SEED, "success"),))
+    for name, latency in (("one", 20), ("other", 200)):
+        (tmp_path / name).mkdir()
+        config = {"task": {}, "evaluate": {"networks": {"radio": {"latency": latency}}}}
+        write_report(report, tmp_path / name / "report.json", None, config, {}, {"radio": report})
+    found = compare_runs(read_runs([tmp_path / "one", tmp_path / "other"]), 0.02)
+    assert [each.condition for each in found] == ["seen"]
 
 
 def test_axes_of_success_end_at_one_and_small_numbers_keep_their_digits(tmp_path: Path) -> None:

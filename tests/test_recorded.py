@@ -213,6 +213,8 @@ def test_a_policy_is_trained_and_its_errors_measured_without_a_simulator(dataset
     repeated = json.loads((tmp_path / "again/errors.json").read_text())
     assert repeated["seeds"] == errors["seeds"] and repeated["components"] == errors["components"]
     (kept,) = tmp_path.glob("outputs/episodes/*")  # both found it
+    here(tmp_path, *recording, *TRAINING, *TINY, f"collect.more=[{kept}]", "hydra.run.dir=more", "output=more")
+    assert json.loads((tmp_path / "more/errors.json").read_text())["seeds"] == errors["seeds"]
     shutil.rmtree(kept)
     assert "name its folder with expert=lerobot expert.folder=DIR" in here(tmp_path, *again, ok=False).stderr
     fewer = here(tmp_path, *again, *recording, "collect.episodes=6", ok=False)

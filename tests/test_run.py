@@ -188,13 +188,22 @@ def test_preview_shows_resets_and_their_draws(home: Path) -> None:
 
 
 def test_a_success_rate_is_printed_even_where_the_report_cannot_be_written(home: Path) -> None:
-    (home / "blocked/report.png").mkdir(parents=True)  # where a file is to go
+    (home / "blocked/report.json").mkdir(parents=True)  # where a file is to go
     arguments = ("checkpoint=run/checkpoints/last.ckpt", "evaluate.episodes=1", "cluster.workers=1", "recorder=none")
     done = here(home, *arguments, "output=blocked", ok=False)
     assert done.stdout.strip().splitlines()[-1].startswith("success ")
     errors = [line for line in done.stderr.splitlines() if line.startswith("error: ")]
-    assert len(errors) == 1 and "blocked/report.png cannot be written (" in errors[0]
-    assert sorted(path.name for path in (home / "blocked").iterdir()) == ["changes.yaml", "config.yaml", "report.png"]
+    assert len(errors) == 1 and "blocked/report.json cannot be written (" in errors[0]
+    names = ["changes.yaml", "config.yaml", "report.json", "report.png"]
+    assert sorted(path.name for path in (home / "blocked").iterdir()) == names
+
+
+def test_a_picture_that_cannot_be_written_costs_no_report(home: Path) -> None:
+    (home / "no_picture/report.png").mkdir(parents=True)  # where a file is to go
+    arguments = ("checkpoint=run/checkpoints/last.ckpt", "evaluate.episodes=1", "cluster.workers=1", "recorder=none")
+    done = here(home, *arguments, "output=no_picture")
+    assert "could not write no_picture/report.png" in done.stdout + done.stderr
+    assert (home / "no_picture/report.json").is_file()
 
 
 def test_export_writes_as_many_episodes_as_asked_for(home: Path) -> None:

@@ -66,6 +66,16 @@ def test_cells_that_failed_are_left_out_and_a_sweep_without_any_writes_nothing(t
     assert row.choices == {} and row.name == "all"
 
 
+def test_agents_without_a_model_are_rows_too(tmp_path: Path) -> None:
+    cell(tmp_path, 0, ["agent=checkpoint"], 9)
+    (tmp_path / "1/.hydra").mkdir(parents=True)
+    (tmp_path / "1/.hydra/overrides.yaml").write_text("- agent=expert\n")
+    write_report(Report((Result(0, "success"),)), tmp_path / "1/report.json", None, {})
+    tabulate(tmp_path)
+    assert (tmp_path / "sweep.md").read_text().endswith("| 100.0 | - | - |\n")
+    assert "expert,seen,1.0" in (tmp_path / "sweep.csv").read_text()
+
+
 def test_a_condition_that_not_every_cell_played_is_left_open(tmp_path: Path) -> None:
     cell(tmp_path, 0, ["evaluate=paper"], 7)
     cell(tmp_path, 1, ["evaluate=default"], 7)

@@ -22,9 +22,9 @@ from yaml import YAMLError
 
 from vla import jobs
 from vla.config.annotations import packages, targets
-from vla.config.check import Job, check
+from vla.config.check import Job, check, devices
 from vla.config.compose import CONF
-from vla.config.experiment import Experiment
+from vla.config.experiment import Experiment, plain
 from vla.config.packages import offer_options, option_folders, trust
 from vla.config.substitutes import with_substitutes
 from vla.deploy import ros
@@ -118,7 +118,7 @@ def _require_sweepable(cfg: DictConfig, job: Job) -> None:
     choices = HydraConfig.get().runtime.choices
     if HydraConfig.get().mode != RunMode.MULTIRUN or choices["hydra/launcher"] == "submitit_slurm":
         return
-    if "trainer" in job.needs(cfg) and cfg.trainer is not None and _devices(cfg.trainer) > 1:
+    if "trainer" in job.needs(cfg) and cfg.trainer is not None and devices(plain(cfg.trainer)) > 1:
         raise ValueError(
             "-m cannot train on several devices in this launcher: add trainer.devices=1, "
             "or hydra/launcher=submitit_slurm, which starts every process of a cell itself"
@@ -130,19 +130,6 @@ def _require_swept() -> None:
     choices = HydraConfig.get().runtime.choices
     if HydraConfig.get().mode == RunMode.RUN and HydraConfig.get().sweeper.params:
         raise ValueError(f"experiment={choices['experiment']} is a grid of runs: add -m")
-
-
-def _devices(trainer: DictConfig) -> int:
-    devices, nodes = trainer.get("devices", "auto"), trainer.get("num_nodes", 1)
-    if OmegaConf.is_list(devices):
-        return len(devices) * nodes
-    if str(devices) not in ("auto", "-1"):
-        return (len(devices.split(",")) if "," in str(devices) else int(devices)) * nodes
-    if trainer.get("accelerator", "auto") == "cpu":
-        return int(nodes)
-    from torch.cuda import device_count  # slow to import
-
-    return max(device_count(), 1) * nodes
 
 
 def _remove_unused() -> None:

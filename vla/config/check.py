@@ -149,6 +149,20 @@ def conditions(evaluate: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
     return named
 
 
+def devices(trainer: Mapping[str, Any]) -> int:
+    """Return how many devices a trainer node asks for, on all of its machines."""
+    asked, nodes = trainer.get("devices", "auto"), trainer.get("num_nodes", 1)
+    if isinstance(asked, list):
+        return len(asked) * nodes
+    if str(asked) not in ("auto", "-1"):
+        return (len(asked.split(",")) if "," in str(asked) else int(asked)) * nodes
+    if trainer.get("accelerator", "auto") == "cpu":
+        return nodes
+    from torch.cuda import device_count  # slow to import
+
+    return max(device_count(), 1) * nodes
+
+
 def with_changes(node: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
     """Return a node merged with changes, key by key; a mapping that names a class replaces the old one."""
     merged = dict(node)

@@ -48,11 +48,8 @@ def _policy(experiment: Experiment) -> Policy:
     make_agent = experiment.make_agent()
     if make_agent is None:
         return experiment.make_policy()()
-    environment = experiment.make_environment()()
-    try:
-        agent: Any = make_agent(environment)
-    finally:
-        environment.close()
+    world: Any = experiment.world()
+    agent: Any = make_agent(world)
     if not hasattr(agent, "plan"):
-        raise ValueError(f"{type(agent).__name__} sees the simulator's truth, which a robot does not have")
+        raise ValueError(f"{type(agent).__name__} plans no chunks of actions, so it cannot be deployed")
     return agent

@@ -50,10 +50,7 @@ def run(experiment: Experiment) -> float | None:
         ValueError: an episode ended in an error; the report is written and contains it.
     """
     output = experiment.output
-    _statements(experiment)  # that they can be made, before any work
-    _networks(experiment)
-    if not experiment.playable and experiment["evaluate"]["conditions"]:
-        raise ValueError("evaluate.conditions change a world, and a recording has none: omit them")
+    require_possible(experiment)
     if experiment["agent"] and experiment.playable:
         return _evaluated(experiment, None)
     # Both modules import Lightning, which takes seconds.
@@ -70,6 +67,18 @@ def run(experiment: Experiment) -> float | None:
     if checkpoint.resolve().parent == (output / CHECKPOINTS).resolve():
         return evaluate_trained(experiment, checkpoint)
     return _evaluated(experiment, checkpoint)
+
+
+def require_possible(experiment: Experiment) -> None:
+    """Refuse, before any work, what an evaluation could not do at its end.
+
+    Raises:
+        ValueError: there is no such run to compare with, nothing to decide, no such network, or no world to change.
+    """
+    _statements(experiment)
+    _networks(experiment)
+    if not experiment.playable and experiment["evaluate"]["conditions"]:
+        raise ValueError("evaluate.conditions change a world, and a recording has none: omit them")
 
 
 def evaluate_trained(experiment: Experiment, checkpoint: Path, rounds: Sequence[Round] = ()) -> float:
@@ -91,7 +100,10 @@ def _evaluated(experiment: Experiment, checkpoint: Path | None, rounds: Sequence
             _write(experiment, checkpoint, reports, statements, rounds, started)
     finally:
         print("\n".join([*(each.say(report) for each in statements), str(report)]))
-    errors = [error for each in reports.values() for error in each.errors]
+    played = {
+        id(each): each for each in reports.values()
+    }  # conditions equal to the training condition share its report
+    errors = [error for each in played.values() for error in each.errors]
     if errors:
         raise ValueError(f"{len(errors)} episodes ended in an error, see {output / REPORT}")
     return report.success
@@ -209,12 +221,16 @@ def _write(
     facts["statements"] = [each.say(report) for each in statements]
     save_config(output, experiment.config, experiment.changes)
     recording = output / RECORDING
+    recording.unlink(missing_ok=True)  # of an earlier evaluation
     if experiment["recorder"]:
         with optional(recording):
             keep_recordings(report, output / "recordings", recording, experiment["evaluate"]["recordings"])
-    plot_report(report, output / "report.png")
+    with optional(output / "report.png"):
+        plot_report(report, output / "report.png")
+    (output / "suite.png").unlink(missing_ok=True)  # of an earlier evaluation
     if others:
-        plot_conditions(reports, output / "suite.png")
+        with optional(output / "suite.png"):
+            plot_conditions(reports, output / "suite.png")
         show(conditions_table(reports, compared))
         rows: Courses = {(name,): course for name, course in courses.items() if course}
         if rows:

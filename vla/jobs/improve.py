@@ -17,13 +17,13 @@ from pathlib import Path
 import torch
 
 from vla.config.adopt import require_identity
-from vla.config.check import TRAINING, Job, with_changes
+from vla.config.check import TRAINING, Job, devices, with_changes
 from vla.config.experiment import Experiment
 from vla.data.episodes import EpisodeStore
 from vla.data.index import listed
 from vla.io.types import Count, Seed, Share
 from vla.jobs.collect import demonstrations
-from vla.jobs.evaluate import evaluate_trained
+from vla.jobs.evaluate import evaluate_trained, require_possible
 from vla.jobs.train import train
 from vla.models.checkpoint import read_checkpoint
 from vla.rollouts.collect import collect, collection_time
@@ -97,11 +97,12 @@ def _require_possible(experiment: Experiment) -> range:
     Raises:
         ValueError: seeds are of evaluation, training is to use several devices, or the expert cannot label.
     """
-    asked, trainer = experiment["improve"], experiment["trainer"]
+    require_possible(experiment)
+    asked = experiment["improve"]
     seeds = range(asked["seed"], asked["seed"] + asked["rounds"] * asked["episodes"])
     if seeds.stop > FIRST_SEED:
         raise ValueError(f"improve.seed={seeds.start}: seeds from {FIRST_SEED} on are reserved for evaluation")
-    if str(trainer.get("devices", 1)) not in ("1", "[0]") or trainer.get("num_nodes", 1) != 1:
+    if devices(experiment["trainer"]) > 1:
         raise ValueError("job=improve trains on one device, because its trainings follow each other: trainer.devices=1")
     environment = experiment.make_environment()()
     try:

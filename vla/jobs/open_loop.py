@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,7 @@ from vla.policy import latency
 from vla.reports.html import PAGE, optional, write_page
 from vla.reports.open_loop import errors_table, plot_errors, write_errors
 from vla.rollouts.open_loop import OpenLoop, open_loop
+from vla.rollouts.rollout import close_agent
 from vla.runs.folder import ERRORS, save_config, wall_time
 
 log = logging.getLogger(__name__)
@@ -46,15 +48,19 @@ def evaluate_open_loop(experiment: Experiment, checkpoint: Path | None) -> float
     else:
         policy = experiment.make_policy(checkpoint)()
         policy.spec.without_truth.require(store.spec.without_truth, f"the checkpoint {checkpoint}", f"{store.folder}")
-        unseen = _unseen(store, checkpoint)
+        unseen = _unseen(store, [Path(folder) for folder in experiment["collect"]["more"] or ()], checkpoint)
         facts |= {"parameters": sum(p.numel() for p in policy.model.parameters()), "latency_ms": latency(policy)}
-    result = _measure(experiment, store, unseen, policy)
+    try:
+        result = _measure(experiment, store, unseen, policy)
+    finally:
+        close_agent(policy)
     seconds = time.monotonic() - started
     facts |= {"wall_time_s": wall_time(checkpoint, seconds)} if checkpoint else {"wall_time_s": seconds}
     facts |= {} if checkpoint else {"model": facts["agent"]}
     with writing(output / ERRORS):
         save_config(output, experiment.config, experiment.changes)
-        plot_errors(result, output / "errors.png")
+        with optional(output / "errors.png"):
+            plot_errors(result, output / "errors.png")
         # Last, because its existence marks the evaluation as finished.
         write_errors(result, output / ERRORS, str(checkpoint) if checkpoint else None, experiment.config, facts)
         with optional(output / PAGE):
@@ -65,20 +71,21 @@ def evaluate_open_loop(experiment: Experiment, checkpoint: Path | None) -> float
 
 
 def _store(experiment: Experiment) -> EpisodeStore:
-    """Return the episodes, importing missing ones."""
+    """Return the episodes, imported if there is no store of them."""
     folder, episodes = Path(experiment["collect"]["folder"]), experiment["collect"]["episodes"]
     if (folder / "store.json").exists():
         return EpisodeStore(folder, episodes)
     return demonstrations(experiment)
 
 
-def _unseen(store: EpisodeStore, checkpoint: Path) -> list[Entry]:
-    """Return the episodes that the training of a checkpoint held out."""
+def _unseen(store: EpisodeStore, more: Sequence[Path], checkpoint: Path) -> list[Entry]:
+    """Return the episodes of the store that the training of a checkpoint on it, and on `more` stores, held out."""
     header, entries = read_header(checkpoint), store.episodes
-    if header.windows != digest_of(entries):
+    if header.windows != digest_of([*entries, *(entry for folder in more for entry in EpisodeStore(folder).episodes)]):
+        folders = " and those in ".join(map(str, [store.folder, *more]))
         raise ValueError(
-            f"{checkpoint} was trained on other episodes than the {len(entries)} in {store.folder}, so which of them "
-            "were held out is unknown: name the recording, its options and collect.episodes as in training"
+            f"{checkpoint} was trained on other episodes than the {len(entries)} in {folders}, so which of them were "
+            "held out is unknown: name the recording, its options, collect.episodes and collect.more as in training"
         )
     return _held_out(store, header.config["data"]["validation_fraction"], f"{checkpoint} was trained on all of them")
 

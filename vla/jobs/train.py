@@ -89,6 +89,10 @@ def _fit(experiment: Experiment, state: TrainingProgress, trainer: Trainer, grac
         )
     if not len(data.held_out_windows):
         trainer.limit_val_batches = 0  # else callbacks wait for a validation that never runs
+        if experiment["validate"]["episodes"]:
+            log.warning(
+                "data.validation_fraction=0: no validation, so no episodes are played in it and last.ckpt is used"
+            )
     with optional(output / FILE):
         draw_samples(data.make_batch(data.order(0)[:SHOWN]), store.spec, output / FILE)
     if state.resume_from:
@@ -155,7 +159,7 @@ def _reported(
     finally:
         seconds = graceful_stop.seconds
         if trainer.is_global_zero:
+            save_training(output, parameters, trainer.global_step, seconds, ended, collection_s)
             with optional(output / PAGE):
-                save_training(output, parameters, trainer.global_step, seconds, ended, collection_s)
                 write_page(output)
     log.info("trained %d steps in %.0f s", trainer.global_step, seconds)

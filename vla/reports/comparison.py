@@ -10,6 +10,7 @@ from typing import Any
 
 from rich.table import Table
 
+from vla.config.check import conditions
 from vla.config.differences import at
 from vla.reports.conditions import COMPARED, NARROW, Courses, short_texts
 from vla.rollouts.comparison import Comparison, compare_pairs, compare_samples, concluded
@@ -120,5 +121,6 @@ def _by_seed(run: Run, condition: str) -> dict[int, tuple[Result, Any]]:
 def _scenes(run: Run, condition: str) -> tuple[Any, ...]:
     """Return what the scenes of all seeds depend on: the task, and how a condition changes it."""
     config = run.report.config if run.report else {}
-    asked = at(config, "evaluate")
-    return at(config, "task"), at(at(asked, "conditions"), condition), at(asked, "one_by_one")
+    asked = at(config, "evaluate", {})
+    changes = conditions({"conditions": {}, "one_by_one": {}, **asked}).get(condition)
+    return at(config, "task"), changes, at(asked, f"networks.{condition}", None), at(asked, "by_clock", None)

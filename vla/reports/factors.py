@@ -93,7 +93,7 @@ def groups(values: Sequence[Any]) -> list[list[int]]:
     quadrants around the median."""
     if isinstance(values[0], tuple):
         values = [str(quarter) for quarter in np.array(values) > np.median(values, axis=0)]
-    different = sorted(set(values))
+    different = sorted(set(values), key=None if numeric(values) else str)
     if len(different) <= BINS or not numeric(values):
         return [[index for index, other in enumerate(values) if other == value] for value in different]
     return [group.tolist() for group in np.array_split(np.argsort(values, kind="stable"), BINS)]

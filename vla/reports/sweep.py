@@ -7,9 +7,9 @@ from pathlib import Path
 from urllib.parse import quote
 
 from vla.io.files import atomic_path, write_text
-from vla.reports.html import SWEEP, TableRow, optional, write_sweep
+from vla.reports.html import ABSENT, SWEEP, TableRow, optional, write_sweep
 from vla.reports.sweep_plot import plot
-from vla.runs.sweep import SweepRow, read_rows
+from vla.runs.sweep import SweepRow, conditions_of, read_rows
 
 
 def tabulate(folder: Path) -> list[SweepRow]:
@@ -26,7 +26,7 @@ def tabulate(folder: Path) -> list[SweepRow]:
 
 def markdown(rows: list[SweepRow]) -> str:
     """Format the table in Markdown: success per condition with its interval, then costs."""
-    conditions = list(dict.fromkeys(condition for row in rows for condition in row.played))
+    conditions = conditions_of(rows)
     head = [*rows[0].choices, *(f"{name} [%]" for name in conditions), "each seed [%]", "parameters [M]", "action [ms]"]
     lines = [head, ["---"] * len(head)]
     for row in rows:
@@ -43,7 +43,11 @@ def markdown(rows: list[SweepRow]) -> str:
 
 def _costs(row: SweepRow) -> list[str]:
     rates = ", ".join(f"{100 * rate:.1f}" for rate in row.rates)
-    return [rates, f"{row.parameters / 1e6:.2f}", f"{row.latency:.1f}"]
+    return [
+        rates,
+        f"{row.parameters / 1e6:.2f}" if row.parameters else ABSENT,
+        f"{row.latency:.1f}" if row.latencies else ABSENT,
+    ]
 
 
 def _write_page(rows: list[SweepRow], folder: Path) -> None:
@@ -68,5 +72,5 @@ def _write_csv(rows: list[SweepRow], path: Path) -> None:
         for row in rows:
             for condition in row.played:
                 counts = [row.successes[condition], row.episodes[condition], len(row.rates)]
-                costs = [row.parameters, round(row.latency, 3)]
+                costs = [row.parameters or "", round(row.latency, 3) if row.latencies else ""]
                 writer.writerow([*row.choices.values(), condition, *row.interval(condition), *counts, *costs])

@@ -18,7 +18,7 @@ from vla.config.differences import at
 from vla.reports.style import error_bars, save
 from vla.rollouts.statistics import wilson_interval
 from vla.runs.folder import read_run
-from vla.runs.sweep import DEMONSTRATIONS, SweepRow
+from vla.runs.sweep import DEMONSTRATIONS, SweepRow, conditions_of
 
 SUCCESS = "success, 95 % CI"
 COLUMNS = 4  # panels per row
@@ -43,7 +43,7 @@ def plot(rows: list[SweepRow], path: Path) -> None:
 
 
 def _draw_numbers(figure: Figure, rows: list[SweepRow]) -> None:
-    conditions, lines = list(rows[0].played), _lines(rows)
+    conditions, lines = conditions_of(rows), _lines(rows)
     curves = {name: {row.choices[DEMONSTRATIONS]: validated(row) for row in line} for name, line in lines.items()}
     trained = {name: each for name, each in curves.items() if any(each.values())}
     columns = max(len(conditions), len(trained))
@@ -74,11 +74,11 @@ def _add_legend(panels: Sequence[Axes]) -> Legend:
 
 
 def _draw_choices(figure: Figure, rows: list[SweepRow]) -> None:
-    conditions = list(dict.fromkeys(condition for row in rows for condition in row.played))
-    latencies = [row.latency for row in rows]
+    conditions = conditions_of(rows)
+    latencies = [row.latency for row in rows if row.latencies]
     lines = [conditions[first : first + COLUMNS] for first in range(0, len(conditions), COLUMNS)]
     heights = [1.2 + 0.3 * len(rows)] * len(lines)
-    if costs := max(latencies) > 2 * min(latencies):
+    if costs := bool(latencies) and max(latencies) > 2 * min(latencies):
         heights.append(4.2)
     figure.set_size_inches(max(8, 2 + 3.3 * len(lines[0])), sum(heights))
     panels = figure.subplots(len(heights), len(lines[0]), squeeze=False, height_ratios=heights)
@@ -153,7 +153,8 @@ def _plot_rows(axes: Axes, rows: list[SweepRow], condition: str) -> None:
             axes.errorbar(rate, height, xerr=reach, fmt="o", color=f"C{height}", capsize=3, clip_on=False)
     if condition in rows[0].played:
         axes.axvline(rows[0].interval(condition)[0], color="C0", linewidth=0.8, linestyle=":")
-    axes.set_yticks(range(len(rows)), [f"{row.name}, {row.parameters / 1e6:.2f} M" for row in rows])
+    sizes = [f", {row.parameters / 1e6:.2f} M" if row.parameters else "" for row in rows]
+    axes.set_yticks(range(len(rows)), [row.name + size for row, size in zip(rows, sizes, strict=True)])
     axes.set_ylim(len(rows) - 0.5, -0.5)
     axes.set_xlim(0, 1)
     axes.set_xticks([0, 0.25, 0.5, 0.75, 1], ["0", "", "0.5", "", "1"])
@@ -164,7 +165,7 @@ def _plot_rows(axes: Axes, rows: list[SweepRow], condition: str) -> None:
 def _plot_costs(axes: Axes, rows: list[SweepRow], condition: str) -> None:
     """Plot success over the time per action with the Pareto front; the area of a point grows with the parameters."""
     for number, row in enumerate(rows):
-        if condition in row.played:
+        if condition in row.played and row.latencies:
             rate, reach = error_bars([row.interval(condition)])
             area = 40 + 60 * (row.parameters / 1e6) ** 0.5
             axes.errorbar(row.latency, rate, reach, color="#c4c8ce", capsize=3, zorder=1, clip_on=False)
@@ -173,7 +174,8 @@ def _plot_costs(axes: Axes, rows: list[SweepRow], condition: str) -> None:
     rates = [row.interval(condition)[0] for row in best]
     axes.plot([row.latency for row in best], rates, color="#8a8f98", linewidth=0.8, zorder=0)
     _label_rates(axes, condition, "time per action [ms]")
-    axes.set_xlim(0.7 * min(row.latency for row in rows), 1.4 * max(row.latency for row in rows))
+    latencies = [row.latency for row in rows if row.latencies]
+    axes.set_xlim(0.7 * min(latencies), 1.4 * max(latencies))
     axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
 
 
@@ -194,7 +196,7 @@ def pareto(rows: list[SweepRow], condition: str) -> list[SweepRow]:
         return row.interval(condition)[0]
 
     best: list[SweepRow] = []
-    played = [row for row in rows if condition in row.played]
+    played = [row for row in rows if condition in row.played and row.latencies]
     for row in sorted(played, key=lambda row: (row.latency, -rate(row))):
         if not best or rate(row) > rate(best[-1]):
             best.append(row)

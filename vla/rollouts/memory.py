@@ -57,7 +57,7 @@ def make_impaired(make_agent: Callable[[Environment], Agent], lacks: Sense, envi
 class NearestDemonstration:
     """Replays the demonstration with the most similar first images, whatever happens; then repeats its last action.
 
-    It is one with the same instruction, if there is any. Similarity is the mean absolute difference of every
+    It has another seed and, if there is one, the same instruction. Similarity is the mean absolute difference of every
     `STRIDE`th pixel of all cameras. It succeeds where a memory of the demonstrations is enough.
     """
 
@@ -74,6 +74,7 @@ class NearestDemonstration:
         store.spec.without_truth.require(spec.without_truth, f"the episode store {folder}", "the task")
         self._entries, self._executed = store.episodes, store.rows("executed")
         self._instructions = np.array([entry.instruction for entry in self._entries])
+        self._seeds = np.array([entry.seed for entry in self._entries])
         starts = [entry.span.start for entry in self._entries]
         images = [np.stack([_few(rows[start]) for start in starts]) for rows in map(store.rows, _fields(spec))]
         self._cameras, self._images = spec.cameras, np.stack(images, axis=1)  # (E, cameras, h, w, 3)
@@ -84,6 +85,7 @@ class NearestDemonstration:
         """Start an episode; the demonstration is chosen at the first action."""
         self._actions: Array | None = None
         self._step = 0
+        self._others = self._seeds != seed  # a recording must not be its own memory
 
     def act(self, observation: Observation) -> Array:
         """Return the next (D,) action of the demonstration."""
@@ -95,8 +97,8 @@ class NearestDemonstration:
 
     def _nearest(self, observation: Observation) -> int:
         seen = np.stack([_few(observation.rgb[camera]) for camera in self._cameras]).astype(np.int16)
-        known = np.flatnonzero(self._instructions == observation.instruction)
-        candidates = known if len(known) else np.arange(len(self._entries))
+        known = np.flatnonzero(self._others & (self._instructions == observation.instruction))
+        candidates = known if len(known) else np.flatnonzero(self._others)
         distances = [np.abs(self._images[index] - seen).mean() for index in candidates]
         return int(candidates[np.argmin(distances)])
 

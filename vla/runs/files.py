@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import repeat
@@ -116,14 +116,16 @@ class Condition:
     motions: list[Motion | None] = field(default_factory=list)
     anytime: bool = False  # intervals are valid whatever the reason to stop playing
 
-    def report(self, seeds: Sequence[int]) -> Report:
-        """Return the report on episodes of these seeds, without draws and instructions."""
+    def report(self, seeds: Sequence[int], tasks: Sequence[str], tiers: Mapping[str, Sequence[str]]) -> Report:
+        """Return the report on episodes of these seeds and tasks, without draws and instructions."""
         reached, motions = self.reached or repeat(()), self.motions or repeat(None)
         results = (
-            Result(seed, outcome, milestones=milestones, motion=motion)
-            for seed, outcome, milestones, motion in zip(seeds, self.outcomes, reached, motions, strict=False)
+            Result(seed, outcome, task=task, milestones=milestones, motion=motion)
+            for seed, task, outcome, milestones, motion in zip(
+                seeds, tasks, self.outcomes, reached, motions, strict=False
+            )
         )
-        return Report(tuple(results), anytime=self.anytime)
+        return Report(tuple(results), tiers, self.anytime)
 
 
 @dataclass(frozen=True)
@@ -168,7 +170,8 @@ class ReportFile:
     @cached_property
     def reports(self) -> dict[str, Report]:
         """Condition → report, the training condition first."""
-        first = Report(
-            tuple(self.per_episode), {tier: [*part.tasks] for tier, part in self.tiers.items()}, self.anytime
-        )
-        return {IN_DISTRIBUTION: first, **{name: part.report(self.seeds) for name, part in self.conditions.items()}}
+        tiers = {tier: [*part.tasks] for tier, part in self.tiers.items()}
+        # Without tiers a condition may change what an episode asks for; a benchmark's task follows from the seed.
+        tasks = [result.task if tiers else "" for result in self.per_episode]
+        others = {name: part.report(self.seeds, tasks, tiers) for name, part in self.conditions.items()}
+        return {IN_DISTRIBUTION: Report(tuple(self.per_episode), tiers, self.anytime), **others}

@@ -19,9 +19,9 @@ class SweepRow:
     """Cells that differ only in their training seed."""
 
     choices: dict[str, str]  # overrides that distinguish the row
-    parameters: int
+    parameters: int  # 0: another agent than a policy acted
     cells: list[Path] = field(default_factory=list)
-    latencies: list[float] = field(default_factory=list)  # per cell [ms]
+    latencies: list[float] = field(default_factory=list)  # per cell in which a policy acted [ms]
     rates: list[float] = field(default_factory=list)  # success rate per cell
     played: dict[str, list[dict[int, bool]]] = field(default_factory=dict)  # condition → per cell, seed → success
 
@@ -32,7 +32,7 @@ class SweepRow:
 
     @property
     def latency(self) -> float:
-        """Minimum latency of the cells [ms], because other load on the machine only increases it."""
+        """Minimum latency of the cells [ms], because other load on the machine only increases it; needs a policy."""
         return min(self.latencies)
 
     @property
@@ -51,6 +51,11 @@ class SweepRow:
         return (rate, *pooled_interval(self.played[condition]))
 
 
+def conditions_of(rows: list[SweepRow]) -> list[str]:
+    """Return the conditions of all rows, in the order in which they appear."""
+    return list(dict.fromkeys(condition for row in rows for condition in row.played))
+
+
 def read_rows(folder: Path) -> list[SweepRow]:
     """Read the rows of all cells that have a report and did not fail, in the order of the sweep."""
     reported = [
@@ -63,11 +68,10 @@ def read_rows(folder: Path) -> list[SweepRow]:
     for overrides, run in reported:
         choices = {key: overrides.get(key, "default") for key in varied}
         file = run.report
-        if file is None or file.parameters is None or file.latency_ms is None:
-            raise ValueError(f"{run.folder / REPORT} is of no evaluation: it lacks parameters or latency_ms")
-        row = rows.setdefault(tuple(choices.values()), SweepRow(choices, file.parameters))
+        assert file is not None, "a cell has a report"
+        row = rows.setdefault(tuple(choices.values()), SweepRow(choices, file.parameters or 0))
         row.cells.append(run.folder)
-        row.latencies.append(file.latency_ms)
+        row.latencies += [] if file.latency_ms is None else [file.latency_ms]
         row.rates.append(run.reports[IN_DISTRIBUTION].success)
         for condition, report in run.reports.items():
             ended = {result.seed: result.success for result in report.results if result.outcome != ERROR}
