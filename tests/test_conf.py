@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from composing import CONF, check, composed
+from composing import CONF, RT1_VARIANTS, check, composed
 from defaults import defaults_of
 from hydra import compose, initialize_config_dir
 from hydra.utils import get_class
@@ -39,6 +39,7 @@ pytestmark = pytest.mark.usefixtures("recording")
 
 # Options that are only for some options of another group.
 TOGETHER = {
+    **{("variant", option): ["model=rt1_tiny"] for option in RT1_VARIANTS},
     ("evaluate", "lerobot"): ["task=metaworld"],
     ("tokenizer", "fast"): ["model=decoder"],
     ("job", "deploy"): ["deploy=ros2"],

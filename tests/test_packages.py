@@ -21,7 +21,7 @@ import toy
 from clusters import PLACES, address_in, dask
 from collecting import content
 from command_line import here, vla
-from composing import CONF, check, composed
+from composing import CONF, RT1_VARIANTS, check, composed
 from conftest import made_once
 from hydra.errors import ConfigCompositionException
 
@@ -130,8 +130,6 @@ OF_ONE_WORLD = {
     *("no_excursions", "no_noise", "coarse_images"),
     *("unheard", "renderer", "lerobot", "metaworld", "metaworld_disturbed", "metaworld_improved", "few_improved"),
 }
-# Variants that change an option of RT-1.
-OF_RT1 = {"as_published", "dropout", "smaller", "no_history", "small_embeddings", "two_tokens"}
 
 
 @pytest.mark.parametrize("group", ["experiment", "evaluate", "validate", "variant"])
@@ -141,7 +139,7 @@ def test_options_go_with_any_world_or_are_refused_for_it(
     monkeypatch.setenv(packages.TRUSTED, "mypackage")
     options = {path.stem for path in (CONF / group).glob("*.yaml")}
     for option in sorted(options - OF_ONE_WORLD):
-        model = ["model=rt1_tiny"] if option in OF_RT1 else []
+        model = ["model=rt1_tiny"] if option in RT1_VARIANTS else []
         check(composed("task=mine", "expert=mine", f"{group}={option}", *model))
     for option in sorted(options & OF_ONE_WORLD):
         with pytest.raises(
