@@ -17,7 +17,6 @@ from vla.config.compose import CONF as CONF
 from vla.config.compose import compose
 from vla.config.packages import TRUSTED, trusted
 
-
 # Variants that change an option of RT-1.
 RT1_VARIANTS = {"as_published", "dropout", "smaller", "no_history", "small_embeddings", "two_tokens"}
 
