@@ -17,7 +17,7 @@ from vla.rollouts.sequential import (
     anytime_difference,
     anytime_interval,
     anytime_p,
-    is_beside,
+    excludes,
     is_settled,
     log_capital,
 )
@@ -62,7 +62,7 @@ def test_intervals_contain_those_of_a_fixed_number() -> None:
 def test_what_is_decided_agrees_with_the_intervals() -> None:
     for won, lost in ((95, 5), (99, 1), (60, 40), (9, 1)):
         low, high = anytime_interval(won, lost)
-        assert is_beside(0.9, won, lost) == (not low <= 0.9 <= high)
+        assert excludes(0.9, won, lost) == (not low <= 0.9 <= high)
     for first, second, pairs in ((0, 5, 20), (1, 20, 100), (5, 6, 90), (5, 5, 2000), (3, 3, 400)):
         low, high = anytime_difference(first, second, pairs)
         assert is_settled(first, second, pairs, 0.03) == (not low <= 0 <= high or (low > -0.03 and high < 0.03))

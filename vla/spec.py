@@ -454,5 +454,11 @@ class Deployment(Protocol):
         ...
 
 
-# Unit of an action → factor and unit for display.
-READABLE = {"m": (1000.0, "mm"), "rad": (180 / math.pi, "deg"), "1": (1.0, "")}
+def readable(unit: str) -> tuple[float, str]:
+    """Return the factor from the unit of an action to the one for display, and that unit; "" for none."""
+    return {"m": (1000.0, "mm"), "rad": (180 / math.pi, "deg"), "1": (1.0, "")}.get(unit, (1.0, unit))
+
+
+def in_brackets(unit: str) -> str:
+    """Format a unit for the title of a plot, as " [m]"; "" for none."""
+    return "" if unit == "1" else f" [{unit}]"

@@ -16,6 +16,7 @@ from vla.io.files import require_file
 T = TypeVar("T")
 
 MAX_BYTES = 64 << 20  # [bytes] of a file
+MAX_YAML_BYTES = 1 << 20  # [bytes] of a YAML file, which is slow to parse
 MAX_VALUES = 100_000  # values in a configuration
 MAX_DEPTH = 64  # nesting levels in YAML; pydantic's JSON parser stops at 200 by itself
 
@@ -33,9 +34,9 @@ def read_json(path: Path, kind: type[T], largest: int = MAX_BYTES) -> T:
     return parse_json(read_bounded(path, largest), kind, str(path))
 
 
-def read_yaml(path: Path, kind: type[T], largest: int = 1 << 20) -> T:
+def read_yaml(path: Path, kind: type[T]) -> T:
     """Read the YAML file at `path` as a `kind`, see `read_json`. Aliases are refused: they expand without bound."""
-    return parse_yaml(read_bounded(path, largest), kind, str(path))
+    return parse_yaml(read_bounded(path, MAX_YAML_BYTES), kind, str(path))
 
 
 def parse_json(text: str | bytes, kind: type[T], name: str) -> T:
@@ -101,11 +102,11 @@ def mappings(value: Any) -> Iterator[dict[Any, Any]]:
         yield from mappings(part)
 
 
-def problems(error: ValidationError, most: int = 3) -> str:
-    """Format at most `most` validation errors, as `spec.cameras[0]: Input should be a valid string`."""
+def problems(error: ValidationError) -> str:
+    """Format the first three validation errors, as `spec.cameras[0]: Input should be a valid string`."""
     found = [f"{_dotted(each['loc'])}{each['msg']}" for each in error.errors(include_url=False, include_input=False)]
-    more = f"; and {len(found) - most} more" if len(found) > most else ""
-    return "; ".join(found[:most]) + more
+    more = f"; and {len(found) - 3} more" if len(found) > 3 else ""
+    return "; ".join(found[:3]) + more
 
 
 def _dotted(location: tuple[int | str, ...]) -> str:

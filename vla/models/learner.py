@@ -15,7 +15,7 @@ from vla.models.compile_cache import set_compile_cache
 from vla.models.fsdp import local_shard, shard, unsharded
 from vla.models.model import Batch, Model
 from vla.models.vision.image_tokenizer import RandomShift
-from vla.spec import READABLE, Spec
+from vla.spec import Spec, readable
 
 CHECK_FINITE_EVERY = 50  # steps
 NEVER = torch.iinfo(torch.int64).max  # first step with a non-finite loss, if there was none
@@ -180,7 +180,7 @@ class Learner(LightningModule):
             actions = self.model.predict(batch).actions
         error = (actions - batch["action"][:, -1]).abs()[batch["valid"][:, -1]]  # (N, D)
         for index, (name, unit) in enumerate(zip(self._spec.action, self._spec.units, strict=True)):
-            factor, unit_name = READABLE.get(unit, (1.0, unit))
+            factor, unit_name = readable(unit)
             metric = self.errors[index]
             assert isinstance(metric, MeanMetric)
             metric.update(error[:, index] * factor)

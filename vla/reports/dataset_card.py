@@ -20,7 +20,7 @@ from vla.data.verification import StoreReport, entries_by_config, episode_of
 from vla.io.files import write_text
 from vla.reports.evaluation import contact_sheet, spans
 from vla.reports.style import BLUE, GREEN, RED, save
-from vla.spec import Spec
+from vla.spec import Spec, in_brackets
 
 ITEMS = (RED, GREEN, BLUE)  # colours of a triple's items
 WORDS, SENTENCES = 8, 12  # maximum number of bars for words and for instructions
@@ -219,8 +219,7 @@ def _plot_actions(figure: SubFigure, findings: StoreReport) -> None:
         )
         axes.hist(labels, bins, color=BLUE, log=True)
         axes.hist(executed, bins, color="black", histtype="step", linewidth=0.8, log=True)
-        unit = {"1": ""}.get(spec.units[index], f" [{spec.units[index]}]")
-        axes.set_title(f"{spec.action[index]}{unit}", fontsize=10)
+        axes.set_title(spec.action[index] + in_brackets(spec.units[index]), fontsize=10)
 
 
 def _plot_draw(axes: Axes, values: Sequence[Any]) -> None:

@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from vla.reports.style import GREEN, GREY, save
-from vla.spec import READABLE, Array, Spec
+from vla.spec import Array, Spec, readable
 
 FILE = "samples.png"
 SHOWN = 6  # windows
@@ -57,8 +57,8 @@ def _plot_action(axes: Axes, left: float, bottom: float, action: Array, spec: Sp
     axes.barh(places, (1 - least) * BAR / 2, 0.8 * step, left=zero + least * BAR / 2, color=GREY, alpha=0.12)
     axes.barh(places, shares * BAR / 2, 0.6 * step, left=zero, color=GREEN)
     for place, name, value, unit in zip(places, spec.action, action, spec.units, strict=True):
-        factor, readable = READABLE.get(unit, (1.0, unit))
+        factor, shown = readable(unit)
         number = round(factor * float(value), 1) + 0.0  # never "-0.0"
-        text = f"{number:.1f} {readable}" if readable else f"{number:.2g}"
+        text = f"{number:.1f} {shown}" if shown else f"{number:.2g}"
         axes.text(left - GAP, place, name, ha="right", va="center", fontsize=7.5, parse_math=False)
         axes.text(left + BAR + GAP, place, text, va="center", fontsize=7.5, parse_math=False)

@@ -17,6 +17,7 @@ from vla.io.files import write_text
 from vla.reports.style import BLUE, GREEN, GREY, save
 from vla.rollouts.open_loop import OpenLoop
 from vla.runs.files import ComponentError
+from vla.spec import in_brackets
 
 COLUMNS = 4  # panels of components per row
 
@@ -82,8 +83,7 @@ def plot_errors(result: OpenLoop, path: Path) -> None:
             continue
         axes.plot(seconds, result.recorded[typical][:, index], color=GREY, linewidth=2.5)
         axes.plot(seconds, result.predicted[typical][:, index], color=BLUE, linewidth=1)
-        unit = {"1": ""}.get(spec.units[index], f" [{spec.units[index]}]")
-        axes.set_title(f"{spec.action[index]}{unit}", fontsize=9)
+        axes.set_title(spec.action[index] + in_brackets(spec.units[index]), fontsize=9)
         axes.tick_params(labelsize=8)
     for axes in panels[max(len(spec.action) - COLUMNS, 0) : len(spec.action)]:
         axes.set_xlabel("time [s]", fontsize=8)

@@ -196,7 +196,7 @@ class RemotePolicy:
         except InvalidStatus as error:
             said = bytes(error.response.body or b"").decode(errors="replace").strip()[:200]
             raise self._error(
-                f"{said} (VLA_API_KEY)" if "API key" in said else said or f"HTTP status {error.response.status_code}"
+                f"{said}: set VLA_API_KEY" if "API key" in said else said or f"HTTP status {error.response.status_code}"
             ) from error
         except (OSError, WebSocketException) as error:
             raise ValueError(f"nobody serves a policy at {self.url} ({error}): start it, or set agent.url") from error

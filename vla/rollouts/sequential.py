@@ -46,13 +46,13 @@ def log_capital(mean: float, ones: Array | float, zeros: Array | float, halves: 
     return np.asarray(largest + np.log(np.exp(growth - largest[..., None]).mean(-1)))
 
 
-def anytime_interval(ones: float, zeros: float, halves: int = 0, level: float = LEVEL) -> tuple[float, float]:
+def anytime_interval(ones: float, zeros: float, halves: int = 0) -> tuple[float, float]:
     """Return the confidence interval of the mean of observations of 0, 1/2 and 1; (0, 1) without observations.
 
     An observation x between 0 and 1 may be counted as x ones and 1 - x zeros: by the inequality of arithmetic and
     geometric means, bets on it win at least as much.
     """
-    seen, limit = ones + zeros + halves, log(1 / level)
+    seen, limit = ones + zeros + halves, log(1 / LEVEL)
     if seen == 0:
         return 0.0, 1.0
     estimate = (ones + halves / 2) / seen
@@ -95,7 +95,7 @@ def anytime_p(first: int, second: int) -> float:
     return float(np.exp(-max(log_capital(0.5, second, first), 0.0)))
 
 
-def is_beside(bar: float, successes: int, failures: int) -> bool:
+def excludes(bar: float, successes: int, failures: int) -> bool:
     """Return whether a success rate has been shown to be above or below a bar, which is between 0 and 1."""
     return bool(log_capital(bar, successes, failures) >= log(1 / LEVEL))
 

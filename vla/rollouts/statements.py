@@ -8,7 +8,7 @@ from typing import Protocol
 
 from vla.rollouts.comparison import Comparison, compare_pairs
 from vla.rollouts.results import Report, Result, pairs_of
-from vla.rollouts.sequential import is_beside, is_settled
+from vla.rollouts.sequential import excludes, is_settled
 
 
 class Statement(Protocol):
@@ -31,7 +31,7 @@ class AgainstBar:
 
     def is_clear(self, report: Report) -> bool:
         """See `Statement`."""
-        return is_beside(self.bar, report.successes, report.episodes - report.successes)
+        return excludes(self.bar, report.successes, report.episodes - report.successes)
 
     def say(self, report: Report) -> str:
         """See `Statement`."""

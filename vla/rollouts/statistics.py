@@ -41,9 +41,9 @@ def stratified_interval(strata: Sequence[tuple[int, int, float]]) -> tuple[float
     won, trials, weights = np.array(strata, float).T
     smooth = (won + 0.5) / (trials + 1)
     mean, variance = weights @ smooth, np.square(weights) @ (smooth * (1 - smooth) / trials)
-    alike = float(mean * (1 - mean) / variance)
+    effective = float(mean * (1 - mean) / variance)
     rate = float(weights @ (won / trials))
-    return rate, *wilson_interval(rate * alike, alike)
+    return rate, *wilson_interval(rate * effective, effective)
 
 
 def bounded_mean_interval(values: Sequence[float], largest: float) -> tuple[float, float]:
@@ -59,8 +59,8 @@ def bounded_mean_interval(values: Sequence[float], largest: float) -> tuple[floa
         return 0.0, largest
     smooth = (total + 0.5) / (count + 1)
     variance = (float(np.square(shares).sum()) + 0.5) / (count + 1) - smooth**2
-    alike = count * smooth * (1 - smooth) / variance
-    low, high = wilson_interval(total / count * alike, alike)
+    effective = count * smooth * (1 - smooth) / variance
+    low, high = wilson_interval(total / count * effective, effective)
     return largest * low, largest * high
 
 
@@ -100,8 +100,9 @@ def pooled_interval(trainings: Sequence[Mapping[int, bool]]) -> tuple[float, flo
         apart = success - rate
         between, within = _squares(apart, training) * len(trainings) / (len(trainings) - 1), _squares(apart, scene)
         squares = max(between, within, between + within - float(apart @ apart))
-        alike = len(np.unique(scene)) if rate in (0, 1) else len(success) ** 2 * rate * (1 - rate) / max(squares, 1e-9)
-        independent = min(independent, alike)
+        variance = max(squares, 1e-9) / len(success) ** 2
+        effective = len(np.unique(scene)) if rate in (0, 1) else rate * (1 - rate) / variance
+        independent = min(independent, effective)
     return wilson_interval(rate * independent, independent)
 
 

@@ -15,7 +15,7 @@ from vla.io.types import Count, Natural, NonNegative, Positive, Share
 from vla.rollouts.comparison import Comparison
 from vla.rollouts.motion import Motion
 from vla.rollouts.results import IN_DISTRIBUTION, Report, Result
-from vla.spec import READABLE
+from vla.spec import readable
 
 Node = dict[str, Any]
 LENIENT = ConfigDict(strict=True, extra="ignore", allow_inf_nan=False)  # what follows from the rest is not read
@@ -81,7 +81,7 @@ class ComponentError:
 
     def readable(self) -> tuple[str, str, str, str]:
         """Format unit, error, its interval and the constant error, in units for display."""
-        factor, unit = READABLE.get(self.unit, (1.0, self.unit))
+        factor, unit = readable(self.unit)
         high = "∞" if self.ci_high is None else f"{factor * self.ci_high:.3g}"
         return unit, f"{factor * self.error:.3g}", f"{factor * self.ci_low:.3g}-{high}", f"{factor * self.constant:.3g}"
 

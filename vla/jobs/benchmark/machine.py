@@ -49,6 +49,6 @@ class Others:
         return (user + nice + system + irq + softirq + steal) / TICKS, sum(os.times()[:4]), time.monotonic()
 
 
-def spoilt(others: float | None) -> bool:
+def spoilt(others: float) -> bool:
     """Return whether other programs used so many cores that figures are worse than the machine."""
-    return others is not None and others > BUSY * (os.cpu_count() or 1)
+    return others > BUSY * (os.cpu_count() or 1)

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from vla.models.tokenizers.tokenizer import ActionTokenizer
-from vla.spec import READABLE, Spec
+from vla.spec import Spec, readable
 
 
 def out_of_bounds(tokenizer: ActionTokenizer, chunks: np.ndarray) -> float:
@@ -28,7 +28,7 @@ def describe_tokenization_error(tokenizer: ActionTokenizer, chunks: np.ndarray, 
     errors = []
     for unit in dict.fromkeys(spec.units):
         of_unit = [index for index, other in enumerate(spec.units) if other == unit]
-        scale, name = READABLE.get(unit, (1.0, unit))
+        scale, name = readable(unit)
         part = scale * error[:, of_unit]
         bias, largest = part.mean(0).abs().max(), part.abs().max()
         named = name or f"of {', '.join(spec.action[index] for index in of_unit)}"
