@@ -165,13 +165,7 @@ def _play(experiment: Experiment, checkpoint: Path | None, statements: Sequence[
     if recorder:
         recordings.mkdir(exist_ok=True)
         needs.append(recordings)
-    others: dict[str, AgentFactory] = {
-        **{f"without_{sense}": partial(make_impaired, make_agent, sense) for sense in asked["without"]},
-        **{
-            name: partial(make_distant, make_agent, network, by_clock=asked["by_clock"])
-            for name, network in _networks(experiment).items()
-        },
-    }
+    others = _other_agents(experiment, make_agent)
     named = {IN_DISTRIBUTION: {}, **conditions(asked), **{name: {} for name in others}}
     different = sum(name in others or with_changes(task, changes) != task for name, changes in named.items())
     until, reports = [each.is_clear for each in statements], dict[str, Report]()
@@ -179,26 +173,33 @@ def _play(experiment: Experiment, checkpoint: Path | None, statements: Sequence[
         if reports and name not in others and with_changes(task, changes) == task:  # equal to the training condition
             reports[name] = reports[IN_DISTRIBUTION]
             continue
-        watching = None if reports else recorder
-        make_environment = experiment.make_environment(changes)
-        tiers = task.get("tiers")  # of worlds that have them
-        clear = partial(_all, until) if asked["until"] and until else None
         reports[name] = evaluate(
-            make_environment,
+            experiment.make_environment(changes),
             others.get(name, make_agent),
-            watching,
+            None if reports else recorder,
             seeds,
             cluster,
             name,
             needs,
-            tiers,
-            clear,
-            asked["recordings"],
+            tiers=task.get("tiers"),  # of worlds that have them
+            until=partial(_all, until) if asked["until"] and until else None,
+            recordings=asked["recordings"],
         )
         first = reports[IN_DISTRIBUTION]
         seeds = [result.seed for result in first.results]
         until = [AgainstCondition(first, asked["margin"], different).is_clear]
     return reports
+
+
+def _other_agents(experiment: Experiment, make_agent: AgentFactory) -> dict[str, AgentFactory]:
+    """Return condition → factory of the same agent without a sense, or at the other end of a network."""
+    asked = experiment["evaluate"]
+    impaired = {f"without_{sense}": partial(make_impaired, make_agent, sense) for sense in asked["without"]}
+    distant = {
+        name: partial(make_distant, make_agent, network, by_clock=asked["by_clock"])
+        for name, network in _networks(experiment).items()
+    }
+    return {**impaired, **distant}
 
 
 def _all(conditions: Sequence[Callable[[Report], bool]], report: Report) -> bool:
