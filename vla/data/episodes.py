@@ -98,7 +98,12 @@ class EpisodeStore:
         different = sorted(key for key in {*asked, *there} if asked.get(key) != there.get(key))
         if different:
             raise ValueError(f"{self.folder} was collected with another config for {different}: choose another folder")
-        if seed is not None and self.tried and self.tried[0].seed != seed:
+        if seed is not None:
+            self.require_first_seed(seed)
+
+    def require_first_seed(self, seed: int) -> None:
+        """Raise a ValueError if the first episode has another seed; a derived store may begin anywhere."""
+        if self.tried and not self.derived and self.tried[0].seed != seed:
             first = self.tried[0].seed
             raise ValueError(f"{self.folder} starts at seed {first}, not {seed}: set collect.seed={first}")
 

@@ -82,11 +82,11 @@ def collect(
     before = len(store.episodes)
     if before < episodes and store.derived:
         raise ValueError(f"{store.folder} was derived from other stores and cannot grow: set collect.episodes={before}")
-    _require_first_seed(store, seed)
+    store.require_first_seed(seed)
     if before < episodes:
         with store.writing():
             before = len(store.episodes)  # another process may have added some meanwhile
-            _require_first_seed(store, seed)
+            store.require_first_seed(seed)
             if before < episodes:
                 began = time.monotonic()  # excludes the wait for another process
                 try:
@@ -130,12 +130,6 @@ def _save_collection_time(folder: Path, seconds: float) -> None:
     if before is not None:
         with suppress(OSError):
             write_text(file, f"{before + seconds:.1f}\n")
-
-
-def _require_first_seed(store: EpisodeStore, seed: int) -> None:
-    if store.tried and not store.derived and store.tried[0].seed != seed:
-        first = store.tried[0].seed
-        raise ValueError(f"{store.folder} starts at seed {first}, not {seed}: set collect.seed={first}")
 
 
 def _fill_with(
@@ -196,7 +190,7 @@ class Attempts:
         missing = most - len(going)
         while missing > 0:
             if self._next >= FIRST_SEED:
-                raise ValueError(f"seeds from {FIRST_SEED} on are kept for evaluation: lower collect.seed")
+                raise ValueError(f"seeds from {FIRST_SEED} on are reserved for evaluation: lower collect.seed")
             needed = self._needed(self._next, expected)
             self._pending.append((self._next, self._pool.submit(self._next) if needed else None))
             expected[self._task_of(self._next)] += needed
