@@ -228,7 +228,7 @@ def test_a_worker_that_dies_is_reported_and_costs_nothing(tmp_path: Path, whole:
 
 def test_demonstrations_never_come_from_the_seeds_of_evaluations(tmp_path: Path) -> None:
     store = EpisodeStore.create_or_open(tmp_path, toy.SPEC, {})
-    with pytest.raises(ValueError, match="seeds from 1000000 on are reserved for evaluation"):  # as one of the four fails
+    with pytest.raises(ValueError, match="seeds from 1000000 on are reserved for evaluation"):  # one fails
         collect(store, toy.make_environment, toy.make_expert, 4, LocalCluster(1), FIRST_SEED - 4)
     assert store.episodes and all(entry.seed < FIRST_SEED for entry in store.tried)
 
