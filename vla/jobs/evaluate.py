@@ -100,10 +100,9 @@ def _evaluated(experiment: Experiment, checkpoint: Path | None, rounds: Sequence
             _write(experiment, checkpoint, reports, statements, rounds, started)
     finally:
         print("\n".join([*(each.say(report) for each in statements), str(report)]))
-    played = {
-        id(each): each for each in reports.values()
-    }  # conditions equal to the training condition share its report
-    errors = [error for each in played.values() for error in each.errors]
+    # Conditions that are equal to the training condition share its report.
+    different = {id(each): each for each in reports.values()}.values()
+    errors = [error for each in different for error in each.errors]
     if errors:
         raise ValueError(f"{len(errors)} episodes ended in an error, see {output / REPORT}")
     return report.success
