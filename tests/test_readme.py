@@ -67,7 +67,8 @@ def cell(command: str, number: int) -> list[str]:
     swept = [argument for argument in arguments_of(command) if argument != "-m"]
     if "-m" in command.split():
         for name in [argument.partition("=")[2] for argument in swept if argument.startswith("experiment=")]:
-            params = OmegaConf.load(CONF / f"experiment/{name}.yaml").hydra.sweeper.params
+            own = OmegaConf.load(CONF / f"experiment/{name}.yaml")
+            params = OmegaConf.select(own, "hydra.sweeper.params", default={})  # none if only the command is a grid
             swept += [f"{key}={values}" for key, values in params.items()]
         pairs = [argument.partition("=")[::2] for argument in swept]
         swept = [f"{key}={values.split(',')[number].strip()}" for key, values in pairs]
