@@ -123,4 +123,5 @@ def _scenes(run: Run, condition: str) -> tuple[Any, ...]:
     config = run.report.config if run.report else {}
     asked = at(config, "evaluate", {})
     changes = conditions({"conditions": {}, "one_by_one": {}, **asked}).get(condition)
-    return at(config, "task"), changes, at(asked, f"networks.{condition}", None), at(asked, "by_clock", None)
+    network = at(asked, "networks", {}).get(condition)
+    return at(config, "task"), changes, network and (network, at(asked, "by_clock", None))
