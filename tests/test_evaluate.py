@@ -99,7 +99,7 @@ def test_errors_are_neither_successes_nor_failures() -> None:
     report = results("success", "error", "dropped", "dropped", "error")
     assert (report.episodes, report.successes, len(report.errors)) == (3, 1, 2)
     assert report.success == 1 / 3
-    assert report.taxonomy == {"error": 2, "dropped": 2, "success": 1}
+    assert report.outcome_counts == {"error": 2, "dropped": 2, "success": 1}
 
 
 def test_a_report_of_errors_alone_has_the_widest_interval() -> None:
@@ -110,7 +110,7 @@ def test_two_workers_report_what_one_reports() -> None:
     alone = evaluate(toy.make_environment, toy.make_agent, None, SEEDS)
     assert evaluate(toy.make_environment, toy.make_agent, None, SEEDS, LocalCluster(2)) == alone
     assert [result.seed for result in alone.results] == list(SEEDS)
-    assert alone.taxonomy == {"success": 8, "timeout": 2}
+    assert alone.outcome_counts == {"success": 8, "timeout": 2}
     first = alone.results[0]
     assert first.steps > 0
     assert first.draws["limit"] == 40 and len(first.draws["point"]) == 2 and first.draws["colour"] in first.instruction

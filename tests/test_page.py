@@ -19,11 +19,12 @@ from PIL import Image
 from toy_recordable import ThinkingAgent, make_environment
 
 from vla.config.differences import differences
+from vla.io.files import warn_on_error
 from vla.reports.comparison import compare_runs, read_runs
 from vla.reports.evaluation import plot_report, write_report
 from vla.reports.filmstrips import MOMENTS, read_filmstrips
 from vla.reports.first_batch import draw_samples
-from vla.reports.html import optional, write_page
+from vla.reports.html import write_page
 from vla.reports.posteriors import compact_letters
 from vla.reports.sweep import tabulate
 from vla.reports.training_curves import draw_run, draw_runs
@@ -303,7 +304,7 @@ def test_runs_with_nothing_to_compare_are_refused(tmp_path: Path) -> None:
 
 def test_a_page_that_cannot_be_made_is_a_warning(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     (tmp_path / "report.json").write_text("{")
-    with caplog.at_level(logging.WARNING), optional(tmp_path / "report.html"):
+    with caplog.at_level(logging.WARNING), warn_on_error(tmp_path / "report.html"):
         write_page(tmp_path)
     assert "could not write" in caplog.text and "report.html" in caplog.text and "report.json is damaged" in caplog.text
     assert [file.name for file in tmp_path.iterdir()] == ["report.json"]

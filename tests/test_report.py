@@ -40,7 +40,7 @@ def test_report_json_tells_everything(tmp_path: Path) -> None:
     assert (content["episodes"], content["successes"], content["errors"]) == (60, report.successes, 1)
     assert (content["ci_low"], content["ci_high"]) == wilson_interval(report.successes, 60)
     assert content["seeds"] == list(range(FIRST_SEED, FIRST_SEED + 61))
-    assert content["taxonomy"] == {**report.taxonomy}
+    assert content["outcome_counts"] == {**report.outcome_counts}
     assert (content["checkpoint"], content["config"]) == ("runs/best.ckpt", {"model": {"width": 16}})
     assert content["per_episode"][0]["draws"] == report.results[0].draws
     assert content["per_episode"][-1]["error"] == "ValueError: broken"
@@ -51,7 +51,7 @@ def test_report_json_tells_everything(tmp_path: Path) -> None:
 def test_plots_are_drawn_whatever_happened(report: Report, tmp_path: Path, figures: list[Figure]) -> None:
     plot_report(report, tmp_path / "report.png")
     outcomes, lengths, *others = figures[0].axes
-    assert bars(outcomes) == [*report.taxonomy.values()][::-1]
+    assert bars(outcomes) == [*report.outcome_counts.values()][::-1]
     played = [result for result in report.results if result.outcome != "error"]
     # Stacked: those of the failures stand on those of the successes.
     tops = [bar.get_y() + bar.get_height() for bar in lengths.patches]  # type: ignore[attr-defined]

@@ -45,7 +45,7 @@ def test_the_main_job_collects_trains_evaluates_and_records(home: Path) -> None:
         "ci_low",
         "ci_high",
         "seeds",
-        "taxonomy",
+        "outcome_counts",
         "checkpoint",
         "config",
     } <= set(report)

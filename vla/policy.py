@@ -222,6 +222,11 @@ def _joined(batches: Sequence[Batch]) -> Batch:
     }
 
 
+def costs(policy: Policy) -> dict[str, float]:
+    """Return the number of parameters of a policy and its latency [ms], under the names of a report's file."""
+    return {"parameters": sum(p.numel() for p in policy.model.parameters()), "latency_ms": latency(policy)}
+
+
 def latency(policy: Policy) -> float:
     """Measure the time from an observation to its action with a full history [ms].
 

@@ -13,6 +13,7 @@ from omegaconf import DictConfig, OmegaConf
 from vla.config.annotations import MissingLibrary, locate
 from vla.config.compose import CONF
 from vla.config.experiment import Node, plain
+from vla.data.header import is_store
 
 log = logging.getLogger(__name__)
 
@@ -23,7 +24,7 @@ def with_substitutes(cfg: DictConfig, overrides: Sequence[str]) -> DictConfig:
     Everything derived from the config, such as the folder of the demonstrations, uses the substitute. An option that
     the command line names stays, and so do all where the demonstrations exist: in a resumed run, and in job=train.
     """
-    stored = cfg.job == "train" and (Path(cfg.collect.folder) / "store.json").is_file()
+    stored = cfg.job == "train" and is_store(Path(cfg.collect.folder))
     if cfg.resume is not None or cfg.task is None or stored:
         return cfg
     for name, node in cfg.task.items():

@@ -24,7 +24,7 @@ from typing import Any, BinaryIO
 import numpy as np
 from filelock import FileLock, Timeout
 
-from vla.data.header import fields_of, header_of, images_of, read_header, write_header
+from vla.data.header import fields_of, header_of, images_of, is_store, read_header, write_header
 from vla.data.image_codec import JPEG, PackedRows, whole_rows
 from vla.data.index import SALVAGE, Entry, dumps, index_line, listed, parse_line, read_index
 from vla.data.statistics import Statistics, statistics_of
@@ -78,7 +78,7 @@ class EpisodeStore:
         """
         folder = Path(folder)
         plain = json.loads(dumps(config))
-        if not (folder / "store.json").exists():
+        if not is_store(folder):
             folder.mkdir(parents=True, exist_ok=True)
             with FileLock(folder / "lock"):
                 write_header(folder, header_of(spec, plain))

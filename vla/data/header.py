@@ -93,6 +93,11 @@ def header_of(spec: Spec, config: dict[str, Any]) -> Header:
     return Header(FORMAT, spec.to_dict(), config, _layouts(spec))
 
 
+def is_store(folder: Path) -> bool:
+    """Return whether a folder holds an episode store, which may be empty or damaged."""
+    return (folder / NAME).exists()
+
+
 def read_header(folder: Path) -> tuple[Header, Spec]:
     """Read the description of the store in a folder.
 
@@ -100,7 +105,7 @@ def read_header(folder: Path) -> tuple[Header, Spec]:
         ValueError: it is missing, damaged or of another kind.
     """
     path = folder / NAME
-    if not path.exists():
+    if not is_store(folder):
         raise ValueError(f"there is no episode store in {folder} (no {NAME}): collect one first, with job=collect")
     try:
         content = read_bounded(path, LARGEST)
@@ -131,7 +136,7 @@ def write_header(folder: Path, header: Header) -> None:
         OSError: it cannot be written.
     """
     path = folder / NAME
-    if path.exists():
+    if is_store(folder):
         return
     orphans = sorted(file.name for file in folder.iterdir() if file.suffix in (".bin", ".jsonl"))
     if orphans:

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from errno import EACCES, EDQUOT, EFBIG, EISDIR, ENOSPC, ENOTDIR, EPERM, EROFS
 from pathlib import Path
+
+log = logging.getLogger(__name__)
 
 UNWRITABLE = (EACCES, EDQUOT, EFBIG, EISDIR, ENOSPC, ENOTDIR, EPERM, EROFS)
 
@@ -63,3 +66,12 @@ def writing(target: Path) -> Iterator[None]:
         raise OSError(
             f"{target} cannot be written ({error.strerror}){kept}: make room there, or choose another folder"
         ) from error
+
+
+@contextmanager
+def warn_on_error(target: Path) -> Iterator[None]:
+    """Reduce any error of writing `target` to a warning: it only presents results which are already saved."""
+    try:
+        yield
+    except Exception as error:
+        log.warning("could not write %s, other results are saved: %s: %s", target, type(error).__name__, error)

@@ -10,6 +10,7 @@ from vla.config.check import Job
 from vla.config.experiment import Experiment
 from vla.data.episodes import EpisodeStore
 from vla.data.formats.imported_demonstrations import ImportedDemonstrations
+from vla.data.header import is_store
 from vla.rollouts.collect import collect
 from vla.spec import FIRST_SEED, Environment, Multitask, Spec, SpecOnly
 
@@ -53,7 +54,7 @@ def complete_store(experiment: Experiment) -> EpisodeStore | None:
         ValueError: the store was collected with another task, expert or first seed.
     """
     folder, asked = Path(experiment["collect"]["folder"]), experiment["collect"]
-    if not (folder / "store.json").exists():
+    if not is_store(folder):
         return None
     store = EpisodeStore(folder)
     store.require(experiment.source, asked["seed"])

@@ -10,7 +10,7 @@ from vla.config.check import Job
 from vla.config.experiment import Experiment
 from vla.policy import Policy
 from vla.reports.evaluation import plot_report, write_report
-from vla.runs.folder import REPORT
+from vla.runs.folder import PLOT, REPORT
 
 JOB = Job(("tokenizer", "model", "policy", "agent", "deploy"), adopts=True)
 
@@ -21,7 +21,7 @@ def run(experiment: Experiment) -> None:
     if report is not None:
         output = experiment.output
         write_report(report, output / REPORT, experiment["checkpoint"], experiment.config)
-        plot_report(report, output / "report.png")
+        plot_report(report, output / PLOT)
         print(report)
 
 

@@ -18,11 +18,11 @@ from rich import print as show
 from vla.config.build import Group, build
 from vla.config.check import Job, conditions, with_changes
 from vla.config.experiment import Experiment
-from vla.io.files import writing
-from vla.policy import latency
+from vla.io.files import warn_on_error, writing
+from vla.policy import costs
 from vla.reports.conditions import Courses, conditions_table, course_table, plot_conditions
 from vla.reports.evaluation import plot_report, write_report
-from vla.reports.html import PAGE, RECORDING, optional, write_page
+from vla.reports.html import write_page
 from vla.rollouts.evaluate import evaluate, keep_recordings
 from vla.rollouts.memory import make_impaired
 from vla.rollouts.realtime import Network, make_distant
@@ -30,7 +30,17 @@ from vla.rollouts.results import IN_DISTRIBUTION, Report, compare_conditions, co
 from vla.rollouts.rollout import AgentFactory
 from vla.rollouts.statements import AgainstBar, AgainstCondition, AgainstRun, Statement
 from vla.runs.files import Round
-from vla.runs.folder import CHECKPOINTS, REPORT, require_run, save_config, wall_time
+from vla.runs.folder import (
+    CHECKPOINTS,
+    PAGE,
+    PLOT,
+    RECORDING,
+    REPORT,
+    SUITE,
+    require_run,
+    save_config,
+    wall_time,
+)
 from vla.runs.resume import cached_success, training_lock
 
 log = logging.getLogger(__name__)
@@ -223,14 +233,14 @@ def _write(
     recording = output / RECORDING
     recording.unlink(missing_ok=True)  # of an earlier evaluation
     if experiment["recorder"]:
-        with optional(recording):
+        with warn_on_error(recording):
             keep_recordings(report, output / "recordings", recording, experiment["evaluate"]["recordings"])
-    with optional(output / "report.png"):
-        plot_report(report, output / "report.png")
-    (output / "suite.png").unlink(missing_ok=True)  # of an earlier evaluation
+    with warn_on_error(output / PLOT):
+        plot_report(report, output / PLOT)
+    (output / SUITE).unlink(missing_ok=True)  # of an earlier evaluation
     if others:
-        with optional(output / "suite.png"):
-            plot_conditions(reports, output / "suite.png")
+        with warn_on_error(output / SUITE):
+            plot_conditions(reports, output / SUITE)
         show(conditions_table(reports, compared))
         rows: Courses = {(name,): course for name, course in courses.items() if course}
         if rows:
@@ -238,7 +248,7 @@ def _write(
     used = str(checkpoint) if checkpoint else None
     # Last, because its existence marks the evaluation as finished.
     write_report(report, output / REPORT, used, experiment.config, facts, others, compared, courses)
-    with optional(output / PAGE):
+    with warn_on_error(output / PAGE):
         write_page(output)
     log.info("wrote %s, report.json, report.png%s", output / PAGE, f" and {RECORDING}" if recording.exists() else "")
 
@@ -248,11 +258,9 @@ def _facts(experiment: Experiment, checkpoint: Path | None, rounds: Sequence[Rou
     if checkpoint is None:
         chosen = experiment["chosen"]
         return {**chosen, "model": chosen["agent"], "wall_time_s": seconds}
-    policy = experiment.make_policy(checkpoint)()
     return {
         **experiment["chosen"],
-        "parameters": sum(p.numel() for p in policy.model.parameters()),
-        "latency_ms": latency(policy),
+        **costs(experiment.make_policy(checkpoint)()),
         "wall_time_s": wall_time(checkpoint, seconds + _before_last_training(rounds)),
         "rounds": [asdict(one) for one in rounds],
     }

@@ -15,17 +15,18 @@ from rich.progress import track
 from vla.config.experiment import Experiment
 from vla.data.datamodule import digest_of, held_out
 from vla.data.episodes import EpisodeStore
+from vla.data.header import is_store
 from vla.data.index import Entry
 from vla.data.verification import episode_of
-from vla.io.files import writing
+from vla.io.files import warn_on_error, writing
 from vla.jobs.collect import demonstrations
 from vla.models.checkpoint import read_header
-from vla.policy import latency
-from vla.reports.html import PAGE, optional, write_page
+from vla.policy import costs
+from vla.reports.html import write_page
 from vla.reports.open_loop import errors_table, plot_errors, write_errors
 from vla.rollouts.open_loop import OpenLoop, open_loop
 from vla.rollouts.rollout import close_agent
-from vla.runs.folder import ERRORS, save_config, wall_time
+from vla.runs.folder import ERRORS, ERRORS_PLOT, PAGE, save_config, wall_time
 
 log = logging.getLogger(__name__)
 
@@ -49,7 +50,7 @@ def evaluate_open_loop(experiment: Experiment, checkpoint: Path | None) -> float
         policy = experiment.make_policy(checkpoint)()
         policy.spec.without_truth.require(store.spec.without_truth, f"the checkpoint {checkpoint}", f"{store.folder}")
         unseen = _unseen(store, [Path(folder) for folder in experiment["collect"]["more"] or ()], checkpoint)
-        facts |= {"parameters": sum(p.numel() for p in policy.model.parameters()), "latency_ms": latency(policy)}
+        facts |= costs(policy)
     try:
         result = _measure(experiment, store, unseen, policy)
     finally:
@@ -59,21 +60,21 @@ def evaluate_open_loop(experiment: Experiment, checkpoint: Path | None) -> float
     facts |= {} if checkpoint else {"model": facts["agent"]}
     with writing(output / ERRORS):
         save_config(output, experiment.config, experiment.changes)
-        with optional(output / "errors.png"):
-            plot_errors(result, output / "errors.png")
+        with warn_on_error(output / ERRORS_PLOT):
+            plot_errors(result, output / ERRORS_PLOT)
         # Last, because its existence marks the evaluation as finished.
         write_errors(result, output / ERRORS, str(checkpoint) if checkpoint else None, experiment.config, facts)
-        with optional(output / PAGE):
+        with warn_on_error(output / PAGE):
             write_page(output)
     show(errors_table(result))
-    log.info("wrote %s, %s and errors.png: open-loop errors, which are not a success rate", output / PAGE, ERRORS)
+    log.info("wrote %s, %s and %s: open-loop errors, which are no success rate", output / PAGE, ERRORS, ERRORS_PLOT)
     return -result.relative
 
 
 def _store(experiment: Experiment) -> EpisodeStore:
     """Return the episodes, imported if there is no store of them."""
     folder, episodes = Path(experiment["collect"]["folder"]), experiment["collect"]["episodes"]
-    if (folder / "store.json").exists():
+    if is_store(folder):
         return EpisodeStore(folder, episodes)
     return demonstrations(experiment)
 

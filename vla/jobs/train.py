@@ -14,15 +14,15 @@ from lightning import Trainer
 from vla.config.check import TRAINING, Job
 from vla.config.experiment import Experiment, training_policy
 from vla.data.episodes import EpisodeStore
-from vla.io.files import writing
+from vla.io.files import warn_on_error, writing
 from vla.jobs.collect import demonstration_spec, demonstrations
 from vla.models.learner import Learner
 from vla.models.model import Model
 from vla.models.tokenizers.tokenization_error import describe_tokenization_error, out_of_bounds
-from vla.reports.first_batch import FILE, SHOWN, draw_samples
-from vla.reports.html import PAGE, optional, write_page
+from vla.reports.first_batch import SHOWN, draw_samples
+from vla.reports.html import write_page
 from vla.rollouts.collect import collection_time
-from vla.runs.folder import CHECKPOINTS, LAST, save_choice, save_config, save_training
+from vla.runs.folder import CHECKPOINTS, LAST, PAGE, SAMPLES, save_choice, save_config, save_training
 from vla.runs.resume import LENGTHS, TrainingProgress, first_process, training_lock, training_progress
 from vla.training.checkpoints import GracefulStop
 from vla.training.closed_loop import ClosedLoop
@@ -93,8 +93,8 @@ def _fit(experiment: Experiment, state: TrainingProgress, trainer: Trainer, grac
             log.warning(
                 "data.validation_fraction=0: no validation, so no episodes are played in it and last.ckpt is used"
             )
-    with optional(output / FILE):
-        draw_samples(data.make_batch(data.order(0)[:SHOWN]), store.spec, output / FILE)
+    with warn_on_error(output / SAMPLES):
+        draw_samples(data.make_batch(data.order(0)[:SHOWN]), store.spec, output / SAMPLES)
     if state.resume_from:
         restore_metrics(trainer, state.resume_from)
     collection_s = collection_time(store, experiment["collect"]["episodes"])
@@ -160,6 +160,6 @@ def _reported(
         seconds = graceful_stop.seconds
         if trainer.is_global_zero:
             save_training(output, parameters, trainer.global_step, seconds, ended, collection_s)
-            with optional(output / PAGE):
+            with warn_on_error(output / PAGE):
                 write_page(output)
     log.info("trained %d steps in %.0f s", trainer.global_step, seconds)

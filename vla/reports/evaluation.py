@@ -90,7 +90,7 @@ def summary(report: Report, of_tier: bool = False) -> dict[str, Any]:
         "episodes": report.episodes,
         "successes": report.successes,
         "errors": len(report.errors),
-        "taxonomy": report.taxonomy,
+        "outcome_counts": report.outcome_counts,
         "milestones": {name: _milestone(report, count) for name, count in report.milestones.items()},
         "motion": {name: asdict(median) for name, median in report.medians.items()},
         **_in_a_row(report),
@@ -142,7 +142,7 @@ def plot_report(report: Report, path: Path) -> None:
 
 def _plot_outcomes(axes: Axes, report: Report) -> None:
     """Plot one bar per outcome, and the interval of the success rate."""
-    names, counts = list(report.taxonomy)[::-1], list(report.taxonomy.values())[::-1]
+    names, counts = list(report.outcome_counts)[::-1], list(report.outcome_counts.values())[::-1]
     colours = [GREEN if name == "success" else GREY if name == ERROR else RED for name in names]
     axes.barh([name.replace("_", " ") for name in names], counts, color=colours, height=0.7)
     low, high = (bound * report.episodes for bound in report.interval)

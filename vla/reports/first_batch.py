@@ -12,7 +12,6 @@ from matplotlib.figure import Figure
 from vla.reports.style import GREEN, GREY, save
 from vla.spec import Array, Spec, readable
 
-FILE = "samples.png"
 SHOWN = 6  # windows
 COLUMNS = 2  # windows side by side
 HEIGHT, TITLE, GAP = 1.5, 0.4, 0.08  # of an image, above it, between parts [inch]

@@ -5,8 +5,7 @@ from __future__ import annotations
 import logging
 import os
 from base64 import b64encode
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import datetime
 from pathlib import Path
@@ -27,13 +26,11 @@ from vla.reports.style import BLUE, GREEN, GREY, RED, Interval
 from vla.reports.training_curves import colours, draw_run, draw_runs
 from vla.rollouts.motion import AMOUNTS
 from vla.rollouts.results import IN_DISTRIBUTION, Report
-from vla.runs.folder import Run, read_run
+from vla.runs.folder import ERRORS_PLOT, PAGE, PLOT, RECORDING, SAMPLES, SUITE, Run, read_run
 
 log = logging.getLogger(__name__)
 
-PAGE, COMPARISON, SWEEP = "report.html", "comparison.html", "sweep.html"
-RECORDING, SAMPLES, PLOTS, SUITE = "rollouts.rrd", "samples.png", "report.png", "suite.png"
-ERRORS = "errors.png"  # of an open-loop evaluation
+COMPARISON, SWEEP = "comparison.html", "sweep.html"
 FAILURES, SUCCESSES = 6, 3  # filmstrips on a run's page
 NAMED = 5  # maximum number of tasks in a title
 COMPARED = 3  # failures per run on a comparison
@@ -55,15 +52,6 @@ class TableRow:
     colour: str = ""  # of its curves
 
 
-@contextmanager
-def optional(path: Path) -> Iterator[None]:
-    """Reduce any error within to a warning, for work that only presents results which are already saved."""
-    try:
-        yield
-    except Exception as error:
-        log.warning("could not write %s, other results are saved: %s: %s", path, type(error).__name__, error)
-
-
 def write_page(folder: Path) -> Path:
     """Write the page of a run from the files in its folder, and return its path; missing files are omitted.
 
@@ -71,7 +59,7 @@ def write_page(folder: Path) -> Path:
         ValueError: a file is damaged.
     """
     run = read_run(folder)
-    pictures = {name: folder / name for name in (SAMPLES, PLOTS, SUITE, ERRORS) if (folder / name).is_file()}
+    pictures = {name: folder / name for name in (SAMPLES, PLOT, SUITE, ERRORS_PLOT) if (folder / name).is_file()}
     return _write(
         folder / PAGE,
         "run.html",

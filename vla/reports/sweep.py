@@ -6,8 +6,8 @@ import csv
 from pathlib import Path
 from urllib.parse import quote
 
-from vla.io.files import atomic_path, write_text
-from vla.reports.html import ABSENT, SWEEP, TableRow, optional, write_sweep
+from vla.io.files import atomic_path, warn_on_error, write_text
+from vla.reports.html import ABSENT, SWEEP, TableRow, write_sweep
 from vla.reports.sweep_plot import plot
 from vla.runs.sweep import SweepRow, conditions_of, read_rows
 
@@ -60,7 +60,7 @@ def _write_page(rows: list[SweepRow], folder: Path) -> None:
         )
         for row in rows
     ]
-    with optional(folder / SWEEP):
+    with warn_on_error(folder / SWEEP):
         write_sweep(folder, list(rows[0].choices), lines, [cell for row in rows for cell in row.cells])
 
 

@@ -78,7 +78,7 @@ class Report:
     @property
     def successes(self) -> int:
         """Number of successes."""
-        return self.taxonomy.get("success", 0)
+        return self.outcome_counts.get("success", 0)
 
     @property
     def success(self) -> float:
@@ -151,7 +151,7 @@ class Report:
         return sum(done) / len(done), low, high
 
     @property
-    def taxonomy(self) -> dict[str, int]:
+    def outcome_counts(self) -> dict[str, int]:
         """Outcome → number of episodes, the most frequent first."""
         return dict(Counter(result.outcome for result in self.results).most_common())
 
@@ -220,7 +220,7 @@ class Report:
     def __str__(self) -> str:
         """Format failures, errors, milestones, motion, several instructions, several tasks, tiers and, last, the
         success rate with its interval."""
-        lines = [f"{outcome} {count}" for outcome, count in self.taxonomy.items() if outcome not in ("success", ERROR)]
+        lines = [f"{name} {count}" for name, count in self.outcome_counts.items() if name not in ("success", ERROR)]
         if self.errors:
             first = self.errors[0]
             lines.append(f"errors {len(self.errors)}, the first at seed {first.seed}: {first.error}")

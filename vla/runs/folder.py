@@ -30,7 +30,9 @@ Curve = tuple[Array, Array]  # steps (N,) and values (N,)
 
 CONFIG, CHANGES, TRAINING = "config.yaml", "changes.yaml", "training.json"
 METRICS, REPORT = "metrics.csv", "report.json"
-ERRORS = "errors.json"  # of an open-loop evaluation, in place of a report
+PAGE, RECORDING = "report.html", "rollouts.rrd"
+SAMPLES, PLOT, SUITE = "samples.png", "report.png", "suite.png"
+ERRORS, ERRORS_PLOT = "errors.json", "errors.png"  # of an open-loop evaluation, in place of a report
 CHECKPOINTS, LAST = "checkpoints", "last.ckpt"  # the folder of weights, and those of the newest save
 
 
