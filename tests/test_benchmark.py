@@ -12,7 +12,7 @@ from vla.jobs.benchmark.machine import Others, machine, spoilt
 from vla.jobs.benchmark.measure import measure
 from vla.jobs.benchmark.memory import peak, reset_peak
 from vla.jobs.benchmark.train import measures
-from vla.parallel.processes import cores
+from vla.parallel.limits import cores
 
 
 def test_a_measure_stands_beside_its_floor() -> None:

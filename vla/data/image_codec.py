@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from vla.parallel.processes import cores
+from vla.parallel.limits import cores
 from vla.spec import Array
 
 JPEG, ZLIB = "jpeg", "zlib"

@@ -8,6 +8,7 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
@@ -69,14 +70,14 @@ def run(experiment: Experiment) -> float | None:
 
         if (checkpoint := train(experiment)) is None:
             return None
+    trained_here = checkpoint is not None and checkpoint.resolve().parent == (output / CHECKPOINTS).resolve()
     if not experiment.playable:
         from vla.jobs.open_loop import evaluate_open_loop
 
-        return evaluate_open_loop(experiment, checkpoint)
+        with training_lock(output / CHECKPOINTS) if trained_here else nullcontext():
+            return evaluate_open_loop(experiment, checkpoint)
     assert checkpoint is not None
-    if checkpoint.resolve().parent == (output / CHECKPOINTS).resolve():
-        return evaluate_trained(experiment, checkpoint)
-    return _evaluated(experiment, checkpoint)
+    return (evaluate_trained if trained_here else _evaluated)(experiment, checkpoint)
 
 
 def require_possible(experiment: Experiment) -> None:

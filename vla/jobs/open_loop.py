@@ -67,7 +67,7 @@ def evaluate_open_loop(experiment: Experiment, checkpoint: Path | None) -> float
         with warn_on_error(output / PAGE):
             write_page(output)
     show(errors_table(result))
-    log.info("wrote %s, %s and %s: open-loop errors, which are no success rate", output / PAGE, ERRORS, ERRORS_PLOT)
+    log.info("wrote %s, %s and %s: open-loop errors, which are not a success rate", output / PAGE, ERRORS, ERRORS_PLOT)
     return -result.relative
 
 

@@ -18,7 +18,8 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from vla.io.types import Count
-from vla.parallel.processes import ProcessEnded, Worker, WorkerFactory, WorkerProcess, cores, one_thread_each
+from vla.parallel.limits import cores
+from vla.parallel.processes import ProcessEnded, Worker, WorkerFactory, WorkerProcess, one_thread_each
 
 log = logging.getLogger(__name__)
 

@@ -1,4 +1,4 @@
-"""Worker processes of this machine: start, communication and end, and their cores and threads."""
+"""Worker processes of this machine: start, communication, threads and end."""
 
 from __future__ import annotations
 
@@ -139,11 +139,6 @@ def _portable(error: Exception) -> Exception:
     except Exception:  # its constructor may fail in any way
         return RuntimeError(f"{type(error).__name__}: {error}")
     return error
-
-
-def cores() -> int:
-    """Return the number of cores available to this process."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def leave_with_parent() -> None:

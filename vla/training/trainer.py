@@ -20,7 +20,7 @@ from lightning.pytorch.strategies import ParallelStrategy
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 
 from vla.config.build import build
-from vla.parallel.processes import cores
+from vla.parallel.limits import cores
 from vla.runs.folder import METRICS, metric_rows
 from vla.training.checkpoints import AtomicCheckpointIO, PeriodicCheckpoint
 from vla.training.ema import EMA

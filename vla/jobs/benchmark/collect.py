@@ -11,8 +11,9 @@ from vla.data.episodes import EpisodeStore
 from vla.jobs.benchmark.baselines.peer import DURATION, peer
 from vla.jobs.benchmark.measure import Floored, Measure, measure, timed
 from vla.jobs.benchmark.rendering import renderings
+from vla.parallel.limits import cores
 from vla.parallel.pool import LocalCluster
-from vla.parallel.processes import WorkerFactory, cores
+from vla.parallel.processes import WorkerFactory
 from vla.rollouts.collect import DemonstrationWorker
 from vla.rollouts.rollout import replay, rollout
 from vla.spec import Agent, Environment, Episode

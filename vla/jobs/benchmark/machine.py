@@ -8,7 +8,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from vla.parallel.processes import cores
+from vla.parallel.limits import cores
 
 # Vector instructions that kernels and compilers choose by, from old to new: of x86, then of ARM.
 INSTRUCTIONS = ("sse4_2", "avx", "avx2", "avx512f", "avx512_bf16", "amx_bf16", "asimd", "sve", "bf16")

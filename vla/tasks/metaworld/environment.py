@@ -7,10 +7,10 @@ from functools import partial
 from typing import Annotated, Any, Literal
 
 import numpy as np
-import psutil
 from annotated_types import Ge, Gt, Le, Predicate
 
 from vla.io.types import ImageSize, Names, Natural, Share, Text
+from vla.parallel.limits import free_memory
 from vla.spec import Array, Observation, Spec
 from vla.tasks.blind import Blindable
 from vla.tasks.metaworld.package import tasks_of
@@ -20,7 +20,7 @@ from vla.tasks.rendering.renderer import RendererFactory
 CONTROL_HZ = 80.0  # five substeps of 2.5 ms
 REACH = 0.01  # largest displacement of the hand per step, along each axis [m]
 STATE = ("hand_x", "hand_y", "hand_z", "opening")  # the first four numbers of an observation
-FREE = 0.25  # share of the machine's memory that scenes leave free
+FREE = 0.25  # share of the memory that scenes leave free
 MOST_STEPS = 500  # of an episode, after which Meta-World refuses to go on
 # Of the simulator's observation (39,).
 OBJECT, GOAL = slice(4, 7), slice(36, 39)
@@ -148,8 +148,7 @@ class MetaWorld(Blindable):
         A scene takes a quarter of a second and some 80 MB. Tasks take turns, so the oldest ones are needed first.
         """
         if task not in self._scenes:
-            memory = psutil.virtual_memory()
-            if self._scenes and memory.available < FREE * memory.total:
+            if self._scenes and free_memory() < FREE:
                 self._scenes.popitem()[1].close()
             self._scenes[task] = self._make_scene(task)
         return self._scenes[task]

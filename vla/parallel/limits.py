@@ -1,0 +1,55 @@
+"""What a machine, container or batch job lets its processes use."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import psutil
+
+CGROUPS, MEMBERSHIP = Path("/sys/fs/cgroup"), Path("/proc/self/cgroup")
+# Limit, use, and the key of `memory.stat` for the part of it that the kernel drops when memory is needed.
+MEMORY_FILES = (
+    ("memory.max", "memory.current", "inactive_file"),  # version 2
+    ("memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file"),  # version 1
+)
+
+
+def cores() -> int:
+    """Return the number of cores that processes may use: those of the affinity, or of the container's quota if fewer.
+
+    `LOKY_MAX_CPU_COUNT` limits it further.
+    """
+    from loky import cpu_count  # takes a twentieth of a second
+
+    return int(cpu_count())
+
+
+def free_memory() -> float:
+    """Return the share of memory that is free, 0…1: of the machine or of the control group with least.
+
+    Containers and batch systems limit memory by control groups.
+    """
+    machine = psutil.virtual_memory()
+    return min([machine.available / machine.total, *(share for folder in _groups() for share in _free(folder))])
+
+
+def _groups() -> Iterator[Path]:
+    """Yield the folders of the control groups of this process, their parents included."""
+    lines = MEMBERSHIP.read_text().splitlines() if MEMBERSHIP.exists() else []
+    for _, controllers, path in (line.split(":", 2) for line in lines):
+        if controllers in ("", "memory"):
+            root = CGROUPS / controllers
+            group = root / path.lstrip("/")
+            yield from (folder for folder in (group, *group.parents) if folder.is_relative_to(root))
+
+
+def _free(group: Path) -> Iterator[float]:
+    """Yield the free share of a control group's memory if it is limited."""
+    for limit, used, droppable in MEMORY_FILES:
+        try:
+            most, now = int((group / limit).read_text()), int((group / used).read_text())
+            held = dict(line.split() for line in (group / "memory.stat").read_text().splitlines())
+        except (OSError, ValueError):  # the other version, or "max"
+            continue
+        yield max(0.0, 1 - (now - int(held.get(droppable, 0))) / most)
