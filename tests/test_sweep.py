@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import csv
 import json
+import re
 from pathlib import Path
 
 import pytest
 from figures import curves, panels, points, spans, texts
 from matplotlib.figure import Figure
 
+from vla.reports.comparison import compare_rows
 from vla.reports.evaluation import write_report
 from vla.reports.sweep import tabulate
 from vla.reports.sweep_plot import pareto, validated
+from vla.rollouts.comparison import compare_samples
 from vla.rollouts.results import Report, Result
 from vla.rollouts.statistics import pooled_interval
 
@@ -72,7 +75,7 @@ def test_agents_without_a_model_are_rows_too(tmp_path: Path) -> None:
     (tmp_path / "1/.hydra/overrides.yaml").write_text("- agent=expert\n")
     write_report(Report((Result(0, "success"),)), tmp_path / "1/report.json", None, {})
     tabulate(tmp_path)
-    assert (tmp_path / "sweep.md").read_text().endswith("| 100.0 | - | - |\n")
+    assert "| 100.0 | - | - |\n" in (tmp_path / "sweep.md").read_text()
     assert "expert,seen,1.0" in (tmp_path / "sweep.csv").read_text()
 
 
@@ -84,6 +87,44 @@ def test_a_condition_that_not_every_cell_played_is_left_open(tmp_path: Path) -> 
     tabulate(tmp_path)
     assert "| default | 70.0 (39.7-89.2) | - |" in (tmp_path / "sweep.md").read_text()
     assert (tmp_path / "sweep.html").exists()
+
+
+def test_rows_are_compared_with_the_first_on_the_same_scenes(tmp_path: Path) -> None:
+    for number, (model, successes) in enumerate([("bc", 10), ("rt1", 3), ("act", 10)]):
+        cell(tmp_path, number, [f"model={model}"], successes)
+    rows = tabulate(tmp_path)
+    compared = {(each.other, each.condition): each.found for each in compare_rows(rows, 0.02)}
+    assert {*compared} == {(model, condition) for model in ("rt1", "act") for condition in ("seen", "dark")}
+    worse = compared["rt1", "seen"]
+    assert (worse.only_first, worse.only_second, worse.episodes, worse.verdict) == (7, 0, 10, "worse")
+    assert worse.p == worse.p_holm == 2 / 2**7  # the other three never differ
+    _, text = (tmp_path / "sweep.md").read_text().split("\n\n")
+    assert text.splitlines()[0] == "| minus bc | condition | points (95 % CI) | p | p Holm | verdict |"
+    assert re.search(r"\| rt1 \| seen \| -70\.0 \(.*\) \| 0\.016 \| 0\.016 \| worse \|", text)
+    page = (tmp_path / "sweep.html").read_text()
+    assert "Differences from bc" in page and page.count("<td>rt1</td>") == 2 and "McNemar" in page
+
+
+def test_several_trainings_count_as_fewer_episodes_in_a_comparison(tmp_path: Path) -> None:
+    for number, (model, successes) in enumerate([("bc", 9), ("bc", 9), ("rt1", 1), ("rt1", 9)]):
+        cell(tmp_path, number, [f"model={model}", f"seed={number % 2}"], successes)
+    seen, _ = compare_rows(tabulate(tmp_path), 0.02)
+    assert seen.found.difference == pytest.approx(-0.4) and (seen.found.episodes, seen.found.only_first) == (40, None)
+    independent = compare_samples(18, 20, 10, 20)
+    assert independent.p < 0.05 < seen.found.p and seen.found.ci_low < independent.ci_low  # the trainings of rt1 differ
+    assert seen.found.verdict == "open"
+
+
+def test_rows_of_other_worlds_are_not_compared(tmp_path: Path) -> None:
+    for number, level in enumerate(("default", "wide")):
+        cell(tmp_path, number, [f"task/randomize={level}"], 5)
+        report = json.loads((tmp_path / f"{number}/report.json").read_text())
+        for result in report["per_episode"]:
+            result["draws"] = {"light": number}
+        report["config"] = {"task": {"randomize": level}}
+        (tmp_path / f"{number}/report.json").write_text(json.dumps(report))
+    assert compare_rows(tabulate(tmp_path), 0.02) == []
+    assert "Differences" not in (tmp_path / "sweep.html").read_text()
 
 
 def test_what_is_slower_and_no_better_is_off_the_front(tmp_path: Path) -> None:
@@ -133,8 +174,8 @@ def test_success_over_training_is_that_of_all_seeds_in_validation(tmp_path: Path
     for seed, share in enumerate((0.25, 0.75)):
         (tmp_path / f"{seed}/config.yaml").write_text("validate: {episodes: 20}")
         (tmp_path / f"{seed}/metrics.csv").write_text(f"step,val/success\n699,{share - 0.25}\n1399,{share}\n")
+    few, many = tabulate(tmp_path)
     assert validated(few) == {700: (10, 40), 1400: (20, 40)} and validated(many) == {}
-    tabulate(tmp_path)
     (training,) = panels(figures[1], "in validation")
     assert curves(training) == {"50": [(700, 0.25), (1400, 0.5)], "100": []}
     assert "demonstrations" in texts(training) and len(panels(figures[1], "seen")) == 1

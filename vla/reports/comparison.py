@@ -15,7 +15,9 @@ from vla.config.differences import at
 from vla.reports.conditions import COMPARED, NARROW, Courses, short_texts
 from vla.rollouts.comparison import Comparison, compare_pairs, compare_samples, concluded
 from vla.rollouts.results import ERROR, IN_DISTRIBUTION, Report, Result, concluded_courses, course_of, pairs_of
+from vla.rollouts.statistics import effective_episodes
 from vla.runs.folder import Run, require_run
+from vla.runs.sweep import SweepRow
 
 CASE = ("second run", "minus first", "condition")  # heads of what was compared
 
@@ -72,6 +74,41 @@ def compare_runs(runs: Mapping[str, Run], margin: float) -> list[RunComparison]:
     verdicts = concluded({number: each.found for number, each in enumerate(found)}, margin)
     courses = concluded_courses({number: each.course for number, each in enumerate(found)})
     return [replace(each, found=verdicts[number], course=courses[number]) for number, each in enumerate(found)]
+
+
+def compare_rows(rows: Sequence[SweepRow], margin: float) -> list[RunComparison]:
+    """Compare every row of a sweep with the first one under each condition, where both played the same scenes.
+
+    Rows of one training each are compared by pairs of episodes, as runs are. Those of several trainings by as many
+    independent episodes as they are worth, see `effective_episodes`; that their scenes are the same is left out.
+
+    Args:
+        rows: of the sweep, at least one.
+        margin: what counts as not worse, 0…1.
+    """
+    first, *others = rows
+    found = [
+        RunComparison(first.name, other.name, condition, compared)
+        for other in others
+        for condition in first.played
+        if condition in other.played and (compared := _compared_rows(first, other, condition))
+    ]
+    verdicts = concluded({number: each.found for number, each in enumerate(found)}, margin)
+    return [replace(each, found=verdicts[number]) for number, each in enumerate(found)]
+
+
+def _compared_rows(first: SweepRow, other: SweepRow, condition: str) -> Comparison | None:
+    """Compare two rows, see `compare_rows`; None in different worlds, or if one stopped when it was clear."""
+    if any(run.reports[condition].anytime for row in (first, other) for run in row.runs if condition in run.reports):
+        return None
+    compared = _compared(first.runs[0], other.runs[0], condition)
+    if compared is None or len(first.runs) == len(other.runs) == 1:
+        return compared and compared[0]
+    samples = [effective_episodes(row.played[condition]) for row in (first, other)]
+    whole = [max(round(number), least) for won, played in samples for number, least in ((won, 0), (played, 1))]
+    rates = [row.interval(condition)[0] for row in (first, other)]
+    episodes = first.episodes[condition] + other.episodes[condition]
+    return replace(compare_samples(*whole), difference=rates[1] - rates[0], episodes=episodes)
 
 
 def without_comparison(runs: Mapping[str, Run], compared: Sequence[RunComparison]) -> str:

@@ -115,16 +115,23 @@ def write_comparison(runs: Mapping[str, Run], compared: Sequence[RunComparison],
     )
 
 
-def write_sweep(folder: Path, choices: Sequence[str], lines: Sequence[TableRow], cells: Sequence[Path]) -> Path:
-    """Write the page of a sweep with its table, plot and training curves, and return its path.
+def write_sweep(
+    folder: Path,
+    choices: Sequence[str],
+    lines: Sequence[TableRow],
+    cells: Sequence[Run],
+    compared: Sequence[RunComparison],
+) -> Path:
+    """Write the page of a sweep with its tables, plot and training curves, and return its path.
 
     Args:
         folder: of the sweep.
         choices: keys of the choices that distinguish the rows.
         lines: rows of the table; their links are named by cells.
-        cells: folders of the cells.
+        cells: of the sweep.
+        compared: rows with the first one.
     """
-    runs = {cell.name: read_run(cell) for cell in cells}
+    runs = {cell.folder.name: cell for cell in cells}
     captions = {cell: f"{cell}: {' '.join(line.words)}" for line in lines for cell in line.links}
     overview = folder / "sweep.png"
     return _write(
@@ -133,6 +140,7 @@ def write_sweep(folder: Path, choices: Sequence[str], lines: Sequence[TableRow],
         title=f"Sweep {folder.resolve().name}",
         lines=lines,
         heads=(choices, ["each seed [%]", "parameters [M]", "action [ms]"], "cells"),
+        compared=[(each, comparison_texts(each.found)) for each in compared],
         curves=draw_runs({name: run.metrics for name, run in runs.items()}),
         cells=dict(zip(map(captions.get, runs), colours(len(runs)), strict=True)),
         pictures={overview.name: overview} if overview.is_file() else {},

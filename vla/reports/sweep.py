@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 import csv
+from collections.abc import Sequence
 from pathlib import Path
 from urllib.parse import quote
 
+from vla.config.differences import at
 from vla.io.files import atomic_path, warn_on_error, write_text
+from vla.reports.comparison import RunComparison, compare_rows
+from vla.reports.conditions import comparison_texts
 from vla.reports.html import ABSENT, SWEEP, TableRow, write_sweep
 from vla.reports.sweep_plot import plot
+from vla.runs.folder import PAGE
 from vla.runs.sweep import SweepRow, conditions_of, read_rows
 
 
@@ -16,12 +21,25 @@ def tabulate(folder: Path) -> list[SweepRow]:
     """Write the table of a sweep's folder and return its rows; without any report, write nothing."""
     rows = read_rows(folder)
     if rows:
+        compared = compare_rows(rows, at(rows[0].runs[0].config, "evaluate.margin", 0.0))
         with atomic_path(folder / "sweep.csv") as draft:
             _write_csv(rows, draft)
-        write_text(folder / "sweep.md", markdown(rows))
+        write_text(folder / "sweep.md", markdown(rows) + markdown_differences(compared))
         plot(rows, folder / "sweep.png")
-        _write_page(rows, folder)
+        _write_page(rows, compared, folder)
     return rows
+
+
+def markdown_differences(compared: Sequence[RunComparison]) -> str:
+    """Format the differences of all rows from the first in Markdown, below an empty line; nothing without any."""
+    if not compared:
+        return ""
+    head = [f"minus {compared[0].one}", "condition", "points (95 % CI)", "p", "p Holm", "verdict"]
+    lines = [head, ["---"] * len(head)]
+    for each in compared:
+        difference, interval, *rest = comparison_texts(each.found)
+        lines.append([each.other, each.condition, f"{difference} ({interval})", *rest])
+    return "\n" + _table(lines)
 
 
 def markdown(rows: list[SweepRow]) -> str:
@@ -38,6 +56,10 @@ def markdown(rows: list[SweepRow]) -> str:
             rate, low, high = (100 * value for value in row.interval(condition))
             shares.append(f"{rate:.1f} ({low:.1f}-{high:.1f})")
         lines.append([*row.choices.values(), *shares, *_costs(row)])
+    return _table(lines)
+
+
+def _table(lines: Sequence[Sequence[str]]) -> str:
     return "".join(f"| {' | '.join(line)} |\n" for line in lines)
 
 
@@ -50,18 +72,18 @@ def _costs(row: SweepRow) -> list[str]:
     ]
 
 
-def _write_page(rows: list[SweepRow], folder: Path) -> None:
+def _write_page(rows: list[SweepRow], compared: Sequence[RunComparison], folder: Path) -> None:
     lines = [
         TableRow(
             list(row.choices.values()),
             {condition: row.interval(condition) for condition in row.played},
             _costs(row),
-            {cell.name: f"{quote(cell.name)}/report.html" for cell in row.cells},
+            {run.folder.name: f"{quote(run.folder.name)}/{PAGE}" for run in row.runs},
         )
         for row in rows
     ]
     with warn_on_error(folder / SWEEP):
-        write_sweep(folder, list(rows[0].choices), lines, [cell for row in rows for cell in row.cells])
+        write_sweep(folder, list(rows[0].choices), lines, [run for row in rows for run in row.runs], compared)
 
 
 def _write_csv(rows: list[SweepRow], path: Path) -> None:

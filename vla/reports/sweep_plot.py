@@ -17,7 +17,6 @@ from matplotlib.ticker import LogLocator
 from vla.config.differences import at
 from vla.reports.style import error_bars, save
 from vla.rollouts.statistics import wilson_interval
-from vla.runs.folder import read_run
 from vla.runs.sweep import DEMONSTRATIONS, SweepRow, conditions_of
 
 SUCCESS = "success, 95 % CI"
@@ -97,7 +96,7 @@ def _draw_choices(figure: Figure, rows: list[SweepRow]) -> None:
 def validated(row: SweepRow) -> Points:
     """Sum the closed-loop validations of all cells; empty if there were none."""
     points: Points = {}
-    for run in map(read_run, row.cells):
+    for run in row.runs:
         played = at(run.config, "validate.episodes", 0)
         if not isinstance(played, int) or played < 1:
             continue

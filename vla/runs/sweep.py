@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 
 from vla.rollouts.results import ERROR, IN_DISTRIBUTION
 from vla.rollouts.statistics import pooled_interval
 from vla.runs.cells import FAILURE, cells, overrides_of, varied_keys
-from vla.runs.folder import REPORT, read_run
+from vla.runs.folder import REPORT, Run, read_run
 
 DEMONSTRATIONS = "collect.episodes"  # override that is the x axis of learning curves
 SEED = "seed"  # override that distinguishes the cells of one row
@@ -19,16 +20,36 @@ class SweepRow:
     """Cells that differ only in their training seed."""
 
     choices: dict[str, str]  # overrides that distinguish the row
-    parameters: int  # 0: another agent than a policy acted
-    cells: list[Path] = field(default_factory=list)
-    latencies: list[float] = field(default_factory=list)  # per cell in which a policy acted [ms]
-    rates: list[float] = field(default_factory=list)  # success rate per cell
-    played: dict[str, list[dict[int, bool]]] = field(default_factory=dict)  # condition → per cell, seed → success
+    runs: list[Run] = field(default_factory=list)  # its cells, evaluated
 
     @property
     def name(self) -> str:
         """Label in tables and plots."""
         return " ".join(self.choices.values()) or "all"
+
+    @property
+    def parameters(self) -> int:
+        """Number of parameters; 0 if another agent than a policy acted."""
+        return self.runs[0].parameters or 0
+
+    @property
+    def latencies(self) -> list[float]:
+        """Latencies of the cells in which a policy acted [ms]."""
+        return [run.report.latency_ms for run in self.runs if run.report and run.report.latency_ms]
+
+    @property
+    def rates(self) -> list[float]:
+        """Success rate of every cell."""
+        return [run.reports[IN_DISTRIBUTION].success for run in self.runs]
+
+    @cached_property
+    def played(self) -> dict[str, list[dict[int, bool]]]:
+        """Condition → for every cell, seed → success; without errors."""
+        found: dict[str, list[dict[int, bool]]] = {}
+        for condition, report in (each for run in self.runs for each in run.reports.items()):
+            ended = {result.seed: result.success for result in report.results if result.outcome != ERROR}
+            found.setdefault(condition, []).append(ended)
+        return found
 
     @property
     def latency(self) -> float:
@@ -67,13 +88,5 @@ def read_rows(folder: Path) -> list[SweepRow]:
     rows: dict[tuple[str, ...], SweepRow] = {}
     for overrides, run in reported:
         choices = {key: overrides.get(key, "default") for key in varied}
-        file = run.report
-        assert file is not None, "a cell has a report"
-        row = rows.setdefault(tuple(choices.values()), SweepRow(choices, file.parameters or 0))
-        row.cells.append(run.folder)
-        row.latencies += [] if file.latency_ms is None else [file.latency_ms]
-        row.rates.append(run.reports[IN_DISTRIBUTION].success)
-        for condition, report in run.reports.items():
-            ended = {result.seed: result.success for result in report.results if result.outcome != ERROR}
-            row.played.setdefault(condition, []).append(ended)
+        rows.setdefault(tuple(choices.values()), SweepRow(choices)).runs.append(run)
     return list(rows.values())
