@@ -225,6 +225,17 @@ def test_conditions_of_an_evaluation_are_checked_with_the_task_that_they_change(
         check(composed("+validate.changes.bloks=3"))
 
 
+@pytest.mark.parametrize("wrong", [["seen"], ["without_images", "+evaluate.without=[images]"], ["light_hard"]])
+def test_conditions_have_names_of_their_own(wrong: list[str]) -> None:
+    name, *also = wrong
+    axis = "+evaluate.one_by_one={hard: {randomize: {light: null, colour: null}}}"
+    cfg = composed(axis, *also)
+    cfg.evaluate.conditions = {name: {"blocks": [3, 3]}}
+    cfg.evaluate.one_by_one.hard.randomize.light = cfg.task.randomize.light
+    with pytest.raises(ValueError, match=f"evaluate has 2 conditions with the name {name}: rename one"):
+        check(cfg)
+
+
 def digested(cfg: DictConfig) -> str:
     return digest("task", "expert", "collect.seed", _root_=cfg)
 

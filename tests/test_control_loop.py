@@ -41,7 +41,7 @@ class World:
             if observation is not None:
                 actions = self.answer(observation)
                 if actions is not None:
-                    self.loop.set_plan(actions, self.now)
+                    self.loop.set_plan(actions)
             command = self.loop.command(self.now)
             if command is not None:
                 if self.follows:
@@ -115,7 +115,7 @@ def test_a_late_answer_still_ends_where_and_when_it_should(world: World) -> None
     start, ticks = world.tool, world.ticks(1.0)
     while not asked or world.now < asked[0] + 0.11:
         next(ticks)
-    world.loop.set_plan(np.repeat(FORWARD, 3, 0), world.now)
+    world.loop.set_plan(np.repeat(FORWARD, 3, 0))
     while world.now < asked[0] + 0.34:
         next(ticks)
     assert (world.tool - start)[0] == pytest.approx(0.03, abs=0.004)

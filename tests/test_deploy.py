@@ -222,6 +222,8 @@ def test_the_whole_loop_reports_and_its_bag_moves_an_agent_again(
     assert "/2 (" in printed.strip().splitlines()[-1]
     report = json.loads((home / "loop/report.json").read_text())
     assert report["seeds"] == [1_000_000, 1_000_001] and report["checkpoint"] == CHECKPOINT.partition("=")[2]
+    # As simulated, whatever the clock says.
+    assert [(each["steps"], each["motion"]["time_s"]) for each in report["per_episode"]] == [(15, 1.5), (15, 1.5)]
     recorded = subprocess.run([VIEWER, "rrd", "stats", "loop/session.rrd"], cwd=home, capture_output=True, text=True)
     for entity in (
         "camera/isaac/camera/image_raw",
@@ -319,6 +321,10 @@ def test_arguments_of_ros_are_split_off() -> None:
         ([CHECKPOINT, "deploy=ros2", "--ros-args", "--nonsense"], "--nonsense"),
         ([CHECKPOINT, "deploy=ros2", "--ros-args", "-p", "command_hz:=0.0"], "command_hz out of range"),
         ([CHECKPOINT, "deploy=loop", "deploy.episodes=0"], "deploy.episodes"),
+        (
+            [CHECKPOINT, "deploy=simulator", "deploy.timing.joints_hz=25"],
+            "joints_hz=25 must be a multiple of the task's 10",
+        ),
         ([CHECKPOINT, "deploy=ros2", "~deploy.topics.images.wrist"], "wrist"),
     ],
 )
@@ -380,7 +386,10 @@ def test_a_ros_installation_finds_the_node() -> None:
     assert done.returncode == 0 and "deploy" in done.stdout
 
 
-EPISODE = {"seed": 1, "instruction": "lift it", "done": False, "outcome": "timeout", "task": "", "milestones": ["near"]}
+EPISODE = {
+    **{"seed": 1, "instruction": "lift it", "done": False, "steps": 7, "seconds": 0.7},
+    **{"outcome": "timeout", "task": "", "milestones": ["near"]},
+}
 
 
 @pytest.mark.parametrize(
@@ -390,7 +399,7 @@ EPISODE = {"seed": 1, "instruction": "lift it", "done": False, "outcome": "timeo
         "{",
         "[" * 10**5,
         "[]",
-        *(json.dumps({**EPISODE, name: value}) for name, value in {"seed": -1, "done": "no", "milestones": 3}.items()),
+        *(json.dumps({**EPISODE, name: -1}) for name in ("seed", "done", "steps", "milestones")),
         json.dumps({**EPISODE, "instruction": "a" * 1001}),
         json.dumps({**EPISODE, "outcome": None}),
         json.dumps({**EPISODE, "seed": float("nan")}),
@@ -403,7 +412,7 @@ def test_the_operator_drops_messages_that_no_simulator_sends(wrong: str, caplog:
     operator = DemoOperator.__new__(DemoOperator)
     operator._on_episode(String(data=json.dumps(EPISODE)))
     known = operator._episode
-    assert known == SimulatedEpisode(1, "lift it", False, "timeout", "", ("near",))
+    assert known == SimulatedEpisode(1, "lift it", False, 7, 0.7, "timeout", "", ("near",))
     operator._on_episode(String(data=wrong))
     assert operator._episode == known
     dropped = "dropped a message: /vla_simulator/episode is damaged or of another kind"

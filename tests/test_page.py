@@ -287,7 +287,7 @@ def test_runs_with_nothing_to_compare_are_refused(tmp_path: Path) -> None:
     (tmp_path / "empty").mkdir()
     for folders, says in (
         ([], r"report\.runs=\[RUN,RUN\]"),
-        ([run, tmp_path / "empty"], "empty is no run: it has neither report.json nor metrics.csv"),
+        ([run, tmp_path / "empty"], "empty is no run: it has none of report.json, errors.json and metrics.csv"),
         ([run, tmp_path / "run/../run"], "contains a folder twice"),
     ):
         with pytest.raises(ValueError, match=says):

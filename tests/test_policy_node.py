@@ -158,6 +158,9 @@ def test_of_a_chunk_as_much_is_executed_as_in_evaluation(world: World) -> None:
     before = len(world.policy.seen)
     world.live(1.5)
     assert 4 <= len(world.policy.seen) - before <= 6
+    world.policy.history, before = 2, len(world.policy.seen)
+    world.live(1.5)
+    assert len(world.policy.seen) - before >= 12  # in training, frames of a history have no gaps
 
 
 def test_a_policy_that_fails_is_a_fault_that_only_deactivation_ends(world: World) -> None:
@@ -371,6 +374,9 @@ def test_speed_is_lowered_at_any_time_and_raised_at_rest_only(world: World) -> N
     assert not set_share(2.0).successful
     result = world.agent.set_parameters([Parameter("command_hz", value=10.0)])[0]
     assert not result.successful and "clean up" in result.reason
+    together = [Parameter("speed_share", value=0.05), Parameter("command_hz", value=10.0)]
+    assert not world.agent.set_parameters_atomically(together).successful
+    assert world.agent.loop.robot.speed_share == 0.1
     assert world.change(Transition.TRANSITION_DEACTIVATE)
     assert set_share(0.5).successful
 

@@ -312,7 +312,7 @@ def test_joint_positions_in_degrees_move_a_robot_in_radians() -> None:
                 loop.on_image(camera, np.zeros((24, 32, 3), np.uint8), now)
         if (observation := loop.next_observation(now)) is not None:
             seen.append(observation.state)
-            loop.set_plan(goal[None].astype(np.float32), now)
+            loop.set_plan(goal[None].astype(np.float32))
         command = loop.command(now)
         assert command is not None
         joints = command.position.copy()

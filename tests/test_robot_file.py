@@ -183,7 +183,7 @@ def test_a_cartesian_policy_moves_the_arm_that_it_was_trained_with(jaco: Tableto
         if tick % 5 == 0:
             loop.on_image("front", np.zeros((*spec.image_size, 3), np.uint8), now)
         if loop.next_observation(now) is not None:
-            loop.set_plan(np.array([[0.0, 0.005, 0, 0, 0, 0, 1]], np.float32), now)
+            loop.set_plan(np.array([[0.0, 0.005, 0, 0, 0, 0, 1]], np.float32))
         if (command := loop.command(now)) is not None:
             joints = command.position
     moved = arm.forward(joints)[0]

@@ -98,7 +98,7 @@ def test_a_policy_sees_the_pictures_of_its_training_and_those_of_the_other_rende
     network = "{_target_: vla.rollouts.realtime.Network, latency: 0.3, jitter: 0, loss: 0, ensemble: null}"
     arguments += ("cluster.workers=1", "task.time_limit=1.0")
     clash = here(home, *arguments, f"+evaluate.networks.renderer_fast={network}", ok=False)
-    assert "evaluate.networks.renderer_fast has the name of another condition" in clash.stderr
+    assert "evaluate has 2 conditions with the name renderer_fast: rename one" in clash.stderr
     done = here(home, *arguments, f"+evaluate.networks.slow={network}")
     report = json.loads((home / "renderers/report.json").read_text())
     assert opened == ["Fast", "Reference", "Fast"]

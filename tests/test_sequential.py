@@ -137,6 +137,11 @@ def test_a_run_is_compared_on_the_episodes_that_both_played() -> None:
     assert other.say(a_report("1" * 10 + "e111")).startswith(
         "compared with A on 11 common episodes: better, +100.0 points"
     )
+    failed = AgainstRun("A", {result.seed: result for result in a_report("e" + "0" * 12).results}, 0.02)
+    assert not failed.is_clear(a_report("1"))  # the other run did not complete that episode
+    failed.require_common([FIRST_SEED, FIRST_SEED + 1])
+    with pytest.raises(ValueError, match="has no episode in common"):
+        failed.require_common([FIRST_SEED, FIRST_SEED + 13])
     elsewhere = AgainstRun("A", {FIRST_SEED: Result(FIRST_SEED, "success", "push")}, 0.02)
     assert elsewhere.say(a_report("1")) == "no episode in common with A"
     with pytest.raises(ValueError, match="has no episode in common"):

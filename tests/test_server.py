@@ -433,7 +433,15 @@ def test_beyond_this_machine_nobody_listens_without_a_key(tmp_path: Path) -> Non
     assert settings(policy, host="0.0.0.0", api_key="open").host == "0.0.0.0"
     with pytest.raises(ValueError, match=r"needs both deploy\.certificate and deploy\.private_key"):
         settings(policy, certificate=str(tmp_path / "certificate.pem"))
+    (tmp_path / "certificate.pem").write_text("no certificate")
+    files = dict.fromkeys(("certificate", "private_key"), str(tmp_path / "certificate.pem"))
+    with pytest.raises(ValueError, match=r"are not a certificate and its key in PEM format"):
+        settings(policy, **files).run()
     with serving(policy) as url:
+        client: Any = remote(url)
+        with pytest.raises(ValueError, match=r"deploy=server serves a trained policy, .* a RemotePolicy is none"):
+            settings(client).run()
+        client.close()
         port = int(url.rpartition(":")[2])
         with pytest.raises(
             ValueError, match=rf"cannot listen at deploy\.host=127\.0\.0\.1 deploy\.port={port}: .*in use"

@@ -33,6 +33,8 @@ class Doubling:
             os.kill(os.getpid(), signal.SIGSEGV)
         if number == 8:
             raise Awkward("eight", 8)
+        if number == 9:
+            return lambda: number  # type: ignore[return-value]
         return 2 * number
 
     def close(self) -> None:
@@ -66,6 +68,11 @@ def test_only_the_item_that_crashes_its_process_twice_is_lost() -> None:
 def test_an_error_that_cannot_be_sent_is_told_in_words() -> None:
     one, error = results(Doubling, 1, 8)
     assert one == 2 and type(error) is RuntimeError and str(error) == "Awkward: eight is 8"
+
+
+def test_a_result_that_cannot_be_sent_is_no_crash() -> None:
+    one, error = results(Doubling, 1, 9)
+    assert one == 2 and not isinstance(error, Crashed) and "pickle" in str(error)
 
 
 def test_a_process_that_is_killed_while_it_starts_is_replaced(tmp_path: Path) -> None:

@@ -45,7 +45,7 @@ class Forward:
     """A policy that moves forward and records its observations."""
 
     spec = SPEC
-    execute = 1
+    execute = history = 1
 
     def __init__(self) -> None:
         self.seen: list[Observation] = []

@@ -51,6 +51,7 @@ class Policy:
         self.device = torch.device(available if device == "auto" else device)
         self.model, self.spec = model.eval().to(self.device), spec
         self.execute = model.execute  # number of actions of a chunk to execute
+        self.history = model.history  # number of frames it looks at; with several it wants to see every one
         self.info: dict[str, Any] = {}
         self.compiled = compile
         self._bf16 = precision == "bf16"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections import Counter
 from collections.abc import Mapping
 from contextlib import nullcontext, suppress
 from dataclasses import dataclass, field
@@ -16,6 +17,7 @@ from omegaconf import DictConfig, OmegaConf
 from vla.config.annotations import MissingLibrary, fits, locate
 from vla.config.build import GROUPS, Group, arguments, check_node, check_value, makes, require_known
 from vla.io.types import Count, Natural, Seed, Shift, Text, unique
+from vla.rollouts.results import IN_DISTRIBUTION
 from vla.spec import FIRST_SEED
 
 UnseenSeed = Annotated[Seed, Ge(FIRST_SEED)]
@@ -132,8 +134,11 @@ def conditions(evaluate: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
 
     Args:
         evaluate: the plain node, whose `one_by_one` is level → argument of the task → part → value.
+
+    Raises:
+        ValueError: two conditions have one name, those of `without` and `networks` and the training condition included.
     """
-    named: dict[str, dict[str, Any]] = dict(evaluate["conditions"])
+    named: list[tuple[str, dict[str, Any]]] = [*evaluate["conditions"].items()]
     levels: dict[tuple[str, str], dict[str, Any]] = {}
     for level, overrides in evaluate["one_by_one"].items():
         for argument, parts in overrides.items():
@@ -145,8 +150,12 @@ def conditions(evaluate: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
         if len(values) > 1 and len({repr(value) for value in values.values()}) == 1:
             values = {"": next(iter(values.values()))}
         for level, value in values.items():
-            named[f"{part}_{level}" if level else part] = {argument: {part: value}}
-    return named
+            named.append((f"{part}_{level}" if level else part, {argument: {part: value}}))
+    others = [IN_DISTRIBUTION, *(f"without_{sense}" for sense in evaluate["without"]), *evaluate["networks"]]
+    for name, count in Counter([*others, *(name for name, _ in named)]).items():
+        if count > 1:
+            raise ValueError(f"evaluate has {count} conditions with the name {name}: rename one")
+    return dict(named)
 
 
 def devices(trainer: Mapping[str, Any]) -> int:

@@ -39,7 +39,7 @@ def with_substitutes(cfg: DictConfig, overrides: Sequence[str]) -> DictConfig:
 
 
 def options(group: str) -> dict[str, Node]:
-    """Return the options of a group that are classes which this machine can use, with their nodes."""
+    """Return the options of a group without those that this machine has a substitute for, with their nodes."""
     files = sorted((CONF / group).glob("*.yaml"))
     nodes = {file.stem: plain(cast(DictConfig, OmegaConf.load(file))) for file in files}
     return {name: node for name, node in nodes.items() if substitute(f"{group}={name}", node) is None}

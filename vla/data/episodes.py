@@ -47,6 +47,7 @@ class EpisodeStore:
         fields: field → shape and dtype of a row, see `fields_of`.
         packed: packed field → codec.
         tried: one entry per seed.
+        episodes: those of the stored episodes, of seeds that succeeded and of labelled failures; at most `episodes`.
 
     Args:
         folder: of the store.
@@ -111,11 +112,6 @@ class EpisodeStore:
         """Raise a ValueError if there are no episodes."""
         if not self.episodes:
             raise ValueError(f"{self.folder} holds no episodes yet: collect some first")
-
-    @property
-    def episodes(self) -> list[Entry]:
-        """Entries of the stored episodes: of the seeds that succeeded, and of labelled failures."""
-        return [entry for entry in self.tried if entry.stored][: self._limit]
 
     @property
     def derived(self) -> bool:
@@ -252,6 +248,8 @@ class EpisodeStore:
                 _write(self._files[name], values.data.cast("B"))
             _write(self._files["index"], memoryview(line))
             self.tried.append(entry)
+            if entry.stored and (self._limit is None or len(self.episodes) < self._limit):
+                self.episodes.append(entry)
             self._rows += entry.steps
             self._index_size += len(line)
         except OSError as error:
@@ -268,6 +266,7 @@ class EpisodeStore:
 
     def _refresh(self) -> None:
         self.tried, self._index_size = read_index(self._path("index"), self.derived, self._damaged)
+        self.episodes = [entry for entry in self.tried if entry.stored][: self._limit]
         self._rows = max((entry.end for entry in self.tried), default=0)
         for field in self.fields if self._rows else ():
             whole = self._whole(field)

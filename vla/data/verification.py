@@ -184,7 +184,7 @@ def derive_store(
         store = EpisodeStore.create_or_open(draft, stores[0].spec, _config(chosen, stores, where))
         with store.writing():
             seeds = [(seed, found) for part in chosen.values() for seed, found in sorted(part.items())]
-            damaged = [seed for seed, found in track(seeds, "writing") if not _write(store, seed, found, repair)]
+            damaged = [seed for seed, found in track(seeds, "writing") if not _write(store, found, repair)]
         os.rename(draft, folder)
     except BaseException as error:
         shutil.rmtree(draft, ignore_errors=True)
@@ -222,7 +222,7 @@ def _config(chosen: Chosen, stores: Sequence[EpisodeStore], where: Mapping[str, 
     return {"parts": parts, "where": conditions}
 
 
-def _write(store: EpisodeStore, seed: int, found: Sequence[Found], repair: bool) -> bool:
+def _write(store: EpisodeStore, found: Sequence[Found], repair: bool) -> bool:
     """Add a seed to a store from its first undamaged copy; returns whether there was one."""
     known = found[0][1]
     for source, entry in sorted(found, key=lambda place: not place[1].stored):

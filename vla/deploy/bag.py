@@ -13,7 +13,7 @@ import math
 import resource
 import time
 from collections.abc import Callable, Collection, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from functools import cache
 from pathlib import Path
 from threading import Event
@@ -208,9 +208,8 @@ def main() -> None:
         if options.do == "play":
             print(f"{play(node, options.folder, options.topics, stopped, options.speed)} messages")
         else:
-            recorder = BagRecorder(node, options.folder)
-            spin(node, stopped)
-            recorder.close()
+            with closing(BagRecorder(node, options.folder)) as recorder:
+                spin(node, stopped)
             print(f"{recorder.messages} messages in {options.folder}")
 
 

@@ -221,7 +221,7 @@ class ControlLoop:
         self._pending = (now, observed, anchor)
         return self._observer.observation(observed, self.instruction)
 
-    def set_plan(self, actions: Array, now: float) -> None:
+    def set_plan(self, actions: Array) -> None:
         """Schedule the policy's actions (k, D); the first one starts at the time of the observation.
 
         Cartesian actions are relative to the goal of the previous one, the first to the pose commanded at the
@@ -232,11 +232,10 @@ class ControlLoop:
             return
         _, observed, anchor = self._pending
         self._pending = None
-        width = len(self.spec.action)
-        if actions.ndim != 2 or actions.shape[1] != width or not len(actions) or not np.isfinite(actions).all():
-            return self._count_rejection(
-                f"the policy returned {'numbers that are not finite' if actions.ndim == 2 else actions.shape}"
-            )
+        if actions.ndim != 2 or not len(actions) or actions.shape[1] != len(self.spec.action):
+            return self._count_rejection(f"the policy returned actions of the shape {actions.shape}")
+        if not np.isfinite(actions).all():
+            return self._count_rejection("the policy returned numbers that are not finite")
         if self.state is not State.RUNNING:
             return None
         self.rejections = 0

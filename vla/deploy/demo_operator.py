@@ -21,9 +21,10 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
+from vla.deploy.calls import CHANGE, RESET
 from vla.deploy.settings import PolicySettings
 from vla.io.documents import STRICT, parse_json
-from vla.io.types import Seed
+from vla.io.types import Natural, NonNegative, Seed
 from vla.rollouts.motion import Motion
 from vla.rollouts.results import Result
 from vla.spec import LONGEST_INSTRUCTION, Name
@@ -33,7 +34,7 @@ log = logging.getLogger(__name__)
 # Time-outs.
 START = 60.0  # of the start of both nodes [s]
 ANSWER = 10.0  # of a service call [s]
-EPISODE = 60.0  # of an episode [s]
+EPISODE = 60.0  # of an episode, in simulated time [s]
 
 
 LONGEST = 100_000  # characters of a message about an episode
@@ -48,6 +49,8 @@ class SimulatedEpisode:
     seed: Seed
     instruction: Annotated[str, MaxLen(LONGEST_INSTRUCTION)]
     done: bool
+    steps: Natural  # of control since the instruction, and simulated time
+    seconds: NonNegative
     outcome: Name
     task: Annotated[str, MaxLen(100)]
     milestones: Annotated[tuple[Name, ...], MaxLen(100)]
@@ -56,16 +59,19 @@ class SimulatedEpisode:
 class DemoOperator:
     """Starts episodes, sends the instructions and monitors both nodes."""
 
-    def __init__(self, settings: PolicySettings, stopped: Event, agent: BaseProcess, simulator: BaseProcess) -> None:
-        """Args: the agent's settings; an event that is set on interruption; the nodes' processes.
+    def __init__(
+        self, settings: PolicySettings, speed: float, stopped: Event, agent: BaseProcess, simulator: BaseProcess
+    ) -> None:
+        """Args: the agent's settings; ratio of simulated to real time; an event that is set on interruption; the nodes'
+        processes.
 
         Raises:
             ValueError: a node exited or does not respond, here and in all methods.
         """
-        self.stopped, self.agent, self.simulator = stopped, agent, simulator
+        self.stopped, self.agent, self.simulator, self._patience = stopped, agent, simulator, EPISODE / speed
         self.node = rclpy.create_node("vla_operator")
-        self._change = self.node.create_client(ChangeState, "/vla_agent/change_state")
-        self._reset = self.node.create_client(Trigger, "/vla_simulator/reset")
+        self._change = self.node.create_client(ChangeState, CHANGE)
+        self._reset = self.node.create_client(Trigger, RESET)
         self._instruction = self.node.create_publisher(String, settings.topics.instruction, 1)
         latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         self.node.create_subscription(String, "/vla_simulator/episode", self._on_episode, latched)
@@ -78,15 +84,13 @@ class DemoOperator:
     def play(self) -> Result | None:
         """Play one episode; return None if it was interrupted."""
         self.begin_episode()
-        started = time.monotonic()
-        self.wait(lambda: not self._playing() or self.stopped.is_set(), EPISODE, "the end of an episode")
-        seconds = time.monotonic() - started
+        self.wait(lambda: not self._playing() or self.stopped.is_set(), self._patience, "the end of an episode")
         episode = self._episode
         assert episode is not None
         if not episode.done:
             return None
-        details = {"task": episode.task, "milestones": episode.milestones, "motion": Motion(round(seconds, 1))}
-        return Result(episode.seed, episode.outcome, episode.instruction, round(10 * seconds), **details)
+        details = {"task": episode.task, "milestones": episode.milestones, "motion": Motion(round(episode.seconds, 1))}
+        return Result(episode.seed, episode.outcome, episode.instruction, episode.steps, **details)
 
     def begin_episode(self) -> None:
         """Deactivate the agent, reset the simulator, activate the agent and send the instruction."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass
 from multiprocessing import get_context
 from pathlib import Path
@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Any
 from vla.deploy.bag import BagRecorder
 from vla.deploy.ros import plain_errors, ros
 from vla.deploy.ros2 import PolicyDeployment, SimulatorDeployment
-from vla.deploy.topic_listener import TopicListener
 from vla.io.types import Count
 from vla.parallel.processes import without_triton
 from vla.rollouts.results import Report, Result
@@ -75,28 +74,29 @@ class Loop:
         for node in nodes:
             node.start()
         try:
-            with ros(agent.network, self.output) as stopped:
+            with ros(agent.network, self.output) as stopped, ExitStack() as opened:
                 from vla.deploy.demo_operator import DemoOperator
 
-                operator = DemoOperator(agent, stopped, *nodes)
-                listeners = self._recorders(operator.node) if self.record else []
+                operator = DemoOperator(agent, simulator.timing.speed, stopped, *nodes)
+                opened.callback(operator.node.destroy_node)
+                if self.record:
+                    self._record(operator.node, opened)
                 yield operator
-                for listener in listeners:
-                    listener.close()
-                operator.node.destroy_node()
         finally:
             for node in nodes:
                 node.terminate()
             for node in nodes:
                 node.join(timeout=5.0)
 
-    def _recorders(self, node: Any) -> list[TopicListener]:
+    def _record(self, node: Any, opened: ExitStack) -> None:
+        """Record until `opened` is closed: an episode that fails is the one to look at."""
         from vla.deploy.view import View
 
         session = self.output / "session.rrd"
-        log.info("rerun %s shows the inputs and commands of the agent", session)
+        opened.callback(log.info, "rerun %s shows the inputs and commands of the agent", session)
+        opened.enter_context(closing(BagRecorder(node, self.output / "bag")))
         shell = self.shell() if self.shell is not None else None
-        return [BagRecorder(node, self.output / "bag"), View(node, session, shell)]
+        opened.enter_context(closing(View(node, session, shell)))
 
 
 def _run(node: PolicyDeployment | SimulatorDeployment) -> None:

@@ -94,9 +94,10 @@ class PolicyNode(GuardedLifecycleNode):
         self.declare_parameter("dry_run", self.settings.dry_run)
         rate = FloatingPointRange(from_value=1.0, to_value=1000.0)
         self.declare_parameter("command_hz", self.settings.command_hz, ParameterDescriptor(floating_point_range=[rate]))
-        self.add_on_set_parameters_callback(self._on_set_parameters)
+        self.add_on_set_parameters_callback(self._require_changeable)
+        self.add_post_set_parameters_callback(self._apply_shares)
 
-    def _on_set_parameters(self, parameters: list[Parameter]) -> SetParametersResult:
+    def _require_changeable(self, parameters: list[Parameter]) -> SetParametersResult:
         """Once configured, allow changes of the shares only; while active, only smaller ones."""
         for parameter in parameters:
             if self.loop is None or not self.has_parameter(parameter.name) or parameter.name == "use_sim_time":
@@ -105,8 +106,13 @@ class PolicyNode(GuardedLifecycleNode):
                 return SetParametersResult(successful=False, reason=f"clean up before changing {parameter.name}")
             if self._timers and parameter.value > self.get_parameter(parameter.name).value:
                 return SetParametersResult(successful=False, reason=f"deactivate before raising {parameter.name}")
-            self.loop.limit(replace(self.loop.robot, **{parameter.name: parameter.value}))
         return SetParametersResult(successful=True)
+
+    def _apply_shares(self, parameters: list[Parameter]) -> None:
+        """Apply changes that were accepted, all of one request."""
+        shares = {parameter.name: parameter.value for parameter in parameters if parameter.name.endswith("_share")}
+        if self.loop is not None and shares:
+            self.loop.limit(replace(self.loop.robot, **shares))
 
     # Lifecycle.
 
@@ -364,7 +370,7 @@ class PolicyNode(GuardedLifecycleNode):
         if self._inference is not None and self._inference[0].done():
             (future, started), self._inference = self._inference, None
             try:
-                self.loop.set_plan(future.result(), time.monotonic())
+                self.loop.set_plan(future.result())
                 self._record("inference", time.monotonic() - started)
                 self._record("image to command", time.monotonic() - self.loop.observed_at)
             except Exception as error:
@@ -380,7 +386,8 @@ class PolicyNode(GuardedLifecycleNode):
             self.policy.reset(observation.instruction, 0)
         size = self.policy.spec.image_size
         rgb = {camera: images.resize(image, size, self._crop) for camera, image in observation.rgb.items()}
-        return self.policy.plan(replace(observation, rgb=rgb))[: self.policy.execute]
+        plan = self.policy.plan(replace(observation, rgb=rgb))
+        return plan[: 1 if self.policy.history > 1 else self.policy.execute]  # a history has no gaps in training either
 
     def _send(self) -> None:
         assert self.loop is not None

@@ -149,10 +149,15 @@ class PolicyServer:
                 "pip install -e '.[server]'"
             ) from error
         policy = self.policy()
+        if not hasattr(policy, "session"):  # an agent in its place
+            raise ValueError(
+                f"deploy=server serves a trained policy, checkpoint=FILE; a {type(policy).__name__} is none"
+            )
         if keyless := [camera for camera in policy.spec.cameras if camera not in self.keys.images]:
             raise ValueError(f"the policy sees {', '.join(keyless)}: add +deploy.keys.images.{keyless[0]}=KEY")
+        service = Service(self, policy)
         try:
-            asyncio.run(Service(self, policy).serve())
+            asyncio.run(service.serve())
         except OSError as error:
             where = f"deploy.host={self.host} deploy.port={self.port}"
             raise ValueError(f"cannot listen at {where}: {error.strerror}; deploy.port=0 is any free one") from error
@@ -164,6 +169,7 @@ class Service:
     def __init__(self, settings: PolicyServer, policy: Policy) -> None:
         self._settings, self._policy = settings, policy
         self._metadata = pack(metadata(policy, settings.keys))
+        self._tls = None if settings.certificate is None else _tls(settings.certificate, settings.private_key)
         self._waiting: asyncio.Queue[tuple[Policy, Observation, asyncio.Future[Array]]] = asyncio.Queue()
         self._connected = 0
 
@@ -172,12 +178,7 @@ class Service:
         """Serve within the context, which is entered with the URL once the first client can be answered."""
         from websockets.asyncio.server import serve
 
-        settings, context = self._settings, None
-        if settings.certificate is not None:
-            context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
-            context.load_cert_chain(settings.certificate, settings.private_key)
-            # Clients with threads, such as openpi's, lose a request in twenty beside the tickets of TLS 1.3.
-            context.num_tickets = 0
+        settings, context = self._settings, self._tls
         limits = {"compression": None, "max_size": settings.largest_message, "max_queue": 1}
         request = {"process_request": self._answer_request, "create_connection": _connection(), "ssl": context}
         with ThreadPoolExecutor(1, "inference") as thread:
@@ -326,7 +327,7 @@ def metadata(policy: Policy, keys: Keys) -> dict[str, Any]:
         "control_hz": spec.control_hz,
         "horizon": policy.model.chunk,
         "execute": policy.execute,
-        "history": policy.model.history,
+        "history": policy.history,
         "reset": True,
     }
 
@@ -356,6 +357,25 @@ def _connection() -> type[ServerConnection]:
             super().data_received(data)
 
     return Connection
+
+
+def _tls(certificate: str, private_key: str | None) -> ssl.SSLContext:
+    """Return the TLS context of two PEM files.
+
+    Raises:
+        ValueError: one is damaged, or they do not belong together.
+    """
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    try:
+        context.load_cert_chain(certificate, private_key)
+    except ssl.SSLError as error:
+        raise ValueError(
+            f"deploy.certificate={certificate} and deploy.private_key={private_key} are not a certificate and its key "
+            f"in PEM format ({error.reason})"
+        ) from error
+    # Clients with threads, such as openpi's, lose a request in twenty beside the tickets of TLS 1.3.
+    context.num_tickets = 0
+    return context
 
 
 def _is_loopback(host: str) -> bool:

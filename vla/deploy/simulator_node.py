@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import time
 from collections import deque
 from functools import partial
@@ -33,12 +34,19 @@ class SimulatorNode(Node):
         """Args: a `Drivable` environment; its arm; topics; rates; seed of the first episode.
 
         Raises:
-            ValueError: the environment has no robot, is not `Drivable`, or gives several instructions in a row.
+            ValueError: the environment has no robot, is not `Drivable`, or gives several instructions in a row, or a
+                control step is not a whole number of ticks.
         """
         model = environment.spec.require_robot("deploy=simulator")
         if not isinstance(environment, Drivable):
             raise ValueError(
                 f"deploy=simulator needs an environment that is Drivable, {type(environment).__name__} is not"
+            )
+        control_hz = environment.spec.control_hz
+        self._ticks_per_step = round(timing.joints_hz / control_hz)
+        if not math.isclose(self._ticks_per_step * control_hz, timing.joints_hz):
+            raise ValueError(
+                f"the simulator's joints_hz={timing.joints_hz:g} must be a multiple of the task's {control_hz:g} Hz"
             )
         super().__init__("vla_simulator")
         self._drivable, self._model = environment, model
@@ -59,8 +67,8 @@ class SimulatorNode(Node):
             deque()
         )  # image publications delayed by the camera latency: when due, publish
         self._elapsed = 0.0  # simulated time since the start [s]
-        self.reset()
         self._period = 1 / timing.joints_hz
+        self.reset()
         self.create_timer(self._period / timing.speed, self._tick, clock=self._steady)
 
     def reset(self) -> None:
@@ -108,8 +116,7 @@ class SimulatorNode(Node):
         self._drivable.drive(*self._target, self._period)
         self._elapsed += self._period
         self._ticks += 1
-        control_period = 1 / self.environment.spec.control_hz
-        if self._running and self._ticks % round(control_period / self._period) == 0:
+        if self._running and self._ticks % self._ticks_per_step == 0:
             self._drivable.judge()
             if self.environment.done:
                 self._running = False
@@ -166,6 +173,8 @@ class SimulatorNode(Node):
             "seed": self.seed,
             "instruction": self.instruction,
             "done": environment.done,
+            "steps": self._ticks // self._ticks_per_step,  # since the instruction
+            "seconds": self._ticks * self._period,
             "outcome": environment.outcome,
             "task": environment.task,
             "milestones": sorted(environment.milestones),

@@ -15,7 +15,7 @@ import pkgutil
 import re
 import time
 from collections.abc import Callable, Iterable, Mapping
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import Any
 
@@ -278,9 +278,8 @@ def main() -> None:
     with command_node("vla_view", options.network) as (node, stopped):
         shell = _shell(options.shell) if options.shell else None
         expected = expected_pictures(options.expected, options.cameras) if options.expected else None
-        view = View(node, options.save, shell, expected)
-        spin(node, stopped)
-        view.close()
+        with closing(View(node, options.save, shell, expected)):
+            spin(node, stopped)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Jobs, `job=…`: an option that names a module each, with its requirements, `JOB`, and a function `run`.
+"""Jobs, `job=…`: each names a module with its requirements, `JOB`, and a function `run`.
 
 `collect`, `train` and `evaluate` are stages of a pipeline: each first runs the earlier stages whose product is missing.
 """

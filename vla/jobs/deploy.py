@@ -8,7 +8,6 @@ from typing import Any
 from vla.config.build import build
 from vla.config.check import Job
 from vla.config.experiment import Experiment
-from vla.policy import Policy
 from vla.reports.evaluation import plot_report, write_report
 from vla.runs.folder import PLOT, REPORT
 
@@ -43,7 +42,7 @@ def deployment(experiment: Experiment) -> Any:
     return built
 
 
-def _policy(experiment: Experiment) -> Policy:
+def _policy(experiment: Experiment) -> Any:
     """Build the trained policy, or the agent in its place; raise a ValueError if there is neither."""
     make_agent = experiment.make_agent()
     if make_agent is None:

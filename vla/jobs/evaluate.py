@@ -24,7 +24,7 @@ from vla.policy import costs
 from vla.reports.conditions import Courses, conditions_table, course_table, plot_conditions
 from vla.reports.evaluation import plot_report, write_report
 from vla.reports.html import write_page
-from vla.rollouts.evaluate import evaluate, keep_recordings
+from vla.rollouts.evaluate import RecorderFactory, evaluate, keep_recordings
 from vla.rollouts.memory import make_impaired
 from vla.rollouts.realtime import Network, make_distant
 from vla.rollouts.results import IN_DISTRIBUTION, Report, compare_conditions, compare_courses
@@ -133,7 +133,9 @@ def _statements(experiment: Experiment) -> list[Statement]:
         report = require_run(Path(against)).report
         if report is None:
             raise ValueError(f"evaluate.against={against} has no report.json to compare with: evaluate that run first")
-        found.append(AgainstRun(against, {result.seed: result for result in report.per_episode}, asked["margin"]))
+        statement = AgainstRun(against, {result.seed: result for result in report.per_episode}, asked["margin"])
+        statement.require_common(range(asked["seed"], asked["seed"] + asked["episodes"]))
+        found.append(statement)
     if asked["until"] and not found and not (conditions(asked) or asked["without"] or asked["networks"]):
         raise ValueError(
             "evaluate.until=decided needs something to decide: evaluate.bar=0.95, evaluate.against=RUN, or conditions, "
@@ -150,14 +152,10 @@ def _networks(experiment: Experiment) -> dict[str, Network]:
     """Return condition → network of `evaluate.networks`.
 
     Raises:
-        ValueError: one is invalid, or has the name of another condition.
+        ValueError: one is invalid.
     """
-    asked = experiment["evaluate"]
-    for name in asked["networks"]:
-        if name in {IN_DISTRIBUTION, *conditions(asked), *(f"without_{sense}" for sense in asked["without"])}:
-            raise ValueError(f"evaluate.networks.{name} has the name of another condition: rename it")
     kind = Group("evaluate.networks", ("vla.rollouts.realtime.Network",))
-    return {name: build(node, kind) for name, node in asked["networks"].items()}
+    return {name: build(node, kind) for name, node in experiment["evaluate"]["networks"].items()}
 
 
 def _play(experiment: Experiment, checkpoint: Path | None, statements: Sequence[Statement]) -> dict[str, Report]:
@@ -175,30 +173,30 @@ def _play(experiment: Experiment, checkpoint: Path | None, statements: Sequence[
     if recorder:
         recordings.mkdir(exist_ok=True)
         needs.append(recordings)
-    others = _other_agents(experiment, make_agent)
-    named = {IN_DISTRIBUTION: {}, **conditions(asked), **{name: {} for name in others}}
-    different = sum(name in others or with_changes(task, changes) != task for name, changes in named.items())
-    until, reports = [each.is_clear for each in statements], dict[str, Report]()
-    for name, changes in named.items():
-        if reports and name not in others and with_changes(task, changes) == task:  # equal to the training condition
-            reports[name] = reports[IN_DISTRIBUTION]
-            continue
-        reports[name] = evaluate(
-            experiment.make_environment(changes),
-            others.get(name, make_agent),
-            None if reports else recorder,
-            seeds,
-            cluster,
-            name,
-            needs,
-            tiers=task.get("tiers"),  # of worlds that have them
-            until=partial(_all, until) if asked["until"] and until else None,
-            recordings=asked["recordings"],
+
+    def played(
+        name: str,
+        seeds: Sequence[int],
+        until: Callable[[Report], bool] | None,
+        changes: dict[str, Any] | None = None,
+        agent: AgentFactory = make_agent,
+        recorder: RecorderFactory | None = None,
+    ) -> Report:
+        environment, tiers = experiment.make_environment(changes), task.get("tiers")  # of worlds that have them
+        until = until if asked["until"] else None
+        return evaluate(
+            environment, agent, recorder, seeds, cluster, name, needs, tiers, until, recordings=asked["recordings"]
         )
-        first = reports[IN_DISTRIBUTION]
-        seeds = [result.seed for result in first.results]
-        until = [AgainstCondition(first, asked["margin"], different).is_clear]
-    return reports
+
+    clear = [each.is_clear for each in statements]
+    first = played(IN_DISTRIBUTION, seeds, partial(_all, clear) if clear else None, recorder=recorder)
+    reports, seeds = {IN_DISTRIBUTION: first}, [result.seed for result in first.results]
+    changed = {name: changes for name, changes in conditions(asked).items() if with_changes(task, changes) != task}
+    others = _other_agents(experiment, make_agent)
+    until = AgainstCondition(first, asked["margin"], len(changed) + len(others)).is_clear
+    for name in conditions(asked):
+        reports[name] = played(name, seeds, until, changed[name]) if name in changed else first
+    return reports | {name: played(name, seeds, until, agent=agent) for name, agent in others.items()}
 
 
 def _other_agents(experiment: Experiment, make_agent: AgentFactory) -> dict[str, AgentFactory]:

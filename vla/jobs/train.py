@@ -62,10 +62,10 @@ def train(experiment: Experiment) -> Path | None:
         if not trainer.is_global_zero:
             logging.getLogger("vla").setLevel(logging.WARNING)  # only the first process logs
         _fit(experiment, state, trainer, graceful_stop)
-    if not trainer.is_global_zero:
-        return None
-    chosen = closed_loop.selected_checkpoint(checkpoints / LAST) if closed_loop else checkpoints / LAST
-    save_choice(output, chosen.name)
+        if not trainer.is_global_zero:
+            return None
+        chosen = closed_loop.selected_checkpoint(checkpoints / LAST) if closed_loop else checkpoints / LAST
+        save_choice(output, chosen.name)
     log.info("the policy is %s", chosen)
     return chosen
 

@@ -68,7 +68,7 @@ class WorkerProcess:
     def answer(self) -> Any:
         """Receive the next answer; raises as `ask` does."""
         try:
-            result, error, remote = self._connection.recv()
+            result, error, remote = pickle.loads(self._connection.recv_bytes())
         except (EOFError, OSError) as end:
             raise ProcessEnded(self._how_it_ended()) from end
         if error is not None:
@@ -113,7 +113,7 @@ def _serve(connection: Connection, make: bytes) -> None:
     leave_with_parent()
     made: list[Worker] = []
     # Unpickled here, not as an argument of the process, so that import errors reach the parent.
-    connection.send(_outcome(lambda: made.append(pickle.loads(make)())))
+    connection.send_bytes(_outcome(lambda: made.append(pickle.loads(make)())))
     for worker in made:
         with closing(worker):
             while True:
@@ -121,15 +121,15 @@ def _serve(connection: Connection, make: bytes) -> None:
                     item = connection.recv()
                 except EOFError:
                     return
-                connection.send(_outcome(worker.attempt, item))
+                connection.send_bytes(_outcome(worker.attempt, item))
 
 
-def _outcome(function: Callable[..., Any], *arguments: Any) -> tuple[Any, Exception | None, str]:
-    """Call a function; returns its result, its error and the traceback of that."""
+def _outcome(function: Callable[..., Any], *arguments: Any) -> bytes:
+    """Call a function; returns its result, its error and the traceback of that, pickled."""
     try:
-        return function(*arguments), None, ""
-    except Exception as error:  # of any kind: the parent raises it
-        return None, _portable(error), traceback.format_exc()
+        return pickle.dumps((function(*arguments), None, ""))
+    except Exception as error:  # of any kind, that of pickling included: the parent raises it
+        return pickle.dumps((None, _portable(error), traceback.format_exc()))
 
 
 def _portable(error: Exception) -> Exception:
@@ -173,7 +173,8 @@ def without_triton() -> None:
     """
     if not Path("/dev/nvidiactl").exists():
         sys.modules.setdefault("triton", None)  # type: ignore[arg-type]
-        logging.getLogger("torch.utils.flop_counter").setLevel(logging.ERROR)  # warns without Triton
+        for name in ("flop_counter", "cpp_extension"):  # they warn without Triton, and without a GPU
+            logging.getLogger(f"torch.utils.{name}").setLevel(logging.ERROR)
 
 
 @contextmanager

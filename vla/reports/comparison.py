@@ -104,11 +104,9 @@ def _compared_rows(first: SweepRow, other: SweepRow, condition: str) -> Comparis
     compared = _compared(first.runs[0], other.runs[0], condition)
     if compared is None or len(first.runs) == len(other.runs) == 1:
         return compared and compared[0]
-    samples = [effective_episodes(row.played[condition]) for row in (first, other)]
-    whole = [max(round(number), least) for won, played in samples for number, least in ((won, 0), (played, 1))]
-    rates = [row.interval(condition)[0] for row in (first, other)]
+    (won, played), (others_won, others_played) = (effective_episodes(row.played[condition]) for row in (first, other))
     episodes = first.episodes[condition] + other.episodes[condition]
-    return replace(compare_samples(*whole), difference=rates[1] - rates[0], episodes=episodes)
+    return replace(compare_samples(won, played, others_won, others_played), episodes=episodes)
 
 
 def without_comparison(runs: Mapping[str, Run], compared: Sequence[RunComparison]) -> str:
@@ -159,6 +157,6 @@ def _scenes(run: Run, condition: str) -> tuple[Any, ...]:
     """Return what the scenes of all seeds depend on: the task, and how a condition changes it."""
     config = run.report.config if run.report else {}
     asked = at(config, "evaluate", {})
-    changes = conditions({"conditions": {}, "one_by_one": {}, **asked}).get(condition)
+    changes = conditions({"conditions": {}, "one_by_one": {}, "without": [], "networks": {}, **asked}).get(condition)
     network = at(asked, "networks", {}).get(condition)
     return at(config, "task"), changes, network and (network, at(asked, "by_clock", None))

@@ -36,7 +36,7 @@ def draw_posteriors(
 
     colour_of = dict(zip(reports, colours, strict=True))
     ordered = sorted(reports, key=lambda name: -reports[name].success)
-    apart = [pair for pair, each in concluded(found, LEVEL).items() if (each.p_holm or 0) <= LEVEL]
+    apart = [pair for pair, each in concluded(found, None).items() if (each.p_holm or 0) <= LEVEL]
     letters = compact_letters(ordered, apart)
     with svg_style("posteriors"):
         figure = Figure(figsize=(9, 0.6 + 0.45 * len(ordered)), layout="constrained")

@@ -45,7 +45,7 @@ class Summary:
 
     episodes: int  # stored
     successes: int  # of the tried seeds
-    added: int  # of these, added by this call
+    added: int  # episodes that this call stored
     tried: int  # seeds of known outcome, that is, without the episodes lost in a repair
     failures: dict[str, int]  # outcome → seeds
     tasks: dict[str, tuple[int, int]]  # task → successes, seeds tried

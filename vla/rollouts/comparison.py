@@ -77,11 +77,14 @@ def compare_pairs(pairs: Pairs, anytime: bool = False) -> Comparison:
     return Comparison(difference, low, high, p, played, pairs.first, pairs.second)
 
 
-def compare_samples(won_first: int, first: int, won_second: int, second: int) -> Comparison:
-    """Compare success in different episodes, `first` and `second` of them: Fisher's exact test, Newcombe's interval."""
+def compare_samples(won_first: float, first: float, won_second: float, second: float) -> Comparison:
+    """Compare success in different episodes, `first` and `second` of them: Fisher's exact test, Newcombe's interval.
+
+    Effective numbers of episodes need not be whole; the test rounds them.
+    """
     low, high = newcombe(won_first, first, won_second, second)
-    p = fisher(won_first, first, won_second, second)
-    return Comparison(won_second / second - won_first / first, low, high, p, first + second)
+    p = fisher(*(round(number) for number in (won_first, first, won_second, second)))
+    return Comparison(won_second / second - won_first / first, low, high, p, round(first + second))
 
 
 def compare_amounts(first: Amounts, second: Amounts, anytime: bool = False) -> Comparison | None:
@@ -158,7 +161,7 @@ def fisher(won_first: int, first: int, won_second: int, second: int) -> float:
     return float(min(1.0, 2 * given.cdf(won_second), 2 * given.sf(won_second - 1)))
 
 
-def newcombe(won_first: int, first: int, won_second: int, second: int) -> tuple[float, float]:
+def newcombe(won_first: float, first: float, won_second: float, second: float) -> tuple[float, float]:
     """Return the 95 % confidence interval of the second rate minus the first, of different episodes.
 
     R. G. Newcombe, "Interval estimation for the difference between independent proportions: comparison of eleven

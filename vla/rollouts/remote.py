@@ -109,10 +109,12 @@ class RemotePolicy:
             self._loop = opened.enter_context(event_loop())
             self._connection, self.metadata = self._connected(opened)
             self._open = opened.pop_all()
-        told, history = (self.metadata.get(name) for name in ("execute", "history"))
-        told = told if isinstance(told, int) and told >= 1 else None
-        # A policy with a history wants to see every frame.
-        self._wanted = self.execute or (1 if isinstance(history, int) and history > 1 else told)
+        told, history = (
+            number if isinstance(number := self.metadata.get(name), int) and number >= 1 else None
+            for name in ("execute", "history")
+        )
+        self.history = history or 1  # frames that the policy looks back; with several it wants to see every one
+        self._wanted = self.execute or (1 if self.history > 1 else told)
         if self.asynchronous:
             link = BackgroundLink(self.plan, self.spec.control_hz)
             self._open.callback(link.close)

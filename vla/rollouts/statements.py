@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Protocol
 
 from vla.rollouts.comparison import Comparison, compare_pairs
-from vla.rollouts.results import Report, Result, pairs_of
+from vla.rollouts.results import ERROR, Report, Result, pairs_of
 from vla.rollouts.sequential import excludes, is_settled
 
 
@@ -54,16 +54,18 @@ class AgainstRun:
         """See `Statement`.
 
         Raises:
-            ValueError: the other run has no episode in common.
+            ValueError: the other run has other episodes with the same seeds.
         """
         found = self._compared(report)
-        if report.episodes and not found.episodes:
-            raise ValueError(
-                f"evaluate.against={self.run} has no episode in common with this evaluation: it needs a run with the "
-                "same task, randomisation and evaluate.seed"
-            )
+        if not found.episodes and self._completed(report):
+            raise self._apart()
         assert found.only_first is not None and found.only_second is not None
         return is_settled(found.only_first, found.only_second, found.episodes, self.margin)
+
+    def require_common(self, seeds: Iterable[int]) -> None:
+        """Raise a ValueError if the other run completed no episode with one of these seeds."""
+        if not any(seed in self.results and self.results[seed].outcome != ERROR for seed in seeds):
+            raise self._apart()
 
     def say(self, report: Report) -> str:
         """See `Statement`."""
@@ -77,13 +79,25 @@ class AgainstRun:
             f"({low} to {high}), p = {found.p:.2g}"
         )
 
-    def _compared(self, report: Report) -> Comparison:
+    def _completed(self, report: Report) -> list[tuple[Result, Result]]:
+        """Return results of the other run and of this one for the seeds that both completed."""
         pairs = [(self.results[mine.seed], mine) for mine in report.results if mine.seed in self.results]
+        return [pair for pair in pairs if ERROR not in (pair[0].outcome, pair[1].outcome)]
+
+    def _compared(self, report: Report) -> Comparison:
         # The same seed gives another episode under another goal or level of randomisation.
         same = [
-            (their, mine) for their, mine in pairs if (their.instruction, their.draws) == (mine.instruction, mine.draws)
+            (their, mine)
+            for their, mine in self._completed(report)
+            if (their.instruction, their.draws) == (mine.instruction, mine.draws)
         ]
         return compare_pairs(pairs_of(same), report.anytime)
+
+    def _apart(self) -> ValueError:
+        return ValueError(
+            f"evaluate.against={self.run} has no episode in common with this evaluation: it needs a run with the same "
+            "task, randomisation and evaluate.seed"
+        )
 
 
 @dataclass(frozen=True)

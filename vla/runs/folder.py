@@ -124,13 +124,13 @@ def wall_time(checkpoint: Path, evaluation: float) -> float | None:
 
 
 def require_run(folder: Path) -> Run:
-    """Read a run's folder that has at least a report or metrics.
+    """Read a run's folder that has a report, errors of an open-loop evaluation, or metrics.
 
     Raises:
-        ValueError: the folder has neither, or a file is damaged.
+        ValueError: the folder has none of them, or a file is damaged.
     """
     if not any((folder / name).is_file() for name in (REPORT, ERRORS, METRICS)):
-        raise ValueError(f"{folder} is no run: it has neither {REPORT} nor {METRICS}")
+        raise ValueError(f"{folder} is no run: it has none of {REPORT}, {ERRORS} and {METRICS}")
     return read_run(folder)
 
 
