@@ -1,4 +1,4 @@
-"""Record all topics as a rosbag2 folder, and play a bag back.
+"""Record all topics of standard messages as a rosbag2 folder, and play a bag back.
 
     python -m vla.deploy.bag record FOLDER      until interrupted; `rerun FOLDER/*.mcap` shows it
     python -m vla.deploy.bag play FOLDER        images, joint states and instructions at their original times

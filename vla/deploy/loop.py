@@ -34,7 +34,7 @@ class Loop:
         agent, simulator: factories of the two deployments, called with `policy`, `environment` and `output`.
         episodes: number of episodes.
         shell: factory of the surface of the arm in `session.rrd`; None draws lines between its joints.
-        record: write the inputs and commands of the agent as `session.rrd`, and all messages as a bag.
+        record: write the inputs and commands of the agent as `session.rrd`, and all standard messages as a bag.
         policy, environment: factories of the checkpoint's policy and of its task's environment.
         output: folder of the report and the recordings.
     """
