@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 import pytest
 import rclpy
+import yaml
 from arm import ROBOT
 from command_line import SMALL, here, vla
 from defaults import defaults_of
@@ -372,8 +373,12 @@ def test_a_policy_is_deployed_where_nothing_renders(monkeypatch: pytest.MonkeyPa
 
 
 def test_the_networks_have_their_options() -> None:
-    options = {path.stem for path in (Path(__file__).parents[1] / "conf/deploy/network").glob("*.yaml")}
-    assert options == set(NETWORKS)
+    files = (Path(__file__).parents[1] / "conf/deploy/network").glob("*.yaml")
+    options = {file.stem: yaml.safe_load(file.read_text()) for file in files}
+    assert options.keys() == NETWORKS.keys()
+    for name, option in options.items():
+        del option["_target_"]
+        assert vars(RosNetwork(**option)) == vars(RosNetwork.named(name))
 
 
 def test_a_ros_installation_finds_the_node() -> None:

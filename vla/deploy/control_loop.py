@@ -19,6 +19,8 @@ from vla.robots.cartesian import CartesianController
 from vla.robots.controllers import GRIPPER, controller_for
 from vla.spec import Array, Observation, Spec
 
+Waypoint = tuple[float, Array, float | None]  # when due, goal of the joints, opening
+
 # How to recover, for messages.
 RESUME = 'python -m vla.deploy.say --resume "INSTRUCTION", or call ~/resume'
 RESTART = "deactivate and activate the agent, or start it again"
@@ -106,7 +108,7 @@ class ControlLoop:
         self.handed_over = False
         self._observer = Observer(self.spec)
         self._commanded: deque[tuple[float, Array]] = deque()  # at, joints
-        self._schedule: list[tuple[float, Array, float | None]] = []  # when due, goal, opening
+        self._schedule: list[Waypoint] = []
         self._pending: tuple[float, float, Array] | None = None  # requested at, observed at, commanded then
         self._next_inference = -np.inf
         self._opening: float | None = 1.0
@@ -278,9 +280,7 @@ class ControlLoop:
         if not self.acting:
             self.limiter.brake()
             return
-        while len(self._schedule) > 1 and self._schedule[0][0] <= now:
-            self._schedule.pop(0)
-        end, goal, self._opening = self._schedule[0]
+        end, goal, self._opening = _next_of(self._schedule, now)
         self.limiter.step(goal, end - now)
 
     def horizon(self, now: float) -> list[Command]:
@@ -290,10 +290,9 @@ class ControlLoop:
         schedule = list(self._schedule) if self.state is State.RUNNING else []
         while schedule and now < schedule[-1][0]:
             now += self.tick
-            while len(schedule) > 1 and schedule[0][0] <= now:
-                schedule.pop(0)
-            limiter.step(schedule[0][1], schedule[0][0] - now)
-            commands.append(Command(limiter.position.copy(), limiter.velocity.copy(), schedule[0][2]))
+            end, goal, opening = _next_of(schedule, now)
+            limiter.step(goal, end - now)
+            commands.append(Command(limiter.position.copy(), limiter.velocity.copy(), opening))
         while not limiter.resting or not commands:
             limiter.brake()
             commands.append(Command(limiter.position.copy(), limiter.velocity.copy(), self._opening))
@@ -401,3 +400,10 @@ class ControlLoop:
         self._commanded.append((now + self.tick, self.limiter.position.copy()))
         while self._commanded[0][0] < now - HISTORY:
             self._commanded.popleft()
+
+
+def _next_of(schedule: list[Waypoint], now: float) -> Waypoint:
+    """Remove what was due before, but for the last, and return the first of the rest."""
+    while len(schedule) > 1 and schedule[0][0] <= now:
+        schedule.pop(0)
+    return schedule[0]

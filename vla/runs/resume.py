@@ -95,20 +95,21 @@ def _newest_interrupted(runs: Path) -> Path:
     for last in files:
         training = last.parent.parent
         in_rounds = training.parent != runs
-        run = training.parent if in_rounds else training
-        if _locked(run if in_rounds else last.parent):
-            continue
-        reported = (run / REPORT).exists() or (run / ERRORS).exists()
-        if not reported if in_rounds else _unfinished(run, reported):
+        run, lock = (training.parent, training.parent) if in_rounds else (training, last.parent)
+        if not _locked(lock) and (not _evaluated(run) if in_rounds else _unfinished(run)):
             return run
     raise ValueError(f"resume=last: none of the {len(files)} trainings in {runs} was interrupted; resume=DIR names one")
 
 
-def _unfinished(run: Path, reported: bool) -> bool:
+def _evaluated(run: Path) -> bool:
+    return (run / REPORT).exists() or (run / ERRORS).exists()
+
+
+def _unfinished(run: Path) -> bool:
     """Return whether a training was interrupted, or the evaluation that was to follow."""
     saved = read_header(run / CHECKPOINTS / LAST)
     unchosen = chosen_checkpoint(run) is None  # killed between the last save and the selection
-    return not saved.finished or unchosen or (saved.config.get("job") == "evaluate" and not reported)
+    return not saved.finished or unchosen or (saved.config.get("job") == "evaluate" and not _evaluated(run))
 
 
 @contextmanager
