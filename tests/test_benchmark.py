@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
+from composing import composed
 
 from vla.config.experiment import Experiment
+from vla.jobs.benchmark import deploy
 from vla.jobs.benchmark.machine import Others, machine, spoilt
 from vla.jobs.benchmark.measure import measure
 from vla.jobs.benchmark.memory import peak, reset_peak
@@ -64,3 +68,17 @@ def test_what_cannot_be_timed_is_refused_before_any_work(
     asked = {"benchmark": {"precisions": precisions, "compile": compiled}, "trainer": {"accelerator": "cpu"}}
     with pytest.raises(ValueError, match=problem):
         measures(Experiment(asked))
+
+
+def test_a_deployment_is_measured_against_its_settings(monkeypatch: pytest.MonkeyPatch) -> None:
+    names = ("image to command p50 [ms]", "inference p50 [ms]", "tick p99 [ms]")
+    operator = SimpleNamespace(status=dict(zip(names, ("30", "20", "21"), strict=True)), watchdog_delay=lambda: 0.25)
+    operator.play = operator.begin_episode = lambda: None
+    loop = SimpleNamespace(episodes=2, running=lambda: nullcontext(operator))
+    monkeypatch.setattr(deploy, "deployment", lambda experiment: loop)
+    found = deploy.measures(Experiment.of(composed("job=benchmark", "deploy=loop")))
+    assert {name: (each["value"], each["floor"]) for name, each in found.items()} == {
+        "deploy: image to command": (30, 20),
+        "deploy: tick p99": (21, 20),
+        "deploy: watchdog": (250, 200),
+    }

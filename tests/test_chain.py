@@ -39,7 +39,7 @@ from vla.tasks.tabletop.language import Grammar
 if TYPE_CHECKING:
     from vla.tasks.tabletop.environment import Tabletop
 
-GRAMMAR = Grammar(["move {block}"], {}, ["{block}"], {"move": ["shift"]}, [])
+GRAMMAR = Grammar(["{move} {block}"], {"move": ["move"]}, ["{block}"], {"move": ["shift"]}, [])
 COMMON: Any = {"language": GRAMMAR, "hold_steps": 3}
 GOALS: dict[str, Goal | None] = {
     "lift": Lift(**COMMON, height=0.1),
@@ -108,7 +108,9 @@ def test_a_chain_that_cannot_be_is_refused() -> None:
         Chain({"lift": GOALS["lift"]}, length=2)
     with pytest.raises(ValueError, match=r"task\.goal\.goals\.pick cannot be part of a chain"):
         Chain({"pick": PickPlace(**COMMON, radius=0.04)}, length=2)
-    coloured = Grammar(["move {block}"], {}, ["{block}"], {"move": ["shift"]}, held_out_colours=["red"])
+    coloured = Grammar(
+        ["{move} {block}"], {"move": ["move"]}, ["{block}"], {"move": ["shift"]}, held_out_colours=["red"]
+    )
     with pytest.raises(ValueError, match="names blocks of all colours"):
         Chain({"lift": Lift(language=coloured, height=0.1, hold_steps=3), "place": GOALS["place"]}, length=2)
 
@@ -234,3 +236,13 @@ def test_a_simulator_that_plays_single_instructions_refuses_a_chain(chain: Table
     )
     with pytest.raises(ValueError, match=r"^deploy=simulator waits for one instruction .*: set task\.goal\.length=1$"):
         deployment.run()
+
+
+def test_a_chain_starts_anywhere_under_noise_and_without_images(chain: Tabletop) -> None:
+    noisy = make_tabletop("task/goal=chain", "task/randomize/sensor=wide", "task.image_size=[32,32]")
+    first = [noisy.reset(seed).rgb["front"] for seed in range(4)]
+    again = [noisy.reset(seed).rgb["front"] for seed in (3, 2, 1, 0)]
+    assert all(np.array_equal(one, two) for one, two in zip(first, again[::-1], strict=True))
+    noisy.close()
+    with chain.blind():
+        assert all(chain.reset(seed).rgb == {} for seed in range(4))

@@ -62,6 +62,7 @@ def test_json_of_another_kind_is_refused_by_name(text: str | bytes, kind: Any, s
         ("a: 2020-01-01", "date is not JSON"),
         ("!!python/object/apply:os.system [ls]", "constructor"),
         ("a: [", "expected"),
+        ("a: 2020-99-99", "month must be in 1..12"),
         (b"\xff", "invalid"),
     ],
 )

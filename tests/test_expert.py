@@ -134,6 +134,9 @@ def test_any_expert_is_perturbed_in_the_components_that_are_named(gripper: float
     episode = rollout(toy.ToyEnvironment(), expert, 0)
     np.testing.assert_allclose(episode.executed[:3], np.tile([0.05, 0.05, gripper], (3, 1)))
     np.testing.assert_array_equal(episode.executed[3:], episode.actions[3:])
+    with pytest.raises(ValueError, match=r"tool=hand is no point of 2 coordinates in the truth, which has target"):
+        elsewhere = Perturbation(corner, corner, **names | {"tool": "hand"})
+        rollout(toy.ToyEnvironment(), Perturbed(toy.SPEC, lambda spec: toy.ToyExpert(noise=0.0), elsewhere), 0)
     with pytest.raises(ValueError, match=r"names dz; actions have x, y, gripper"):
         Perturbation((0, 0, 0), corner + corner[:1], **names | {"move": ("x", "y", "dz")}).reset(toy.SPEC, 0)
 

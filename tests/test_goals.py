@@ -21,7 +21,7 @@ from vla.tasks.tabletop.goals.stack import Stack
 from vla.tasks.tabletop.goals.stay import Stay, Wait
 from vla.tasks.tabletop.language import Grammar
 
-GRAMMAR = Grammar(["move {block}"], {}, ["{block}"], {"move": ["shift"]}, [])
+GRAMMAR = Grammar(["{move} {block}"], {"move": ["move"]}, ["{block}"], {"move": ["shift"]}, [])
 COMMON: Any = {"language": GRAMMAR, "hold_steps": 3}
 
 

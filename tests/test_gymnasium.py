@@ -78,6 +78,8 @@ def test_rendered_images_are_resized_and_components_numbered() -> None:
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
+        ({"id": "toy/Endless-v0"}, "toy/Endless-v0 does not tell how long an episode lasts: set task.steps"),
+        ({"success": "is_success"}, "task.success=is_success must be a path that begins with observation. or info."),
         ({"id": "toy/None-v0"}, "task.id=toy/None-v0 is not registered by toy_gym"),
         ({"id": "toy_gym:toy/Toy-v0"}, "is no environment of task.package=toy_gym"),
         ({"id": "toy/Elsewhere-v0"}, "is no environment of task.package=toy_gym"),
@@ -93,6 +95,16 @@ def test_rendered_images_are_resized_and_components_numbered() -> None:
 def test_what_does_not_fit_is_named(changes: dict[str, Any], words: str) -> None:
     with pytest.raises(ValueError, match=re.escape(words)):
         make(**changes)
+
+
+def test_success_that_is_never_told_is_named_once(caplog: pytest.LogCaptureFixture) -> None:
+    world = make(success="info.sucess", steps=2, id="toy/Endless-v0")
+    for seed in (0, 1):
+        world.reset(seed)
+        while not world.done:
+            world.step(np.zeros(3, np.float32))
+        assert world.outcome == "timeout"
+    assert caplog.text.count("the environment gave no info.sucess, task.success") == 1
 
 
 def test_what_the_command_line_names_is_trusted_and_what_a_file_names_is_not(

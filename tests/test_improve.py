@@ -6,9 +6,11 @@ import json
 import shutil
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import torch
 import toy
 from collecting import content
 from command_line import SMALL, here
@@ -219,3 +221,12 @@ def test_rounds_that_were_killed_go_on_to_the_same_result(home: Path) -> None:
     assert trained["collect"]["more"] == ["rounds/round_1/episodes", "rounds/round_2/episodes"]
     assert trained["pretrained"] == "rounds/round_1/checkpoints/last.ckpt"
     assert len(json.loads(report.read_text())["rounds"]) == 2
+
+
+def test_weights_are_told_apart_with_all_that_modules_keep_beside_them(monkeypatch: pytest.MonkeyPatch) -> None:
+    digests = set()
+    for weight, rules in ((1.0, "a"), (2.0, "a"), (1.0, "b")):
+        state = {"tokenizer._extra_state": {"bpe": rules}, "weight": torch.tensor([weight])}
+        monkeypatch.setattr(improve, "read_checkpoint", lambda path, state=state: SimpleNamespace(state=state))
+        digests.add(improve._digest(Path()))
+    assert len(digests) == 3 and all(len(digest) == 12 for digest in digests)

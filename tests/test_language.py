@@ -51,6 +51,8 @@ def test_a_held_out_part_that_training_uses_is_refused() -> None:
         Grammar(["{put} {block}"], {"put": ["put"]}, ["{block}"], {"put": ["put"]}, [])
     with pytest.raises(ValueError, match="empty"):
         Grammar(["{put} {block}"], {"put": ["put"]}, [], {"put": ["set"]}, [])
+    with pytest.raises(ValueError, match="held_out_words has no slot of the phrasings"):
+        Grammar(["take {block}"], {}, ["{put} {block}"], {"put": ["set"]}, [])
 
 
 def test_other_words_replace_all_that_is_named_or_nothing_is_said() -> None:

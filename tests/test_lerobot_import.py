@@ -24,6 +24,7 @@ from toy_episodes import content
 
 from vla.config.experiment import make_expert
 from vla.data.episodes import EpisodeStore
+from vla.data.formats import lerobot_tables as tables
 from vla.data.formats.lerobot_import import LeRobotDemonstrations
 from vla.data.formats.video import encode
 from vla.spec import Spec
@@ -361,6 +362,24 @@ def test_a_table_that_unpacks_without_end_is_not_read(
     monkeypatch.setattr(f"vla.data.formats.lerobot_tables.{limit}", 5)
     with pytest.raises(ValueError, match=rf"file-000\.parquet {says}"):
         demonstrations(str(copied(home, tmp_path / "dataset")), ARM_SPEC)
+
+
+def test_the_size_of_a_column_does_not_depend_on_its_name(tmp_path: Path) -> None:
+    values = pa.array(np.ones((50, 6), np.float32).tolist())
+    pq.write_table(pa.table({"action": values, "observation.state": values}), tmp_path / "table.parquet")
+    sizes = [
+        tables._unpacked_size(tmp_path / "table.parquet", [name], False) for name in ("action", "observation.state")
+    ]
+    assert sizes[0] == sizes[1] >= 50 * 6 * 8
+
+
+def test_rows_of_different_lengths_are_no_matrix() -> None:
+    ragged = pa.chunked_array([pa.array([[1.0] * 5, [2.0] * 7])])
+    assert tables.matrix(ragged, 6) is None
+    whole = tables.matrix(pa.chunked_array([pa.array([[1.0] * 6, [2.0] * 6])]), 6)
+    assert whole is not None and whole.tolist() == [[1.0] * 6, [2.0] * 6]
+    assert tables.lists_have(pa.chunked_array([pa.array([[[1, 2], [3, 4]]])]), 2, 2)
+    assert not tables.lists_have(pa.chunked_array([pa.array([[[1], [2, 3, 4]]])]), 2, 2)
 
 
 def test_a_video_of_another_size_is_not_decoded(home: Path, tmp_path: Path) -> None:

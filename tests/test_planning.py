@@ -12,8 +12,10 @@ from finished_runs import a_run
 from rich import get_console
 from scipy.stats import binom, multinomial
 
+from vla.rollouts import planning
 from vla.rollouts.comparison import fisher, mcnemar
 from vla.rollouts.planning import (
+    MOST,
     SIMULATIONS,
     episodes_needed,
     power_for_bar,
@@ -63,6 +65,8 @@ def test_the_number_is_where_the_power_is_reached() -> None:
     # (1.960 √0.04 + 0.8416 √(0.04 - 0.02²))² / 0.02² = 781; the exact test needs more.
     assert 781 < needed < 1.1 * 781
     assert episodes_needed(lambda episodes: 0.5, 0.8) is None
+    assert episodes_needed(lambda episodes: float(episodes >= 150_000), 0.8) == 150_000
+    assert episodes_needed(lambda episodes: float(episodes > MOST), 0.8) is None
 
 
 def test_stopping_rarely_errs_and_is_early_where_the_difference_is_large() -> None:
@@ -74,6 +78,12 @@ def test_stopping_rarely_errs_and_is_early_where_the_difference_is_large() -> No
         assert stops.mean < 1.1 * fixed < stops.most < 2.5 * fixed and early.mean < 0.5 * fixed
         assert 0.005 * SIMULATIONS < stops.wrong * SIMULATIONS < 0.05 * SIMULATIONS
     assert stopping(0.5, 0.11, 0.1, 0.99, 10) is None
+
+
+def test_bounds_of_stopping_are_the_same_in_parts(monkeypatch: pytest.MonkeyPatch) -> None:
+    whole = stopping(0.5, 0.6, 0.2, 0.8, 50)
+    monkeypatch.setattr(planning, "PART", 7)
+    assert whole is not None and stopping(0.5, 0.6, 0.2, 0.8, 50) == whole
 
 
 def test_the_command_prints_a_row_per_design(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -150,3 +150,14 @@ def test_an_error_of_the_policy_is_one_of_the_episode() -> None:
     acting = RealTime(SPEC, SimulatedLink(fail, network_of(0.1), 10.0), lambda: 1, None)
     with pytest.raises(ValueError, match="server failed"):
         acting.act(SPEC.random_observation(np.random.default_rng(0)))
+
+
+def test_an_agent_with_a_history_sees_every_frame() -> None:
+    agent = Counting(3, 3)
+    agent.history = 2  # type: ignore[attr-defined]
+    distant = Distant(agent, network_of(0.0), SPEC)
+    distant.reset("", 0)
+    observation = SPEC.random_observation(np.random.default_rng(0))
+    for _ in range(4):
+        distant.act(observation)
+    assert agent.calls == 4

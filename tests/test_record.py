@@ -13,9 +13,10 @@ from PIL import Image
 from rerun.chunk import RrdReader
 from toy_recordable import ThinkingAgent, make_environment
 
+from vla.rollouts import recorder
 from vla.rollouts.recorder import VIEWER, RerunRecorder, merge, recording_name
 from vla.rollouts.rollout import rollout
-from vla.spec import Episode
+from vla.spec import Episode, Shape
 
 SUCCESS, FAILURE = 1_000_000, 1_000_003  # the toy world fails at seeds that are three more than a multiple of five
 
@@ -135,3 +136,9 @@ def test_merging_refuses_nothing_and_nonsense(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="could not merge 1 recordings"):
         merge([nonsense], tmp_path / "rollouts.rrd")
     assert list(tmp_path.iterdir()) == [nonsense]
+
+
+def test_colours_beyond_the_range_are_clipped() -> None:
+    rgba = np.array([-0.2, 1.25, 0.5, 1])
+    shape = Shape("table", "top", "box", np.zeros(3), np.array([1.0, 0, 0, 0]), np.ones(3), rgba)
+    assert recorder._solid(shape).colors.as_arrow_array().to_pylist() == [0x00FF80FF]

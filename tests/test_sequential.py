@@ -110,8 +110,9 @@ def test_an_evaluation_stops_when_it_is_clear_whatever_the_number_of_workers() -
 
 def test_tasks_that_take_turns_are_played_in_whole_rounds() -> None:
     tiers = {"easy": ["reach", "push", "pull"], "hard": ["stack"]}
-    report = evaluate(toy.make_environment, toy.make_agent, None, SEEDS, tiers=tiers, until=lambda report: True)
-    assert report.episodes == 4 and report.mean_over_tiers is None
+    always = {"tiers": tiers, "until": lambda report: True}
+    report = evaluate(toy.make_environment, toy.make_agent, None, SEEDS, **always, turns=2)
+    assert report.episodes == 2 and report.mean_over_tiers is None
 
 
 def test_recordings_of_episodes_that_do_not_count_are_removed(tmp_path: Path) -> None:

@@ -487,6 +487,29 @@ def test_somebody_elses_actions_become_ours() -> None:
             remote(url, actions={**swapped, "x": Component(3)}).act(observation)
 
 
+def test_a_late_answer_is_not_taken_for_that_of_the_next_observation(monkeypatch: pytest.MonkeyPatch) -> None:
+    policy, gate, plan, asked = as_policy(make_bc()), threading.Event(), server._plan, list[Any]()
+
+    def gated(sessions: Sequence[Any], observations: Sequence[Observation]) -> list[Array]:
+        asked.extend(observations)
+        assert len(asked) != 2 or gate.wait(30)
+        return plan(sessions, observations)
+
+    monkeypatch.setattr(server, "_plan", gated)
+    seen = observations(4)
+    with serving(policy) as url:
+        agent = remote(url, timeout=0.5)
+        agent.act(seen[0])
+        with pytest.raises(ValueError, match=r"no answer within 0\.5 s"):
+            agent.act(seen[1])
+        gate.set()
+        with pytest.raises(ValueError, match="closed the connection"):
+            agent.act(seen[2])  # within the same episode it stays that way
+        agent.reset(seen[3].instruction, 1)
+        np.testing.assert_array_equal(agent.act(seen[3]), policy.session().plan(seen[3])[0])
+        agent.close()
+
+
 def test_a_server_that_goes_away_fails_the_episode_and_says_so() -> None:
     policy = as_policy(make_bc())
     with serving(policy) as url:

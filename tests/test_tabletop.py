@@ -125,3 +125,15 @@ def test_the_robot_can_be_drawn_with_all_its_faces(tabletop: Tabletop) -> None:
 def test_more_blocks_than_colours_are_refused() -> None:
     with pytest.raises(Exception, match=r"task\.blocks must be from 2 to 6"):
         make_tabletop("task.blocks=7")
+    # An impossible instruction names a colour that neither a block nor the held-out part has.
+    with pytest.raises(Exception, match=r"task\.blocks must be from 3 to 4"):
+        make_tabletop("task.blocks=5", "task/goal=mixed_or_stay")
+
+
+def test_the_number_of_distractors_is_that_on_the_table() -> None:
+    world = make_tabletop("task/goal=stack", "task/randomize=wide", "task.image_size=[32,32]")
+    with world.blind():
+        for seed in range(12):
+            world.reset(seed)
+            assert world.draws["distractors"]["count"] == world.simulation.compiled.present - 1 >= 2
+    world.close()

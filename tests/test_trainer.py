@@ -8,6 +8,7 @@ import os
 import signal
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import lightning
@@ -24,7 +25,7 @@ from small_training import fit, make_learner
 from vla.models.diffusion import Diffusion
 from vla.models.learner import Learner
 from vla.models.model import Model
-from vla.training.checkpoints import GracefulStop
+from vla.training.checkpoints import SAVE_EVERY, GracefulStop, PeriodicCheckpoint
 from vla.training.closed_loop import ClosedLoop
 from vla.training.trainer import explain_memory_errors, make_trainer
 
@@ -262,3 +263,16 @@ def test_a_checkpoint_does_not_say_what_was_measured(interrupted: dict[str, Any]
     train(make_bc(), folder, tmp_path, checkpoint=last, max_steps=VALIDATED)
     errors = [row["val/error_x_mm"] for row in logged(tmp_path) if row["val/error_x_mm"]]
     assert errors and all(0 <= float(error) < 1000 for error in errors)
+
+
+def test_where_gradients_are_accumulated_nothing_is_saved_within_a_step(tmp_path: Path) -> None:
+    saved = []
+    trainer: Any = SimpleNamespace(global_step=SAVE_EVERY, enable_validation=False, val_check_batch=None)
+    trainer.save_checkpoint = lambda path, weights_only: saved.append(trainer.global_step)
+    checkpoint = PeriodicCheckpoint(tmp_path)
+    nothing: Any = None
+    checkpoint.on_train_start(trainer, nothing)  # resumed from a save at that step
+    for step in (SAVE_EVERY, SAVE_EVERY, SAVE_EVERY + 1, 2 * SAVE_EVERY, 2 * SAVE_EVERY):
+        trainer.global_step = step
+        checkpoint.on_train_batch_end(trainer, nothing, None, None, 0)
+    assert saved == [2 * SAVE_EVERY]

@@ -25,5 +25,6 @@ class Toy(GymEnvironment):
         return {**super()._info(), "truth": self._truth}
 
 
-gymnasium.register("toy/Toy-v0", "toy_gym:Toy")
+gymnasium.register("toy/Toy-v0", "toy_gym:Toy", max_episode_steps=500)
+gymnasium.register("toy/Endless-v0", "toy_gym:Toy")
 gymnasium.register("toy/Elsewhere-v0", "vla.envs.gym:Task")

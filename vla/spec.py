@@ -410,7 +410,7 @@ class Expert(Agent, Protocol):
 class Recorder(Protocol):
     """Observer of a rollout."""
 
-    def start(self, name: str, environment: Environment) -> None:
+    def start(self, environment: Environment) -> None:
         """Begin an episode; one that has not ended is discarded."""
         ...
 

@@ -53,8 +53,7 @@ def adopt(cfg: DictConfig, overrides: Sequence[str]) -> DictConfig:
     saved = read_header(cfg.checkpoint).config
     given = [_path(override) for override in parsed if not override.is_delete()]
     require_no_paths(saved, OF_POLICY, cfg.checkpoint, given)
-    named, kept = {override.key_or_group for override in parsed}, saved.get("chosen", {})
-    chosen = {group: cfg.chosen[group] if group in named else kept.get(group) for group in CHOSEN}
+    chosen = {group: saved.get("chosen", {}).get(group) for group in CHOSEN}
     reported = _reported(cfg, saved) if cfg.job == "evaluate" else {}
     return _on_top(cfg, {**{name: saved[name] for name in OF_POLICY}, **reported, "chosen": chosen}, parsed)
 
@@ -175,7 +174,9 @@ def _parsed(overrides: Sequence[str]) -> list[Override]:
 
 
 def _path(override: Override) -> str:
-    return override.key_or_group.replace("/", ".")
+    """Return the dotted path that an override changes: its package, as in group@package=option, or that of its key."""
+    package = override.package
+    return package if package and not package.startswith("_") else override.key_or_group.replace("/", ".")
 
 
 def _on_top(cfg: DictConfig, saved: Mapping[str, Any], parsed: Sequence[Override]) -> DictConfig:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import copy
 import inspect
 import json
+import re
 import sys
 from collections import ChainMap
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
@@ -17,7 +18,7 @@ from functools import cache, reduce
 from importlib import import_module
 from typing import Annotated, Any, Literal, get_args, get_origin
 
-from annotated_types import Gt, Le, MinLen
+from annotated_types import MinLen, Predicate
 from hydra.errors import InstantiationException
 from hydra.utils import instantiate
 
@@ -36,7 +37,7 @@ from vla.config.annotations import (
 )
 from vla.io.documents import require_resolved
 from vla.io.suggestion import suggestion
-from vla.io.types import Count, Inherited, Natural, NonNegative, Share, Text
+from vla.io.types import Count, Inherited, Natural, NonNegative, Share
 
 HYDRA_KEYS = ("_target_", "_partial_")
 
@@ -95,16 +96,25 @@ GROUPS = {
 
 RUNTIME = {name for group in GROUPS.values() for name in group.runtime}
 
+
+def device_list(text: str) -> bool:
+    """a number of devices, or numbers with commas between them"""
+    return re.fullmatch(r"\d+(,\d+)*,?", text) is not None
+
+
 # Narrower than Lightning's annotations: with other values its trainer fails late, or silently trains nothing.
 NARROWER: dict[str, dict[str, Any]] = {
     "lightning.Trainer": {
         "max_steps": Literal[-1] | Count,
-        "max_epochs": Literal[-1] | Count | None,
-        "devices": Literal["auto", -1] | Count | Annotated[list[Natural], MinLen(1)] | Text,
+        "max_epochs": Literal[-1] | None,  # an epoch never ends
+        "devices": Literal["auto", -1]
+        | Count
+        | Annotated[list[Natural], MinLen(1)]
+        | Annotated[str, Predicate(device_list)],
         "num_nodes": Count,
         "accumulate_grad_batches": Count,
         "gradient_clip_val": NonNegative | None,
-        "val_check_interval": Count | Annotated[float, Gt(0), Le(1)] | None,
+        "val_check_interval": Count,
         "limit_val_batches": Natural | Share | None,
         "limit_train_batches": Natural | Share | None,
         "log_every_n_steps": Count,

@@ -164,7 +164,7 @@ def devices(trainer: Mapping[str, Any]) -> int:
     if isinstance(asked, list):
         return len(asked) * nodes
     if str(asked) not in ("auto", "-1"):
-        return (len(asked.split(",")) if "," in str(asked) else int(asked)) * nodes
+        return (len(asked.rstrip(",").split(",")) if "," in str(asked) else int(asked)) * nodes
     if trainer.get("accelerator", "auto") == "cpu":
         return nodes
     from torch.cuda import device_count  # slow to import

@@ -6,9 +6,12 @@ Shapes: N steps, P state components, D action components.
 from __future__ import annotations
 
 import logging
+from bisect import bisect_left
 from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import replace
+from itertools import islice
+from operator import itemgetter
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -136,11 +139,10 @@ class BagDemonstrations(ImportedDemonstrations):
         """Return the steps of a stretch, made as the policy node makes its observations; a ValueError without any."""
         observer, steps, period = Observer(self.spec), list[Step](), 1 / self.spec.control_hz
         last = earliest = -np.inf
-        for now, each in self._index.inputs:
+        first = bisect_left(self._index.inputs, stretch.start - 1.0, key=itemgetter(0))
+        for now, each in islice(self._index.inputs, first, None):
             if now > stretch.end:
                 break
-            if now < stretch.start - 1.0:
-                continue
             if not isinstance(each, Picture):
                 observer.on_joint_state(each)
                 continue

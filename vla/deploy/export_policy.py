@@ -18,6 +18,7 @@ from torch import Tensor, nn
 from torch.export import Dim, ExportedProgram
 from torch.onnx import ONNXProgram
 
+from vla.io.documents import lines_of
 from vla.io.files import atomic_path
 from vla.io.types import Text
 from vla.models.model import Batch, Model
@@ -160,7 +161,7 @@ def capture(program: Encode | Act, inputs: Inputs) -> ExportedProgram:
         return torch.export.export(program.eval(), (inputs,), dynamic_shapes=(shapes,))
     except Exception as error:  # of many kinds
         names = f"{type(model).__name__} with {type(model.tokenizer).__name__}"
-        raise ValueError(f"{names} cannot be exported: {str(error).strip().splitlines()[0]}") from error
+        raise ValueError(f"{names} cannot be exported: {lines_of(error)[0]}") from error
 
 
 def write_pt2(captured: ExportedProgram, inputs: Inputs, path: Path) -> Run:

@@ -57,6 +57,11 @@ def parse_plain(value: Any, kind: type[T], name: str) -> T:
     return parse_json(text, kind, name)
 
 
+def lines_of(error: BaseException) -> list[str]:
+    """Return the lines of an error's message, or its type if it has none."""
+    return (str(error).strip() or type(error).__name__).splitlines()
+
+
 def parse_yaml(text: str | bytes, kind: type[T], name: str) -> T:
     """Parse YAML text, called `name` in errors, as a `kind`, see `read_yaml`."""
     depth = 0
@@ -65,10 +70,17 @@ def parse_yaml(text: str | bytes, kind: type[T], name: str) -> T:
             depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
             if depth > MAX_DEPTH or isinstance(event, yaml.AliasEvent):
                 raise ValueError(f"{name} is nested deeper than {MAX_DEPTH} levels, or has aliases")
-        plain = json.dumps(yaml.load(text, Loader=yaml.CSafeLoader))
+        plain = json.dumps(_loaded(text))
     except (yaml.YAMLError, UnicodeDecodeError, TypeError, RecursionError) as error:
         raise ValueError(f"{name} is no plain YAML: {' '.join(str(error).split())[:200]}") from error
     return parse_json(plain, kind, name)
+
+
+def _loaded(text: str | bytes) -> Any:
+    try:
+        return yaml.load(text, Loader=yaml.CSafeLoader)
+    except ValueError as error:  # such as that of a date without such a day
+        raise TypeError(str(error)) from error
 
 
 def require_resolved(value: Any, name: str) -> None:

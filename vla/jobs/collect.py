@@ -73,6 +73,8 @@ def _source(experiment: Experiment) -> tuple[Environment | SpecOnly, Spec, Impor
 def _fill(experiment: Experiment) -> EpisodeStore:
     asked, cluster = experiment["collect"], experiment.cluster()
     world, spec, recorded = _source(experiment)
+    if recorded is not None and asked["seed"]:
+        raise ValueError(f"collect.seed={asked['seed']}: recorded episodes are numbered from 0, so omit it")
     store = EpisodeStore.create_or_open(Path(asked["folder"]), spec, experiment.source)
     if recorded is not None:
         added = recorded.fill(store, asked["episodes"])

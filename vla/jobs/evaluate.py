@@ -43,6 +43,7 @@ from vla.runs.folder import (
     wall_time,
 )
 from vla.runs.resume import cached_success, training_lock
+from vla.spec import Multitask
 
 log = logging.getLogger(__name__)
 
@@ -88,6 +89,8 @@ def require_possible(experiment: Experiment) -> None:
     """
     _statements(experiment)
     _networks(experiment)
+    if experiment["evaluate"]["by_clock"] and not experiment["evaluate"]["networks"]:
+        raise ValueError("evaluate.by_clock is about evaluate.networks, and there are none: add evaluate=latency")
     if not experiment.playable and experiment["evaluate"]["conditions"]:
         raise ValueError("evaluate.conditions change a world, and a recording has none: omit them")
 
@@ -183,11 +186,11 @@ def _play(experiment: Experiment, checkpoint: Path | None, statements: Sequence[
         recorder: RecorderFactory | None = None,
     ) -> Report:
         environment, tiers = experiment.make_environment(changes), task.get("tiers")  # of worlds that have them
-        until = until if asked["until"] else None
-        return evaluate(
-            environment, agent, recorder, seeds, cluster, name, needs, tiers, until, recordings=asked["recordings"]
-        )
+        until, limit = until if asked["until"] else None, asked["recordings"]
+        return evaluate(environment, agent, recorder, seeds, cluster, name, needs, tiers, until, limit, turns)
 
+    world = experiment.world() if asked["until"] else None
+    turns = len(world.tasks) if isinstance(world, Multitask) else 1
     clear = [each.is_clear for each in statements]
     first = played(IN_DISTRIBUTION, seeds, partial(_all, clear) if clear else None, recorder=recorder)
     reports, seeds = {IN_DISTRIBUTION: first}, [result.seed for result in first.results]

@@ -59,7 +59,9 @@ def run(experiment: Experiment) -> float:
     seeds = _require_possible(experiment)
     with training_lock(experiment.output):
         _save_config(experiment)
-        require_new(seeds, demonstrations(experiment))
+        more = experiment["collect"]["more"] or ()
+        for store in (demonstrations(experiment), *map(EpisodeStore, more)):
+            require_new(seeds, store)
         return _improved(experiment, seeds)
 
 
@@ -181,6 +183,8 @@ def _described(folder: Path, store: EpisodeStore | None) -> Round:
 def _digest(checkpoint: Path) -> str:
     """Return what identifies the weights in a checkpoint: twelve hexadecimal digits."""
     digest = hashlib.sha256()
-    for name, values in sorted(read_checkpoint(checkpoint).state.items()):
-        digest.update(name.encode() + values.flatten().view(torch.uint8).numpy().tobytes())
+    for name, value in sorted(read_checkpoint(checkpoint).state.items()):
+        tensor = isinstance(value, torch.Tensor)  # or what a module keeps besides, such as the rules of a tokenizer
+        digest.update(name.encode())
+        digest.update(value.flatten().view(torch.uint8).numpy().tobytes() if tensor else repr(value).encode())
     return digest.hexdigest()[:12]

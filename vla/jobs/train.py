@@ -81,6 +81,8 @@ def _fit(experiment: Experiment, state: TrainingProgress, trainer: Trainer, grac
         experiment.fit_tokenizer(learner.model.tokenizer, store)
     data = experiment.data(store, learner.model.history, learner.model.chunk)
     _log_tokenization_error(learner.model, store)
+    for folder in experiment["collect"]["more"] or ():
+        _warn_of_clipped(learner.model, EpisodeStore(folder))
     data.setup()
     if data.batch_size > len(data.training_windows):
         raise ValueError(
@@ -121,12 +123,17 @@ def _endless(experiment: Experiment) -> bool:
 
 def _log_tokenization_error(model: Model, store: EpisodeStore) -> None:
     """Log the tokenisation error and the share of actions beyond the tokenizer's bounds."""
-    chunks = store.statistics.chunks(model.chunk)
     if model.uses_tokens:
-        error = describe_tokenization_error(model.tokenizer, chunks, store.spec)
+        error = describe_tokenization_error(model.tokenizer, store.statistics.chunks(model.chunk), store.spec)
         log.info("action tokens, %s: mean error %s", type(model.tokenizer).__name__, error)
-    if outside := out_of_bounds(model.tokenizer, chunks):
-        log.warning("%.2g %% of the demonstrated actions exceed the bounds of the tokenizer", 100 * outside)
+    _warn_of_clipped(model, store)
+
+
+def _warn_of_clipped(model: Model, store: EpisodeStore) -> None:
+    """Log the share of actions beyond the tokenizer's bounds, to which they are clipped, if there are any."""
+    if outside := out_of_bounds(model.tokenizer, store.statistics.chunks(model.chunk)):
+        where = f"{100 * outside:.2g} % of the demonstrated actions in {store.folder}"
+        log.warning("%s exceed the bounds of the tokenizer, to which they are clipped", where)
 
 
 def _closed_loop(experiment: Experiment, checkpoints: Path) -> ClosedLoop | None:

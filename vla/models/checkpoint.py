@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 from torch.overrides import TorchFunctionMode
 
-from vla.io.documents import require_resolved
+from vla.io.documents import lines_of, require_resolved
 from vla.models.model import Model
 from vla.models.pickles import require_stored, require_tensor_archive
 from vla.spec import Spec
@@ -48,7 +48,7 @@ class Checkpoint(Header):
             with TensorBudget(self.path):
                 model.load_state_dict(self.state)
         except Exception as error:  # whatever modules raise for a state that is not theirs
-            first = str(error).strip().splitlines()[-1].strip()[:200]
+            first = lines_of(error)[-1].strip()[:200]
             raise ValueError(f"{self.path} does not fit the model of its own configuration: {first}") from error
 
     def initialize(self, model: Model) -> None:

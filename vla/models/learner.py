@@ -7,7 +7,7 @@ from typing import Any, Literal
 
 import torch
 from lightning import LightningModule
-from torch import Tensor, nn
+from torch import Tensor, distributed, nn
 from torchmetrics import MeanMetric
 
 from vla.io.types import Natural, NonNegative, Positive, Rate
@@ -158,6 +158,9 @@ class Learner(LightningModule):
             self._require_finite()
 
     def _require_finite(self) -> None:
+        if self._non_finite_step is not None and distributed.is_available() and distributed.is_initialized():
+            # Else one process would end, and the others wait for it.
+            distributed.all_reduce(self._non_finite_step, op=distributed.ReduceOp.MIN)
         if self._non_finite_step is not None and (step := int(self._non_finite_step)) != NEVER:
             raise ValueError(
                 f"the loss is not a finite number at step {step}: lower learner.lr (now {self._lr}), raise "

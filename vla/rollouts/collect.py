@@ -27,7 +27,7 @@ from vla.io.documents import read_json
 from vla.io.files import write_text
 from vla.parallel.pool import Cluster, Future, Pool, WorkersLost
 from vla.parallel.processes import WorkerFactory
-from vla.rollouts.rollout import AgentFactory, EnvironmentFactory, replay, rollout
+from vla.rollouts.rollout import AgentFactory, EnvironmentFactory, close_agent, replay, rollout
 from vla.spec import FIRST_SEED, Episode, Multitask
 
 log = logging.getLogger(__name__)
@@ -164,7 +164,7 @@ class Attempts:
         self._task_of = multitask.task_of if multitask else lambda seed: ""
         self._solved = dict.fromkeys(multitask.tasks if multitask else [""], 0)
         for entry in store.episodes:
-            self._solved[self._task_of(entry.seed)] += 1
+            self._solved[self._task_of(entry.seed)] += entry.success
         self._next = first if store.next_seed is None else store.next_seed
         self._pending: deque[tuple[int, Future | None]] = deque()
 
@@ -266,5 +266,6 @@ class DemonstrationWorker:
         return episode if episode.success or self._keep_failures else replace(episode, observations=[])
 
     def close(self) -> None:
-        """Close the environment."""
+        """Close the environment and the expert."""
         self._environment.close()
+        close_agent(self._expert)

@@ -37,6 +37,7 @@ def evaluate(
     tiers: Mapping[str, Sequence[str]] | None = None,
     until: Callable[[Report], bool] | None = None,
     recordings: int | None = None,
+    turns: int = 1,
 ) -> Report:
     """Play the episodes of the seeds; `name` is the label of the progress bar, `tiers` are those of the report.
 
@@ -46,9 +47,9 @@ def evaluate(
     Every process of the `cluster` calls the factories once and accesses the paths `needs`. Errors of a factory end the
     evaluation; errors of an episode, or a crash of its process, are reported in its result.
 
-    With `until` it ends as soon as that accepts the report on the first n seeds, in their order; with tiers, n is a
-    multiple of the number of tasks, which take turns. Episodes of later seeds do not count even if they were played, so
-    that the report does not depend on the number of workers.
+    With `until` it ends as soon as that accepts the report on the first n seeds, in their order; n is a multiple of
+    `turns`, the number of tasks where these take turns. Episodes of later seeds do not count even if they were played,
+    so that the report does not depend on the number of workers.
 
     Raises:
         ValueError: there are no seeds, seeds are in the range of collection, or the cluster raises one.
@@ -59,7 +60,7 @@ def evaluate(
     at_once = recordings is None
     columns = (TextColumn(name), BarColumn(), MofNCompleteColumn(), TextColumn("{task.fields[note]}"))
     results: dict[int, Result] = {}
-    counted, clear, turns = 0, False, sum(map(len, (tiers or {}).values())) or 1
+    counted, clear = 0, False
     with cluster.pool(make, needs) as pool, Progress(*columns, TimeRemainingColumn()) as bar:
         task = bar.add_task("", total=len(seeds), note="")
         seed_of = {pool.submit((seed, at_once)): seed for seed in seeds}

@@ -15,6 +15,7 @@ from vla.spec import Array
 MOST = 200_000  # episodes
 FAR = 9.0  # standard deviations beyond which outcomes are too rare to count
 SIMULATIONS = 10_000
+PART = 4096  # counts of observations to bound at once, for their memory
 HORIZON = 4  # times as many episodes as a fixed number, which simulations last
 
 
@@ -25,9 +26,9 @@ def episodes_needed(power: Callable[[int], float], enough: float) -> int | None:
     """
     low, high = 0, 1
     while power(high) < enough:
-        low, high = high, 2 * high
-        if high > MOST:
+        if high == MOST:
             return None
+        low, high = high, min(2 * high, MOST)
     while high - low > 1:
         middle = (low + high) // 2
         low, high = (low, middle) if power(middle) >= enough else (middle, high)
@@ -107,7 +108,9 @@ def stopping(mean: float, one: float, zero: float, enough: float, fixed: int) ->
     """
     random, counting = np.random.default_rng(0), one + zero
     horizon = ceil(HORIZON * fixed * counting) + 10
-    bounds = _decisive(mean, np.arange(1, horizon + 1))
+    parts = np.array_split(np.arange(1, horizon + 1), 1 + horizon // PART)
+    lower, upper = (np.concatenate(ends) for ends in zip(*(_decisive(mean, part) for part in parts), strict=True))
+    bounds = lower, upper
     ended = np.sort(_ends(random, bounds, one / counting, counting))
     most = ended[ceil(enough * SIMULATIONS) - 1]
     if not np.isfinite(most):

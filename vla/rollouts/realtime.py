@@ -254,7 +254,10 @@ class Distant:
         plan: Plan = getattr(agent, "plan", lambda observation: agent.act(observation)[None])
         self._thread = BackgroundLink(plan, spec.control_hz, network) if by_clock else None
         link: Link = self._thread or SimulatedLink(plan, network, spec.control_hz)
-        self._real_time = RealTime(spec, link, lambda: getattr(agent, "execute", None) or 1, network.ensemble)
+        # An agent with a history wants to see every frame.
+        every = getattr(agent, "history", 1) > 1
+        execute = lambda: 1 if every else getattr(agent, "execute", None) or 1  # noqa: E731
+        self._real_time = RealTime(spec, link, execute, network.ensemble)
         self.info: dict[str, Any] = {}
 
     def reset(self, instruction: str, seed: int) -> None:

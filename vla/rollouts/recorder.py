@@ -44,7 +44,7 @@ class RerunRecorder:
         self._folder = Path(folder)
         self._folder.mkdir(parents=True, exist_ok=True)
 
-    def start(self, name: str, environment: Environment) -> None:
+    def start(self, environment: Environment) -> None:
         """Begin an episode; an unfinished one is discarded."""
         self._spec = environment.spec
         self._world = environment if isinstance(environment, Drawable) else None
@@ -226,7 +226,7 @@ def encoded(pixels: Array, kind: str, palette: Array | None = None, **options: i
 
 
 def _solid(shape: Shape) -> Any:
-    colour, (radius, half_length) = np.round(np.asarray(shape.rgba) * 255).astype(np.uint8), shape.size[:2]
+    colour, (radius, half_length) = np.round(255 * np.clip(shape.rgba, 0, 1)).astype(np.uint8), shape.size[:2]
     if shape.kind == "mesh":
         vertices, faces = np.asarray(shape.vertices), np.asarray(shape.faces)
         normals = _normals(vertices, faces)

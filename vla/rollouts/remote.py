@@ -104,6 +104,7 @@ class RemotePolicy:
         if self.actions is not None and sorted(self.actions) != sorted(self.spec.action):
             raise ValueError(f"agent.actions must map {', '.join(self.spec.action)}, got {', '.join(self.actions)}")
         self.info: dict[str, Any] = {}
+        self._broken = False
         self._low, self._high = np.array(self.spec.low, np.float32), np.array(self.spec.high, np.float32)
         with ExitStack() as opened:
             self._loop = opened.enter_context(event_loop())
@@ -123,8 +124,11 @@ class RemotePolicy:
         self._real_time = RealTime(self.spec, link, lambda: self.execute or 1, self.ensemble)
 
     def reset(self, instruction: str, seed: int) -> None:
-        """Start an episode: drop all chunks, and tell a server that has episodes."""
+        """Start an episode: drop all chunks, connect again if that broke, and tell a server that has episodes."""
         self._real_time.reset(seed)
+        if self._broken:
+            self._connection, self.metadata = self._connected(self._open)
+            self._broken = False
         if self.metadata.get("reset") is True:
             self._ask({"reset": True, "prompt": instruction, "seed": seed})
 
@@ -214,8 +218,11 @@ class RemotePolicy:
         try:
             return self._wait(answered())
         except ConnectionClosed as error:
+            self._broken = True
             raise self._error("it closed the connection") from error
         except TimeoutError as error:
+            self._broken = True
+            self._loop.call_soon_threadsafe(self._connection.transport.abort)  # a late answer would be the next one's
             raise self._error(f"no answer within {self.timeout:g} s") from error
 
     def _wait(self, work: Coroutine[Any, Any, Result]) -> Result:

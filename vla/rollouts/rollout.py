@@ -31,7 +31,7 @@ def rollout(
     observation = environment.reset(seed)
     agent.reset(observation.instruction, seed)
     if recorder is not None:
-        recorder.start(f"seed {seed}", environment)
+        recorder.start(environment)
     observations, clean, executed = [], [], []
     components, traced = len(environment.spec.action), environment if isinstance(environment, Traceable) else None
     tool = [traced.tool] if traced else []
@@ -88,7 +88,7 @@ def replay(environment: Environment, episode: Episode, recorder: Recorder | None
     """Execute the actions of an episode again from its seed; record this world with the observations of the episode."""
     observation = environment.reset(episode.seed)
     if recorder is not None:
-        recorder.start(f"seed {episode.seed}", environment)
+        recorder.start(environment)
     same, seen = [], []
     for recorded, action in zip(episode.observations, episode.executed, strict=True):
         if environment.done:

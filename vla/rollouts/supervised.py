@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from vla.rollouts.rollout import close_agent
 from vla.spec import Agent, Array, Environment, Expert, Observation
 
 
@@ -50,6 +51,11 @@ class Supervised:
         label = self._expert.info.get("clean", executed)
         self.info = {**self._policy.info, "clean": label, "draws": {"expert_acts": self._acts}}
         return label if self._expert_acts else action
+
+    def close(self) -> None:
+        """Close the policy and the expert."""
+        close_agent(self._policy)
+        close_agent(self._expert)
 
 
 def require_memoryless(expert: Agent) -> None:

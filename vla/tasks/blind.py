@@ -14,8 +14,8 @@ class Blindable:
     @contextmanager
     def blind(self) -> Iterator[None]:
         """Return no images within this context, which makes steps several times faster."""
-        self._blind = True
+        before, self._blind = self._blind, True
         try:
             yield
         finally:
-            self._blind = False
+            self._blind = before

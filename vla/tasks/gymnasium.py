@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping
 from importlib import import_module
 from typing import Annotated, Any
@@ -19,7 +20,10 @@ from vla.spec import Array, Observation, Spec
 from vla.tasks.blind import Blindable
 from vla.tasks.gl import choose_backend
 
+log = logging.getLogger(__name__)
+
 OBSERVATION, INFO, RENDER = "observation", "info", "render"
+MISSING = object()
 PATHS = (f"{OBSERVATION}.", f"{INFO}.")
 
 
@@ -95,7 +99,9 @@ class Gymnasium(Blindable):
             truth=tuple((name, np.size(_get(values, path))) for name, path in truth.items()),
         )
         self._observe(values)  # refuses images that are none
-        _get(values, success, default=False)
+        if not success.startswith(PATHS):
+            raise ValueError(f"task.success={success} must be a path that begins with {' or '.join(PATHS)}")
+        self._told = False  # of success, or its absence
 
     def reset(self, seed: int) -> Observation:
         """Start the episode of `seed`, which seeds the environment."""
@@ -112,6 +118,10 @@ class Gymnasium(Blindable):
         success = bool(_get(values, self._success, default=False))
         self.outcome = "success" if success else "failure" if terminated else "timeout"
         self.done = success or terminated or truncated
+        self._told |= _get(values, self._success, default=MISSING) is not MISSING
+        if self.done and not self._told:
+            self._told = True
+            log.warning("in a whole episode the environment gave no %s, task.success: that is a failure", self._success)
         return self._observe(values)
 
     def close(self) -> None:
@@ -145,6 +155,8 @@ def _make(package: str, id: str, options: Mapping[str, object], steps: int | Non
         raise ValueError(f"task.id={id} is not registered by {package}: {error}") from error
     if spec is None or _home(spec) != package:
         raise ValueError(f"task.id={id} is no environment of task.package={package}")
+    if steps is None and spec.max_episode_steps is None:
+        raise ValueError(f"{id} does not tell how long an episode lasts: set task.steps")
     return gymnasium.make(
         spec,
         max_episode_steps=steps,

@@ -82,8 +82,17 @@ class Perturbation:
         """Return the (D,) action to execute instead of `clean`, not yet clipped to the bounds of the spec.
 
         With `must_turn` the gripper also turns in episodes without turns; with `steady` no excursion begins.
+
+        Raises:
+            ValueError: the truth has no such tool.
         """
-        tool, opens = truth[self.tool], bool((clean[self._grip] >= (self._shut + self._wide) / 2).all())
+        tool, coordinates = truth.get(self.tool), len(self.low)
+        if tool is None or tool.shape != (coordinates,):
+            raise ValueError(
+                f"expert.perturb.tool={self.tool} is no point of {coordinates} coordinates in the truth, which has "
+                f"{', '.join(truth) or 'nothing'}"
+            )
+        opens = bool((clean[self._grip] >= (self._shut + self._wide) / 2).all())
         grasps, self._open = self._open and not opens, opens
         if self._left == 0 and self._random.uniform() < self.rate and not steady:
             self._begin(self.steps)

@@ -131,6 +131,10 @@ class PeriodicCheckpoint(Checkpoint):
     def __init__(self, checkpoints: Path) -> None:
         self._path, self._due, self._step = checkpoints / LAST, False, -1
 
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Count from this step: where gradients are accumulated, several batches have it."""
+        self._step = trainer.global_step
+
     def on_train_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
     ) -> None:

@@ -88,7 +88,8 @@ class VlaPolicy(PreTrainedPolicy):
         arrays: dict[str, Any] = {
             key: value.float().cpu().numpy() for key, value in batch.items() if isinstance(value, Tensor)
         }
-        seen = observations({**arrays, TASK: batch.get(TASK, [""])}, self._policy.spec)
+        said = {TASK: batch[TASK]} if TASK in batch else {}
+        seen = observations({**arrays, **said}, self._policy.spec)
         if len(self._sessions) != len(seen):
             self._sessions = [self._policy.session() for _ in seen]
         # One by one, so that every action is exactly the one that the policy gives alone.

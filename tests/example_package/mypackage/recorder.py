@@ -22,7 +22,7 @@ class Lines:
         self._digits, self._folder = digits, folder
         self._lines: list[Any] = []
 
-    def start(self, name: str, environment: Environment) -> None:
+    def start(self, environment: Environment) -> None:
         """Begin an episode."""
         self._lines = []
 

@@ -209,7 +209,7 @@ class LeRobotDataset:
 
     def _require_one_rate(self) -> None:
         rates = {key: self.info.features[key].video_rate for key in self._videos}
-        if others := [f"{key} {rate:g} Hz" for key, rate in rates.items() if rate not in (None, self.info.fps)]:
+        if others := [f"{key} {str(rate)[:20]} Hz" for key, rate in rates.items() if rate not in (None, self.info.fps)]:
             raise ValueError(
                 f"{self.folder} has {self.info.fps:g} Hz, but {', '.join(others)}: record all cameras at one rate"
             )

@@ -143,7 +143,8 @@ class LeRobotDemonstrations(ImportedDemonstrations):
             return np.zeros(shape, np.uint16)
         path, column = self._dataset.column(number, layout.depth_key(camera), tables.pixels)
         values = np.asarray(column.combine_chunks().flatten().flatten())
-        if values.dtype != np.uint16 or len(values) != np.prod(shape):
+        regular = tables.lists_have(column, *self.spec.image_size) and len(values) == np.prod(shape)
+        if values.dtype != np.uint16 or not regular:
             raise ValueError(f"{path} has {layout.depth_key(camera)} of another size in episode {number}: {REMEDY}")
         return values.reshape(shape)
 

@@ -112,16 +112,27 @@ def _unpacked_size(path: Path, columns: Collection[str], filtered: bool) -> int:
     metadata, sizes = pq.read_metadata(path), []
     for group in (metadata.row_group(number) for number in range(metadata.num_row_groups)):
         of = [group.column(number) for number in range(group.num_columns)]
-        chosen = [column for column in of if column.path_in_schema.partition(".")[0] in columns]
+        chosen = [each for each in of if any(f"{each.path_in_schema}.".startswith(f"{name}.") for name in columns)]
         sizes.append(sum(max(column.total_uncompressed_size, 8 * column.num_values) for column in chosen))
     return (max if filtered else sum)([0, *sizes])
 
 
 def matrix(column: pa.ChunkedArray, size: int) -> Array | None:
     """Return a column of `numbers` as (N, size) float32; None if rows have another size or are not finite."""
+    if _is_list(column.type) and not lists_have(column, size):
+        return None
     flat = pc.list_flatten(column) if _is_list(column.type) else column
     values = np.asarray(flat.combine_chunks(), np.float32)
     return values.reshape(-1, size) if len(values) == len(column) * size and np.isfinite(values).all() else None
+
+
+def lists_have(column: pa.ChunkedArray, *sizes: int) -> bool:
+    """Return whether all lists of a column have the first of the sizes, the lists in these the next, and so on."""
+    for size in sizes:
+        if not pc.all(pc.equal(pc.list_value_length(column), size)).as_py():
+            return False
+        column = pc.list_flatten(column)
+    return True
 
 
 def _is_list(kind: pa.DataType) -> bool:

@@ -35,6 +35,6 @@ def measures(experiment: Experiment) -> dict[str, Measure]:
     agent = experiment["deploy"]["agent"]
     return {
         "deploy: image to command": measure(image, "ms", loop.episodes, inference),
-        "deploy: tick p99": measure(tick, "ms", loop.episodes, 1000 / agent.command_hz),
-        "deploy: watchdog": measure(float(np.median(delays)), "ms", len(delays), 1000 * agent.safety.joints_age),
+        "deploy: tick p99": measure(tick, "ms", loop.episodes, 1000 / agent["command_hz"]),
+        "deploy: watchdog": measure(float(np.median(delays)), "ms", len(delays), 1000 * agent["safety"]["joints_age"]),
     }

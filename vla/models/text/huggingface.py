@@ -15,7 +15,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from vla.io.documents import mappings, parse_json, read_bounded
+from vla.io.documents import lines_of, mappings, parse_json, read_bounded
 from vla.models.packaged import PackagedFile
 from vla.models.text.ngrams import TextEncoder
 from vla.models.text.tensor_cache import TensorCache
@@ -100,7 +100,7 @@ class SentenceEncoder:
             )
             tokenizer = PreTrainedTokenizerFast.from_pretrained(folder)
         except (OSError, RuntimeError, ValueError, SafetensorError) as error:
-            raise ValueError(f"{folder} cannot be read as an encoder: {str(error).strip().splitlines()[0]}") from error
+            raise ValueError(f"{folder} cannot be read as an encoder: {lines_of(error)[0]}") from error
         missing = sorted(name for name in report["missing_keys"] if not name.startswith("pooler."))  # not used
         if missing:
             raise ValueError(f"the weights in {folder} are those of another network: {missing[0]} is missing")

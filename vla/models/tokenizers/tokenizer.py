@@ -16,7 +16,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from vla.io.types import Bins, Count, NonNegative
+from vla.io.types import Bins, Natural, NonNegative
 from vla.spec import Spec
 
 log = logging.getLogger(__name__)
@@ -196,7 +196,7 @@ class Uniform(EvenBins):
         bins: Bins,
         margin: NonNegative,
         smoothing: NonNegative,
-        reach: Count,
+        reach: Natural,
         *,
         spec: Spec,
         statistics: ActionStatistics | None = None,

@@ -134,7 +134,7 @@ class Tabletop(Blindable):
         If it fails at one of them, the episode is about that one.
         """
         task, expert = self.simulation, Waypoint(self.spec)
-        self._joint_noise = np.random.RandomState(0)
+        self._joint_noise, self._image_noise = np.random.RandomState(0), np.random.default_rng(0)
         task.disturber = None  # disturbances are for who acts next
         with self.blind():
             while task.current < number and not task.over:

@@ -37,7 +37,8 @@ class Grammar:
         held_out_colours: block colours that training instructions never name.
 
         Raises:
-            ValueError: a held-out part is empty or overlaps with training, or a phrasing has a malformed slot.
+            ValueError: a held-out part is empty, replaces nothing or overlaps with training, or a phrasing has a
+                malformed slot.
         """
         self.phrasings, self.words = tuple(phrasings), {slot: tuple(choices) for slot, choices in words.items()}
         self.held_out_phrasings = tuple(held_out_phrasings)
@@ -49,6 +50,8 @@ class Grammar:
             raise ValueError(f"task.goal.language holds out what training also uses: {sorted(leaked)}")
         if not held_out_phrasings or not held_out_words:
             raise ValueError("the held-out part of task.goal.language is empty")
+        if not any(f"{{{slot}}}" in phrasing for phrasing in phrasings for slot in held_out_words):
+            raise ValueError("task.goal.language.held_out_words has no slot of the phrasings, so it replaces no word")
         self.slots = {slot for phrasing in (*phrasings, *held_out_phrasings) for slot in _slots(phrasing)} - {*words}
 
     def renamed(self, slots: Mapping[str, str]) -> Grammar:

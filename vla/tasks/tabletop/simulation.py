@@ -91,6 +91,8 @@ class Simulation:
         draws = {name: axis(self.compiled, self.streams(seed, name)) for name, axis in axes.items()}
         goal = self.goals.draw(self.streams(seed, "goal"))
         self.compiled.present = max(self.compiled.present, goal.blocks)
+        if "distractors" in draws:
+            draws["distractors"] = {"count": self.compiled.present - 1}  # a goal may need more than were drawn
         self._pads = goal.pads
         self.compiled.finish(goal.pads)
         self._physics.forward()
@@ -167,7 +169,8 @@ class Simulation:
         order = [int(index) for index in random_state.permutation(self.compiled.present)]
         # The sort is stable: without held-out colours it changes nothing.
         order.sort(key=lambda index: (self.compiled.block_names[index] in colours) != (held_out == "combinations"))
-        order = order[self.compiled.skip :] + order[: self.compiled.skip]
+        skip = self.compiled.skip % len(order)
+        order = order[skip:] + order[:skip]
         pads = [int(index) for index in random_state.permutation(goal.pads)]
         return Referents(tuple(order[: goal.named]), tuple(pads))
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from vla.io.types import Share
 from vla.tasks.tabletop.goals.goal import Goal
-from vla.tasks.tabletop.goals.stay import Stay, Wait
+from vla.tasks.tabletop.goals.stay import Stay, Wait, colours_left
 
 
 class Mixed:
@@ -32,7 +32,8 @@ class Mixed:
             raise ValueError(f"task.goal.impossible and task.goal.silent are {impossible + silent:g} in all, at most 1")
         self.impossible, self.silent = impossible, silent
         self.blocks = max(goal.blocks for goal in self.goals.values())
-        self.absent = max([goal.absent for goal in self.goals.values()] + [Stay.absent] * bool(impossible))
+        kept = [colours_left(goal.language) for goal in self.goals.values() if impossible]
+        self.absent = max([goal.absent for goal in self.goals.values()] + kept)
 
     def draw(self, random_state: np.random.RandomState) -> Goal:
         """Draw one of the goals; which does not depend on the two shares."""

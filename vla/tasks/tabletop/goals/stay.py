@@ -13,14 +13,17 @@ REST_STEPS = 15  # consecutive control steps for which it must rest
 UNMOVED = 0.01  # largest displacement of a block that counts as none [m]
 
 
+def colours_left(language: Grammar) -> int:
+    """Return how many colours no block may have, so that one can be named that training may name, too."""
+    return 1 + len(language.held_out_colours)
+
+
 class Stay(Goal):
     """Leave everything in place, because the instruction names a block that is not on the table."""
 
-    absent = 1
-
     def __init__(self, language: Grammar, pads: Count) -> None:
         """Args: grammar; number of pads on the table."""
-        self.pads = pads
+        self.pads, self.absent = pads, colours_left(language)
         super().__init__(language, REST_STEPS)
 
     @classmethod
@@ -39,8 +42,7 @@ class Stay(Goal):
 class Wait(Stay):
     """Leave everything in place, because the instruction is empty."""
 
-    absent = 0
-
     def __init__(self, pads: Count) -> None:
         """Args: number of pads on the table."""
         super().__init__(Silence(), pads)
+        self.absent = 0
