@@ -185,7 +185,7 @@ def _label_rates(axes: Axes, condition: str, label: str) -> None:
     axes.xaxis.set_minor_formatter("")
     axes.set_ylim(0, 1)
     axes.set_xlabel(label)
-    axes.set_title(condition.replace("_", " "), fontsize=10)
+    axes.set_title(condition.replace("_", " "), fontsize=10, pad=10)  # above the points at 1
 
 
 def pareto(rows: list[SweepRow], condition: str) -> list[SweepRow]:
