@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import os
 import sys
+import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -226,6 +227,26 @@ def test_a_gripper_that_changes_its_mind_cancels_first(make_world: Callable[...,
     move.obey()
     world.live(1.0, until=lambda: grasp.running)
     assert grasp.running and grasp.goals[0].force == 20.0 and grasp.goals[0].epsilon.outer == 0.08
+
+
+def test_after_a_stop_no_goal_of_the_gripper_follows(make_world: Callable[..., World]) -> None:
+    from franka_msgs.action import Grasp, Move
+
+    world = make_world("joint_state", gripper=GRIPPERS["franka"])
+    grasp, move = Controller(world.node, Grasp, "/gripper/grasp"), Controller(world.node, Move, "/gripper/move")
+    world.start()
+    world.live(1.0, until=lambda: move.running)
+    world.policy.action = lambda: np.append(FORWARD[:, :6], [[0.0]], 1).astype(np.float32)
+    world.live(0.6)
+    assert world.agent.loop is not None
+    world.agent.loop.stop("by hand")
+    world.live(0.3)
+    move.obey()
+    world.live(0.6)
+    assert not grasp.goals and not move.running
+    assert world.agent.loop.resume(time.monotonic())
+    world.live(2.0, until=lambda: grasp.running)
+    assert grasp.running
 
 
 def test_a_dry_run_sends_no_goal(make_world: Callable[..., World]) -> None:

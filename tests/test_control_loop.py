@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from arm import ARM, FORWARD, ROBOT, SAFETY, SPEC
 
-from vla.deploy.control_loop import Command, ControlLoop, Safety, State
+from vla.deploy.control_loop import REPEATED, Command, ControlLoop, Safety, State
 from vla.deploy.joint_limiter import Robot
 from vla.robots.panda import CHAIN, HOME, JOINT_HIGH, forward
 from vla.spec import Observation, Spec
@@ -217,6 +217,7 @@ def test_the_next_instruction_ends_a_stop_by_time_out_and_no_other() -> None:
     world.loop.on_instruction("go", world.now)
     world.run(1.5)
     assert world.loop.state is State.STOPPED
+    world.run(REPEATED)
     assert world.loop.on_instruction("go", world.now)
     world.run(0.5)
     assert world.loop.state is State.RUNNING
@@ -315,6 +316,64 @@ def test_an_arm_outside_its_limits_is_a_fault() -> None:
     world = World()
     world.joints = JOINT_HIGH - 0.01
     assert world.run(0.2) == [] and world.loop.state is State.FAULT and "outside" in world.loop.reason
+    world.joints = HOME.copy()  # a person moves it inside
+    assert world.run(0.2) == [] and world.loop.state is State.FAULT
+
+
+def test_a_plan_for_the_instruction_before_is_not_executed(world: World) -> None:
+    world.answer = lambda observation: 0 * FORWARD
+    world.run(0.5)
+    asked: list[Observation] = []
+    world.answer = lambda observation: asked.append(observation)
+    ticks = world.ticks(2.0)
+    while not asked:
+        next(ticks)
+    start = world.tool
+    world.loop.on_instruction("lift the blue block", world.now)
+    world.loop.set_plan(np.repeat(FORWARD, 8, 0))  # the answer to what was seen before
+    while len(asked) < 2:
+        next(ticks)
+    assert asked[1].instruction == "lift the blue block"
+    np.testing.assert_allclose(world.tool, start, atol=1e-4)
+
+
+def test_a_repeated_instruction_does_not_start_anew() -> None:
+    world = World(replace(SAFETY, instruction=1.0))
+    world.run(0.1)
+    for _ in range(6):  # as `ros2 topic pub` sends it
+        world.loop.on_instruction("go", world.now)
+        world.run(0.5)
+    assert world.loop.state is State.STOPPED and "time-out" in world.loop.reason
+    world.run(2.0)
+    assert world.loop.on_instruction("go", world.now)
+
+
+def test_what_was_grasped_is_held_to_the_end_of_what_was_sent_ahead() -> None:
+    world = World()
+    world.loop.limit(replace(ROBOT, acceleration=[3.0] * 7))
+    world.run(0.1)
+    world.loop.on_instruction("go", world.now)
+    grasp = np.repeat(FORWARD, 4, 0)
+    grasp[:, 6] = [1, 1, 0, 0]
+    asked: list[Observation] = []
+    world.answer = lambda observation: grasp if not asked.append(observation) and len(asked) == 1 else None
+    openings = []
+    for command in world.ticks(0.9):
+        world.loop.commit(command, world.now)
+        openings.append(command.opening)
+    closed = next(number for number, opening in enumerate(openings) if opening is not None and opening < 0.5)
+    assert all(opening == 0 for opening in openings[closed:])
+
+
+def test_corners_of_the_workspace_may_be_any_two_opposite_ones() -> None:
+    goals = []
+    for workspace in (((0.25, -0.4, 0.008), (0.75, 0.4, 0.5)), ((0.25, 0.4, 0.008), (0.75, -0.4, 0.5))):
+        world = World(replace(SAFETY, workspace=workspace))
+        world.run(0.1)
+        world.loop.on_instruction("go", world.now)
+        world.run(0.6)
+        goals.append(world.tool)
+    np.testing.assert_array_equal(goals[0], goals[1])
 
 
 def test_the_horizon_ends_at_rest(world: World) -> None:

@@ -322,6 +322,7 @@ def test_arguments_of_ros_are_split_off() -> None:
         ([CHECKPOINT, "deploy=ros2", "--ros-args", "--nonsense"], "--nonsense"),
         ([CHECKPOINT, "deploy=ros2", "--ros-args", "-p", "command_hz:=0.0"], "command_hz out of range"),
         ([CHECKPOINT, "deploy=loop", "deploy.episodes=0"], "deploy.episodes"),
+        ([CHECKPOINT, "deploy=loop", "deploy.agent.command=trajectory"], "obeys deploy.agent.command=joint_state only"),
         (
             [CHECKPOINT, "deploy=simulator", "deploy.timing.joints_hz=25"],
             "joints_hz=25 must be a multiple of the task's 10",

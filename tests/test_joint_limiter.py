@@ -101,7 +101,25 @@ def test_an_arm_outside_its_limits_is_not_taken_over() -> None:
         JointLimiter(ROBOT, PERIOD).start(np.array([0.0, 1.99]))
 
 
-@pytest.mark.parametrize("wrong", [{"low": [0.0]}, {"speed_share": 0.0}, {"acceleration_share": 1.5}])
+def test_without_overshoot_a_joint_at_its_goal_stays_there() -> None:
+    limiter = JointLimiter(replace(ROBOT, overshoot=0.0), PERIOD)
+    limiter.start(np.zeros(2))
+    np.testing.assert_array_equal(limiter.step(np.zeros(2)), np.zeros(2))
+    assert np.isfinite(limiter.step(np.array([0.1, 0.0]))).all()
+    for _ in range(100):
+        limiter.step(np.array([0.1, 0.0]))
+    assert limiter.position == pytest.approx([0.1, 0.0], abs=1e-3)
+    limiter.brake()
+    assert limiter.resting
+
+
+WRONG = [
+    *({"low": [0.0]}, {"speed_share": 0.0}, {"acceleration_share": 1.5}, {"margin": -0.5}, {"overshoot": np.nan}),
+    *({"acceleration": [0.0, 1.0]}, {"speed": [np.inf, 1.0]}, {"finger_travel": 0.0}, {"low": [1.0, -2.0]}),
+]
+
+
+@pytest.mark.parametrize("wrong", WRONG, ids=str)
 def test_a_robot_that_cannot_be_is_refused(wrong: dict) -> None:
     with pytest.raises(ValueError, match=r"deploy\.robot"):
         replace(ROBOT, **wrong)

@@ -270,6 +270,19 @@ def test_other_scenes_under_the_same_seeds_are_not_compared(tmp_path: Path) -> N
     assert "Not compared, because no episode is the same in both: plain and dark." in told
 
 
+def test_episodes_without_draws_are_the_same_only_in_the_same_task(tmp_path: Path) -> None:
+    runs = []
+    for number, task in enumerate(("one", "one", "other")):
+        runs.append(a_run(tmp_path / str(number), "ssssssss" if number else "dddddddd"))
+        content = json.loads((runs[-1] / "report.json").read_text())
+        for result in content["per_episode"]:
+            result["draws"] = {}
+        content["config"]["task"] = {"id": task}
+        (runs[-1] / "report.json").write_text(json.dumps(content))
+    compared = compare_runs(read_runs(runs), 0.02)
+    assert {(each.one, each.other) for each in compared if each.condition == "seen"} == {("0", "1")}
+
+
 def test_other_seeds_of_the_same_world_are_compared_as_they_are(tmp_path: Path) -> None:
     one, other = a_run(tmp_path / "one", "sssssssd"), a_run(tmp_path / "other", "sddddddd")
     file = other / "report.json"

@@ -510,6 +510,26 @@ def test_a_late_answer_is_not_taken_for_that_of_the_next_observation(monkeypatch
         agent.close()
 
 
+def test_an_error_of_the_server_costs_one_episode(monkeypatch: pytest.MonkeyPatch) -> None:
+    policy, plan, asked = as_policy(make_bc()), server._plan, list[Any]()
+
+    def failing(sessions: Sequence[Any], observations: Sequence[Observation]) -> list[Array]:
+        asked.extend(observations)
+        if len(asked) == 1:
+            raise RuntimeError("no idea")
+        return plan(sessions, observations)
+
+    monkeypatch.setattr(server, "_plan", failing)
+    seen = observations(2)
+    with serving(policy) as url:
+        agent = remote(url)
+        with pytest.raises(ValueError, match=r"the policy server at .* failed"):
+            agent.act(seen[0])
+        agent.reset(seen[1].instruction, 1)
+        np.testing.assert_array_equal(agent.act(seen[1]), policy.session().plan(seen[1])[0])
+        agent.close()
+
+
 def test_a_server_that_goes_away_fails_the_episode_and_says_so() -> None:
     policy = as_policy(make_bc())
     with serving(policy) as url:

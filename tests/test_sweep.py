@@ -166,6 +166,14 @@ def test_over_the_number_of_demonstrations_success_is_a_curve_under_each_conditi
     assert {"default", "wide"} <= texts(seen) and {"50", "1000", "demonstrations"} <= texts(dark)
 
 
+def test_a_cell_that_does_not_name_its_demonstrations_has_those_of_its_config(tmp_path: Path) -> None:
+    cell(tmp_path, 0, ["collect.episodes=10"], 5)
+    cell(tmp_path, 1, ["model=bc"], 5)
+    (tmp_path / "1/config.yaml").write_text("collect: {episodes: 500}")
+    tabulate(tmp_path)
+    assert (tmp_path / "sweep.html").exists() and (tmp_path / "sweep.png").exists()
+
+
 def test_success_over_training_is_that_of_all_seeds_in_validation(tmp_path: Path, figures: list[Figure]) -> None:
     for number, (count, seed) in enumerate([(50, 0), (50, 1), (100, 0), (100, 1)]):
         cell(tmp_path, number, [f"collect.episodes={count}", f"seed={seed}"], 5)

@@ -117,7 +117,7 @@ def test_the_expected_picture_is_what_episodes_begin_with(tmp_path: Path) -> Non
 
 def described(joints: list[str], fingers: list[str], chain: Any) -> tuple[str, String]:
     """What an agent says of its arm."""
-    limits: Any = dict.fromkeys(("low", "high", "speed", "acceleration"), [1.0] * len(joints))
+    limits: Any = dict.fromkeys(("high", "speed", "acceleration"), [1.0] * len(joints)) | {"low": [-1.0] * len(joints)}
     robot = replace(ROBOT, joints=joints, fingers=fingers, **limits)
     return "/vla_agent/arm", messages.fill_arm(String(), robot, RobotModel(tuple(joints), "base", chain=chain))
 

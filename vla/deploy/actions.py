@@ -105,6 +105,8 @@ class GoalSender:
         future.add_done_callback(self._node.guard(partial(callback, self._newest)))
 
     def _give_up(self, what: str) -> None:
+        if self._handle is not None:
+            self._handle.cancel_goal_async()
         self._given_up, self._handle, self._sent_at = True, None, None
         self._fail(f"the action server {self.name} {what}")
 
@@ -113,7 +115,10 @@ class GoalSender:
         if newest:
             self._sent_at = None
         if not handle.accepted:
-            return self._on_rejection() if newest else None
+            return self._on_rejection() if newest and not self._given_up else None
+        if self._given_up:  # accepted too late
+            handle.cancel_goal_async()
+            return None
         handle.get_result_async().add_done_callback(self._node.guard(partial(self._on_result, number)))
         if newest:
             self._handle, self._rejected = handle, False
@@ -201,6 +206,10 @@ class GripperGoals:
             self._wanted = False
         self._advance()
 
+    def hold(self) -> None:
+        """Send nothing until the next command, not even what a goal that is being cancelled was to make room for."""
+        self._wanted = None
+
     def _advance(self) -> None:
         """Send what is wanted, after the goal before has ended: Franka's gripper takes one at a time."""
         if self._wanted is None or self._wanted == self._sent:
@@ -208,6 +217,7 @@ class GripperGoals:
         busy = [sender for sender in self.senders.values() if sender.active]
         for sender in busy:
             sender.cancel()
+            self._sent = None
         if not busy:
             sender, goal = self._goals[self._wanted]
             self._sent = self._wanted

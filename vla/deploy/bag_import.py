@@ -233,7 +233,8 @@ def _recording(
     bounds = {name: action_bounds(values) for name, values in zip(arm.joints, np.transpose(track.values), strict=True)}
     cameras = tuple(images)
     taken = [each.at for _, each in index.inputs if isinstance(each, Picture) and each.camera == cameras[0]]
-    rate = round(1 / float(np.median(np.diff(taken))), 1) if len(taken) > 1 else 1.0
+    period = float(np.median(np.diff(taken))) if len(taken) > 1 else 0.0
+    rate = round(1 / period, 1) if period > 0 else 1.0
     joints = tuple(arm.joints)
     return Recording(cameras, rate, joints, joints, bounds, len(_chosen(index, steps)))
 

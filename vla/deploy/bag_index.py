@@ -19,7 +19,7 @@ import numpy as np
 
 from vla.deploy import messages
 from vla.deploy.bag import damage, message_types, messages_of, opened
-from vla.deploy.control_loop import State
+from vla.deploy.control_loop import REPEATED, State
 from vla.deploy.joint_limiter import Robot
 from vla.deploy.observer import Measured, age_of
 from vla.deploy.settings import Topics
@@ -32,7 +32,6 @@ JOINTS, TRAJECTORY, NUMBERS = (
 )
 TWIST = "geometry_msgs/msg/TwistStamped"
 GAP = 0.3  # longest time between two commands of one motion [s]
-REPEATED = 2.0  # an equal instruction within this time is a repetition, as `ros2 topic pub` sends them [s]
 STILL, STILL_OPENING = 0.01, 0.002  # an arm that has moved less [rad], and its gripper [m], has not begun to move
 LEAD = 0.1  # of a motion that are kept before it begins and after it ends [s]
 SHORTEST = 0.5  # shorter stretches are left out [s]
@@ -157,6 +156,7 @@ class _Reading:
         self._instruction, self._said_at = "", -np.inf
         self._person: bool | None = None  # moves the arm; None: nobody does
         self._has_status, self._seen = False, set[str]()  # cameras of usable images
+        self._taken: dict[str, tuple[int, int]] = {}  # camera → time stamp of its last image
         self._number = 0  # of the try: the next one begins with an instruction, or when the agent runs again
         self._moments: list[tuple[float, int, bool | None, str]] = []  # of joint states: try, who moves the arm, words
         self._dropped: dict[str, str] = {}  # topic → why its first unusable message is that
@@ -223,10 +223,14 @@ class _Reading:
     # Messages.
 
     def _image(self, camera: str, stamp: int, at: float, message: Any) -> None:
+        taken = message.header.stamp.sec, message.header.stamp.nanosec
+        if taken != (0, 0) and taken == self._taken.get(camera):
+            raise ValueError(f"two images of the camera {camera} have the same time stamp")
+        self._taken[camera] = taken
         if camera not in self._seen or not hasattr(message, "format"):
             messages.image_from(message)  # other compressed ones are decoded when they are needed
             self._seen.add(camera)
-        age = age_of((message.header.stamp.sec, message.header.stamp.nanosec), stamp * 1e-9)
+        age = age_of(taken, stamp * 1e-9)
         self.index.inputs.append((at, Picture(camera, at - age, stamp)))
 
     def _joints(self, stamp: int, at: float, message: Any) -> None:

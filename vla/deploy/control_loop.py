@@ -25,6 +25,7 @@ Waypoint = tuple[float, Array, float | None]  # when due, goal of the joints, op
 RESUME = 'python -m vla.deploy.say --resume "INSTRUCTION", or call ~/resume'
 RESTART = "deactivate and activate the agent, or start it again"
 HAND_BACK = "python -m vla.deploy.say --hand-back, or call ~/hand_over with false"
+REPEATED = 2.0  # an equal instruction within this time is a repetition, as `ros2 topic pub` sends them [s]
 STILL, STILL_FOR = 0.005, 0.2  # an arm that has moved less [rad] for so long [s] is at rest
 
 
@@ -104,12 +105,14 @@ class ControlLoop:
         self.limiter = JointLimiter(self.limiter.robot, self.tick)
         self.state, self.reason = State.WAITING, "no joint state yet"
         self.instruction, self._instructed_at, self._timed_out = "", 0.0, False
+        self._said_at = -np.inf
         self.overruns, self.rejections = 0, 0
         self.handed_over = False
         self._observer = Observer(self.spec)
         self._commanded: deque[tuple[float, Array]] = deque()  # at, joints
         self._schedule: list[Waypoint] = []
         self._pending: tuple[float, float, Array] | None = None  # requested at, observed at, commanded then
+        self._outdated = False  # True if what is pending is not to be executed
         self._next_inference = -np.inf
         self._opening: float | None = 1.0
         self.acting = False  # True if the last command is an action of the policy
@@ -138,13 +141,19 @@ class ControlLoop:
     def on_instruction(self, instruction: str, now: float) -> bool:
         """Set the instruction, which also ends a stop by time-out; an empty one stops the arm.
 
+        An equal one within `REPEATED` of the last is a repetition and changes nothing.
+
         Returns whether the instruction is executed: not after any other stop, nor after a fault.
         """
         if not instruction.strip():
             self.stop("the instruction is empty")
             return False
+        repeated = instruction.strip() == self.instruction and now - self._said_at < REPEATED
+        self._said_at = now
+        if repeated:
+            return self.state not in (State.STOPPED, State.FAULT)
         self.instruction, self._instructed_at = instruction.strip(), now
-        self._schedule, self._next_inference, self._keeps = [], -np.inf, False
+        self._schedule, self._next_inference, self._keeps, self._outdated = [], -np.inf, False, True
         if self.state is State.STOPPED and self._timed_out:
             self.resume(now)
         return self.state not in (State.STOPPED, State.FAULT)
@@ -220,7 +229,7 @@ class ControlLoop:
         if not self._follows_positions:
             anchor = self._observer.measured_at(observed).joints
         self.resumed, self._last_observed, self.observed_at = np.isinf(self._last_observed), observed, observed
-        self._pending = (now, observed, anchor)
+        self._pending, self._outdated = (now, observed, anchor), False
         return self._observer.observation(observed, self.instruction)
 
     def set_plan(self, actions: Array) -> None:
@@ -238,7 +247,7 @@ class ControlLoop:
             return self._count_rejection(f"the policy returned actions of the shape {actions.shape}")
         if not np.isfinite(actions).all():
             return self._count_rejection("the policy returned numbers that are not finite")
-        if self.state is not State.RUNNING:
+        if self.state is not State.RUNNING or self._outdated:
             return None
         self.rejections = 0
         period = 1 / self.spec.control_hz
@@ -285,7 +294,7 @@ class ControlLoop:
 
     def horizon(self, now: float) -> list[Command]:
         """Return the commands after this tick's if no further input arrives; the last one is at rest."""
-        limiter = copy.copy(self.limiter)
+        limiter, opening = copy.copy(self.limiter), self._opening
         commands = []
         schedule = list(self._schedule) if self.state is State.RUNNING else []
         while schedule and now < schedule[-1][0]:
@@ -295,7 +304,7 @@ class ControlLoop:
             commands.append(Command(limiter.position.copy(), limiter.velocity.copy(), opening))
         while not limiter.resting or not commands:
             limiter.brake()
-            commands.append(Command(limiter.position.copy(), limiter.velocity.copy(), self._opening))
+            commands.append(Command(limiter.position.copy(), limiter.velocity.copy(), opening))
         return commands
 
     def commit(self, command: Command, now: float) -> list[Command] | None:
@@ -332,7 +341,7 @@ class ControlLoop:
         newest = self._observer.newest
         if newest is None:
             return
-        if not self._commanded:
+        if not self._commanded and self.state is not State.FAULT:
             self._take_over(newest, now)
         if self.state in (State.STOPPED, State.FAULT):
             return
@@ -392,7 +401,7 @@ class ControlLoop:
         if state is not self.state:
             self._keeps = False
         if state is not self.state and state is not State.RUNNING:
-            self._observer.cameras.fresh, self._schedule = 0, []
+            self._observer.cameras.fresh, self._schedule, self._outdated = 0, [], True
             self._next_inference = self._last_observed = -np.inf
         self.state, self.reason = state, reason
 

@@ -5,6 +5,7 @@ Shapes: J joints. Positions [rad], speeds [rad/s], accelerations [rad/s²].
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -57,6 +58,13 @@ class Robot:
             )
         if not (0 < self.speed_share <= 1 and 0 < self.acceleration_share <= 1):
             raise ValueError("deploy.robot.speed_share and acceleration_share must be above 0 and at most 1")
+        # Parameters of ROS come here without the checks of a config.
+        if not all(0 < value < math.inf for value in (*self.speed, *self.acceleration, self.finger_travel)):
+            raise ValueError("deploy.robot.speed, acceleration and finger_travel must be above 0 and finite")
+        if not all(0 <= value < math.inf for value in (self.margin, self.overshoot)):
+            raise ValueError("deploy.robot.margin and overshoot must be at least 0 and finite")
+        if not (np.isfinite([*self.low, *self.high]).all() and (self.min_position < self.max_position).all()):
+            raise ValueError("deploy.robot.low must be below high by more than twice the margin, for every joint")
 
     @property
     def min_position(self) -> Array:
@@ -113,7 +121,8 @@ class JointLimiter:
         wanted = distance / max(remaining, self._period)
         fastest = np.minimum(self._stoppable(np.abs(distance) + self.robot.overshoot), self.robot.max_speed)
         # Scale all joints alike, so that the tool stays on its path.
-        share = np.min(fastest / np.maximum(np.abs(wanted), fastest))
+        speed = np.abs(wanted)
+        share = np.min(np.divide(fastest, speed, out=np.ones_like(speed), where=speed > fastest))
         return self._move(share * wanted)
 
     def brake(self) -> Array:

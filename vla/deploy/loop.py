@@ -52,13 +52,20 @@ class Loop:
         """Play all episodes.
 
         Raises:
-            ValueError: a node exited or does not respond.
+            ValueError: a node exited or does not respond in the first episode, or is not to move the arm.
         """
         with self.running() as operator:
             results: list[Result] = []
             log.info("playing %d episodes", self.episodes)
             while len(results) < self.episodes and not operator.stopped.is_set():
-                if result := operator.play():
+                try:
+                    result = operator.play()
+                except ValueError as error:
+                    if not results:
+                        raise
+                    log.error("%s: the report has the %d episodes before", error, len(results))
+                    break
+                if result:
                     results.append(result)
                     log.info("seed %d: %s", result.seed, result.outcome)
             log.info("%s", ", ".join(f"{key} {value}" for key, value in operator.status.items() if "[ms]" in key))
@@ -69,6 +76,10 @@ class Loop:
         """Start both nodes, and the recorders if configured; yields the operator."""
         arguments = {"policy": self.policy, "environment": self.environment, "output": self.output}
         agent, simulator = self.agent(**arguments), self.simulator(**arguments)
+        if agent.command != "joint_state" or agent.dry_run:
+            raise ValueError(
+                "deploy=loop: the simulator obeys deploy.agent.command=joint_state only, without deploy.agent.dry_run"
+            )
         processes = get_context("spawn")
         nodes = [processes.Process(target=_run, args=(node,), daemon=True) for node in (agent, simulator)]
         for node in nodes:

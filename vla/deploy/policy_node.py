@@ -69,6 +69,7 @@ class PolicyNode(GuardedLifecycleNode):
         self._stamps: dict[str, tuple[int, int]] = {}
         self._sizes: dict[str, tuple[int, ...]] = {}  # camera → shape of its last image
         self._inference: tuple[Future[Array], float] | None = None
+        self._pool = ThreadPoolExecutor(1, thread_name_prefix="policy")
         self._last_tick: float | None = None
         self._reported: tuple[State | None, str] = (None, "")
         self._ignored = ""  # message about an instruction that is ignored after a stop or a fault
@@ -138,7 +139,10 @@ class PolicyNode(GuardedLifecycleNode):
         rate, follows = self.get_parameter("command_hz").value, not (dry_run or twist)
         loop = ControlLoop(spec, robot, self.settings.safety, rate, follows)
         self._warm_up()
-        reliable = self.get_parameter("image_reliability").value == "reliable"
+        reliability = self.get_parameter("image_reliability").value
+        if reliability not in ("best_effort", "reliable"):
+            raise ValueError(f"image_reliability is '{reliability}', expected best_effort or reliable")
+        reliable = reliability == "reliable"
         best_effort = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
         image_qos = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE) if reliable else best_effort
         for camera in spec.cameras:
@@ -159,7 +163,6 @@ class PolicyNode(GuardedLifecycleNode):
         self.add_service(Trigger, "~/resume", self._on_resume)
         self.add_service(SetBool, "~/hand_over", self._on_hand_over)
         self._connect_actions(loop)
-        self._pool = ThreadPoolExecutor(1, thread_name_prefix="policy")
         self._latencies, self._stamps, self._sizes, self._dropped = {}, {}, {}, 0
         self.loop = loop
 
@@ -250,6 +253,7 @@ class PolicyNode(GuardedLifecycleNode):
     def clean_up(self) -> None:
         """Shut the inference thread down and drop the control loop."""
         self._pool.shutdown(cancel_futures=True)
+        self._pool = ThreadPoolExecutor(1, thread_name_prefix="policy")  # starts its thread with the first inference
         for sender in self._senders:
             sender.destroy()
         self._arm_goals, self._gripper_goals = None, None
@@ -401,7 +405,9 @@ class PolicyNode(GuardedLifecycleNode):
     def _publish(self, command: Command, now: float) -> None:
         assert self.loop is not None
         robot = self.loop.robot
-        if self._gripper_goals is not None and self.loop.acting and command.opening is not None:
+        if self._gripper_goals is not None and not self.loop.acting:
+            self._gripper_goals.hold()
+        elif self._gripper_goals is not None and command.opening is not None:
             self._gripper_goals.command(command.opening)
         if self._arm_goals is not None and (ahead := self.loop.commit(command, now)) is not None:
             goal = self._arm_goals.kind.Goal()

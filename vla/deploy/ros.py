@@ -140,6 +140,8 @@ def plain_errors() -> Iterator[None]:
         yield
     except (ValueError, ImportError) as error:
         sys.exit(f"error: {error}")
+    except OSError as error:
+        sys.exit(f"error: {error.filename}: {error.strerror}" if error.filename else f"error: {error}")
 
 
 @contextmanager

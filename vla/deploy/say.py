@@ -6,6 +6,7 @@ import argparse
 import sys
 
 from vla.deploy.ros import NETWORKS, command_node
+from vla.deploy.settings import NAME
 from vla.spec import LONGEST_INSTRUCTION
 
 
@@ -23,6 +24,8 @@ def main() -> None:
     options = parser.parse_args()
     if options.instruction is None and not any((options.resume, options.reset, options.hand_over, options.hand_back)):
         parser.error("nothing to do: add an instruction, --resume, --hand-over, --hand-back or --reset")
+    if not NAME.fullmatch(options.topic):
+        parser.error(f"--topic {options.topic!r} is no name in ROS")
     instruction = options.instruction or ""
     if len(instruction) > LONGEST_INSTRUCTION:
         sys.exit(f"error: the instruction has {len(instruction)} characters, the limit is {LONGEST_INSTRUCTION}")

@@ -25,6 +25,7 @@ import rerun.blueprint as rrb
 
 from vla.data.episodes import EpisodeStore
 from vla.deploy import messages
+from vla.deploy.control_loop import REPEATED
 from vla.deploy.ros import NETWORKS, command_node, spin
 from vla.deploy.topic_listener import TopicListener
 from vla.io.files import atomic_path
@@ -35,7 +36,6 @@ from vla.spec import Array, Shell
 
 SMALL = 256 * 256  # images of at most so many pixels are logged as PNG: JPEG artefacts would hide small objects
 POSE_PERIOD = 0.1  # between two poses of the arm [s]
-REPEATED = 2.0  # equal instructions at shorter intervals are logged once, as `ros2 topic pub` repeats them [s]
 EYE, LOOK_AT = (1.2, -0.9, 0.8), (0.25, 0.0, 0.35)  # initial camera of the 3-D view [m]
 ARM_TOPIC = "/vla_agent/arm"  # of the agent, in any namespace
 THICKNESS = 0.02  # radius of the lines between joints [m]

@@ -6,6 +6,7 @@ import argparse
 from typing import Any
 
 from vla.deploy.ros import NETWORKS, command_node, spin
+from vla.deploy.settings import NAME
 
 
 def main() -> None:
@@ -14,6 +15,8 @@ def main() -> None:
     parser.add_argument("--agent", default="/vla_agent")
     parser.add_argument("--network", choices=NETWORKS, default="loopback")
     options = parser.parse_args()
+    if not NAME.fullmatch(options.agent):
+        parser.error(f"--agent {options.agent!r} is no name in ROS")
     with command_node("vla_watch", options.network) as (node, stopped):
         from diagnostic_msgs.msg import DiagnosticStatus
 

@@ -104,6 +104,11 @@ def _held_out(store: EpisodeStore, fraction: float, otherwise: str) -> list[Entr
 def _measure(experiment: Experiment, store: EpisodeStore, unseen: list[Entry], policy: Any) -> OpenLoop:
     actions, known = store.rows("action"), {entry.seed for entry in unseen}
     seen = [actions[entry.span] for entry in store.episodes if entry.seed not in known]
+    if not seen:
+        raise ValueError(
+            f"all {len(unseen)} episodes in {store.folder} are held out, so there is no constant action to compare "
+            "with: record more, or raise collect.episodes"
+        )
     shown = unseen[: experiment["evaluate"]["episodes"]]
     episodes = (episode_of(store, entry) for entry in track(shown, "evaluating"))
     return open_loop(policy, store.spec, episodes, np.concatenate(seen).mean(0))

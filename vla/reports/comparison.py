@@ -149,7 +149,9 @@ def _by_seed(run: Run, condition: str) -> dict[int, tuple[Result, Any]]:
     """Return seed → result under a condition, and what identifies its scene and instruction."""
     results = [result for result in run.reports.get(condition, Report(())).results if result.outcome != ERROR]
     if condition == IN_DISTRIBUTION:
-        return {result.seed: (result, (result.instruction, result.draws)) for result in results}
+        # A world may tell nothing of what it drew.
+        scenes = _scenes(run, condition)
+        return {result.seed: (result, (result.instruction, result.draws or scenes)) for result in results}
     return {result.seed: (result, _scenes(run, condition)) for result in results}
 
 

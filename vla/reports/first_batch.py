@@ -57,7 +57,7 @@ def _plot_action(axes: Axes, left: float, bottom: float, action: Array, spec: Sp
     axes.barh(places, shares * BAR / 2, 0.6 * step, left=zero, color=GREEN)
     for place, name, value, unit in zip(places, spec.action, action, spec.units, strict=True):
         factor, shown = readable(unit)
-        number = round(factor * float(value), 1) + 0.0  # never "-0.0"
-        text = f"{number:.1f} {shown}" if shown else f"{number:.2g}"
+        number = factor * float(value)
+        text = f"{round(number, 1) + 0.0:.1f} {shown}" if shown else f"{round(number, 4) + 0.0:.2g}"  # never "-0.0"
         axes.text(left - GAP, place, name, ha="right", va="center", fontsize=7.5, parse_math=False)
         axes.text(left + BAR + GAP, place, text, va="center", fontsize=7.5, parse_math=False)

@@ -43,7 +43,7 @@ def plot(rows: list[SweepRow], path: Path) -> None:
 
 def _draw_numbers(figure: Figure, rows: list[SweepRow]) -> None:
     conditions, lines = conditions_of(rows), _lines(rows)
-    curves = {name: {row.choices[DEMONSTRATIONS]: validated(row) for row in line} for name, line in lines.items()}
+    curves = {name: {str(_demonstrations(row)): validated(row) for row in line} for name, line in lines.items()}
     trained = {name: each for name, each in curves.items() if any(each.values())}
     columns = max(len(conditions), len(trained))
     figure.set_size_inches(max(8, 5.5 * columns), 10 if trained else 5)
@@ -115,7 +115,8 @@ def _lines(rows: list[SweepRow]) -> dict[str, list[SweepRow]]:
 
 
 def _demonstrations(row: SweepRow) -> int:
-    return int(row.choices[DEMONSTRATIONS])
+    choice = row.choices[DEMONSTRATIONS]  # "default" in a cell of another sweep in the folder
+    return int(choice) if choice.isdecimal() else int(at(row.runs[0].config, DEMONSTRATIONS, 0))
 
 
 def _plot_curves(axes: Axes, lines: dict[str, list[SweepRow]], condition: str) -> None:

@@ -87,7 +87,7 @@ def controller_for(
         raise ValueError(f"the policy's action is {_listed(found)}, expected {_listed(expected)}")
     if workspace is None:
         raise ValueError("deploy.safety.workspace=null: Cartesian motion needs a box for the tool point")
-    return CartesianController(arm, 1 / spec.control_hz, *workspace)
+    return CartesianController(arm, 1 / spec.control_hz, *np.sort(workspace, axis=0))
 
 
 def _kinematics(model: RobotModel, limits: tuple[Array, Array, Array] | None) -> Kinematics:

@@ -217,6 +217,9 @@ class RemotePolicy:
 
         try:
             return self._wait(answered())
+        except ValueError:  # told by the server, which then closes the connection
+            self._broken = True
+            raise
         except ConnectionClosed as error:
             self._broken = True
             raise self._error("it closed the connection") from error
