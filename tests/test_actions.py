@@ -214,7 +214,8 @@ def test_a_gripper_is_told_once_per_change_and_a_grasp_is_no_error(make_world: C
     assert world.agent.loop.reason.startswith(f"the action server /gripper{'/move' if name == 'franka' else ''}")
 
 
-def test_a_gripper_that_changes_its_mind_cancels_first(make_world: Callable[..., World]) -> None:
+def undecided(make_world: Callable[..., World]) -> tuple[World, Controller, Controller]:
+    """A policy that wants to close the gripper while that opens; the controllers of both."""
     from franka_msgs.action import Grasp, Move
 
     world = make_world("joint_state", gripper=GRIPPERS["franka"])
@@ -224,20 +225,18 @@ def test_a_gripper_that_changes_its_mind_cancels_first(make_world: Callable[...,
     world.policy.action = lambda: np.append(FORWARD[:, :6], [[0.0]], 1).astype(np.float32)
     world.live(0.6)
     assert move.running and not grasp.goals
+    return world, grasp, move
+
+
+def test_a_gripper_that_changes_its_mind_cancels_first(make_world: Callable[..., World]) -> None:
+    world, grasp, move = undecided(make_world)
     move.obey()
     world.live(1.0, until=lambda: grasp.running)
     assert grasp.running and grasp.goals[0].force == 20.0 and grasp.goals[0].epsilon.outer == 0.08
 
 
 def test_after_a_stop_no_goal_of_the_gripper_follows(make_world: Callable[..., World]) -> None:
-    from franka_msgs.action import Grasp, Move
-
-    world = make_world("joint_state", gripper=GRIPPERS["franka"])
-    grasp, move = Controller(world.node, Grasp, "/gripper/grasp"), Controller(world.node, Move, "/gripper/move")
-    world.start()
-    world.live(1.0, until=lambda: move.running)
-    world.policy.action = lambda: np.append(FORWARD[:, :6], [[0.0]], 1).astype(np.float32)
-    world.live(0.6)
+    world, grasp, move = undecided(make_world)
     assert world.agent.loop is not None
     world.agent.loop.stop("by hand")
     world.live(0.3)
