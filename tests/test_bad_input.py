@@ -139,7 +139,8 @@ def test_an_experiment_that_is_a_grid_is_refused_as_a_single_run(tmp_path: Path)
 
 def test_without_gl_the_error_says_what_to_install(tmp_path: Path) -> None:
     environment = {**os.environ, "MUJOCO_GL": "egl", "__EGL_VENDOR_LIBRARY_FILENAMES": "/nowhere.json"}
-    del environment[TRIED]
+    for name in (TRIED, "DISPLAY"):
+        environment.pop(name, None)
     done = subprocess.run(
         [sys.executable, "-m", "vla.run", "job=preview", "preview.episodes=1"],
         cwd=tmp_path,

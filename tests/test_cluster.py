@@ -185,8 +185,10 @@ def test_a_scheduler_that_is_not_there_or_goes_away_is_named(tmp_path: Path, mon
     monkeypatch.setattr("vla.parallel.dask.CONNECT", 0.5)
     folder = tmp_path / "episodes"
     silence = pytest.raises(ValueError, match="no Dask scheduler answers")
-    with scheduler(tmp_path) as (address, process), worker(address, "--no-nanny"), killed(process, folder), silence:
-        gather(folder, cluster(address), toy.make_slow_environment)
+    with scheduler(tmp_path) as (address, process), worker(address, "--no-nanny"):
+        with killed(process, folder) as committed, silence:
+            gather(folder, cluster(address), toy.make_slow_environment)
+        assert committed and committed[0] >= 3  # it had been there
     with create_server(("127.0.0.1", 0)) as mute, pytest.raises(ValueError, match="no Dask scheduler answers"):
         gather(folder, cluster(f"tcp://127.0.0.1:{mute.getsockname()[1]}"))
     with pytest.raises(ValueError, match=r"must read tcp://HOST:PORT, got '8786'"):

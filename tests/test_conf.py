@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import yaml
 from composing import CONF, RT1_VARIANTS, check, composed
 from defaults import defaults_of
 from hydra import compose, initialize_config_dir
@@ -18,12 +19,13 @@ from hydra.utils import get_class
 from omegaconf import OmegaConf
 
 from vla.config.check import conditions
-from vla.config.experiment import plain
+from vla.config.experiment import Experiment, plain
 from vla.deploy.bag import POLICY_INPUTS
 from vla.deploy.view import CAMERAS
 from vla.robots.cartesian import LIMIT_MARGIN
 from vla.robots.panda import FINGER_TRAVEL, JOINT_HIGH, JOINT_LOW, JOINT_SPEED
 from vla.spec import FIRST_SEED
+from vla.tasks.tabletop.environment import Tabletop
 from vla.tasks.tabletop.simulation import WORKSPACE
 
 AXES = CONF / "task/randomize"  # a group for each, with levels of the same names
@@ -84,6 +86,22 @@ def test_option(group: str, option: str) -> None:
     top = group.partition("/")[0]
     job = [f"job={top}"] if top in ("export", "deploy") and option != "none" else []
     check(composed(*TOGETHER.get((group, option), brought_by(group)), f"{group}={option}", *job))
+
+
+def variants(experiment: str) -> list[str]:
+    """What a grid compares."""
+    file = yaml.safe_load((CONF / f"experiment/{experiment}.yaml").read_text())
+    return [name.strip() for name in file["hydra"]["sweeper"]["params"]["variant"].split(",")]
+
+
+GRIDS = [(name, variant) for name in ("ablation", "images_alone", "recipe") for variant in variants(name)]
+
+
+@pytest.mark.parametrize(("experiment", "variant"), GRIDS, ids="-".join)
+def test_every_variant_of_a_grid_is_a_model(experiment: str, variant: str, tabletop: Tabletop) -> None:
+    chosen = (f"experiment={experiment}", f"variant={variant}")
+    learner = Experiment.of(composed(*chosen)).learner(tabletop.spec)
+    assert sum(weight.numel() for weight in learner.model.parameters()) > 10_000
 
 
 @pytest.mark.parametrize("level", LEVELS)

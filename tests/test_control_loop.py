@@ -75,7 +75,9 @@ def test_nothing_is_commanded_before_the_first_joint_state() -> None:
 
 def test_without_an_instruction_the_measured_pose_is_held() -> None:
     world = World()
-    for command in world.run(0.5):
+    commands = world.run(0.5)
+    assert len(commands) > 20
+    for command in commands:
         np.testing.assert_array_equal(command.position, HOME)
         assert command.opening == 1.0
     assert world.loop.state is State.WAITING and "instruction" in world.loop.reason

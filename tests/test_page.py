@@ -131,10 +131,10 @@ def test_tasks_have_their_own_rates_where_there_are_several(tmp_path: Path) -> N
     for name, played in {"one": results[1:], "two": results}.items():
         (tmp_path / name).mkdir()
         write_report(Report(tuple(played)), tmp_path / name / "report.json", None, CONFIG)
-    assert "task success [%] episodes lift 100.0 (34.2-100.0) 2/2 push 100.0 (20.7-100.0) 1/1" in text(
+    assert "Success by task task success [%] episodes lift 100.0 (34.2-100.0) 2/2 push 100.0 (20.7-100.0) 1/1" in text(
         write_page(tmp_path / "two")
     )
-    assert "Lift" not in text(write_page(tmp_path / "one"))
+    assert "Success by task" not in text(write_page(tmp_path / "one"))
 
 
 def test_tiers_have_their_rates_and_their_mean(tmp_path: Path) -> None:

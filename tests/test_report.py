@@ -56,6 +56,7 @@ def test_plots_are_drawn_whatever_happened(report: Report, tmp_path: Path, figur
     # Stacked: those of the failures stand on those of the successes.
     tops = [bar.get_y() + bar.get_height() for bar in lengths.patches]  # type: ignore[attr-defined]
     assert max(tops) > 0 if played else not any(tops)
+    assert bool(others) == (len(played) > 1)
     assert all(axes.has_data() and texts(axes) & {*factors(played)} for axes in others)
     assert Image.open(tmp_path / "report.png").width > 1000
 

@@ -14,6 +14,7 @@ import time
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import replace
+from itertools import cycle, takewhile
 from pathlib import Path
 from typing import Any
 from urllib.error import HTTPError
@@ -167,7 +168,9 @@ def test_a_slow_server_is_not_waited_for(monkeypatch: pytest.MonkeyPatch) -> Non
         held = np.where([True, True, False], 0, first[2])
         np.testing.assert_array_equal(actions[3:], [held, held])
         gate.set()
-        later = next(action for each in seen[5:] if not np.array_equal(action := agent.act(each), held))
+        end = time.monotonic() + 60
+        more = takewhile(lambda _: time.monotonic() < end, cycle(seen[5:]))
+        later = next(action for each in more if not np.array_equal(action := agent.act(each), held))
         # The second observation was sent at step 1; two actions followed, the third of its chunk is due.
         np.testing.assert_array_equal(later, policy.session().plan(seen[1])[2])
         agent.reset(seen[0].instruction, 0)  # whatever is awaited is dropped
@@ -456,17 +459,18 @@ def test_it_serves_until_it_is_told_to_stop(number: signal.Signals, caplog: pyte
     asked = []
 
     def stop() -> None:
-        while not caplog.messages:
+        deadline = time.monotonic() + 60
+        while not caplog.messages and time.monotonic() < deadline:
             time.sleep(0.01)
         url = caplog.messages[0].removeprefix("serving the policy at ").replace("ws://", "http://")
         asked.append(urlopen(f"{url}/healthz").read())
         os.kill(os.getpid(), number)
 
     with caplog.at_level(logging.INFO, "vla.deploy.server"):
-        thread = threading.Thread(target=stop)
+        thread = threading.Thread(target=stop, daemon=True)
         thread.start()
         settings(as_policy(make_bc())).run()
-        thread.join()
+        thread.join(60)
     assert asked == [b"OK\n"]
 
 
@@ -498,11 +502,13 @@ def test_a_late_answer_is_not_taken_for_that_of_the_next_observation(monkeypatch
     monkeypatch.setattr(server, "_plan", gated)
     seen = observations(4)
     with serving(policy) as url:
-        agent = remote(url, timeout=0.5)
+        agent = remote(url)
         agent.act(seen[0])
+        agent.timeout = 0.5
         with pytest.raises(ValueError, match=r"no answer within 0\.5 s"):
             agent.act(seen[1])
         gate.set()
+        agent.timeout = 30.0
         with pytest.raises(ValueError, match="closed the connection"):
             agent.act(seen[2])  # within the same episode it stays that way
         agent.reset(seen[3].instruction, 1)

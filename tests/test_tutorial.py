@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import shlex
 import shutil
@@ -34,6 +35,7 @@ def test_the_tutorial_ends_with_a_policy_for_its_own_goal(tmp_path: Path) -> Non
     assert len(FILES) == 2 and len(COMMANDS) == 5
     for command in COMMANDS:
         vla(tmp_path, *shlex.split(command), *small(command))
-    page = (tmp_path / "outputs/runs/left_of/report.html").read_text(encoding="utf-8")
-    assert "LeftOf" in page or "left_of" in page
+    report = json.loads((tmp_path / "outputs/runs/left_of/report.json").read_text(encoding="utf-8"))
+    assert report["config"]["task"]["goal"]["_target_"].endswith(".LeftOf")
+    assert {result["task"] for result in report["per_episode"]} == {"left_of"}
     assert (tmp_path / "comparison.html").exists() or list(tmp_path.glob("outputs/runs/*/comparison.html"))
