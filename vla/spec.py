@@ -20,6 +20,7 @@ from vla.io.types import Count, Point, Positive, unique
 
 Array = np.ndarray
 
+IN_DISTRIBUTION = "seen"  # name of the unchanged condition of an evaluation, which a policy is trained for
 FIRST_SEED = 1_000_000  # of evaluation; collection uses smaller seeds only
 LONGEST_INSTRUCTION = 1000  # characters
 

@@ -17,8 +17,7 @@ from omegaconf import DictConfig, OmegaConf
 from vla.config.annotations import MissingLibrary, fits, locate
 from vla.config.build import GROUPS, Group, arguments, check_node, check_value, makes, require_known
 from vla.io.types import Count, Natural, Seed, Shift, Text, unique
-from vla.rollouts.results import IN_DISTRIBUTION
-from vla.spec import FIRST_SEED
+from vla.spec import FIRST_SEED, IN_DISTRIBUTION
 
 UnseenSeed = Annotated[Seed, Ge(FIRST_SEED)]
 

@@ -27,7 +27,7 @@ from vla.reports.html import write_page
 from vla.rollouts.evaluate import RecorderFactory, evaluate, keep_recordings
 from vla.rollouts.memory import make_impaired
 from vla.rollouts.realtime import Network, make_distant
-from vla.rollouts.results import IN_DISTRIBUTION, Report, compare_conditions, compare_courses
+from vla.rollouts.results import Report, compare_conditions, compare_courses
 from vla.rollouts.rollout import AgentFactory
 from vla.rollouts.statements import AgainstBar, AgainstCondition, AgainstRun, Statement
 from vla.runs.files import Round
@@ -43,7 +43,7 @@ from vla.runs.folder import (
     wall_time,
 )
 from vla.runs.resume import cached_success, training_lock
-from vla.spec import Multitask
+from vla.spec import IN_DISTRIBUTION, Multitask
 
 log = logging.getLogger(__name__)
 

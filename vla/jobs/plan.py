@@ -24,7 +24,7 @@ from vla.rollouts.planning import (
     power_of_samples,
     stopping,
 )
-from vla.rollouts.results import IN_DISTRIBUTION
+from vla.spec import IN_DISTRIBUTION
 
 Between = Annotated[float, Gt(0), Lt(1)]
 

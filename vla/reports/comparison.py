@@ -14,10 +14,11 @@ from vla.config.check import conditions
 from vla.config.differences import at
 from vla.reports.conditions import COMPARED, NARROW, Courses, short_texts
 from vla.rollouts.comparison import Comparison, compare_pairs, compare_samples, concluded
-from vla.rollouts.results import ERROR, IN_DISTRIBUTION, Report, Result, concluded_courses, course_of, pairs_of
+from vla.rollouts.results import ERROR, Report, Result, concluded_courses, course_of, pairs_of
 from vla.rollouts.statistics import effective_episodes
 from vla.runs.folder import Run, require_run
 from vla.runs.sweep import SweepRow
+from vla.spec import IN_DISTRIBUTION
 
 CASE = ("second run", "minus first", "condition")  # heads of what was compared
 

@@ -25,8 +25,9 @@ from vla.reports.posteriors import draw_posteriors
 from vla.reports.style import BLUE, GREEN, GREY, RED, Interval
 from vla.reports.training_curves import colours, draw_run, draw_runs
 from vla.rollouts.motion import AMOUNTS
-from vla.rollouts.results import IN_DISTRIBUTION, Report
+from vla.rollouts.results import Report
 from vla.runs.folder import ERRORS_PLOT, PAGE, PLOT, RECORDING, SAMPLES, SUITE, Run, read_run
+from vla.spec import IN_DISTRIBUTION
 
 log = logging.getLogger(__name__)
 

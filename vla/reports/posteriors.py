@@ -11,8 +11,9 @@ from matplotlib.figure import Figure
 from vla.reports.comparison import RunComparison
 from vla.reports.style import as_svg, svg_style
 from vla.rollouts.comparison import concluded
-from vla.rollouts.results import IN_DISTRIBUTION, Report
+from vla.rollouts.results import Report
 from vla.rollouts.sequential import LEVEL
+from vla.spec import IN_DISTRIBUTION
 
 FEWEST, MOST = 3, len(ascii_lowercase)  # runs in one figure
 

@@ -15,7 +15,6 @@ from vla.rollouts.motion import AMOUNTS, Motion
 from vla.rollouts.sequential import anytime_interval
 from vla.rollouts.statistics import bounded_mean_interval, stratified_interval, wilson_interval
 
-IN_DISTRIBUTION = "seen"  # name of the unchanged condition, which a policy is trained for
 ERROR = "error"  # outcome of an episode that was not completed
 
 

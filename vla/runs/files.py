@@ -14,8 +14,8 @@ from vla.io.documents import STRICT
 from vla.io.types import Count, Natural, NonNegative, Positive, Share
 from vla.rollouts.comparison import Comparison
 from vla.rollouts.motion import Motion
-from vla.rollouts.results import IN_DISTRIBUTION, Report, Result
-from vla.spec import readable
+from vla.rollouts.results import Report, Result
+from vla.spec import IN_DISTRIBUTION, readable
 
 Node = dict[str, Any]
 LENIENT = ConfigDict(strict=True, extra="ignore", allow_inf_nan=False)  # what follows from the rest is not read

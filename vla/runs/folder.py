@@ -19,9 +19,9 @@ import yaml
 from vla.config.differences import at
 from vla.io.documents import read_bounded, read_json, read_yaml
 from vla.io.files import write_text
-from vla.rollouts.results import IN_DISTRIBUTION, Report
+from vla.rollouts.results import Report
 from vla.runs.files import Change, ErrorsFile, Node, ReportFile, Training
-from vla.spec import Array
+from vla.spec import IN_DISTRIBUTION, Array
 
 log = logging.getLogger(__name__)
 

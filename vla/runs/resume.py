@@ -16,8 +16,8 @@ from filelock import FileLock, Timeout
 from vla.config.adopt import require_identity
 from vla.config.differences import differences
 from vla.models.checkpoint import read_header
-from vla.rollouts.results import IN_DISTRIBUTION
 from vla.runs.folder import CHECKPOINTS, ERRORS, LAST, REPORT, chosen_checkpoint, read_report
+from vla.spec import IN_DISTRIBUTION
 
 log = logging.getLogger(__name__)
 

@@ -6,10 +6,11 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 
-from vla.rollouts.results import ERROR, IN_DISTRIBUTION
+from vla.rollouts.results import ERROR
 from vla.rollouts.statistics import pooled_interval
 from vla.runs.cells import FAILURE, cells, overrides_of, varied_keys
 from vla.runs.folder import REPORT, Run, read_run
+from vla.spec import IN_DISTRIBUTION
 
 DEMONSTRATIONS = "collect.episodes"  # override that is the x axis of learning curves
 SEED = "seed"  # override that distinguishes the cells of one row
