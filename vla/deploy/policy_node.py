@@ -391,7 +391,8 @@ class PolicyNode(GuardedLifecycleNode):
         size = self.policy.spec.image_size
         rgb = {camera: images.resize(image, size, self._crop) for camera, image in observation.rgb.items()}
         plan = self.policy.plan(replace(observation, rgb=rgb))
-        return plan[: 1 if self.policy.history > 1 else self.policy.execute]  # a history has no gaps in training either
+        # In training the frames of a history have no gaps either.
+        return plan[: 1 if getattr(self.policy, "history", 1) > 1 else self.policy.execute]
 
     def _send(self) -> None:
         assert self.loop is not None

@@ -81,8 +81,9 @@ def _fit(experiment: Experiment, state: TrainingProgress, trainer: Trainer, grac
         experiment.fit_tokenizer(learner.model.tokenizer, store)
     data = experiment.data(store, learner.model.history, learner.model.chunk)
     _log_tokenization_error(learner.model, store)
-    for folder in experiment["collect"]["more"] or ():
-        _warn_of_clipped(learner.model, EpisodeStore(folder))
+    for further in map(EpisodeStore, experiment["collect"]["more"] or ()):
+        if further.episodes:
+            _warn_of_clipped(learner.model, further)
     data.setup()
     if data.batch_size > len(data.training_windows):
         raise ValueError(
