@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from contextlib import suppress
 
 from vla.parallel.processes import without_triton
 
@@ -22,6 +23,8 @@ def choose_backend() -> None:
     A backend that the user has set is only probed. Triton, which conflicts with Mesa, is blocked too.
     """
     without_triton()
+    with suppress(ImportError):
+        import backports.zstd  # noqa: F401 # binds its library now, else to Mesa's: bags would have other bytes
     chosen = os.environ.get("MUJOCO_GL")
     if os.environ.get("DISPLAY") or sys.platform != "linux" or chosen in (NONE, os.environ.get(TRIED, NONE)):
         return
