@@ -32,6 +32,11 @@ class Controller:
         """Whether a goal is executed."""
         return self._running is not None
 
+    @property
+    def cancelled(self) -> bool:
+        """Whether the client has cancelled the goal that is executed."""
+        return self._running is not None and bool(self._running[0].is_cancel_requested)
+
     def _on_goal(self, goal: Any) -> GoalResponse:
         time.sleep(self.takes)
         return GoalResponse.ACCEPT if self.accepts else GoalResponse.REJECT
@@ -61,7 +66,7 @@ class Controller:
 
     def obey(self) -> None:
         """End a goal that the client has cancelled."""
-        if self._running is not None and self._running[0].is_cancel_requested:
+        if self.cancelled:
             self.end("canceled")
 
 

@@ -154,6 +154,10 @@ def test_a_server_that_fails_stops_the_policy_with_its_name_and_the_reason(
     monkeypatch.setattr(actions, "ANSWER", 0.02)
     controller.takes = 0.1
     fails("the action server /commands has not answered a goal for 0.02 s")
+    world.live(3.0, until=lambda: controller.running and controller.cancelled)  # accepted too late
+    controller.obey()
+    world.live(3.0, until=lambda: controller.ended[-1] == "canceled")
+    assert controller.ended[-1] == "canceled"
     monkeypatch.setattr(actions, "ANSWER", 1.0)
     controller.takes = 0.0
     goes_on()
