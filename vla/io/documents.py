@@ -64,23 +64,24 @@ def lines_of(error: BaseException) -> list[str]:
 
 def parse_yaml(text: str | bytes, kind: type[T], name: str) -> T:
     """Parse YAML text, called `name` in errors, as a `kind`, see `read_yaml`."""
-    depth = 0
     try:
-        for event in yaml.parse(text, Loader=yaml.CSafeLoader):
-            depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
-            if depth > MAX_DEPTH or isinstance(event, yaml.AliasEvent):
-                raise ValueError(f"{name} is nested deeper than {MAX_DEPTH} levels, or has aliases")
-        plain = json.dumps(_loaded(text))
-    except (yaml.YAMLError, UnicodeDecodeError, TypeError, RecursionError) as error:
+        shallow = _is_shallow(text)
+        plain = json.dumps(yaml.load(text, Loader=yaml.CSafeLoader) if shallow else None)
+    except (yaml.YAMLError, ValueError, TypeError, RecursionError) as error:  # a ValueError also for impossible dates
         raise ValueError(f"{name} is no plain YAML: {' '.join(str(error).split())[:200]}") from error
+    if not shallow:
+        raise ValueError(f"{name} is nested deeper than {MAX_DEPTH} levels, or has aliases")
     return parse_json(plain, kind, name)
 
 
-def _loaded(text: str | bytes) -> Any:
-    try:
-        return yaml.load(text, Loader=yaml.CSafeLoader)
-    except ValueError as error:  # such as that of a date without such a day
-        raise TypeError(str(error)) from error
+def _is_shallow(text: str | bytes) -> bool:
+    """Return whether YAML text has at most `MAX_DEPTH` levels and no aliases."""
+    depth = 0
+    for event in yaml.parse(text, Loader=yaml.CSafeLoader):
+        depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
+        if depth > MAX_DEPTH or isinstance(event, yaml.AliasEvent):
+            return False
+    return True
 
 
 def require_resolved(value: Any, name: str) -> None:

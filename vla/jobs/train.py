@@ -24,6 +24,7 @@ from vla.reports.html import write_page
 from vla.rollouts.collect import collection_time
 from vla.runs.folder import CHECKPOINTS, LAST, PAGE, SAMPLES, save_choice, save_config, save_training
 from vla.runs.resume import LENGTHS, TrainingProgress, first_process, training_lock, training_progress
+from vla.spec import Array
 from vla.training.checkpoints import GracefulStop
 from vla.training.closed_loop import ClosedLoop
 from vla.training.trainer import explain_memory_errors, make_trainer, quiet_lightning, restore_metrics
@@ -83,7 +84,7 @@ def _fit(experiment: Experiment, state: TrainingProgress, trainer: Trainer, grac
     _log_tokenization_error(learner.model, store)
     for further in map(EpisodeStore, experiment["collect"]["more"] or ()):
         if further.episodes:
-            _warn_of_clipped(learner.model, further)
+            _warn_of_clipped(learner.model, further, further.statistics.chunks(learner.model.chunk))
     data.setup()
     if data.batch_size > len(data.training_windows):
         raise ValueError(
@@ -124,15 +125,16 @@ def _endless(experiment: Experiment) -> bool:
 
 def _log_tokenization_error(model: Model, store: EpisodeStore) -> None:
     """Log the tokenisation error and the share of actions beyond the tokenizer's bounds."""
+    chunks = store.statistics.chunks(model.chunk)
     if model.uses_tokens:
-        error = describe_tokenization_error(model.tokenizer, store.statistics.chunks(model.chunk), store.spec)
+        error = describe_tokenization_error(model.tokenizer, chunks, store.spec)
         log.info("action tokens, %s: mean error %s", type(model.tokenizer).__name__, error)
-    _warn_of_clipped(model, store)
+    _warn_of_clipped(model, store, chunks)
 
 
-def _warn_of_clipped(model: Model, store: EpisodeStore) -> None:
-    """Log the share of actions beyond the tokenizer's bounds, to which they are clipped, if there are any."""
-    if outside := out_of_bounds(model.tokenizer, store.statistics.chunks(model.chunk)):
+def _warn_of_clipped(model: Model, store: EpisodeStore, chunks: Array) -> None:
+    """Log the share of `chunks` of a store beyond the tokenizer's bounds, to which they are clipped."""
+    if outside := out_of_bounds(model.tokenizer, chunks):
         where = f"{100 * outside:.2g} % of the demonstrated actions in {store.folder}"
         log.warning("%s exceed the bounds of the tokenizer, to which they are clipped", where)
 

@@ -254,16 +254,17 @@ class Distant:
         plan: Plan = getattr(agent, "plan", lambda observation: agent.act(observation)[None])
         self._thread = BackgroundLink(plan, spec.control_hz, network) if by_clock else None
         link: Link = self._thread or SimulatedLink(plan, network, spec.control_hz)
-        # An agent with a history wants to see every frame.
-        every = getattr(agent, "history", 1) > 1
-        execute = lambda: 1 if every else getattr(agent, "execute", None) or 1  # noqa: E731
-        self._real_time = RealTime(spec, link, execute, network.ensemble)
+        self._real_time = RealTime(spec, link, self._execute, network.ensemble)
         self.info: dict[str, Any] = {}
 
     def reset(self, instruction: str, seed: int) -> None:
         """Start an episode."""
         self._real_time.reset(seed)  # first, because it waits until the policy is idle
         self._agent.reset(instruction, seed)
+
+    def _execute(self) -> int:
+        """Return how many actions to execute before the next observation; a history wants to see every one."""
+        return 1 if getattr(self._agent, "history", 1) > 1 else getattr(self._agent, "execute", None) or 1
 
     def act(self, observation: Observation) -> Array:
         """Return the action (D,) to execute now."""

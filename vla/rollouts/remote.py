@@ -215,18 +215,16 @@ class RemotePolicy:
             await self._connection.send(pack(message))
             return await self._received(self._connection)
 
+        self._broken = True  # until it has answered: after an error, too, a server closes the connection
         try:
-            return self._wait(answered())
-        except ValueError:  # told by the server, which then closes the connection
-            self._broken = True
-            raise
+            answer = self._wait(answered())
         except ConnectionClosed as error:
-            self._broken = True
             raise self._error("it closed the connection") from error
         except TimeoutError as error:
-            self._broken = True
             self._loop.call_soon_threadsafe(self._connection.transport.abort)  # a late answer would be the next one's
             raise self._error(f"no answer within {self.timeout:g} s") from error
+        self._broken = False
+        return answer
 
     def _wait(self, work: Coroutine[Any, Any, Result]) -> Result:
         return asyncio.run_coroutine_threadsafe(work, self._loop).result()
