@@ -10,6 +10,7 @@ import signal
 import sys
 from collections.abc import Callable, Iterator
 from functools import cache
+from itertools import cycle
 from pathlib import Path
 from tempfile import mkdtemp
 from typing import TYPE_CHECKING, Any
@@ -23,8 +24,13 @@ from vla.tasks.gl import choose_backend, has_egl
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+    from world import World
 
     from vla.tasks.tabletop.environment import Tabletop
+
+# Domains of ROS for the tests of this worker, one after the other; test_deploy has one of its own.
+WORKER = int(os.environ.get("PYTEST_XDIST_WORKER", "gw0").removeprefix("gw")) % 3
+domains = cycle(range(1 + 33 * WORKER, 33 + 33 * WORKER))
 
 CONF = Path(__file__).parents[1] / "conf"
 
@@ -162,3 +168,19 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     import toy
 
     return Path(toy.make_store(tmp_path_factory.mktemp("episodes")).folder)
+
+
+@pytest.fixture
+def make_world() -> Iterator[Callable[..., World]]:
+    """Makes worlds with a policy node, each on a domain of its own; arguments are the command and those of ROS."""
+    from world import World
+
+    worlds: list[World] = []
+
+    def make(command: str = "joint_state", *arguments: str, **options: Any) -> World:
+        worlds.append(World(next(domains), command, list(arguments), **options))
+        return worlds[-1]
+
+    yield make
+    for world in worlds:
+        world.close()

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import itertools
-import os
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -37,23 +36,7 @@ pytestmark = [
     pytest.mark.filterwarnings("ignore:coroutine"),  # goals that a server still executes at the end of a test
 ]
 
-WORKER = int(os.environ.get("PYTEST_XDIST_WORKER", "gw0").removeprefix("gw"))
-domains = itertools.count(1 + 33 * (WORKER % 3))
 FOLLOW = "follow_joint_trajectory"
-
-
-@pytest.fixture
-def make_world() -> Iterator[Callable[..., World]]:
-    """A world on a domain of its own."""
-    worlds: list[World] = []
-
-    def make(command: str = FOLLOW, *arguments: str, gripper: Any = None) -> World:
-        worlds.append(World(next(domains), command, list(arguments), gripper=gripper))
-        return worlds[-1]
-
-    yield make
-    for world in worlds:
-        world.close()
 
 
 def controlled(world: World) -> TrajectoryController:
@@ -95,7 +78,7 @@ def test_an_arm_follows_trajectories_that_replace_each_other(make_world: Callabl
 def test_hand_over_cancels_what_is_executed_and_the_arm_is_taken_back_where_it_was_left(
     make_world: Callable[..., World],
 ) -> None:
-    world = make_world()
+    world = make_world(FOLLOW)
     controller = controlled(world)
     world.start()
     world.live(0.3)
@@ -116,7 +99,7 @@ def test_a_server_that_fails_stops_the_policy_with_its_name_and_the_reason(
     make_world: Callable[..., World], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A violated tolerance, another client's goal, a rejection, silence, and an end."""
-    world = make_world()
+    world = make_world(FOLLOW)
     controller = controlled(world)
     world.start()
 
@@ -263,7 +246,7 @@ def test_a_dry_run_sends_no_goal(make_world: Callable[..., World]) -> None:
 
 
 def test_what_goals_command_is_recorded_and_imported(make_world: Callable[..., World], tmp_path: Path) -> None:
-    world = make_world()
+    world = make_world(FOLLOW)
     controlled(world)
     recorder = BagRecorder(world.node, tmp_path / "bag")
     world.start()

@@ -38,6 +38,16 @@ def test_forward_kinematics_and_jacobian_equal_mujocos(tabletop: Tabletop, seed:
     np.testing.assert_allclose(jacobian, np.concatenate([linear, angular])[:, compiled.velocities], atol=1e-6)
 
 
+def test_an_arm_is_driven_at_rates_of_whole_physics_steps(tabletop: Tabletop) -> None:
+    tabletop.reset(0)
+    tabletop.drive(HOME, 1.0, 1 / 50)
+    before = tabletop.simulation.compiled.data.time
+    for rate in (100, 500):
+        with pytest.raises(ValueError, match=f"cannot be driven at {rate} Hz, as physics runs at 250 Hz"):
+            tabletop.drive(HOME, 1.0, 1 / rate)
+    assert tabletop.simulation.compiled.data.time == before
+
+
 def test_rotation_vectors_are_inverse_to_rotations() -> None:
     vector = np.array([0.3, -0.2, 0.9])
     np.testing.assert_allclose(vector_from_rotation(rotation_from_vector(vector)), vector, atol=1e-12)

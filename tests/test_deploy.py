@@ -35,7 +35,8 @@ from warm import Started
 from vla.data.episodes import EpisodeStore
 from vla.deploy import messages
 from vla.deploy.bag import POLICY_INPUTS
-from vla.deploy.demo_operator import DemoOperator, SimulatedEpisode
+from vla.deploy.demo_operator import DemoOperator
+from vla.deploy.messages import SimulatedEpisode
 from vla.deploy.ros import NETWORKS, RosNetwork, split_arguments
 from vla.io.images import resize
 from vla.models.checkpoint import read_header
@@ -344,6 +345,13 @@ def test_a_too_long_instruction_is_not_sent(start: Callable[..., Started]) -> No
     said = start("vla.deploy.say", "push " * 201)
     assert said.printed(30).startswith("error: the instruction has 1005 characters")
     assert said.wait() == 1
+
+
+def test_an_interrupted_instruction_is_not_sent(start: Callable[..., Started], probe: Probe) -> None:
+    said = start("vla.deploy.say", "push the block")
+    probe.until(lambda: "vla_say" in probe.node.get_node_names())
+    said.send_signal(signal.SIGINT)
+    assert said.wait(5) == -signal.SIGINT  # and not after the ten seconds in which it waits for an agent
 
 
 def test_a_damaged_checkpoint_is_named_before_anything_starts(home: Path) -> None:

@@ -138,7 +138,7 @@ def test_a_command_goes_there_and_back() -> None:
     command = Command(np.array([0.1, 0.2]), np.array([1.0, 2.0]), 0.5)
     message = messages.fill_joint_state(SimpleNamespace(velocity=[], effort=[]), ROBOT, command)
     assert message.name == ["one", "two", "left", "right"] and message.velocity == message.effort == []
-    position, opening = messages.command_from(message, ROBOT)
+    position, opening = messages.command_from(message.name, message.position, ROBOT)
     assert position.tolist() == [0.1, 0.2] and opening == pytest.approx(0.5)
 
 
@@ -147,7 +147,7 @@ def test_a_command_goes_there_and_back() -> None:
 )
 def test_a_command_that_does_not_fit_is_refused(wrong: dict) -> None:
     with pytest.raises(ValueError, match="joint command"):
-        messages.command_from(SimpleNamespace(**wrong), ROBOT)
+        messages.command_from(wrong["name"], wrong["position"], ROBOT)
 
 
 def test_a_trajectory_is_timed_and_ends_at_rest() -> None:

@@ -96,7 +96,7 @@ def test_a_checkpoint_acts_through_its_programs_quantised_ones_about_like_the_mo
     seen = [model.spec.random_observation(random) for _ in range(3)]
     apart = max((np.abs(onnx.plan(each) - model.plan(each)) / span).max() for each in seen)
     assert 1e-7 < apart < 0.02
-    assert onnx.compiled  # a server plans for one client at a time
+    assert onnx.one_at_a_time  # a server plans for one client at a time
 
 
 def test_a_model_that_cannot_be_exported_is_named(tmp_path: Path) -> None:

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import itertools
-import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -30,22 +29,6 @@ from vla.robots.panda import HOME, forward
 pytestmark = pytest.mark.realtime
 
 FROZEN = Time(sec=5, nanosec=5)
-WORKER = int(os.environ.get("PYTEST_XDIST_WORKER", "gw0").removeprefix("gw"))
-domains = itertools.cycle(range(1 + 33 * (WORKER % 3), 33 + 33 * (WORKER % 3)))  # and one more for test_deploy
-
-
-@pytest.fixture
-def make_world() -> Iterator[Callable[..., World]]:
-    """A world on a domain of its own."""
-    worlds: list[World] = []
-
-    def make(command: str = "joint_state", *arguments: str, compressed: bool = False) -> World:
-        worlds.append(World(next(domains), command, list(arguments), compressed))
-        return worlds[-1]
-
-    yield make
-    for world in worlds:
-        world.close()
 
 
 @pytest.fixture
@@ -147,7 +130,7 @@ def test_a_slow_policy_skips_ticks_and_a_stuck_one_holds_the_arm(world: World) -
     world.policy.takes = 0.15
     world.live(1.0)
     assert world.state is State.RUNNING
-    assert world.agent.loop is not None and world.agent.loop.overruns > 2
+    assert world.agent.loop is not None and world.agent.loop.late_plans > 2
     world.policy.takes = 1.0
     assert world.becomes(State.HOLDING)
 
@@ -362,6 +345,14 @@ def test_ros_arguments_remap_and_set_parameters(make_world: Callable[..., World]
     assert world.agent.loop.robot.speed_share == 0.5
     assert world.agent.resolve_topic_name("/front") == "/isaac/front"
     assert any(name == "/isaac/front" for name, _ in world.agent.get_topic_names_and_types())
+
+
+def test_whole_numbers_among_the_limits_are_numbers(make_world: Callable[..., World]) -> None:
+    low = [-2, *ROBOT.low[1:]]
+    world = make_world(robot=replace(ROBOT, low=low, speed_share=1))
+    assert world.change(Transition.TRANSITION_CONFIGURE)
+    assert world.agent.loop is not None and world.agent.loop.robot.low == low
+    assert world.agent.set_parameters([Parameter("speed_share", value=0.1)])[0].successful
 
 
 def test_speed_is_lowered_at_any_time_and_raised_at_rest_only(world: World) -> None:

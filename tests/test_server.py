@@ -291,6 +291,7 @@ WRONG: dict[str, tuple[Any, str]] = {
         msgpack.packb({b"__ndarray__": True, b"dtype": "<f8", b"data": b"", b"shape": [10**9, 10**9]}),
         "has too many or too few bytes",
     ),
+    "reset without a prompt": (pack({"reset": True, "seed": 7}), "prompt is an instruction"),
     "deep": (b"\x91" * 100_000 + b"\x01", "is no message in msgpack"),
     "lists": (msgpack.packb([[0] * 1000] * (LONGEST_LIST // 1000)), "hold more than 10000 items"),
     "maps": (msgpack.packb([{}] * (LARGEST_MAP + 1)), "more than 1000 maps"),

@@ -28,6 +28,7 @@ from trajectory_msgs.msg import JointTrajectory
 
 from vla.deploy import messages
 from vla.deploy.control_loop import State
+from vla.deploy.joint_limiter import Robot
 from vla.deploy.policy_node import PolicyNode
 from vla.deploy.ros import RosNetwork
 from vla.deploy.ros2 import PolicyDeployment
@@ -68,7 +69,13 @@ class World:
     """Cameras, an arm that follows its commands, and an operator; the policy node runs in the same thread."""
 
     def __init__(
-        self, domain: int, command: Any, arguments: list[str], compressed: bool = False, gripper: Any = None
+        self,
+        domain: int,
+        command: Any,
+        arguments: list[str],
+        compressed: bool = False,
+        gripper: Any = None,
+        robot: Robot = ROBOT,
     ) -> None:
         RosNetwork.named("loopback").apply()
         self.contexts = [Context(), Context()]
@@ -79,7 +86,7 @@ class World:
         self.compressed = compressed
         topics = {camera: f"/{camera}{'/compressed' if compressed else ''}" for camera in SPEC.cameras}
         self.settings = PolicyDeployment(
-            robot=ROBOT,
+            robot=robot,
             network=RosNetwork.named("loopback"),
             topics=replace(TOPICS, images=topics),
             safety=SAFETY,

@@ -361,7 +361,11 @@ class Drivable(Protocol):
     """Environment whose arm also takes joint targets, independently of control periods, like a robot driver."""
 
     def drive(self, joints: Array, opening: float, seconds: float) -> None:
-        """Move towards joint targets (J,) [rad] and a gripper opening 0…1 for `seconds` [s]."""
+        """Move towards joint targets (J,) [rad] and a gripper opening 0…1 for `seconds` [s].
+
+        Raises:
+            ValueError: physics cannot step for so long.
+        """
         ...
 
     def judge(self) -> None:

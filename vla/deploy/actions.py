@@ -50,11 +50,12 @@ class GoalSender:
         self.name = node.resolve_topic_name(name)
         self._node, self.kind, self._complaint, self._fail, self._ended = node, kind, complaint, fail, ended
         self._client = ActionClient(node, kind, name)
+        self._newest = 0  # number of the newest goal
         self.reset()
 
     def reset(self) -> None:
         """Forget what has been sent."""
-        self._newest = getattr(self, "_newest", 0) + 1
+        self._newest += 1
         self._handle: Any = None  # of the newest goal that was accepted and has not ended
         self._sent_at: float | None = None  # when the newest goal was sent, until it is answered
         self._cancelled = self._rejected = self._given_up = False
@@ -79,7 +80,8 @@ class GoalSender:
             return
         self._newest += 1
         self._sent_at, self._cancelled = time.monotonic(), False
-        self._then(self._client.send_goal_async(goal), self._on_answer)
+        answered = self._node.guard(partial(self._on_answer, self._newest))
+        self._client.send_goal_async(goal).add_done_callback(answered)
 
     def cancel(self) -> None:
         """Cancel the newest goal as soon as it is known to the server, if it has not ended by then."""
@@ -100,9 +102,6 @@ class GoalSender:
     def destroy(self) -> None:
         """Destroy the client."""
         self._client.destroy()
-
-    def _then(self, future: Any, callback: Callable[[int, Any], None]) -> None:
-        future.add_done_callback(self._node.guard(partial(callback, self._newest)))
 
     def _give_up(self, what: str) -> None:
         if self._handle is not None:
@@ -183,7 +182,7 @@ class GripperGoals:
             stuck = sender(move, f"{server}/move", lambda result, _: result.error or "it does not reach its width")
             self._goals = {True: (stuck, opening), False: (missed, closing)}
         else:
-            (kind,) = (action_class(*names) for names in settings.actions)
+            kind = action_class(*settings.actions[0])
             # A stall is what a grasp looks like.
             only = sender(kind, server, lambda result, _: "" if result.stalled else "it does not reach its position")
             self._goals = {wanted: (only, kind.Goal()) for wanted in (True, False)}

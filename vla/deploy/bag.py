@@ -96,11 +96,11 @@ def play(node: Any, folder: Path, topics: Collection[str], stopped: Event, speed
         for topic, stamp, raw in messages_of(reader, connections, folder):
             if not start <= stamp <= end:
                 raise ValueError(f"{folder} is damaged: a message lies outside its time range")
-            with damage(folder):
-                message = _stamped_now(node, raw, classes[topic])
             stopped.wait(max(0.0, begin + (stamp - start) * 1e-9 / speed - time.monotonic()))
             if stopped.is_set():
                 break
+            with damage(folder):
+                message = _stamped_now(node, raw, classes[topic])
             publishers[topic].publish(message)
             published += 1
     return published

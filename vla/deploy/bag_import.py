@@ -8,7 +8,6 @@ from __future__ import annotations
 import logging
 from bisect import bisect_left
 from collections.abc import Mapping, Sequence
-from contextlib import nullcontext
 from dataclasses import replace
 from itertools import islice
 from operator import itemgetter
@@ -23,7 +22,7 @@ from vla.deploy import messages
 from vla.deploy.bag import damage, message_types, messages_of, opened
 from vla.deploy.bag_index import BagIndex, Picture, Stretch, read_index
 from vla.deploy.joint_limiter import Robot
-from vla.deploy.observer import Observer
+from vla.deploy.observer import HISTORY, Observer
 from vla.deploy.settings import Topics
 from vla.io.images import Crop, resize
 from vla.io.types import Text
@@ -86,7 +85,7 @@ class BagDemonstrations(ImportedDemonstrations):
         self._controller = recorded_controller(spec)
         self._grip = spec.action.index(GRIPPER) if GRIPPER in {*spec.action} - {*model.joints} else None
         self._topics = {camera: topics.images[camera] for camera in spec.cameras}
-        self._index = _indexed(folder, topics, robot, status, self._topics)
+        self._index = read_index(_folder_of(folder), replace(topics, images=self._topics), robot, status)
         self._stretches = _chosen(self._index, steps)
         self._steps = [self._steps_in(stretch) for stretch in self._stretches]
         self._beyond = 0
@@ -139,7 +138,7 @@ class BagDemonstrations(ImportedDemonstrations):
         """Return the steps of a stretch, made as the policy node makes its observations; a ValueError without any."""
         observer, steps, period = Observer(self.spec), list[Step](), 1 / self.spec.control_hz
         last = earliest = -np.inf
-        first = bisect_left(self._index.inputs, stretch.start - 1.0, key=itemgetter(0))
+        first = bisect_left(self._index.inputs, stretch.start - HISTORY, key=itemgetter(0))
         for now, each in islice(self._index.inputs, first, None):
             if now > stretch.end:
                 break
@@ -191,15 +190,14 @@ class BagDemonstrations(ImportedDemonstrations):
             return motion
         opening = index.grips.last(end)
         if opening is None:
-            stroke = max(self._robot.finger_travel * len(self._robot.fingers), 1e-6)
-            opening = float(index.openings.between(end)) / stroke
+            opening = float(index.openings.between(end)) / self._robot.stroke
         return np.insert(motion, self._grip, opening)
 
 
-def _indexed(folder: Path | str | None, topics: Topics, robot: Robot, status: str, images: dict[str, str]) -> BagIndex:
+def _folder_of(folder: Path | str | None) -> Path:
     if folder is None:
         raise ValueError("expert=bag needs a bag: name its folder with expert=bag expert.folder=DIR")
-    return read_index(Path(folder), replace(topics, images=images), robot, status)
+    return Path(folder)
 
 
 def _chosen(index: BagIndex, steps: str) -> list[Stretch]:
@@ -225,10 +223,10 @@ def _recording(
 ) -> Recording:
     arm = Robot(**{name: value for name, value in robot.items() if name != "_target_"})
     named = Topics(**{name: value for name, value in topics.items() if name != "_target_"})
-    with opened(Path(folder)) if folder else nullcontext() as reader:
-        there = {connection.topic for connection in reader.connections} if reader else set[str]()
+    with opened(_folder_of(folder)) as reader:
+        there = {connection.topic for connection in reader.connections}
     images = {camera: topic for camera, topic in named.images.items() if topic in there} or named.images
-    index = _indexed(folder, named, arm, status, images)
+    index = read_index(_folder_of(folder), replace(named, images=images), arm, status)
     track = index.commands if index.commands.times else index.measured
     bounds = {name: action_bounds(values) for name, values in zip(arm.joints, np.transpose(track.values), strict=True)}
     cameras = tuple(images)

@@ -8,7 +8,7 @@ from __future__ import annotations
 import json
 from bisect import bisect_right
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, field, replace
 from functools import lru_cache
 from itertools import groupby
@@ -26,10 +26,9 @@ from vla.deploy.settings import Topics
 from vla.spec import LONGEST_INSTRUCTION, Array
 
 IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
-JOINTS, TRAJECTORY, NUMBERS = (
-    *("sensor_msgs/msg/JointState", "trajectory_msgs/msg/JointTrajectory"),
-    "std_msgs/msg/Float64MultiArray",
-)
+JOINTS = "sensor_msgs/msg/JointState"
+TRAJECTORY = "trajectory_msgs/msg/JointTrajectory"
+NUMBERS = "std_msgs/msg/Float64MultiArray"
 TWIST = "geometry_msgs/msg/TwistStamped"
 GAP = 0.3  # longest time between two commands of one motion [s]
 STILL, STILL_OPENING = 0.01, 0.002  # an arm that has moved less [rad], and its gripper [m], has not begun to move
@@ -154,7 +153,7 @@ class _Reading:
         self.index = BagIndex(folder)
         self._robot, self._joint_states = robot, messages.JointStates(robot)
         self._instruction, self._said_at = "", -np.inf
-        self._person: bool | None = None  # moves the arm; None: nobody does
+        self._person: bool | None = None  # whether a person moves the arm, or the policy; None: nobody
         self._has_status, self._seen = False, set[str]()  # cameras of usable images
         self._taken: dict[str, tuple[int, int]] = {}  # camera → time stamp of its last image
         self._number = 0  # of the try: the next one begins with an instruction, or when the agent runs again
@@ -265,7 +264,7 @@ class _Reading:
         """Leave out commands that do not tell where the arm goes: its motion tells it."""
 
     def _command(self, stamp: int, at: float, message: Any) -> None:
-        joints, opening = messages.command_from(message, self._robot)
+        joints, opening = messages.command_from(message.name, message.position, self._robot)
         self.index.commands.add(at, joints)
         if opening is not None:
             self.index.grips.add(at, opening)
@@ -273,12 +272,10 @@ class _Reading:
     def _trajectory(self, stamp: int, at: float, message: Any) -> None:
         for point in message.points:
             due = at + point.time_from_start.sec + point.time_from_start.nanosec * 1e-9
-            named: Any = _Named(message.joint_names, point.positions)
-            self.index.commands.add(due, messages.command_from(named, self._robot)[0])
+            self.index.commands.add(due, messages.command_from(message.joint_names, point.positions, self._robot)[0])
 
     def _numbers(self, stamp: int, at: float, message: Any) -> None:
-        named: Any = _Named(self._robot.joints, message.data)
-        self.index.commands.add(at, messages.command_from(named, self._robot)[0])
+        self.index.commands.add(at, messages.command_from(self._robot.joints, message.data, self._robot)[0])
 
     def _fingers(self, stamp: int, at: float, message: Any) -> None:
         opening = float(np.mean(message.data)) / self._robot.finger_travel if len(message.data) else np.nan
@@ -297,10 +294,3 @@ class _Reading:
             person = tuple((run[0][0], run[-1][0]) for who, run in runs if who)
             if end - start >= SHORTEST:
                 yield Stretch(words, start, end, person)
-
-
-class _Named(NamedTuple):
-    """Positions by name, as in a JointState."""
-
-    name: Sequence[str]
-    position: Any

@@ -42,9 +42,7 @@ def resume(node: Any) -> None:
     Raises:
         ValueError: there is no agent, or it is not stopped.
     """
-    answer = _call(node, Trigger, RESUME, Trigger.Request())
-    if not answer.success:
-        raise ValueError(answer.message)
+    _require(_call(node, Trigger, RESUME, Trigger.Request()))
 
 
 def hand_over(node: Any, to_person: bool) -> None:
@@ -53,9 +51,7 @@ def hand_over(node: Any, to_person: bool) -> None:
     Raises:
         ValueError: there is no agent, or it refuses, as while the arm moves.
     """
-    answer = _call(node, SetBool, HAND_OVER, SetBool.Request(data=to_person))
-    if not answer.success:
-        raise ValueError(answer.message)
+    _require(_call(node, SetBool, HAND_OVER, SetBool.Request(data=to_person)))
 
 
 def next_episode(node: Any) -> str:
@@ -83,10 +79,15 @@ def next_episode(node: Any) -> str:
     return description
 
 
+def _require(answer: Any) -> None:
+    if not answer.success:
+        raise ValueError(answer.message)
+
+
 def _call(node: Any, kind: Any, service: str, request: Any) -> Any:
     client = node.create_client(kind, service)
     if not client.wait_for_service(TIMEOUT):
-        raise ValueError(f"no service {service}: is the agent running, and on the same network and domain?")
+        raise ValueError(f"no service {service}: is its node running, and on the same network and domain?")
     answer = client.call_async(request)
     rclpy.spin_until_future_complete(node, answer, timeout_sec=TIMEOUT)
     if not answer.done():

@@ -83,7 +83,6 @@ class ControlLoop:
             ValueError: the policy does not fit the arm or the command rate.
         """
         model = spec.require_robot("deployment")
-        Observer(spec)  # raises an error if the state has more than joint states contain
         if len(robot.joints) != len(model.joints):
             raise ValueError(
                 f"the policy was trained with {len(model.joints)} joints, the robot has {len(robot.joints)}"
@@ -106,7 +105,7 @@ class ControlLoop:
         self.state, self.reason = State.WAITING, "no joint state yet"
         self.instruction, self._instructed_at, self._timed_out = "", 0.0, False
         self._said_at = -np.inf
-        self.overruns, self.rejections = 0, 0
+        self.late_plans, self.rejections = 0, 0
         self.handed_over = False
         self._observer = Observer(self.spec)
         self._commanded: deque[tuple[float, Array]] = deque()  # at, joints
@@ -116,8 +115,9 @@ class ControlLoop:
         self._next_inference = -np.inf
         self._opening: float | None = 1.0
         self.acting = False  # True if the last command is an action of the policy
-        self._committed: tuple[float, list[Command]] | None = None  # since when, commands of the ticks from then on
-        self._keeps = False  # True if the arm is to keep to them
+        # Trajectory that the arm executes by itself: since when, its commands.
+        self._sent: tuple[float, list[Command]] | None = None
+        self._sent_holds = False  # True until something changes
         self.observed_at = -np.inf  # time stamp of the last observation
         self.resumed = True  # True if the last observation is the first since the loop started to run
         self._last_observed = -np.inf  # as `observed_at`, but reset whenever the loop stops running
@@ -153,7 +153,7 @@ class ControlLoop:
         if repeated:
             return self.state not in (State.STOPPED, State.FAULT)
         self.instruction, self._instructed_at = instruction.strip(), now
-        self._schedule, self._next_inference, self._keeps, self._outdated = [], -np.inf, False, True
+        self._schedule, self._next_inference, self._sent_holds, self._outdated = [], -np.inf, False, True
         if self.state is State.STOPPED and self._timed_out:
             self.resume(now)
         return self.state not in (State.STOPPED, State.FAULT)
@@ -190,7 +190,7 @@ class ControlLoop:
         if self._observer.moved(STILL_FOR) > STILL:
             raise ValueError("the arm still moves: let it rest first")
         self.limiter.start(measured.joints)
-        self._committed, self._keeps = None, False
+        self._sent, self._sent_holds = None, False
         self._commanded.clear()
         self._record(now)
         self.handed_over, self._opening, self._off_track_since = False, None, None
@@ -222,7 +222,7 @@ class ControlLoop:
         if self.state is not State.RUNNING or self._pending is not None or observed is None:
             return None
         if self._schedule and now > self._schedule[-1][0] + 0.5 / self.spec.control_hz:
-            self.overruns += 1
+            self.late_plans += 1
         # Anchor on the pose commanded at that time. The measured pose lags behind it; the last goal runs ahead of an
         # arm that its limits slow down, and the policy would overshoot.
         anchor = min(self._commanded, key=lambda command: abs(command[0] - observed))[1]
@@ -258,7 +258,7 @@ class ControlLoop:
         if not self._follows_positions and (measured := self._observer.newest) is not None:
             self.limiter.position = np.array(measured.joints, float)
         ends = observed + period * np.arange(1, len(actions) + 1)
-        self._schedule, self._keeps = list(zip(ends.tolist(), goals, openings, strict=True)), False
+        self._schedule, self._sent_holds = list(zip(ends.tolist(), goals, openings, strict=True)), False
         self._next_inference = float(ends[-1])
         return None
 
@@ -277,9 +277,9 @@ class ControlLoop:
         if not self._commanded:
             return None
         self.acting = self.state is State.RUNNING and bool(self._schedule)
-        if self._committed is not None:
-            self._catch_up(*self._committed, now)
-        if not self._keeps:
+        if self._sent is not None:
+            self._catch_up(*self._sent, now)
+        if not self._sent_holds:
             self._move(now)
         self._record(now)
         return Command(self.limiter.position.copy(), self.limiter.velocity.copy(), self._opening)
@@ -308,19 +308,19 @@ class ControlLoop:
         return commands
 
     def commit(self, command: Command, now: float) -> list[Command] | None:
-        """Return this tick's command and those after it, which the next ticks keep to until something changes.
+        """Return the trajectory from this command to rest, for an arm that executes it by itself.
 
-        For an arm that executes trajectories of its own. None if nothing has changed since the last one.
+        None if the last one still holds, because nothing has changed since.
         """
-        if self._keeps:
+        if self._sent_holds:
             return None
         ahead = [command, *self.horizon(now)]
-        self._committed, self._keeps = (now, ahead), True
+        self._sent, self._sent_holds = (now, ahead), True
         return ahead
 
     def _catch_up(self, since: float, ahead: list[Command], now: float) -> None:
         """Move to where an arm that executes `ahead` is to be after this tick; before it, if something has changed."""
-        ticks = round((now - since) / self.tick) - (not self._keeps)
+        ticks = round((now - since) / self.tick) - (not self._sent_holds)
         planned = ahead[min(max(ticks, 0), len(ahead) - 1)]
         self.limiter.position, self.limiter.velocity = planned.position.copy(), planned.velocity.copy()
         self._opening = planned.opening
@@ -332,7 +332,7 @@ class ControlLoop:
 
     def limit(self, robot: Robot) -> None:
         """Replace the limits."""
-        self.limiter.robot, self._keeps = robot, False
+        self.limiter.robot, self._sent_holds = robot, False
 
     # Supervision.
 
@@ -367,8 +367,7 @@ class ControlLoop:
             self.limiter.start(measured.joints)
         except ValueError as error:
             return self.fail(str(error))
-        stroke = max(self.robot.finger_travel * len(self.robot.fingers), 1e-6)
-        self._opening = float(np.clip(measured.opening / stroke, 0.0, 1.0))
+        self._opening = float(np.clip(measured.opening / self.robot.stroke, 0.0, 1.0))
         return self._record(now)
 
     def _input_problem(self, newest: Measured, now: float) -> str:
@@ -399,7 +398,7 @@ class ControlLoop:
 
     def _set_state(self, state: State, reason: str) -> None:
         if state is not self.state:
-            self._keeps = False
+            self._sent_holds = False
         if state is not self.state and state is not State.RUNNING:
             self._observer.cameras.fresh, self._schedule, self._outdated = 0, [], True
             self._next_inference = self._last_observed = -np.inf

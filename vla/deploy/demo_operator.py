@@ -7,13 +7,11 @@ import os
 import signal
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
 from multiprocessing.process import BaseProcess
 from threading import Event
-from typing import Annotated, Any
+from typing import Any
 
 import rclpy
-from annotated_types import MaxLen
 from diagnostic_msgs.msg import DiagnosticStatus
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
@@ -21,13 +19,11 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
+from vla.deploy import messages
 from vla.deploy.calls import CHANGE, RESET
-from vla.deploy.settings import PolicySettings
-from vla.io.documents import STRICT, parse_json
-from vla.io.types import Natural, NonNegative, Seed
+from vla.deploy.messages import SimulatedEpisode
 from vla.rollouts.motion import Motion
 from vla.rollouts.results import Result
-from vla.spec import LONGEST_INSTRUCTION, Name
 
 log = logging.getLogger(__name__)
 
@@ -37,33 +33,14 @@ ANSWER = 10.0  # of a service call [s]
 EPISODE = 60.0  # of an episode, in simulated time [s]
 
 
-LONGEST = 100_000  # characters of a message about an episode
-
-
-@dataclass(frozen=True)
-class SimulatedEpisode:
-    """Message of the simulator about its episode."""
-
-    __pydantic_config__ = STRICT
-
-    seed: Seed
-    instruction: Annotated[str, MaxLen(LONGEST_INSTRUCTION)]
-    done: bool
-    steps: Natural  # of control since the instruction, and simulated time
-    seconds: NonNegative
-    outcome: Name
-    task: Annotated[str, MaxLen(100)]
-    milestones: Annotated[tuple[Name, ...], MaxLen(100)]
-
-
 class DemoOperator:
     """Starts episodes, sends the instructions and monitors both nodes."""
 
     def __init__(
-        self, settings: PolicySettings, speed: float, stopped: Event, agent: BaseProcess, simulator: BaseProcess
+        self, instruction_topic: str, speed: float, stopped: Event, agent: BaseProcess, simulator: BaseProcess
     ) -> None:
-        """Args: the agent's settings; ratio of simulated to real time; an event that is set on interruption; the nodes'
-        processes.
+        """Args: topic of the instructions; ratio of simulated to real time; an event that is set on interruption; the
+        processes of the nodes.
 
         Raises:
             ValueError: a node exited or does not respond, here and in all methods.
@@ -72,7 +49,7 @@ class DemoOperator:
         self.node = rclpy.create_node("vla_operator")
         self._change = self.node.create_client(ChangeState, CHANGE)
         self._reset = self.node.create_client(Trigger, RESET)
-        self._instruction = self.node.create_publisher(String, settings.topics.instruction, 1)
+        self._instruction = self.node.create_publisher(String, instruction_topic, 1)
         latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         self.node.create_subscription(String, "/vla_simulator/episode", self._on_episode, latched)
         self.node.create_subscription(DiagnosticStatus, "/vla_agent/status", self._on_status, 10)
@@ -128,7 +105,7 @@ class DemoOperator:
 
     def _on_episode(self, message: Any) -> None:
         try:
-            self._episode = parse_json(message.data[:LONGEST], SimulatedEpisode, "/vla_simulator/episode")
+            self._episode = messages.episode_from(message)
         except ValueError as error:  # anybody on the network can send one
             log.warning("dropped a message: %s", error)
 

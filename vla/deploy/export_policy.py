@@ -34,16 +34,16 @@ TOLERANCE = 1e-3  # largest difference between the outputs of a program and of t
 INSTRUCTIONS = ("go", "do this first, and then something else")  # of different lengths
 
 
-class Encode(nn.Module):
-    """One frame → its cached tokens (1, 1, N, E).
-
-    Args:
-        model: a model that caches the tokens of past frames.
-    """
+class Program(nn.Module):
+    """A part of a model, as it is exported."""
 
     def __init__(self, model: Model) -> None:
         super().__init__()
         self.model = model
+
+
+class Encode(Program):
+    """One frame → its cached tokens (1, 1, N, E), of a model that caches the tokens of past frames."""
 
     def forward(self, inputs: Inputs) -> Tensor:
         """Named inputs: each camera's (1, 1, H, W, 3) uint8, state (1, 1, P), present (1, 1) bool, text (1, L)."""
@@ -52,16 +52,8 @@ class Encode(nn.Module):
         return tokens
 
 
-class Act(nn.Module):
-    """A window of frames → the actions after its newest one: (1, k, D), not clipped to the bounds of the spec.
-
-    Args:
-        model: any model.
-    """
-
-    def __init__(self, model: Model) -> None:
-        super().__init__()
-        self.model = model
+class Act(Program):
+    """A window of frames → the actions after its newest one: (1, k, D), not clipped to the bounds of the spec."""
 
     def forward(self, inputs: Inputs) -> Tensor:
         """Named inputs: tokens (1, T, N, E), or T frames of the inputs of `Encode`; present (1, T), text (1, L);

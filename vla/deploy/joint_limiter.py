@@ -77,6 +77,11 @@ class Robot:
         return np.array(self.high) - self.margin
 
     @property
+    def stroke(self) -> float:
+        """Opening of the gripper when open [m]; tiny without fingers, as openings are divided by it."""
+        return max(self.finger_travel * len(self.fingers), 1e-6)
+
+    @property
     def max_speed(self) -> Array:
         """(J,) largest allowed speeds [rad/s]."""
         return np.array(self.speed) * self.speed_share
@@ -150,8 +155,7 @@ class JointLimiter:
     def _stoppable(self, distance: Array) -> Array:
         """(J,) largest speed from which constant deceleration stops within `distance` (J,), this step included."""
         change = self.robot.max_acceleration * self._period
-        steps = np.maximum(distance, 0.0) / (
-            change * self._period
-        )  # in units of the speed change of one step times its period
+        unit = change * self._period  # distance by which each further step of braking is longer
+        steps = np.maximum(distance, 0.0) / unit
         whole = np.floor((np.sqrt(1 + 8 * steps) - 1) / 2)  # n steps cover n(n + 1)/2 of these
         return change * (whole + (steps - whole * (whole + 1) / 2) / (whole + 1))

@@ -88,7 +88,7 @@ class Loop:
             with ros(agent.network, self.output) as stopped, ExitStack() as opened:
                 from vla.deploy.demo_operator import DemoOperator
 
-                operator = DemoOperator(agent, simulator.timing.speed, stopped, *nodes)
+                operator = DemoOperator(agent.topics.instruction, simulator.timing.speed, stopped, *nodes)
                 opened.callback(operator.node.destroy_node)
                 if self.record:
                     self._record(operator.node, opened)

@@ -22,7 +22,8 @@ from PIL import Image
 from vla.deploy.control_loop import Command
 from vla.deploy.joint_limiter import Robot
 from vla.io.documents import STRICT, parse_json
-from vla.spec import Array, Name, Names, Numbers, RobotModel
+from vla.io.types import Natural, NonNegative, Seed
+from vla.spec import LONGEST_INSTRUCTION, Array, Name, Names, Numbers, RobotModel
 
 # Encoding → bytes per pixel, and the places of red, green and blue among them.
 ENCODINGS = {
@@ -34,6 +35,7 @@ ENCODINGS = {
 
 HANDED_OVER = "handed over"  # in the agent's status: yes if a person moves the arm, always in a dry run; no
 MOST_PIXELS = 4096 * 4096  # of a compressed image, whose header may promise any number
+LONGEST = 100_000  # characters of a message about an episode
 FINGERS_AGE = 0.5  # oldest state of fingers that come in messages of their own [s]
 
 
@@ -46,6 +48,22 @@ class ArmDescription:
     joints: Names  # in joint states and commands, base to tip
     fingers: Annotated[tuple[Name, ...], MaxLen(100)]
     chain: Annotated[tuple[Numbers, ...], MaxLen(101)]  # as in `RobotModel`, empty if unknown
+
+
+@dataclass(frozen=True)
+class SimulatedEpisode:
+    """Message of the simulator about its episode; the JSON text of `/vla_simulator/episode`."""
+
+    __pydantic_config__ = STRICT
+
+    seed: Seed
+    instruction: Annotated[str, MaxLen(LONGEST_INSTRUCTION)]
+    done: bool
+    steps: Natural  # of control since the instruction, and simulated time
+    seconds: NonNegative
+    outcome: Name
+    task: Annotated[str, MaxLen(100)]
+    milestones: Annotated[tuple[Name, ...], MaxLen(100)]
 
 
 def shorten(text: str, longest: int = 80) -> str:
@@ -114,6 +132,11 @@ def arm_from(message: Any) -> ArmDescription:
     if arm.chain and not fits:
         raise ValueError(f"the arm's chain is not 7 numbers for each of {len(arm.joints)} joints and the tool")
     return arm
+
+
+def episode_from(message: Any) -> SimulatedEpisode:
+    """Read a simulator's episode from a std_msgs/String; raise a ValueError if it is none."""
+    return parse_json(message.data[:LONGEST], SimulatedEpisode, "/vla_simulator/episode")
 
 
 class JointStates:
@@ -214,13 +237,13 @@ def finger_positions(robot: Robot, command: Command) -> list[float]:
     return [] if command.opening is None else [command.opening * robot.finger_travel] * len(robot.fingers)
 
 
-def command_from(message: Any, robot: Robot) -> tuple[Array, float | None]:
-    """Read target positions (J,) [rad] and opening 0 … 1, or None without fingers, of a JointState, by name.
+def command_from(names: Sequence[str], positions: Any, robot: Robot) -> tuple[Array, float | None]:
+    """Read target positions (J,) [rad] and opening 0 … 1, or None without fingers, of a command, by name.
 
     Raises:
         ValueError: a joint is missing, the lengths differ, or a number is not finite.
     """
-    names, positions = list(message.name), np.array(message.position, dtype=float)
+    names, positions = list(names), np.array(positions, dtype=float)
     missing = [name for name in robot.joints if name not in names]
     if missing or len(names) != len(positions) or not np.isfinite(positions).all():
         problem = f"lacks {', '.join(missing)}" if missing else "needs one finite position per name"

@@ -57,7 +57,7 @@ class OnnxPolicy(Policy):
                 log.info("exporting the model to %s", programs)
                 write = {suffix: write_quantized if quantize else write_onnx}
                 write_programs(self, programs, write, math.inf if quantize else TOLERANCE)
-        self.compiled = True  # for one observation
+        self.one_at_a_time = True
         act = open_onnx(programs / f"act.{suffix}", threads)
         self._predict_chunk = lambda batch: Prediction(act(inputs_of(batch)))
         if (encoder := programs / f"encode.{suffix}").exists():  # the model caches tokens of past frames

@@ -5,10 +5,11 @@ from __future__ import annotations
 import time
 import traceback
 from collections import deque
+from collections.abc import Collection
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import asdict, replace
 from functools import partial
-from typing import Any, get_args
+from typing import Any, cast, get_args
 
 import numpy as np
 from builtin_interfaces.msg import Duration
@@ -87,21 +88,24 @@ class PolicyNode(GuardedLifecycleNode):
         for name, value in asdict(self.settings.robot).items():
             share = name.endswith("_share")
             limits = [FloatingPointRange(from_value=0.01, to_value=1.0)] if share else []
-            value = list(value) if isinstance(value, (list, tuple)) else value
+            if name not in ("joints", "fingers"):
+                value = np.asarray(value, float).tolist()  # YAML may hold whole numbers, which ROS tells from others
             self.declare_parameter(name, value, ParameterDescriptor(floating_point_range=limits))
         self.declare_parameter("command", self.settings.command)
         self.declare_parameter("image_reliability", self.settings.image_reliability)
         self.declare_parameter("image_crop", self.settings.image_crop)
         self.declare_parameter("dry_run", self.settings.dry_run)
         rate = FloatingPointRange(from_value=1.0, to_value=1000.0)
-        self.declare_parameter("command_hz", self.settings.command_hz, ParameterDescriptor(floating_point_range=[rate]))
+        self.declare_parameter(
+            "command_hz", float(self.settings.command_hz), ParameterDescriptor(floating_point_range=[rate])
+        )
         self.add_on_set_parameters_callback(self._require_changeable)
         self.add_post_set_parameters_callback(self._apply_shares)
 
     def _require_changeable(self, parameters: list[Parameter]) -> SetParametersResult:
         """Once configured, allow changes of the shares only; while active, only smaller ones."""
         for parameter in parameters:
-            if self.loop is None or not self.has_parameter(parameter.name) or parameter.name == "use_sim_time":
+            if self.loop is None or parameter.name == "use_sim_time":
                 continue
             if not parameter.name.endswith("_share"):
                 return SetParametersResult(successful=False, reason=f"clean up before changing {parameter.name}")
@@ -125,26 +129,22 @@ class PolicyNode(GuardedLifecycleNode):
             missing = ", ".join(unnamed)
             raise ValueError(f"no topic for the policy's cameras {missing}: add +deploy.topics.images.{unnamed[0]}")
         robot = Robot(**{name: self.get_parameter(name).value for name in asdict(self.settings.robot)})
-        self._command_type = self.get_parameter("command").value
-        if self._command_type not in COMMANDS:
-            raise ValueError(f"command is '{self._command_type}', expected one of {', '.join(COMMANDS)}")
+        self._command_type = self._choice("command", COMMANDS)
         self.settings.require_messages(self._command_type)
-        self._crop = self.get_parameter("image_crop").value
-        if self._crop not in get_args(images.Crop):
-            raise ValueError(f"image_crop is '{self._crop}', expected one of {', '.join(get_args(images.Crop))}")
+        self._crop = cast("images.Crop", self._choice("image_crop", get_args(images.Crop)))
+        reliability = self._choice("image_reliability", ("best_effort", "reliable"))
         self._dry_run = dry_run = self.get_parameter("dry_run").value
         twist = self._command_type == "twist"
         if twist and acts_on_joints(spec):
             raise ValueError("command=twist needs a policy of Cartesian actions, this one's are joint positions")
         rate, follows = self.get_parameter("command_hz").value, not (dry_run or twist)
         loop = ControlLoop(spec, robot, self.settings.safety, rate, follows)
-        self._warm_up()
-        reliability = self.get_parameter("image_reliability").value
-        if reliability not in ("best_effort", "reliable"):
-            raise ValueError(f"image_reliability is '{reliability}', expected best_effort or reliable")
-        reliable = reliability == "reliable"
+        if self.settings.gripper is not None and (topics.gripper is None or not loop.grips):
+            missing = "its action server in deploy.topics.gripper" if loop.grips else "a policy that moves a gripper"
+            raise ValueError(f"deploy/gripper needs {missing}")
+        self._pool.submit(self._warm_up).result()  # in the thread of inference: compiled programs are kept per thread
         best_effort = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
-        image_qos = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE) if reliable else best_effort
+        image_qos = QoSProfile(depth=1, reliability=ReliabilityPolicy[reliability.upper()])
         for camera in spec.cameras:
             kind = CompressedImage if topics.images[camera].endswith(COMPRESSED) else Image
             self.add_subscription(kind, topics.images[camera], partial(self._on_image, camera), image_qos)
@@ -162,7 +162,7 @@ class PolicyNode(GuardedLifecycleNode):
         self.add_service(Trigger, "~/stop", self._on_stop)
         self.add_service(Trigger, "~/resume", self._on_resume)
         self.add_service(SetBool, "~/hand_over", self._on_hand_over)
-        self._connect_actions(loop)
+        self._connect_actions()
         self._latencies, self._stamps, self._sizes, self._dropped = {}, {}, {}, 0
         self.loop = loop
 
@@ -174,12 +174,16 @@ class PolicyNode(GuardedLifecycleNode):
         commands = f"{below}/commands" if own else topics.commands
         return commands, topics.gripper and (f"{below}/gripper" if own_gripper else topics.gripper)
 
-    def _connect_actions(self, loop: ControlLoop) -> None:
+    def _choice(self, name: str, choices: Collection[str]) -> str:
+        """Return a parameter that must be one of `choices`."""
+        value = str(self.get_parameter(name).value)
+        if value not in choices:
+            raise ValueError(f"{name} is '{value}', expected one of {', '.join(choices)}")
+        return value
+
+    def _connect_actions(self) -> None:
         """Create the clients of the actions; a dry run has none."""
         topics, gripper = self.settings.topics, self.settings.gripper
-        if gripper is not None and (topics.gripper is None or not loop.grips):
-            missing = "its action server in deploy.topics.gripper" if loop.grips else "a policy that moves a gripper"
-            raise ValueError(f"deploy/gripper needs {missing}")
         if self._command_type == FOLLOW and not self._dry_run:
             kind, complaint = action_class(*TRAJECTORY_ACTION), actions.trajectory_complaint
             self._arm_goals = GoalSender(self, kind, topics.commands, complaint, self._fail)
@@ -457,7 +461,7 @@ class PolicyNode(GuardedLifecycleNode):
             messages.HANDED_OVER: "yes" if loop.handed_over or self._dry_run else "no",
             "instruction": messages.shorten(loop.instruction),
             "messages dropped": str(self._dropped),
-            "ticks skipped": str(loop.overruns),
+            "late plans": str(loop.late_plans),
         }
         for name, seconds in self._latencies.items():
             middle, high = np.percentile(list(seconds), [50, 99]) * 1000

@@ -35,7 +35,11 @@ def split_arguments(argv: Sequence[str]) -> tuple[list[str], list[str]]:
 
 
 Range = Literal["SYSTEM_DEFAULT", "LOCALHOST", "SUBNET", "OFF"]
-NETWORKS: dict[str, Range] = {"loopback": "SYSTEM_DEFAULT", "localhost": "LOCALHOST", "site": "SUBNET"}
+NETWORKS: dict[str, tuple[Range, str | None]] = {  # discovery range and profile of the options of `deploy/network`
+    "loopback": ("SYSTEM_DEFAULT", "loopback"),
+    "localhost": ("LOCALHOST", None),
+    "site": ("SUBNET", None),
+}
 
 
 class RosNetwork:
@@ -55,7 +59,7 @@ class RosNetwork:
     @classmethod
     def named(cls, name: str) -> RosNetwork:
         """Return an option of `deploy/network`, for commands that do not compose a config."""
-        return cls(NETWORKS[name], "loopback" if name == "loopback" else None, domain=None)
+        return cls(*NETWORKS[name], domain=None)
 
     def apply(self) -> None:
         """Set the environment variables that ROS reads at start.

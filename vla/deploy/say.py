@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import signal
 import sys
 
 from vla.deploy.ros import NETWORKS, command_node
@@ -30,6 +31,8 @@ def main() -> None:
     if len(instruction) > LONGEST_INSTRUCTION:
         sys.exit(f"error: the instruction has {len(instruction)} characters, the limit is {LONGEST_INSTRUCTION}")
     with command_node("vla_say", options.network) as (node, _):
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, signal.SIG_DFL)  # end at once: there is no arm to brake here
         from vla.deploy.calls import hand_over, next_episode, resume, say
 
         if options.reset:

@@ -277,7 +277,7 @@ class Service:
             seed = message.get("seed", 0)
             if type(seed) is not int or not 0 <= seed < 2**32:
                 raise ValueError(f"seed is {str(seed)[:50]}, expected an integer from 0 to 2**32 - 1")
-            session.reset(_prompt("prompt", message.get("prompt", "")), seed)
+            session.reset(_prompt("prompt", message.get("prompt")), seed)
             return {"reset": True}
         observation = self._settings.keys.observation(message, session.spec, self._settings.image_crop)
         began = time.perf_counter()
@@ -289,7 +289,7 @@ class Service:
     async def _infer(self, thread: Executor) -> None:
         """Plan for the clients that wait, for those that wait at the same time in one pass."""
         loop = asyncio.get_running_loop()
-        largest = 1 if self._policy.compiled else self._settings.batch
+        largest = 1 if self._policy.one_at_a_time else self._settings.batch
         while True:
             group = [await self._waiting.get()]
             while len(group) < largest and not self._waiting.empty():

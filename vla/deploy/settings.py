@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import asdict, dataclass
-from typing import Literal
+from typing import ClassVar, Literal
 
 from vla.deploy.control_loop import Safety
 from vla.deploy.joint_limiter import Robot
@@ -60,10 +60,7 @@ class GripperCommand:
     closed: float
     effort: Positive  # largest [N] or [Nm]
 
-    @property
-    def actions(self) -> list[tuple[str, str]]:
-        """Packages and names of the actions."""
-        return [("control_msgs", "GripperCommand")]
+    actions: ClassVar = (("control_msgs", "GripperCommand"),)  # packages and names
 
 
 @dataclass(frozen=True)
@@ -76,10 +73,7 @@ class FrankaGripper:
     speed: Positive  # [m/s]
     force: Positive  # [N]
 
-    @property
-    def actions(self) -> list[tuple[str, str]]:
-        """Packages and names of the actions, to close and to open."""
-        return [("franka_msgs", "Grasp"), ("franka_msgs", "Move")]
+    actions: ClassVar = (("franka_msgs", "Grasp"), ("franka_msgs", "Move"))  # packages and names: to close, to open
 
 
 @dataclass(kw_only=True)

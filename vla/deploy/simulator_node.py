@@ -6,6 +6,7 @@ import json
 import math
 import time
 from collections import deque
+from dataclasses import asdict
 from functools import partial
 from typing import Any
 
@@ -20,6 +21,7 @@ from std_srvs.srv import Trigger
 
 from vla.deploy import messages
 from vla.deploy.joint_limiter import Robot
+from vla.deploy.messages import SimulatedEpisode
 from vla.deploy.settings import Timing, Topics
 from vla.spec import LONGEST_INSTRUCTION, Array, Drivable, Environment, InARow
 
@@ -63,9 +65,7 @@ class SimulatorNode(Node):
         self.create_subscription(JointState, topics.commands, self._on_command, qos)
         self.create_subscription(String, topics.instruction, self._on_instruction, qos)
         self.create_service(Trigger, "~/reset", self._on_reset)
-        self._delayed: deque[tuple[float, Any]] = (
-            deque()
-        )  # image publications delayed by the camera latency: when due, publish
+        self._delayed: deque[tuple[float, Any]] = deque()  # images that wait for the camera latency: when due, publish
         self._elapsed = 0.0  # simulated time since the start [s]
         self._period = 1 / timing.joints_hz
         self.reset()
@@ -77,8 +77,8 @@ class SimulatorNode(Node):
         self.instruction = self.environment.reset(self.seed).instruction
         if isinstance(self.environment, InARow) and self.environment.instructions > 1:
             raise ValueError("deploy=simulator waits for one instruction per episode: set task.goal.length=1")
-        self._commanded_at: float | None
-        self._target, self._commanded_at = self._hold_command(), None
+        self._target = self._hold_command()
+        self._commanded_at: float | None = None
         self._running, self._ticks = False, 0
         self._until_frame = 0.0
         self.get_logger().info(self.description)
@@ -101,7 +101,7 @@ class SimulatorNode(Node):
 
     def _on_command(self, message: JointState) -> None:
         try:
-            joints, opening = messages.command_from(message, self.robot)
+            joints, opening = messages.command_from(message.name, message.position, self.robot)
         except ValueError as error:
             return self.get_logger().warning(messages.shorten(str(error), 300), throttle_duration_sec=1.0)
         self._target = (joints, self._target[1] if opening is None else opening)
@@ -150,8 +150,7 @@ class SimulatorNode(Node):
     def _hold_command(self) -> tuple[Array, float]:
         """Return the command that holds the measured pose: joints [rad] and opening 0 … 1."""
         joints, _, opening = self._measured()
-        stroke = max(self.robot.finger_travel * len(self.robot.fingers), 1e-6)
-        return joints.astype(float), opening / stroke
+        return joints.astype(float), opening / self.robot.stroke
 
     def _measured(self) -> tuple[Array, Array, float]:
         """Return joints [rad], their velocities [rad/s] and the gripper's opening [m]."""
@@ -169,14 +168,7 @@ class SimulatorNode(Node):
 
     def _publish_episode(self) -> None:
         environment = self.environment
-        episode = {
-            "seed": self.seed,
-            "instruction": self.instruction,
-            "done": environment.done,
-            "steps": self._ticks // self._ticks_per_step,  # since the instruction
-            "seconds": self._ticks * self._period,
-            "outcome": environment.outcome,
-            "task": environment.task,
-            "milestones": sorted(environment.milestones),
-        }
-        self._episode.publish(String(data=json.dumps(episode)))
+        steps, seconds = self._ticks // self._ticks_per_step, self._ticks * self._period
+        ended = (environment.done, steps, seconds, environment.outcome, environment.task)
+        episode = SimulatedEpisode(self.seed, self.instruction, *ended, tuple(sorted(environment.milestones)))
+        self._episode.publish(String(data=json.dumps(asdict(episode))))

@@ -20,34 +20,37 @@ def frame_positions(chain: Sequence[Sequence[float]], joints: ArrayLike) -> Arra
         chain: as in `vla.spec.RobotModel`, (J + 1, 7).
         joints: (J,) [rad].
     """
-    rotation, position = np.eye(3), np.zeros(3)
-    positions = [position]
-    for frame, angle in zip(chain, [*np.asarray(joints), 0.0], strict=True):
-        position = position + rotation @ np.asarray(frame[:3])
-        rotation = rotation @ _rotation(frame[3:]) @ _rotation((np.cos(angle / 2), 0.0, 0.0, np.sin(angle / 2)))
-        positions.append(position)
-    return np.array(positions)
+    return np.vstack([np.zeros(3), _frames(_links(chain), joints)[:, :3, 3]])
 
 
 def forward_of(chain: Sequence[Sequence[float]]) -> Callable[[Array], tuple[Array, Array]]:
     """Return the function of a chain that `vla.robots.cartesian.Kinematics` needs: joints to pose and Jacobian."""
-    links = np.tile(np.eye(4), (len(chain), 1, 1))
-    for link, frame in zip(links, chain, strict=True):
-        link[:3, :3], link[:3, 3] = _rotation(frame[3:]), frame[:3]
+    links = _links(chain)
 
     def forward(joints: Array) -> tuple[Array, Array]:
-        pose, frames = np.eye(4), []
-        for link, cosine, sine in zip(links[:-1], np.cos(joints), np.sin(joints), strict=True):
-            pose = pose @ link
-            frames.append(pose)
-            turn = np.eye(4)
-            turn[:2, :2] = (cosine, -sine), (sine, cosine)
-            pose = pose @ turn
-        pose = pose @ links[-1]
-        axes, origins = np.array(frames)[:, :3, 2], np.array(frames)[:, :3, 3]
+        frames = _frames(links, joints)
+        axes, origins, pose = frames[:-1, :3, 2], frames[:-1, :3, 3], frames[-1]
         return pose, np.concatenate([np.cross(axes, pose[:3, 3] - origins), axes], 1).T
 
     return forward
+
+
+def _links(chain: Sequence[Sequence[float]]) -> Array:
+    """Return the (J + 1, 4, 4) transforms of a chain."""
+    links = np.tile(np.eye(4), (len(chain), 1, 1))
+    for link, frame in zip(links, chain, strict=True):
+        link[:3, :3], link[:3, 3] = _rotation(frame[3:]), frame[:3]
+    return links
+
+
+def _frames(links: Array, joints: ArrayLike) -> Array:
+    """Return the (J + 1, 4, 4) poses of every joint's frame, without its own rotation, and of the tool."""
+    frames = [links[0]]
+    for link, cosine, sine in zip(links[1:], np.cos(joints), np.sin(joints), strict=True):
+        turn = np.eye(4)
+        turn[:2, :2] = (cosine, -sine), (sine, cosine)
+        frames.append(frames[-1] @ turn @ link)
+    return np.array(frames)
 
 
 def _rotation(quaternion: ArrayLike) -> Array:

@@ -151,7 +151,11 @@ class Tabletop(Blindable):
 
     def drive(self, joints: Array, opening: float, seconds: float) -> None:
         """Move towards joint targets (J,) [rad] and a gripper opening 0…1 for `seconds`; call `judge` once per control
-        period."""
+        period.
+
+        Raises:
+            ValueError: `seconds` is no whole number of physics steps.
+        """
         self.simulation.follow(joints, opening, seconds)
 
     def judge(self) -> None:

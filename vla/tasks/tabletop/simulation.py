@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -215,8 +216,17 @@ class Simulation:
         """Step physics for `seconds` with targets interpolated linearly to `joints` (J,) [rad] and an opening 0…1.
 
         An arm that is pushed returns afterwards, because its driver does not know.
+
+        Raises:
+            ValueError: `seconds` is no whole number of physics steps.
         """
-        substeps, timestep = round(seconds / self._physics.timestep()), self._physics.timestep()
+        timestep = self._physics.timestep()
+        substeps = round(seconds / timestep)
+        if not math.isclose(substeps * timestep, seconds):
+            raise ValueError(
+                f"the arm cannot be driven at {1 / seconds:g} Hz, as physics runs at {1 / timestep:g} Hz: choose a "
+                "whole fraction of that"
+            )
         if self.disturber:
             joints, opening = self._disturbed(joints, opening, substeps * timestep)
         robot, grip = self.scene.robot, self._command[-1]
