@@ -57,7 +57,7 @@ def problem(**changes: Any) -> str:
 
 def test_a_right_config_passes() -> None:
     check(config())
-    check(config(**{"task.time_limit": 10, "task.image_size": [64, 128], "expert.perturb": None}))
+    check(config(**{"task.time_limit": 10, "task.image_size": [64, 128], "task.randomize.size": None}))
 
 
 def test_fields_that_a_dataclass_inherits_from_another_module_are_checked() -> None:
@@ -164,7 +164,7 @@ def test_a_target_that_is_no_class_of_the_package_is_refused(target: str) -> Non
 
 def test_a_class_stands_only_where_its_kind_is_asked_for() -> None:
     node = {**PERTURBED, "perturb": MASSES}
-    with pytest.raises(ValueError, match=r"expert\.perturb must be Perturbation or null, got \{'_target_': .*Masses"):
+    with pytest.raises(ValueError, match=r"expert\.perturb must be Perturbation, got \{'_target_': .*Masses"):
         build(node, "expert", spec=None)
     kind = "a class of kind Agent or ImportedDemonstrations"
     with pytest.raises(ValueError, match=rf"expert\._target_ must name {kind}, got .*Masses"):
@@ -253,7 +253,7 @@ def test_the_digest_is_stable_and_changes_with_the_episodes_only() -> None:
     different: list[dict[str, Any]] = [
         {"collect.seed": 1},
         {"task.blocks": 2},
-        {"expert.perturb": None},
+        {"expert.perturb.rate": 0.2},
         {"task.randomize.size": 1},
     ]
     assert len({digested(config(**change)) for change in different} | {expected}) == 5

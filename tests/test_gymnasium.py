@@ -89,6 +89,11 @@ def test_rendered_images_are_resized_and_components_numbered() -> None:
             "there is no observation.pose in what the environment returns: instead",
         ),
         ({"state": {"observation.state": ["east"]}}, "observation.state has 2 components, and 1 names: east"),
+        (
+            {"state": {"observation.state": ["east", "east"]}},
+            "task.id=toy/Toy-v0",
+        ),
+        ({"options": {"seconds_per_stop": 0.1}}, "task.options={'seconds_per_stop': 0.1} does not fit toy/Toy-v0: "),
         ({"images": {"eye": "observation.state"}}, "task.images.eye names no (H, W, 3) image of uint8, but float32"),
     ],
 )

@@ -7,6 +7,7 @@ import shutil
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -125,10 +126,11 @@ def test_only_a_memoryless_expert_labels() -> None:
     class Silent(toy.Wanderer):
         """Says nothing about its memory."""
 
-    for other in (Counting(), Silent(), Perturbed(toy.SPEC, lambda spec: Counting(), None)):
+    unused: Any = None  # the perturbation
+    for other in (Counting(), Silent(), Perturbed(toy.SPEC, lambda spec: Counting(), unused)):
         with pytest.raises(ValueError, match="cannot label the states of another agent"):
             require_memoryless(other)
-    require_memoryless(Perturbed(toy.SPEC, lambda spec: toy.ToyExpert(), None))
+    require_memoryless(Perturbed(toy.SPEC, lambda spec: toy.ToyExpert(), unused))
 
 
 @pytest.mark.parametrize(

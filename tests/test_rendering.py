@@ -90,10 +90,13 @@ def test_pictures_of_a_hundred_scenes_equal_mujocos(wide: tuple[Tabletop, Render
 
 
 def test_no_object_is_missing(wide: tuple[Tabletop, Renderer, ReferenceRenderer]) -> None:
-    environment, first, second = wide
+    environment, first, _ = wide
     model = environment.simulation.compiled.model
     head = model.vis.headlight
     before = [np.array(values) for values in (head.ambient, head.diffuse, model.light_active)]
+    segmenter, option = mujoco.Renderer(model, SIZE, SIZE), mujoco.MjvOption()
+    segmenter.enable_segmentation_rendering()
+    option.geomgroup[:] = [group == 2 for group in range(mujoco.mjNGROUP)]
     for seed in range(20):
         data = start(environment, seed)
         model.geom_matid[:] = -1
@@ -106,10 +109,13 @@ def test_no_object_is_missing(wide: tuple[Tabletop, Renderer, ReferenceRenderer]
         rgb = first.render(data)[0].astype(int)
         seen = np.where(rgb.any(axis=3), rgb[..., 0] // 10 + 25 * (rgb[..., 1] // 100), -1)
         for camera in (0, 1):
-            expected = second.segment(data, camera)
+            segmenter.update_scene(data, camera, option)
+            ids, kinds = np.moveaxis(segmenter.render(), 2, 0)
+            expected = np.where(kinds == mujoco.mjtObj.mjOBJ_GEOM, ids, -1)
             assert (seen[camera] == expected)[expected >= 0].mean() > 0.99
             found, counts = np.unique(expected, return_counts=True)
             assert set(found[(counts > 5) & (found >= 0)]) <= set(seen[camera].ravel())
+    segmenter.close()
     head.ambient, head.diffuse, model.light_active[:] = before
 
 

@@ -24,12 +24,12 @@ def choose_backend() -> None:
     """
     without_triton()
     with suppress(ImportError):
-        import backports.zstd  # noqa: F401 # binds its library now, else to Mesa's: bags would have other bytes
+        import backports.zstd  # noqa: F401 # the system's library: after Mesa it would be Mesa's, and bags would have other bytes
     chosen = os.environ.get("MUJOCO_GL")
     if os.environ.get("DISPLAY") or sys.platform != "linux" or chosen in (NONE, os.environ.get(TRIED, NONE)):
         return
     candidates = [chosen] if chosen else ["egl", "osmesa"]
-    works = next(filter(_works, candidates), None)
+    works = next((name for name in candidates if _runs(PROBE, MUJOCO_GL=name)), None)
     os.environ["MUJOCO_GL"] = works or NONE
     os.environ[TRIED if works else FAILED] = works or " or ".join(candidates)
 
@@ -47,15 +47,14 @@ def require_backend() -> None:
         )
 
 
-def _works(backend: str) -> bool:
-    # A failing GL backend can abort the process, so probe it in a subprocess.
-    environment = {**os.environ, "MUJOCO_GL": backend}
-    return subprocess.run([sys.executable, "-c", PROBE], env=environment, capture_output=True).returncode == 0
-
-
 def has_egl() -> bool:
     """Return whether the fast renderer can draw on this machine."""
     if EGL not in os.environ:
-        probe = subprocess.run([sys.executable, "-c", EGL_PROBE], capture_output=True)
-        os.environ[EGL] = str(probe.returncode == 0)
+        os.environ[EGL] = str(_runs(EGL_PROBE))
     return os.environ[EGL] == "True"
+
+
+def _runs(code: str, **settings: str) -> bool:
+    # In a process of its own, which a failing GL backend can abort.
+    environment = {**os.environ, **settings}
+    return subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True).returncode == 0

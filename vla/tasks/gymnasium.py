@@ -86,7 +86,7 @@ class Gymnasium(Blindable):
         rate = control_hz or self._environment.metadata.get("render_fps")
         if rate is None:
             raise ValueError(f"{id} does not tell its rate: set task.control_hz")
-        self.spec = Spec(
+        spec = Spec(
             cameras=tuple(images),
             image_size=self._size,
             state=tuple(names),
@@ -98,10 +98,11 @@ class Gymnasium(Blindable):
             control_hz=float(rate),
             truth=tuple((name, np.size(_get(values, path))) for name, path in truth.items()),
         )
+        self.spec = Spec.from_dict(spec.to_dict(), f"task.id={id}")
         self._observe(values)  # refuses images that are none
         if not success.startswith(PATHS):
             raise ValueError(f"task.success={success} must be a path that begins with {' or '.join(PATHS)}")
-        self._told = False  # of success, or its absence
+        self._success_reported = False  # in a step, or its absence in the log
 
     def reset(self, seed: int) -> Observation:
         """Start the episode of `seed`, which seeds the environment."""
@@ -118,9 +119,9 @@ class Gymnasium(Blindable):
         success = bool(_get(values, self._success, default=False))
         self.outcome = "success" if success else "failure" if terminated else "timeout"
         self.done = success or terminated or truncated
-        self._told |= _get(values, self._success, default=MISSING) is not MISSING
-        if self.done and not self._told:
-            self._told = True
+        self._success_reported |= _get(values, self._success, default=MISSING) is not MISSING
+        if self.done and not self._success_reported:
+            self._success_reported = True
             log.warning("in a whole episode the environment gave no %s, task.success: that is a failure", self._success)
         return self._observe(values)
 
@@ -157,13 +158,12 @@ def _make(package: str, id: str, options: Mapping[str, object], steps: int | Non
         raise ValueError(f"task.id={id} is no environment of task.package={package}")
     if steps is None and spec.max_episode_steps is None:
         raise ValueError(f"{id} does not tell how long an episode lasts: set task.steps")
-    return gymnasium.make(
-        spec,
-        max_episode_steps=steps,
-        disable_env_checker=True,
-        **options,
-        **({"render_mode": "rgb_array"} if render else {}),
-    )
+    if render:
+        options = {**options, "render_mode": "rgb_array"}
+    try:
+        return gymnasium.make(spec, max_episode_steps=steps, disable_env_checker=True, **options)
+    except TypeError as error:
+        raise ValueError(f"task.options={dict(options)} does not fit {id}: {error}") from error
 
 
 def _home(spec: EnvSpec) -> str:

@@ -114,11 +114,11 @@ class Perturbation:
 class Perturbed:
     """An expert with perturbed actions; `info["clean"]` is the expert's own action, the label to imitate."""
 
-    def __init__(self, spec: Spec, expert: Callable[..., Agent], perturb: Perturbation | None) -> None:
+    def __init__(self, spec: Spec, expert: Callable[..., Agent], perturb: Perturbation) -> None:
         """Args:
         spec: the environment's spec.
         expert: factory of the expert, called with `spec`.
-        perturb: None disables perturbation.
+        perturb: the perturbation.
         """
         self._spec, self._expert, self._perturb = spec, expert(spec=spec), perturb
         self.memoryless = bool(getattr(self._expert, "memoryless", False))  # of the label
@@ -129,19 +129,16 @@ class Perturbed:
         """Start an episode; `seed` seeds the expert and the perturbation."""
         self.info = {}
         self._expert.reset(instruction, seed)
-        if self._perturb is not None:
-            self._perturb.reset(self._spec, seed)
+        self._perturb.reset(self._spec, seed)
 
     def act(self, observation: Observation) -> Array:
         """Return the (D,) float32 action to execute.
 
         Raises:
-            ValueError: there is a perturbation, and the observation lacks the simulator's truth.
+            ValueError: the observation lacks the simulator's truth.
         """
         clean = self._expert.act(observation)
         self.info = {**self._expert.info, "clean": clean}
-        if self._perturb is None:
-            return clean
         if observation.truth is None:
             raise ValueError("expert.perturb needs the simulator's truth, which this observation lacks")
         needs = {name: self._expert.info[name] for name in ("must_turn", "steady") if name in self._expert.info}

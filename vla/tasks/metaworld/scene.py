@@ -71,7 +71,7 @@ class Scene:
         seen = self._places if drawn is None else sorted(set(self._places))  # all of a camera's picture once
         self._view = View(seen, height, width, site_groups=(0, 1, 2), aspect=1.0)
         self._camera = camera
-        self._renderers = renderer
+        self._renderer_factory = renderer
         self._renderer: Renderer | None = None
         self._changed = True
 
@@ -96,7 +96,7 @@ class Scene:
     def pictures(self) -> Array:
         """Draw every camera's picture (cameras, H, W, 3) uint8."""
         if self._renderer is None:
-            self._renderer = self._renderers.open(self.model, self._view)
+            self._renderer = self._renderer_factory.open(self.model, self._view)
         elif self._changed:
             self._renderer.update()
         self._changed = False

@@ -49,7 +49,7 @@ class Cameras:
 
     def behind(self, number: int, plane: Array) -> bool:
         """Return whether a camera sees a plane of pose (3, 4) from behind."""
-        return _dot((self.eyes[number] - plane[:, 3]).tolist(), plane[:, 2].tolist()) < 0
+        return bool((self.eyes[number] - plane[:, 3]) @ plane[:, 2] < 0)
 
     def _lens(self, camera: int) -> Array:
         """Return a camera's projection (4, 4)."""
@@ -73,7 +73,3 @@ def _enlarging(windows: Array) -> Array:
     transforms[:, 0, 0], transforms[:, 0, 3] = 1 / (right - left), (1 - left - right) / (right - left)
     transforms[:, 1, 1], transforms[:, 1, 3] = 1 / (bottom - top), (top + bottom - 1) / (bottom - top)
     return transforms
-
-
-def _dot(one: list[float], other: list[float]) -> float:
-    return one[0] * other[0] + one[1] * other[1] + one[2] * other[2]

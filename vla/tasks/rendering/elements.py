@@ -74,18 +74,16 @@ def unsupported(model: mujoco.MjModel, view: View) -> list[str]:
     infinite = (elements.kind == mujoco.mjtGeom.mjGEOM_PLANE) & (elements.size[:, :2] <= 0).any(axis=1)
     sky = (model.tex_type == mujoco.mjtTexture.mjTEXTURE_SKYBOX).any()
     odd = (mujoco.mjtLightType.mjLIGHT_POINT, mujoco.mjtLightType.mjLIGHT_IMAGE)
-    counts = {
-        "height fields": int((elements.seen & (elements.kind == mujoco.mjtGeom.mjGEOM_HFIELD)).sum()),
+    drawn = elements.material[elements.seen & (elements.material >= 0)]
+    present = {
+        "height fields": (elements.seen & (elements.kind == mujoco.mjtGeom.mjGEOM_HFIELD)).any(),
         "skins": model.nskin,
         "flexible bodies": model.nflex,
-        "spatial tendons": int((model.wrap_type != mujoco.mjtWrap.mjWRAP_JOINT).any()),
-        "reflections": int(
-            model.nmat
-            and (model.mat_reflectance[elements.material[elements.seen & (elements.material >= 0)]] > 0).any()
-        ),
-        "haze at the horizon": int(sky and (elements.seen & infinite).any()),
-        "lights of the types point and image": int(np.isin(model.light_type, odd).sum()),
-        "textures of one or two channels": int((model.tex_nchannel < 3).sum()),
-        "slider-cranks": int((model.actuator_trntype == mujoco.mjtTrn.mjTRN_SLIDERCRANK).sum()),
+        "spatial tendons": (model.wrap_type != mujoco.mjtWrap.mjWRAP_JOINT).any(),
+        "reflections": (model.mat_reflectance[drawn] > 0).any(),
+        "haze at the horizon": sky and (elements.seen & infinite).any(),
+        "lights of the types point and image": np.isin(model.light_type, odd).any(),
+        "textures of one or two channels": (model.tex_nchannel < 3).any(),
+        "slider-cranks": (model.actuator_trntype == mujoco.mjtTrn.mjTRN_SLIDERCRANK).any(),
     }
-    return [name for name, count in counts.items() if count]
+    return [name for name, there in present.items() if there]

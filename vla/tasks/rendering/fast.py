@@ -47,23 +47,14 @@ class Run:
     count: int  # of the indices
 
 
+@dataclass(frozen=True)
 class Fast:
     """The choice of the fast renderer."""
 
-    def __init__(
-        self,
-        samples: Literal[1, 4],
-        soft: Annotated[int, Ge(0), Le(4)],
-        light: Literal["auto", "vertex", "pixel"],
-        faces: Annotated[int, Ge(100)] | None,
-    ) -> None:
-        """Args:
-        samples: per pixel, which are averaged; 4 draws twice as many rows and columns, for smooth edges.
-        soft: texels around the nearest one over which the edges of shadows are averaged.
-        light: whether light is computed at vertices, as in MuJoCo, or pixels; auto: pixels for spot lights only.
-        faces: most faces of a mesh, heavier ones are decimated for pictures; None keeps all.
-        """
-        self.samples, self.soft, self.light, self.faces = samples, soft, light, faces
+    samples: Literal[1, 4]  # per pixel, which are averaged; 4 draws twice as many rows and columns, for smooth edges
+    soft: Annotated[int, Ge(0), Le(4)]  # texels around the nearest one over which the edges of shadows are averaged
+    light: Literal["auto", "vertex", "pixel"]  # at vertices as in MuJoCo, or pixels; auto: pixels for spots only
+    faces: Annotated[int, Ge(100)] | None  # most faces of a mesh, heavier ones are decimated for pictures; None: all
 
     @staticmethod
     def substitute() -> tuple[str, str] | None:

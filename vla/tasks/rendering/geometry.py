@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import mujoco
@@ -51,9 +51,7 @@ class Geometry:
         self._slices, self._stacks = int(quality.numslices), int(quality.numstacks)
         self._sphere, self._box = shapes.sphere(self._slices, self._stacks // 2 * 2), shapes.box()
         self._cylinder = shapes.cylinder(self._slices)
-        self._reach = (
-            np.append(model.geom_rbound, model.site_size.max(axis=1)) if model.nsite else model.geom_rbound.copy()
-        )
+        self._reach = np.append(model.geom_rbound, model.site_size.max(axis=1))
         self._known: dict[int, Block] = {}  # element → its present block
         self.blocks: list[Block] = []
 
@@ -124,13 +122,8 @@ class Geometry:
         """Return the cylinder around the camera that shows the sky, seen from inside."""
         if element not in self._known:
             shape = shapes.cylinder(self._slices)
-            inside = Shape(
-                shape.position * SKY_DISTANCE * self._far,
-                shape.normal,
-                shape.texcoord,
-                shape.raw,
-                shape.triangles[:, ::-1],
-            )
+            position = shape.position * SKY_DISTANCE * self._far
+            inside = replace(shape, position=position, triangles=shape.triangles[:, ::-1])
             self._known[element] = _packed(element, (), inside, shape.raw[:, [0, 2, 1]] * [1, 1, -1])
         return self._known[element]
 

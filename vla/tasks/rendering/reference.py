@@ -61,21 +61,6 @@ class ReferenceRenderer:
             mujoco.mjr_readPixels(rgb[number], depth[number], self._rect, self._context)
         return rgb[:, ::-1], self._metres(depth[:, ::-1])
 
-    def segment(self, data: mujoco.MjData, camera: int) -> Array:
-        """Return (H, W) int32, the id of the geom in each pixel of a camera's picture, -1 where there is none."""
-        self._gl.make_current()
-        flags = [int(mujoco.mjtRndFlag.mjRND_SEGMENT), int(mujoco.mjtRndFlag.mjRND_IDCOLOR)]
-        self._scene.flags[flags] = True
-        self._draw(data, camera)
-        self._scene.flags[flags] = False
-        rgb = np.empty((self._view.height, self._view.width, 3), np.uint8)
-        mujoco.mjr_readPixels(rgb, None, self._rect, self._context)
-        ids = np.full(self._scene.ngeom + 1, -1, np.int32)
-        for geom in self._scene.geoms[: self._scene.ngeom]:
-            if geom.objtype == mujoco.mjtObj.mjOBJ_GEOM:
-                ids[geom.segid + 1] = geom.objid
-        return ids[rgb[::-1].astype(np.int32) @ np.array([1, 256, 65536])]
-
     def _draw(self, data: mujoco.MjData, camera: int, window: Sequence[float] | None = None) -> None:
         self._camera.fixedcamid = camera
         mujoco.mjv_updateScene(

@@ -9,7 +9,7 @@ from vla.tasks.rendering.lights import ROWS
 
 POSE = 3  # texels of an element's pose: rows of a 3 x 4 matrix
 TEXELS = 4  # of an element's appearance: colour, light, what it follows, rate of texture coordinates there
-CAMERA = 24  # floats of a camera's block before shadow projections and lights: projection, eye, and a spare
+CAMERA = 20  # floats of a camera's block before shadow projections and lights: projection and eye
 Texture = Literal["none", "2d", "cube"]
 
 PLACE = """
@@ -32,7 +32,8 @@ vec3 place(int element, vec3 eye, out mat3 turn, out vec3 shift) {
 }
 """
 
-SHADOW_VERTEX = f"""#version 330
+SHADOW_PROGRAM = {
+    "vertex_shader": f"""#version 330
 {PLACE}
 uniform mat4 projection;
 uniform vec3 lamp;
@@ -40,10 +41,10 @@ void main() {{
     mat3 turn;
     vec3 shift;
     gl_Position = projection * vec4(place(int(in_element), lamp, turn, shift), 1.0);
-}}"""
-
-SHADOW_FRAGMENT = """#version 330
-void main() {}"""
+}}""",
+    "fragment_shader": """#version 330
+void main() {}""",
+}
 
 # OpenGL's fixed-function lighting with a local viewer, as MuJoCo's classic renderer uses it.
 LIGHT = """
@@ -68,11 +69,6 @@ vec3 shine(int number, vec3 place, vec3 normal, vec3 colour, vec4 material) {
 """
 
 
-def shadow_program() -> dict[str, str]:
-    """Return the sources of the shaders of shadow maps."""
-    return {"vertex_shader": SHADOW_VERTEX, "fragment_shader": SHADOW_FRAGMENT}
-
-
 def scene_program(
     lights: int, lamps: Sequence[int], spots: Sequence[bool], texture: Texture, pixel: bool, soft: int
 ) -> dict[str, str]:
@@ -91,7 +87,6 @@ def scene_program(
 layout(std140) uniform Camera {{
     mat4 projection;
     vec4 eye;
-    vec4 spare;
     {f"mat4 shadow_projection[{count}];" if count else ""}
     vec4 lights[{lights * ROWS}];
 }};

@@ -38,7 +38,7 @@ class Shadows:
         self._edge = int(model.vis.quality.shadowsize)
         self._still, self._drawn = ([self._target() for _ in self._lamps] for _ in range(2))
         self.maps = [target.depth_attachment for target in self._drawn]
-        self.program = gl.program(**shaders.shadow_program())
+        self.program = gl.program(**shaders.SHADOW_PROGRAM)
         self._buffers = Buffers(gl)
         content = [(self._buffers.vertices, "3f 1f", "in_position", "in_element")]
         self._casters = gl.vertex_array(self.program, content, self._buffers.indices)

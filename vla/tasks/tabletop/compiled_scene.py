@@ -10,6 +10,8 @@ import numpy as np
 from dm_control import mjcf
 
 from vla.spec import Array, Shape
+from vla.tasks.rendering.shapes import mesh_triangles
+from vla.tasks.tabletop.robot import VISIBLE
 from vla.tasks.tabletop.scene import BLOCK_DENSITY, BLOCK_HALF_SIZE, COLOURS, PAD_THICKNESS, PADS, Scene
 
 AWAY = (-1.5, 0.0, -3.0)  # position of blocks and pads that are absent [m]
@@ -88,9 +90,8 @@ class CompiledScene:
         self.block_velocities = self.model.jnt_dofadr[free]
         self.zones = [int(self.model.body(f"{name}_pad").mocapid[0]) for name in PADS]
         self.cameras = {"front": self.model.camera("front").id, "wrist": self.model.camera(f"{robot.prefix}wrist").id}
-        self.robot_geoms = np.flatnonzero(
-            [model_body.startswith(robot.prefix) for model_body in map(self._body_of, range(self.model.ngeom))]
-        )
+        bodies = [self.model.body(body).name for body in self.model.geom_bodyid]
+        self.robot_geoms = np.flatnonzero([body.startswith(robot.prefix) for body in bodies])
         self._materials = {name: int(self.model.geom_matid[self.model.geom(name).id]) for name in ("table", "floor")}
         self.model.geom_matid[:] = -1  # plain surfaces render faster without a material
         self._nominal = {name: getattr(self.model, name).copy() for name in self.RANDOMISABLE}
@@ -117,9 +118,6 @@ class CompiledScene:
         for index in range(count):
             self.place_block(index, 0.52, 0.12 * (index - (self.present - 1) / 2), 0.0)
         self.place_arm(self.robot.kinematics.home, self.robot.widest)
-
-    def _body_of(self, geom: int) -> str:
-        return str(self.model.body(self.model.geom_bodyid[geom]).name)
 
     def paint_blocks(self, names: list[str], rgb: Array) -> None:
         """Set each block's colour (count, 3) and its name in instructions."""
@@ -200,11 +198,7 @@ class CompiledScene:
 
     def turn_camera(self, camera: int, rotation: Array) -> None:
         """Turn camera `camera` by the rotation vector `rotation` (3,) [rad] in its own frame."""
-        turn, turned = np.empty(4), np.empty(4)
-        angle = float(np.linalg.norm(rotation))
-        mujoco.mju_axisAngle2Quat(turn, rotation / angle if angle > 0 else np.array([1.0, 0, 0]), angle)
-        mujoco.mju_mulQuat(turned, self.model.cam_quat[camera], turn)
-        self.model.cam_quat[camera] = turned
+        mujoco.mju_quatIntegrate(self.model.cam_quat[camera], rotation, 1.0)
 
     def place_block(self, index: int, x: float, y: float, yaw: float) -> None:
         """Put block `index` on the table at (x, y) [m], turned by `yaw` [rad]."""
@@ -241,16 +235,13 @@ class CompiledScene:
             int(mujoco.mjtGeom.mjGEOM_SPHERE): "sphere",
             int(mujoco.mjtGeom.mjGEOM_CAPSULE): "capsule",
         }
-        for geom in np.flatnonzero(model.geom_group == 2):
+        for geom in np.flatnonzero(model.geom_group == VISIBLE):
             kind = kinds.get(int(model.geom_type[geom]))
             if kind is None:
                 continue
             vertices = faces = None
             if kind == "mesh":
-                mesh = model.geom_dataid[geom]
-                vertex, face = model.mesh_vertadr[mesh], model.mesh_faceadr[mesh]
-                vertices = model.mesh_vert[vertex : vertex + model.mesh_vertnum[mesh]].copy()
-                faces = model.mesh_face[face : face + model.mesh_facenum[mesh]].copy()
+                vertices, faces = (values.copy() for values in mesh_triangles(model, int(model.geom_dataid[geom])))
             name = model.geom(geom).name or f"geom{geom}"
             body = model.body(model.geom_bodyid[geom]).name
             place = (model.geom_pos[geom].copy(), model.geom_quat[geom].copy(), model.geom_size[geom].copy())

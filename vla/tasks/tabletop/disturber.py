@@ -25,7 +25,7 @@ from vla.tasks.tabletop.goals.goal import Subgoal, WorldState
 from vla.tasks.tabletop.outcome import CLEAR
 from vla.tasks.tabletop.scene import PAD_RADIUS
 
-PUSH = 0.04  # largest motion of a push per control step [m]
+PUSH_STEP = 0.04  # largest motion of a push per control step [m]
 OPEN_STEPS = 3  # control steps for which a drop keeps the gripper open
 APPROACH = 0.2  # distance between tool and block at which it is being approached [m]
 ABOVE = 0.02  # height of the gripper above an object at which it can be moved [m]
@@ -120,7 +120,7 @@ class Disturber:
     def _push(self, state: WorldState) -> str:
         """Begin a push in the first direction that ends in the area."""
         for place in self._around(state.tool):
-            self._steps_left = max(1, math.ceil(self._drawn.distance / PUSH))
+            self._steps_left = max(1, math.ceil(self._drawn.distance / PUSH_STEP))
             self.motion = np.append(place - state.tool[:2], 0.0) / self._steps_left
             self.offset = self.motion
             return f"push: the arm is pushed by {100 * self._drawn.distance:.1f} cm"

@@ -21,14 +21,13 @@ from vla.tasks.tabletop.goals.goal import Goal
 from vla.tasks.tabletop.goals.mixed import Mixed
 from vla.tasks.tabletop.panda import Panda
 from vla.tasks.tabletop.randomize.randomizer import Randomizer
-from vla.tasks.tabletop.robot import Robot
+from vla.tasks.tabletop.robot import VISIBLE, Robot
 from vla.tasks.tabletop.robot_file import RobotFile
 from vla.tasks.tabletop.scene import COLOURS, Scene
 from vla.tasks.tabletop.simulation import CONTROL_HZ, Simulation
 
 TRANSLATION = 0.04  # largest translation per step [m]
 ROTATION = 0.25  # largest rotation per step [rad]
-VISIBLE = 2  # group of the geoms in pictures
 MILLIMETRES = 1000.0  # of a metre
 QUANTILES = np.array([NormalDist().inv_cdf((index + 0.5) / 256) for index in range(256)])  # of the normal distribution
 
@@ -109,7 +108,7 @@ class Tabletop(Blindable):
         self.done, self.outcome, self.task = True, "timeout", ""
         self.milestones: frozenset[str] = frozenset()
         self.draws: dict[str, Any] = {}
-        self._renderers = renderer
+        self._renderer_factory = renderer
         self._renderer: Renderer | None = None
         self._changed = True
 
@@ -224,7 +223,8 @@ class Tabletop(Blindable):
         if self._renderer is None:
             compiled, (height, width) = self.simulation.compiled, self.spec.image_size
             cameras = [compiled.cameras[name] for name in self.spec.cameras]
-            self._renderer = self._renderers.open(compiled.model, View(cameras, height, width, geom_groups=(VISIBLE,)))
+            view = View(cameras, height, width, geom_groups=(VISIBLE,))
+            self._renderer = self._renderer_factory.open(compiled.model, view)
         return self._renderer
 
     def look(self) -> Observation:

@@ -42,7 +42,7 @@ class Waypoint:
         """
         self._low, self._high = np.array(spec.low), np.array(spec.high)
         if spec.robot is None or spec.robot.gripper is None:
-            raise ValueError("expert=waypoint acts in task=tabletop only: choose the expert of this task")
+            raise ValueError("the expert of the tabletop acts in task=tabletop only: choose the expert of this task")
         self._gripper = spec.state.index(spec.robot.gripper)
         self.info: dict[str, Any] = {}
 

@@ -91,6 +91,10 @@ class Silence(Grammar):
         self.phrasings = self.held_out_phrasings = ("",)
         self.words, self.held_out_words, self.held_out_colours, self.slots = {}, {}, (), set()
 
+    def renamed(self, slots: Mapping[str, str]) -> Silence:
+        """No slots."""
+        return self
+
     @property
     def held_out_kinds(self) -> tuple[HeldOut, ...]:
         """No kinds."""

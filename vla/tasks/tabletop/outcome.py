@@ -35,14 +35,14 @@ class OutcomeClassifier:
         self._hold_steps = hold_steps
         self._held_for = 0
         self._near = self._lifted = self._lifted_other = self._dropped = self._holding = False
-        self._manner: Skill | None = None
+        self._skill: Skill | None = None
         self._height, self._block = 0.0, -1
 
     def update(self, state: WorldState, subgoals: Sequence[Subgoal], named: Sequence[int]) -> None:
         """Update with one step: its state, its subgoals, the indices of the named blocks."""
         self._held_for = self._held_for + 1 if all(subgoal.done for subgoal in subgoals) else 0
         now = current(subgoals)
-        block, self._manner = now.block, now.skill
+        block, self._skill = now.block, now.skill
         if block != self._block:
             self._block, self._near, self._lifted, self._holding, self._dropped = block, False, False, False, False
         self._near |= bool(
@@ -68,12 +68,12 @@ class OutcomeClassifier:
         """Success, or the name of the failure so far."""
         if self.success:
             return "success"
-        if self._manner == "stay":
+        if self._skill == "stay":
             return "did_not_stay"
         if not self._lifted:
             if self._lifted_other:
                 return "wrong_object"
-            if self._manner == "push" and self._near:
+            if self._skill == "push" and self._near:
                 return "not_placed"
             return "missed_grasp" if self._near else "never_reached"
         if self._holding:
@@ -84,6 +84,6 @@ class OutcomeClassifier:
     def milestones(self) -> frozenset[str]:
         """ "grasped" after the block was lifted, or "reached" after the tool came near a block to be pushed; empty for
         "stay"."""
-        if self._manner in (None, "stay") or self.outcome not in GRASPED:
+        if self._skill in (None, "stay") or self.outcome not in GRASPED:
             return frozenset()
-        return frozenset({"reached" if self._manner == "push" else "grasped"})
+        return frozenset({"reached" if self._skill == "push" else "grasped"})

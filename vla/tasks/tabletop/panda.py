@@ -23,7 +23,17 @@ from vla.robots.panda import (
     PANDA,
 )
 from vla.spec import Array, RobotModel
-from vla.tasks.tabletop.robot import CORNERS, FINGERTIP_CONTACT, ROBOT_CONTACT, CameraPose, Robot, look_at, spread
+from vla.tasks.tabletop.robot import (
+    CORNERS,
+    FINGERTIP_CONTACT,
+    HIDDEN,
+    ROBOT_CONTACT,
+    VISIBLE,
+    CameraPose,
+    Robot,
+    look_at,
+    spread,
+)
 
 # Mass [kg], centre of mass [m] and inertia xx yy zz xy xz yz [kg m²]: franka_description, inertial.yaml (identified
 # by Gaz et al., "Dynamic Identification of the Franka Emika Panda Robot", RA-L 2019).
@@ -66,7 +76,7 @@ LINKS: tuple[dict[str, Any], ...] = (
 )
 TORQUE = (87, 87, 87, 87, 12, 12, 12)  # [N m], Franka Control Interface documentation, "Limits for Panda"
 STIFFNESS = (4500, 4500, 3500, 3500, 2000, 2000, 2000)  # position servo [N m/rad], as in MuJoCo Menagerie's Panda
-DAMPING_RATIO = 0.05  # servo damping over stiffness [s]: tracks within a control period without overshoot
+LEAD = 0.05  # servo damping over stiffness [s]: tracks within a control period without overshoot
 ARMATURE = 0.1  # reflected rotor inertia [kg m²], as in MuJoCo Menagerie's Panda
 HAND_MASS, FINGER_MASS = 0.73, 0.015  # [kg], franka_description, hand.xacro
 FINGER_OFFSET = 0.0584  # hand to finger along z [m], ibid.
@@ -109,7 +119,7 @@ class Panda(Robot):
     """Seven position-servoed joints with gravity compensation and a gripper whose fingers share one servo."""
 
     prefix = "panda/"
-    arm, kinematics, lead = ARM, PANDA, DAMPING_RATIO
+    arm, kinematics, lead = ARM, PANDA, LEAD
     joints = servos = tuple(f"panda/joint{index}" for index in range(1, 8))
     fingers, grips, tool = ("panda/left_finger", "panda/right_finger"), ("panda/fingers",), "panda/tcp"
     fingertips = (("panda/left_pad",), ("panda/right_pad",))
@@ -145,9 +155,9 @@ class Panda(Robot):
                 self.root.asset.add("mesh", name=f"{name}_seen", file=str(folder / "visual" / f"{name}.stl"))
 
     def _add_mesh(self, body: mjcf.Element, mesh: str, rgba: tuple[float, ...], collide: bool = True) -> None:
-        body.add("geom", type="mesh", mesh=f"{mesh}_seen", group=2, rgba=rgba, mass=0, **NO_CONTACT)
+        body.add("geom", type="mesh", mesh=f"{mesh}_seen", group=VISIBLE, rgba=rgba, mass=0, **NO_CONTACT)
         if collide:
-            body.add("geom", type="mesh", mesh=mesh, group=3, mass=0, **ROBOT_CONTACT)
+            body.add("geom", type="mesh", mesh=mesh, group=HIDDEN, mass=0, **ROBOT_CONTACT)
 
     def _add_link(self, parent: mjcf.Element, index: int, link: dict[str, Any]) -> mjcf.Element:
         body = parent.add("body", name=f"link{index + 1}", pos=CHAIN[index][:3], quat=CHAIN[index][3:], gravcomp=1)
@@ -161,7 +171,7 @@ class Panda(Robot):
             name=f"joint{index + 1}",
             joint=joint,
             kp=STIFFNESS[index],
-            kv=STIFFNESS[index] * DAMPING_RATIO,
+            kv=STIFFNESS[index] * LEAD,
             ctrlrange=limits,
             forcerange=(-TORQUE[index], TORQUE[index]),
         )
@@ -176,7 +186,7 @@ class Panda(Robot):
         axes = look_at(WRIST.position, WRIST.target, (1, 0, 0))
         hand.add("camera", name="wrist", pos=WRIST.position, xyaxes=(*axes[:, 0], *axes[:, 1]), fovy=WRIST.fovy)
         fingers = []
-        for side, euler in (("left", (0, 0, 0)), ("right", (0, 0, 3.141592653589793))):
+        for side, euler in (("left", (0, 0, 0)), ("right", (0, 0, np.pi))):
             finger = hand.add("body", name=f"{side}_finger", pos=(0, 0, FINGER_OFFSET), euler=euler, gravcomp=1)
             finger.add("inertial", mass=FINGER_MASS, pos=(0, 0, 0), diaginertia=(2.375e-6, 2.375e-6, 7.5e-7))
             fingers.append(
@@ -199,7 +209,7 @@ class Panda(Robot):
                 size=(0.0085, 0.004, 0.0085),
                 pos=(0, 0.0045, 0.0445),
                 rgba=DARK,
-                group=2,
+                group=VISIBLE,
                 mass=0,
                 **FINGERTIP_CONTACT,
                 **ROBOT_CONTACT,

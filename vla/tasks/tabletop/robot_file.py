@@ -8,7 +8,7 @@ slip, a tool frame and a wrist camera.
 from __future__ import annotations
 
 from importlib.util import find_spec
-from itertools import product
+from itertools import pairwise, product
 from os.path import normpath
 from pathlib import Path
 from typing import Annotated, Literal
@@ -23,7 +23,7 @@ from vla.io.types import Inherited, Names, Point, Positive, Text
 from vla.robots.cartesian import LIMIT_MARGIN, Kinematics, rotation_z
 from vla.spec import Array, RobotModel
 from vla.tasks.tabletop import robot_spec
-from vla.tasks.tabletop.robot import Robot
+from vla.tasks.tabletop.robot import TIMESTEP, Robot
 
 PREFIX = "robot/"  # of the names of all elements in the scene
 FREQUENCY = 100.0  # natural frequency of a joint of the arm with its servo, at home [rad/s]
@@ -34,7 +34,6 @@ FASTEST = 0.02  # time in which its whole force moves a finger through its trave
 CLOSING = 0.2  # shortest time in which the gripper closes [s]
 OPENINGS, SETTLING = 17, 250  # commands at which the opening is measured; steps in which the fingers come to rest
 LEAST_TRAVEL = 0.02  # change of the opening of a gripper that can hold a block [m]
-TIMESTEP = 0.004  # of the scene [s]
 ASIDE = 0.08  # largest distance between the tool point and the middle between the closed fingertips [m]
 FAR = 1.0  # up to which an opening is measured [m]
 
@@ -257,17 +256,10 @@ class RobotFile(Robot):
 
     def _chain(self) -> tuple[tuple[float, ...], ...]:
         """Return the chain of the arm, as in `vla.spec.RobotModel`, with every joint's axis as its z axis."""
-        self.kinematics.forward(np.zeros(len(self.joints)))
-        data, chain = self._data, []
-        before = np.eye(4)
-        for name in self.joints:
-            index = self._model.joint(name).id
-            chain.append(_relative(before, _frame(data.xanchor[index], data.xaxis[index])))
-            before = _frame(data.xanchor[index], data.xaxis[index])
-        tool = data.site(self.tool)
-        pose = np.eye(4)
-        pose[:3, :3], pose[:3, 3] = tool.xmat.reshape(3, 3), tool.xpos
-        return (*chain, _relative(before, pose))
+        tool, _ = self.kinematics.forward(np.zeros(len(self.joints)))
+        indices = [self._model.joint(name).id for name in self.joints]
+        frames = [_frame(self._data.xanchor[index], self._data.xaxis[index]) for index in indices]
+        return tuple(_relative(before, frame) for before, frame in pairwise([np.eye(4), *frames, tool]))
 
 
 class InstalledRobot(RobotFile):

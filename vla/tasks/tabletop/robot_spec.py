@@ -17,13 +17,13 @@ import numpy as np
 from vla.io.suggestion import suggestion
 from vla.robots.cartesian import DOWN
 from vla.spec import Array
-from vla.tasks.tabletop.robot import CORNERS, FINGERTIP_CONTACT, ROBOT_CONTACT, look_at, spread
+from vla.tasks.rendering.shapes import mesh_triangles
+from vla.tasks.tabletop.robot import CORNERS, FINGERTIP_CONTACT, HIDDEN, ROBOT_CONTACT, VISIBLE, look_at, spread
 
 HAND = "hand_"  # in front of the names in a hand's own file
 TOOL, SERVO, WRIST = "vla_tool", "vla_servo_", "wrist"  # names of what is added
 ALIGNED = 0.9  # smallest cosine between the axes of the tool's site and forward, left, down at home
 FOVY = 75.0  # of the wrist camera [degrees]
-VISIBLE, HIDDEN = 2, 3  # groups of geoms
 SEEN_GROUPS = 3  # the first groups, which MuJoCo draws
 UNCOLOURED = (0.5, 0.5, 0.5, 1.0)  # what MuJoCo gives geoms without a colour
 LISTED = 30  # names in an error
@@ -263,8 +263,7 @@ def lighten(spec: mujoco.MjSpec, model: mujoco.MjModel) -> None:
 def _add_hull(spec: mujoco.MjSpec, model: mujoco.MjModel, mesh: str, name: str) -> bool:
     """Add the hull of a mesh, unless it is flat; return whether."""
     index = model.mesh(mesh).id
-    start, count = model.mesh_vertadr[index], model.mesh_vertnum[index]
-    points = np.asarray(model.mesh_vert[start : start + count], float)
+    points = np.asarray(mesh_triangles(model, index)[0], float)
     if np.linalg.matrix_rank(points - points.mean(0), tol=1e-3) < 3:
         return False
     turn = np.empty(9)
@@ -276,10 +275,8 @@ def _add_hull(spec: mujoco.MjSpec, model: mujoco.MjModel, mesh: str, name: str) 
 
 def corners(model: mujoco.MjModel, geom: int) -> Array:
     """Return points (N, 3) in the frame of a geom whose hull contains it [m]: vertices of a mesh, else of a box."""
-    mesh = model.geom_dataid[geom]
     if model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_MESH:
-        start = model.mesh_vertadr[mesh]
-        return np.asarray(model.mesh_vert[start : start + model.mesh_vertnum[mesh]], float)
+        return np.asarray(mesh_triangles(model, int(model.geom_dataid[geom]))[0], float)
     return model.geom_aabb[geom, :3] + np.array([*product((-1, 1), repeat=3)]) * model.geom_aabb[geom, 3:]
 
 

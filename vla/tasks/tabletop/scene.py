@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from dm_control import mjcf
 
-from vla.tasks.tabletop.robot import CameraPose, Robot, look_at
+from vla.tasks.tabletop.robot import TIMESTEP, VISIBLE, CameraPose, Robot, look_at
 
 COLOURS: dict[str, tuple[float, float, float]] = {
     "red": (0.85, 0.10, 0.10),
@@ -47,7 +47,7 @@ class Block:
             density=BLOCK_DENSITY,
             condim=4,
             friction=(1.0, 0.01, 0.0002),
-            group=2,
+            group=VISIBLE,
             **BLOCK_CONTACT,
         )
 
@@ -55,7 +55,7 @@ class Block:
 class Scene:
     """The complete scene; `CompiledScene` indexes its compiled model."""
 
-    def __init__(self, robot: Robot, blocks: int = 4, shadows: bool = True) -> None:
+    def __init__(self, robot: Robot, blocks: int, shadows: bool = True) -> None:
         """Args: the robot; number of blocks; whether the lamp casts shadows."""
         self._root = mjcf.RootElement(model="tabletop")
         self._root.compiler.angle = "radian"
@@ -77,7 +77,7 @@ class Scene:
 
     def _set_physics(self) -> None:
         option = self._root.option
-        option.timestep, option.integrator = 0.004, "implicitfast"
+        option.timestep, option.integrator = TIMESTEP, "implicitfast"
         option.cone, option.impratio = "elliptic", 10  # prevent slip of held blocks
 
     def _set_quality(self) -> None:
@@ -111,7 +111,7 @@ class Scene:
             pos=(*TABLE_CENTRE, -TABLE_HALF_SIZE[2]),
             rgba=(0.72, 0.66, 0.58, 1),
             friction=(1.0, 0.01, 0.0002),
-            group=2,
+            group=VISIBLE,
             material=self._add_material("table", repeat=(3, 4)),
         )
         world.add(
@@ -121,7 +121,7 @@ class Scene:
             size=(3, 3, 0.1),
             pos=(0, 0, -0.75),
             rgba=(0.45, 0.46, 0.48, 1),
-            group=2,
+            group=VISIBLE,
             material=self._add_material("floor", repeat=(6, 6)),
         )
         for name, rgb in PADS.items():
@@ -134,7 +134,7 @@ class Scene:
                 rgba=(*rgb, 1),
                 contype=0,
                 conaffinity=0,
-                group=2,
+                group=VISIBLE,
             )
 
     def _add_material(self, name: str, repeat: tuple[int, int]) -> mjcf.Element:

@@ -14,7 +14,7 @@ from vla.robots.cartesian import CartesianController, solve
 from vla.spec import FIRST_SEED, Array
 from vla.tasks.streams import Streams
 from vla.tasks.tabletop.compiled_scene import CompiledScene
-from vla.tasks.tabletop.disturber import PUSH, Disturber
+from vla.tasks.tabletop.disturber import PUSH_STEP, Disturber
 from vla.tasks.tabletop.goals.chain import Chain
 from vla.tasks.tabletop.goals.goal import SKILLS, Goal, Referents, WorldState, current
 from vla.tasks.tabletop.goals.mixed import Mixed
@@ -103,7 +103,7 @@ class Simulation:
         self._command = np.append(self.controller.joints, self.compiled.grip)
         data.ctrl[:] = self.compiled.controls(self._command[None])[0]
         delay = round(self.compiled.latency / self._physics.timestep())
-        self._late = np.tile(data.ctrl, (delay, 1))  # controls of the last steps of physics that are still to come
+        self._late = np.tile(data.ctrl, (delay, 1))  # controls that are delayed by the latency, oldest first
         self._start()
         self._axes = draws
         self.draws = self._described()
@@ -237,7 +237,7 @@ class Simulation:
     def _disturbed(self, joints: Array, opening: float, seconds: float) -> tuple[Array, float]:
         """Return joint targets and opening under the disturbance; the tool is pushed no faster than by an action."""
         assert self.disturber
-        furthest = PUSH * CONTROL_HZ * seconds
+        furthest = PUSH_STEP * CONTROL_HZ * seconds
         self._shove += np.clip(self.disturber.offset - self._shove, -furthest, furthest)
         if self._shove.any():
             kinematics = self.scene.robot.kinematics

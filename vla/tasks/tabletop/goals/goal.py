@@ -25,7 +25,7 @@ class WorldState:
     """True state of the world after a step; B blocks on the table, Z pads."""
 
     positions: Array  # (B, 3) centres of the blocks [m]
-    starts: Array  # (B, 3) centres at the start of the episode [m]
+    starts: Array  # (B, 3) centres when the instruction was given [m]
     extents: Array  # (B, 3) half sizes, upright [m]
     speeds: Array  # (B,) of the centres [m/s]
     lifts: Array  # (B,) largest height above the start so far [m]

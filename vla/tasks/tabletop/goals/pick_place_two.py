@@ -7,7 +7,7 @@ import numpy as np
 from vla.tasks.tabletop.goals.goal import Referents, Subgoal, WorldState, placed
 from vla.tasks.tabletop.goals.pick_place import PickPlace
 
-CLEAR = 0.06  # distance at which the tool has left a block [m]
+LEFT = 0.06  # distance at which the tool has left a block [m]
 
 
 class PickPlaceTwo(PickPlace):
@@ -18,7 +18,7 @@ class PickPlaceTwo(PickPlace):
     def subgoals(self, state: WorldState, referents: Referents) -> list[Subgoal]:
         """Place and leave the first block, then place the second."""
         (first, second), (one, other) = referents.blocks, referents.pads
-        left = bool(np.linalg.norm(state.tool - state.positions[first]) > CLEAR)
+        left = bool(np.linalg.norm(state.tool - state.positions[first]) > LEFT)
         done = placed(state, first, one, self.radius) and left, placed(state, second, other, self.radius)
         return [
             Subgoal(first, state.on_table(first, state.pads[one]), "place", done[0]),

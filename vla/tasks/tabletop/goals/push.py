@@ -12,8 +12,8 @@ class Push(Goal):
     pads = 2
 
     def __init__(self, radius: Positive, highest: Positive, **inherited: Inherited) -> None:
-        """Args: maximum distance between the centres of block and pad, and maximum height above the table during the
-        episode [m]."""
+        """Args: largest distance between the centres of block and pad, and largest rise of the block above its start,
+        while the instruction is carried out [m]."""
         super().__init__(**inherited)
         self.radius, self.highest = radius, highest
 

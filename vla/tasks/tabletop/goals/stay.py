@@ -8,7 +8,7 @@ from vla.io.types import Count
 from vla.tasks.tabletop.goals.goal import Goal, Referents, Subgoal, WorldState
 from vla.tasks.tabletop.language import Grammar, Silence
 
-AT_REST = 0.05  # speed of the fastest joint below which the arm is at rest [rad/s]
+ARM_AT_REST = 0.05  # speed of the fastest joint below which the arm is at rest [rad/s]
 REST_STEPS = 15  # consecutive control steps for which it must rest
 UNMOVED = 0.01  # largest displacement of a block that counts as none [m]
 
@@ -35,7 +35,7 @@ class Stay(Goal):
         """Keep every block in place and the arm at rest."""
         (block,) = referents.blocks
         moved = np.linalg.norm(state.positions - state.starts, axis=1)
-        done = state.arm_speed < AT_REST and bool((moved < UNMOVED).all())
+        done = state.arm_speed < ARM_AT_REST and bool((moved < UNMOVED).all())
         return [Subgoal(block, state.positions[block], "stay", done)]
 
 

@@ -21,7 +21,7 @@ class Disturbances:
 
     kinds: Annotated[Sequence[Kind], MinLen(1), Predicate(unique)]  # to draw from
     times: NaturalRange  # range of how often it happens
-    start: NaturalRange  # range of the steps before a push, without the first
+    start: NaturalRange  # range of the steps before a push, beside the first one
     delay: NaturalRange  # of the steps for which anything else is possible before it happens
     push: Lengths  # range of the distance by which the arm is pushed [m]
     move: Lengths  # of that by which an object is moved [m]

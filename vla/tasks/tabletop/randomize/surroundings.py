@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 from annotated_types import Ge, Le
@@ -66,24 +66,29 @@ class Cameras:
 
 @dataclass(frozen=True)
 class Colour:
-    """A random colour."""
+    """Colour of a surface."""
 
+    surface: ClassVar[str]
     brightness: Shares  # range of brightness, 0…1
     tint: Share  # maximum change of each channel
 
-    def draw(self, random_state: np.random.RandomState) -> Array:
-        """Draw (3,) red, green and blue, which the tint may move beyond 0…1."""
-        return random_state.uniform(*self.brightness) + random_state.uniform(-self.tint, self.tint, 3)
+    def __call__(self, scene: CompiledScene, random_state: np.random.RandomState) -> dict[str, Any]:
+        """Draw a colour, which the tint may move beyond 0…1; the surface shows the nearest one within."""
+        rgb = random_state.uniform(*self.brightness) + random_state.uniform(-self.tint, self.tint, 3)
+        scene.model.geom_rgba[scene.model.geom(self.surface).id, :3] = np.clip(rgb, 0, 1)
+        return {"rgb": rounded(rgb)}
 
 
 class Table(Colour):
     """Colour of the table."""
 
-    def __call__(self, scene: CompiledScene, random_state: np.random.RandomState) -> dict[str, Any]:
-        """Draw a colour."""
-        rgb = self.draw(random_state)
-        scene.model.geom_rgba[scene.model.geom("table").id, :3] = rgb
-        return {"rgb": rounded(rgb)}
+    surface = "table"
+
+
+class Background(Colour):
+    """Colour of the floor around the table."""
+
+    surface = "floor"
 
 
 @dataclass(frozen=True)
@@ -113,13 +118,3 @@ def _pattern(kind: str, random_state: np.random.RandomState) -> Array:
     if kind == "stripes":
         return ((across // width) % 2).astype(float)
     return ((across // width + along // width) % 2).astype(float)
-
-
-class Background(Colour):
-    """Colour of the floor around the table."""
-
-    def __call__(self, scene: CompiledScene, random_state: np.random.RandomState) -> dict[str, Any]:
-        """Draw a colour."""
-        rgb = self.draw(random_state)
-        scene.model.geom_rgba[scene.model.geom("floor").id, :3] = np.clip(rgb, 0, 1)
-        return {"rgb": rounded(rgb)}
