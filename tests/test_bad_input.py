@@ -87,7 +87,12 @@ NONSENSE = {
             "trainer.max_steps=0",
         ),
         *("trainer.val_check_interval=0", "trainer.accumulate_grad_batches=0", "trainer.devices=-7"),
-        *("trainer.val_check_interval=0.5", "trainer.val_check_interval=null", "trainer.max_epochs=3"),
+        *(
+            "trainer.val_check_interval=0.5",
+            "trainer.val_check_interval=null",
+            "trainer.max_epochs=3",
+            "trainer.max_epochs=null",
+        ),
         *("trainer.devices=abc", "trainer.devices='1,x'"),
         *("trainer.gradient_clip_val=-1", "trainer.limit_val_batches=-1", "trainer.precision=17"),
     ),

@@ -21,7 +21,7 @@ SKIPPED = ("lock",)
 def train(folder: Path) -> None:
     """What a training does with a store before and while it learns from every step."""
     store = EpisodeStore.create_or_open(folder, ARM_SPEC, CONFIG)
-    assert store.statistics.steps
+    assert len(store.statistics.actions)
     windows = WindowDataModule(
         folder,
         ARM_SPEC,

@@ -55,12 +55,10 @@ def test_the_files_can_be_read_without_this_package(tmp_path: Path) -> None:
 
 def test_statistics_are_those_of_all_stored_actions(tmp_path: Path) -> None:
     statistics = add(tmp_path, EPISODES).statistics
-    actions = np.concatenate([episode.actions for episode in EPISODES if episode.success]).astype(np.float64)
+    actions = np.concatenate([episode.actions for episode in EPISODES if episode.success])
+    np.testing.assert_array_equal(statistics.actions, actions)
     np.testing.assert_array_equal(statistics.low, actions.min(0))
     np.testing.assert_array_equal(statistics.high, actions.max(0))
-    np.testing.assert_allclose(statistics.mean, actions.mean(0), rtol=1e-12)
-    np.testing.assert_allclose(statistics.std, actions.std(0), rtol=1e-9, atol=1e-12)
-    assert statistics.steps == len(actions)
 
 
 def test_a_sample_of_chunks_stays_within_its_episodes_and_its_size(
@@ -83,7 +81,7 @@ def test_a_sample_of_chunks_stays_within_its_episodes_and_its_size(
 def test_a_reader_can_keep_to_the_first_episodes(tmp_path: Path) -> None:
     add(tmp_path, EPISODES)
     assert [entry.seed for entry in EpisodeStore(tmp_path, episodes=2).episodes] == [0, 1]
-    assert EpisodeStore(tmp_path, episodes=2).statistics.steps == sum(len(episode.actions) for episode in EPISODES[:2])
+    assert len(EpisodeStore(tmp_path, episodes=2).statistics.actions) == sum(len(each.actions) for each in EPISODES[:2])
     with pytest.raises(ValueError, match="holds 4 of 9 episodes"):
         EpisodeStore(tmp_path, episodes=9)
 

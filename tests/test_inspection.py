@@ -187,7 +187,7 @@ def test_stores_of_several_configs_keep_them_apart(tmp_path: Path) -> None:
     require_whole(verify_store(merged))
     assert [entry.seed for entry in merged.episodes] == [0, 1, 1, 2]
     assert find_episode(merged, 0)[0] == CONFIG and find_episode(merged, 2)[0] == {"task": {"size": 2.0}}
-    with pytest.raises(ValueError, match="has 2 episodes of seed 1: ask one of the stores"):
+    with pytest.raises(ValueError, match="has 2 episodes of seed 1: inspect one of the stores"):
         find_episode(merged, 1)
     add(tmp_path / "third", MORE[6:7])
     derive_store([merged, EpisodeStore(tmp_path / "third")], tmp_path / "again")
@@ -198,7 +198,7 @@ def test_a_store_that_was_put_together_serves_training_and_does_not_grow(tmp_pat
     derive_store([add(tmp_path / "store", EPISODES)], tmp_path / "chosen", {"seed": [1, 2]})
     chosen = EpisodeStore.create_or_open(tmp_path / "chosen", ARM_SPEC, {"task": {"size": 3.0}})
     assert [entry.seed for entry in chosen.episodes] == [1, 2] and chosen.derived
-    assert chosen.statistics.steps == len(EPISODES[1].actions) + len(EPISODES[2].actions)
+    assert len(chosen.statistics.actions) == len(EPISODES[1].actions) + len(EPISODES[2].actions)
     assert collect(chosen, make_environment, make_expert, episodes=2, cluster=LocalCluster(1), seed=0).added == 0
     with pytest.raises(ValueError, match=r"cannot grow: set collect\.episodes=2"):
         collect(chosen, make_environment, make_expert, episodes=3, cluster=LocalCluster(1), seed=0)
@@ -226,6 +226,13 @@ def test_conditions_choose_episodes(tmp_path: Path, name: str) -> None:
     assert [entry.seed for entry in store.tried] == [episode.seed for episode in MORE if fits(episode)]
     assert store.config["where"] == [where]
     require_whole(verify_store(store))
+
+
+def test_an_empty_draw_fits_no_condition(tmp_path: Path) -> None:
+    lacks: dict[int, list[str]] = {1: [], 2: ["depth"]}
+    episodes = [replace(EPISODES[seed], draws={"lacks": values}) for seed, values in lacks.items()]
+    derive_store([add(tmp_path / "store", episodes)], tmp_path / "chosen", {"lacks": "depth"})
+    assert [entry.seed for entry in EpisodeStore(tmp_path / "chosen").tried] == [2]
 
 
 def test_conditions_that_cannot_be_meant_are_refused(tmp_path: Path) -> None:
@@ -267,7 +274,7 @@ def test_a_seed_that_is_not_there_is_named(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="has no seed 7: it holds 0 to 4"):
         find_episode(store, 7)
     with pytest.raises(
-        ValueError, match=r"seed 3 in .* ended as timeout, and only successes are kept: there is 2 or 4"
+        ValueError, match=r"seed 3 in .* ended as timeout, and its steps were not kept: there is 2 or 4"
     ):
         find_episode(store, 3)
     change(tmp_path / "action.bin", lambda data: flip(data, 0))

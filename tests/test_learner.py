@@ -37,7 +37,7 @@ def test_the_error_of_a_component_is_the_mean_distance_over_what_is_valid() -> N
     batch = make_batch(1)
     batch["valid"][0] = False
     metrics = make_trainer(1).validate(learner, loader(batch, 1), verbose=False)[0]
-    logits = model(learner.prepare(batch))["logits"]
+    logits = model(learner.on_after_batch_transfer(batch, 0))["logits"]
     error = (model.tokenizer.decode_logits(logits) - batch["action"]).abs()[1:, ..., 0].mean() * 1000
     assert metrics["val/error_x_mm"] == pytest.approx(error.item(), rel=1e-4)
 
@@ -126,7 +126,7 @@ def test_a_checkpoint_holds_what_it_takes_to_build_the_policy(tmp_path: Path) ->
     assert checkpoint.config == CONFIG and checkpoint.spec == SPEC
     model = make_bc()
     checkpoint.restore(model)
-    batch = learner.prepare(make_batch(1))
+    batch = learner.on_after_batch_transfer(make_batch(1), 0)
     assert torch.equal(model.eval()(batch)["logits"], learner.model.eval()(batch)["logits"])
 
 

@@ -223,7 +223,8 @@ def test_a_checkpoint_is_read_as_it_was_written(tmp_path: Path) -> None:
     assert checkpoint.config == CONFIG and checkpoint.spec == SPEC
     checkpoint.restore(make_bc())
     header = read_header(tmp_path / "a.ckpt")
-    assert (header.config, header.spec) == (CONFIG, SPEC)
+    assert (header.config, header.spec, header.windows) == (CONFIG, SPEC, "")
+    assert read_header(save(tmp_path / "b.ckpt", OwnDataModule={"windows": "ab"})).windows == "ab"
 
 
 def test_weights_of_another_model_are_refused(tmp_path: Path) -> None:

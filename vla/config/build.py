@@ -106,7 +106,7 @@ def device_list(text: str) -> bool:
 NARROWER: dict[str, dict[str, Any]] = {
     "lightning.Trainer": {
         "max_steps": Literal[-1] | Count,
-        "max_epochs": Literal[-1] | None,  # an epoch never ends
+        "max_epochs": Literal[-1],  # an epoch never ends
         "devices": Literal["auto", -1]
         | Count
         | Annotated[list[Natural], MinLen(1)]

@@ -43,7 +43,7 @@ def _recording(expert: str) -> Recording:
         raise ValueError(
             "task=recorded needs recorded demonstrations: expert=lerobot expert.folder=DIR, or an expert of your own"
         )
-    return target.recording(options)
+    return target.recording(**options)
 
 
 OmegaConf.register_new_resolver("recorded", recorded, replace=True)

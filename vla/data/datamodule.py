@@ -141,21 +141,22 @@ class WindowDataModule(LightningDataModule):
         """
         stores = [EpisodeStore(self._folder, self._episodes), *map(EpisodeStore, self._more)]
         rows = [max((entry.end for entry in store.episodes), default=0) for store in stores]
-        sides: dict[bool, list[Array]] = {False: [], True: []}
+        trained, unseen = list[Array](), list[Array]()
         for store, first in zip(stores, np.cumsum([0, *rows]), strict=False):
             there = store.spec if store.spec.truth else replace(store.spec, truth=self._spec.truth)
             self._spec.require(there, "the model", f"the episode store {store.folder}")
             for entry in store.episodes:
-                sides[held_out(entry.seed, self._fraction)].append(first + np.arange(entry.start, entry.end))
+                side = unseen if held_out(entry.seed, self._fraction) else trained
+                side.append(first + np.arange(entry.start, entry.end))
         episodes = [entry for store in stores for entry in store.episodes]
-        if not sides[False] or (self._fraction > 0 and not sides[True]):
+        if not trained or (self._fraction > 0 and not unseen):
             raise ValueError(
-                f"{len(episodes)} episodes leave {len(sides[False])} for training and {len(sides[True])} for "
-                f"validation: raise collect.episodes, or set data.validation_fraction (now {self._fraction})"
+                f"{len(episodes)} episodes leave {len(trained)} for training and {len(unseen)} for validation: raise "
+                f"collect.episodes, or set data.validation_fraction (now {self._fraction})"
             )
         self._digest = digest_of(episodes)
-        self.training_windows = np.concatenate(sides[False])  # row numbers
-        self.held_out_windows = np.concatenate(sides[True]) if sides[True] else np.empty(0, np.int64)
+        self.training_windows = np.concatenate(trained)  # row numbers
+        self.held_out_windows = np.concatenate([np.empty(0, np.int64), *unseen])
         layout = self._history, self._chunk, self._depth, self._on_gpu(), self._spec.truth_size
         self.make_batch = JoinedBatcher([WindowBatcher(store, *layout) for store in stores], rows)
 

@@ -7,7 +7,7 @@ all of them do.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from fnmatch import fnmatchcase
 from typing import Any
 
@@ -23,36 +23,37 @@ def facts(entry: Entry) -> dict[str, Any]:
     return {**{name: getattr(entry, name) for name in FACTS}, **flat(entry.draws)}
 
 
-class EpisodeFilter:
-    """Predicate of index entries: all conditions match. An entry that lacks a named value does not match."""
+def episode_filter(where: Mapping[str, Any], entries: Iterable[Entry]) -> Callable[[Entry], bool]:
+    """Return the predicate of index entries that all conditions match.
 
-    def __init__(self, where: Mapping[str, Any], entries: Iterable[Entry]) -> None:
-        """Args:
+    An entry matches a condition if it has values of that name, and all of them match.
+
+    Args:
         where: name of a fact → condition.
         entries: the entries to filter; each name must occur in one of them.
 
-        Raises:
-            ValueError: a name occurs in no entry, or a condition is of another kind.
-        """
-        self._where = where
-        known = dict.fromkeys(name for entry in entries for name in facts(entry))
-        for name, condition in where.items():
-            if name not in known:
-                hint = suggestion(name, known) or f": there are {', '.join(known)}"
-                raise ValueError(f"inspect.where: no episode has {name}{hint}")
-            if not (isinstance(condition, (str, bool, int, float)) or _is_range(condition) or _is_texts(condition)):
-                raise ValueError(
-                    f"inspect.where: {name} must be a text, in which * stands for anything, a number, a range "
-                    f"[low, high] or a list of texts, not {condition!r}"
-                )
+    Raises:
+        ValueError: a name occurs in no entry, or a condition is of another kind.
+    """
+    known = dict.fromkeys(name for entry in entries for name in facts(entry))
+    for name, condition in where.items():
+        if name not in known:
+            hint = suggestion(name, known) or f": there are {', '.join(known)}"
+            raise ValueError(f"inspect.where: no episode has {name}{hint}")
+        if not (isinstance(condition, (str, bool, int, float)) or _is_range(condition) or _is_texts(condition)):
+            raise ValueError(
+                f"inspect.where: {name} must be a text, in which * stands for anything, a number, a range "
+                f"[low, high] or a list of texts, not {condition!r}"
+            )
 
-    def __call__(self, entry: Entry) -> bool:
-        """Return whether `entry` matches."""
-        known = facts(entry)
+    def matches(entry: Entry) -> bool:
+        values = {name: leaves(value) for name, value in facts(entry).items() if name in where}
         return all(
-            name in known and all(_matches(value, condition) for value in leaves(known[name]))
-            for name, condition in self._where.items()
+            values.get(name) and all(_matches(value, condition) for value in values[name])
+            for name, condition in where.items()
         )
+
+    return matches
 
 
 def _is_range(condition: Any) -> bool:

@@ -27,7 +27,7 @@ from filelock import FileLock, Timeout
 from vla.data.header import fields_of, header_of, images_of, is_store, read_header, write_header
 from vla.data.image_codec import JPEG, PackedRows, whole_rows
 from vla.data.index import SALVAGE, Entry, dumps, index_line, listed, parse_line, read_index
-from vla.data.statistics import Statistics, statistics_of
+from vla.data.statistics import Statistics
 from vla.spec import Array, Episode, Observation, Spec
 
 Rows = Array | PackedRows
@@ -88,8 +88,8 @@ class EpisodeStore:
         store.require(plain)
         return store
 
-    def require(self, config: Mapping[str, Any], seed: int | None = None) -> None:
-        """Raise a ValueError if the episodes have another config or start at another seed.
+    def require(self, config: Mapping[str, Any]) -> None:
+        """Raise a ValueError if the episodes have another config.
 
         A derived store may differ: its episodes were chosen explicitly.
         """
@@ -99,8 +99,6 @@ class EpisodeStore:
         different = sorted(key for key in {*asked, *there} if asked.get(key) != there.get(key))
         if different:
             raise ValueError(f"{self.folder} was collected with another config for {different}: choose another folder")
-        if seed is not None:
-            self.require_first_seed(seed)
 
     def require_first_seed(self, seed: int) -> None:
         """Raise a ValueError if the first episode has another seed; a derived store may begin anywhere."""
@@ -125,11 +123,12 @@ class EpisodeStore:
 
     @property
     def statistics(self) -> Statistics:
-        """Moments and a sample of the actions in `episodes`; a ValueError if there are none, or if they are damaged."""
+        """Bounds and a sample of the actions in `episodes`; a ValueError if there are none, or if they are damaged."""
         self.require_episodes()
         actions = self.rows("action")
         self.verify(self.episodes, {"action": actions})
-        return statistics_of(self.episodes, np.asarray(actions))
+        ends = np.array([entry.end for entry in self.episodes])
+        return Statistics(np.asarray(actions)[: ends[-1]], ends)
 
     def rows(self, field: str) -> Rows:
         """Return all committed rows of `field`, (N, …), which are read when they are indexed.

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from rich.progress import track
 
-from vla.data.episode_filter import EpisodeFilter
+from vla.data.episode_filter import episode_filter
 from vla.data.episodes import EpisodeStore, observations_of, stored
 from vla.data.index import DAMAGED, LOST, NOT_NEEDED, Entry, listed
 from vla.spec import Array, Episode
@@ -110,18 +110,18 @@ def find_episode(store: EpisodeStore, seed: int) -> tuple[dict[str, Any], Episod
     if not found:
         seeds = [entry.seed for entry in store.tried]
         raise ValueError(f"{store.folder} has no seed {seed}: it holds {listed(seeds) or 'none yet'}")
-    stored = [(config, entry) for config, entry in found if entry.stored]
-    if not stored:
+    kept = [(config, entry) for config, entry in found if entry.stored]
+    if not kept:
         seeds = sorted({entry.seed for entry in store.episodes}, key=lambda other: abs(other - seed))[:2]
         raise ValueError(
-            f"seed {seed} in {store.folder} ended as {found[0][1].outcome}, and only successes are kept: there is "
+            f"seed {seed} in {store.folder} ended as {found[0][1].outcome}, and its steps were not kept: there is "
             f"{' or '.join(map(str, seeds)) or 'none'}"
         )
-    if len(stored) > 1:
+    if len(kept) > 1:
         raise ValueError(
-            f"{store.folder} has {len(stored)} episodes of seed {seed}: ask one of the stores it is made of"
+            f"{store.folder} has {len(kept)} episodes of seed {seed}: inspect one of the stores that it was merged from"
         )
-    return stored[0][0], episode_of(store, stored[0][1])
+    return kept[0][0], episode_of(store, kept[0][1])
 
 
 def episode_of(store: EpisodeStore, entry: Entry) -> Episode:
@@ -201,7 +201,7 @@ Chosen = dict[str, dict[int, list[Found]]]  # config as JSON → seed → its co
 
 
 def _choose(stores: Sequence[EpisodeStore], where: Mapping[str, Any]) -> Chosen:
-    matches = EpisodeFilter(where, [entry for store in stores for entry in store.tried])
+    matches = episode_filter(where, [entry for store in stores for entry in store.tried])
     chosen: Chosen = {}
     for store in stores:
         for config, entries in entries_by_config(store):
@@ -245,11 +245,9 @@ def _write(store: EpisodeStore, found: Sequence[Found], repair: bool) -> bool:
 def _rows_of(store: EpisodeStore, entry: Entry) -> tuple[dict[str, Array], str]:
     """Return the rows of an episode and a description of their damage, or an empty text."""
     try:
-        rows = store.read(entry) if entry.steps else {}
+        rows = store.read(entry)
     except ValueError:
-        rows = {}
-    if not rows:
-        return rows, "rows changed or lost"
+        return {}, "rows changed or lost"
     if not all(np.isfinite(values).all() for values in rows.values() if values.dtype.kind == "f"):
         return rows, "numbers that are not finite"
     return rows, ""

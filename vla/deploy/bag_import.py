@@ -91,9 +91,31 @@ class BagDemonstrations(ImportedDemonstrations):
         self._beyond = 0
 
     @classmethod
-    def recording(cls, options: Mapping[str, Any]) -> Recording:
+    def recording(
+        cls,
+        folder: Path | str | None,
+        steps: str,
+        topics: Mapping[str, Any],
+        status: str,
+        robot: Mapping[str, Any],
+        image_crop: str,
+    ) -> Recording:
         """Describe a bag: its state and action are the joints, see `ImportedDemonstrations.recording`."""
-        return _recording(**options)
+        arm = Robot(**{name: value for name, value in robot.items() if name != "_target_"})
+        named = Topics(**{name: value for name, value in topics.items() if name != "_target_"})
+        with opened(_folder_of(folder)) as reader:
+            there = {connection.topic for connection in reader.connections}
+        images = {camera: topic for camera, topic in named.images.items() if topic in there} or named.images
+        index = read_index(_folder_of(folder), replace(named, images=images), arm, status)
+        track = index.commands if index.commands.times else index.measured
+        values = np.transpose(track.values)
+        bounds = {name: action_bounds(each) for name, each in zip(arm.joints, values, strict=True)}
+        cameras = tuple(images)
+        taken = [each.at for _, each in index.inputs if isinstance(each, Picture) and each.camera == cameras[0]]
+        period = float(np.median(np.diff(taken))) if len(taken) > 1 else 0.0
+        rate = round(1 / period, 1) if period > 0 else 1.0
+        joints = tuple(arm.joints)
+        return Recording(cameras, rate, joints, joints, bounds, len(_chosen(index, steps)))
 
     def __len__(self) -> int:
         """Return the number of episodes."""
@@ -211,30 +233,6 @@ def _chosen(index: BagIndex, steps: str) -> list[Stretch]:
     if not found:
         raise ValueError(f"{index.folder} has no instruction that an arm followed")
     return found
-
-
-def _recording(
-    folder: Path | str | None,
-    steps: str,
-    topics: Mapping[str, Any],
-    status: str,
-    robot: Mapping[str, Any],
-    image_crop: str,
-) -> Recording:
-    arm = Robot(**{name: value for name, value in robot.items() if name != "_target_"})
-    named = Topics(**{name: value for name, value in topics.items() if name != "_target_"})
-    with opened(_folder_of(folder)) as reader:
-        there = {connection.topic for connection in reader.connections}
-    images = {camera: topic for camera, topic in named.images.items() if topic in there} or named.images
-    index = read_index(_folder_of(folder), replace(named, images=images), arm, status)
-    track = index.commands if index.commands.times else index.measured
-    bounds = {name: action_bounds(values) for name, values in zip(arm.joints, np.transpose(track.values), strict=True)}
-    cameras = tuple(images)
-    taken = [each.at for _, each in index.inputs if isinstance(each, Picture) and each.camera == cameras[0]]
-    period = float(np.median(np.diff(taken))) if len(taken) > 1 else 0.0
-    rate = round(1 / period, 1) if period > 0 else 1.0
-    joints = tuple(arm.joints)
-    return Recording(cameras, rate, joints, joints, bounds, len(_chosen(index, steps)))
 
 
 def _runs(flags: Sequence[bool]) -> list[tuple[int, int]]:

@@ -284,7 +284,7 @@ class PolicyNode(GuardedLifecycleNode):
             return self._drop(f"camera {camera}: {error}")
         if self._sizes.get(camera) != image.shape:
             self._sizes[camera] = image.shape
-            if resizing := images.describe_resize(image, self.policy.spec.image_size, self._crop):
+            if resizing := images.describe_resize(image.shape, self.policy.spec.image_size, self._crop):
                 self.get_logger().info(f"camera {camera}: {resizing}")
         age = age_of(stamp, self.get_clock().now().nanoseconds * 1e-9)
         self._record("image age", age)

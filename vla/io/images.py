@@ -29,14 +29,14 @@ def resize(image: Array, size: tuple[int, int], crop: Crop) -> Array:
     return np.array(cropped.resize((size[1], size[0]), Image.Resampling.BILINEAR, reducing_gap=3.0))
 
 
-def describe_resize(image: Array, size: tuple[int, int], crop: Crop) -> str:
-    """Describe what `resize` does to an image (H, W, 3); empty if it has that size already."""
-    if image.shape[:2] == size:
+def describe_resize(shape: tuple[int, ...], size: tuple[int, int], crop: Crop) -> str:
+    """Describe what `resize` does to images (H, W, …); empty if they have that size already."""
+    if shape[:2] == size:
         return ""
-    rows, columns = _crop_region(image.shape, size, crop)
+    rows, columns = _crop_region(shape, size, crop)
     height, width = rows.stop - rows.start, columns.stop - columns.start
-    crop_text = f"cropped at the centre to {width} by {height} and " if (height, width) != image.shape[:2] else ""
-    return f"images of {image.shape[1]} by {image.shape[0]} pixels are {crop_text}resized to {size[1]} by {size[0]}"
+    crop_text = f"cropped at the centre to {width} by {height} and " if (height, width) != shape[:2] else ""
+    return f"images of {shape[1]} by {shape[0]} pixels are {crop_text}resized to {size[1]} by {size[0]}"
 
 
 def _crop_region(shape: tuple[int, ...], size: tuple[int, int], crop: Crop) -> tuple[slice, slice]:

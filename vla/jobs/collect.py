@@ -57,7 +57,8 @@ def complete_store(experiment: Experiment) -> EpisodeStore | None:
     if not is_store(folder):
         return None
     store = EpisodeStore(folder)
-    store.require(experiment.source, asked["seed"])
+    store.require(experiment.source)
+    store.require_first_seed(asked["seed"])
     return store if len(store.episodes) >= asked["episodes"] else None
 
 

@@ -12,8 +12,8 @@ import torch
 from torch import Tensor, nn
 
 from vla.io.types import Inherited, Layers, NonNegative, Width
-from vla.models.chunk_policy import ChunkModel, mean_where, transformer_decoder
-from vla.models.model import Batch, Prediction, require_heads
+from vla.models.chunk_policy import ChunkModel, transformer_decoder
+from vla.models.model import Batch, Prediction, mean_where, require_heads
 
 
 class CVAEEncoder(nn.Module):
@@ -108,7 +108,7 @@ class ACT(ChunkModel):
     def action_loss(self, output: dict[str, Tensor], batch: Batch) -> dict[str, Tensor]:
         """Return the L1 error of the scaled actions plus, in training, the weighted KL divergence of the latent."""
         distance = (output["actions"].float() - self.scaled(batch["action"][:, -1])).abs()  # (B, k, D)
-        losses = {"action_loss": mean_where(distance, batch["valid"][:, -1])}
+        losses = {"action_loss": mean_where(distance.mean(-1), batch["valid"][:, -1])}
         if "mean" in output:
             mean, log_variance = output["mean"].float(), output["log_variance"].float()
             divergence = (mean.square() + log_variance.exp() - 1 - log_variance).sum(-1) / 2  # (B,)

@@ -105,15 +105,15 @@ def _header(path: Path, content: dict[str, Any]) -> Header:
             f"{path} is no checkpoint of this project: its configuration lacks {', '.join(REQUIRED_NODES)}"
         )
     finished = content.get("finished") is True
-    trained_on = content.get("WindowDataModule")
-    windows = trained_on.get("windows") if isinstance(trained_on, dict) else None
+    states = [part for part in content.values() if isinstance(part, dict)]  # that of the data module among them
+    windows = next((part["windows"] for part in states if isinstance(part.get("windows"), str)), "")
     return Header(
         path,
         config,
         Spec.from_dict(spec, f"{path}: spec"),
         finished,
         steps if isinstance(steps, int) else 0,
-        windows if isinstance(windows, str) else "",
+        windows,
     )
 
 

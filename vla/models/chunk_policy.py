@@ -57,8 +57,3 @@ def transformer_decoder(width: int, layers: int, heads: int) -> nn.Module:
     """Build a pre-norm transformer decoder without dropout."""
     layer = nn.TransformerDecoderLayer(width, heads, 4 * width, 0.0, "gelu", batch_first=True, norm_first=True)
     return nn.TransformerDecoder(layer, layers, nn.LayerNorm(width))
-
-
-def mean_where(values: Tensor, valid: Tensor) -> Tensor:
-    """Return the mean of (…, k, D) values where the (…, k) bool `valid` is true."""
-    return (values.mean(-1) * valid).sum() / valid.sum().clamp(min=1)

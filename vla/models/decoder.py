@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from vla.io.types import Inherited, Layers, Rate, Width
 from vla.models.frame_tokens import FrameModel
-from vla.models.model import Batch, Prediction, newest, require_heads
+from vla.models.model import Batch, Prediction, mean_where, newest, require_heads
 from vla.models.tokenizers.tokenizer import PerComponent
 
 
@@ -129,7 +129,7 @@ class Decoder(FrameModel):
         logits, tokens = output["logits"].float(), output["tokens"]
         mask = self.tokenizer.loss_mask(tokens, batch["valid"][:, -1])  # (B, L)
         losses = self.tokenizer.token_losses(logits, tokens, batch["action"][:, -1])
-        result = {"action_loss": (losses * mask).sum() / mask.sum().clamp(min=1)}
+        result = {"action_loss": mean_where(losses, mask)}
         if not self.training:
             result["token_accuracy"] = (logits.argmax(-1) == tokens)[mask].float().mean()
         return result

@@ -13,8 +13,8 @@ import torch
 from torch import Tensor, nn
 
 from vla.io.types import Inherited, Layers, NonNegative, Steps
-from vla.models.chunk_policy import ChunkModel, mean_where, transformer_decoder
-from vla.models.model import Batch, Prediction, require_heads
+from vla.models.chunk_policy import ChunkModel, transformer_decoder
+from vla.models.model import Batch, Prediction, mean_where, require_heads
 
 MAX_FREQUENCY, MIN_FREQUENCY = 100.0, 1.0  # of the time embedding [rad]; time runs from 0 to 1
 
@@ -122,7 +122,7 @@ class DenoisingModel(ChunkModel):
         uniform = torch.rand(len(action), generator=generator).to(action)
         noisy, time, target = self.corrupt(action, noise, uniform)
         error = (self.denoiser(noisy, time, context).float() - target).square()
-        return {"action_loss": mean_where(error, batch["valid"][:, -1].repeat(self.copies, 1))}
+        return {"action_loss": mean_where(error.mean(-1), batch["valid"][:, -1].repeat(self.copies, 1))}
 
     def predict(self, batch: Batch) -> Prediction:
         """Denoise the "noise" of the batch, or else a fixed noise."""

@@ -129,11 +129,7 @@ class Learner(LightningModule):
         return {**moved, "instruction": batch["instruction"]}
 
     def on_after_batch_transfer(self, batch: Batch, dataloader_idx: int) -> Batch:
-        """Tokenize the instructions, outside the compiled part."""
-        return self.prepare(batch)
-
-    def prepare(self, batch: Batch) -> Batch:
-        """Return the batch with its tokenized instructions as `text`."""
+        """Return the batch with its tokenized instructions as `text`: outside the compiled part."""
         return {**batch, "text": self.model.text.tokenize(batch["instruction"]).to(batch["state"].device)}
 
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:

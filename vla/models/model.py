@@ -14,7 +14,6 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from vla.io.types import Inherited, NonNegative, Steps, Width
-from vla.models.fsdp import sum_over_processes
 from vla.models.kinematics import ForwardKinematics
 from vla.models.text.ngrams import TextEncoder
 from vla.models.tokenizers.tokenizer import ActionTokenizer, PerComponent
@@ -59,16 +58,28 @@ class RunningNormalizer(nn.Module):
         return normalized * present.unsqueeze(-1)
 
     def _update(self, values: Tensor, weight: Tensor) -> None:
-        added = sum_over_processes(weight.sum())
+        added = _sum_over_processes(weight.sum())
         total = (self.count + added).clamp(min=1)
-        mean = sum_over_processes((values * weight).sum((0, 1))) / added.clamp(min=1)
-        squares = sum_over_processes(((values - mean).square() * weight).sum((0, 1)))
+        mean = _sum_over_processes((values * weight).sum((0, 1))) / added.clamp(min=1)
+        squares = _sum_over_processes(((values - mean).square() * weight).sum((0, 1)))
         # Parallel variance algorithm (Chan et al. 1979).
         shift = mean - self.mean
         between = shift.square() * self.count * added / total
         self.variance.copy_((self.variance * self.count + squares + between) / total)
         self.mean.add_(shift * added / total)
         self.count.add_(added)
+
+
+def mean_where(values: Tensor, mask: Tensor) -> Tensor:
+    """Return the mean of values where the bool mask of the same shape is true; 0 if it is so nowhere."""
+    return (values * mask).sum() / mask.sum().clamp(min=1)
+
+
+def _sum_over_processes(tensor: Tensor) -> Tensor:
+    """Sum a tensor in place over all processes of a training."""
+    if torch.distributed.is_available() and torch.distributed.is_initialized():
+        torch.distributed.all_reduce(tensor)
+    return tensor
 
 
 class Prediction(NamedTuple):
@@ -193,7 +204,7 @@ class Model(nn.Module, ABC):
             known = batch["present"][:, -frames:] & truth.isfinite().all(-1)
             target = self.truth_scale(truth.nan_to_num(), known)
             error = (output["truth"].float() - target).square().mean(-1)  # (B, T')
-            losses["truth_loss"] = (error * known).sum() / known.sum().clamp(min=1)
+            losses["truth_loss"] = mean_where(error, known)
             losses["loss"] = losses["loss"] + self.auxiliary * losses["truth_loss"]
         return losses
 
@@ -219,7 +230,7 @@ class TokenModel(Model):
         logits = output["logits"]
         frames = logits.shape[1]
         action, valid = batch["action"][:, -frames:], batch["valid"][:, -frames:]
-        losses = {"action_loss": self.tokenizer.loss(logits, action, valid)}
+        losses = {"action_loss": mean_where(self.tokenizer.cross_entropy(logits.float(), action).mean(-1), valid)}
         if not self.training:
             correct = logits.argmax(-1) == self.tokenizer.encode(action)  # (B, T', k, D)
             losses["token_accuracy"] = correct[valid].float().mean()

@@ -24,7 +24,7 @@ log = logging.getLogger(__name__)
 FOUND = "VLA_LAST"  # environment variable that passes the run found by resume=last to other processes
 LOCK = ".training"  # held by the process that trains into a folder
 
-LENGTHS = ("max_steps", "max_epochs", "max_time")  # of the trainer
+LENGTHS = ("max_steps", "max_time")  # of the trainer
 
 
 @dataclass(frozen=True)

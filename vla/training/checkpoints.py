@@ -79,7 +79,7 @@ class GracefulStop(Checkpoint):
     ) -> None:
         """Stop if requested, unless gradients are being accumulated or a validation follows."""
         self._step_complete = (batch_idx + 1) % trainer.accumulate_grad_batches == 0
-        if not _validates(trainer, batch_idx):
+        if not _validates(trainer):
             self._stop(trainer)
 
     def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
@@ -141,7 +141,7 @@ class PeriodicCheckpoint(Checkpoint):
         """Save if due, unless a validation follows."""
         step = trainer.global_step
         self._due, self._step = step != self._step and step % SAVE_EVERY == 0, step
-        if not _validates(trainer, batch_idx):
+        if not _validates(trainer):
             self._save(trainer)
 
     def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
@@ -154,9 +154,10 @@ class PeriodicCheckpoint(Checkpoint):
             trainer.save_checkpoint(self._path, weights_only=False)
 
 
-def _validates(trainer: Trainer, batch_idx: int) -> bool:
+def _validates(trainer: Trainer) -> bool:
+    """Return whether a validation follows this batch, counted from the start of the training."""
     every = trainer.val_check_batch
-    return bool(trainer.enable_validation and every and (batch_idx + 1) % every == 0)
+    return bool(trainer.enable_validation and every and (trainer.fit_loop.total_batch_idx + 1) % every == 0)
 
 
 class AtomicCheckpointIO(TorchCheckpointIO):

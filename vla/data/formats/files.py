@@ -9,6 +9,7 @@ from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import contextmanager, suppress
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import Any, Generic, TypeVar
@@ -116,17 +117,9 @@ class Files(FolderExporter):
 
 
 def provenance(entry: Entry) -> dict[str, Any]:
-    """Return seed, instruction, outcome, draws and checksums of an episode, as JSON values."""
-    return {
-        "seed": entry.seed,
-        "task": entry.task,
-        "instruction": entry.instruction,
-        "outcome": entry.outcome,
-        "milestones": list(entry.milestones),
-        "steps": entry.steps,
-        "draws": entry.draws,
-        "crc": entry.crc,
-    }
+    """Return an index entry as JSON values, without its place in the store."""
+    fields = {**asdict(entry), "milestones": list(entry.milestones)}
+    return {name: value for name, value in fields.items() if name != "start"}
 
 
 def write_json(path: Path, value: Any) -> None:

@@ -39,7 +39,7 @@ class ImportedDemonstrations(ABC):
     spec: Spec
 
     @classmethod
-    def recording(cls, options: Mapping[str, Any]) -> Recording:
+    def recording(cls, **options: Any) -> Recording:
         """Describe the recording that `options`, the arguments of the constructor but the spec, name.
 
         Raises:

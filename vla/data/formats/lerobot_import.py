@@ -20,6 +20,7 @@ from vla.data.formats.imported_demonstrations import ImportedDemonstrations, Rec
 from vla.data.formats.lerobot_compatibility import mismatches, out_of_bounds
 from vla.data.formats.lerobot_dataset import LeRobotDataset
 from vla.data.formats.lerobot_tables import REMEDY
+from vla.io.images import describe_resize
 from vla.io.types import Count, Text, unique
 from vla.spec import Array, Episode, Spec
 
@@ -77,9 +78,21 @@ class LeRobotDemonstrations(ImportedDemonstrations):
         dataset.open(spec.cameras, list(dict.fromkeys([*state, *action, *extra, *executed])))
 
     @classmethod
-    def recording(cls, options: Mapping[str, Any]) -> Recording:
+    def recording(
+        cls, folder: Path | str | None, images: dict[str, Text] | None, state: Keys, action: Keys, every: Count
+    ) -> Recording:
         """Describe a dataset, see `ImportedDemonstrations.recording`."""
-        return _recording(**options)
+        dataset = _opened(folder, images)
+        states, actions = dataset.components(state), dataset.components(action)
+        values = dataset.read(action)
+        return Recording(
+            cameras=tuple(dataset.images),
+            control_hz=dataset.info.fps / every,
+            state=tuple(states),
+            action=tuple(actions),
+            bounds={name: action_bounds(values[key][:, at]) for name, (key, at) in actions.items()},
+            episodes=len(dataset.table("meta/episodes", {"episode_index": tables.counts})),
+        )
 
     def __len__(self) -> int:
         """Return the number of episodes."""
@@ -150,12 +163,10 @@ class LeRobotDemonstrations(ImportedDemonstrations):
 
     def fill(self, store: EpisodeStore, episodes: int) -> int:
         """Append episodes, and log what an import changes: the size of images, and actions beyond the bounds."""
-        size = self.spec.image_size
         for camera in self.spec.cameras:
-            height, width = self._dataset.info.features[self._dataset.images[camera]].image_size
-            if (height, width) != size:
-                cropped = "cropped at the centre and " if height * size[1] != width * size[0] else ""
-                log.info("camera %s: images of %d x %d are %sresized to %d x %d", camera, height, width, cropped, *size)
+            shape = self._dataset.info.features[self._dataset.images[camera]].image_size
+            if resizing := describe_resize(shape, self.spec.image_size, "centre"):
+                log.info("camera %s: %s", camera, resizing)
         if self._beyond:
             log.info("%.2g %% of the actions are clipped to the bounds of the task", 100 * self._beyond)
         return super().fill(store, episodes)
@@ -165,22 +176,6 @@ def _opened(folder: Path | str | None, images: dict[str, Text] | None) -> LeRobo
     if folder is None:
         raise ValueError("expert=lerobot needs a dataset: name its folder with expert=lerobot expert.folder=DIR")
     return LeRobotDataset(Path(folder), images)
-
-
-def _recording(
-    folder: Path | str | None, images: dict[str, Text] | None, state: Keys, action: Keys, every: Count
-) -> Recording:
-    dataset = _opened(folder, images)
-    states, actions = dataset.components(state), dataset.components(action)
-    values = dataset.read(action)
-    return Recording(
-        cameras=tuple(dataset.images),
-        control_hz=dataset.info.fps / every,
-        state=tuple(states),
-        action=tuple(actions),
-        bounds={name: action_bounds(values[key][:, at]) for name, (key, at) in actions.items()},
-        episodes=len(dataset.table("meta/episodes", {"episode_index": tables.counts})),
-    )
 
 
 def _exported(spec: Spec) -> dict[str, dict[str, Any]]:

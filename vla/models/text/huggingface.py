@@ -16,10 +16,10 @@ import torch
 from torch import Tensor, nn
 
 from vla.io.documents import lines_of, mappings, parse_json, read_bounded
+from vla.models.hub import fetch
 from vla.models.packaged import PackagedFile
 from vla.models.text.ngrams import TextEncoder
 from vla.models.text.tensor_cache import TensorCache
-from vla.models.vision.hub import fetch
 
 log = logging.getLogger(__name__)
 

@@ -124,11 +124,6 @@ class PerComponent(ActionTokenizer):
         """Return the (…, D) cross-entropy of (…, D, K) logits against (…, D) actions."""
         return _hard_cross_entropy(logits, self.encode(action))
 
-    def loss(self, logits: Tensor, action: Tensor, valid: Tensor) -> Tensor:
-        """Return the mean cross-entropy of (…, D, K) logits and (…, D) actions where the (…) bool `valid` is true."""
-        losses = self.cross_entropy(logits.float(), action).mean(-1)  # (…)
-        return (losses * valid).sum() / valid.sum().clamp(min=1)
-
     def length(self, chunk: int) -> int:
         """Return k·D."""
         return chunk * self.components

@@ -15,9 +15,9 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from vla.io.types import Pixels, Width
+from vla.models.hub import fetch
 from vla.models.packaged import PackagedFile
 from vla.models.pickles import load_tensors
-from vla.models.vision.hub import fetch
 from vla.models.vision.image_tokenizer import FiLM, ImageEncoder
 
 log = logging.getLogger(__name__)
