@@ -168,7 +168,7 @@ def test_a_seed_that_brings_down_every_worker_is_reported(tmp_path: Path) -> Non
         with death:
             gather(folder, cluster(address), toy.make_deadly_environment)
         report = evaluate(deadly, toy_recordable.make_agent, None, seeds, cluster(address))
-    assert "die, killed for their memory" in report.errors[0].error
+    assert "die, perhaps for lack of memory" in report.errors[0].error
     assert [entry.seed for entry in EpisodeStore(folder).tried] == list(range(lines(folder)))
 
 

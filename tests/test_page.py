@@ -33,6 +33,7 @@ from vla.rollouts.recorder import RerunRecorder
 from vla.rollouts.results import Report, Result
 from vla.rollouts.rollout import rollout
 from vla.rollouts.statistics import pooled_interval
+from vla.runs.files import Training
 from vla.runs.folder import read_run, save_config, save_training
 from vla.spec import FIRST_SEED
 
@@ -54,7 +55,7 @@ def pictures(page: Path) -> list[Image.Image]:
 def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run that left everything, of the toy world."""
     folder = a_run(tmp_path_factory.mktemp("runs") / "whole", "sssdsd")
-    save_training(folder, 1_500_000, 40, 400.0, "done")
+    save_training(folder, Training(1_500_000, 40, 400.0, "done"))
     environment, recorder = make_environment(), RerunRecorder(folder / "recordings")
     episodes = [rollout(environment, ThinkingAgent(), seed, recorder) for seed in SEEN]
     report = Report(tuple(Result(each.seed, each.outcome, each.instruction) for each in episodes))
@@ -119,7 +120,7 @@ def test_a_page_refers_to_nothing_outside_and_runs_nothing(whole: Path, tmp_path
 def test_words_of_others_are_escaped(tmp_path: Path) -> None:
     folder = a_run(tmp_path / "run")
     save_config(folder, CONFIG, [{"key": "task.said", "here": SAID, "default": "<b>"}])
-    save_training(folder, 1, 1, 1.0, "the loss is <nan>")
+    save_training(folder, Training(1, 1, 1.0, "the loss is <nan>"))
     page = write_page(folder)
     assert SAID in text(page) and "Training failed: the loss is <nan>" in text(page)
     assert "<script" not in page.read_text() and "<nan>" not in page.read_text()
@@ -155,7 +156,7 @@ def test_what_is_missing_is_left_out(tmp_path: Path) -> None:
     for section in ("success", "Training", "Rollouts", "conditions", "differs"):
         assert section not in told
     (tmp_path / "metrics.csv").write_text(CURVES)
-    save_training(tmp_path, 1, 39, 3.0, "interrupted")
+    save_training(tmp_path, Training(1, 39, 3.0, "interrupted"))
     told = text(write_page(tmp_path))
     assert f"Training was interrupted after 39 steps; resume={tmp_path} continues it." in told
     assert "Rollouts" not in told

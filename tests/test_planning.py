@@ -96,6 +96,7 @@ def test_the_command_prints_a_row_per_design(tmp_path: Path, monkeypatch: pytest
     for words in ("a bar of 80 %", "different episodes", "24 % differ", f" {fixed} "):
         assert words in " ".join(told.split()), words
     assert json.loads((tmp_path / "one/report.json").read_text())["successes"] == 40
+    assert "2 % differ" in " ".join(here(tmp_path, *where[:3], "plan.discordant=0.02").stdout.split())  # the least
     wrong = here(tmp_path, *where, "plan.discordant=0.1", ok=False)
     assert "differ in 15 % to 25 % of the same episodes, not in 10 %" in wrong.stderr
     assert "are equal" in here(tmp_path, *where, "plan.rates=[0.5,0.5]", ok=False).stderr

@@ -24,7 +24,7 @@ def changed(**values: Any) -> Callable[[str], str]:
 
 def test_what_was_written_is_read(tmp_path: Path) -> None:
     folder = a_run(tmp_path / "run", "sd")
-    save_training(folder, 12, 40, 3.04, "done", 2.0)
+    save_training(folder, Training(12, 40, 3.0, "done", 2.0))
     save_choice(folder, "best.ckpt")
     run = read_run(folder)
     assert run.training == Training(12, 40, 3.0, "done", 2.0, "best.ckpt")
@@ -74,7 +74,7 @@ def test_a_file_of_another_kind_is_refused_by_name_with_a_way_out(
     file: str, content: str | Callable[[str], str], says: str, tmp_path: Path
 ) -> None:
     folder = a_run(tmp_path / "run")
-    save_training(folder, 12, 40, 3.0, "done")
+    save_training(folder, Training(12, 40, 3.0, "done"))
     path = folder / file
     path.write_text(content if isinstance(content, str) else content(path.read_text()))
     with pytest.raises(ValueError, match=says) as refused:
@@ -115,7 +115,7 @@ def test_a_damaged_description_of_the_training_costs_no_evaluation(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     folder = a_run(tmp_path / "run")
-    save_training(folder, 12, 40, 3.0, "done", 2.0)
+    save_training(folder, Training(12, 40, 3.0, "done", 2.0))
     for name in ("metrics.csv", "report.json", "config.yaml"):
         (folder / name).write_text("[1]")
     assert wall_time(folder / "checkpoints/last.ckpt", 1.0) == 6.0

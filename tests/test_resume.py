@@ -16,6 +16,7 @@ from vla.config.adopt import resume
 from vla.config.experiment import plain
 from vla.reports.evaluation import write_report
 from vla.rollouts.results import Report, Result
+from vla.runs.files import Training
 from vla.runs.folder import save_choice, save_training
 from vla.runs.resume import FOUND, TrainingProgress, cached_success, interrupted_run, training_progress
 
@@ -29,7 +30,7 @@ def leave(run: Path, config: dict[str, Any], finished: bool, chosen: str = "") -
     content = {"config": config, "spec": toy.SPEC.to_dict(), "state_dict": {}, "finished": finished}
     torch.save({**content, "global_step": steps}, run / "checkpoints/last.ckpt")
     if chosen:
-        save_training(run, 1, 1, 1.0, "done")
+        save_training(run, Training(1, 1, 1.0, "done"))
         save_choice(run, chosen)
 
 

@@ -45,13 +45,6 @@ def test_what_is_whole_is_not_repaired(tmp_path: Path, caplog: pytest.LogCapture
     assert "nothing is repaired" in caplog.text and [path.name for path in tmp_path.iterdir()] == ["store"]
 
 
-def test_no_stores_are_none(tmp_path: Path) -> None:
-    add(tmp_path / "store", EPISODES)
-    with pytest.raises(ValueError, match=r"inspect\.stores=\[\] is empty"):
-        inspect(tmp_path / "store", stores=[], into=str(tmp_path / "new"))
-    assert not (tmp_path / "new").exists()
-
-
 def test_stores_are_merged(tmp_path: Path) -> None:
     stores = [str(add(tmp_path / name, some).folder) for name, some in (("a", MORE[:4]), ("b", MORE[3:]))]
     inspect(tmp_path / "nowhere", stores=stores, into=str(tmp_path / "merged"))

@@ -17,17 +17,28 @@ from vla.reports.sweep import tabulate
 from vla.reports.sweep_plot import pareto, validated
 from vla.rollouts.comparison import compare_samples
 from vla.rollouts.results import Report, Result
+from vla.rollouts.sequential import anytime_interval
 from vla.rollouts.statistics import pooled_interval
 
 
-def cell(sweep: Path, number: int, overrides: list[str], successes: int, latency: float = 2.0, dark: int = 1) -> None:
+def cell(
+    sweep: Path,
+    number: int,
+    overrides: list[str],
+    successes: int,
+    latency: float = 2.0,
+    dark: int = 1,
+    anytime: bool = False,
+) -> None:
     """A cell as a run leaves it: 10 episodes, and 5 in the dark."""
     folder = sweep / str(number)
     (folder / ".hydra").mkdir(parents=True)
     (folder / ".hydra/overrides.yaml").write_text("".join(f"- {one}\n" for one in overrides))
     seen = ["success"] * successes + ["timeout"] * (10 - successes)
     in_the_dark = ["success"] * dark + ["dropped"] * (5 - dark) + ["error"] * 5
-    plain, other = (Report(tuple(map(Result, range(10), outcomes))) for outcomes in (seen, in_the_dark))
+    plain, other = (
+        Report(tuple(map(Result, range(10), outcomes)), anytime=anytime) for outcomes in (seen, in_the_dark)
+    )
     size = {"parameters": 2_000_000, "latency_ms": latency}
     write_report(plain, folder / "report.json", None, {}, size, {"dark": other})
 
@@ -113,6 +124,14 @@ def test_several_trainings_count_as_fewer_episodes_in_a_comparison(tmp_path: Pat
     independent = compare_samples(18, 20, 10, 20)
     assert independent.p < 0.05 < seen.found.p and seen.found.ci_low < independent.ci_low  # the trainings of rt1 differ
     assert seen.found.verdict == "open"
+
+
+def test_a_row_that_stopped_when_it_was_clear_has_its_anytime_valid_interval(tmp_path: Path) -> None:
+    cell(tmp_path, 0, ["model=bc"], 9, anytime=True)
+    low, high = (100 * bound for bound in anytime_interval(9, 1))
+    tabulate(tmp_path)
+    assert f"| 90.0 ({low:.1f}-{high:.1f}) |" in (tmp_path / "sweep.md").read_text()
+    assert "are anytime-valid" in (tmp_path / "sweep.html").read_text()
 
 
 def test_rows_of_other_worlds_are_not_compared(tmp_path: Path) -> None:

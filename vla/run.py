@@ -149,8 +149,8 @@ def _do(cfg: DictConfig) -> float | None:
     trust(composed.get("trust"), [composed["job"], *targets(composed)], packages(composed))
     cfg = _adopted(cfg, overrides)
     job = jobs.find(cfg.job).JOB
-    _require_sweepable(cfg, job)  # with the trainer that a run brings
     check(cfg, job)
+    _require_sweepable(cfg, job)  # with the trainer that a run brings
     if "task" in job.needs(cfg):
         cfg = with_substitutes(cfg, overrides)
     return jobs.run(Experiment.of(cfg, compose("config")))

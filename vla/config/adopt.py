@@ -22,8 +22,8 @@ from vla.models.checkpoint import read_header
 
 OF_POLICY = ("task", "tokenizer", "model")
 OF_MODEL = ("tokenizer", "model", "data")  # the batch size depends on the model
-# What a report on a policy includes of its training: nodes, which only an open-loop evaluation builds, and values of
-# other nodes.
+# Parts of a training that a report on its policy shows: whole nodes, which only an open-loop evaluation builds, and
+# single values of other nodes.
 REPORTED = ("expert", "data", "learner", "validate", "seed")
 CHOSEN = ("experiment", "model")  # groups in `chosen`
 PRESETS = ("experiment", "variant", "shift")  # groups and keys that change other groups
@@ -31,8 +31,9 @@ SCHEDULE = ("max_steps", "val_check_interval", "accumulate_grad_batches", "gradi
 REPORTED_VALUES = {"collect": ("episodes", "seed"), "trainer": (*SCHEDULE, "precision")}
 LAST = Path("checkpoints/last.ckpt")  # in the folder of a training
 OF_THIS_COMMAND = ("output", "resume", "trust")  # keys that are not taken from a resumed run
-MACHINES = ("accelerator", "devices", "num_nodes", "strategy")  # keys of the trainer that its options change in one
-IDENTITY = (  # keys that nothing changes in one, because they make another training
+# Keys of the trainer that trainer=OPTION changes in a resumed run.
+MACHINES = ("accelerator", "devices", "num_nodes", "strategy")
+IDENTITY = (  # keys that must not change in a resumed run: with other values it is another training
     *(group.name for group in GROUPS.values() if group.training == "part"),
     *("collect.episodes", "collect.seed", "collect.folder", "collect.more", "validate", "seed", "pretrained"),
     *(f"trainer.{name}" for name in ("val_check_interval", "accumulate_grad_batches", "gradient_clip_val")),

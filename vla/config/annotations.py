@@ -127,7 +127,7 @@ def fits(found: type, expected: Any) -> bool:
     if not isinstance(expected, type):
         return False
     if getattr(expected, "_is_protocol", False):
-        methods = {name for name, member in vars(expected).items() if inspect.isfunction(member)} - {"__init__"}
+        methods = {name for name, member in vars(expected).items() if inspect.isfunction(member)}
         return all(any(name in vars(base) for base in found.__mro__) for name in methods - IN_EVERY_PROTOCOL)
     return issubclass(found, expected)
 

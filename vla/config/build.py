@@ -16,6 +16,7 @@ from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, reduce
 from importlib import import_module
+from operator import or_
 from typing import Annotated, Any, Literal, get_args, get_origin
 
 from annotated_types import MinLen, Predicate
@@ -153,7 +154,7 @@ def build(node: Mapping[str, Any], group: str | Group, **runtime: Any) -> Any:
 def makes(group: Group) -> Any:
     """Return the class, protocol or union of the objects that a group describes."""
     classes = [getattr(import_module(module), name) for module, _, name in (p.rpartition(".") for p in group.makes)]
-    return classes[0] if len(classes) == 1 else classes[0] | classes[1]
+    return reduce(or_, classes)
 
 
 def check_node(key: str, node: Any, expected: Any, runtime: Sequence[str] = ()) -> None:

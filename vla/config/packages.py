@@ -124,4 +124,6 @@ def _names(variable: str) -> list[str]:
 
 def _made_for(distribution: str) -> bool:
     needed = [requirement for requirement in requires(distribution) or () if "extra ==" not in requirement]
-    return any(re.fullmatch(r"(vla|gymnasium)\b(?![.-]).*", requirement, re.DOTALL) for requirement in needed)
+    return any(
+        re.fullmatch(r"(vla|gymnasium)\b(?![.-]).*", requirement, re.DOTALL | re.IGNORECASE) for requirement in needed
+    )

@@ -9,7 +9,7 @@ import logging
 import time
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -29,7 +29,7 @@ from vla.rollouts.memory import make_impaired
 from vla.rollouts.realtime import Network, make_distant
 from vla.rollouts.results import Report, compare_conditions, compare_courses
 from vla.rollouts.rollout import AgentFactory
-from vla.rollouts.statements import AgainstBar, AgainstCondition, AgainstRun, Statement
+from vla.rollouts.statements import AgainstBar, AgainstRun, Statement, differs_clearly
 from vla.runs.files import Round
 from vla.runs.folder import (
     CHECKPOINTS,
@@ -185,18 +185,19 @@ def _play(experiment: Experiment, checkpoint: Path | None, statements: Sequence[
         agent: AgentFactory = make_agent,
         recorder: RecorderFactory | None = None,
     ) -> Report:
-        environment, tiers = experiment.make_environment(changes), task.get("tiers")  # of worlds that have them
-        until, limit = until if asked["until"] else None, asked["recordings"]
-        return evaluate(environment, agent, recorder, seeds, cluster, name, needs, tiers, until, limit, turns)
+        environment, limit = experiment.make_environment(changes), asked["recordings"]
+        until = until if asked["until"] else None
+        report = evaluate(environment, agent, recorder, seeds, cluster, name, needs, until, limit, turns)
+        return replace(report, tiers=task.get("tiers") or {})  # of worlds that have them
 
     world = experiment.world() if asked["until"] else None
     turns = len(world.tasks) if isinstance(world, Multitask) else 1
-    clear = [each.is_clear for each in statements]
-    first = played(IN_DISTRIBUTION, seeds, partial(_all, clear) if clear else None, recorder=recorder)
+    decided = (lambda report: all(each.is_clear(report) for each in statements)) if statements else None
+    first = played(IN_DISTRIBUTION, seeds, decided, recorder=recorder)
     reports, seeds = {IN_DISTRIBUTION: first}, [result.seed for result in first.results]
     changed = {name: changes for name, changes in conditions(asked).items() if with_changes(task, changes) != task}
     others = _other_agents(experiment, make_agent)
-    until = AgainstCondition(first, asked["margin"], len(changed) + len(others)).is_clear
+    until = partial(differs_clearly, first, asked["margin"], len(changed) + len(others))
     for name in conditions(asked):
         reports[name] = played(name, seeds, until, changed[name]) if name in changed else first
     return reports | {name: played(name, seeds, until, agent=agent) for name, agent in others.items()}
@@ -211,10 +212,6 @@ def _other_agents(experiment: Experiment, make_agent: AgentFactory) -> dict[str,
         for name, network in _networks(experiment).items()
     }
     return {**impaired, **distant}
-
-
-def _all(conditions: Sequence[Callable[[Report], bool]], report: Report) -> bool:
-    return all(each(report) for each in conditions)
 
 
 def _write(

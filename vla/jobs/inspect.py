@@ -67,8 +67,6 @@ def _chosen(
     folder: str, stores: list[str] | None, where: dict[str, Any] | None, repair: bool, into: str | None
 ) -> Path:
     """Return the path of the store to inspect; make it if needed."""
-    if stores == []:
-        raise ValueError("inspect.stores=[] is empty: omit it, or give at least one folder")
     if into is None and (stores or where):
         raise ValueError("inspect.stores and inspect.where make a new store: give its folder, inspect.into=DIR")
     if into is None and not repair:

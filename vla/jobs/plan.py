@@ -69,8 +69,8 @@ def plan_table(one: float, other: float, power: float, discordant: float | None)
     largest = min(one + other, 2 - one - other)
     if discordant is None:
         shares = {" (independent failures)": apart, " (the better never fails alone)": difference}
-    elif difference <= discordant <= largest + 1e-9:
-        shares = {"": discordant}
+    elif difference - 1e-9 <= discordant <= largest + 1e-9:
+        shares = {"": max(discordant, difference)}
     else:
         raise ValueError(
             f"policies of {_percent(one)} and {_percent(other)} differ in {_percent(difference)} to "

@@ -22,6 +22,7 @@ from vla.models.tokenizers.tokenization_error import describe_tokenization_error
 from vla.reports.first_batch import SHOWN, draw_samples
 from vla.reports.html import write_page
 from vla.rollouts.collect import collection_time
+from vla.runs.files import Training
 from vla.runs.folder import CHECKPOINTS, LAST, PAGE, SAMPLES, save_choice, save_config, save_training
 from vla.runs.resume import LENGTHS, TrainingProgress, first_process, training_lock, training_progress
 from vla.spec import Array
@@ -169,7 +170,8 @@ def _reported(
     finally:
         seconds = graceful_stop.seconds
         if trainer.is_global_zero:
-            save_training(output, parameters, trainer.global_step, seconds, ended, collection_s)
+            collected = collection_s and round(collection_s, 1)
+            save_training(output, Training(parameters, trainer.global_step, round(seconds, 1), ended, collected))
             with warn_on_error(output / PAGE):
                 write_page(output)
     log.info("trained %d steps in %.0f s", trainer.global_step, seconds)

@@ -154,8 +154,7 @@ class _DaskFuture:
                 raise self._pool.lost() from error
             except KilledWorker as error:
                 raise Crashed(
-                    f"the workers of {self._pool.cluster.address} die, killed for their memory or by a crash outside "
-                    "Python: see their output"
+                    f"the workers of {self._pool.cluster.address} die, perhaps for lack of memory: see their output"
                 ) from error
             self._pool.require_workers()
 
@@ -171,7 +170,7 @@ def _attempt(pool: str, make: WorkerFactory, item: Any) -> Any:
     if getattr(_cached, "pool", None) != pool:
         if hasattr(_cached, "worker"):
             _cached.worker.close()
-            del _cached.worker
+            del _cached.worker, _cached.pool
         _cached.worker, _cached.pool = make(), pool
     return _cached.worker.attempt(item)
 

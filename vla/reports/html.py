@@ -142,6 +142,7 @@ def write_sweep(
         lines=lines,
         heads=(choices, ["each seed [%]", "parameters [M]", "action [ms]"], "cells"),
         compared=[(each, comparison_texts(each.found)) for each in compared],
+        anytime=any(run.reports[IN_DISTRIBUTION].anytime for run in cells if run.report),
         curves=draw_runs({name: run.metrics for name, run in runs.items()}),
         cells=dict(zip(map(captions.get, runs), colours(len(runs)), strict=True)),
         pictures={overview.name: overview} if overview.is_file() else {},
@@ -157,8 +158,8 @@ def _write(path: Path, template: str, **content: Any) -> Path:
         lstrip_blocks=True,
     )
     environment.filters.update(percent=_percent, duration=_duration, brief=_brief, embedded=_embedded, svg=Markup)
-    colours: dict[str, Any] = {"green": GREEN, "red": RED, "blue": BLUE, "grey": GREY}
-    environment.globals.update(colours)
+    named: dict[str, Any] = {"green": GREEN, "red": RED, "blue": BLUE, "grey": GREY}
+    environment.globals.update(named)
     page = environment.get_template(template).render(written=f"{datetime.now():%Y-%m-%d %H:%M}", **content)
     write_text(path, page)
     return path
@@ -206,9 +207,7 @@ def _error_table(run: Run) -> list[tuple[str, str, str]]:
 
 def _rate_tables(run: Run) -> dict[str, dict[str, Rate]]:
     """Return table → name → row of a run's page."""
-    if run.report is None:
-        return {"condition": {}, "tier": {}, "task": {}, "milestone": {}, "completed": {}}
-    first, conditions = run.reports[IN_DISTRIBUTION], run.report.conditions
+    first, conditions = run.reports.get(IN_DISTRIBUTION, Report(())), run.report.conditions if run.report else {}
     mean = first.mean_over_tiers
     compared = {name: comparison_texts(each.comparison) for name, each in conditions.items() if each.comparison}
     return {

@@ -8,7 +8,7 @@ from __future__ import annotations
 import json
 import logging
 import traceback
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
@@ -34,12 +34,11 @@ def evaluate(
     cluster: Cluster = THIS_PROCESS,
     name: str = "evaluating",
     needs: Sequence[Path] = (),
-    tiers: Mapping[str, Sequence[str]] | None = None,
     until: Callable[[Report], bool] | None = None,
     recordings: int | None = None,
     turns: int = 1,
 ) -> Report:
-    """Play the episodes of the seeds; `name` is the label of the progress bar, `tiers` are those of the report.
+    """Play the episodes of the seeds; `name` is the label of the progress bar.
 
     `recordings` is the limit of `keep_recordings`. Which episodes it keeps is known at the end only: those are played
     once more and recorded.
@@ -81,7 +80,7 @@ def evaluate(
                 for later in seed_of:
                     later.cancel()
                 break
-        report = Report(tuple(results[seed] for seed in seeds[:counted]), tiers or {}, anytime=until is not None)
+        report = Report(tuple(results[seed] for seed in seeds[:counted]), anytime=until is not None)
         if make_recorder is not None and recordings:
             _record(pool, _kept(report, recordings))
     return report

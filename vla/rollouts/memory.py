@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
@@ -11,7 +10,7 @@ import numpy as np
 
 from vla.data.episodes import EpisodeStore
 from vla.io.types import Count
-from vla.rollouts.rollout import close_agent
+from vla.rollouts.rollout import AgentFactory, close_agent
 from vla.spec import Agent, Array, Environment, Observation, Spec
 
 Sense = Literal["images", "instruction"]
@@ -49,7 +48,7 @@ class Impaired:
         close_agent(self._agent)
 
 
-def make_impaired(make_agent: Callable[[Environment], Agent], lacks: Sense, environment: Environment) -> Impaired:
+def make_impaired(make_agent: AgentFactory, lacks: Sense, environment: Environment) -> Impaired:
     """Build an agent that lacks a sense for an environment."""
     return Impaired(make_agent(environment), lacks)
 

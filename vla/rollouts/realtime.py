@@ -18,7 +18,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from vla.io.types import NonNegative, Rate
-from vla.rollouts.rollout import close_agent
+from vla.rollouts.rollout import AgentFactory, close_agent
 from vla.spec import Agent, Array, Environment, Observation, Spec
 
 Plan = Callable[[Observation], Array]  # returns a chunk (k, D)
@@ -199,7 +199,6 @@ class BackgroundLink:
         self._network = network
         self._thread = ThreadPoolExecutor(1, "policy")
         self._answer: Future[tuple[Array, bool]] | None = None
-        self._next = 0.0
         self.reset(0)
 
     @property
@@ -278,7 +277,7 @@ class Distant:
 
 
 def make_distant(
-    make_agent: Callable[[Environment], Agent], network: Network, environment: Environment, by_clock: bool = False
+    make_agent: AgentFactory, network: Network, environment: Environment, by_clock: bool = False
 ) -> Distant:
     """Build an agent at the other end of a network for an environment."""
     return Distant(make_agent(environment), network, environment.spec, by_clock)

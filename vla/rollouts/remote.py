@@ -17,7 +17,7 @@ import numpy as np
 from PIL import Image, ImageOps
 
 from vla.io.array_messages import pack, unpack
-from vla.io.types import Count, Natural, NonNegative, Pixels, Positive, Text
+from vla.io.types import Count, ImageSize, Natural, NonNegative, Positive, Text
 from vla.rollouts.realtime import IDEAL, BackgroundLink, RealTime, SimulatedLink
 from vla.spec import Array, Observation, Spec
 
@@ -80,7 +80,7 @@ class RemotePolicy:
 
     url: Text
     images: dict[str, Text | None]
-    image_size: tuple[Pixels, Pixels] | None
+    image_size: ImageSize | None
     state: dict[str, list[Text] | None]
     prompt: Text
     actions: dict[str, Component] | None
@@ -198,7 +198,7 @@ class RemotePolicy:
         try:
             connection = self._wait(connected())
             opened.callback(lambda: self._wait(connection.close()))
-            metadata = self._wait(self._received(connection))
+            metadata = self._wait(asyncio.wait_for(self._received(connection), self.timeout))
         except InvalidStatus as error:
             said = bytes(error.response.body or b"").decode(errors="replace").strip()[:200]
             raise self._error(
@@ -217,7 +217,7 @@ class RemotePolicy:
 
         self._broken = True  # until it has answered: after an error, too, a server closes the connection
         try:
-            answer = self._wait(answered())
+            answer = self._wait(asyncio.wait_for(answered(), self.timeout))
         except ConnectionClosed as error:
             raise self._error("it closed the connection") from error
         except TimeoutError as error:
@@ -230,8 +230,7 @@ class RemotePolicy:
         return asyncio.run_coroutine_threadsafe(work, self._loop).result()
 
     async def _received(self, connection: ClientConnection) -> dict[str, Any]:
-        async with asyncio.timeout(self.timeout):
-            data = await connection.recv()
+        data = await connection.recv()
         if isinstance(data, str):
             raise self._error(data.strip().splitlines()[-1][:500] if data.strip() else "an empty error")
         answer = unpack(data)

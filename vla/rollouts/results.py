@@ -130,7 +130,7 @@ class Report:
 
     @property
     def in_a_row(self) -> dict[str, int]:
-        """ "1/4" → number of episodes in which at least one of four instructions was completed, and so on.
+        """Number of episodes that completed at least n of several instructions, by a label such as 1/4.
 
         Empty if the episodes have only one instruction.
         """
@@ -144,7 +144,8 @@ class Report:
             return None
         done, length = [done for done, _ in self._chains], max(length for _, length in self._chains)
         if self.anytime:  # bets on shares of a success lose more than bets on the values would
-            low, high = (length * bound for bound in self.interval_of(sum(done) / length))
+            share = sum(done) / length
+            low, high = (length * bound for bound in anytime_interval(share, len(done) - share))
         else:
             low, high = bounded_mean_interval(done, length)
         return sum(done) / len(done), low, high

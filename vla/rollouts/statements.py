@@ -100,15 +100,7 @@ class AgainstRun:
         )
 
 
-@dataclass(frozen=True)
-class AgainstCondition:
-    """Difference of success under a condition from the `first` condition, or a bound on it, `margin`."""
-
-    first: Report
-    margin: float
-    conditions: int  # number of those compared
-
-    def is_clear(self, report: Report) -> bool:
-        """See `Statement`."""
-        pairs = pairs_of(zip(self.first.results, report.results, strict=False))
-        return is_settled(pairs.first, pairs.second, sum(pairs), self.margin, self.conditions)
+def differs_clearly(first: Report, margin: float, conditions: int, report: Report) -> bool:
+    """Return whether success under one of several conditions differs from `first`, or by less than `margin`."""
+    pairs = pairs_of(zip(first.results, report.results, strict=False))
+    return is_settled(pairs.first, pairs.second, sum(pairs), margin, conditions)

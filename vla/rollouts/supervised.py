@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
-from vla.rollouts.rollout import close_agent
+from vla.rollouts.rollout import AgentFactory, close_agent
 from vla.spec import Agent, Array, Environment, Expert, Observation
 
 
@@ -68,11 +67,7 @@ def require_memoryless(expert: Agent) -> None:
 
 
 def make_supervised(
-    make_policy: Callable[[Environment], Agent],
-    make_expert: Callable[[Environment], Agent],
-    beta: float,
-    segment: int,
-    environment: Environment,
+    make_policy: AgentFactory, make_expert: AgentFactory, beta: float, segment: int, environment: Environment
 ) -> Supervised:
     """Build the policy and its expert for an environment."""
     return Supervised(make_policy(environment), make_expert(environment), beta, segment)

@@ -140,30 +140,14 @@ def save_config(folder: Path, config: Mapping[str, Any], changes: list[Node]) ->
         write_text(folder / name, yaml.safe_dump(content, sort_keys=False, allow_unicode=True, width=120))
 
 
-def save_training(
-    folder: Path, parameters: int, steps: int, seconds: float, ended: str, collection: float | None = None
-) -> None:
-    """Save the result of a training.
-
-    Args:
-        folder: of the run.
-        parameters: of the model.
-        steps: of the optimiser.
-        seconds: duration of training [s].
-        ended: "done", "interrupted", or an error.
-        collection: duration of the collection [s], if known.
-    """
-    collected = None if collection is None else round(collection, 1)
-    _write_training(folder, Training(parameters, steps, round(seconds, 1), ended, collected))
+def save_training(folder: Path, training: Training) -> None:
+    """Save the result of a training."""
+    write_text(folder / TRAINING, json.dumps(asdict(training), ensure_ascii=False) + "\n")
 
 
 def save_choice(folder: Path, checkpoint: str) -> None:
     """Add the checkpoint selected for evaluation to what `save_training` wrote."""
-    _write_training(folder, replace(read_json(folder / TRAINING, Training), checkpoint=checkpoint))
-
-
-def _write_training(folder: Path, training: Training) -> None:
-    write_text(folder / TRAINING, json.dumps(asdict(training), ensure_ascii=False) + "\n")
+    save_training(folder, replace(read_json(folder / TRAINING, Training), checkpoint=checkpoint))
 
 
 def _read(path: Path, read: Callable[[Path], T], otherwise: T) -> T:

@@ -68,7 +68,10 @@ class SweepRow:
         return {condition: sum(map(len, cells)) for condition, cells in self.played.items()}
 
     def interval(self, condition: str) -> tuple[float, float, float]:
-        """Return the pooled success rate and its 95 % confidence interval over trainings and scenes."""
+        """Return the success rate and its 95 % confidence interval, of several cells over trainings and scenes."""
+        if len(self.runs) == 1:  # its own: stratified with tiers, anytime-valid where playing stopped early
+            report = self.runs[0].reports[condition]
+            return (report.success, *report.interval)
         rate = self.successes[condition] / max(self.episodes[condition], 1)
         return (rate, *pooled_interval(self.played[condition]))
 

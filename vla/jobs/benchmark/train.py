@@ -73,8 +73,8 @@ def measures(experiment: Experiment) -> dict[str, Measure]:
         loading.append(trials[0].load())
     found: dict[str, Measure] = {}
     for trial in trials:
-        peak = max(max(other.peak, other.rate) for other in trials if other.precision == trial.precision)
-        found |= trial.measures(peak, trials[0].loss)
+        fastest_rate = max(max(other.peak, other.rate) for other in trials if other.precision == trial.precision)
+        found |= trial.measures(fastest_rate, trials[0].loss)
     fastest = max(trial.samples / trial.best.seconds for trial in trials)
     found["train: loader alone"] = measure(trials[0].samples / min(loading), "samples/s", trials[0].samples, fastest)
     return found
