@@ -18,7 +18,7 @@ from vla.models.denoiser import DenoisingModel
 from vla.models.model import Model
 from vla.models.rt1 import RT1
 from vla.models.text.ngrams import NGrams
-from vla.models.tokenizers.tokenizer import ActionTokenizer, Uniform
+from vla.models.tokenizers.tokenizer import Uniform
 from vla.models.vision.image_tokenizer import FilmConv
 from vla.policy import Policy
 from vla.spec import Spec
@@ -62,144 +62,39 @@ def with_text(model: Model, batch: dict[str, Any]) -> dict[str, Any]:
     return {**batch, "text": model.text.tokenize(batch["instruction"])}
 
 
-def make_bc(
-    chunk: int = 1,
-    auxiliary: float = 1.0,
-    image: Callable[..., Any] = TINY_IMAGE,
-    text: Callable[..., Any] = TINY_TEXT,
-    shift: tuple[float, float] = (0, 0),
-    spec: Spec = SPEC,
-    execute: int | None = None,
-) -> BC:
+def _small(kind: Callable[..., Any], option: str, small: dict[str, Any], options: dict[str, Any]) -> Any:
+    """A model of an option, smaller and without random shifts."""
+    sizes = {"keypoints": 8, "text_width": 16, "width": 32, "auxiliary": 1.0, "shift": (0, 0)}
+    spec = options.get("spec", SPEC)
+    tokenizer = Uniform(spec=spec, **defaults_of("tokenizer/uniform", bins=64))
+    parts = {"image": TINY_IMAGE, "text": TINY_TEXT, "spec": spec, "tokenizer": tokenizer}
+    return kind(**{**parts, **defaults_of(option, **{**sizes, **small, **options})})
+
+
+def make_bc(**options: Any) -> BC:
     """A small BC."""
-    return BC(
-        image=image,
-        text=text,
-        chunk=chunk,
-        keypoints=8,
-        text_width=16,
-        width=64,
-        shift=shift,
-        auxiliary=auxiliary,
-        execute=execute,
-        spec=spec,
-        tokenizer=Uniform(spec=spec, **defaults_of("tokenizer/uniform", bins=64)),
-    )
+    return _small(BC, "model/bc", {"width": 64}, options)
 
 
-def make_rt1(
-    history: int = 3,
-    chunk: int = 1,
-    proprioception: bool = False,
-    keypoints: int = 8,
-    auxiliary: float = 1.0,
-    dropout: float = 0.0,
-    layers: int = 2,
-) -> RT1:
-    """A small RT-1 without random shifts."""
-    return RT1(
-        image=TINY_IMAGE,
-        text=TINY_TEXT,
-        history=history,
-        image_size=None,
-        learned_tokens=2,
-        keypoints=keypoints,
-        proprioception=proprioception,
-        chunk=chunk,
-        auxiliary=auxiliary,
-        text_width=16,
-        width=32,
-        layers=layers,
-        heads=2,
-        key_width=16,
-        dropout=dropout,
-        position_std=0.05,
-        shift=(0, 0),
-        spec=SPEC,
-        tokenizer=Uniform(spec=SPEC, **defaults_of("tokenizer/uniform", bins=64)),
-    )
+def make_rt1(**options: Any) -> RT1:
+    """A small RT-1 without dropout."""
+    small = {"history": 3, "image_size": None, "learned_tokens": 2, "layers": 2, "heads": 2, "key_width": 16}
+    return _small(RT1, "model/rt1", {**small, "dropout": 0.0}, options)
 
 
-def make_decoder(
-    history: int = 2,
-    chunk: int = 1,
-    auxiliary: float = 1.0,
-    tokenizer: ActionTokenizer | None = None,
-    layers: int = 2,
-) -> Decoder:
-    """A small decoder without dropout and random shifts."""
-    return Decoder(
-        image=TINY_IMAGE,
-        text=TINY_TEXT,
-        spec=SPEC,
-        tokenizer=tokenizer or Uniform(spec=SPEC, **defaults_of("tokenizer/uniform", bins=64)),
-        **defaults_of(
-            "model/decoder",
-            history=history,
-            learned_tokens=2,
-            keypoints=8,
-            chunk=chunk,
-            auxiliary=auxiliary,
-            text_width=16,
-            width=32,
-            layers=layers,
-            heads=2,
-            feedforward=64,
-            shift=(0, 0),
-        ),
-    )
+def make_decoder(**options: Any) -> Decoder:
+    """A small decoder."""
+    return _small(Decoder, "model/decoder", {"learned_tokens": 2, "heads": 2, "feedforward": 64}, options)
 
 
-def make_act(chunk: int = 4, execute: int = 2, auxiliary: float = 1.0, kl_weight: float = 10.0) -> ACT:
-    """A small ACT without random shifts."""
-    return ACT(
-        image=TINY_IMAGE,
-        text=TINY_TEXT,
-        spec=SPEC,
-        tokenizer=Uniform(spec=SPEC, **defaults_of("tokenizer/uniform")),
-        **defaults_of(
-            "model/act",
-            chunk=chunk,
-            execute=execute,
-            keypoints=8,
-            text_width=16,
-            width=32,
-            heads=2,
-            latent=4,
-            kl_weight=kl_weight,
-            shift=(0, 0),
-            auxiliary=auxiliary,
-        ),
-    )
+def make_act(**options: Any) -> ACT:
+    """A small ACT."""
+    return _small(ACT, "model/act", {"chunk": 4, "heads": 2, "latent": 4}, options)
 
 
-def make_denoising(
-    kind: type[DenoisingModel],
-    chunk: int = 4,
-    execute: int = 2,
-    auxiliary: float = 1.0,
-    layers: int = 2,
-    steps: int = 10,
-) -> DenoisingModel:
-    """A small model that starts from noise, without random shifts."""
-    return kind(
-        image=TINY_IMAGE,
-        text=TINY_TEXT,
-        chunk=chunk,
-        execute=execute,
-        keypoints=8,
-        text_width=16,
-        width=32,
-        layers=layers,
-        heads=2,
-        copies=8,
-        steps=steps,
-        temperature=0.5,
-        shift=(0, 0),
-        auxiliary=auxiliary,
-        spec=SPEC,
-        tokenizer=Uniform(spec=SPEC, **defaults_of("tokenizer/uniform")),
-    )
+def make_denoising(kind: type[DenoisingModel], **options: Any) -> DenoisingModel:
+    """A small model that starts from noise."""
+    return _small(kind, "model/diffusion", {"chunk": 4, "layers": 2, "heads": 2, "copies": 8}, options)
 
 
 def as_policy(model: Model, spec: Spec = SPEC, **options: Any) -> Policy:

@@ -9,7 +9,7 @@ from fake_batch import make_act, make_batch, with_text
 def test_without_weight_there_is_no_latent() -> None:
     model = make_act(kl_weight=0.0)
     losses = model.loss(with_text(model, make_batch(1, 4)))
-    assert "divergence" not in losses and not hasattr(model, "style")
+    assert "divergence" not in losses and not hasattr(model, "cvae_encoder")
 
 
 def test_the_divergence_is_that_of_two_normal_distributions() -> None:
@@ -35,9 +35,9 @@ def test_the_latent_is_drawn_in_training_only() -> None:
 
 def test_the_latent_does_not_know_what_is_not_valid() -> None:
     model = make_act()
-    style, standing, action = model.cvae_encoder, torch.randn(4, model.robot_state_width), torch.randn(4, 4, 3)
+    encoder, standing, action = model.cvae_encoder, torch.randn(4, model.robot_state_width), torch.randn(4, 4, 3)
     valid = torch.arange(4) < torch.tensor([[1], [2], [4], [0]])
-    mean, log_variance = style(standing, action, valid)
-    other = style(standing, action + 3.0 * ~valid.unsqueeze(-1), valid)
+    mean, log_variance = encoder(standing, action, valid)
+    other = encoder(standing, action + 3.0 * ~valid.unsqueeze(-1), valid)
     assert torch.allclose(mean, other[0], atol=1e-6) and torch.allclose(log_variance, other[1], atol=1e-6)
-    assert not torch.allclose(mean, style(standing, action + 3.0, valid)[0], atol=1e-3)
+    assert not torch.allclose(mean, encoder(standing, action + 3.0, valid)[0], atol=1e-3)

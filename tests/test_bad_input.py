@@ -85,6 +85,7 @@ NONSENSE = {
             "learner.ema=nan",
             "learner.warmup_steps=-1",
             "trainer.max_steps=0",
+            "data.batch_size=0",
         ),
         *("trainer.val_check_interval=0", "trainer.accumulate_grad_batches=0", "trainer.devices=-7"),
         *(

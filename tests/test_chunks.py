@@ -9,14 +9,12 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from defaults import defaults_of
 from fake_batch import (
-    TINY_IMAGE,
-    TINY_TEXT,
     as_policy,
     make_act,
     make_batch,
     make_bc,
+    make_decoder,
     make_denoising,
     overfit,
     with_text,
@@ -24,12 +22,10 @@ from fake_batch import (
 from observing import observations
 from toy import SPEC, ToyEnvironment
 
-from vla.models.act import ACT
 from vla.models.chunk_policy import ChunkModel
 from vla.models.diffusion import Diffusion
 from vla.models.flow import Flow
 from vla.models.one_frame import OneFrameModel
-from vla.models.tokenizers.tokenizer import Uniform
 from vla.rollouts.rollout import rollout
 
 MODELS: dict[str, Callable[..., ChunkModel]] = {
@@ -154,28 +150,16 @@ def test_looks_again_after_the_actions_that_are_executed(make: Callable[..., One
     assert plan.shape == (4, 3) and np.array_equal(plan[:2], acted[:2])
 
 
-@pytest.mark.parametrize("kind", [ACT, Diffusion, Flow])
-def test_a_width_that_heads_cannot_share_is_refused(kind: type[Any]) -> None:
+@pytest.mark.parametrize("make", [*MODELS.values(), make_decoder], ids=[*MODELS, "decoder"])
+def test_a_width_that_heads_cannot_share_is_refused(make: Callable[..., Any]) -> None:
     with pytest.raises(ValueError, match=r"model\.width=32 must be a multiple of model\.heads=5"):
-        kind(
-            image=TINY_IMAGE,
-            text=TINY_TEXT,
-            spec=SPEC,
-            tokenizer=Uniform(spec=SPEC, **defaults_of("tokenizer/uniform")),
-            **defaults_of(f"model/{kind.__name__.lower()}", width=32, heads=5),
-        )
+        make(heads=5)
 
 
 @pytest.mark.parametrize("kind", [Diffusion, Flow])
 def test_a_width_without_room_for_pairs_is_refused(kind: type[Any]) -> None:
     with pytest.raises(ValueError, match=r"model\.width=33 must be even"):
-        kind(
-            image=TINY_IMAGE,
-            text=TINY_TEXT,
-            spec=SPEC,
-            tokenizer=Uniform(spec=SPEC, **defaults_of("tokenizer/uniform")),
-            **defaults_of(f"model/{kind.__name__.lower()}", width=33, heads=3),
-        )
+        make_denoising(kind, width=33, heads=3)
 
 
 def test_more_cannot_be_executed_than_is_predicted() -> None:

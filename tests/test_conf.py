@@ -76,11 +76,6 @@ def test_deploying_nothing_is_refused() -> None:
         check(composed("job=deploy"))
 
 
-def test_empty_batches_are_refused() -> None:
-    with pytest.raises(ValueError, match=r"data\.batch_size must be a whole number, at least 1, got 0"):
-        check(composed("data.batch_size=0"))
-
-
 @pytest.mark.parametrize(("group", "option"), OPTIONS, ids=[f"{group}={option}" for group, option in OPTIONS])
 def test_option(group: str, option: str) -> None:
     top = group.partition("/")[0]

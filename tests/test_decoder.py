@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 import torch
 from defaults import defaults_of
-from fake_batch import TINY_IMAGE, TINY_TEXT, Motions, as_policy, make_batch, make_decoder, overfit, with_text
-from observing import act, observations
+from fake_batch import Motions, as_policy, make_batch, make_decoder, overfit, with_text
 from small_training import loader, make_learner, make_trainer
 from toy import SPEC, ToyEnvironment
 
@@ -166,16 +165,6 @@ def test_writing_ends_when_all_have_ended() -> None:
     assert tokens.tolist() == [[model.tokenizer.end]] * 4
 
 
-def test_what_was_perceived_is_kept_while_the_window_moves_on() -> None:
-    model = make_decoder(history=3)
-    policy = as_policy(model)
-    frames: list[int] = []
-    model.image.register_forward_pre_hook(lambda module, inputs: frames.append(len(inputs[0])))
-    actions = act(policy, observations(5))
-    assert frames == [1] * (5 * len(SPEC.cameras))
-    assert np.array_equal(act(as_policy(model), observations(5)), actions)
-
-
 def test_a_trained_decoder_of_fast_tokens_plays_an_episode_from_its_checkpoint(tmp_path: Path) -> None:
     model = make_fast(chunk=4)
     trainer = make_trainer(3)
@@ -187,14 +176,3 @@ def test_a_trained_decoder_of_fast_tokens_plays_an_episode_from_its_checkpoint(t
     assert episode.actions.shape == (40, 3)
     expected = rollout(ToyEnvironment(), as_policy(model), seed=3)
     assert episode.actions == pytest.approx(expected.actions, abs=1e-6)
-
-
-def test_heads_that_do_not_divide_the_width_are_refused() -> None:
-    with pytest.raises(ValueError, match=r"model\.width=32 must be a multiple of model\.heads=5"):
-        Decoder(
-            image=TINY_IMAGE,
-            text=TINY_TEXT,
-            spec=SPEC,
-            tokenizer=RT1Bins(spec=SPEC, **defaults_of("tokenizer/rt1")),
-            **defaults_of("model/decoder", width=32, heads=5),
-        )

@@ -313,13 +313,8 @@ def test_arguments_of_ros_are_split_off() -> None:
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["deploy=ros2"], "checkpoint=FILE"),
-        (["deploy=ros2", "checkpoint=nowhere.ckpt"], "there is no checkpoint nowhere.ckpt"),
         (["deploy=ros2", "agent=expert"], "plans no chunks of actions"),
-        ([CHECKPOINT], "deploy=OPTION"),
-        ([CHECKPOINT, "deploy=ros2", "deploy.command=velocity"], "joint_state, trajectory, forward"),
         ([CHECKPOINT, "deploy=ros2", "deploy.network.profile=nowhere.xml"], "nowhere.xml"),
-        ([CHECKPOINT, "deploy=ros2", "deploy.robot.speed_share=2"], "speed_share"),
         ([CHECKPOINT, "deploy=ros2", "deploy.network.domain=9999"], "9999"),
         ([CHECKPOINT, "deploy=ros2", "deploy.topics.commands='bad topic!'"], "topics.commands is 'bad topic!'"),
         ([CHECKPOINT, "deploy=ros2", "--ros-args", "--nonsense"], "--nonsense"),

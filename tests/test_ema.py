@@ -42,19 +42,3 @@ def test_it_is_the_exponential_average_of_the_steps_and_what_is_validated_and_sa
     torch.testing.assert_close(read_checkpoint(tmp_path / "last.ckpt").state["head.weight"], average)
     saved = torch.load(tmp_path / "last.ckpt", weights_only=True)
     torch.testing.assert_close(saved["current_model_state"]["model.head.weight"], watch.trained[-1])
-
-
-def test_going_on_from_a_checkpoint_gives_what_one_run_gives(tmp_path: Path) -> None:
-    batch, ends = make_batch(1), []
-    for name, stops in (("whole", [4]), ("halves", [2, 4])):
-        torch.manual_seed(0)
-        path = None
-        for stop in stops:
-            trainer = make_trainer(stop, EMA(DECAY))
-            learner = make_learner(schedule="constant", warmup_steps=2)
-            trainer.fit(learner, loader(batch, 4), ckpt_path=path, weights_only=True)
-            path = tmp_path / f"{name}{stop}.ckpt"
-            trainer.save_checkpoint(path)
-        ends.append(torch.load(tmp_path / f"{name}4.ckpt", weights_only=True))
-    for state in ("state_dict", "current_model_state"):
-        torch.testing.assert_close(ends[0][state], ends[1][state])

@@ -186,7 +186,7 @@ def test_the_entry_imports_nothing_heavy_at_once(module: str) -> None:
 @pytest.mark.parametrize("option", [["--help"], ["--cfg", "job"], ["--cfg", "job", "--resolve"]])
 def test_questions_are_answered_without_heavy_imports(option: list[str]) -> None:
     command = [sys.executable, "-X", "importtime", "-m", "vla.run", *option]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=20)
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=60)
     assert done.returncode == 0, done.stderr[-500:]
     assert "evaluate" in done.stdout
     imported = {line.rpartition("|")[2].strip() for line in done.stderr.splitlines()}

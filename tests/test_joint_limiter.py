@@ -115,6 +115,7 @@ def test_without_overshoot_a_joint_at_its_goal_stays_there() -> None:
 
 WRONG = [
     *({"low": [0.0]}, {"speed_share": 0.0}, {"acceleration_share": 1.5}, {"margin": -0.5}, {"overshoot": np.nan}),
+    {"speed_share": 2.0},
     *({"acceleration": [0.0, 1.0]}, {"speed": [np.inf, 1.0]}, {"finger_travel": 0.0}, {"low": [1.0, -2.0]}),
 ]
 

@@ -89,7 +89,7 @@ def test_without_rosbags_the_sentence_says_what_to_install(tmp_path: Path) -> No
     script = tmp_path / "export.py"
     script.write_text(
         "import sys; sys.modules['rosbags'] = None\n"
-        "from test_export import Path, exporter; exporter('mcap', Path('x'))\n"
+        "from pathlib import Path; from exporting import exporter; exporter('mcap', Path('x'))\n"
     )
     tests = Path(__file__).parent
     done = subprocess.run(

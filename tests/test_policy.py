@@ -6,6 +6,7 @@ import os
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -66,8 +67,9 @@ def test_kept_tokens_give_what_the_whole_window_gives(proprioception: bool) -> N
         assert policy.info["probabilities"] == pytest.approx(logits[0].softmax(-1).numpy(), abs=1e-5)
 
 
-def test_only_the_newest_frame_is_encoded() -> None:
-    model = make_rt1(history=3)
+@pytest.mark.parametrize("make", [make_rt1, make_decoder], ids=["rt1", "decoder"])
+def test_only_the_newest_frame_is_encoded(make: Callable[..., Any]) -> None:
+    model = make(history=3)
     policy = as_policy(model)
     frames = []
     model.image.register_forward_pre_hook(lambda module, inputs: frames.append(len(inputs[0])))

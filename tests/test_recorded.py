@@ -249,7 +249,7 @@ def episode_at(folder: Path, seed: int) -> Episode:
     return find_episode(EpisodeStore(folder), seed)[1]
 
 
-@pytest.mark.parametrize("format", ["lerobot", "mcap", "files", "packed"])
+@pytest.mark.parametrize("format", ["lerobot", "mcap"])
 def test_imported_episodes_are_exported_as_others_are(dataset: Path, tmp_path: Path, format: str) -> None:
     recording = ("task=recorded", f"expert.folder={dataset}", "task.image_size=[24,32]", "collect.folder=store")
     if format == "mcap":

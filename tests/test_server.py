@@ -405,7 +405,7 @@ def test_an_agent_that_finds_nobody_leaves_no_thread() -> None:
         before = threading.active_count()
         with pytest.raises(ValueError, match="API key"):
             remote(url)
-        assert threading.active_count() == before
+        assert threading.active_count() <= before
 
 
 def test_of_many_that_come_at_once_only_so_many_stay() -> None:
