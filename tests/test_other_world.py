@@ -26,8 +26,9 @@ from vla.data.formats.lerobot_import import LeRobotDemonstrations
 from vla.data.verification import require_whole, verify_store
 from vla.policy import Policy
 from vla.reports.dataset_card import store_table, write_card
-from vla.reports.evaluation import contact_sheet, plot_report, write_report
+from vla.reports.evaluation import plot_report, write_report
 from vla.reports.html import write_page
+from vla.reports.resets import contact_sheet
 from vla.reports.sweep import tabulate
 from vla.rollouts.evaluate import evaluate, keep_recordings
 from vla.rollouts.recorder import RerunRecorder

@@ -14,8 +14,9 @@ from PIL import Image
 from rich.console import Console
 from toy_recordable import make_environment
 
-from vla.reports.evaluation import contact_sheet, draws_table, plot_report, write_report
+from vla.reports.evaluation import plot_report, write_report
 from vla.reports.factors import factors
+from vla.reports.resets import contact_sheet, draws_table
 from vla.rollouts.results import Report, Result
 from vla.rollouts.statistics import wilson_interval
 from vla.spec import FIRST_SEED

@@ -12,7 +12,7 @@ from vla.config.check import Job
 from vla.config.experiment import Experiment
 from vla.io.files import atomic_path, writing
 from vla.io.types import Count, Seed
-from vla.reports.evaluation import contact_sheet, draws_table
+from vla.reports.resets import contact_sheet, draws_table
 from vla.rollouts.recorder import RerunRecorder, merge
 from vla.rollouts.rollout import rollout
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,8 +18,8 @@ from vla.data.draws import flat
 from vla.data.index import NOT_NEEDED, Entry, listed
 from vla.data.verification import StoreReport, entries_by_config, episode_of
 from vla.io.files import write_text
-from vla.reports.evaluation import contact_sheet, spans
-from vla.reports.style import BLUE, GREEN, RED, save
+from vla.reports.resets import contact_sheet, spans
+from vla.reports.style import BLUE, GREEN, RED, markdown_table, save
 from vla.spec import Spec, in_brackets
 
 ITEMS = (RED, GREEN, BLUE)  # colours of a triple's items
@@ -105,34 +105,28 @@ def _text(findings: StoreReport) -> str:
         f"{_summary(findings)}.",
         "![First frames, outcomes, actions and draws](card.png)",
         "## Outcomes",
-        _markdown(("outcome", "seeds"), findings.outcomes.items()),
+        markdown_table(("outcome", "seeds"), findings.outcomes.items()),
         "## Instructions",
-        _markdown(("instruction", "episodes"), _instructions(findings).most_common()),
+        markdown_table(("instruction", "episodes"), _instructions(findings).most_common()),
         "## One step",
-        _markdown(("field", "shape", "type", "total bytes"), fields),
-        _markdown(("component of the state", "unit"), zip(spec.state, spec.state_units, strict=True)),
+        markdown_table(("field", "shape", "type", "total bytes"), fields),
+        markdown_table(("component of the state", "unit"), zip(spec.state, spec.state_units, strict=True)),
         *(["Depth is in mm."] if spec.depth else []),
         f"`action` is the label to imitate, `executed` was sent to the robot{_frame(spec)}:",
-        _markdown(("component", "unit", "minimum", "maximum", "mean", "standard deviation"), components),
+        markdown_table(("component", "unit", "minimum", "maximum", "mean", "standard deviation"), components),
         "## Draws",
-        _markdown(("draw", "range"), spans([_draws(findings.whole)]).items()),
+        markdown_table(("draw", "range"), spans([_draws(findings.whole)]).items()),
         "## Configuration",
         *conditions,
         *configs,
         "## Training on this store",
         f"```\npython -m vla.run job=train collect.folder=FOLDER collect.episodes={len(findings.whole)}\n```",
     ]
-    return "\n\n".join(paragraphs) + "\n"
+    return "\n\n".join(each.strip() for each in paragraphs) + "\n"
 
 
 def _frame(spec: Spec) -> str:
     return f" in frame {spec.robot.frame}" if spec.robot else ""
-
-
-def _markdown(head: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
-    """Format a Markdown table; pipes and line breaks in cells are escaped."""
-    cells = [[str(cell).replace("|", "\\|").replace("\n", " ") for cell in row] for row in rows]
-    return "\n".join(" | ".join(row) for row in [list(head), ["---"] * len(head), *cells])
 
 
 def _instructions(findings: StoreReport) -> Counter[str]:

@@ -12,6 +12,7 @@ from vla.io.files import atomic_path, warn_on_error, write_text
 from vla.reports.comparison import RunComparison, compare_rows
 from vla.reports.conditions import comparison_texts
 from vla.reports.html import ABSENT, SWEEP, TableRow, write_sweep
+from vla.reports.style import markdown_table
 from vla.reports.sweep_plot import plot
 from vla.runs.folder import PAGE
 from vla.runs.sweep import SweepRow, conditions_of, read_rows
@@ -35,18 +36,18 @@ def markdown_differences(compared: Sequence[RunComparison]) -> str:
     if not compared:
         return ""
     head = [f"minus {compared[0].one}", "condition", "points (95 % CI)", "p", "p Holm", "verdict"]
-    lines = [head, ["---"] * len(head)]
+    lines = []
     for each in compared:
         difference, interval, *rest = comparison_texts(each.found)
         lines.append([each.other, each.condition, f"{difference} ({interval})", *rest])
-    return "\n" + _table(lines)
+    return "\n" + markdown_table(head, lines)
 
 
 def markdown(rows: list[SweepRow]) -> str:
     """Format the table in Markdown: success per condition with its interval, then costs."""
     conditions = conditions_of(rows)
     head = [*rows[0].choices, *(f"{name} [%]" for name in conditions), "each seed [%]", "parameters [M]", "action [ms]"]
-    lines = [head, ["---"] * len(head)]
+    lines = []
     for row in rows:
         shares = []
         for condition in conditions:
@@ -56,11 +57,7 @@ def markdown(rows: list[SweepRow]) -> str:
             rate, low, high = (100 * value for value in row.interval(condition))
             shares.append(f"{rate:.1f} ({low:.1f}-{high:.1f})")
         lines.append([*row.choices.values(), *shares, *_costs(row)])
-    return _table(lines)
-
-
-def _table(lines: Sequence[Sequence[str]]) -> str:
-    return "".join(f"| {' | '.join(line)} |\n" for line in lines)
+    return markdown_table(head, lines)
 
 
 def _costs(row: SweepRow) -> list[str]:
