@@ -13,7 +13,7 @@ import toy
 from fake_batch import as_policy, make_act
 
 from vla.rollouts.evaluate import evaluate
-from vla.rollouts.realtime import Distant, Network, RealTime, Schedule, SimulatedLink, make_distant
+from vla.rollouts.realtime import Network, OverNetwork, RealTime, Schedule, SimulatedLink, make_over_network
 from vla.rollouts.rollout import rollout
 from vla.spec import FIRST_SEED, Array, Observation
 
@@ -53,7 +53,7 @@ def acted(
     """The moves of `steps` steps; with `hz` they follow the clock."""
     spec = replace(SPEC, control_hz=hz or SPEC.control_hz)
     observation = SPEC.random_observation(np.random.default_rng(0))
-    with closing(Distant(Counting(chunk, execute), network, spec, by_clock=hz is not None)) as agent:
+    with closing(OverNetwork(Counting(chunk, execute), network, spec, by_clock=hz is not None)) as agent:
         agent.reset("", seed)
         actions = [agent.act(observation) for _ in range(steps)]
     assert all(action.shape == (3,) and action.dtype == np.float32 for action in actions)
@@ -104,10 +104,10 @@ def test_chunks_for_the_same_step_are_averaged_with_the_oldest_first() -> None:
 def test_an_evaluation_without_latency_is_that_of_the_policy_and_with_latency_repeatable() -> None:
     policy = as_policy(make_act(chunk=4, execute=2))
     expected = rollout(toy.make_environment(), policy.session(), FIRST_SEED)
-    here = rollout(toy.make_environment(), Distant(policy.session(), network_of(0.0), toy.SPEC), FIRST_SEED)
+    here = rollout(toy.make_environment(), OverNetwork(policy.session(), network_of(0.0), toy.SPEC), FIRST_SEED)
     np.testing.assert_array_equal(here.executed, expected.executed)
     late = [
-        rollout(toy.make_environment(), Distant(policy.session(), network_of(0.2, 0.1, 0.1), toy.SPEC), FIRST_SEED)
+        rollout(toy.make_environment(), OverNetwork(policy.session(), network_of(0.2, 0.1, 0.1), toy.SPEC), FIRST_SEED)
         for _ in range(2)
     ]
     np.testing.assert_array_equal(late[0].executed, late[1].executed)
@@ -127,7 +127,7 @@ def test_by_the_clock_a_chunk_goes_on_while_the_next_one_is_under_way() -> None:
 def test_latency_costs_steps_and_then_success() -> None:
     seeds = range(FIRST_SEED, FIRST_SEED + 10)
     at_once, late, later = (
-        evaluate(toy.make_environment, partial(make_distant, toy.make_expert, network_of(latency)), None, seeds)
+        evaluate(toy.make_environment, partial(make_over_network, toy.make_expert, network_of(latency)), None, seeds)
         for latency in (0.0, 0.1, 0.4)
     )
     assert at_once == evaluate(toy.make_environment, toy.make_expert, None, seeds)
@@ -156,7 +156,7 @@ def test_an_error_of_the_policy_is_one_of_the_episode() -> None:
 def test_an_agent_with_a_history_sees_every_frame() -> None:
     agent = Counting(3, 3)
     agent.history = 2  # type: ignore[attr-defined]
-    distant = Distant(agent, network_of(0.0), SPEC)
+    distant = OverNetwork(agent, network_of(0.0), SPEC)
     distant.reset("", 0)
     observation = SPEC.random_observation(np.random.default_rng(0))
     for _ in range(4):

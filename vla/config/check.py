@@ -29,8 +29,8 @@ class Job:
     groups: tuple[str | Group, ...]  # that it builds from; only these are checked and imported; names in `GROUPS`
     options: Mapping[str, Any] = field(default_factory=dict)  # name → type, in the config node of the job's name
     adopts: bool = False  # takes checkpoint=FILE
-    without_agent: tuple[str, ...] = ()  # further groups, unless an agent acts
-    without_checkpoint: tuple[str, ...] = ()  # further groups, unless an agent or a checkpoint acts
+    without_agent: tuple[str, ...] = ()  # groups also needed without agent=OPTION
+    without_checkpoint: tuple[str, ...] = ()  # groups also needed without agent=OPTION and checkpoint=FILE
     stored: tuple[str, ...] = ()  # groups whose libraries may be missing: a complete episode store takes their place
 
     def needs(self, config: Any) -> dict[str, Group]:

@@ -43,7 +43,7 @@ class PackedRows:
         codec: `JPEG` or `ZLIB`.
         shape: of the field, (N, …).
         dtype: of the field.
-        changed: row number → the error to raise if the row cannot be decoded.
+        damaged: row number → the error to raise if the row cannot be decoded.
     """
 
     def __init__(
@@ -53,10 +53,10 @@ class PackedRows:
         codec: str,
         shape: tuple[int, ...],
         dtype: np.dtype,
-        changed: Callable[[int], ValueError],
+        damaged: Callable[[int], ValueError],
     ) -> None:
         self.shape, self.dtype = shape, dtype
-        self._codec, self._changed = codec, changed
+        self._codec, self._damaged = codec, damaged
         self._offsets = np.asarray(np.memmap(folder / f"{field}.offsets", OFFSET, mode="r", shape=(len(self) + 1,)))
         self._bytes = np.asarray(np.memmap(folder / f"{field}.pack", np.uint8, mode="r"))
 
@@ -78,7 +78,7 @@ class PackedRows:
                 try:
                     images[place] = self._decode(self._bytes[starts[place] : ends[place]])
                 except (zlib.error, ValueError) as error:
-                    raise self._changed(int(rows[place])) from error
+                    raise self._damaged(int(rows[place])) from error
 
         pending = [_threads().submit(decode, range(first, len(rows), cores())) for first in range(cores())]
         wait(pending)  # even if one fails: no thread may use `out` or the file afterwards

@@ -24,7 +24,7 @@ from vla.spec import Array, Episode
 
 # N steps, D action components
 
-Found = tuple[EpisodeStore, Entry]
+Copy = tuple[EpisodeStore, Entry]
 
 
 class DamageError(ValueError):
@@ -197,7 +197,7 @@ def derive_store(
     return damaged
 
 
-Chosen = dict[str, dict[int, list[Found]]]  # config as JSON → seed → its copies
+Chosen = dict[str, dict[int, list[Copy]]]  # config as JSON → seed → its copies
 
 
 def _choose(stores: Sequence[EpisodeStore], where: Mapping[str, Any]) -> Chosen:
@@ -222,10 +222,10 @@ def _config(chosen: Chosen, stores: Sequence[EpisodeStore], where: Mapping[str, 
     return {"parts": parts, "where": conditions}
 
 
-def _write(store: EpisodeStore, found: Sequence[Found], repair: bool) -> bool:
+def _write(store: EpisodeStore, copies: Sequence[Copy], repair: bool) -> bool:
     """Add a seed to a store from its first undamaged copy; returns whether there was one."""
-    known = found[0][1]
-    for source, entry in sorted(found, key=lambda place: not place[1].stored):
+    known = copies[0][1]
+    for source, entry in sorted(copies, key=lambda copy: not copy[1].stored):
         if entry.outcome == LOST:
             continue
         known = entry

@@ -25,8 +25,8 @@ from vla.reports.conditions import Courses, conditions_table, course_table, plot
 from vla.reports.evaluation import plot_report, write_report
 from vla.reports.html import write_page
 from vla.rollouts.evaluate import RecorderFactory, evaluate, keep_recordings
-from vla.rollouts.memory import make_impaired
-from vla.rollouts.realtime import Network, make_distant
+from vla.rollouts.memory import make_without
+from vla.rollouts.realtime import Network, make_over_network
 from vla.rollouts.results import Report, compare_conditions, compare_courses
 from vla.rollouts.rollout import AgentFactory
 from vla.rollouts.statements import AgainstBar, AgainstRun, Statement, differs_clearly
@@ -204,11 +204,11 @@ def _play(experiment: Experiment, checkpoint: Path | None, statements: Sequence[
 
 
 def _other_agents(experiment: Experiment, make_agent: AgentFactory) -> dict[str, AgentFactory]:
-    """Return condition → factory of the same agent without a sense, or at the other end of a network."""
+    """Return condition → factory of the same agent without a modality, or at the other end of a network."""
     asked = experiment["evaluate"]
-    impaired = {f"without_{sense}": partial(make_impaired, make_agent, sense) for sense in asked["without"]}
+    impaired = {f"without_{each}": partial(make_without, make_agent, each) for each in asked["without"]}
     distant = {
-        name: partial(make_distant, make_agent, network, by_clock=asked["by_clock"])
+        name: partial(make_over_network, make_agent, network, by_clock=asked["by_clock"])
         for name, network in _networks(experiment).items()
     }
     return {**impaired, **distant}

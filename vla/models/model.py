@@ -115,7 +115,7 @@ class Model(nn.Module, ABC):
     """
 
     history = 1  # T, number of frames in the input
-    uses_tokens = True  # whether actions are predicted as tokens of the tokenizer, rather than within its bounds
+    uses_tokens = True  # whether actions are predicted as tokens; else as numbers, scaled by the tokenizer's bounds
     TRUTH_INPUT = 1  # length of the features that the auxiliary head reads [width]
 
     pose: Tensor  # indices of the state components that are not rates

@@ -13,27 +13,27 @@ from vla.io.types import Count
 from vla.rollouts.rollout import AgentFactory, close_agent
 from vla.spec import Agent, Array, Environment, Observation, Spec
 
-Sense = Literal["images", "instruction"]
+Modality = Literal["images", "instruction"]
 
 GREY = 128
 STRIDE = 4  # of the pixels in which demonstrations are compared
 
 
-class Impaired:
+class Without:
     """An agent that sees only grey images without depth, or hears only an empty instruction."""
 
-    def __init__(self, agent: Agent, lacks: Sense) -> None:
-        """Args: the agent, and what it lacks."""
-        self._agent, self._lacks = agent, lacks
+    def __init__(self, agent: Agent, missing: Modality) -> None:
+        """Args: the agent, and the modality that it does without."""
+        self._agent, self._missing = agent, missing
         self.info: dict[str, Any] = {}
 
     def reset(self, instruction: str, seed: int) -> None:
         """Start an episode."""
-        self._agent.reset("" if self._lacks == "instruction" else instruction, seed)
+        self._agent.reset("" if self._missing == "instruction" else instruction, seed)
 
     def act(self, observation: Observation) -> Array:
         """Return the (D,) action of the agent."""
-        if self._lacks == "instruction":
+        if self._missing == "instruction":
             observation = replace(observation, instruction="")
         else:
             rgb = {camera: np.full_like(image, GREY) for camera, image in observation.rgb.items()}
@@ -48,9 +48,9 @@ class Impaired:
         close_agent(self._agent)
 
 
-def make_impaired(make_agent: AgentFactory, lacks: Sense, environment: Environment) -> Impaired:
-    """Build an agent that lacks a sense for an environment."""
-    return Impaired(make_agent(environment), lacks)
+def make_without(make_agent: AgentFactory, missing: Modality, environment: Environment) -> Without:
+    """Build an agent without a modality for an environment."""
+    return Without(make_agent(environment), missing)
 
 
 class NearestDemonstration:

@@ -64,7 +64,7 @@ class Schedule:
         self.step = 0  # the next one
 
     def add(self, actions: Array, observed: int) -> None:
-        """Add a chunk (k, D) for an observation before the step `observed`; those of earlier steps are skipped."""
+        """Add a chunk (k, D) of an observation before the step `observed`; actions for past steps are skipped."""
         self._chunks.append((observed, actions))
 
     def is_due(self, execute: int) -> bool:
@@ -244,7 +244,7 @@ class BackgroundLink:
         self._thread.shutdown()
 
 
-class Distant:
+class OverNetwork:
     """An agent at the other end of a simulated network; one that does not plan chunks has chunks of one action."""
 
     def __init__(self, agent: Agent, network: Network, spec: Spec, by_clock: bool = False) -> None:
@@ -276,8 +276,8 @@ class Distant:
         close_agent(self._agent)
 
 
-def make_distant(
+def make_over_network(
     make_agent: AgentFactory, network: Network, environment: Environment, by_clock: bool = False
-) -> Distant:
+) -> OverNetwork:
     """Build an agent at the other end of a network for an environment."""
-    return Distant(make_agent(environment), network, environment.spec, by_clock)
+    return OverNetwork(make_agent(environment), network, environment.spec, by_clock)

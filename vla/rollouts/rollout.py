@@ -19,8 +19,8 @@ def rollout(
 ) -> Episode:
     """Run the episode of `seed` to its end.
 
-    Without `all_images` its observations lack those that the agent does not look at. If a new instruction makes it look
-    at one of them, the episode starts again with all.
+    Without `all_images`, images are not rendered at steps where the agent does not look at them. If a new instruction
+    makes it look at such a step, the episode starts again with all of them.
 
     The label for imitation is `agent.info["clean"]` if present, else the executed action. What the agent drew,
     `agent.info["draws"]`, is added to the draws of the environment. A new instruction resets the agent.

@@ -18,7 +18,7 @@ from vla.rollouts.results import Report, Result
 from vla.spec import IN_DISTRIBUTION, readable
 
 Node = dict[str, Any]
-LENIENT = ConfigDict(strict=True, extra="ignore", allow_inf_nan=False)  # what follows from the rest is not read
+LENIENT = ConfigDict(strict=True, extra="ignore", allow_inf_nan=False)  # derived values are ignored
 CheckpointName = Annotated[str, StringConstraints(pattern=r"^\w[\w.-]*\.ckpt$")]  # in the run's own folder
 
 
@@ -111,7 +111,7 @@ class Condition:
     outcomes: list[str]  # with `anytime`, of the first seeds
     comparison: Comparison | None = None  # with the training condition
     course: dict[str, Comparison] = field(default_factory=dict)  # milestone or field of `Motion` → the same
-    # Per episode, as `outcomes`; empty in reports of before they were kept.
+    # Per episode, as `outcomes`; empty in reports written before these were stored.
     reached: list[tuple[str, ...]] = field(default_factory=list)  # milestones
     motions: list[Motion | None] = field(default_factory=list)
     anytime: bool = False  # intervals are valid whatever the reason to stop playing

@@ -24,8 +24,8 @@ log = logging.getLogger(__name__)
 
 BEST = "best.ckpt"
 
-# Of success, -1 before the first validation; the sum of the shares of several processes is rounded.
-Rate = Annotated[float, Ge(-1), Le(1.001)]
+# Success rate, -1: not measured. The sum of the shares of several processes may exceed 1 by rounding.
+Success = Annotated[float, Ge(-1), Le(1.001)]
 
 
 @dataclass(frozen=True)
@@ -34,8 +34,8 @@ class ClosedLoopState:
 
     __pydantic_config__ = STRICT
 
-    success: Rate
-    best: Rate
+    success: Success
+    best: Success
     seeds: list[int] | None = None
 
 
@@ -46,7 +46,7 @@ class ClosedLoop(Callback):
     ties go to the newest. With sharded weights nothing is played, because all processes would have to act in step.
 
     Args:
-        make_environment: factory of the environment, called for every validation: what it holds is free in between.
+        make_environment: factory of the environment, called for every validation, after which it is closed.
         make_policy: factory of a policy from the model in training.
         seeds: of the episodes, the same in every validation.
         checkpoints: folder of `best.ckpt`.

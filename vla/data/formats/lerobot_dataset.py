@@ -81,7 +81,7 @@ class LeRobotDataset:
         return {key: self.matrix(rows, key) for key in keys}
 
     def open(self, cameras: Sequence[str], keys: Sequence[str]) -> None:
-        """Read the numbers of the features `keys` for `numbers`, and check all files that the episodes need.
+        """Load the features `keys`, whose rows `numbers` returns, and check all files that the episodes need.
 
         Raises:
             ValueError: a file is missing, damaged or contradicts others; or the frames have several rates.

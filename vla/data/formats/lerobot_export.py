@@ -61,11 +61,11 @@ class LeRobotExporter:
         store.require_episodes()
         source = self._source(store)
         with staging_folder(self._folder) as place:
-            if _is_of(self._folder, source):
+            if _holds(self._folder, source):
                 return self._folder
             require_empty(self._folder)
             draft = place / "dataset"
-            if not _is_of(draft, source):
+            if not _holds(draft, source):
                 shutil.rmtree(draft, ignore_errors=True)
                 (draft / "meta").mkdir(parents=True)
                 write_json(draft / "meta/vla.json", source)
@@ -133,7 +133,7 @@ class LeRobotExporter:
         return counts
 
 
-def _is_of(folder: Path, source: Mapping[str, Any]) -> bool:
+def _holds(folder: Path, source: Mapping[str, Any]) -> bool:
     path = folder / "meta/vla.json"
     try:
         return read_json(path, dict[str, Any], MAX_BYTES) == source

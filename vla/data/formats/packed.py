@@ -62,7 +62,7 @@ class PackedExporter:
         tried = _tried(store)
         header = self._header(store, len(tried))
         with staging_folder(self._folder) as place:
-            if _is_of(self._folder, header, tried):
+            if _holds(self._folder, header, tried):
                 return self._folder
             require_empty(self._folder)
             draft = place / "store"
@@ -80,7 +80,8 @@ class PackedExporter:
     def _header(self, store: EpisodeStore, tried: int) -> Header:
         """Return the header of the new store."""
         quality = self._quality if self._colour == JPEG else None
-        return replace(store.header, config=_first(store.config, tried), packed=self._codecs(store), quality=quality)
+        config, codecs = _config_of_first(store.config, tried), self._codecs(store)
+        return replace(store.header, config=config, packed=codecs, quality=quality)
 
     def _write(self, folder: Path, store: EpisodeStore, tried: Sequence[Entry], cluster: Cluster) -> None:
         lengths: dict[str, list[int]] = {name: [0] for name in self._codecs(store)}
@@ -121,7 +122,7 @@ def _tried(store: EpisodeStore) -> list[Entry]:
     return store.tried if every else store.tried[: store.tried.index(shown[-1]) + 1]
 
 
-def _first(config: Mapping[str, Any], tried: int) -> dict[str, Any]:
+def _config_of_first(config: Mapping[str, Any], tried: int) -> dict[str, Any]:
     """Return the config of the first `tried` entries of a store."""
     if "parts" not in config:
         return dict(config)
@@ -133,7 +134,7 @@ def _first(config: Mapping[str, Any], tried: int) -> dict[str, Any]:
     return {**config, "parts": parts}
 
 
-def _is_of(folder: Path, header: Header, tried: Sequence[Entry]) -> bool:
+def _holds(folder: Path, header: Header, tried: Sequence[Entry]) -> bool:
     try:
         there = EpisodeStore(folder)
         same = [replace(entry, crc={}) for entry in there.tried] == [replace(entry, crc={}) for entry in tried]
