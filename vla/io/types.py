@@ -44,9 +44,8 @@ Steps = Annotated[int, Ge(1), Le(1024)]  # of history, of a chunk of actions
 Bins = Annotated[int, Ge(2), Le(65536)]
 Widths = Annotated[list[Width], MinLen(1)]
 Kernels = Annotated[list[Annotated[int, Ge(1), Le(31)]], MinLen(1)]
-Shift = tuple[
-    NonNegative, NonNegative
-]  # largest random shift of training images, vertical and horizontal [1/256 of their height]
+# Largest random shift of training images, vertical and horizontal [1/256 of their height].
+Shift = tuple[NonNegative, NonNegative]
 
 Text = Annotated[str, MinLen(1)]
 

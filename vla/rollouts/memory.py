@@ -19,7 +19,7 @@ GREY = 128
 STRIDE = 4  # of the pixels in which demonstrations are compared
 
 
-class Without:
+class WithoutModality:
     """An agent that sees only grey images without depth, or hears only an empty instruction."""
 
     def __init__(self, agent: Agent, missing: Modality) -> None:
@@ -48,9 +48,9 @@ class Without:
         close_agent(self._agent)
 
 
-def make_without(make_agent: AgentFactory, missing: Modality, environment: Environment) -> Without:
+def make_without(make_agent: AgentFactory, missing: Modality, environment: Environment) -> WithoutModality:
     """Build an agent without a modality for an environment."""
-    return Without(make_agent(environment), missing)
+    return WithoutModality(make_agent(environment), missing)
 
 
 class NearestDemonstration:
