@@ -63,6 +63,9 @@ def test_tiers_weigh_the_same_whatever_the_number_of_their_tasks() -> None:
     # Which task it is explains part of the outcomes: an interval for fixed tasks is narrower than Wilson's.
     low, high = report.interval
     assert low < report.success < high and high - low < 0.9 * np.diff(wilson_interval(20, 30))
+    unknown = tuple(replace(result, task="") for result in results[:10])  # as an error leaves them in a condition
+    rate, reach = Report((*unknown, *results[10:]), tiers), Report(tuple(results[10:]), tiers)
+    assert rate.interval == reach.interval
     told = summary(report)
     assert told["mean_over_tiers"]["rate"] == pytest.approx(0.55)
     assert {tier: part["success"] for tier, part in told["tiers"].items()} == {"easy": 0.9, "very_hard": 0.2}

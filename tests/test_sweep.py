@@ -126,6 +126,16 @@ def test_several_trainings_count_as_fewer_episodes_in_a_comparison(tmp_path: Pat
     assert seen.found.verdict == "open"
 
 
+def test_several_trainings_are_compared_only_if_all_their_scenes_are_the_same(tmp_path: Path) -> None:
+    for number, (level, seed) in enumerate([("default", 0), ("default", 1), ("wide", 0), ("wide", 1)]):
+        cell(tmp_path, number, [f"task/randomize={level}", f"seed={seed}"], 5)
+        report = json.loads((tmp_path / f"{number}/report.json").read_text())
+        for result in report["per_episode"]:
+            result["draws"] = {"blocks": 2 if result["seed"] < 3 or level == "default" else 3}
+        (tmp_path / f"{number}/report.json").write_text(json.dumps(report))
+    assert [each.condition for each in compare_rows(tabulate(tmp_path), 0.02)] == ["dark"]
+
+
 def test_a_row_that_stopped_when_it_was_clear_has_its_anytime_valid_interval(tmp_path: Path) -> None:
     cell(tmp_path, 0, ["model=bc"], 9, anytime=True)
     low, high = (100 * bound for bound in anytime_interval(9, 1))

@@ -136,7 +136,10 @@ def _statements(experiment: Experiment) -> list[Statement]:
         report = require_run(Path(against)).report
         if report is None:
             raise ValueError(f"evaluate.against={against} has no report.json to compare with: evaluate that run first")
-        statement = AgainstRun(against, {result.seed: result for result in report.per_episode}, asked["margin"])
+        theirs = {result.seed: result for result in report.per_episode}
+        if not any(result.draws for result in report.per_episode) and report.config.get("task") != experiment["task"]:
+            theirs = {}  # a world that tells nothing of what it drew: equal seeds are other episodes in another task
+        statement = AgainstRun(against, theirs, asked["margin"], report.anytime)
         statement.require_common(range(asked["seed"], asked["seed"] + asked["episodes"]))
         found.append(statement)
     if asked["until"] and not found and not (conditions(asked) or asked["without"] or asked["networks"]):

@@ -105,6 +105,9 @@ def _compared_rows(first: SweepRow, other: SweepRow, condition: str) -> Comparis
     compared = _compared(first.runs[0], other.runs[0], condition)
     if compared is None or len(first.runs) == len(other.runs) == 1:
         return compared and compared[0]
+    one, two = (_by_seed(row.runs[0], condition) for row in (first, other))
+    if any(seed in two and scene != two[seed][1] for seed, (_, scene) in one.items()):
+        return None  # effective numbers are of all episodes, of which some are other scenes
     (won, played), (others_won, others_played) = (effective_episodes(row.played[condition]) for row in (first, other))
     episodes = first.episodes[condition] + other.episodes[condition]
     return replace(compare_samples(won, played, others_won, others_played), episodes=episodes)

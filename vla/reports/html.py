@@ -142,7 +142,7 @@ def write_sweep(
         lines=lines,
         heads=(choices, ["each seed [%]", "parameters [M]", "action [ms]"], "cells"),
         compared=[(each, comparison_texts(each.found)) for each in compared],
-        anytime=any(run.reports[IN_DISTRIBUTION].anytime for run in cells if run.report),
+        anytime=any(report.anytime for run in cells for report in run.reports.values()),
         curves=draw_runs({name: run.metrics for name, run in runs.items()}),
         cells=dict(zip(map(captions.get, runs), colours(len(runs)), strict=True)),
         pictures={overview.name: overview} if overview.is_file() else {},

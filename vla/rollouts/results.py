@@ -90,7 +90,8 @@ class Report:
         if self.anytime or not self.tiers:
             return self.interval_of(self.successes)
         played = [part for part in self.tasks.values() if part.episodes]
-        return stratified_interval([part._share_of(self.episodes) for part in played])[1:]
+        known = sum(part.episodes for part in played)  # an error in `seen` leaves other conditions without its task
+        return stratified_interval([part._share_of(known) for part in played])[1:]
 
     def interval_of(self, count: float) -> tuple[float, float]:
         """Return the 95 % confidence interval of the rate of an event that `count` completed episodes had."""

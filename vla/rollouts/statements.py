@@ -49,6 +49,7 @@ class AgainstRun:
     run: str
     results: Mapping[int, Result]  # seed → result of the other run
     margin: float
+    anytime: bool = False  # whether the other run stopped when something was clear
 
     def is_clear(self, report: Report) -> bool:
         """See `Statement`.
@@ -91,7 +92,7 @@ class AgainstRun:
             for their, mine in self._completed(report)
             if (their.instruction, their.draws) == (mine.instruction, mine.draws)
         ]
-        return compare_pairs(pairs_of(same), report.anytime)
+        return compare_pairs(pairs_of(same), self.anytime or report.anytime)
 
     def _apart(self) -> ValueError:
         return ValueError(
