@@ -138,9 +138,25 @@ def test_a_job_that_takes_no_checkpoint_says_which_word_does(tmp_path: Path) -> 
     assert "job=train takes no checkpoint: resume=RUN continues a run, pretrained=x.ckpt starts" in done.stderr
 
 
-def test_an_experiment_that_is_a_grid_is_refused_as_a_single_run(tmp_path: Path) -> None:
-    done = here(tmp_path, "experiment=recipe", ok=False)
-    assert done.stderr.endswith("error: experiment=recipe is a grid of runs: add -m\n")
+@pytest.mark.parametrize(
+    ("line", "sentence"),
+    [
+        ("experiment=recipe", "experiment=recipe is a grid of runs: add -m"),
+        ("-m experiment=ablation,recipe", "experiment=ablation is a grid of its own: name no other one beside it"),
+        ("-m seed=0,1 output=there", "every cell has a folder of its own: name that of the sweep, hydra.sweep.dir=DIR"),
+        ("variant=no_transformer model=rt1_small", "variant=no_transformer is model=bc: omit model=rt1_small"),
+        ("experiment=standard task=metaworld", "the option chosen for task has no randomize: choose another task"),
+        ("task.image_size.height=64", "height"),
+        ("checkpoint=x.ckpt output=2", "output=2 is no path"),
+    ],
+)
+def test_a_line_that_would_not_do_what_it_says_is_refused(tmp_path: Path, line: str, sentence: str) -> None:
+    done = here(tmp_path, *line.split(), ok=False)
+    assert sentence in done.stderr and "Traceback" not in done.stderr
+
+
+def test_an_experiment_may_have_options_of_another_job() -> None:
+    check(composed("experiment=few_improved", "job=collect"))
 
 
 def test_without_gl_the_error_says_what_to_install(tmp_path: Path) -> None:

@@ -312,6 +312,10 @@ def test_a_checkpoint_brings_its_task_tokenizer_and_model_and_task_overrides_app
     assert harder.task.blocks == 4
     assert untouched.chosen == SAVED["chosen"]
     assert "light" not in adopt(cfg, ["~task.randomize.light"]).task.randomize
+    merged = adopt(cfg, ["task.randomize={size: {b: 2}}"])
+    assert OmegaConf.to_container(merged.task.randomize) == {**SAVED["task"]["randomize"], "size": {"b": 2}}
+    with pytest.raises(ValueError, match=r"removes a key of task\.nothing, which the checkpoint lacks"):
+        adopt(cfg, ["~task.nothing.light"])
     elsewhere = adopt(cfg, ["+task/randomize@evaluate.conditions.wide.randomize=wide"])
     assert OmegaConf.to_container(elsewhere.task) == SAVED["task"]
 

@@ -71,6 +71,12 @@ def test_a_checkpoint_brings_the_encoder_of_its_instructions(tmp_path: Path, tab
         assert weight.data_ptr() == newest["weights"][name].data_ptr()
 
 
+def test_a_training_from_weights_has_its_own_order_of_windows(tmp_path: Path, tabletop: Tabletop) -> None:
+    _, checkpoint = trained(tmp_path, tabletop)
+    config = finetune(composed(*SMALL, f"pretrained={checkpoint}", "seed=3"), ["seed=3"])
+    assert config.data.seed == 3
+
+
 def test_the_documented_program_acts_like_the_policy(tmp_path: Path, tabletop: Tabletop) -> None:
     policy, checkpoint = trained(tmp_path, tabletop)
     seen = tabletop.reset(0)

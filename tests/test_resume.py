@@ -17,7 +17,7 @@ from vla.config.experiment import plain
 from vla.reports.evaluation import write_report
 from vla.rollouts.results import Report, Result
 from vla.runs.files import Training
-from vla.runs.folder import save_choice, save_training
+from vla.runs.folder import save_choice, save_config, save_training
 from vla.runs.resume import FOUND, TrainingProgress, cached_success, interrupted_run, training_progress
 
 OF_TRAINER = ("trainer.max_steps=9", "trainer.precision=bf16")
@@ -50,6 +50,32 @@ def test_the_newest_run_that_did_not_end_is_found(tmp_path: Path) -> None:
     assert interrupted_run(tmp_path) == tmp_path / "unchosen"
     leave(tmp_path / "unfinished", trained, finished=False)
     assert interrupted_run(tmp_path) == tmp_path / "unfinished"
+
+
+def test_a_run_that_was_extended_after_its_report_is_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    run, rounds = tmp_path / "run", tmp_path / "rounds"
+    leave(run, plain(composed()), finished=True, chosen="last.ckpt")
+    leave(rounds / "round_0", plain(composed("job=train")), finished=True, chosen="last.ckpt")
+    save_config(rounds, plain(composed("job=improve")), [])
+    for folder, last in ((run, run), (rounds, rounds / "round_0")):
+        monkeypatch.setenv(FOUND, "")
+        write_report(Report((Result(0, "success"),)), folder / "report.json", None, {})
+        later = time.time() + 10
+        os.utime(last / "checkpoints/last.ckpt", (later, later))
+        assert interrupted_run(tmp_path) == folder
+        os.utime(folder / "report.json", (later, later))
+
+
+def test_several_processes_are_told_the_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("SLURM_STEP_NUM_TASKS", "2")
+    with pytest.raises(ValueError, match="each of several processes would search for itself: name the run, resume=RUN"):
+        interrupted_run(tmp_path)
+
+
+def test_a_training_without_rounds_is_not_resumed_as_one(tmp_path: Path) -> None:
+    leave(tmp_path / "one", plain(composed("job=train")), finished=True)
+    with pytest.raises(ValueError, match=r"one is a training without rounds: job=improve pretrained="):
+        resume(composed(f"output={tmp_path}/now", "job=improve"), tmp_path / "one", ["job=improve"])
 
 
 def test_a_run_is_resumed_with_its_config_in_its_folder(tmp_path: Path) -> None:

@@ -562,7 +562,10 @@ def test_whoever_acts_is_evaluated_by_the_same_job(tmp_path: Path) -> None:
             f"+evaluate.networks.near={network}",
             "+evaluate.conditions.dark={shadows: true}",
         )
-        here(tmp_path, "agent=remote", f"agent.url={url}", *common, *conditions, "output=remote")
+        here(
+            tmp_path, "agent=remote", f"agent.url={url}", "agent.api_key=s3cret", *common, *conditions, "output=remote"
+        )
+    assert not [path for path in (tmp_path / "remote").rglob("*") if path.is_file() and b"s3cret" in path.read_bytes()]
     report = json.loads((tmp_path / "remote/report.json").read_text())
     (played,) = report["per_episode"]
     assert (played["outcome"], played["steps"], played["draws"]) == (expected.outcome, 10, expected.draws)

@@ -17,6 +17,7 @@ from safetensors.torch import save_file
 
 from vla.models.vision import timm_encoders
 from vla.models.vision.timm_encoders import WEIGHTS, FilmBackbone, FilmEfficientNet, load_backbone
+from vla.training.trainer import SyncBatchNorm
 
 
 @pytest.fixture
@@ -44,6 +45,15 @@ def test_at_the_start_the_efficientnet_is_the_plain_one_bit_for_bit() -> None:
         expected = ours.projection(plain.forward_features(ours.normalize(images)))
         assert torch.equal(ours(images, torch.randn(2, 8)), expected)
     assert len(ours.films) == len(ours.blocks) == 16
+
+
+def test_batch_normalisation_over_processes_keeps_the_activations() -> None:
+    torch.manual_seed(0)
+    network = FilmEfficientNet("efficientnet_b0", pretrained=False, channels=32, text_width=8).eval()
+    images, text = torch.rand(2, 3, 64, 64), torch.randn(2, 8)
+    with torch.inference_mode():
+        expected = network(images, text)
+        assert torch.allclose(SyncBatchNorm().apply(network)(images, text), expected, atol=1e-5)
 
 
 NETWORKS = [("test_vit", 32), ("test_resnet", None), ("test_vit4", None), ("vit_base_patch16_siglip_224", 32)]

@@ -49,7 +49,7 @@ def sentence(error: Exception) -> str:
         reason = error.message.splitlines()[0]
         return f"cannot read {error.override}: {reason}; quote special characters, as in 'key=\"value\"'"
     if isinstance(error, ConfigCompositionException) and "No match in the defaults list" in str(error):
-        return _unmatched(str(error).split("'")[1])
+        return _unmatched(re.split(r"Could not \w+ '", str(error))[-1].partition("'")[0])
     if isinstance(error, ConfigCompositionException) and isinstance(cause, OmegaConfBaseException) and cause.full_key:
         return _unknown_key(cause)
     if isinstance(error, MissingMandatoryValue) and error.full_key:
@@ -109,6 +109,8 @@ def _meant_for_user(error: Exception) -> bool:
     if not isinstance(error, (ValueError, RuntimeError, ImportError)) or not lines:
         return False
     file, statement = lines[-1]
+    if Path(file).name == "omegaconf.py":  # a key of a list that is no number
+        return True
     ours = any(Path(file).is_relative_to(folder) for folder in (PACKAGE, Path(hydra.__file__).parent))
     return ours and statement.startswith("raise")
 
@@ -126,10 +128,23 @@ def _require_sweepable(cfg: DictConfig, job: Job) -> None:
 
 
 def _require_swept() -> None:
-    """Refuse an experiment that is a grid without -m, which would run one cell only."""
-    choices = HydraConfig.get().runtime.choices
-    if HydraConfig.get().mode == RunMode.RUN and HydraConfig.get().sweeper.params:
+    """Refuse grids of which only one cell would run, cells that share a folder, and variants that would not apply."""
+    hydra_config = HydraConfig.get()
+    parts = [override.partition("=") for override in hydra_config.overrides.task]
+    said = {key: value for key, _, value in parts}
+    choices, swept = hydra_config.runtime.choices, hydra_config.mode == RunMode.MULTIRUN
+    if not swept and hydra_config.sweeper.params:
         raise ValueError(f"experiment={choices['experiment']} is a grid of runs: add -m")
+    if not said.keys() >= (hydra_config.sweeper.params or {}).keys():
+        raise ValueError(f"experiment={choices['experiment']} is a grid of its own: name no other one beside it")
+    if swept and "${" not in said.get("output", "${"):
+        raise ValueError("with -m every cell has a folder of its own: name that of the sweep, hydra.sweep.dir=DIR")
+    file = CONF / f"variant/{choices.get('variant')}.yaml"
+    for entry in OmegaConf.select(OmegaConf.load(file), "defaults", default=[]) if file.is_file() else []:
+        for key, option in entry.items() if isinstance(entry, DictConfig) else ():
+            group = str(key).removeprefix("override /")
+            if choices.get(group) != option:
+                raise ValueError(f"variant={file.stem} is {group}={option}: omit {group}={choices.get(group)}")
 
 
 def _remove_unused() -> None:
@@ -162,8 +177,8 @@ def _adopted(cfg: DictConfig, overrides: list[str]) -> DictConfig:
     Raises:
         ValueError: a value is no path, or the named file cannot be used.
     """
-    for key in ("resume", "checkpoint", "pretrained"):
-        if not isinstance(cfg[key], str | None):
+    for key in ("resume", "checkpoint", "pretrained", "output"):
+        if not isinstance(cfg[key], str | None) or (key == "output" and not cfg[key]):
             raise ValueError(f"{key}={cfg[key]} is no path: give a folder or file, in quotes if it is called so")
     if cfg.resume is cfg.pretrained is cfg.checkpoint is None:
         return cfg

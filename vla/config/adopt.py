@@ -76,7 +76,10 @@ def finetune(cfg: DictConfig, overrides: Sequence[str]) -> DictConfig:
     saved = read_header(own if own.exists() and not Path(cfg.pretrained).exists() else cfg.pretrained).config
     require_no_paths(saved, OF_MODEL, cfg.pretrained)
     chosen = {**cfg.chosen, "model": saved.get("chosen", {}).get("model")}
-    return _on_top(cfg, {**{name: saved[name] for name in OF_MODEL if name in saved}, "chosen": chosen}, parsed)
+    nodes = {name: saved[name] for name in OF_MODEL if name in saved}
+    if "seed" in nodes.get("data", {}):
+        nodes["data"] = {**nodes["data"], "seed": "${seed}"}  # of this training: it orders the windows
+    return _on_top(cfg, {**nodes, "chosen": chosen}, parsed)
 
 
 def resume(cfg: DictConfig, run: Path, overrides: Sequence[str]) -> DictConfig:
@@ -98,7 +101,10 @@ def resume(cfg: DictConfig, run: Path, overrides: Sequence[str]) -> DictConfig:
             f"your own are resumed. If it is yours, add output={run}; to use somebody else's weights: "
             f"pretrained={run / LAST}"
         )
-    parsed, known = _parsed(overrides), {*map(str, cfg), saved.get("job")}  # a job has a node of its own
+    if cfg.job == "improve" != saved.get("job"):
+        raise ValueError(f"resume={run} is a training without rounds: job=improve pretrained={run / LAST} improves it")
+    own = str(saved.get("job")).rpartition(".")[2]  # a job has a node of its own
+    parsed, known = _parsed(overrides), {*map(str, cfg), own}
     _require_own_parts(parsed, PRESETS)
     taken = {name: node for name, node in saved.items() if name in known and name not in OF_THIS_COMMAND}
     require_trust(taken, taken, file)
@@ -192,7 +198,12 @@ def _on_top(cfg: DictConfig, saved: Mapping[str, Any], parsed: Sequence[Override
                 continue
             if override.is_delete():
                 parent, _, name = path.rpartition(".")
-                OmegaConf.select(adopted, parent).pop(name, None)
+                node = OmegaConf.select(adopted, parent)
+                if not isinstance(node, DictConfig):
+                    raise ValueError(f"{override.input_line} removes a key of {parent}, which the checkpoint lacks")
+                node.pop(name, None)
+            elif isinstance(value := override.value(), dict):  # which Hydra merges with what is there
+                OmegaConf.update(adopted, path, value, merge=True, force_add=True)
             else:
                 OmegaConf.update(adopted, path, OmegaConf.select(cfg, path), merge=False, force_add=True)
     return adopted

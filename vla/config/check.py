@@ -16,6 +16,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from vla.config.annotations import MissingLibrary, fits, locate
 from vla.config.build import GROUPS, Group, arguments, check_node, check_value, makes, require_known
+from vla.config.packages import CONF
 from vla.io.types import Count, Natural, Seed, Shift, Text, unique
 from vla.spec import FIRST_SEED, IN_DISTRIBUTION
 
@@ -83,8 +84,10 @@ def check(cfg: DictConfig, job: Job) -> None:
     groups, plain = job.needs(cfg), dict(PLAIN)
     if job.options:
         plain[cfg.job.rpartition(".")[2]] = job.options
+    jobs = {file.stem for file in (CONF / "job").glob("*.yaml")}  # an experiment may have options of another job
     for name in cfg:
-        require_known("", str(name), (*plain, *GROUPS, *groups), "the config")
+        if name not in jobs:
+            require_known("", str(name), (*plain, *GROUPS, *groups), "the config")
     for name, annotation in plain.items():
         node = OmegaConf.to_container(cfg[name], resolve=True) if OmegaConf.is_config(cfg[name]) else cfg[name]
         _check_plain(name, node, annotation)

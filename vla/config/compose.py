@@ -17,11 +17,7 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 import vla.config.check
 import vla.config.recorded  # noqa: F401  these two register the resolvers
 from vla.config.experiment import Node, plain
-from vla.config.packages import offer_options, option_folders
-
-PACKAGE = Path(__file__).resolve().parents[1]
-# Inside the package if installed from a wheel, beside it in a clone.
-CONF = next(path for path in (PACKAGE / "conf", PACKAGE.parent / "conf") if (path / "config.yaml").is_file())
+from vla.config.packages import CONF, offer_options, option_folders
 
 
 def compose(*overrides: str) -> DictConfig:

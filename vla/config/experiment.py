@@ -255,7 +255,15 @@ def make_policy(policy: Node, checkpoint: Path, environment: Environment | None 
     tokenizer = build(saved.config["tokenizer"], "tokenizer", spec=saved.spec)
     model = _model(_without_pretraining(saved.config["model"]), saved.spec, tokenizer, saved)
     saved.restore(model)
-    return build(policy, "policy", model=model, spec=saved.spec)
+    try:
+        return build(policy, "policy", model=model, spec=saved.spec)
+    except RuntimeError as error:  # torch.OutOfMemoryError, or one of CUDA itself
+        if "out of memory" not in str(error):
+            raise
+        raise ValueError(
+            "the GPU has too little memory for a policy in every process: lower cluster.workers, as in "
+            "cluster.workers=8, or set policy.device=cpu"
+        ) from error
 
 
 def load_policy(checkpoint: Path | str, device: str = "auto", precision: str = "fp32") -> Policy:

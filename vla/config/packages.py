@@ -24,6 +24,9 @@ TRUST = "VLA_TRUST"  # environment variable of the user: packages, separated by 
 TRUSTED = "VLA_TRUSTED"  # environment variable that passes trusted packages and classes to child processes
 ENTRY_POINTS = "vla.conf"
 MISSING = "???"  # a value that the command line must give
+PACKAGE = Path(__file__).resolve().parents[1]
+# Options of `vla` itself: inside the package if installed from a wheel, beside it in a clone.
+CONF = next(path for path in (PACKAGE / "conf", PACKAGE.parent / "conf") if (path / "config.yaml").is_file())
 
 
 class InstalledOptions(SearchPathPlugin):
@@ -82,8 +85,7 @@ def trust(packages: Any, chosen: Iterable[Any], used: Iterable[Any] = ()) -> Non
         if not isinstance(name, str) or not can_be_trusted(name):
             key = "package" if name in used else "trust"
             raise ValueError(
-                f"{key} cannot name {name!r}: it takes packages made for vla or gymnasium, which have it among their "
-                "dependencies"
+                f"{key} cannot name {name!r}: it takes packages made for vla or gymnasium, which depend on one of them"
             )
     offering = {package for package, _ in option_folders()}
     classes = {each for each in chosen if isinstance(each, str) and each.partition(".")[0] in offering}

@@ -11,8 +11,8 @@ from typing import Any, cast
 from omegaconf import DictConfig, OmegaConf
 
 from vla.config.annotations import MissingLibrary, locate
-from vla.config.compose import CONF
 from vla.config.experiment import Node, plain
+from vla.config.packages import CONF
 from vla.data.header import is_store
 
 log = logging.getLogger(__name__)

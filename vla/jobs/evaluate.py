@@ -38,6 +38,7 @@ from vla.runs.folder import (
     RECORDING,
     REPORT,
     SUITE,
+    read_run,
     require_run,
     save_config,
     wall_time,
@@ -93,6 +94,25 @@ def require_possible(experiment: Experiment) -> None:
         raise ValueError("evaluate.by_clock is about evaluate.networks, and there are none: add evaluate=latency")
     if not experiment.playable and experiment["evaluate"]["conditions"]:
         raise ValueError("evaluate.conditions change a world, and a recording has none: omit them")
+    output = Path(experiment["output"])  # not created yet
+    if read_run(output).config.get("job") == "improve" != experiment["job"]:
+        raise ValueError(f"{output} has the rounds of a job=improve, whose report this would replace: add output=DIR")
+    if experiment.playable:
+        for name, changes in conditions(experiment["evaluate"]).items():
+            _require_world(experiment, name, changes)
+
+
+def _require_world(experiment: Experiment, name: str, changes: dict[str, Any]) -> None:
+    """Raise a ValueError if there is no episode under a condition, such as with more blocks than colours."""
+    try:
+        world = experiment.make_environment(changes)()
+        try:
+            with world.blind():
+                world.reset(experiment["evaluate"]["seed"])
+        finally:
+            world.close()
+    except ValueError as error:
+        raise ValueError(f"condition {name} of the evaluation: {error}") from error
 
 
 def evaluate_trained(experiment: Experiment, checkpoint: Path, rounds: Sequence[Round] = ()) -> float:

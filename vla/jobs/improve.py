@@ -25,7 +25,7 @@ from vla.io.types import Count, Seed, Share
 from vla.jobs.collect import demonstrations
 from vla.jobs.evaluate import evaluate_trained, require_possible
 from vla.jobs.train import train
-from vla.models.checkpoint import read_checkpoint
+from vla.models.checkpoint import read_checkpoint, read_header
 from vla.rollouts.collect import collect, collection_time
 from vla.rollouts.supervised import make_supervised, require_memoryless
 from vla.runs.files import Round
@@ -90,7 +90,8 @@ def _save_config(experiment: Experiment) -> None:
     saved = read_run(experiment.output).config
     if saved.get("job") == "improve":
         require_identity(saved, experiment.config, experiment.output)
-    save_config(experiment.output, experiment.config, experiment.changes)
+    if saved != experiment.config:  # else its date would tell that the rounds began again
+        save_config(experiment.output, experiment.config, experiment.changes)
 
 
 def _require_possible(experiment: Experiment) -> range:
@@ -109,6 +110,9 @@ def _require_possible(experiment: Experiment) -> range:
     environment = experiment.make_environment()()
     try:
         require_memoryless(experiment.make_expert()(environment))
+        if (policy := experiment.pretrained) is not None:
+            known = read_header(policy).spec.without_truth
+            known.require(environment.spec.without_truth, f"the checkpoint {policy}", "the task")
     finally:
         environment.close()
     return seeds

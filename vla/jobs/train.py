@@ -9,6 +9,7 @@ from functools import partial
 from pathlib import Path
 
 import lightning
+import torch
 from lightning import Trainer
 
 from vla.config.check import TRAINING, Job
@@ -64,6 +65,8 @@ def train(experiment: Experiment) -> Path | None:
         if not trainer.is_global_zero:
             logging.getLogger("vla").setLevel(logging.WARNING)  # only the first process logs
         _fit(experiment, state, trainer, graceful_stop)
+        if torch.distributed.is_available() and torch.distributed.is_initialized():
+            torch.distributed.destroy_process_group()  # together: at their exit the others would wait for the first one
         if not trainer.is_global_zero:
             return None
         chosen = closed_loop.selected_checkpoint(checkpoints / LAST) if closed_loop else checkpoints / LAST

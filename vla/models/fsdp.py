@@ -28,7 +28,7 @@ def shard(model: nn.Module, mesh: DeviceMesh) -> None:
 
     for weight in model.parameters():
         weight.data = weight.data.contiguous()  # channels-last filters cannot be sharded
-    for part in list(model.modules()):
+    for part in reversed([*model.modules()]):  # inner blocks first, as `fully_shard` wants it
         for block in part if isinstance(part, nn.ModuleList) else ():
             if sum(weight.numel() for weight in block.parameters()) >= MIN_PARAMETERS:
                 fully_shard(block, mesh=mesh)

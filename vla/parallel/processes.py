@@ -166,12 +166,12 @@ def collect_rarely() -> None:
 
 
 def without_triton() -> None:
-    """Block the import of Triton where PyTorch cannot use it, on machines without an NVIDIA GPU.
+    """Block the import of Triton where PyTorch cannot use it, on machines without a GPU.
 
     Triton and Mesa's software renderer each contain an LLVM, and processes that load both crash. Call this before
     Lightning is imported, which imports Triton.
     """
-    if not Path("/dev/nvidiactl").exists():
+    if not any(Path("/dev", name).exists() for name in ("nvidiactl", "dxg", "kfd")):  # NVIDIA, the same in WSL, AMD
         sys.modules.setdefault("triton", None)  # type: ignore[arg-type]
         for name in ("flop_counter", "cpp_extension"):  # they warn without Triton, and without a GPU
             logging.getLogger(f"torch.utils.{name}").setLevel(logging.ERROR)

@@ -16,7 +16,7 @@ from filelock import FileLock, Timeout
 from vla.config.adopt import require_identity
 from vla.config.differences import differences
 from vla.models.checkpoint import read_header
-from vla.runs.folder import CHECKPOINTS, ERRORS, LAST, REPORT, chosen_checkpoint, read_report
+from vla.runs.folder import CHECKPOINTS, CONFIG, ERRORS, LAST, REPORT, chosen_checkpoint, read_report
 from vla.spec import IN_DISTRIBUTION
 
 log = logging.getLogger(__name__)
@@ -84,6 +84,9 @@ def interrupted_run(runs: Path) -> Path:
     Raises:
         ValueError: there is no unfinished run.
     """
+    started = os.environ.get("SLURM_STEP_NUM_TASKS", os.environ.get("TORCHELASTIC_RUN_ID") and os.environ["WORLD_SIZE"])
+    if int(started or 1) > 1:
+        raise ValueError("resume=last: each of several processes would search for itself: name the run, resume=RUN")
     if os.environ.get("LOCAL_RANK", "0") == "0" or FOUND not in os.environ:
         os.environ[FOUND] = str(_newest_interrupted(runs))
     return Path(os.environ[FOUND])
@@ -96,20 +99,23 @@ def _newest_interrupted(runs: Path) -> Path:
         training = last.parent.parent
         in_rounds = training.parent != runs
         run, lock = (training.parent, training.parent) if in_rounds else (training, last.parent)
-        if not _locked(lock) and (not _evaluated(run) if in_rounds else _unfinished(run)):
+        if not _locked(lock) and (not _evaluated(run, last, run / CONFIG) if in_rounds else _unfinished(run)):
             return run
     raise ValueError(f"resume=last: none of the {len(files)} trainings in {runs} was interrupted; resume=DIR names one")
 
 
-def _evaluated(run: Path) -> bool:
-    return (run / REPORT).exists() or (run / ERRORS).exists()
+def _evaluated(run: Path, *since: Path) -> bool:
+    """Return whether a run has a report that is not older than the files `since`."""
+    began = max((path.stat().st_mtime for path in since if path.exists()), default=0.0)
+    return any(path.exists() and path.stat().st_mtime >= began for path in (run / REPORT, run / ERRORS))
 
 
 def _unfinished(run: Path) -> bool:
     """Return whether a training was interrupted, or the evaluation that was to follow."""
     saved = read_header(run / CHECKPOINTS / LAST)
     unchosen = chosen_checkpoint(run) is None  # killed between the last save and the selection
-    return not saved.finished or unchosen or (saved.config.get("job") == "evaluate" and not _evaluated(run))
+    last = run / CHECKPOINTS / LAST
+    return not saved.finished or unchosen or (saved.config.get("job") == "evaluate" and not _evaluated(run, last))
 
 
 @contextmanager

@@ -16,6 +16,7 @@ import torch
 from lightning import Callback, LightningModule, Trainer
 from lightning.pytorch.accelerators import CPUAccelerator
 from lightning.pytorch.loggers import CSVLogger, Logger
+from lightning.pytorch.plugins.layer_sync import TorchSyncBatchNorm
 from lightning.pytorch.strategies import ParallelStrategy
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 
@@ -55,6 +56,16 @@ class StepSeeding(Callback):
             torch.manual_seed(seed)
 
 
+class SyncBatchNorm(TorchSyncBatchNorm):
+    """Batch normalisation over all processes; timm's layers keep their activations, which torch's conversion drops."""
+
+    def apply(self, model: torch.nn.Module) -> torch.nn.Module:
+        """Return the model with its layers converted."""
+        from vla.models.vision.timm_encoders import synchronised
+
+        return synchronised(model)
+
+
 def make_trainer(config: Mapping[str, Any], checkpoints: Path | None, *callbacks: Callback) -> Trainer:
     """Create the trainer of a config, with EMA and, if a checkpoint folder is given, logging and periodic checkpoints.
 
@@ -75,6 +86,8 @@ def make_trainer(config: Mapping[str, Any], checkpoints: Path | None, *callbacks
     try:
         node = dict(config["trainer"])
         options["precision"] = PRECISIONS[node.pop("precision")]
+        if node.get("sync_batchnorm"):
+            options["plugins"] = [SyncBatchNorm()]
         trainer: Trainer = build(node, "trainer", callbacks=all_callbacks, **options)
         if isinstance(trainer.strategy, ParallelStrategy) and trainer.strategy.cluster_environment:
             # Compare the number of processes with the cluster now; Lightning would only at the start of training.

@@ -130,6 +130,8 @@ class Fast(ActionTokenizer):
         Raises:
             ValueError: they are not those of a fitted tokenizer of this configuration.
         """
+        if type(state).__name__ == "_EXTRA_STATE":  # PyTorch's mark of what a sharded model is not to load
+            return
         try:
             kind = cast(type[tuple[int, int]], Coefficients)
             self._least, self._most = parse_plain(state["coefficients"], kind, "coefficients")

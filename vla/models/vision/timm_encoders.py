@@ -25,6 +25,13 @@ log = logging.getLogger(__name__)
 WEIGHTS = "model.safetensors"  # file name of timm's weights on the hub
 
 
+def synchronised(model: nn.Module) -> nn.Module:
+    """Return a model whose batch normalisation is over all processes, with the activations in timm's layers."""
+    from timm.layers import convert_sync_batchnorm
+
+    return convert_sync_batchnorm(model)
+
+
 class Normalize(nn.Module):
     """Input normalisation of a timm network.
 

@@ -98,6 +98,7 @@ def simplify(spec: mujoco.MjSpec, joints: Collection[str], grips: Collection[str
     fixed = [j.name for j in map(model.joint, range(model.njnt)) if j.name not in joints and j.bodyid[0] not in hand]
     for body, masses in zip(spec.bodies, range(model.nbody), strict=True):
         _weigh(body, model, masses)
+        body.name = body.name or f"vla_body{masses}"
     for element in [*spec.actuators]:
         if element.name not in grips:
             spec.delete(element)

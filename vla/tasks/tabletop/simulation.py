@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import mujoco
@@ -111,7 +111,11 @@ class Simulation:
     def _requests(self, goal: Goal | Chain, seed: int) -> list[Request]:
         """Draw what the instructions of the episode ask for."""
         if isinstance(goal, Chain):
-            links = goal.plan(self.compiled.present, self.streams(seed, "chain"))
+            present, skip = self.compiled.present, self.compiled.skip
+            links = [
+                (link, replace(named, blocks=tuple((block + skip) % present for block in named.blocks)))
+                for link, named in goal.plan(present, self.streams(seed, "chain"))
+            ]
             return [self._request(*link, seed, f" {number}") for number, link in enumerate(links, start=1)]
         return [self._request(goal, None, seed)]
 
@@ -120,6 +124,8 @@ class Simulation:
         held_out = self._held_out(goal, self.streams(seed, f"novelty{stream}"), seed)
         if referents is None:
             referents = self._choose(goal, held_out, self.streams(seed, "named"))
+            if self.compiled.skip and not goal.absent:  # the block may be new where that of the draw was not
+                held_out = self._held_out_for(goal, referents, held_out)
         words = self._slots(goal, referents, seed)
         said = goal.language.say(words, held_out, self.streams(seed, f"language{stream}"))
         if self.compiled.paraphrases and seed >= FIRST_SEED and said:
@@ -164,12 +170,24 @@ class Simulation:
         kinds = [kind for kind in goal.language.held_out_kinds if kind != "combinations" or possible]
         return kinds[random_state.randint(len(kinds))] if kinds else None
 
+    def _held_out_for(self, goal: Goal, referents: Referents, drawn: HeldOut | None) -> HeldOut | None:
+        """Return what is held out when another block is named than that of the draw: again one thing only."""
+        new = self.compiled.block_names[referents.blocks[0]] in goal.language.held_out_colours
+        if new == (drawn == "combinations"):
+            return drawn
+        return "combinations" if new else next((k for k in goal.language.held_out_kinds if k != "combinations"), None)
+
     def _choose(self, goal: Goal, held_out: HeldOut | None, random_state: np.random.RandomState) -> Referents:
         """Draw the named blocks and pads; the first block has a colour that the instruction may name."""
         colours = goal.language.held_out_colours
         order = [int(index) for index in random_state.permutation(self.compiled.present)]
         # The sort is stable: without held-out colours it changes nothing.
         order.sort(key=lambda index: (self.compiled.block_names[index] in colours) != (held_out == "combinations"))
+        if held_out != "combinations" and self.compiled.block_names[order[0]] in colours:
+            raise ValueError(
+                "task.goal.language.held_out_colours: all blocks of a scene have such a colour, so none can be named: "
+                "hold out fewer, or raise task.randomize.distractors.count"
+            )
         skip = self.compiled.skip % len(order)
         order = order[skip:] + order[:skip]
         pads = [int(index) for index in random_state.permutation(goal.pads)]

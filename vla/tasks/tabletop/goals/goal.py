@@ -13,6 +13,7 @@ import numpy as np
 from vla.io.types import Count
 from vla.spec import Array
 from vla.tasks.tabletop.language import Grammar
+from vla.tasks.tabletop.scene import COLOURS
 
 AT_REST = 0.02  # speed below which a block is at rest [m/s]
 
@@ -126,6 +127,8 @@ class Goal(ABC):
         known = ["block", "other"][: self.named] + ["pad", "rest"][: self.pads] + ["absent"] * bool(self.absent)
         if unknown := sorted(language.slots - set(known)):
             raise ValueError(f"task.goal.language has the slots {unknown}, but {type(self).__name__} fills {known}")
+        if strange := sorted(set(language.held_out_colours) - set(COLOURS)):
+            raise ValueError(f"task.goal.language.held_out_colours has {strange}, the colours are {', '.join(COLOURS)}")
         self.language, self.hold_steps = language, hold_steps
 
     @property
