@@ -166,6 +166,19 @@ def in_a_row(*counts: int) -> Report:
     )
 
 
+def test_a_chain_is_also_asked_for_with_other_blocks() -> None:
+    environment = make_tabletop("task/goal=chain", "task.goal.length=3", "task/randomize/naming=swapped")
+    plain = make_tabletop("task/goal=chain", "task.goal.length=3")
+    for seed in (FIRST, SECOND):
+        with environment.blind(), plain.blind():
+            environment.reset(seed)
+            plain.reset(seed)
+        asked, before = environment.simulation.requests, plain.simulation.requests
+        assert [type(each.goal) for each in asked] == [type(each.goal) for each in before]
+        assert all(one.referents.blocks != other.referents.blocks for one, other in zip(asked, before, strict=True))
+        assert all(one.referents.pads == other.referents.pads for one, other in zip(asked, before, strict=True))
+
+
 def test_a_report_tells_how_many_were_completed_in_a_row(tmp_path: Path) -> None:
     report = in_a_row(4, 4, 2, 0)
     assert report.in_a_row == {"1/4": 3, "2/4": 3, "3/4": 2, "4/4": 2}

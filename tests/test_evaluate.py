@@ -10,8 +10,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import toy_recordable as toy
+from composing import composed
 from rerun.chunk import RrdReader
 
+from vla.config.experiment import Experiment
+from vla.jobs.evaluate import require_possible
 from vla.parallel.pool import LocalCluster
 from vla.reports.evaluation import summary, write_report
 from vla.rollouts.evaluate import evaluate, keep_recordings
@@ -48,6 +51,12 @@ def test_several_tasks_are_told_apart() -> None:
     assert summary(report)["tasks"] == {task: summary(report.tasks[task]) for task in ("lift", "push")}
     alone = Report(tuple(push))
     assert "push" not in str(alone) and summary(alone)["tasks"] == {}
+
+
+def test_a_condition_without_an_episode_is_refused_before_any_is_played() -> None:
+    asked = composed("task/randomize=wide", "task.blocks=6", "evaluate=language", "agent=expert")
+    with pytest.raises(ValueError, match=r"condition impossible of the evaluation: task\.blocks must be from 2 to 5"):
+        require_possible(Experiment.of(asked))
 
 
 def test_tiers_weigh_the_same_whatever_the_number_of_their_tasks() -> None:

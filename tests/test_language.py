@@ -194,6 +194,32 @@ def test_the_same_scene_is_asked_for_another_block() -> None:
     other.close()
 
 
+def test_another_block_is_asked_for_with_something_new_and_one_thing_only() -> None:
+    swapped = make_tabletop("task/goal=mixed_or_stay", "task/randomize=wide", "task/randomize/naming=swapped")
+    found = set()
+    for seed in range(FIRST_SEED, FIRST_SEED + 60):
+        with swapped.blind():
+            swapped.reset(seed)
+        (request,) = swapped.simulation.requests
+        grammar = request.goal.language
+        if request.goal.absent or not request.instruction:
+            continue
+        colour = swapped.simulation.compiled.block_names[request.referents.blocks[0]]
+        assert (request.held_out == "combinations") == (colour in grammar.held_out_colours)
+        found.add(request.held_out)
+    assert found == {"combinations", "phrasings", "words"}
+
+
+def test_held_out_colours_exist_and_leave_one_to_name() -> None:
+    with pytest.raises(InstantiationException, match=r"held_out_colours has \['grean'\], the colours are red, "):
+        make_tabletop("task.goal.language.held_out_colours=[grean]")
+    all_but_one = "task.goal.language.held_out_colours=[green,blue,yellow]"
+    environment = make_tabletop(all_but_one, "task.randomize.distractors.count=[1,1]")
+    with environment.blind(), pytest.raises(ValueError, match="all blocks of a scene have such a colour"):
+        for seed in range(20):
+            environment.reset(seed)
+
+
 def test_what_cannot_be_done_is_about_a_block_that_is_not_there() -> None:
     environment = make_tabletop("task/goal=stay", "task/randomize=wide")
     with environment.blind():

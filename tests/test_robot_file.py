@@ -126,8 +126,9 @@ def test_the_expert_acts_with_an_arm_of_a_package() -> None:
 @pytest.mark.parametrize("kind", ["mjcf", "urdf"])
 def test_the_expert_acts_with_an_arm_from_a_file(tmp_path: Path, kind: str) -> None:
     file = tmp_path / f"arm.{'xml' if kind == 'mjcf' else 'urdf'}"
-    file.write_text(mjcf() if kind == "mjcf" else urdf())
+    file.write_text(mjcf().replace('name="b2" ', "") if kind == "mjcf" else urdf())  # bodies need no name
     environment = make(file)
+    assert "" not in environment.poses() and len(environment.simulation.compiled.robot_geoms) >= 10
     robot: Any = environment.spec.robot
     assert robot.joints == tuple(f"j{index}" for index in range(6))
     assert environment.simulation.scene.robot.widest == pytest.approx(0.08, abs=2e-3)
