@@ -123,6 +123,9 @@ def test_joint_positions_of_any_robot_are_learned_from_a_bag_alone(bag: Path) ->
     states = [seen.state for seen in episode.observations]
     np.testing.assert_allclose(episode.actions[:-1], states[1:], atol=0.01)
     assert np.abs(np.diff(episode.actions, axis=0)).sum() > 0.05
+    degrees = replace(spec, units=("deg",) * len(spec.action))
+    with pytest.raises(ValueError, match=r"most actions exceed the bounds of .*: set task\.low and task\.high"):
+        build(config["expert"], "expert", spec=degrees)
 
 
 @pytest.mark.parametrize(

@@ -228,6 +228,13 @@ def test_conditions_choose_episodes(tmp_path: Path, name: str) -> None:
     require_whole(verify_store(store))
 
 
+def test_a_store_that_was_copied_without_its_index_is_not_taken_for_an_empty_one(tmp_path: Path) -> None:
+    folder = add(tmp_path / "store", EPISODES).folder
+    (folder / "index.jsonl").unlink()
+    with pytest.raises(ValueError, match=r"index\.jsonl is missing, which .* beside it needs: copy the folder again"):
+        EpisodeStore(folder)
+
+
 def test_an_empty_draw_fits_no_condition(tmp_path: Path) -> None:
     lacks: dict[int, list[str]] = {1: [], 2: ["depth"]}
     episodes = [replace(EPISODES[seed], draws={"lacks": values}) for seed, values in lacks.items()]

@@ -118,6 +118,56 @@ def test_parts_of_a_dataset_are_chosen_by_name(dataset: Path) -> None:
         assert np.abs(seen.rgb["eye"].astype(int) - expected).max() <= 4
 
 
+def renamed(dataset: Path, folder: Path, names: list[str] | None) -> Path:
+    """A copy of the dataset whose action has other names."""
+    copy = Path(shutil.copytree(dataset, folder))
+    info = json.loads((copy / "meta/info.json").read_text())
+    info["features"]["action"]["names"] = names
+    (copy / "meta/info.json").write_text(json.dumps(info))
+    return copy
+
+
+def test_components_of_one_name_are_told_apart(dataset: Path, tmp_path: Path) -> None:
+    copy = renamed(dataset, tmp_path / "dataset", ["joint", "joint", "gripper"])
+    spec = build(composed(copy)["task"], "task").spec
+    assert spec.action == ("action.joint_0", "action.joint_1", "action.gripper_2")
+
+
+def test_unnamed_components_are_chosen_by_their_numbers(dataset: Path, tmp_path: Path) -> None:
+    copy = renamed(dataset, tmp_path / "dataset", None)
+    config = composed(copy, "task.action=[action_2,action_0,action_1]", "task.image_size=[12,12]")
+    spec = build(config["task"], "task").spec
+    found = build(config["expert"], "expert", spec=spec).episode(1)
+    np.testing.assert_array_equal(found.actions, episode(1).actions[:, [2, 0, 1]])
+
+
+def test_another_recording_is_not_taken_for_the_stored_one(dataset: Path, tmp_path: Path) -> None:
+    copy = Path(shutil.copytree(dataset, tmp_path / "dataset"))
+    bounds = ("task.low=[-99,-99,-99]", "task.high=[99,99,99]", "task.image_size=[12,12]")
+    import_it = ("task=recorded", "expert.folder=dataset", *bounds, "job=collect", "collect.folder=store", "output=run")
+    here(tmp_path, *import_it)
+    for path in (copy / "data").rglob("*.parquet"):
+        table = pq.read_table(path)
+        values = [[number + 1 for number in row] for row in table["action"].to_pylist()]
+        column = pa.array(values, table.schema.field("action").type)
+        pq.write_table(table.set_column(table.column_names.index("action"), "action", column), path)
+    assert "store holds other episodes than these" in here(tmp_path, *import_it, ok=False).stderr
+
+
+def test_a_repaired_import_goes_on(dataset: Path, tmp_path: Path) -> None:
+    config = composed(dataset, "task.image_size=[12,12]")
+    spec = build(config["task"], "task").spec
+    recorded = build(config["expert"], "expert", spec=spec)
+    store = EpisodeStore.create_or_open(tmp_path / "store", spec, {})
+    with store.writing():
+        store.append(recorded.episode(0))
+        store.fail(replace(recorded.episode(1), outcome="damaged"))
+    assert recorded.fill(store, EPISODES - 1) == EPISODES - 2
+    assert [entry.seed for entry in store.episodes] == [0, *range(2, EPISODES)]
+    with pytest.raises(ValueError, match=rf"only {EPISODES - 1} episodes are whole"):
+        recorded.fill(EpisodeStore(tmp_path / "store"), EPISODES)
+
+
 def test_outliers_do_not_widen_the_bounds_and_rare_events_do() -> None:
     moving = np.append(np.linspace(-1, 1, 1000), 30.0)
     low, high = action_bounds(moving)

@@ -263,6 +263,13 @@ def test_an_episode_is_replayed_into_a_recording(home: Path) -> None:
     assert "has no seed 99" in done.stderr and "Traceback" not in done.stderr
 
 
+def test_further_demonstrations_that_are_not_there_are_missed_before_any_are_collected(tmp_path: Path) -> None:
+    refused = here(
+        tmp_path, "job=train", "collect.more=[lessons]", "collect.folder=store", "output=run", ok=False
+    ).stderr
+    assert "lessons" in refused and not (tmp_path / "store").exists()
+
+
 def test_a_damaged_checkpoint_is_named(home: Path) -> None:
     whole = (home / "run/checkpoints/last.ckpt").read_bytes()
     (home / "cut.ckpt").write_bytes(whole[: len(whole) // 2])

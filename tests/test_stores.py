@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from command_line import here
 from toy_episodes import EPISODES, MORE, add, change, content, flip
 
 from vla.data.episodes import EpisodeStore
@@ -49,6 +50,19 @@ def test_stores_are_merged(tmp_path: Path) -> None:
     stores = [str(add(tmp_path / name, some).folder) for name, some in (("a", MORE[:4]), ("b", MORE[3:]))]
     inspect(tmp_path / "nowhere", stores=stores, into=str(tmp_path / "merged"))
     assert stored(tmp_path / "merged") == stored(add(tmp_path / "whole", MORE).folder)
+
+
+def test_a_replay_changes_no_store(tmp_path: Path) -> None:
+    for asked in ("inspect.repair=true", "inspect.into=there"):
+        refused = here(tmp_path, "job=inspect", "inspect.episode=7", asked, ok=False).stderr
+        assert f"omit {asked.partition('=')[0]}" in refused
+
+
+def test_a_card_that_cannot_be_written_hides_no_damage(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    store = add(tmp_path / "store", EPISODES)
+    (store.folder / "card.png").mkdir()
+    inspect(store.folder)
+    assert "could not write" in caplog.text
 
 
 def test_a_new_store_needs_a_folder(tmp_path: Path) -> None:

@@ -26,7 +26,7 @@ from filelock import FileLock, Timeout
 
 from vla.data.header import fields_of, header_of, images_of, is_store, read_header, write_header
 from vla.data.image_codec import JPEG, PackedRows, whole_rows
-from vla.data.index import SALVAGE, Entry, dumps, index_line, listed, parse_line, read_index
+from vla.data.index import REMEDY, SALVAGE, Entry, dumps, index_line, listed, parse_line, read_index
 from vla.data.statistics import Statistics
 from vla.spec import Array, Episode, Observation, Spec
 
@@ -264,6 +264,9 @@ class EpisodeStore:
             os.truncate(self._path(field), self._size(field))
 
     def _refresh(self) -> None:
+        index = self._path("index")
+        if not index.exists() and (there := [field for field in self.fields if self._path(field).exists()]):
+            raise ValueError(f"{index} is missing, which {self._path(there[0]).name} beside it needs: {REMEDY}")
         self.tried, self._index_size = read_index(self._path("index"), self.derived, self._damaged)
         self.episodes = [entry for entry in self.tried if entry.stored][: self._limit]
         self._rows = max((entry.end for entry in self.tried), default=0)

@@ -11,6 +11,7 @@ from __future__ import annotations
 import argparse
 import math
 import resource
+import shutil
 import time
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import closing, contextmanager
@@ -32,6 +33,7 @@ POLICY_INPUTS = (
     "/isaac/franka/joint_states",
     "/user/command",
 )
+RESERVE = 256 << 20  # space on a disk that is left to finish a bag [bytes]
 MAX_MEMORY = 2 << 30  # for reading a bag, beyond what the process has [bytes]
 MAX_FILE_SIZE = 8 << 30  # of a file that is decompressed to disk [bytes]
 
@@ -52,6 +54,7 @@ class BagRecorder(TopicListener):
         if folder.exists():
             raise ValueError(f"{folder} exists already: choose another folder")
         folder.parent.mkdir(parents=True, exist_ok=True)
+        self._folder = folder
         self._writer = Writer(folder, version=9, storage_plugin=StoragePlugin.MCAP)
         self._writer.open()
         self.messages = 0
@@ -62,6 +65,8 @@ class BagRecorder(TopicListener):
         connection = self._writer.add_connection(topic, kind, typestore=message_types())
 
         def write(message: bytes) -> None:
+            if shutil.disk_usage(self._folder).free < RESERVE:
+                raise ValueError(f"{self._folder} ends here: the disk has less than {RESERVE >> 20} MiB left")
             self._writer.write(connection, time.time_ns(), message)
             self.messages += 1
 

@@ -30,6 +30,7 @@ from vla.robots.controllers import GRIPPER, recorded_controller
 from vla.spec import Array, Episode, Observation, Spec
 
 MEASURED_WITHIN = 0.2  # largest time between an observation and its joint state [s]
+MOSTLY = 0.5  # share of the actions beyond a bound from which it is a bound of something else
 
 log = logging.getLogger(__name__)
 
@@ -89,6 +90,13 @@ class BagDemonstrations(ImportedDemonstrations):
         self._stretches = _chosen(self._index, steps)
         self._steps = [self._steps_in(stretch) for stretch in self._stretches]
         self._beyond = 0
+        actions = np.array([self._action(step.at) for steps in self._steps for step in steps])
+        beyond = ((actions < spec.low) | (actions > spec.high)).mean(0)
+        if far := [name for name, share in zip(spec.action, beyond, strict=True) if share > MOSTLY]:
+            raise ValueError(
+                f"{self._index.folder}: most actions exceed the bounds of {', '.join(far)}: set task.low and task.high "
+                "in the units of task.units"
+            )
 
     @classmethod
     def recording(

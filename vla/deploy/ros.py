@@ -81,7 +81,7 @@ class RosNetwork:
 
 @contextmanager
 def ros(network: RosNetwork, log_folder: Path | None = None) -> Iterator[Event]:
-    """Run ROS; yields an event that SIGINT and SIGTERM set.
+    """Run ROS; yields an event that SIGINT, SIGTERM and a hang-up of the terminal set.
 
     The handlers of ROS would shut it down before a node can publish its last command.
 
@@ -107,7 +107,8 @@ def ros(network: RosNetwork, log_folder: Path | None = None) -> Iterator[Event]:
     def stop(number: int, frame: FrameType | None) -> None:
         stopped.set()
 
-    before = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM)}
+    hangup = () if signal.getsignal(signal.SIGHUP) is signal.SIG_IGN else (signal.SIGHUP,)  # ignored by nohup
+    before = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM, *hangup)}
     try:
         try:
             rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)

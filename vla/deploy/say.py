@@ -31,7 +31,7 @@ def main() -> None:
     if len(instruction) > LONGEST_INSTRUCTION:
         sys.exit(f"error: the instruction has {len(instruction)} characters, the limit is {LONGEST_INSTRUCTION}")
     with command_node("vla_say", options.network) as (node, _):
-        for number in (signal.SIGINT, signal.SIGTERM):
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
             signal.signal(number, signal.SIG_DFL)  # end at once: there is no arm to brake here
         from vla.deploy.calls import hand_over, next_episode, resume, say
 

@@ -37,6 +37,9 @@ def demonstrations(experiment: Experiment) -> EpisodeStore:
     if store is None:
         store = _fill(experiment)
     else:
+        folder = experiment["expert"].get("folder")
+        if folder and Path(folder).exists() and not store.derived and (recorded := _source(experiment)[2]):
+            recorded.require_held(store)
         log.info("%s: %d of its %d episodes, none of them new", store.folder, asked["episodes"], len(store.episodes))
     return EpisodeStore(store.folder, asked["episodes"])
 

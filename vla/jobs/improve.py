@@ -59,8 +59,8 @@ def run(experiment: Experiment) -> float:
     seeds = _require_possible(experiment)
     with training_lock(experiment.output):
         _save_config(experiment)
-        more = experiment["collect"]["more"] or ()
-        for store in (demonstrations(experiment), *map(EpisodeStore, more)):
+        more = [EpisodeStore(folder) for folder in experiment["collect"]["more"] or ()]
+        for store in (demonstrations(experiment), *more):
             require_new(seeds, store)
         return _improved(experiment, seeds)
 

@@ -16,6 +16,7 @@ from vla.config.experiment import Experiment, make_environment
 from vla.data.episodes import EpisodeStore
 from vla.data.index import listed
 from vla.data.verification import derive_store, find_episode, require_whole, verify_store
+from vla.io.files import warn_on_error
 from vla.io.types import Natural, Text
 from vla.reports.dataset_card import store_table, write_card
 from vla.rollouts.recorder import RerunRecorder, recording_name
@@ -43,6 +44,8 @@ def run(experiment: Experiment) -> None:
     if seed is None:
         inspect_store(**asked)
     else:
+        if others := [name for name in ("stores", "where", "repair", "into") if asked[name]]:
+            raise ValueError(f"inspect.episode replays an episode of inspect.folder: omit inspect.{others[0]}")
         replay_episode(experiment.output, Path(asked["folder"]), seed, experiment["task"].get("robot"))
 
 
@@ -59,7 +62,8 @@ def inspect_store(
     findings = verify_store(EpisodeStore(_chosen(folder, stores, where, repair, into), damaged=True))
     show(store_table(findings))
     if findings.whole:
-        log.info("wrote %s and card.png", write_card(findings))
+        with warn_on_error(findings.store.folder / "card.md"):  # a store may be read-only
+            log.info("wrote %s and card.png", write_card(findings))
     require_whole(findings)
 
 

@@ -77,6 +77,7 @@ def train(experiment: Experiment) -> Path | None:
 
 def _fit(experiment: Experiment, state: TrainingProgress, trainer: Trainer, graceful_stop: GracefulStop) -> None:
     """Collect missing demonstrations and train on them."""
+    more = [EpisodeStore(folder) for folder in experiment["collect"]["more"] or ()]
     output, origin = experiment.output, state.resume_from or experiment.pretrained
     lightning.seed_everything(experiment["seed"], verbose=False)
     with explain_memory_errors(experiment.config):
@@ -86,7 +87,7 @@ def _fit(experiment: Experiment, state: TrainingProgress, trainer: Trainer, grac
         experiment.fit_tokenizer(learner.model.tokenizer, store)
     data = experiment.data(store, learner.model.history, learner.model.chunk)
     _log_tokenization_error(learner.model, store)
-    for further in map(EpisodeStore, experiment["collect"]["more"] or ()):
+    for further in more:
         if further.episodes:
             _warn_of_clipped(learner.model, further, further.statistics.chunks(learner.model.chunk))
     data.setup()

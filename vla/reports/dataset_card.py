@@ -120,6 +120,7 @@ def _text(findings: StoreReport) -> str:
         *conditions,
         *configs,
         "## Training on this store",
+        "With the task and the expert above on the command line:",
         f"```\npython -m vla.run job=train collect.folder=FOLDER collect.episodes={len(findings.whole)}\n```",
     ]
     return "\n\n".join(each.strip() for each in paragraphs) + "\n"

@@ -65,16 +65,23 @@ class ImportedDemonstrations(ABC):
             raise ValueError(
                 f"there are only {len(self)} recorded episodes: set collect.episodes={len(self)}, or fewer"
             )
-        last = min(len(store.episodes), len(self)) - 1
-        if last >= 0 and not np.array_equal(store.read(store.episodes[last])["action"], self.episode(last).actions):
-            raise ValueError(f"{store.folder} holds other episodes than these: choose another collect.folder")
+        self.require_held(store)
         if len(store.episodes) >= episodes:
             return 0
+        first = store.next_seed or 0
+        if (possible := len(store.episodes) + len(self) - first) < episodes:  # damaged ones do not come back
+            raise ValueError(f"only {possible} episodes are whole: set collect.episodes={possible}, or fewer")
         with store.writing():
-            missing = range(len(store.episodes), episodes)
+            missing = range(first, first + episodes - len(store.episodes))
             for number in track(missing, "importing"):
                 store.append(self.episode(number))
         return len(missing)
+
+    def require_held(self, store: EpisodeStore) -> None:
+        """Raise a ValueError unless the last episode that a store and this recording share is the same in both."""
+        held = [entry for entry in store.episodes if entry.seed < len(self)][-1:]
+        if any(not np.array_equal(store.read(entry)["action"], self.episode(entry.seed).actions) for entry in held):
+            raise ValueError(f"{store.folder} holds other episodes than these: choose another collect.folder")
 
 
 def action_bounds(values: Array) -> tuple[float, float]:

@@ -68,11 +68,14 @@ class LeRobotDataset:
                 raise ValueError(f"{self.folder} has {size} components in {key}, the limit is {MOST_COMPONENTS}")
         named = {key: dict(enumerate(self.info.features[key].components or ())) for key in keys}
         places = [(key, index) for key in keys for index in range(self.info.features[key].shape[0])]
-        if not any(named.values()) and len(places) == len(anonymous):
+        numbered = {f"{key.rpartition('.')[2]}_{index}" for key, index in places}
+        if not any(named.values()) and len(places) == len(anonymous) and not numbered >= {*anonymous}:
             return dict(zip(anonymous, places, strict=True))
         names = [named[key].get(index, f"{key.rpartition('.')[2]}_{index}") for key, index in places]
         if len(set(names)) < len(names):
             names = [f"{key}.{name}" for (key, _), name in zip(places, names, strict=True)]
+        if len(set(names)) < len(names):  # within a feature, such as those of two arms
+            names = [f"{name}_{index}" for (_, index), name in zip(places, names, strict=True)]
         return dict(zip(names, places, strict=True))
 
     def read(self, keys: Sequence[str]) -> dict[str, Array]:
