@@ -59,6 +59,12 @@ def test_a_condition_without_an_episode_is_refused_before_any_is_played() -> Non
         require_possible(Experiment.of(asked))
 
 
+def test_the_report_of_rounds_is_not_replaced(tmp_path: Path) -> None:
+    (tmp_path / "round_0/checkpoints").mkdir(parents=True)
+    with pytest.raises(ValueError, match="has the rounds of a job=improve, whose report this would replace"):
+        require_possible(Experiment.of(composed(f"output={tmp_path}", "agent=expert")))
+
+
 def test_tiers_weigh_the_same_whatever_the_number_of_their_tasks() -> None:
     tiers = {"easy": ["reach", "push"], "very_hard": ["stack"], "unseen": ["fold"]}
     asked = [("reach", 10), ("push", 8), ("stack", 2)]

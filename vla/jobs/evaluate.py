@@ -38,7 +38,6 @@ from vla.runs.folder import (
     RECORDING,
     REPORT,
     SUITE,
-    read_run,
     require_run,
     save_config,
     wall_time,
@@ -95,7 +94,7 @@ def require_possible(experiment: Experiment) -> None:
     if not experiment.playable and experiment["evaluate"]["conditions"]:
         raise ValueError("evaluate.conditions change a world, and a recording has none: omit them")
     output = Path(experiment["output"])  # not created yet
-    if read_run(output).config.get("job") == "improve" != experiment["job"]:
+    if experiment["job"] != "improve" and any(output.glob(f"round_*/{CHECKPOINTS}")):
         raise ValueError(f"{output} has the rounds of a job=improve, whose report this would replace: add output=DIR")
     if experiment.playable:
         for name, changes in conditions(experiment["evaluate"]).items():
