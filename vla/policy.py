@@ -169,7 +169,7 @@ class Policy:
             raise ValueError(f"the policy's state is {self.spec.state}, the observation's {observation.state.shape}")
         return {
             "rgb": {camera: self._tensor(observation.rgb[camera]) for camera in self.spec.cameras},
-            "state": self._tensor(observation.state),
+            "state": self._tensor(np.asarray(observation.state, np.float32)),
             "present": torch.ones(1, 1, dtype=torch.bool, device=self.device),
             "text": self._text,
         }

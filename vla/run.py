@@ -7,6 +7,7 @@ import re
 import shutil
 import sys
 import traceback
+from importlib.util import find_spec
 from pathlib import Path
 from string import Template
 from typing import Any, NoReturn
@@ -95,7 +96,7 @@ def _meant_for_user(error: Exception) -> bool:
     """Return whether `error` is about the command line, a file or the machine rather than a bug.
 
     Libraries also raise ValueError and RuntimeError for bugs. The traceback of a deliberate error, here or in a worker
-    process, ends with a `raise` in this package, or in Hydra for the command line.
+    process, ends with a `raise` in this package or one that adds options, or in Hydra for the command line.
     """
     if isinstance(error, (OSError, HydraException, OmegaConfBaseException)):
         return True
@@ -111,7 +112,9 @@ def _meant_for_user(error: Exception) -> bool:
     file, statement = lines[-1]
     if Path(file).name == "omegaconf.py":  # a key of a list that is no number
         return True
-    ours = any(Path(file).is_relative_to(folder) for folder in (PACKAGE, Path(hydra.__file__).parent))
+    added = [find_spec(package) for package, _ in option_folders()]
+    places = [Path(place) for spec in added if spec for place in spec.submodule_search_locations or ()]
+    ours = any(Path(file).is_relative_to(folder) for folder in (PACKAGE, Path(hydra.__file__).parent, *places))
     return ours and statement.startswith("raise")
 
 

@@ -178,6 +178,8 @@ def check_node(key: str, node: Any, expected: Any, runtime: Sequence[str] = ()) 
     parameters = arguments(target)
     several = [name for name, each in parameters.items() if each.kind is inspect.Parameter.VAR_KEYWORD]
     known = [name for name in parameters if name not in (*runtime, *several)]
+    if lacking := [name for name in runtime if not several and name not in parameters]:
+        raise ValueError(f"{key}: {target.__name__} must take the arguments {', '.join(lacking)}, which the job gives")
     hints = {name: each.annotation for name, each in parameters.items()} | NARROWER.get(node["_target_"], {})
     for name, value in node.items():
         if name in HYDRA_KEYS:

@@ -8,6 +8,7 @@ from collections import Counter
 from collections.abc import Mapping
 from contextlib import nullcontext, suppress
 from dataclasses import dataclass, field
+from inspect import Parameter
 from typing import Annotated, Any, Literal, cast
 
 from annotated_types import Ge, Gt, Lt, Predicate
@@ -196,7 +197,10 @@ def _require_apart(cfg: DictConfig) -> None:
 
 
 def _require_together(tokenizer: type, model: type) -> None:
-    if not fits(tokenizer, arguments(model)["tokenizer"].annotation):
+    taken = arguments(model).get("tokenizer")
+    if taken is None:
+        raise ValueError(f"{model.__name__} does not name its arguments: end them with **inherited: Inherited")
+    if taken.annotation not in (Any, Parameter.empty) and not fits(tokenizer, taken.annotation):
         raise ValueError(
             f"{model.__name__} predicts one token per component, which {tokenizer.__name__} does not have: choose "
             "another tokenizer, such as uniform, or model=decoder, which goes with all"

@@ -20,7 +20,7 @@ from vla.config.check import with_changes
 from vla.config.differences import ABSENT, at, differences
 from vla.config.packages import trusted, with_trust
 from vla.parallel.processes import without_triton
-from vla.spec import SpecOnly
+from vla.spec import Spec, SpecOnly
 
 if TYPE_CHECKING:
     from vla.data.datamodule import WindowDataModule
@@ -219,6 +219,7 @@ def make_environment(task: Node) -> Environment:
             "the task has no simulator, only recordings, so nothing can be played in it: job=collect, train, evaluate, "
             "export and inspect work with recordings, and so do deploy=server and deploy=ros2"
         )
+    Spec.from_dict(environment.spec.to_dict(), f"the spec of {type(environment).__name__}")
     return environment
 
 

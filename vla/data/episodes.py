@@ -28,7 +28,7 @@ from vla.data.header import fields_of, header_of, images_of, is_store, read_head
 from vla.data.image_codec import JPEG, PackedRows, whole_rows
 from vla.data.index import REMEDY, SALVAGE, Entry, dumps, index_line, listed, parse_line, read_index
 from vla.data.statistics import Statistics
-from vla.spec import Array, Episode, Observation, Spec
+from vla.spec import FIRST_SEED, Array, Episode, Observation, Spec
 
 Rows = Array | PackedRows
 
@@ -222,9 +222,18 @@ class EpisodeStore:
         """Store an episode atomically: a success, or a failure whose labels are to be kept.
 
         Raises:
-            ValueError: it does not match the spec, has another seed than the next, or cannot be written.
+            ValueError: it does not match the spec, has several instructions or another seed than the next, or cannot be
+                written.
         """
-        rows = self._rows_of(episode)
+        if any(seen.instruction != episode.instruction for seen in episode.observations):
+            raise ValueError(
+                f"seed {episode.seed} has several instructions, and a store keeps one per episode: give episodes below "
+                f"seed {FIRST_SEED} one each"
+            )
+        try:
+            rows = self._rows_of(episode)
+        except KeyError as error:
+            raise ValueError(f"seed {episode.seed}: an observation lacks {error}, which the spec names") from error
         self._commit(self._entry(episode, episode.instruction, len(episode.actions), checksums(rows)), rows)
 
     def fail(self, episode: Episode) -> None:

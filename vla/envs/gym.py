@@ -14,7 +14,7 @@ from vla.config.experiment import make_environment
 from vla.spec import FIRST_SEED, LONGEST_INSTRUCTION, Array, Environment, Observation
 
 UNBOUNDED = np.finfo(np.float32).max
-LATIN = "".join(filter(str.isprintable, map(chr, range(0x100))))  # characters of an instruction
+LETTERS = "".join(filter(str.isprintable, map(chr, range(0x10000))))  # of an instruction in most languages
 
 
 class GymEnvironment(gymnasium.Env[dict[str, Any], Array]):
@@ -36,7 +36,7 @@ class GymEnvironment(gymnasium.Env[dict[str, Any], Array]):
             {
                 **{camera: Box(0, 255, (*spec.image_size, 3), np.uint8) for camera in spec.cameras},
                 "state": Box(-UNBOUNDED, UNBOUNDED, (len(spec.state),), np.float32),
-                "instruction": Text(LONGEST_INSTRUCTION, min_length=0, charset=LATIN),
+                "instruction": Text(LONGEST_INSTRUCTION, min_length=0, charset=LETTERS),
             }
         )
         self.action_space = Box(np.array(spec.low, np.float32), np.array(spec.high, np.float32), dtype=np.float32)

@@ -239,7 +239,10 @@ class TokenModel(Model):
     def predict(self, batch: Batch) -> Prediction:
         """Decode the logits of the newest frame."""
         frame = newest(batch["present"])
-        logits = self(batch)["logits"][torch.arange(len(frame)), frame].float()  # (B, k, D, K)
+        logits = self(batch)["logits"]
+        if logits.shape[1] != batch["present"].shape[1]:
+            raise ValueError(f"{type(self).__name__}.forward must return logits for every frame of its history")
+        logits = logits[torch.arange(len(frame)), frame].float()  # (B, k, D, K)
         return Prediction(self.tokenizer.decode_logits(logits), logits.softmax(-1))
 
 

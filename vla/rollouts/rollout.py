@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import nullcontext
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -26,9 +27,14 @@ def rollout(
     `agent.info["draws"]`, is added to the draws of the environment. A new instruction resets the agent.
 
     Raises:
-        ValueError: the agent returned an action of the wrong shape, or one that is not finite.
+        ValueError: the agent returned an action of the wrong shape, or one that is not finite, or the episode is over
+            at its start.
     """
     observation = environment.reset(seed)
+    if environment.done:
+        raise ValueError(f"the episode of seed {seed} is over at its start: `reset` must draw another one")
+    if not hasattr(agent, "info"):
+        raise ValueError(f"{type(agent).__name__} has no `info`: set self.info = {{}} in its constructor")
     agent.reset(observation.instruction, seed)
     if recorder is not None:
         recorder.start(environment)
@@ -41,11 +47,11 @@ def rollout(
             agent.reset(observation.instruction, seed)
             if blind and isinstance(agent, Looking) and agent.looks:
                 return rollout(environment, agent, seed, recorder)
-        action = np.asarray(agent.act(observation), dtype=np.float32)
+        action = np.array(agent.act(observation), dtype=np.float32)
         if action.shape != (components,) or not np.isfinite(action).all():
             raise ValueError(f"{type(agent).__name__} must return {components} finite numbers, got {action}")
-        observations.append(observation)
-        clean.append(agent.info.get("clean", action))
+        observations.append(_copied(observation))
+        clean.append(np.array(agent.info.get("clean", action), dtype=np.float32))
         executed.append(action)
         if recorder is not None:
             recorder.step(observation, action, agent.info)
@@ -72,6 +78,13 @@ def rollout(
     return episode
 
 
+def _copied(seen: Observation) -> Observation:
+    """Return a copy with a state of 32 bits: a world may use its arrays again."""
+    rgb, depth = ({name: np.array(image) for name, image in images.items()} for images in (seen.rgb, seen.depth))
+    truth = None if seen.truth is None else {name: np.array(value) for name, value in seen.truth.items()}
+    return replace(seen, rgb=rgb, depth=depth, truth=truth, state=np.array(seen.state, np.float32))
+
+
 def _completed(environment: Environment) -> tuple[int, int] | None:
     several = isinstance(environment, InARow) and environment.instructions > 1
     return (environment.completed, environment.instructions) if several else None
@@ -93,8 +106,8 @@ def replay(environment: Environment, episode: Episode, recorder: Recorder | None
     for recorded, action in zip(episode.observations, episode.executed, strict=True):
         if environment.done:
             break
-        same.append(np.array_equal(observation.state, recorded.state))
-        seen.append(observation)
+        seen.append(_copied(observation))
+        same.append(np.array_equal(seen[-1].state, recorded.state))
         if recorder is not None:
             recorder.step(recorded, action, {})
         observation = environment.step(action)

@@ -77,7 +77,7 @@ def make_trainer(config: Mapping[str, Any], checkpoints: Path | None, *callbacks
     _keep_freed_memory()
     all_callbacks: list[Callback] = [TrainingProgressBar(), *callbacks]
     options: dict[str, Any] = {"logger": False, "enable_checkpointing": False}
-    if config["learner"]["ema"]:
+    if config["learner"].get("ema"):
         all_callbacks.append(EMA(config["learner"]["ema"]))
     if checkpoints is not None:
         all_callbacks += [Throughput(), PeriodicCheckpoint(checkpoints)]

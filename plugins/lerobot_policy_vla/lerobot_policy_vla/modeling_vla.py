@@ -38,6 +38,7 @@ class VlaPolicy(PreTrainedPolicy):
         device = "cuda" if str(config.device).startswith("cuda") else "cpu"
         options = {"device": device, "precision": config.precision, "compile": config.compile}
         self._policy: Policy = make_policy({"_target_": "vla.policy.Policy", **options}, Path(config.checkpoint))
+        self._policy.device = torch.device(str(config.device) if device == "cuda" else "cpu")  # such as cuda:1
         self.model = self._policy.model  # a module, so that it moves with this one
         self._sessions: list[Policy] = []
 

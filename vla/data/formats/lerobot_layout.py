@@ -250,4 +250,4 @@ def _arrow(values: Array) -> pa.Array:
 
 
 def _fps(spec: Spec) -> float | int:
-    return int(spec.control_hz) if spec.control_hz.is_integer() else spec.control_hz
+    return int(spec.control_hz) if float(spec.control_hz).is_integer() else spec.control_hz
