@@ -246,6 +246,24 @@ def handed_over(world: World) -> None:
     world.joints = world.joints + 0.2
 
 
+def test_an_arm_that_was_moved_while_its_states_were_missing_is_not_pulled_back(world: World) -> None:
+    world.measures = False
+    world.run(0.6)
+    world.joints, world.measures, world.follows = HOME + 0.4, True, False
+    for command in world.run(0.2)[1:]:
+        np.testing.assert_array_equal(command.position, HOME + 0.4)
+    assert world.loop.state is State.FAULT and "moved while it was held" in world.loop.reason
+
+
+def test_an_arm_that_is_moved_while_it_is_stopped_is_not_pulled_back(world: World) -> None:
+    world.loop.stop("enough")
+    world.run(0.5)
+    world.joints, world.follows = HOME + 0.4, False
+    world.run(SAFETY.tracking_for + 0.1)
+    assert world.loop.state is State.FAULT and "moved while it was held" in world.loop.reason
+    np.testing.assert_array_equal(world.run(0.1)[-1].position, HOME + 0.4)
+
+
 def test_an_arm_in_the_hands_of_a_person_is_not_commanded_and_goes_on_from_where_it_is_left(world: World) -> None:
     world.run(0.3)
     handed_over(world)

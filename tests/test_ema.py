@@ -35,9 +35,9 @@ def test_it_is_the_exponential_average_of_the_steps_and_what_is_validated_and_sa
     trainer = make_trainer(steps, EMA(DECAY), watch)
     trainer.fit(make_learner(lr=1e-2, warmup_steps=0), loader(batch, steps), loader(batch, 1))
     trainer.save_checkpoint(tmp_path / "last.ckpt")
-    average, share = watch.trained[0], DECAY**EVERY
-    for weight in watch.trained[EVERY - 1 :: EVERY]:
-        average = share * average + (1 - share) * weight
+    weights = [DECAY ** (steps - step) for step in range(EVERY, steps + 1, EVERY)]
+    seen = torch.stack(watch.trained[EVERY - 1 :: EVERY])
+    average = torch.einsum("n,n...->...", torch.tensor(weights) / sum(weights), seen)  # of the initial weights nothing
     torch.testing.assert_close(watch.validated[-1], average)
     torch.testing.assert_close(read_checkpoint(tmp_path / "last.ckpt").state["head.weight"], average)
     saved = torch.load(tmp_path / "last.ckpt", weights_only=True)

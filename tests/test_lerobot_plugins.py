@@ -102,7 +102,7 @@ def test_lerobot_finds_the_plugins_by_its_rules() -> None:
 def test_the_commands_of_the_page_compose() -> None:
     page = (ROOT / "docs/lerobot.md").read_text(encoding="utf-8")
     options = PLUGINS["lerobot_policy_vla"] / "lerobot_policy_vla/conf"
-    export, evaluate = re.findall(r"^python -m vla\.run (.*)$", page, re.MULTILINE)
+    export, evaluate = re.findall(r"^python -m vla\.run (.*)$", page.replace("\\\n", ""), re.MULTILINE)
     assert composed(*shlex.split(export)).export.folder == "DATASET"
     agent = plain(composed(*shlex.split(evaluate), f"hydra.searchpath=[file://{options}]"))["agent"]
     target = agent.pop("_target_")

@@ -134,6 +134,20 @@ def test_joint_states_that_do_not_fit_are_refused(changed: dict, reason: str) ->
         messages.joints_from(joints(**changed), ROBOT)
 
 
+def test_joints_without_a_velocity_are_at_rest_and_other_joints_do_not_matter() -> None:
+    message = joints(name=["one", "two", "left", "right", "wheel"], position=[1.0, 2.0, 0.01, 0.02, float("nan")])
+    message.velocity = [float("nan")] * 5
+    position, velocity, _ = messages.joints_from(message, ROBOT)
+    assert position.tolist() == [1.0, 2.0] and velocity.tolist() == [0.0, 0.0]
+
+
+def test_a_gripper_may_report_further_joints() -> None:
+    states = messages.JointStates(ROBOT)
+    assert states.read(joints(name=["left", "right", "knuckle"], position=[0.01, 0.02, 0.5], velocity=[]), 1.0) is None
+    arm = states.read(joints(name=["one", "two"], position=[0.0, 0.0], velocity=[]), 1.1)
+    assert arm is not None and arm[2] == pytest.approx(0.03)
+
+
 def test_a_command_goes_there_and_back() -> None:
     command = Command(np.array([0.1, 0.2]), np.array([1.0, 2.0]), 0.5)
     message = messages.fill_joint_state(SimpleNamespace(velocity=[], effort=[]), ROBOT, command)

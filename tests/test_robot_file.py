@@ -170,9 +170,7 @@ def test_a_cartesian_policy_moves_the_arm_that_it_was_trained_with(jaco: Tableto
     limits = {"low": [-9.0] * 6, "high": [9.0] * 6, "speed": [2.0] * 6, "acceleration": [50.0] * 6}
     shares = {"speed_share": 1.0, "acceleration_share": 1.0}
     robot = Robot(
-        **defaults_of(
-            "deploy/robot/simulated", joints=list(spec.require_robot("this").joints), fingers=[], **limits, **shares
-        )
+        **defaults_of("deploy/robot/simulated", joints=list(spec.require_robot("this").joints), **limits, **shares)
     )
     loop = ControlLoop(spec, robot, replace(SAFETY, workspace=((-2.0,) * 3, (2.0,) * 3)), 50.0)
     now, joints = 100.0, arm.home.copy()

@@ -47,6 +47,14 @@ def test_at_the_start_the_efficientnet_is_the_plain_one_bit_for_bit() -> None:
     assert len(ours.films) == len(ours.blocks) == 16
 
 
+def test_a_frozen_backbone_keeps_its_statistics_from_the_start() -> None:
+    encoder = FilmBackbone("test_resnet", False, frozen=True, size=32, channels=8, text_width=8)
+    before = {name: buffer.clone() for name, buffer in encoder.backbone.named_buffers()}
+    encoder(torch.rand(2, 3, 32, 32), torch.randn(2, 8))  # in the mode that Lightning finds
+    for name, buffer in encoder.backbone.named_buffers():
+        torch.testing.assert_close(buffer, before[name])
+
+
 def test_batch_normalisation_over_processes_keeps_the_activations() -> None:
     torch.manual_seed(0)
     network = FilmEfficientNet("efficientnet_b0", pretrained=False, channels=32, text_width=8).eval()

@@ -165,6 +165,8 @@ class Policy:
         shapes = {camera: image.shape for camera, image in observation.rgb.items()}
         if any(shapes.get(camera) != shape for camera in self.spec.cameras):
             raise ValueError(f"the policy needs cameras {self.spec.cameras} of {shape}, the observation has {shapes}")
+        if other := [camera for camera in self.spec.cameras if observation.rgb[camera].dtype != np.uint8]:
+            raise ValueError(f"images must be uint8, 0 to 255, that of {other[0]} is {observation.rgb[other[0]].dtype}")
         if observation.state.shape != (len(self.spec.state),):
             raise ValueError(f"the policy's state is {self.spec.state}, the observation's {observation.state.shape}")
         return {

@@ -174,9 +174,10 @@ class GripperGoals:
 
         if isinstance(settings, FrankaGripper):
             grasp, move = (action_class(*names) for names in settings.actions)
-            opening = move.Goal(width=settings.open, speed=settings.speed)
-            closing = grasp.Goal(width=settings.closed, speed=settings.speed, force=settings.force)
-            closing.epsilon.inner, closing.epsilon.outer = settings.epsilon
+            speed, force = float(settings.speed), float(settings.force)  # YAML may hold whole numbers
+            opening = move.Goal(width=float(settings.open), speed=speed)
+            closing = grasp.Goal(width=float(settings.closed), speed=speed, force=force)
+            closing.epsilon.inner, closing.epsilon.outer = map(float, settings.epsilon)
             # What is not grasped has no error; the driver's own errors have a text.
             missed = sender(grasp, f"{server}/grasp", lambda result, _: result.error)
             stuck = sender(move, f"{server}/move", lambda result, _: result.error or "it does not reach its width")
@@ -188,7 +189,7 @@ class GripperGoals:
             self._goals = {wanted: (only, kind.Goal()) for wanted in (True, False)}
             for wanted, position in ((True, settings.open), (False, settings.closed)):
                 command = self._goals[wanted][1].command
-                command.position, command.max_effort = position, settings.effort
+                command.position, command.max_effort = float(position), float(settings.effort)
         self.senders = {sender.name: sender for sender, _ in self._goals.values()}
         self.reset()
 

@@ -92,6 +92,8 @@ class ControlLoop:
         self._grip = spec.action.index(GRIPPER) if GRIPPER in {*spec.action} - {*model.joints} else None
         self.grips = self._grip is not None
         self._motion = [index for index in range(len(spec.action)) if index != self._grip]
+        if model.gripper in spec.state and not robot.fingers:
+            raise ValueError("the policy sees how far its gripper is open: name the joints in deploy.robot.fingers")
         if command_hz < spec.control_hz:
             raise ValueError(f"command_hz is {command_hz}, below the {spec.control_hz} actions/s of the policy")
         self.spec, self.safety, self.tick = spec, safety, 1 / command_hz
@@ -122,6 +124,7 @@ class ControlLoop:
         self.resumed = True  # True if the last observation is the first since the loop started to run
         self._last_observed = -np.inf  # as `observed_at`, but reset whenever the loop stops running
         self._off_track_since: float | None = None
+        self._lost = False  # True if the newest joint state was too old at the last tick
 
     @property
     def robot(self) -> Robot:
@@ -343,10 +346,16 @@ class ControlLoop:
             return
         if not self._commanded and self.state is not State.FAULT:
             self._take_over(newest, now)
+        off_track, lost, self._lost = self._off_track(newest, now), self._lost, now - newest.at > self.safety.joints_age
+        returned = lost and not self._lost and self._away(newest)
+        if self.state is not State.FAULT and (returned or (off_track and self.state is State.STOPPED)):
+            self.limiter.position, self.limiter.velocity = newest.joints.copy(), np.zeros(len(newest.joints))
+            self._sent, self._sent_holds = None, False
+            return self.fail("the arm was moved while it was held")
         if self.state in (State.STOPPED, State.FAULT):
-            return
+            return None
         problem = self._input_problem(newest, now)
-        if self._off_track(newest, now):
+        if off_track:
             return self.fail(f"a joint is more than {self.safety.tracking} rad away from its command")
         if not self.instruction:
             return self._set_state(State.WAITING, "no instruction yet")
@@ -382,12 +391,16 @@ class ControlLoop:
 
     def _off_track(self, newest: Measured, now: float) -> bool:
         """Return whether the tracking error has exceeded its limit for too long."""
-        outdated = now - newest.at > self.safety.joints_age or not self._follows_positions
-        if outdated or np.abs(self.limiter.position - newest.joints).max() <= self.safety.tracking:
+        if now - newest.at > self.safety.joints_age or not self._away(newest):
             self._off_track_since = None
         elif self._off_track_since is None:
             self._off_track_since = now
         return self._off_track_since is not None and now - self._off_track_since > self.safety.tracking_for
+
+    def _away(self, newest: Measured) -> bool:
+        """Return whether the arm is further from its command than the tracking error may be."""
+        error = np.abs(self.limiter.position - newest.joints).max()
+        return bool(self._commanded) and self._follows_positions and bool(error > self.safety.tracking)
 
     def _count_rejection(self, reason: str) -> None:
         self.rejections += 1

@@ -14,7 +14,7 @@ from vla.deploy.bag import BagRecorder
 from vla.deploy.ros import plain_errors, ros
 from vla.deploy.ros2 import PolicyDeployment, SimulatorDeployment
 from vla.io.types import Count
-from vla.parallel.processes import without_triton
+from vla.parallel.processes import leave_with_parent, without_triton
 from vla.rollouts.results import Report, Result
 from vla.spec import Shell
 
@@ -98,6 +98,7 @@ class Loop:
                 node.terminate()
             for node in nodes:
                 node.join(timeout=5.0)
+                node.kill()
 
     def _record(self, node: Any, opened: ExitStack) -> None:
         """Record until `opened` is closed: an episode that fails is the one to look at."""
@@ -112,6 +113,7 @@ class Loop:
 
 def _run(node: PolicyDeployment | SimulatorDeployment) -> None:
     """Run a node in its own process; user errors exit with one sentence."""
+    leave_with_parent()
     without_triton()
     with plain_errors():
         node.run()

@@ -153,7 +153,8 @@ class JointStates:
             ValueError: as `joints_from`; fingers are missing if none came within the last `FINGERS_AGE`.
         """
         fingers, names = self._robot.fingers, {*message.name}
-        if fingers and names == {*fingers}:
+        of_gripper = names >= {*fingers} and names.isdisjoint(self._robot.joints)  # which may have further joints
+        if fingers and of_gripper and len(names) < len(fingers) + len(self._robot.joints):
             self._fingers = (at, float(_positions(message, fingers)[0].sum()))
             return None
         recent = at - self._fingers[0] <= FINGERS_AGE and names.isdisjoint(fingers)
@@ -163,7 +164,7 @@ class JointStates:
 def joints_from(message: Any, robot: Robot, opening: float | None = None) -> tuple[Array, Array, float]:
     """Read positions (J,) [rad], velocities (J,) [rad/s] and gripper opening [m] of a sensor_msgs/JointState, by name.
 
-    Missing velocities become zero. With an `opening` from elsewhere the fingers need not be there.
+    Missing velocities, also NaN, become zero. With an `opening` from elsewhere the fingers need not be there.
 
     Raises:
         ValueError: a joint is missing or named twice, the lengths differ, or a number is not finite.
@@ -188,10 +189,12 @@ def _positions(message: Any, joints: Sequence[str]) -> tuple[Array, Array]:
         )
     position = np.array(message.position, dtype=float)
     velocity = np.array(message.velocity, dtype=float) if len(message.velocity) else np.zeros(len(names))
+    places = [names.index(name) for name in joints]
+    position, velocity = position[places], velocity[places]
+    velocity = np.where(np.isnan(velocity), 0.0, velocity)  # ros2_control's mark of a joint without one
     if not (np.isfinite(position).all() and np.isfinite(velocity).all()):
         raise ValueError("joint state has a number that is not finite")
-    places = [names.index(name) for name in joints]
-    return position[places], velocity[places]
+    return position, velocity
 
 
 def fill_joint_state(message: Any, robot: Robot, command: Command) -> Any:

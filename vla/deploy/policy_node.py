@@ -103,14 +103,16 @@ class PolicyNode(GuardedLifecycleNode):
         self.add_post_set_parameters_callback(self._apply_shares)
 
     def _require_changeable(self, parameters: list[Parameter]) -> SetParametersResult:
-        """Once configured, allow changes of the shares only; while active, only smaller ones."""
+        """Once configured, allow changes of the shares only; while active, only a smaller share of the speed."""
         for parameter in parameters:
             if self.loop is None or parameter.name == "use_sim_time":
                 continue
             if not parameter.name.endswith("_share"):
                 return SetParametersResult(successful=False, reason=f"clean up before changing {parameter.name}")
-            if self._timers and parameter.value > self.get_parameter(parameter.name).value:
-                return SetParametersResult(successful=False, reason=f"deactivate before raising {parameter.name}")
+            raised = parameter.value > self.get_parameter(parameter.name).value
+            fixed = parameter.name == "acceleration_share"  # with less the arm could not brake before its limits
+            if self._timers and (raised or fixed):
+                return SetParametersResult(successful=False, reason=f"deactivate before changing {parameter.name}")
         return SetParametersResult(successful=True)
 
     def _apply_shares(self, parameters: list[Parameter]) -> None:
@@ -273,6 +275,7 @@ class PolicyNode(GuardedLifecycleNode):
     def _on_image(self, camera: str, message: Any) -> None:
         now = time.monotonic()
         stamp = (message.header.stamp.sec, message.header.stamp.nanosec)
+        age = age_of(stamp, self.get_clock().now().nanoseconds * 1e-9)  # now: decoding takes its time
         if not self._timers or self.loop is None:
             return
         if stamp != (0, 0) and stamp == self._stamps.get(camera):
@@ -286,7 +289,6 @@ class PolicyNode(GuardedLifecycleNode):
             self._sizes[camera] = image.shape
             if resizing := images.describe_resize(image.shape, self.policy.spec.image_size, self._crop):
                 self.get_logger().info(f"camera {camera}: {resizing}")
-        age = age_of(stamp, self.get_clock().now().nanoseconds * 1e-9)
         self._record("image age", age)
         self.loop.on_image(camera, image, now - age)
         return self._advance()

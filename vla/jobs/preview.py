@@ -29,10 +29,14 @@ def run(experiment: Experiment) -> None:
     seeds = range(asked["seed"], asked["seed"] + asked["episodes"])
     with writing(output / "preview.rrd"), TemporaryDirectory(prefix=".recordings-", dir=output) as folder:
         recorder = RerunRecorder(folder)
-        episodes = [rollout(environment, expert, seed, recorder) for seed in seeds]
+        first, draws = [], []  # of every episode; all of their images might not fit into memory
+        for seed in seeds:
+            episode = rollout(environment, expert, seed, recorder)
+            first.append(episode.observations[0])
+            draws.append(episode.draws)
         environment.close()
         merge(sorted(Path(folder).glob("*.rrd")), output / "preview.rrd")
     with atomic_path(output / "preview.png") as draft:
-        contact_sheet(list(seeds), [episode.observations[0] for episode in episodes]).save(draft)
-    show(draws_table(list(seeds), [episode.draws for episode in episodes]))
+        contact_sheet(list(seeds), first).save(draft)
+    show(draws_table(list(seeds), draws))
     log.info("wrote %s and %s", output / "preview.png", output / "preview.rrd")

@@ -204,7 +204,10 @@ def _make_checked(make: WorkerFactory, versions: dict[str, str], needs: Sequence
 
 def _versions() -> dict[str, str]:
     """Return name → version of the installed dependencies of vla and of packages made for it."""
-    installed = {_normal(each.name): each for each in distributions()}
+    installed: dict[str, Any] = {}
+    for each in distributions():
+        if each.name:  # an interrupted installation leaves nameless ones; of several copies the first one is imported
+            installed.setdefault(_normal(each.name), each)
     needed = {
         name: [_normal(re.split(r"[^\w.-]", text)[0]) for text in each.requires or ()]
         for name, each in installed.items()

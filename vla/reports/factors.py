@@ -35,6 +35,8 @@ def factors(played: Sequence[Result]) -> dict[str, list[Any]]:
 
 
 def _items(name: str, value: Any) -> Iterator[tuple[str, Any]]:
+    if isinstance(value, dict):  # an object in a list, which forms no groups
+        return
     if not isinstance(value, list):
         yield name, value
     elif _is_point(value):

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from matplotlib import colormaps
 from PIL import Image, ImageDraw, ImageFont
+from rich.markup import escape
 from rich.table import Table
 
 from vla.data.draws import flat, leaves
@@ -15,6 +16,7 @@ from vla.spec import Array, Observation
 
 TILE = 144  # minimum height of an image on a contact sheet [px]
 CAPTION = 18  # height of a text line on a contact sheet [px]
+WIDEST = 420  # most of a caption beyond its images [px]
 
 
 def contact_sheet(seeds: Sequence[int], observations: Sequence[Observation], columns: int = 2) -> Image.Image:
@@ -33,13 +35,18 @@ def contact_sheet(seeds: Sequence[int], observations: Sequence[Observation], col
         enlarged = [tile.repeat(factor, 0).repeat(factor, 1) for tile in tiles]
         framed = [np.pad(tile, ((0, 4), (0, 4), (0, 0)), constant_values=255) for tile in enlarged]
         blocks.append(np.concatenate(framed, axis=1))
-    height, width = blocks[0].shape[0] + CAPTION, blocks[0].shape[1] + CAPTION
+    font = ImageFont.load_default(13)
+    captions = [f"seed {seed}: {each.instruction}" for seed, each in zip(seeds, observations, strict=True)]
+    room = max(blocks[0].shape[1], min(WIDEST, int(max(map(font.getlength, captions))) + 1))
+    height, width = blocks[0].shape[0] + CAPTION, room + CAPTION
     rows = -(-len(blocks) // columns)
     sheet = Image.new("RGB", (columns * width + CAPTION, rows * (height + CAPTION // 2) + 2 * CAPTION), "white")
-    draw, font = ImageDraw.Draw(sheet), ImageFont.load_default(13)
-    for index, (seed, each, block) in enumerate(zip(seeds, observations, blocks, strict=True)):
+    draw = ImageDraw.Draw(sheet)
+    for index, (caption, block) in enumerate(zip(captions, blocks, strict=True)):
         left, top = CAPTION + index % columns * width, CAPTION // 2 + index // columns * (height + CAPTION // 2)
-        draw.text((left, top), f"seed {seed}: {each.instruction}", fill="black", font=font)
+        strip = Image.new("RGB", (room, CAPTION), "white")  # cuts off what is longer
+        ImageDraw.Draw(strip).text((0, 0), caption, fill="black", font=font)
+        sheet.paste(strip, (left, top))
         sheet.paste(Image.fromarray(block), (left, top + CAPTION))
     legend = [f"{name} depth {low / 1000:.2f}-{high / 1000:.2f} m" for name, (low, high) in ranges.items()]
     names = ", ".join([f"{name} colour" for name in observations[0].rgb] + legend)
@@ -60,7 +67,7 @@ def draws_table(seeds: Sequence[int], draws: Sequence[Mapping[str, Any]]) -> Tab
     first = flat(draws[0])
     for name, span in spans(draws).items():
         values = [f"{leaf:.3g}" if isinstance(leaf, float) else str(leaf) for leaf in leaves(first.get(name))]
-        table.add_row(name, span, " ".join(values))
+        table.add_row(*map(escape, (name, span, " ".join(values))))
     return table
 
 

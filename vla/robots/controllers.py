@@ -20,6 +20,7 @@ from vla.spec import Array, RobotModel, Spec
 GRIPPER = "gripper"  # action component that opens the gripper at 1 and closes it at 0, unless it is a joint
 
 # Unit of a joint → factor to [rad], or to [m] of a prismatic one.
+SLACK = 0.1  # of bounds that are those of an opening
 UNITS = {"rad": 1.0, "deg": math.pi / 180, "m": 1.0}
 
 
@@ -72,7 +73,7 @@ def controller_for(
     Args:
         spec: of the policy.
         workspace: opposite corners of the box for the tool point of Cartesian motion, in the base frame [m].
-        limits: (J,) smallest and largest positions [rad] and speeds [rad/s] of an arm other than the Panda; None: none.
+        limits: (J,) smallest and largest positions [rad] and speeds [rad/s] of the arm; None: the Panda's own, or none.
 
     Raises:
         ValueError: the kinematics are not known, the actions are of another kind, or the box cannot be kept.
@@ -87,6 +88,10 @@ def controller_for(
         raise ValueError(f"the policy's action is {_listed(found)}, expected {_listed(expected)}")
     if workspace is None:
         raise ValueError("deploy.safety.workspace=null: Cartesian motion needs a box for the tool point")
+    if ((arm.home < arm.lowest) | (arm.home > arm.highest)).any():
+        raise ValueError(
+            "the home posture of the policy's arm is outside the limits of deploy.robot: is it another arm?"
+        )
     return CartesianController(arm, 1 / spec.control_hz, *np.sort(workspace, axis=0))
 
 
@@ -94,7 +99,7 @@ def _kinematics(model: RobotModel, limits: tuple[Array, Array, Array] | None) ->
     """Return the kinematics of the Panda, or those of another arm's chain."""
     count = len(model.joints)
     if np.shape(model.chain) == np.shape(panda.CHAIN) and np.allclose(model.chain, panda.CHAIN):
-        return panda.PANDA
+        return panda.PANDA if limits is None else Kinematics(panda.forward, panda.HOME, *limits)
     if not model.chain or not model.home:
         raise ValueError(
             f"Cartesian actions need the kinematics of the arm of {count} joints, and the checkpoint lacks its "
@@ -139,6 +144,13 @@ def _joint_controller(spec: Spec, model: RobotModel, workspace: tuple[Point, Poi
             "deploy.safety.workspace cannot be kept by a policy that acts with joint positions: set it to null, and "
             "narrow deploy.robot.low and high where the arm must not go"
         )
+    if GRIPPER in spec.action and GRIPPER not in model.joints:
+        place = spec.action.index(GRIPPER)
+        if spec.low[place] < -SLACK or spec.high[place] > 1 + SLACK:
+            raise ValueError(
+                f"the action {GRIPPER} must be an opening, 0 closed to 1 open, and is from {spec.low[place]:g} to "
+                f"{spec.high[place]:g}: scale it before training"
+            )
     units = dict(zip(spec.action, spec.units, strict=True))
     motion = [name for name in spec.action if name != GRIPPER or name in model.joints]
     order = [motion.index(name) for name in model.joints]

@@ -189,7 +189,7 @@ class RemotePolicy:
                 "agent=remote needs websockets: install this package with its extra server, as in "
                 "pip install -e '.[server]'"
             ) from error
-        times = {"open_timeout": self.timeout, "close_timeout": self.timeout}
+        times = {"open_timeout": self.timeout, "close_timeout": self.timeout, "ping_timeout": self.timeout}
         headers = {"Authorization": f"Api-Key {self.api_key}"} if self.api_key else None
 
         async def connected() -> ClientConnection:

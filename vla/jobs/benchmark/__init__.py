@@ -60,7 +60,7 @@ def run(experiment: Experiment) -> dict[str, Measure]:
     write_text(
         experiment.output / "benchmark.json", json.dumps({"machine": here, "measures": measures}, indent=2) + "\n"
     )
-    table = Table("stage", "value", "unit", "n", "floor", "ratio", "others [cores]")
+    table = Table("stage", "value", "unit", "n", "floor", "ratio", r"others \[cores]")
     for name, each in measures.items():
         table.add_row(name, *map(str, each.values()))
     show(table)

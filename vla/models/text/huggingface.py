@@ -26,6 +26,14 @@ log = logging.getLogger(__name__)
 FILES = ("config.json", "tokenizer.json", "tokenizer_config.json", "model*.safetensors", "model.safetensors.index.json")
 CACHE_BYTES = 64 << 20  # of sentence vectors; 16 000 sentences of 1024 components
 LONGEST = 1 << 16  # tokens of a padded text
+# What configurations name and transformers reads, although it is no field with a default.
+FURTHER = {
+    "modernbert": ("global_rope_theta", "local_rope_theta", "rope_scaling", "global_attn_every_n_layers"),
+    "deberta-v2": (
+        *("share_att_key", "position_buckets", "norm_rel_ebd", "attention_head_size"),
+        *("conv_kernel_size", "conv_groups", "conv_act"),
+    ),
+}
 INSERTIONS, INSERTED = 4, 8  # replacements of a normalizer, and characters of one: a text grows by 8^4 at most
 
 # The encoders that may be built: model type → text-only class in transformers. A configuration also comes out of a
@@ -259,7 +267,7 @@ def _configuration(text: str | bytes) -> Any:
     kind = values.pop("model_type", None)
     if not isinstance(kind, str) or kind.removesuffix("_text_model") not in (*ENCODERS, *TOWERS):
         raise ValueError(f"{str(kind)[:100]} is none of the text encoders {', '.join((*ENCODERS, *TOWERS))}")
-    known = AutoConfig.for_model(kind).to_dict()
+    known = {*AutoConfig.for_model(kind).to_dict(), *FURTHER.get(kind, ())}
     config = AutoConfig.for_model(kind, **{name: value for name, value in values.items() if name in known})
     tower = getattr(config, "text_config", None)
     return config if tower is None else _configuration(tower.to_json_string(use_diff=False))

@@ -129,7 +129,7 @@ class FilmBackbone(ImageEncoder):
         self.size = size or self.backbone.pretrained_cfg["input_size"][-1]
         self.frozen = frozen
         self.normalized = "hiera" not in name  # the only family without a normalisation of feature maps
-        self.backbone.requires_grad_(not frozen)
+        self.backbone.requires_grad_(not frozen).train(not frozen)  # Lightning keeps the mode that it finds
         self.normalize = Normalize(self.backbone)
         self.projection = nn.Conv2d(last.get("num_chs_norm", last["num_chs"]), channels, 1, bias=False)
         self.film = FiLM(text_width, channels, identity=True)
