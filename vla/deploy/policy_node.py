@@ -18,6 +18,7 @@ from geometry_msgs.msg import TwistStamped
 from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor, SetParametersResult
 from rclpy.clock import Clock, ClockType
 from rclpy.context import Context
+from rclpy.duration import Duration as Delay
 from rclpy.exceptions import ParameterException
 from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile, ReliabilityPolicy
@@ -47,6 +48,7 @@ LEVELS = {
     State.STOPPED: DiagnosticStatus.WARN,
     State.FAULT: DiagnosticStatus.ERROR,
 }
+DELIVERED = Delay(seconds=1.0)  # longest wait for the last commands to arrive
 MAX_MESSAGE = 300  # length of a log line or status message [characters]
 COMMANDS = {
     "joint_state": JointState,
@@ -252,6 +254,7 @@ class PolicyNode(GuardedLifecycleNode):
             if loop.limiter.resting:
                 break
             time.sleep(loop.tick)
+        self._commands.wait_for_all_acked(DELIVERED)  # the last ones must arrive, even if the node then ends
         time.sleep(2 * loop.tick if self._senders else 0.0)  # a server is a little behind
         for sender in self._senders:
             sender.cancel()
