@@ -31,6 +31,7 @@ COMMANDS = [command for command in commands("vla.run") if command != "--help"]  
 TOOLS = [(tool, command) for tool in ("say", "watch", "view", "bag") for command in commands(f"vla.deploy.{tool}")]
 TOOLS.remove(("bag", "play"))  # which a sentence names without its argument
 FILE = "outputs/runs/half/checkpoints/last.ckpt"
+METAWORLD = "metaworld/checkpoints/last.ckpt"
 STANDS = {
     "ENCODER": "encoder",
     "FILE": FILE,
@@ -48,15 +49,19 @@ def test_all_the_commands_are_found() -> None:
 
 @pytest.fixture(scope="module")
 def folder(home: Path) -> Path:
-    """A folder with a RUN and an interrupted one, with its checkpoint FILE."""
-    half = torch.load(home / "run/checkpoints/last.ckpt", weights_only=True) | {"finished": False}
-    (home / FILE).parent.mkdir(parents=True)
-    torch.save(half, home / FILE)
+    """A folder with a RUN and an interrupted one, with its checkpoint FILE, and with a checkpoint of Meta-World."""
+    trained = torch.load(home / "run/checkpoints/last.ckpt", weights_only=True)
+    metaworld = OmegaConf.to_container(composed("experiment=metaworld"), resolve=True)
+    for path, changed in ((FILE, {"finished": False}), (METAWORLD, {"config": metaworld})):
+        (home / path).parent.mkdir(parents=True)
+        torch.save(trained | changed, home / path)
     return home
 
 
 def arguments_of(command: str) -> list[str]:
     """The arguments, with what stands for the names in capital letters."""
+    if "task.drawn=" in command:  # which a task of Meta-World has
+        command = command.replace("FILE", METAWORLD)
     for name, path in STANDS.items():
         command = command.replace(name, path)
     return shlex.split(command)

@@ -225,7 +225,7 @@ class EpisodeStore:
             ValueError: it does not match the spec, has several instructions or another seed than the next, or cannot be
                 written.
         """
-        if any(seen.instruction != episode.instruction for seen in episode.observations):
+        if len({seen.instruction for seen in episode.observations}) > 1:
             raise ValueError(
                 f"seed {episode.seed} has several instructions, and a store keeps one per episode: give episodes below "
                 f"seed {FIRST_SEED} one each"

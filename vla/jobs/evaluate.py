@@ -256,8 +256,8 @@ def _write(
     if experiment["recorder"]:
         with warn_on_error(recording):
             keep_recordings(report, output / "recordings", recording, experiment["evaluate"]["recordings"])
-    (output / PLOT).unlink(missing_ok=True)
     with warn_on_error(output / PLOT):
+        (output / PLOT).unlink(missing_ok=True)  # of an earlier evaluation
         plot_report(report, output / PLOT)
     (output / SUITE).unlink(missing_ok=True)  # of an earlier evaluation
     if others:
