@@ -44,6 +44,7 @@ def address_in(file: Path) -> str:
 
 
 def until(condition: Callable[[], bool]) -> None:
+    """Wait until a condition holds, or fail after two minutes."""
     give_up = time.monotonic() + 120
     while not condition():
         assert time.monotonic() < give_up

@@ -9,7 +9,6 @@ import re
 import shutil
 import signal
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +17,7 @@ import pytest
 import torch
 import warm
 import yaml
+from clusters import until
 from command_line import SMALL, here, vla
 from PIL import Image
 from rerun.chunk import RrdReader
@@ -28,12 +28,12 @@ from vla.tasks.rendering.fast import Fast
 from vla.tasks.rendering.reference import Reference
 
 
-def wait_for(condition: Callable[[], bool]) -> None:
-    """Until it holds, or too long."""
-    give_up = time.monotonic() + 120
-    while not condition():
-        assert time.monotonic() < give_up
-        time.sleep(0.02)
+def test_the_key_of_a_server_is_in_no_file_of_a_training(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("VLA_API_KEY", "s3cret")
+    here(tmp_path, "job=train", "model=bc", "deploy=server", *SMALL, "output=run")
+    files = [path for path in (tmp_path / "run").rglob("*") if path.is_file()]
+    assert tmp_path / "run/checkpoints/last.ckpt" in files
+    assert not [path for path in files if b"s3cret" in path.read_bytes()]
 
 
 def test_the_main_job_collects_trains_evaluates_and_records(home: Path) -> None:
@@ -218,15 +218,15 @@ def test_a_collection_killed_again_and_again_goes_on_and_ends_up_the_same(home: 
     def committed() -> int:
         return index.read_bytes().count(b"\n") if index.exists() else 0
 
-    for until, pause in ((1, 0.0), (4, 0.1)):  # at its first commit, and on the way
+    for episodes, pause in ((1, 0.0), (4, 0.1)):  # at its first commit, and on the way
 
-        def kill(process: int, until: int = until, pause: float = pause) -> None:
-            wait_for(lambda: committed() >= until)
+        def kill(process: int, episodes: int = episodes, pause: float = pause) -> None:
+            until(lambda: committed() >= episodes)
             time.sleep(pause)
             os.kill(process, signal.SIGKILL)
 
         assert warm.run(home, *arguments, meanwhile=kill).returncode == -signal.SIGKILL
-        assert until <= committed() < 12  # killed on the way, not at its end
+        assert episodes <= committed() < 12  # killed on the way, not at its end
     vla(home, *arguments)
     (reference,) = (home / "outputs/episodes").iterdir()
     for file in reference.iterdir():
@@ -358,7 +358,7 @@ def test_training_that_is_interrupted_saves_and_goes_on(home: Path) -> None:
 
         def interrupt(process: int) -> None:
             before = metrics.stat().st_size if metrics.exists() else 0
-            wait_for(lambda: metrics.exists() and metrics.stat().st_size > before)
+            until(lambda: metrics.exists() and metrics.stat().st_size > before)
             os.kill(process, number)
 
         done = warm.run(home, *arguments, meanwhile=interrupt)

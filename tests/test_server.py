@@ -555,7 +555,7 @@ def test_whoever_acts_is_evaluated_by_the_same_job(tmp_path: Path) -> None:
     expected = play(environment, policy.session(), FIRST_SEED)
     environment.close()
     keys = Keys({"front": "observation/image", "wrist": "observation/wrist_image"}, ["observation/state"], "prompt")
-    with serving(policy, keys=keys, connections=1) as url:  # each condition closes its own
+    with serving(policy, keys=keys, api_key="s3cret", connections=1) as url:  # each condition closes its own
         network = "{_target_: vla.rollouts.realtime.Network, latency: 0.1, jitter: 0, loss: 0, ensemble: null}"
         conditions = (
             "evaluate.without=[images]",

@@ -131,7 +131,7 @@ def _require_sweepable(cfg: DictConfig, job: Job) -> None:
 
 
 def _require_swept() -> None:
-    """Refuse grids of which only one cell would run, cells that share a folder, and variants that would not apply."""
+    """Refuse grids of which only one cell would run, and cells that share a folder."""
     hydra_config = HydraConfig.get()
     parts = [override.partition("=") for override in hydra_config.overrides.task]
     said = {key: value for key, _, value in parts}
@@ -142,6 +142,11 @@ def _require_swept() -> None:
         raise ValueError(f"experiment={choices['experiment']} is a grid of its own: name no other one beside it")
     if swept and "${" not in said.get("output", "${"):
         raise ValueError("with -m every cell has a folder of its own: name that of the sweep, hydra.sweep.dir=DIR")
+
+
+def _require_variant() -> None:
+    """Refuse an option of the command line that replaces the one which makes the variant."""
+    choices = HydraConfig.get().runtime.choices
     file = CONF / f"variant/{choices.get('variant')}.yaml"
     for entry in OmegaConf.select(OmegaConf.load(file), "defaults", default=[]) if file.is_file() else []:
         for key, option in entry.items() if isinstance(entry, DictConfig) else ():
@@ -160,6 +165,7 @@ def _remove_unused() -> None:
 
 def _do(cfg: DictConfig) -> float | None:
     _require_swept()
+    _require_variant()
     without_triton()
     composed: Any = OmegaConf.to_container(cfg, resolve=False)
     overrides = HydraConfig.get().overrides.task

@@ -7,7 +7,7 @@ import logging
 from collections.abc import Callable, Mapping
 from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
-from functools import partial, reduce
+from functools import cached_property, partial, reduce
 from operator import getitem
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -37,6 +37,8 @@ log = logging.getLogger(__name__)
 
 Node = dict[str, Any]
 
+SECRET = "api_key"  # key whose values no file is to hold
+
 
 @dataclass(frozen=True)
 class Experiment:
@@ -45,8 +47,8 @@ class Experiment:
     Factories for worker processes hold only plain values, so they can be pickled, and the list of trusted packages.
     """
 
-    config: Node  # resolved
-    changes: list[Node] = field(default_factory=list)  # key, value and default of every difference from the default
+    nodes: Node  # resolved
+    changes: list[Node] = field(default_factory=list)  # key, value and default of differences from the default, to show
 
     @classmethod
     def of(cls, cfg: DictConfig, default: DictConfig | None = None) -> Experiment:
@@ -59,21 +61,27 @@ class Experiment:
             {"key": key, "here": value, "default": before}
             for key, value, before in differences(chosen, standard)
             if not at(here, key) == at(there, key) != ABSENT  # else one is an interpolation of the same value
+            and key.rpartition(".")[2] != SECRET
         ]
-        return cls(here, changes)
+        return cls(here, _without_secrets(changes))
+
+    @cached_property
+    def config(self) -> Node:
+        """The nodes without secrets, for reports, checkpoints and all other files."""
+        return _without_secrets(self.nodes)
 
     def __getitem__(self, key: str) -> Any:
         """Return a top-level node or value."""
-        return self.config[key]
+        return self.nodes[key]
 
     def with_values(self, values: Mapping[str, Any]) -> Experiment:
         """Return a copy with other values at dotted keys."""
-        config = copy.deepcopy(self.config)
+        nodes = copy.deepcopy(self.nodes)
         for key, value in values.items():
             *path, name = key.split(".")
-            node: Any = reduce(getitem, path, config)
+            node: Any = reduce(getitem, path, nodes)
             node[name] = value
-        return replace(self, config=config)
+        return replace(self, nodes=nodes)
 
     @property
     def output(self) -> Path:
@@ -197,6 +205,12 @@ class Experiment:
             episodes=self["collect"]["episodes"],
             more=self["collect"]["more"] or (),
         )
+
+
+def _without_secrets(values: Any) -> Any:
+    if isinstance(values, dict):
+        return {name: None if name == SECRET else _without_secrets(value) for name, value in values.items()}
+    return [_without_secrets(value) for value in values] if isinstance(values, list) else values
 
 
 def plain(node: DictConfig) -> Node:

@@ -30,6 +30,7 @@ from vla.robots.controllers import GRIPPER, recorded_controller
 from vla.spec import Array, Episode, Observation, Spec
 
 MEASURED_WITHIN = 0.2  # largest time between an observation and its joint state [s]
+ROUNDING = 1e-6  # of an action that is at its bound
 MOSTLY = 0.5  # share of the actions beyond a bound from which it is a bound of something else
 
 log = logging.getLogger(__name__)
@@ -89,14 +90,15 @@ class BagDemonstrations(ImportedDemonstrations):
         self._index = read_index(_folder_of(folder), replace(topics, images=self._topics), robot, status)
         self._stretches = _chosen(self._index, steps)
         self._steps = [self._steps_in(stretch) for stretch in self._stretches]
-        self._beyond = 0
-        actions = np.array([self._action(step.at) for steps in self._steps for step in steps])
-        beyond = ((actions < spec.low) | (actions > spec.high)).mean(0)
-        if far := [name for name, share in zip(spec.action, beyond, strict=True) if share > MOSTLY]:
+        self._actions = [np.array([self._action(step.at) for step in taken]) for taken in self._steps]
+        actions = np.concatenate(self._actions)
+        beyond = (actions < np.array(spec.low) - ROUNDING) | (actions > np.array(spec.high) + ROUNDING)
+        if far := [name for name, share in zip(spec.action, beyond.mean(0), strict=True) if share > MOSTLY]:
             raise ValueError(
                 f"{self._index.folder}: most actions exceed the bounds of {', '.join(far)}: set task.low and task.high "
                 "in the units of task.units"
             )
+        self._beyond = float(beyond.any(1).mean())
 
     @classmethod
     def recording(
@@ -146,9 +148,7 @@ class BagDemonstrations(ImportedDemonstrations):
             )
             for step in steps
         ]
-        actions = np.array([self._action(step.at) for step in steps])
-        clipped = np.clip(actions, spec.low, spec.high).astype(np.float32)
-        self._beyond += int((np.abs(clipped - actions) > 1e-6).any(1).sum())
+        clipped = np.clip(self._actions[number], spec.low, spec.high).astype(np.float32)
         acts = _runs([any(start <= step.at <= end for start, end in stretch.person) for step in steps])
         share = sum(last - first + 1 for first, last in acts) / len(steps)
         recorded = {"episode": number, "corrected": round(share, 3), "lacks": ["depth"] if spec.depth else []}
@@ -158,11 +158,9 @@ class BagDemonstrations(ImportedDemonstrations):
 
     def fill(self, store: EpisodeStore, episodes: int) -> int:
         """Append episodes, and log what the import changes."""
-        self._beyond = 0
-        added = super().fill(store, episodes)
         if self._beyond:
-            log.info("%d actions are clipped to the bounds of the task", self._beyond)
-        return added
+            log.info("%.2g %% of the actions are clipped to the bounds of the task", 100 * self._beyond)
+        return super().fill(store, episodes)
 
     def _steps_in(self, stretch: Stretch) -> list[Step]:
         """Return the steps of a stretch, made as the policy node makes its observations; a ValueError without any."""

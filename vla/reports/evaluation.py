@@ -18,7 +18,6 @@ from vla.reports.style import GREEN, GREY, RED, error_bars, save
 from vla.rollouts.comparison import Comparison
 from vla.rollouts.results import ERROR, Report, Result
 from vla.rollouts.statistics import wilson_interval
-from vla.runs.folder import without_secrets
 
 PANELS = 8  # maximum number of factors on the page
 
@@ -61,7 +60,7 @@ def write_report(
             }
             for name, other in (conditions or {}).items()
         },
-        "config": without_secrets(config),
+        "config": config,
         "per_episode": [asdict(result) for result in report.results],
     }
     write_text(path, json.dumps(content, indent=1, allow_nan=False, ensure_ascii=False) + "\n")

@@ -17,7 +17,6 @@ from vla.io.files import write_text
 from vla.reports.style import BLUE, GREEN, GREY, save
 from vla.rollouts.open_loop import OpenLoop
 from vla.runs.files import ComponentError
-from vla.runs.folder import without_secrets
 from vla.spec import in_brackets
 
 COLUMNS = 4  # panels of components per row
@@ -52,7 +51,7 @@ def write_errors(
         "relative": result.relative,
         "checkpoint": checkpoint,
         **facts,
-        "config": without_secrets(config),
+        "config": config,
         "per_episode": [{"seed": seed, "steps": len(steps), "errors": errors} for seed, steps, errors in per_episode],
     }
     write_text(path, json.dumps(content, indent=1, allow_nan=False, ensure_ascii=False) + "\n")

@@ -19,8 +19,8 @@ from vla.spec import Array, RobotModel, Spec
 
 GRIPPER = "gripper"  # action component that opens the gripper at 1 and closes it at 0, unless it is a joint
 
+SLACK = 0.1  # by which the bounds of an opening may exceed 0 and 1
 # Unit of a joint → factor to [rad], or to [m] of a prismatic one.
-SLACK = 0.1  # of bounds that are those of an opening
 UNITS = {"rad": 1.0, "deg": math.pi / 180, "m": 1.0}
 
 

@@ -134,20 +134,10 @@ def require_run(folder: Path) -> Run:
     return read_run(folder)
 
 
-def without_secrets(config: Any) -> Any:
-    """Return a plain config without the values of `api_key`, which no file is to hold."""
-    if isinstance(config, dict):
-        return {name: None if name == "api_key" else without_secrets(value) for name, value in config.items()}
-    return [without_secrets(value) for value in config] if isinstance(config, list) else config
-
-
 def save_config(folder: Path, config: Mapping[str, Any], changes: list[Node]) -> None:
-    """Save the resolved config and its differences from the default, both without secrets."""
-    shown = [change for change in changes if not change["key"].endswith("api_key")]
-    for name, content in ((CONFIG, config), (CHANGES, shown)):
-        write_text(
-            folder / name, yaml.safe_dump(without_secrets(content), sort_keys=False, allow_unicode=True, width=120)
-        )
+    """Save the resolved config and its differences from the default."""
+    for name, content in ((CONFIG, config), (CHANGES, changes)):
+        write_text(folder / name, yaml.safe_dump(content, sort_keys=False, allow_unicode=True, width=120))
 
 
 def save_training(folder: Path, training: Training) -> None:

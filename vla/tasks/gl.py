@@ -23,8 +23,8 @@ def choose_backend() -> None:
     A backend that the user has set is only probed. Triton, which conflicts with Mesa, is blocked too.
     """
     without_triton()
-    with suppress(ImportError):
-        import backports.zstd  # noqa: F401 # the system's library: after Mesa it would be Mesa's, and bags would have other bytes
+    with suppress(ImportError):  # the system's library: after Mesa it would be Mesa's, and bags would have other bytes
+        import backports.zstd  # noqa: F401
     chosen = os.environ.get("MUJOCO_GL")
     if os.environ.get("DISPLAY") or sys.platform != "linux" or chosen in (NONE, os.environ.get(TRIED, NONE)):
         return
