@@ -79,6 +79,11 @@ def test_contact_sheet_shows_the_observations() -> None:
             )
 
 
+def test_a_contact_sheet_of_one_episode_has_one_column() -> None:
+    first = [make_environment().reset(FIRST_SEED)]
+    assert contact_sheet([FIRST_SEED], first).size == contact_sheet([FIRST_SEED], first, columns=1).size
+
+
 def test_draws_table_tells_ranges_and_words() -> None:
     draws = [
         {"light": {"tint": [0.1, 0.2]}, "colour": "red", "blocks": 3},

@@ -39,6 +39,7 @@ def contact_sheet(seeds: Sequence[int], observations: Sequence[Observation], col
     captions = [f"seed {seed}: {each.instruction}" for seed, each in zip(seeds, observations, strict=True)]
     room = max(blocks[0].shape[1], min(WIDEST, int(max(map(font.getlength, captions))) + 1))
     height, width = blocks[0].shape[0] + CAPTION, room + CAPTION
+    columns = min(columns, len(blocks))
     rows = -(-len(blocks) // columns)
     sheet = Image.new("RGB", (columns * width + CAPTION, rows * (height + CAPTION // 2) + 2 * CAPTION), "white")
     draw = ImageDraw.Draw(sheet)
