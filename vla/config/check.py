@@ -18,6 +18,7 @@ from omegaconf import DictConfig, OmegaConf
 from vla.config.annotations import MissingLibrary, fits, locate
 from vla.config.build import GROUPS, Group, arguments, check_node, check_value, makes, require_known
 from vla.config.packages import CONF
+from vla.io.documents import canonical
 from vla.io.types import Count, Natural, Seed, Shift, Text, unique
 from vla.spec import FIRST_SEED, IN_DISTRIBUTION
 
@@ -215,7 +216,7 @@ def digest(*keys: str, _root_: DictConfig) -> str:
     """
     values = [OmegaConf.select(_root_, key, throw_on_missing=True) for key in keys]
     plain = [OmegaConf.to_container(value, resolve=True) if OmegaConf.is_config(value) else value for value in values]
-    return hashlib.sha256(json.dumps(_canonical(plain)).encode()).hexdigest()[:12]
+    return hashlib.sha256(json.dumps(canonical(plain)).encode()).hexdigest()[:12]
 
 
 def chosen(group: str, *, _root_: DictConfig) -> str | None:
@@ -223,14 +224,6 @@ def chosen(group: str, *, _root_: DictConfig) -> str | None:
     if "hydra" in _root_:
         return _root_.hydra.runtime.choices.get(group)
     return HydraConfig.get().runtime.choices.get(group) if HydraConfig.initialized() else None
-
-
-def _canonical(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {name: _canonical(item) for name, item in value.items() if item is not None}
-    if isinstance(value, list):
-        return [_canonical(item) for item in value]
-    return int(value) if isinstance(value, float) and value.is_integer() else value
 
 
 def _check_plain(key: str, value: Any, annotation: Any) -> None:

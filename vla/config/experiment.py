@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import logging
 from collections.abc import Callable, Mapping
 from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
@@ -31,9 +30,7 @@ if TYPE_CHECKING:
     from vla.models.tokenizers.tokenizer import ActionTokenizer
     from vla.parallel.pool import Cluster
     from vla.policy import Policy
-    from vla.spec import Agent, Environment, Recorder, Spec
-
-log = logging.getLogger(__name__)
+    from vla.spec import Agent, Environment, Recorder
 
 Node = dict[str, Any]
 

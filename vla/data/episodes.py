@@ -28,6 +28,7 @@ from vla.data.header import fields_of, header_of, images_of, is_store, read_head
 from vla.data.image_codec import JPEG, PackedRows, whole_rows
 from vla.data.index import REMEDY, SALVAGE, Entry, dumps, index_line, listed, parse_line, read_index
 from vla.data.statistics import Statistics
+from vla.io.documents import canonical
 from vla.spec import FIRST_SEED, Array, Episode, Observation, Spec
 
 Rows = Array | PackedRows
@@ -95,7 +96,7 @@ class EpisodeStore:
         """
         if self.derived:
             return
-        asked, there = _without_nulls(json.loads(dumps(config))), _without_nulls(self.config)
+        asked, there = canonical(json.loads(dumps(config))), canonical(self.config)
         different = sorted(key for key in {*asked, *there} if asked.get(key) != there.get(key))
         if different:
             raise ValueError(f"{self.folder} was collected with another config for {different}: choose another folder")
@@ -340,15 +341,6 @@ def observations_of(spec: Spec, rows: Mapping[str, Array], instruction: str) -> 
 def stored(rows: Rows, span: slice) -> Array:
     """Return consecutive rows as stored on disk: the rows, or compressed bytes (M,)."""
     return rows[span] if isinstance(rows, np.ndarray) else rows.stored(span)
-
-
-def _without_nulls(value: Any) -> Any:
-    """Remove the keys that are null from a plain value, at every level."""
-    if isinstance(value, list):
-        return [_without_nulls(item) for item in value]
-    if not isinstance(value, dict):
-        return value
-    return {name: _without_nulls(item) for name, item in value.items() if item is not None}
 
 
 def checksums(rows: Mapping[str, Array]) -> dict[str, int]:

@@ -20,8 +20,10 @@ MAX_YAML_BYTES = 1 << 20  # [bytes] of a YAML file, which is slow to parse
 MAX_VALUES = 100_000  # values in a configuration
 MAX_DEPTH = 64  # nesting levels in YAML; pydantic's JSON parser stops at 200 by itself
 
-# `__pydantic_config__` of the dataclasses and typed dictionaries that describe a file.
+# `__pydantic_config__` of the dataclasses and typed dictionaries that describe a file; LENIENT: which may hold further
+# keys, such as derived values, or those of other programs.
 STRICT = ConfigDict(strict=True, extra="forbid", allow_inf_nan=False)
+LENIENT = ConfigDict(STRICT, extra="ignore")
 
 
 def read_json(path: Path, kind: type[T], largest: int = MAX_BYTES) -> T:
@@ -113,6 +115,15 @@ def mappings(value: Any) -> Iterator[dict[Any, Any]]:
         yield value
     for part in value.values() if isinstance(value, dict) else value if isinstance(value, list) else ():
         yield from mappings(part)
+
+
+def canonical(value: Any) -> Any:
+    """Return a plain value without the keys that are null, at every level, and with 10 for 10.0."""
+    if isinstance(value, dict):
+        return {name: canonical(item) for name, item in value.items() if item is not None}
+    if isinstance(value, list):
+        return [canonical(item) for item in value]
+    return int(value) if isinstance(value, float) and value.is_integer() else value
 
 
 def problems(error: ValidationError) -> str:

@@ -15,7 +15,7 @@ from matplotlib.legend import Legend
 from matplotlib.ticker import LogLocator
 
 from vla.config.differences import at
-from vla.reports.style import error_bars, save
+from vla.reports.style import GREY, error_bars, save
 from vla.rollouts.statistics import wilson_interval
 from vla.runs.sweep import DEMONSTRATIONS, SweepRow, conditions_of
 
@@ -172,7 +172,7 @@ def _plot_costs(axes: Axes, rows: list[SweepRow], condition: str) -> None:
             axes.scatter(row.latency, rate, s=area, color=f"C{number}", alpha=0.9, clip_on=False)
     best = pareto(rows, condition)
     rates = [row.interval(condition)[0] for row in best]
-    axes.plot([row.latency for row in best], rates, color="#8a8f98", linewidth=0.8, zorder=0)
+    axes.plot([row.latency for row in best], rates, color=GREY, linewidth=0.8, zorder=0)
     _label_rates(axes, condition, "time per action [ms]")
     latencies = [row.latency for row in rows if row.latencies]
     axes.set_xlim(0.7 * min(latencies), 1.4 * max(latencies))

@@ -92,14 +92,7 @@ class CartesianController:
     """
 
     # Names and units of the action components that it takes.
-    motion: tuple[tuple[str, str], ...] = (
-        ("dx", "m"),
-        ("dy", "m"),
-        ("dz", "m"),
-        ("rx", "rad"),
-        ("ry", "rad"),
-        ("rz", "rad"),
-    )
+    motion = (("dx", "m"), ("dy", "m"), ("dz", "m"), ("rx", "rad"), ("ry", "rad"), ("rz", "rad"))
 
     def __init__(self, arm: Kinematics, period: float, low: ArrayLike, high: ArrayLike) -> None:
         """Args: the arm; control period [s]; corners (3,) of the box for the tool point in the base frame [m]."""

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Protocol
 
 import numpy as np
 
@@ -22,22 +21,6 @@ GRIPPER = "gripper"  # action component that opens the gripper at 1 and closes i
 SLACK = 0.1  # by which the bounds of an opening may exceed 0 and 1
 # Unit of a joint → factor to [rad], or to [m] of a prismatic one.
 UNITS = {"rad": 1.0, "deg": math.pi / 180, "m": 1.0}
-
-
-class Controller(Protocol):
-    """Turns the motion of an action, all but the gripper, into joint targets."""
-
-    def reset(self, joints: Array) -> None:
-        """Set the last commanded joints (J,) [rad]."""
-        ...
-
-    def step(self, motion: Array) -> Array:
-        """Return joint targets (J,) [rad] one control period ahead."""
-        ...
-
-    def motion_between(self, before: Array, after: Array) -> Array:
-        """Return the motion that takes joints (J,) [rad] from `before` to `after`: the inverse of `step`."""
-        ...
 
 
 class JointController:
@@ -67,7 +50,7 @@ class JointController:
 
 def controller_for(
     spec: Spec, workspace: tuple[Point, Point] | None, limits: tuple[Array, Array, Array] | None = None
-) -> Controller:
+) -> CartesianController | JointController:
     """Build the controller for the actions in `spec`: joint positions, or Cartesian motion.
 
     Args:
@@ -115,7 +98,7 @@ def acts_on_joints(spec: Spec) -> bool:
     return {*spec.require_robot("deployment").joints} <= {*spec.action}
 
 
-def recorded_controller(spec: Spec) -> Controller:
+def recorded_controller(spec: Spec) -> CartesianController | JointController:
     """Build the controller for actions that have been executed already, by the person who is responsible for them.
 
     Raises:

@@ -13,7 +13,7 @@ import time
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -84,31 +84,6 @@ class Schedule:
         return (weights @ found / weights.sum()).astype(np.float32)
 
 
-class Link(Protocol):
-    """Way to a policy for one observation at a time."""
-
-    @property
-    def busy(self) -> bool:
-        """True while an answer is awaited."""
-        ...
-
-    def reset(self, seed: int) -> None:
-        """Start an episode; an answer that is awaited is dropped."""
-        ...
-
-    def tick(self) -> None:
-        """Begin a control step."""
-        ...
-
-    def send(self, observation: Observation) -> None:
-        """Send an observation; only if not busy."""
-        ...
-
-    def receive(self, wait: bool) -> Array | None:
-        """Return the chunk (k, D) if it has arrived, which ends the wait; with `wait` it always has."""
-        ...
-
-
 class RealTime:
     """Acts at every step with the newest chunk that has arrived, and holds where there is none.
 
@@ -117,7 +92,13 @@ class RealTime:
     part of the state. A component without a unit, such as the command of a gripper, is repeated.
     """
 
-    def __init__(self, spec: Spec, link: Link, execute: Callable[[], int], ensemble: float | None) -> None:
+    def __init__(
+        self,
+        spec: Spec,
+        link: SimulatedLink | BackgroundLink,
+        execute: Callable[[], int],
+        ensemble: float | None,
+    ) -> None:
         """Args:
         spec: of the actions.
         link: to the policy.
@@ -159,7 +140,7 @@ class RealTime:
 
 
 class SimulatedLink:
-    """A network whose delays pass in control steps, so that an episode is a function of its seed."""
+    """Way to a policy, for one observation at a time, whose delays pass in control steps: a function of the seed."""
 
     def __init__(self, plan: Plan, network: Network, control_hz: float) -> None:
         """Args: the policy; the network; steps per second [Hz]."""
@@ -183,7 +164,7 @@ class SimulatedLink:
         self._actions, self.busy = self._plan(observation), True
 
     def receive(self, wait: bool) -> Array | None:
-        """Return the chunk if it has arrived, which ends the wait."""
+        """Return the chunk (k, D) if it has arrived, which ends the wait; with `wait` it always has."""
         if self._now < self._due and not wait:
             return None
         self.busy = False
@@ -191,7 +172,7 @@ class SimulatedLink:
 
 
 class BackgroundLink:
-    """A policy that plans in a thread, while control steps follow the clock; late ones are not made up for."""
+    """Way to a policy that plans in a thread, while control steps follow the clock; late ones are not made up for."""
 
     def __init__(self, plan: Plan, control_hz: float, network: Network = IDEAL) -> None:
         """Args: the policy; steps per second [Hz]; a network in front of it whose delays pass by the clock."""
@@ -232,7 +213,7 @@ class BackgroundLink:
         return actions, lost
 
     def receive(self, wait: bool) -> Array | None:
-        """Return the chunk if it is there; raises what the policy raised."""
+        """Return the chunk (k, D) if it is there, or with `wait` once it is; raises what the policy raised."""
         if self._answer is None or not (wait or self._answer.done()):
             return None
         answer, self._answer = self._answer, None
@@ -252,7 +233,7 @@ class OverNetwork:
         self._agent = agent
         plan: Plan = getattr(agent, "plan", lambda observation: agent.act(observation)[None])
         self._thread = BackgroundLink(plan, spec.control_hz, network) if by_clock else None
-        link: Link = self._thread or SimulatedLink(plan, network, spec.control_hz)
+        link = self._thread or SimulatedLink(plan, network, spec.control_hz)
         self._real_time = RealTime(spec, link, self._execute, network.ensemble)
         self.info: dict[str, Any] = {}
 

@@ -4,23 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from typing import Protocol
 
 from vla.rollouts.comparison import Comparison, compare_pairs
 from vla.rollouts.results import ERROR, Report, Result, pairs_of
 from vla.rollouts.sequential import excludes, is_settled
-
-
-class Statement(Protocol):
-    """Something to decide by playing episodes."""
-
-    def is_clear(self, report: Report) -> bool:
-        """Return whether it is decided by the episodes of a report, to be asked after any number of them."""
-        ...
-
-    def say(self, report: Report) -> str:
-        """Return a sentence on it for a finished report."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -30,11 +17,11 @@ class AgainstBar:
     bar: float
 
     def is_clear(self, report: Report) -> bool:
-        """See `Statement`."""
+        """Return whether it is decided by the episodes of a report, to be asked after any number of them."""
         return excludes(self.bar, report.successes, report.episodes - report.successes)
 
     def say(self, report: Report) -> str:
-        """See `Statement`."""
+        """Return a sentence on it for a finished report."""
         low, high = report.interval
         bar = f"the bar of {100 * self.bar:g} %"
         if low <= self.bar <= high:
@@ -52,7 +39,7 @@ class AgainstRun:
     anytime: bool = False  # whether the other run stopped when something was clear
 
     def is_clear(self, report: Report) -> bool:
-        """See `Statement`.
+        """Return whether it is decided by the episodes of a report, to be asked after any number of them.
 
         Raises:
             ValueError: the other run has other episodes with the same seeds.
@@ -69,7 +56,7 @@ class AgainstRun:
             raise self._apart()
 
     def say(self, report: Report) -> str:
-        """See `Statement`."""
+        """Return a sentence on it for a finished report."""
         found = self._compared(report)
         if not found.episodes:
             return f"no episode in common with {self.run}"
@@ -99,6 +86,9 @@ class AgainstRun:
             f"evaluate.against={self.run} has no episode in common with this evaluation: it needs a run with the same "
             "task, randomisation and evaluate.seed"
         )
+
+
+Statement = AgainstBar | AgainstRun
 
 
 def differs_clearly(first: Report, margin: float, conditions: int, report: Report) -> bool:

@@ -25,9 +25,9 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 from annotated_types import Ge, MaxLen
-from pydantic import ConfigDict
 
 from vla.data.formats.video import PIXELS
+from vla.io.documents import LENIENT
 from vla.io.types import Count, Positive
 from vla.spec import Array, Spec
 
@@ -45,9 +45,6 @@ FILES_PER_CHUNK = 1000
 STATE, ACTION, EXECUTED, RATES = "observation.state", "action", "executed", "velocities"
 COUNTERS = {"timestamp": "float32", "frame_index": "int64", "episode_index": "int64"}
 COUNTERS |= {"index": "int64", "task_index": "int64"}
-
-# Datasets of other writers may have further keys.
-LENIENT = ConfigDict(strict=True, extra="ignore", allow_inf_nan=False)
 
 
 @dataclass

@@ -61,7 +61,7 @@ class ReferenceRenderer:
             mujoco.mjr_readPixels(rgb[number], depth[number], self._rect, self._context)
         return rgb[:, ::-1], self._metres(depth[:, ::-1])
 
-    def _draw(self, data: mujoco.MjData, camera: int, window: Sequence[float] | None = None) -> None:
+    def _draw(self, data: mujoco.MjData, camera: int, window: Sequence[float] | None) -> None:
         self._camera.fixedcamid = camera
         mujoco.mjv_updateScene(
             self._model, data, self._option, None, self._camera, mujoco.mjtCatBit.mjCAT_ALL.value, self._scene

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import mujoco
 import numpy as np
@@ -35,44 +35,18 @@ from vla.tasks.tabletop.robot import (
     spread,
 )
 
+Link = tuple[float, tuple[float, ...], tuple[float, ...]]
+
 # Mass [kg], centre of mass [m] and inertia xx yy zz xy xz yz [kg m²]: franka_description, inertial.yaml (identified
 # by Gaz et al., "Dynamic Identification of the Franka Emika Panda Robot", RA-L 2019).
-LINKS: tuple[dict[str, Any], ...] = (
-    {
-        "mass": 4.970684,
-        "com": (0.003875, 0.002081, -0.04762),
-        "inertia": (0.70337, 0.70661, 0.009117, -0.000139, 0.006772, 0.019169),
-    },
-    {
-        "mass": 0.646926,
-        "com": (-0.003141, -0.02872, 0.003495),
-        "inertia": (0.007962, 0.02811, 0.025995, -0.003925, 0.010254, 0.000704),
-    },
-    {
-        "mass": 3.228604,
-        "com": (0.027518, 0.039252, -0.066502),
-        "inertia": (0.037242, 0.036155, 0.01083, -0.004761, -0.011396, -0.012805),
-    },
-    {
-        "mass": 3.587895,
-        "com": (-0.05317, 0.104419, 0.027454),
-        "inertia": (0.025853, 0.019552, 0.028323, 0.007796, -0.001332, 0.008641),
-    },
-    {
-        "mass": 1.225946,
-        "com": (-0.011953, 0.041065, -0.038437),
-        "inertia": (0.035549, 0.029474, 0.008627, -0.002117, -0.004037, 0.000229),
-    },
-    {
-        "mass": 1.666555,
-        "com": (0.060149, -0.014117, -0.010517),
-        "inertia": (0.001964, 0.004354, 0.005433, 0.000109, -0.001158, 0.000341),
-    },
-    {
-        "mass": 0.735522,
-        "com": (0.010517, -0.004252, 0.061597),
-        "inertia": (0.012516, 0.010027, 0.004815, -0.000428, -0.001196, -0.000741),
-    },
+LINKS: tuple[Link, ...] = (
+    (4.970684, (0.003875, 0.002081, -0.04762), (0.70337, 0.70661, 0.009117, -0.000139, 0.006772, 0.019169)),
+    (0.646926, (-0.003141, -0.02872, 0.003495), (0.007962, 0.02811, 0.025995, -0.003925, 0.010254, 0.000704)),
+    (3.228604, (0.027518, 0.039252, -0.066502), (0.037242, 0.036155, 0.01083, -0.004761, -0.011396, -0.012805)),
+    (3.587895, (-0.05317, 0.104419, 0.027454), (0.025853, 0.019552, 0.028323, 0.007796, -0.001332, 0.008641)),
+    (1.225946, (-0.011953, 0.041065, -0.038437), (0.035549, 0.029474, 0.008627, -0.002117, -0.004037, 0.000229)),
+    (1.666555, (0.060149, -0.014117, -0.010517), (0.001964, 0.004354, 0.005433, 0.000109, -0.001158, 0.000341)),
+    (0.735522, (0.010517, -0.004252, 0.061597), (0.012516, 0.010027, 0.004815, -0.000428, -0.001196, -0.000741)),
 )
 TORQUE = (87, 87, 87, 87, 12, 12, 12)  # [N m], Franka Control Interface documentation, "Limits for Panda"
 STIFFNESS = (4500, 4500, 3500, 3500, 2000, 2000, 2000)  # position servo [N m/rad], as in MuJoCo Menagerie's Panda
@@ -159,9 +133,10 @@ class Panda(Robot):
         if collide:
             body.add("geom", type="mesh", mesh=mesh, group=HIDDEN, mass=0, **ROBOT_CONTACT)
 
-    def _add_link(self, parent: mjcf.Element, index: int, link: dict[str, Any]) -> mjcf.Element:
+    def _add_link(self, parent: mjcf.Element, index: int, link: Link) -> mjcf.Element:
         body = parent.add("body", name=f"link{index + 1}", pos=CHAIN[index][:3], quat=CHAIN[index][3:], gravcomp=1)
-        body.add("inertial", mass=link["mass"], pos=link["com"], fullinertia=link["inertia"])
+        mass, com, inertia = link
+        body.add("inertial", mass=mass, pos=com, fullinertia=inertia)
         limits = (JOINT_LOW[index], JOINT_HIGH[index])
         joint = body.add(
             "joint", name=f"joint{index + 1}", axis=(0, 0, 1), range=limits, limited=True, armature=ARMATURE
