@@ -43,11 +43,13 @@ def a_run(
     light: float | None = None,
     dark: str = "",
 ) -> Path:
-    """A folder as an evaluation leaves it, without pictures and recordings; s is a success, d a drop, and in the dark
-    all are drops unless told."""
+    """A folder as an evaluation leaves it, without pictures and recordings.
+
+    s is a success, d a drop, e an error, and in the dark all are drops unless told.
+    """
     folder.mkdir(parents=True)
     report, in_the_dark = (
-        a_report(*({"s": "success", "d": "dropped"}[outcome] for outcome in all_of_them))
+        a_report(*({"s": "success", "d": "dropped", "e": "error"}[outcome] for outcome in all_of_them))
         for all_of_them in (outcomes, dark or "d" * len(outcomes))
     )
     if light is not None:

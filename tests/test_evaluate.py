@@ -74,7 +74,9 @@ def test_tiers_weigh_the_same_whatever_the_number_of_their_tasks() -> None:
     report = Report(tuple(results), tiers)
     *_, easy, hard, mean, success = str(report).splitlines()
     assert easy.startswith("easy 18/20 (90.0 %, ") and hard.startswith("very hard 2/10 (20.0 %, ")
-    assert mean.startswith("mean over tiers 55.0 % (95 % CI ") and success.startswith("success 20/30 (66.7 %, ")
+    assert mean.startswith("mean over tiers, 3 of 4 tasks, 55.0 % (95 % CI ") and success.startswith(
+        "success 20/30 (66.7 %, "
+    )
     # Which task it is explains part of the outcomes: an interval for fixed tasks is narrower than Wilson's.
     low, high = report.interval
     assert low < report.success < high and high - low < 0.9 * np.diff(wilson_interval(20, 30))
@@ -152,6 +154,18 @@ def test_a_draw_that_no_report_can_hold_is_an_error_of_its_episode(draw: object)
 
     report = evaluate(Drawing, toy.make_agent, None, SEEDS[:2])
     assert [result.outcome for result in report.results] == ["error", "error"]
+
+
+def test_a_motion_that_no_report_can_hold_is_an_error_of_its_episode(tmp_path: Path) -> None:
+    class Lost(toy.ToyEnvironment):
+        @property
+        def tool(self) -> np.ndarray:
+            return np.array([*self._point, np.nan if self._seed == SEEDS[1] else 0.0])
+
+    report = evaluate(Lost, toy.make_agent, None, SEEDS[:3])
+    assert [result.outcome == "error" for result in report.results] == [False, True, False]
+    assert report.results[0].motion and report.results[0].motion.path_m
+    write_report(report, tmp_path / "report.json", None, {})
 
 
 def test_an_episode_that_kills_its_process_is_an_error_and_the_others_are_played() -> None:

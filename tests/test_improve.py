@@ -159,6 +159,12 @@ def test_the_episodes_of_a_round_may_have_another_task() -> None:
         check(composed("job=improve", "+improve.changes.time=5.0"))
 
 
+def test_a_round_validates_once_at_its_end(tmp_path: Path) -> None:
+    asked = composed("job=improve", "improve.steps=50", "trainer.accumulate_grad_batches=3")
+    trainer = improve._round(Experiment.of(asked), tmp_path / "last.ckpt", tmp_path, [])["trainer"]
+    assert (trainer["max_steps"], trainer["val_check_interval"]) == (50, 150)  # steps, and batches
+
+
 def test_rounds_resume_with_their_own_config(tmp_path: Path) -> None:
     run = tmp_path / "run"
     saved = composed("job=improve", f"output={run}", "pretrained=policy.ckpt", "improve.steps=7", "trainer.max_steps=9")

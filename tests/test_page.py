@@ -271,6 +271,12 @@ def test_other_scenes_under_the_same_seeds_are_not_compared(tmp_path: Path) -> N
     assert "Not compared, because no episode is the same in both: plain and dark." in told
 
 
+def test_episodes_that_ended_in_errors_are_told_beside_the_rates_without_them(tmp_path: Path) -> None:
+    whole, crashing = a_run(tmp_path / "whole", "ssssssdd"), a_run(tmp_path / "crashing", "sseeeeee")
+    told = text(compared([whole, crashing], tmp_path / "new"))
+    assert "Episodes that ended in errors, which count nowhere: 6 of 8 in crashing (seen)." in told
+
+
 def test_episodes_without_draws_are_the_same_only_in_the_same_task(tmp_path: Path) -> None:
     runs = []
     for number, task in enumerate(("one", "one", "other")):

@@ -289,6 +289,11 @@ def test_training_goes_on_as_what_it_was(home: Path) -> None:
         assert other.partition("=")[0].partition("/")[0] in refused.stderr and "Traceback" not in refused.stderr
     done = here(home, "job=train", "resume=longer", "output=longer", "trainer.max_steps=6")
     assert "trained 6 steps" in done.stdout
+    # Its evaluation was of the policy before: nothing of it is said of this one.
+    assert (home / "longer/evaluation_4/report.json").read_bytes() == (home / "run/report.json").read_bytes()
+    assert not list((home / "longer").glob("report.json")) and not list((home / "longer").glob("*.rrd"))
+    page = (home / "longer/report.html").read_text()
+    assert "6 steps" in page and "95 % CI" not in page
 
 
 def test_a_policy_is_trained_further_for_another_goal(home: Path, tmp_path: Path) -> None:

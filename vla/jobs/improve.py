@@ -151,7 +151,7 @@ def _labelled(experiment: Experiment, checkpoint: Path, folder: Path, seed: int)
 
 def _round(experiment: Experiment, checkpoint: Path, folder: Path, stores: Sequence[Path]) -> Experiment:
     """Return the training of a round: from the weights of the one before, on demonstrations and all rounds so far."""
-    steps = experiment["improve"]["steps"]
+    steps, batches = experiment["improve"]["steps"], experiment["trainer"]["accumulate_grad_batches"]
     more = [*(experiment["collect"]["more"] or ()), *map(str, stores)]
     return experiment.with_values(
         {
@@ -160,7 +160,7 @@ def _round(experiment: Experiment, checkpoint: Path, folder: Path, stores: Seque
             "pretrained": str(checkpoint),
             "collect.more": more,
             "trainer.max_steps": steps,
-            "trainer.val_check_interval": steps,  # once, at the end
+            "trainer.val_check_interval": steps * batches,  # once, at the end
         }
     )
 

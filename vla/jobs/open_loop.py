@@ -88,6 +88,10 @@ def _unseen(store: EpisodeStore, more: Sequence[Path], checkpoint: Path) -> list
             f"{checkpoint} was trained on other episodes than the {len(entries)} in {folders}, so which of them were "
             "held out is unknown: name the recording, its options, collect.episodes and collect.more as in training"
         )
+    if origin := header.config.get("pretrained"):
+        log.warning(
+            "%s began with the weights of %s: whether these were trained on its episodes is unknown", checkpoint, origin
+        )
     return _held_out(store, header.config["data"]["validation_fraction"], f"{checkpoint} was trained on all of them")
 
 

@@ -10,7 +10,7 @@ from rich import print as show
 from vla.config.check import Job
 from vla.config.experiment import Experiment
 from vla.io.types import Text
-from vla.reports.comparison import CASE, compare_runs, course_rows, read_runs, runs_table, without_comparison
+from vla.reports.comparison import CASE, compare_runs, course_rows, read_runs, remarks, runs_table
 from vla.reports.conditions import course_table
 from vla.reports.html import write_comparison
 
@@ -25,8 +25,8 @@ def run(experiment: Experiment) -> None:
     compared = compare_runs(runs, experiment["evaluate"]["margin"])
     if compared:
         show(runs_table(compared))
-    if apart := without_comparison(runs, compared):
-        log.info("%s", apart)
+    for remark in remarks(runs, compared):
+        log.info("%s", remark)
     if rows := course_rows(compared):
         show(course_table(rows, CASE))
     log.info("wrote %s", write_comparison(runs, compared, Path(experiment["output"])))

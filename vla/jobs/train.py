@@ -24,7 +24,16 @@ from vla.reports.first_batch import SHOWN, draw_samples
 from vla.reports.html import write_page
 from vla.rollouts.collect import collection_time
 from vla.runs.files import Training
-from vla.runs.folder import CHECKPOINTS, LAST, PAGE, SAMPLES, save_choice, save_config, save_training
+from vla.runs.folder import (
+    CHECKPOINTS,
+    LAST,
+    PAGE,
+    SAMPLES,
+    save_choice,
+    save_config,
+    save_training,
+    set_evaluation_aside,
+)
 from vla.runs.resume import LENGTHS, TrainingProgress, first_process, training_lock, training_progress
 from vla.spec import Array
 from vla.training.checkpoints import GracefulStop
@@ -107,6 +116,8 @@ def _fit(experiment: Experiment, state: TrainingProgress, trainer: Trainer, grac
     if state.resume_from:
         restore_metrics(trainer, state.resume_from)
     collection_s = collection_time(store, experiment["collect"]["episodes"])
+    if trainer.is_global_zero:
+        set_evaluation_aside(output)
     with writing(output), _reported(experiment, trainer, graceful_stop, learner, collection_s):
         try:
             with (

@@ -113,11 +113,20 @@ def _compared_rows(first: SweepRow, other: SweepRow, condition: str) -> Comparis
     return replace(compare_samples(won, played, others_won, others_played), episodes=episodes)
 
 
-def without_comparison(runs: Mapping[str, Run], compared: Sequence[RunComparison]) -> str:
-    """Return a sentence on the runs that are not compared and why, or an empty string."""
+def remarks(runs: Mapping[str, Run], compared: Sequence[RunComparison]) -> list[str]:
+    """Return sentences on the runs that are not compared and why, and on episodes that ended in errors."""
     found = {(each.one, each.other) for each in compared}
     pairs = [f"{one} and {other}" for one, other in combinations(runs, 2) if (one, other) not in found]
-    return f"not compared, because no episode is the same in both: {', '.join(pairs)}" if pairs else ""
+    failed = [
+        f"{len(report.errors)} of {len(report.results)} in {name} ({condition})"
+        for name, run in runs.items()
+        for condition, report in run.reports.items()
+        if report.errors
+    ]
+    return [
+        *([f"not compared, because no episode is the same in both: {', '.join(pairs)}"] if pairs else []),
+        *([f"episodes that ended in errors, which count nowhere: {', '.join(failed)}"] if failed else []),
+    ]
 
 
 def runs_table(compared: Sequence[RunComparison]) -> Table:

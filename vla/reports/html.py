@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import os
 from base64 import b64encode
 from collections.abc import Mapping, Sequence
@@ -19,7 +18,7 @@ from markupsafe import Markup
 from vla.config.differences import ABSENT, at, differences
 from vla.data.index import listed
 from vla.io.files import write_text
-from vla.reports.comparison import CASE, RunComparison, course_rows, without_comparison
+from vla.reports.comparison import CASE, RunComparison, course_rows, remarks
 from vla.reports.conditions import Courses, comparison_texts, course_head, course_names, course_texts
 from vla.reports.posteriors import draw_posteriors
 from vla.reports.style import BLUE, GREEN, GREY, RED, Interval
@@ -28,8 +27,6 @@ from vla.rollouts.motion import AMOUNTS
 from vla.rollouts.results import Report
 from vla.runs.folder import ERRORS_PLOT, PAGE, PLOT, RECORDING, SAMPLES, SUITE, Run, read_run
 from vla.spec import IN_DISTRIBUTION
-
-log = logging.getLogger(__name__)
 
 COMPARISON, SWEEP = "comparison.html", "sweep.html"
 FAILURES, SUCCESSES = 6, 3  # filmstrips on a run's page
@@ -106,7 +103,7 @@ def write_comparison(runs: Mapping[str, Run], compared: Sequence[RunComparison],
         posteriors=draw_posteriors(reports, compared, colours(len(runs))) if len(reports) == len(runs) else None,
         curves=draw_runs({name: run.metrics for name, run in runs.items()}),
         pairs=[(each, comparison_texts(each.found)) for each in compared],
-        apart=without_comparison(runs, compared),
+        remarks=remarks(runs, compared),
         course=_course(course_rows(compared)),
         case=CASE,
         anytime=any(report.anytime for run in runs.values() for report in run.reports.values()),
@@ -214,7 +211,7 @@ def _rate_tables(run: Run) -> dict[str, dict[str, Rate]]:
         "condition": {name: (*_rate(report)[:2], compared.get(name, ())) for name, report in run.reports.items()},
         "tier": {
             **{name: _rate(part) for name, part in first.by_tier.items()},
-            **({"mean over tiers": (mean, "", ())} if mean else {}),
+            **({first.mean_label.rstrip(","): (mean, "", ())} if mean else {}),
         },
         "task": {name: _rate(part) for name, part in first.by_task.items()},
         "milestone": {name: _rate(first, count) for name, count in first.milestones.items()},

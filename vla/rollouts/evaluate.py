@@ -10,6 +10,7 @@ import logging
 import traceback
 from collections.abc import Callable, Sequence
 from contextlib import suppress
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 
@@ -127,14 +128,20 @@ def play(environment: Environment, agent: Agent, seed: int, recorder: Recorder |
     """Play one episode; errors become results, so that one seed ends neither an evaluation nor a training."""
     try:
         episode = rollout(environment, agent, seed, recorder, all_images=recorder is not None)
-        # Draws may be arrays; plain values support comparison and JSON.
-        draws = json.loads(json.dumps(episode.draws, default=lambda value: value.tolist(), allow_nan=False))
+        motion = motion_of(episode, environment.spec.control_hz)
+        # Worlds may give arrays; plain values support comparison and JSON.
+        draws, completed, _ = json.loads(
+            json.dumps(
+                [episode.draws, episode.completed, asdict(motion)],
+                default=lambda value: value.tolist(),
+                allow_nan=False,
+            )
+        )
     except Exception as problem:
         where = traceback.extract_tb(problem.__traceback__)[-1]
         what = f"{type(problem).__name__}: {problem} ({Path(where.filename).name}:{where.lineno})"
         return Result(seed, ERROR, error=what)
     steps, milestones = len(episode.observations), tuple(sorted(episode.milestones))
-    motion = motion_of(episode, environment.spec.control_hz)
     return Result(
         seed,
         episode.outcome,
@@ -143,7 +150,7 @@ def play(environment: Environment, agent: Agent, seed: int, recorder: Recorder |
         draws,
         episode.task,
         milestones,
-        completed=episode.completed,
+        completed=completed and tuple(completed),
         motion=motion,
     )
 

@@ -196,6 +196,13 @@ class Report:
             ]
         )
 
+    @property
+    def mean_label(self) -> str:
+        """Name of `mean_over_tiers`, which says so if tasks of the tiers are missing from it."""
+        listed = {task for tasks in self.tiers.values() for task in tasks}
+        known = sum(part.episodes > 0 for task, part in self.tasks.items() if task in listed)
+        return "mean over tiers" if known == len(listed) else f"mean over tiers, {known} of {len(listed)} tasks,"
+
     def compare(self, other: Report) -> Comparison:
         """Compare the success of another report, as the second, with this one, the first, on the same seeds.
 
@@ -237,7 +244,7 @@ class Report:
         lines += [f"{tier.replace('_', ' ')} {report._rate()}" for tier, report in self.by_tier.items()]
         if mean := self.mean_over_tiers:
             rate, low, high = (f"{100 * value:.1f}" for value in mean)
-            lines.append(f"mean over tiers {rate} % (95 % CI {low}-{high})")
+            lines.append(f"{self.mean_label} {rate} % (95 % CI {low}-{high})")
         return "\n".join([*lines, f"success {self._rate()}"])
 
     def _rate(self, count: int | None = None) -> str:

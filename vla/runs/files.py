@@ -8,9 +8,9 @@ from functools import cached_property
 from itertools import repeat
 from typing import Annotated, Any
 
-from pydantic import ConfigDict, StringConstraints
+from pydantic import StringConstraints
 
-from vla.io.documents import STRICT
+from vla.io.documents import LENIENT, STRICT
 from vla.io.types import Count, Natural, NonNegative, Positive, Share
 from vla.rollouts.comparison import Comparison
 from vla.rollouts.motion import Motion
@@ -18,7 +18,6 @@ from vla.rollouts.results import Report, Result
 from vla.spec import IN_DISTRIBUTION, readable
 
 Node = dict[str, Any]
-LENIENT = ConfigDict(strict=True, extra="ignore", allow_inf_nan=False)  # derived values are ignored
 CheckpointName = Annotated[str, StringConstraints(pattern=r"^\w[\w.-]*\.ckpt$")]  # in the run's own folder
 
 
@@ -54,7 +53,7 @@ class Round:
     __pydantic_config__ = STRICT
 
     episodes: Natural  # 0: training on demonstrations alone
-    successes: Natural  # of these episodes, by the policy before this training
+    successes: Natural  # of these episodes, by the policy before this training, or by it and the expert in turns
     collection_s: NonNegative  # duration of the episodes
     training_s: NonNegative
     validation: Share | None  # success rate in the last validation; None without one

@@ -106,6 +106,22 @@ def chosen_checkpoint(folder: Path) -> str | None:
     return training.checkpoint if training else None
 
 
+def set_evaluation_aside(folder: Path) -> None:
+    """Move the evaluation in a run's folder into a folder within it: training goes on, so it is of another policy.
+
+    Raises:
+        ValueError: the file that tells the number of its steps is damaged.
+    """
+    names = (REPORT, ERRORS, PLOT, SUITE, ERRORS_PLOT, RECORDING)
+    if files := [file for name in names if (file := folder / name).exists()]:
+        training = read_training(folder)
+        target = folder / f"evaluation_{training.steps if training else 0}"
+        target.mkdir(exist_ok=True)
+        for file in files:
+            file.replace(target / file.name)
+        log.info("moved the evaluation so far to %s", target)
+
+
 def wall_time(checkpoint: Path, evaluation: float) -> float | None:
     """Return the wall time of collection, training and evaluation of a checkpoint [s], or None if unknown.
 

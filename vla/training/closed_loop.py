@@ -85,9 +85,11 @@ class ClosedLoop(Callback):
         for result in results:
             if result.error:
                 log.warning("validation: seed %d could not be played: %s", result.seed, result.error)
-        successes = sum(result.success for result in results)
-        share = torch.tensor(successes / len(self._seeds), device=pl_module.device)
-        pl_module.log("val/success", share, sync_dist=True, reduce_fx="sum")
+        counts = [sum(result.success for result in results), sum(not result.error for result in results)]
+        gathered = pl_module.all_gather(torch.tensor(counts, device=pl_module.device))
+        assert isinstance(gathered, torch.Tensor)
+        won, completed = gathered.view(-1, 2).sum(0)  # of all processes
+        pl_module.log("val/success", won / completed.clamp(min=1), sync_dist=True)
 
     def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Save `best.ckpt` if the success rate is at least the best so far."""
