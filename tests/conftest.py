@@ -19,7 +19,7 @@ import pytest
 import warm
 from filelock import FileLock
 
-from vla.parallel.processes import THREAD_SETTINGS, collect_rarely, without_triton
+from vla.parallel.processes import THREAD_SETTINGS, raise_gc_thresholds, without_triton
 from vla.tasks.gl import choose_backend, has_egl
 
 if TYPE_CHECKING:
@@ -42,7 +42,7 @@ has_egl()  # once, for the programs that tests start
 without_triton()
 
 warm.compose_faster()
-collect_rarely()
+raise_gc_thresholds()
 
 # What a shell runs in the background ignores interrupts, and so would the programs that tests start and interrupt.
 signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -61,7 +61,7 @@ def pytest_configure(config: pytest.Config) -> None:
 
 
 def pytest_collection_finish() -> None:
-    """What has been imported by now stays: nobody need look through it again and again for what could be freed."""
+    """Freeze all imported objects, so that the garbage collector does not scan them again."""
     gc.collect()
     gc.freeze()
 

@@ -91,7 +91,7 @@ def test_frames_of_unknown_truth_do_not_count_in_the_auxiliary_loss() -> None:
     assert torch.isfinite(losses["loss"])
 
 
-def test_standardize_gathers_the_statistics_of_what_is_present() -> None:
+def test_running_normalizer_accumulates_statistics_of_present_frames() -> None:
     torch.manual_seed(0)
     normalizer = RunningNormalizer(3)
     values = torch.randn(50, 2, 3) * torch.tensor([0.1, 2.0, 0.0]) + torch.tensor([1.0, -3.0, 7.0])
@@ -105,7 +105,7 @@ def test_standardize_gathers_the_statistics_of_what_is_present() -> None:
     assert torch.allclose((standard * normalizer.std + normalizer.mean)[present], values[present], atol=1e-4)
 
 
-def test_standardize_leaves_its_statistics_alone_outside_training() -> None:
+def test_running_normalizer_does_not_update_outside_training() -> None:
     normalizer = RunningNormalizer(2).eval()
     normalizer(torch.ones(1, 1, 2), torch.ones(1, 1, dtype=torch.bool))
     assert normalizer.count == 0

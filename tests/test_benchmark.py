@@ -12,7 +12,7 @@ from composing import composed
 
 from vla.config.experiment import Experiment
 from vla.jobs.benchmark import deploy
-from vla.jobs.benchmark.machine import Others, machine, spoilt
+from vla.jobs.benchmark.machine import OtherLoad, is_unreliable, machine
 from vla.jobs.benchmark.measure import measure
 from vla.jobs.benchmark.memory import peak, reset_peak
 from vla.jobs.benchmark.train import measures
@@ -34,19 +34,19 @@ def test_the_machine_is_named() -> None:
 def test_the_time_of_other_programs_is_told_from_ones_own(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of 4 s that the cores were busy, this process and its children took 3; the clock went on by 2 s."""
     readings = iter([(100.0, 10.0, 50.0), (104.0, 13.0, 52.0), None, (104.0, 13.0, 52.0)])
-    monkeypatch.setattr(Others, "_now", lambda _: next(readings))
-    assert Others().cores() == pytest.approx(0.5)
-    assert Others().cores() is None
+    monkeypatch.setattr(OtherLoad, "_now", lambda _: next(readings))
+    assert OtherLoad().cores() == pytest.approx(0.5)
+    assert OtherLoad().cores() is None
 
 
 def test_the_clock_of_other_programs_runs() -> None:
-    one, two = Others()._now(), Others()._now()
+    one, two = OtherLoad()._now(), OtherLoad()._now()
     assert one and two and all(late >= early > 0 for early, late in zip(one, two, strict=True))
 
 
 @pytest.mark.parametrize(("others", "result"), [(0.0, False), (1e3, True)])
 def test_busy_machines_spoil_figures(others: float, result: bool) -> None:
-    assert spoilt(others) is result
+    assert is_unreliable(others) is result
 
 
 def test_a_peak_of_memory_is_remembered_until_it_is_forgotten() -> None:

@@ -372,7 +372,7 @@ def test_a_report_says_what_the_training_of_its_checkpoint_was(checkpoint: Path)
         ({"validate.seed": 1_000_004, "validate.episodes": 1}, "share episodes"),
     ],
 )
-def test_what_would_judge_what_it_chose_or_trained_on_is_refused(override: dict[str, Any], says: str) -> None:
+def test_evaluation_seeds_used_for_training_or_selection_are_refused(override: dict[str, Any], says: str) -> None:
     with pytest.raises(ValueError, match=says):
         check(config(**override))
 

@@ -64,7 +64,7 @@ def test_a_level_of_noise_keeps_its_share_of_the_variance() -> None:
 
 
 @pytest.mark.parametrize("steps", [1, 3, 10])
-def test_who_knows_the_noise_finds_the_actions(steps: int) -> None:
+def test_ddim_with_the_true_noise_recovers_the_actions(steps: int) -> None:
     model = make_denoising(Diffusion)
     model.steps = steps
     action = 2 * torch.rand(2, 4, 3) - 1
@@ -78,7 +78,7 @@ def test_who_knows_the_noise_finds_the_actions(steps: int) -> None:
 
 
 @pytest.mark.parametrize("steps", [1, 2, 5, 10])
-def test_noise_that_tells_nothing_does_not_become_an_action(steps: int) -> None:
+def test_samples_of_the_ideal_denoiser_do_not_exceed_the_prior_spread(steps: int) -> None:
     model = make_denoising(Diffusion)
     model.steps, spread = steps, 0.2
 

@@ -1,4 +1,4 @@
-"""Models on a GPU, by torch's fake tensors, which know where they would lie, and refuse to meet across devices."""
+"""Device placement of models, tested with torch's fake tensors, which raise on operations across devices."""
 
 from __future__ import annotations
 

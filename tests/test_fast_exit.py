@@ -35,7 +35,7 @@ with fast_exit():
         ("raise ValueError('wrong')", 1, "ValueError: wrong\n"),
     ],
 )
-def test_all_but_the_freeing_is_done(last: str, status: int, said: str) -> None:
+def test_fast_exit_runs_threads_and_handlers_but_no_finalizers(last: str, status: int, said: str) -> None:
     done = subprocess.run([sys.executable, "-c", PROGRAM.format(last=last)], capture_output=True, text=True, timeout=30)
     assert (done.returncode, done.stdout) == (status, "thread\nhandler\n")
     assert done.stderr.endswith(said) and bool(done.stderr) == bool(said)

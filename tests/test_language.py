@@ -40,7 +40,7 @@ def test_training_uses_every_phrasing_and_word_that_is_not_held_out() -> None:
     assert instructions(None) == instructions("combinations") == expected
 
 
-def test_what_is_held_out_is_new_in_one_way_at_a_time() -> None:
+def test_a_held_out_instruction_has_one_kind_of_novelty() -> None:
     assert instructions("words") == {"set the blue block there"}
     assert instructions("phrasings") == {"there goes the blue block"}
     assert GRAMMAR.held_out_kinds == ("words", "phrasings", "combinations")
@@ -161,7 +161,7 @@ def test_in_a_mixture_some_colours_are_named_with_some_goals_in_evaluation_only(
     assert new and all(draw["named"]["colour"] == held_out[draw["named"]["goal"]] for draw in new)
 
 
-def test_who_is_named_does_not_depend_on_how_it_is_said() -> None:
+def test_named_blocks_do_not_depend_on_held_out_phrasing() -> None:
     environment = make_tabletop("task/randomize=wide")
     with environment.blind():
         for seed in range(FIRST_SEED, FIRST_SEED + 10):

@@ -155,7 +155,7 @@ def test_more_components_than_memory_holds_are_refused(home: Path, tmp_path: Pat
     ids=["rate", "camera", "joints", "names", "units"],
 )
 def test_differences_from_the_task_are_named(home: Path, spec: Spec, says: str) -> None:
-    with pytest.raises(ValueError, match=rf"dataset is not of the task's kind of step: .*{says}"):
+    with pytest.raises(ValueError, match=rf"dataset does not match the task: .*{says}"):
         demonstrations(str(home / "dataset"), spec)
 
 

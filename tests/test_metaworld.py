@@ -236,7 +236,7 @@ def test_the_hands_picture_is_a_part_of_lerobots_that_moves_along() -> None:
         ("task.tasks=[reach] task.window=[0.5,0,0.4,1]", "top above bottom, left of right"),
     ],
 )
-def test_what_there_is_not_is_named(override: str, words: str) -> None:
+def test_unknown_tasks_cameras_and_windows_are_refused(override: str, words: str) -> None:
     with pytest.raises(ValueError, match=words):
         world(*(item if "walk" not in item else f"+{item}" for item in override.split())).reset(0)
 

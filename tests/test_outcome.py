@@ -76,7 +76,7 @@ def test_with_two_subgoals_it_is_about_the_one_whose_turn_it_is() -> None:
     assert classifier.outcome == "never_reached"
 
 
-def test_who_should_have_stayed_did_not() -> None:
+def test_acting_on_a_stay_goal_is_did_not_stay() -> None:
     classifier = OutcomeClassifier(3)
     step(classifier, height=0.12, held=True, skill="stay")
     assert classifier.outcome == "did_not_stay" and classifier.milestones == frozenset()

@@ -282,7 +282,7 @@ def test_a_damaged_checkpoint_is_named(home: Path) -> None:
         read_checkpoint(home / "flipped.ckpt")
 
 
-def test_training_goes_on_as_what_it_was(home: Path) -> None:
+def test_resuming_refuses_a_changed_identity_and_archives_the_evaluation(home: Path) -> None:
     shutil.copytree(home / "run", home / "longer")
     for other in ("model.width=32", "task/goal=lift", "learner.lr=1"):
         refused = here(home, "job=train", "resume=longer", "output=longer", other, ok=False)

@@ -19,7 +19,7 @@ from vla.rollouts.sequential import (
     anytime_interval,
     anytime_p,
     excludes,
-    is_settled,
+    is_decided,
     log_capital,
 )
 from vla.rollouts.statements import AgainstBar, AgainstRun
@@ -66,7 +66,7 @@ def test_what_is_decided_agrees_with_the_intervals() -> None:
         assert excludes(0.9, won, lost) == (not low <= 0.9 <= high)
     for first, second, pairs in ((0, 5, 20), (1, 20, 100), (5, 6, 90), (5, 5, 2000), (3, 3, 400)):
         low, high = anytime_difference(first, second, pairs)
-        assert is_settled(first, second, pairs, 0.03) == (not low <= 0 <= high or (low > -0.03 and high < 0.03))
+        assert is_decided(first, second, pairs, 0.03) == (not low <= 0 <= high or (low > -0.03 and high < 0.03))
 
 
 @pytest.mark.parametrize("bar", [0.5, 0.9])
@@ -90,7 +90,7 @@ def test_policies_that_are_equal_or_a_margin_apart_are_rarely_called_otherwise(l
         drawn = random.random(1500)
         first, second = np.cumsum(drawn < lost), np.cumsum(drawn > 1 - won)
         for n in range(50, 1501, 50):
-            if is_settled(int(first[n - 1]), int(second[n - 1]), n, 0.02):
+            if is_decided(int(first[n - 1]), int(second[n - 1]), n, 0.02):
                 low, high = anytime_difference(int(first[n - 1]), int(second[n - 1]), n)
                 wrong += not low <= won - lost <= high
                 break
@@ -98,14 +98,14 @@ def test_policies_that_are_equal_or_a_margin_apart_are_rarely_called_otherwise(l
 
 
 def test_an_evaluation_stops_when_it_is_clear_whatever_the_number_of_workers() -> None:
-    until = AgainstBar(0.5).is_clear
+    until = AgainstBar(0.5).is_decided
     alone = evaluate(toy.make_environment, toy.make_agent, None, SEEDS, until=until)
     assert evaluate(toy.make_environment, toy.make_agent, None, SEEDS, LocalCluster(2), until=until) == alone
     assert alone.anytime and [result.seed for result in alone.results] == [*SEEDS[: alone.episodes]]
     assert until(alone) and not any(until(Report(alone.results[:played])) for played in range(alone.episodes))
     assert alone.interval[0] > 0.5 and "anytime-valid 95 % CI" in str(alone)
     assert AgainstBar(0.5).say(alone) == "success is above the bar of 50 %"
-    everything = evaluate(toy.make_environment, toy.make_agent, None, SEEDS[:4], until=AgainstBar(0.7).is_clear)
+    everything = evaluate(toy.make_environment, toy.make_agent, None, SEEDS[:4], until=AgainstBar(0.7).is_decided)
     assert everything.episodes == 4 and "open" in AgainstBar(0.7).say(everything)
 
 
@@ -118,7 +118,7 @@ def test_tasks_that_take_turns_are_played_in_whole_rounds() -> None:
 
 def test_recordings_of_episodes_that_do_not_count_are_removed(tmp_path: Path) -> None:
     folder = tmp_path / "recordings"
-    until = AgainstBar(0.5).is_clear
+    until = AgainstBar(0.5).is_decided
     report = evaluate(
         toy.make_environment, toy.make_agent, toy.make_recorder(folder), SEEDS, LocalCluster(2), until=until
     )
@@ -135,18 +135,18 @@ def a_report(outcomes: str, anytime: bool = True) -> Report:
 
 def test_a_run_is_compared_on_the_episodes_that_both_played() -> None:
     other = AgainstRun("A", {result.seed: result for result in a_report("0" * 12).results}, 0.02)
-    assert not other.is_clear(a_report("111e11")) and other.is_clear(a_report("1" * 9))
+    assert not other.is_decided(a_report("111e11")) and other.is_decided(a_report("1" * 9))
     assert other.say(a_report("1" * 10 + "e111")).startswith(
         "compared with A on 11 common episodes: better, +100.0 points"
     )
     stopped, some = replace(other, anytime=True), a_report("1" * 6, anytime=False)
     assert ": better, " in other.say(some) and ": open, " in stopped.say(some)  # six pairs, chosen by when it stopped
     failed = AgainstRun("A", {result.seed: result for result in a_report("e" + "0" * 12).results}, 0.02)
-    assert not failed.is_clear(a_report("1"))  # the other run did not complete that episode
+    assert not failed.is_decided(a_report("1"))  # the other run did not complete that episode
     failed.require_common([FIRST_SEED, FIRST_SEED + 1])
     with pytest.raises(ValueError, match="has no episode in common"):
         failed.require_common([FIRST_SEED, FIRST_SEED + 13])
     elsewhere = AgainstRun("A", {FIRST_SEED: Result(FIRST_SEED, "success", "push")}, 0.02)
     assert elsewhere.say(a_report("1")) == "no episode in common with A"
     with pytest.raises(ValueError, match="has no episode in common"):
-        elsewhere.is_clear(a_report("1"))
+        elsewhere.is_decided(a_report("1"))

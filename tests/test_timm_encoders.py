@@ -94,7 +94,7 @@ def test_at_the_start_a_feature_map_is_that_of_the_network(name: str, size: int 
         assert smaller.shape == (2, 8, *expected.shape[-2:])
 
 
-def test_a_frozen_network_stays_what_it_was_while_what_reads_it_learns() -> None:
+def test_a_frozen_backbone_is_unchanged_while_the_rest_of_the_model_learns() -> None:
     torch.manual_seed(0)
     model = make_bc(image=partial(FilmBackbone, "test_resnet", False, frozen=True, size=32, channels=8))
     encoder: Any = model.images[0]

@@ -1,5 +1,4 @@
-"""A training that is interrupted and gone on with is, bit for bit, the one that was not; what it says meanwhile, and
-where it ends for want of memory."""
+"""Training: an interrupted and resumed run equals an uninterrupted one bit for bit; logging; out-of-memory errors."""
 
 from __future__ import annotations
 
@@ -79,7 +78,7 @@ class DieAt(lightning.Callback):
 
 
 @pytest.mark.parametrize("killed", [False, True], ids=["interrupted", "killed"])
-def test_what_ends_at_a_step_that_is_validated_does_not_lose_the_validation(
+def test_resuming_at_a_validation_step_keeps_its_validation(
     killed: bool, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     start = make_bc().state_dict()
@@ -134,7 +133,7 @@ def test_it_logs_how_fast_it_is_and_what_it_waits_for(folder: Path, tmp_path: Pa
         assert 0 <= float(row["pace/waiting"]) <= 1 and 0 < float(row["pace/mfu"]) <= 1
 
 
-def test_want_of_memory_names_what_to_lower() -> None:
+def test_out_of_memory_errors_name_the_options_to_lower() -> None:
     """Images larger than all addresses, none of which is there before the model wants to compute with them."""
     batch = make_batch(3)
     batch["rgb"] = {name: image[:, :, :1, :1].expand(-1, -1, 10**8, 10**8, -1) for name, image in batch["rgb"].items()}

@@ -9,7 +9,7 @@ import toy
 from vla.data.window_batches import BufferPool, disturbed
 
 
-def test_what_follows_an_excursion_is_no_label_for_what_came_before() -> None:
+def test_a_step_is_disturbed_if_the_executed_action_differs_from_the_label_by_more_than_noise() -> None:
     label = np.array([0.04, -0.01, 1.0])
     executed = [
         label,

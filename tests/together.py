@@ -73,7 +73,7 @@ def train_pairs(store: Path, folder: Path) -> None:
 
 
 def train_in_pieces(store: Path, folder: Path) -> None:
-    """Leave the checkpoints of a training in one piece, of its first half, and of this one gone on with."""
+    """Save the checkpoints of an uninterrupted training, of its first half, and of the resumed second half."""
     model = make_rt1(dropout=0.2)
     start = {name: value.clone() for name, value in model.state_dict().items()}
     half = folder / "half/checkpoints" / LAST

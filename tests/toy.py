@@ -1,6 +1,6 @@
 """A world small enough to test with: a point is moved to a target, and a little camera looks on.
 
-Of no robot, depth or scene to draw it knows anything; where a test is about these, `ARM_SPEC` has them.
+It has no robot, no depth and no drawable scene; tests that need a robot or depth use `ARM_SPEC`.
 """
 
 from __future__ import annotations

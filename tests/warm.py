@@ -27,7 +27,7 @@ from typing import Any, TextIO
 from unittest.mock import patch
 
 from vla.parallel.fast_exit import fast_exit
-from vla.parallel.processes import collect_rarely, without_triton
+from vla.parallel.processes import raise_gc_thresholds, without_triton
 from vla.tasks.gl import choose_backend
 
 CONF = str(Path(__file__).parents[1] / "conf")
@@ -216,7 +216,7 @@ def compose_faster() -> None:
 
 def load() -> None:
     """Import the heavy libraries."""
-    collect_rarely()
+    raise_gc_thresholds()
     choose_backend()
     without_triton()
     compose_faster()

@@ -31,7 +31,7 @@ from vla.config.substitutes import with_substitutes
 from vla.deploy import ros
 from vla.io.suggestion import suggestion
 from vla.parallel.fast_exit import fast_exit
-from vla.parallel.processes import collect_rarely, without_triton
+from vla.parallel.processes import raise_gc_thresholds, without_triton
 from vla.runs.cells import failures, save_failure
 
 PACKAGE = Path(__file__).resolve().parent
@@ -256,7 +256,7 @@ def _menu() -> str:
 
 def main() -> None:
     """Run the command line; errors that the user can fix end in one sentence unless HYDRA_FULL_ERROR=1."""
-    collect_rarely()
+    raise_gc_thresholds()
     os.environ.setdefault(TRACEBACKS, os.environ.get("HYDRA_FULL_ERROR", "0"))
     os.environ["HYDRA_FULL_ERROR"] = "1"  # otherwise Hydra prints errors itself
     sys.argv[1:], ros.arguments[:] = ros.split_arguments(sys.argv[1:])

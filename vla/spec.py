@@ -46,7 +46,7 @@ class RobotModel:
 
     __pydantic_config__ = STRICT
 
-    joints: Names  # joint positions [rad] in the state, base to tip
+    joints: Names  # names of the joint positions in the state, base to tip; [rad], or as `state_units` says
     frame: Annotated[str, MaxLen(100)]  # reference frame of Cartesian actions
     velocities: Annotated[tuple[Name, ...], MaxLen(100), Predicate(unique)] = ()  # joint velocities, in the same order
     gripper: Name | None = None  # gripper opening [m] in the state
@@ -267,7 +267,7 @@ class Environment(Protocol):
     def blind(self) -> AbstractContextManager[None]:
         """Return a context in which observations carry no images, which makes steps cheap.
 
-        Images after it are those that they would be without it.
+        Later images do not depend on whether the context was used.
         """
         ...
 
@@ -289,7 +289,7 @@ class Multitask(Protocol):
     tasks: tuple[str, ...]
 
     def task_of(self, seed: int) -> str:
-        """Return the task of the episode of `seed`, one of `tasks`, each of which returns within a few seeds."""
+        """Return the task of the episode of `seed`; every task in `tasks` recurs within a few consecutive seeds."""
         ...
 
 
@@ -306,7 +306,7 @@ class InARow(Protocol):
 
 @runtime_checkable
 class Traceable(Protocol):
-    """Environment that tells where the tool is: reports have the length of its path and how smooth that is."""
+    """Environment that exposes the tool position, so that reports contain path length and smoothness."""
 
     @property
     def tool(self) -> Array:
@@ -331,11 +331,11 @@ class Drawable(Protocol):
 
 @runtime_checkable
 class Eventful(Protocol):
-    """Environment in which things happen that the agent does not do; recordings tell when."""
+    """Environment with events that the agent does not cause, such as disturbances; recordings mark their steps."""
 
     @property
     def events(self) -> Sequence[tuple[int, str]]:
-        """Events so far: index of the last observation before one, or the first that shows it, and its description."""
+        """(index, description) per event so far; index of the last observation before it or the first that shows it."""
         ...
 
 
@@ -396,13 +396,13 @@ class Agent(Protocol):
 
 @runtime_checkable
 class Looking(Agent, Protocol):
-    """Agent that says when it looks at images, so that others need not be drawn."""
+    """Agent that declares at which steps it reads images, so that no other images are rendered."""
 
     @property
     def looks(self) -> bool:
         """Whether the next action may depend on the images.
 
-        Not while a plan is executed, until a new instruction discards it; never for an expert on the simulator's truth.
+        False while a planned chunk is executed and no new instruction discards it; always for experts on the truth.
         """
         ...
 

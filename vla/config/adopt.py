@@ -42,9 +42,9 @@ IDENTITY = (  # keys that must not change in a resumed run: with other values it
 
 
 def adopt(cfg: DictConfig, overrides: Sequence[str]) -> DictConfig:
-    """Return `cfg` with task, tokenizer and model of `cfg.checkpoint`; for an evaluation also with what it reports.
+    """Return `cfg` with task, tokenizer and model of `cfg.checkpoint`; for job=evaluate also its training settings.
 
-    Neither has files, folders or devices of the checkpoint's author.
+    A path in these nodes is an error; in the training settings it becomes null. Devices are not taken over.
 
     Raises:
         ValueError: the file does not exist, or an override contradicts its weights.

@@ -249,7 +249,7 @@ def _part(node: Any, key: str) -> Any:
 def _paths_in(node: Any, key: str) -> Iterator[str]:
     """Dotted names of the arguments in a node, called `key`, that name a file or folder.
 
-    What this machine cannot import has none: the jobs that build it refuse it anyway.
+    A class that this machine cannot import yields no paths, because jobs that build it fail in any case.
     """
     if is_node(node):
         try:

@@ -160,9 +160,7 @@ class Experiment:
         node = self["model"]
         saved = read_checkpoint(origin) if origin else None
         if saved:
-            saved.spec.without_truth.require(
-                spec.without_truth, f"the checkpoint {origin}", "what it is to be trained on"
-            )
+            saved.spec.without_truth.require(spec.without_truth, f"the checkpoint {origin}", "the demonstrations")
             spec, node = replace(spec, robot=saved.spec.robot), _without_pretraining(node)
         model = _model(node, spec, build(self["tokenizer"], "tokenizer", spec=spec), saved)
         if saved:
@@ -182,7 +180,7 @@ class Experiment:
     def fitted_learner(self, store: EpisodeStore) -> Learner:
         """Build the learner of a new training, of the weights of `pretrained` or `checkpoint` if one is given.
 
-        Without, its tokenizer is fitted to the store's actions.
+        Without initial weights, the tokenizer is fitted to the store's actions.
         """
         origin = self.pretrained or self.checkpoint
         learner = self.learner(store.spec, origin)

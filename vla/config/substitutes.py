@@ -22,7 +22,7 @@ def with_substitutes(cfg: DictConfig, overrides: Sequence[str]) -> DictConfig:
     """Return `cfg` with the substitute of every part of the task that cannot be used here, and log a warning.
 
     Everything derived from the config, such as the folder of the demonstrations, uses the substitute. An option that
-    the command line names stays, and so do all where the demonstrations exist: in a resumed run, and in job=train.
+    the command line names is kept. Nothing is substituted in a resumed run, or in job=train if the store exists.
     """
     stored = cfg.job == "train" and is_store(Path(cfg.collect.folder))
     if cfg.resume is not None or cfg.task is None or stored:

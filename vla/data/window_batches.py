@@ -81,7 +81,7 @@ class WindowBatcher:
         chunk: actions k that label a frame.
         depth: include depth.
         pin: allocate page-locked memory, from which copies to a GPU are asynchronous.
-        truth_size: scalars S of the truth, which are not a number where the store has no truth; None: its own.
+        truth_size: number S of truth scalars, NaN if the store has no truth; None: that of the store.
 
     Raises:
         ValueError: numeric rows of the store differ from their checksums.
@@ -156,7 +156,9 @@ class WindowBatcher:
         return batch
 
     def verify(self, episodes: Array | None = None) -> None:
-        """Compare the images of episodes, numbers (N,) or all, with their checksums, which else their first windows do.
+        """Compare the images of the episodes with numbers (N,), by default of all, with their checksums.
+
+        Otherwise an episode is verified when its first window is read.
 
         Raises:
             ValueError: they differ.

@@ -163,7 +163,7 @@ class GripperGoals:
         server: str,
         fail: Callable[[str], None],
     ) -> None:
-        """Args: the node; what the gripper takes; name of its server; as of `GoalSender`.
+        """Args: the node; settings of the gripper; name of its action server; `fail` as in `GoalSender`.
 
         Raises:
             ValueError: a package of messages is not installed.
@@ -178,13 +178,13 @@ class GripperGoals:
             opening = move.Goal(width=float(settings.open), speed=speed)
             closing = grasp.Goal(width=float(settings.closed), speed=speed, force=force)
             closing.epsilon.inner, closing.epsilon.outer = map(float, settings.epsilon)
-            # What is not grasped has no error; the driver's own errors have a text.
+            # A missed grasp has an empty error text, so only errors of the driver count.
             missed = sender(grasp, f"{server}/grasp", lambda result, _: result.error)
             stuck = sender(move, f"{server}/move", lambda result, _: result.error or "it does not reach its width")
             self._goals = {True: (stuck, opening), False: (missed, closing)}
         else:
             kind = action_class(*settings.actions[0])
-            # A stall is what a grasp looks like.
+            # A stalled gripper has grasped something, which is no error.
             only = sender(kind, server, lambda result, _: "" if result.stalled else "it does not reach its position")
             self._goals = {wanted: (only, kind.Goal()) for wanted in (True, False)}
             for wanted, position in ((True, settings.open), (False, settings.closed)):
@@ -207,7 +207,7 @@ class GripperGoals:
         self._advance()
 
     def hold(self) -> None:
-        """Send nothing until the next command, not even what a goal that is being cancelled was to make room for."""
+        """Send nothing until the next command; drop a goal that waits for the cancellation of the previous one."""
         self._wanted = None
 
     def _advance(self) -> None:

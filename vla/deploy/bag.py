@@ -104,7 +104,7 @@ def play(node: Any, folder: Path, topics: Collection[str], stopped: Event, speed
             stopped.wait(max(0.0, begin + (stamp - start) * 1e-9 / speed - time.monotonic()))
             if stopped.is_set():
                 break
-            with damage(folder):
+            with bag_errors(folder):
                 message = _stamped_now(node, raw, classes[topic])
             publishers[topic].publish(message)
             published += 1
@@ -135,7 +135,7 @@ def opened(folder: Path) -> Iterator[Any]:
     for path in folder.iterdir():
         require_file(path)
     with _limits():
-        with damage(folder):
+        with bag_errors(folder):
             reader = Reader(folder)
             reader.open()
         try:
@@ -150,7 +150,7 @@ def messages_of(
     """Yield topic, time [ns] and bytes of every message of some connections, from `start` to before `stop` [ns]."""
     messages = reader.messages(connections, start, stop)
     while True:
-        with damage(folder):
+        with bag_errors(folder):
             message = next(messages, None)
         if message is None:
             return
@@ -159,8 +159,8 @@ def messages_of(
 
 
 @contextmanager
-def damage(folder: Path) -> Iterator[None]:
-    """Turn the exceptions of rosbags and ROS, which can be of any type, into a ValueError about the bag."""
+def bag_errors(folder: Path) -> Iterator[None]:
+    """Convert exceptions of rosbags and ROS, which can be of any type, into a ValueError that names the bag."""
     try:
         yield
     except MemoryError as error:

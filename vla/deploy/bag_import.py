@@ -19,7 +19,7 @@ import numpy as np
 from vla.data.episodes import EpisodeStore
 from vla.data.formats.imported_demonstrations import ImportedDemonstrations, Recording, action_bounds
 from vla.deploy import messages
-from vla.deploy.bag import damage, message_types, messages_of, opened
+from vla.deploy.bag import bag_errors, message_types, messages_of, opened
 from vla.deploy.bag_index import BagIndex, Picture, Stretch, read_index
 from vla.deploy.joint_limiter import Robot
 from vla.deploy.observer import HISTORY, Observer
@@ -30,8 +30,8 @@ from vla.robots.controllers import GRIPPER, recorded_controller
 from vla.spec import Array, Episode, Observation, Spec
 
 MEASURED_WITHIN = 0.2  # largest time between an observation and its joint state [s]
-ROUNDING = 1e-6  # of an action that is at its bound
-MOSTLY = 0.5  # share of the actions beyond a bound from which it is a bound of something else
+ROUNDING = 1e-6  # tolerance of the action bounds
+MOSTLY = 0.5  # largest share of a component's actions beyond its bounds; a larger one means other units
 
 log = logging.getLogger(__name__)
 
@@ -204,7 +204,7 @@ class BagDemonstrations(ImportedDemonstrations):
             kinds = {connection.topic: connection.msgtype for connection in connections}
             for topic, stamp, raw in messages_of(reader, connections, folder, *span):
                 if (key := (cameras[topic], stamp)) in wanted:
-                    with damage(folder):
+                    with bag_errors(folder):
                         image = messages.image_from(types.deserialize_cdr(raw, kinds[topic]))
                     images[key] = resize(image, self.spec.image_size, self._crop)
         return images

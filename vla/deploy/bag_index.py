@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from vla.deploy import messages
-from vla.deploy.bag import damage, message_types, messages_of, opened
+from vla.deploy.bag import bag_errors, message_types, messages_of, opened
 from vla.deploy.control_loop import REPEATED, State
 from vla.deploy.joint_limiter import Robot
 from vla.deploy.observer import Measured, age_of
@@ -201,7 +201,7 @@ class _Reading:
         kinds = {connection.topic: connection.msgtype for connection in connections}
         folder, start, read = self.index.folder, reader.start_time, 0
         for topic, stamp, raw in messages_of(reader, connections, folder):
-            with damage(folder):
+            with bag_errors(folder):
                 message = types.deserialize_cdr(raw, kinds[topic])
             read += 1
             try:
@@ -261,7 +261,7 @@ class _Reading:
         self._number += before is not None and self._person is None
 
     def _nothing(self, stamp: int, at: float, message: Any) -> None:
-        """Leave out commands that do not tell where the arm goes: its motion tells it."""
+        """Ignore twist commands, which contain no joint positions: actions then follow from the measured motion."""
 
     def _command(self, stamp: int, at: float, message: Any) -> None:
         joints, opening = messages.command_from(message.name, message.position, self._robot)

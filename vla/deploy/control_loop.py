@@ -119,7 +119,7 @@ class ControlLoop:
         self.acting = False  # True if the last command is an action of the policy
         # Trajectory that the arm executes by itself: since when, its commands.
         self._sent: tuple[float, list[Command]] | None = None
-        self._sent_holds = False  # True until something changes
+        self._sent_valid = False  # True until something changes
         self.observed_at = -np.inf  # time stamp of the last observation
         self.resumed = True  # True if the last observation is the first since the loop started to run
         self._last_observed = -np.inf  # as `observed_at`, but reset whenever the loop stops running
@@ -156,7 +156,7 @@ class ControlLoop:
         if repeated:
             return self.state not in (State.STOPPED, State.FAULT)
         self.instruction, self._instructed_at = instruction.strip(), now
-        self._schedule, self._next_inference, self._sent_holds, self._outdated = [], -np.inf, False, True
+        self._schedule, self._next_inference, self._sent_valid, self._outdated = [], -np.inf, False, True
         if self.state is State.STOPPED and self._timed_out:
             self.resume(now)
         return self.state not in (State.STOPPED, State.FAULT)
@@ -172,14 +172,14 @@ class ControlLoop:
         if self.state is not State.STOPPED:
             return False
         self._instructed_at = now
-        self._go_on("resumed")
+        self._wait_to_run("resumed")
         return True
 
     def hand_over(self) -> None:
         """Leave the arm, which is to be at rest, to a person; nothing is commanded from now on."""
         self.handed_over, self._pending = True, None
         if self.state not in (State.STOPPED, State.FAULT):
-            self._go_on("")
+            self._wait_to_run("")
 
     def take_back(self, now: float) -> None:
         """Command the arm again, from its measured pose; the gripper is left as it is until the policy moves it.
@@ -193,16 +193,16 @@ class ControlLoop:
         if self._observer.moved(STILL_FOR) > STILL:
             raise ValueError("the arm still moves: let it rest first")
         self.limiter.start(measured.joints)
-        self._sent, self._sent_holds = None, False
+        self._sent, self._sent_valid = None, False
         self._commanded.clear()
         self._record(now)
         self.handed_over, self._opening, self._off_track_since = False, None, None
         self._instructed_at = now
         if self.state is State.HANDED_OVER:
-            self._go_on("handed back")
+            self._wait_to_run("handed back")
 
-    def _go_on(self, why: str) -> None:
-        """Run again after fresh images, as soon as no person moves the arm."""
+    def _wait_to_run(self, why: str) -> None:
+        """Enter HANDED_OVER while a person moves the arm, otherwise HOLDING until the images are fresh."""
         if self.handed_over:
             self._set_state(State.HANDED_OVER, f"a person moves the arm; to continue: {HAND_BACK}")
         else:
@@ -261,7 +261,7 @@ class ControlLoop:
         if not self._follows_positions and (measured := self._observer.newest) is not None:
             self.limiter.position = np.array(measured.joints, float)
         ends = observed + period * np.arange(1, len(actions) + 1)
-        self._schedule, self._sent_holds = list(zip(ends.tolist(), goals, openings, strict=True)), False
+        self._schedule, self._sent_valid = list(zip(ends.tolist(), goals, openings, strict=True)), False
         self._next_inference = float(ends[-1])
         return None
 
@@ -281,8 +281,8 @@ class ControlLoop:
             return None
         self.acting = self.state is State.RUNNING and bool(self._schedule)
         if self._sent is not None:
-            self._catch_up(*self._sent, now)
-        if not self._sent_holds:
+            self._follow_sent(*self._sent, now)
+        if not self._sent_valid:
             self._move(now)
         self._record(now)
         return Command(self.limiter.position.copy(), self.limiter.velocity.copy(), self._opening)
@@ -313,17 +313,20 @@ class ControlLoop:
     def commit(self, command: Command, now: float) -> list[Command] | None:
         """Return the trajectory from this command to rest, for an arm that executes it by itself.
 
-        None if the last one still holds, because nothing has changed since.
+        None if the trajectory that was sent last is still valid.
         """
-        if self._sent_holds:
+        if self._sent_valid:
             return None
         ahead = [command, *self.horizon(now)]
-        self._sent, self._sent_holds = (now, ahead), True
+        self._sent, self._sent_valid = (now, ahead), True
         return ahead
 
-    def _catch_up(self, since: float, ahead: list[Command], now: float) -> None:
-        """Move to where an arm that executes `ahead` is to be after this tick; before it, if something has changed."""
-        ticks = round((now - since) / self.tick) - (not self._sent_holds)
+    def _follow_sent(self, since: float, ahead: list[Command], now: float) -> None:
+        """Set the commanded state from the trajectory `ahead`, sent at `since`.
+
+        It is that of this tick while the trajectory is valid, else that of the previous tick, because `_move` follows.
+        """
+        ticks = round((now - since) / self.tick) - (not self._sent_valid)
         planned = ahead[min(max(ticks, 0), len(ahead) - 1)]
         self.limiter.position, self.limiter.velocity = planned.position.copy(), planned.velocity.copy()
         self._opening = planned.opening
@@ -335,7 +338,7 @@ class ControlLoop:
 
     def limit(self, robot: Robot) -> None:
         """Replace the limits."""
-        self.limiter.robot, self._sent_holds = robot, False
+        self.limiter.robot, self._sent_valid = robot, False
 
     # Supervision.
 
@@ -350,7 +353,7 @@ class ControlLoop:
         returned = lost and not self._lost and self._away(newest)
         if self.state is not State.FAULT and (returned or (off_track and self.state is State.STOPPED)):
             self.limiter.position, self.limiter.velocity = newest.joints.copy(), np.zeros(len(newest.joints))
-            self._sent, self._sent_holds = None, False
+            self._sent, self._sent_valid = None, False
             return self.fail("the arm was moved while it was held")
         if self.state in (State.STOPPED, State.FAULT):
             return None
@@ -411,7 +414,7 @@ class ControlLoop:
 
     def _set_state(self, state: State, reason: str) -> None:
         if state is not self.state:
-            self._sent_holds = False
+            self._sent_valid = False
         if state is not self.state and state is not State.RUNNING:
             self._observer.cameras.fresh, self._schedule, self._outdated = 0, [], True
             self._next_inference = self._last_observed = -np.inf
@@ -424,7 +427,7 @@ class ControlLoop:
 
 
 def _next_of(schedule: list[Waypoint], now: float) -> Waypoint:
-    """Remove what was due before, but for the last, and return the first of the rest."""
+    """Drop the waypoints that are already due, but keep at least one; return the first that remains."""
     while len(schedule) > 1 and schedule[0][0] <= now:
         schedule.pop(0)
     return schedule[0]

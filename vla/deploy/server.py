@@ -287,7 +287,7 @@ class Service:
         return {"actions": actions, "server_timing": {"infer_ms": 1000 * (time.perf_counter() - began)}}
 
     async def _infer(self, thread: Executor) -> None:
-        """Plan for the clients that wait, for those that wait at the same time in one pass."""
+        """Run inference on queued observations until cancelled, in batches of at most `batch` clients."""
         loop = asyncio.get_running_loop()
         largest = 1 if self._policy.one_at_a_time else self._settings.batch
         while True:

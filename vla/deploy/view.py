@@ -61,7 +61,7 @@ class View(TopicListener):
         """Args:
         node: the node that subscribes, which the caller spins.
         save: a .rrd file; None opens the viewer.
-        shell: the surface of the arms with its chain; others, and all without it, are drawn as lines.
+        shell: surface of arms with the same kinematic chain; other arms, or all if None, are drawn as lines.
         expected: topic of a camera → picture (H, W, 3) uint8 that is laid over its images.
         """
         self._expected = dict(expected or {})

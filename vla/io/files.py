@@ -45,7 +45,7 @@ def write_text(target: Path, text: str) -> None:
 
 
 def require_file(path: Path) -> None:
-    """Refuse what is there without being a file: reading from a pipe or a device may never end.
+    """Require that `path` is missing or a regular file, because reading from a pipe or a device may never end.
 
     Raises:
         ValueError: it is a folder, a pipe or a device.

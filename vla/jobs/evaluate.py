@@ -157,7 +157,7 @@ def _statements(experiment: Experiment) -> list[Statement]:
             raise ValueError(f"evaluate.against={against} has no report.json to compare with: evaluate that run first")
         theirs = {result.seed: result for result in report.per_episode}
         if not any(result.draws for result in report.per_episode) and report.config.get("task") != experiment["task"]:
-            theirs = {}  # a world that tells nothing of what it drew: equal seeds are other episodes in another task
+            theirs = {}  # without draws to compare, equal seeds are the same episodes in the same task only
         statement = AgainstRun(against, theirs, asked["margin"], report.anytime)
         statement.require_common(range(asked["seed"], asked["seed"] + asked["episodes"]))
         found.append(statement)
@@ -168,7 +168,7 @@ def _statements(experiment: Experiment) -> list[Statement]:
         )
     if not experiment.playable and (found or asked["until"] or asked["without"] or asked["networks"]):
         raise ValueError(
-            "evaluate.bar, against, until, without and networks are about success, which a recording has not: omit them"
+            "evaluate.bar, against, until, without and networks need success, which recordings do not have: omit them"
         )
     return found
 
@@ -214,7 +214,7 @@ def _play(experiment: Experiment, checkpoint: Path | None, statements: Sequence[
 
     world = experiment.world() if asked["until"] else None
     turns = len(world.tasks) if isinstance(world, Multitask) else 1
-    decided = (lambda report: all(each.is_clear(report) for each in statements)) if statements else None
+    decided = (lambda report: all(each.is_decided(report) for each in statements)) if statements else None
     first = played(IN_DISTRIBUTION, seeds, decided, recorder=recorder)
     reports, seeds = {IN_DISTRIBUTION: first}, [result.seed for result in first.results]
     changed = {name: changes for name, changes in conditions(asked).items() if with_changes(task, changes) != task}

@@ -1,4 +1,4 @@
-"""`job=plan`: how many episodes tell two success rates apart, and how many less if playing stops when it is clear."""
+"""`job=plan`: number of episodes needed to distinguish two success rates, with and without early stopping."""
 
 from __future__ import annotations
 
@@ -48,8 +48,8 @@ def run(experiment: Experiment) -> None:
     share = _discordant(asked["runs"]) if asked["runs"] else asked["discordant"]
     show(plan_table(one, other, asked["power"], share))
     show(
-        f"Without stopping the numbers are exact; with it they are for the same power, of {SIMULATIONS} simulated "
-        "evaluations, and so is the share of those that find a difference where there is none. evaluate.until=decided "
+        "Without early stopping the numbers are exact. With it, they and the false-positive rate come from "
+        f"{SIMULATIONS} simulated evaluations, at the same power. evaluate.until=decided "
         "also stops when two policies differ by less than evaluate.margin: set that below the difference."
     )
 

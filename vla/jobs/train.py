@@ -29,10 +29,10 @@ from vla.runs.folder import (
     LAST,
     PAGE,
     SAMPLES,
+    archive_evaluation,
     save_choice,
     save_config,
     save_training,
-    set_evaluation_aside,
 )
 from vla.runs.resume import LENGTHS, TrainingProgress, first_process, training_lock, training_progress
 from vla.spec import Array
@@ -117,7 +117,7 @@ def _fit(experiment: Experiment, state: TrainingProgress, trainer: Trainer, grac
         restore_metrics(trainer, state.resume_from)
     collection_s = collection_time(store, experiment["collect"]["episodes"])
     if trainer.is_global_zero:
-        set_evaluation_aside(output)
+        archive_evaluation(output)
     with writing(output), _reported(experiment, trainer, graceful_stop, learner, collection_s):
         try:
             with (

@@ -39,7 +39,7 @@ class Checkpoint(Header):
     state: dict[str, Tensor]  # of the model
 
     def restore(self, model: torch.nn.Module) -> None:
-        """Load the weights into `model`; parts that it only makes now, such as a text encoder, fit in the file too.
+        """Load the weights into `model`; `TensorBudget` also limits tensors that loading creates, as of a text encoder.
 
         Raises:
             ValueError: they belong to another model.

@@ -86,7 +86,7 @@ def require_stored(content: Any, size: int) -> None:
 
 
 def _require_known(pickled: BinaryIO) -> None:
-    """Require the next pickle of a file to call nothing but what makes tensors, and go to its end.
+    """Require that the next pickle in a file names nothing but `KNOWN`, the constructors of tensors, and read it fully.
 
     PyTorch by itself also lets a pickle call `bytearray(10**10)`, for example.
 

@@ -160,8 +160,8 @@ def one_thread() -> None:
         torch.set_num_threads(1)
 
 
-def collect_rarely() -> None:
-    """Look for garbage in cycles rarely: imports create many objects and few cycles, and looking takes a second."""
+def raise_gc_thresholds() -> None:
+    """Raise the thresholds of the cyclic garbage collector: its passes during imports take a second and free little."""
     gc.set_threshold(50_000, 20, 100)
 
 

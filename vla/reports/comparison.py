@@ -64,7 +64,7 @@ def compare_runs(runs: Mapping[str, Run], margin: float) -> list[RunComparison]:
 
     Args:
         runs: by name.
-        margin: what counts as not worse, 0…1.
+        margin: non-inferiority margin of the success rate, 0…1.
     """
     found = [
         RunComparison(one, other, condition, *compared)
@@ -80,12 +80,12 @@ def compare_runs(runs: Mapping[str, Run], margin: float) -> list[RunComparison]:
 def compare_rows(rows: Sequence[SweepRow], margin: float) -> list[RunComparison]:
     """Compare every row of a sweep with the first one under each condition, where both played the same scenes.
 
-    Rows of one training each are compared by pairs of episodes, as runs are. Those of several trainings by as many
-    independent episodes as they are worth, see `effective_episodes`; that their scenes are the same is left out.
+    Rows of one training each are compared by paired tests, as runs are. Rows of several trainings are compared as
+    independent samples of size `effective_episodes`, which ignores the pairing by scenes.
 
     Args:
         rows: of the sweep, at least one.
-        margin: what counts as not worse, 0…1.
+        margin: non-inferiority margin of the success rate, 0…1.
     """
     first, *others = rows
     found = [

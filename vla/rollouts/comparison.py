@@ -129,7 +129,7 @@ def concluded(comparisons: Mapping[Key, Comparison], margin: float | None) -> di
 
     Args:
         comparisons: those made together.
-        margin: what counts as not worse, 0…1; None if it is not about success.
+        margin: non-inferiority margin of the success rate, 0…1; None if it is not about success.
     """
     left = sum(
         each.only_first is None or each.only_first + (each.only_second or 0) > 0 for each in comparisons.values()

@@ -47,9 +47,9 @@ def evaluate(
     Every process of the `cluster` calls the factories once and accesses the paths `needs`. Errors of a factory end the
     evaluation; errors of an episode, or a crash of its process, are reported in its result.
 
-    With `until` it ends as soon as that accepts the report on the first n seeds, in their order; n is a multiple of
-    `turns`, the number of tasks where these take turns. Episodes of later seeds do not count even if they were played,
-    so that the report does not depend on the number of workers.
+    With `until` the evaluation stops as soon as `until(report on the first n seeds)` is true; n is a multiple of
+    `turns`, the number of tasks if seeds cycle through tasks. Results of later seeds are discarded, so that the report
+    does not depend on the number of workers.
 
     Raises:
         ValueError: there are no seeds, seeds are in the range of collection, or the cluster raises one.

@@ -1,4 +1,4 @@
-"""Controls of what a policy has memorised: policies that lack a sense, and demonstrations replayed open loop."""
+"""Controls for memorisation: policies without one input modality, and demonstrations replayed open loop."""
 
 from __future__ import annotations
 
@@ -56,8 +56,9 @@ def make_without(make_agent: AgentFactory, missing: Modality, environment: Envir
 class NearestDemonstration:
     """Replays the demonstration with the most similar first images, whatever happens; then repeats its last action.
 
-    It has another seed and, if there is one, the same instruction. Similarity is the mean absolute difference of every
-    `STRIDE`th pixel of all cameras. It succeeds where a memory of the demonstrations is enough.
+    The demonstration has another seed and, if one exists, the same instruction. The distance of two first images is the
+    mean absolute difference over every `STRIDE`th row and column of all cameras. This baseline for memorisation
+    succeeds where remembering the demonstrations is enough.
     """
 
     def __init__(self, folder: Path, episodes: Count, *, spec: Spec) -> None:
@@ -75,7 +76,7 @@ class NearestDemonstration:
         self._instructions = np.array([entry.instruction for entry in self._entries])
         self._seeds = np.array([entry.seed for entry in self._entries])
         starts = [entry.span.start for entry in self._entries]
-        images = [np.stack([_few(rows[start]) for start in starts]) for rows in map(store.rows, _fields(spec))]
+        images = [np.stack([_subsampled(rows[start]) for start in starts]) for rows in map(store.rows, _fields(spec))]
         self._cameras, self._images = spec.cameras, np.stack(images, axis=1)  # (E, cameras, h, w, 3)
         self.info: dict[str, Any] = {}
         self.reset("", 0)
@@ -95,14 +96,14 @@ class NearestDemonstration:
         return np.asarray(action, np.float32)
 
     def _nearest(self, observation: Observation) -> int:
-        seen = np.stack([_few(observation.rgb[camera]) for camera in self._cameras]).astype(np.int16)
+        seen = np.stack([_subsampled(observation.rgb[camera]) for camera in self._cameras]).astype(np.int16)
         known = np.flatnonzero(self._others & (self._instructions == observation.instruction))
         candidates = known if len(known) else np.flatnonzero(self._others)
         distances = [np.abs(self._images[index] - seen).mean() for index in candidates]
         return int(candidates[np.argmin(distances)])
 
 
-def _few(image: Array) -> Array:
+def _subsampled(image: Array) -> Array:
     return image[::STRIDE, ::STRIDE]
 
 

@@ -12,7 +12,7 @@ from vla.spec import Array, Episode
 
 @dataclass(frozen=True)
 class Motion:
-    """Amounts of which less is better: faster, shorter, smoother."""
+    """Motion of an episode; less of each is better: duration, path length and jerk."""
 
     time_s: float
     path_m: float | None = None  # of the tool; None if the world does not tell where it is

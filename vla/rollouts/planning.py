@@ -15,8 +15,8 @@ from vla.spec import Array
 MOST = 200_000  # episodes
 FAR = 9.0  # standard deviations beyond which outcomes are too rare to count
 SIMULATIONS = 10_000
-PART = 4096  # counts of observations to bound at once, for their memory
-HORIZON = 4  # times as many episodes as a fixed number, which simulations last
+PART = 4096  # numbers of observations per batch, which limits memory
+HORIZON = 4  # length of a simulated evaluation, as a multiple of the fixed number of episodes
 
 
 def episodes_needed(power: Callable[[int], float], enough: float) -> int | None:
@@ -88,9 +88,9 @@ def power_of_samples(episodes: int, one: float, other: float) -> float:
 class Stopping:
     """Numbers of episodes of evaluations that stop when it is clear, by simulation."""
 
-    most: int  # after which `enough` of them are decided
-    mean: float  # if they end there
-    wrong: float  # share of those that decide although there is no difference
+    most: int  # number of episodes after which the share `enough` of the evaluations is decided
+    mean: float  # mean number of episodes if evaluations end after `most`
+    wrong: float  # type I error: share of the evaluations that are decided although there is no difference
 
 
 def stopping(mean: float, one: float, zero: float, enough: float, fixed: int) -> Stopping | None:

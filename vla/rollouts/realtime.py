@@ -1,7 +1,7 @@
 """Asynchronous execution of chunks: one is executed while the next is computed; actions that arrive late are skipped.
 
-Time is counted in executed actions. While an arm holds because no action is there, it stays where it was observed, and
-the plan for it does not age.
+The schedule counts executed actions, not time. While the arm holds for lack of an action, the schedule does not
+advance, and no action becomes obsolete.
 
 Shapes: k action chunk, D action components.
 """
@@ -87,9 +87,9 @@ class Schedule:
 class RealTime:
     """Acts at every step with the newest chunk that has arrived, and holds where there is none.
 
-    An episode starts with the first answer, for which it waits. To hold is to repeat the last action, but zero in
-    components that are motion: those with a unit that may be negative or positive, apart from positions, which are also
-    part of the state. A component without a unit, such as the command of a gripper, is repeated.
+    The first action waits for the first chunk. Holding repeats the last action, but with zero in relative components:
+    those with a unit and bounds on both sides of zero that are not part of the state, as absolute positions are. A
+    component without a unit, such as a gripper command, is repeated.
     """
 
     def __init__(

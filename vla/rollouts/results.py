@@ -91,14 +91,14 @@ class Report:
             return self.interval_of(self.successes)
         played = [part for part in self.tasks.values() if part.episodes]
         known = sum(part.episodes for part in played)  # an error in `seen` leaves other conditions without its task
-        return stratified_interval([part._share_of(known) for part in played])[1:]
+        return stratified_interval([part._stratum(known) for part in played])[1:]
 
     def interval_of(self, count: float) -> tuple[float, float]:
         """Return the 95 % confidence interval of the rate of an event that `count` completed episodes had."""
         return anytime_interval(count, self.episodes - count) if self.anytime else wilson_interval(count, self.episodes)
 
-    def _share_of(self, episodes: float) -> tuple[int, int, float]:
-        """Return successes, completed episodes, and their share of `episodes`."""
+    def _stratum(self, episodes: float) -> tuple[int, int, float]:
+        """Return successes, completed episodes and weight, their share of `episodes`, as a stratum of an interval."""
         return self.successes, self.episodes, self.episodes / episodes
 
     @property
@@ -189,7 +189,7 @@ class Report:
             return None
         return stratified_interval(
             [
-                part._share_of(len(tiers) * tier.episodes)
+                part._stratum(len(tiers) * tier.episodes)
                 for tier in tiers
                 for part in tier.tasks.values()
                 if part.episodes
@@ -296,7 +296,7 @@ def compare_conditions(reports: Mapping[str, Report], margin: float) -> dict[str
 
     Args:
         reports: by condition.
-        margin: what counts as not worse, 0…1.
+        margin: non-inferiority margin of the success rate, 0…1.
     """
     (_, first), *others = reports.items()
     return concluded({name: first.compare(report) for name, report in others}, margin)

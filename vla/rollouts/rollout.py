@@ -20,8 +20,8 @@ def rollout(
 ) -> Episode:
     """Run the episode of `seed` to its end.
 
-    Without `all_images`, images are not rendered at steps where the agent does not look at them. If a new instruction
-    makes it look at such a step, the episode starts again with all of them.
+    Without `all_images`, images are rendered only at steps where the agent reads them. If a new instruction makes the
+    agent read an image that was not rendered, the episode is run again with all images.
 
     The label for imitation is `agent.info["clean"]` if present, else the executed action. What the agent drew,
     `agent.info["draws"]`, is added to the draws of the environment. A new instruction resets the agent.
@@ -91,10 +91,10 @@ def _completed(environment: Environment) -> tuple[int, int] | None:
 
 
 class Replay(NamedTuple):
-    """What was seen in a replay."""
+    """Result of a replay."""
 
     observations: list[Observation]
-    differs: int | None  # first step whose state differs in any bit; N: only the end of the episode does; None: nothing
+    differs: int | None  # first step with another state; number of replayed steps if only the end differs; None: equal
 
 
 def replay(environment: Environment, episode: Episode, recorder: Recorder | None = None) -> Replay:

@@ -1,8 +1,8 @@
-"""Statements that are valid however the number of episodes was chosen, so that an evaluation may stop when it is clear.
+"""Anytime-valid inference for success rates: p-values and intervals that stay valid under optional stopping.
 
-A gambler bets on the next observation at the odds that a hypothesis calls fair. Under the hypothesis the capital,
-1 at first, ever reaches 20 with a probability of at most 1/20 (J. Ville, "Étude critique de la notion de collectif",
-1939). The hypotheses on which it is below 20 form a 95 % confidence sequence (I. Waudby-Smith, A. Ramdas, "Estimating
+The capital of bets at the odds of a hypothesis, 1 at first, is a test martingale. If the hypothesis is true, the
+capital ever reaches 20 with a probability of at most 1/20 (J. Ville, "Étude critique de la notion de collectif",
+1939). The hypotheses with a capital below 20 form a 95 % confidence sequence (I. Waudby-Smith, A. Ramdas, "Estimating
 means of bounded random variables by betting", Journal of the Royal Statistical Society B 86, 2024): the intervals after
 all numbers of episodes cover the truth together with a probability of 95 %.
 
@@ -100,15 +100,15 @@ def excludes(bar: float, successes: int, failures: int) -> bool:
     return bool(log_capital(bar, successes, failures) >= log(1 / LEVEL))
 
 
-def is_settled(first: int, second: int, pairs: int, margin: float, comparisons: int = 1) -> bool:
-    """Return whether two success rates have been shown to differ, or to differ by less than a margin.
+def is_decided(first: int, second: int, pairs: int, margin: float, comparisons: int = 1) -> bool:
+    """Return whether two success rates are shown to be different, or equivalent within a margin, at any time.
 
     Args:
         first: pairs in which only the first succeeded.
         second: pairs in which only the second succeeded.
         pairs: all of them.
         margin: of what counts as equal, between 0 and 1.
-        comparisons: number of those made together, for a difference in any of which 5 % hold.
+        comparisons: number of comparisons, for the Bonferroni correction of the test for a difference.
     """
     if log_capital(0.5, second, first) >= log(comparisons / LEVEL):
         return True

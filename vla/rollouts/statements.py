@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from vla.rollouts.comparison import Comparison, compare_pairs
 from vla.rollouts.results import ERROR, Report, Result, pairs_of
-from vla.rollouts.sequential import excludes, is_settled
+from vla.rollouts.sequential import excludes, is_decided
 
 
 @dataclass(frozen=True)
@@ -16,12 +16,12 @@ class AgainstBar:
 
     bar: float
 
-    def is_clear(self, report: Report) -> bool:
-        """Return whether it is decided by the episodes of a report, to be asked after any number of them."""
+    def is_decided(self, report: Report) -> bool:
+        """Return whether the episodes of a report decide the statement; valid after any number of episodes."""
         return excludes(self.bar, report.successes, report.episodes - report.successes)
 
     def say(self, report: Report) -> str:
-        """Return a sentence on it for a finished report."""
+        """Describe the verdict on a finished report in one sentence."""
         low, high = report.interval
         bar = f"the bar of {100 * self.bar:g} %"
         if low <= self.bar <= high:
@@ -38,8 +38,8 @@ class AgainstRun:
     margin: float
     anytime: bool = False  # whether the other run stopped when something was clear
 
-    def is_clear(self, report: Report) -> bool:
-        """Return whether it is decided by the episodes of a report, to be asked after any number of them.
+    def is_decided(self, report: Report) -> bool:
+        """Return whether the episodes of a report decide the statement; valid after any number of episodes.
 
         Raises:
             ValueError: the other run has other episodes with the same seeds.
@@ -48,7 +48,7 @@ class AgainstRun:
         if not found.episodes and self._completed(report):
             raise self._apart()
         assert found.only_first is not None and found.only_second is not None
-        return is_settled(found.only_first, found.only_second, found.episodes, self.margin)
+        return is_decided(found.only_first, found.only_second, found.episodes, self.margin)
 
     def require_common(self, seeds: Iterable[int]) -> None:
         """Raise a ValueError if the other run completed no episode with one of these seeds."""
@@ -56,7 +56,7 @@ class AgainstRun:
             raise self._apart()
 
     def say(self, report: Report) -> str:
-        """Return a sentence on it for a finished report."""
+        """Describe the verdict on a finished report in one sentence."""
         found = self._compared(report)
         if not found.episodes:
             return f"no episode in common with {self.run}"
@@ -92,6 +92,6 @@ Statement = AgainstBar | AgainstRun
 
 
 def differs_clearly(first: Report, margin: float, conditions: int, report: Report) -> bool:
-    """Return whether success under one of several conditions differs from `first`, or by less than `margin`."""
+    """Return whether a condition's success is shown to differ from `first`, or to be equivalent within `margin`."""
     pairs = pairs_of(zip(first.results, report.results, strict=False))
-    return is_settled(pairs.first, pairs.second, sum(pairs), margin, conditions)
+    return is_decided(pairs.first, pairs.second, sum(pairs), margin, conditions)

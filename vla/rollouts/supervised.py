@@ -25,7 +25,7 @@ class Supervised:
         segment: length [steps].
 
         Raises:
-            ValueError: the expert cannot label what it did not come to by itself.
+            ValueError: the expert is not memoryless, so that it cannot label states of another agent.
         """
         require_memoryless(expert)
         self._policy, self._expert, self._beta, self._segment = policy, expert, beta, segment
@@ -61,8 +61,8 @@ def require_memoryless(expert: Agent) -> None:
     """Raise a ValueError unless the expert's labels depend on the observation alone, as its `memoryless` says."""
     if not (isinstance(expert, Expert) and expert.memoryless):
         raise ValueError(
-            f"{type(expert).__name__} cannot label the states of another agent: of an expert that does not say "
-            "memoryless = True, actions may depend on what it did before; choose another expert"
+            f"{type(expert).__name__} cannot label the states of another agent: without memoryless = True its actions "
+            "may depend on its earlier actions; choose another expert"
         )
 
 

@@ -106,11 +106,11 @@ def chosen_checkpoint(folder: Path) -> str | None:
     return training.checkpoint if training else None
 
 
-def set_evaluation_aside(folder: Path) -> None:
-    """Move the evaluation in a run's folder into a folder within it: training goes on, so it is of another policy.
+def archive_evaluation(folder: Path) -> None:
+    """Archive the evaluation in a run's folder as `evaluation_STEPS`, because further training changes the policy.
 
     Raises:
-        ValueError: the file that tells the number of its steps is damaged.
+        ValueError: training.json is damaged.
     """
     names = (REPORT, ERRORS, PLOT, SUITE, ERRORS_PLOT, RECORDING)
     if files := [file for name in names if (file := folder / name).exists()]:

@@ -17,7 +17,7 @@ EVERY = 4  # steps; an update takes a twentieth of the step of a small model
 class EMA(Callback):
     """Exponential moving average (EMA) of the weights and floating-point buffers, also under FSDP.
 
-    It is updated every fourth step with `decay**4`, and remembers nothing of the initial weights. A checkpoint holds
+    It is updated every fourth step with `decay**4` and bias-corrected for its initial value. A checkpoint holds
     the average as its `state_dict`, and the weights in training as `current_model_state`.
 
     Lightning's `EMAWeightAveraging` does not work under FSDP, loses the weights in training at the end, and updates
@@ -48,7 +48,7 @@ class EMA(Callback):
             self._average = [one.clone() for one in _averaged(pl_module).values()]
         elif self._step % EVERY == 0:
             current = _averaged(pl_module).values()
-            # Without a share of the first weights, as Adam corrects its moments (arXiv 1412.6980, section 3).
+            # Bias correction, as for Adam's moments (arXiv 1412.6980, section 3).
             share = (1 - self._decay**EVERY) / (1 - self._decay**self._step)
             # One fused kernel, which cannot mix plain and sharded tensors.
             torch._foreach_lerp_([*map(local_shard, self._average)], [*map(local_shard, current)], share)

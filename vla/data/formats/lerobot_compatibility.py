@@ -10,8 +10,8 @@ from collections.abc import Iterable, Iterator, Mapping
 from vla.data.formats.lerobot_dataset import LeRobotDataset
 from vla.spec import Array, Spec
 
-# Largest share of the actions that may lie beyond the bounds of a component, by more than a rounding error: more tells
-# of other units. Quantiles as bounds leave out two percent.
+# Largest share of a component's actions beyond its bounds, and tolerance relative to its range. A larger share means
+# other units. Bounds from quantiles exclude 2 % of the actions.
 OUTSIDE, ROUNDING = 0.02, 1e-3
 LONGEST = 200  # characters of a dataset text in a message
 
@@ -19,7 +19,7 @@ Places = Mapping[str, tuple[str, int]]  # component → feature and index
 
 
 def mismatches(dataset: LeRobotDataset, state: Places, action: Places, spec: Spec, every: int) -> Iterator[str]:
-    """Yield the differences between the metadata of a dataset and the spec, of which every n-th frame is kept."""
+    """Yield the differences between the spec and the metadata of a dataset of which every `every`-th frame is kept."""
     if abs(dataset.info.fps / every - spec.control_hz) > 1e-6 * spec.control_hz:
         kept = f" and expert.every={every}" if every > 1 else ""
         yield f"a rate of {dataset.info.fps:g} Hz{kept}, the task has {spec.control_hz:g} Hz"

@@ -120,7 +120,7 @@ class LeRobotDemonstrations(ImportedDemonstrations):
         return Episode(*what, observations, actions, executed)
 
     def _require_fit(self, keys: Keys) -> None:
-        """Require what the metadata and the actions, of the features `keys`, tell to be of the task's kind."""
+        """Raise a ValueError unless metadata and action range, from the features `keys`, match the task."""
         dataset, spec = self._dataset, self.spec
         found = [*mismatches(dataset, self._state, self._action, spec, self._every)]
         if all(name in self._action for name in spec.action):
@@ -130,7 +130,7 @@ class LeRobotDemonstrations(ImportedDemonstrations):
             found += out_of_bounds(actions, spec)
             self._beyond = float(((actions < self._low) | (actions > self._high)).mean())
         if found:
-            raise ValueError(f"{dataset.folder} is not of the task's kind of step: {'; '.join(found)}")
+            raise ValueError(f"{dataset.folder} does not match the task: {'; '.join(found)}")
 
     def _states(self, rows: slice) -> Array:
         """Return (N, P) float32; joint velocities are differences of positions if the dataset has none."""
@@ -179,7 +179,7 @@ def _opened(folder: Path | str | None, images: dict[str, Text] | None) -> LeRobo
 
 
 def _exported(spec: Spec) -> dict[str, dict[str, Any]]:
-    """Return the features of an export that are no images, in the form in which a description is read."""
+    """Return the non-image features of an export for `spec`, with shapes as tuples, as `Info` reads them."""
     features = layout.features(spec, depth=True)
     return {
         key: {**feature, "shape": tuple(feature["shape"])} for key, feature in features.items() if "info" not in feature

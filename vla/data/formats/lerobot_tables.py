@@ -105,9 +105,9 @@ def _read(path: Path, columns: Mapping[str, Kind], only: Any) -> pa.Table:
 
 
 def _unpacked_size(path: Path, columns: Collection[str], filtered: bool) -> int:
-    """Return the size of columns without compression and run lengths [bytes], of the largest group of rows if filtered.
+    """Estimate the decoded size of columns [bytes], summed over row groups or, if filtered, of the largest one.
 
-    The file says so itself. Rows that repeat one text of a dictionary are larger.
+    The estimate uses the metadata of the file; dictionary-encoded texts can take more memory.
     """
     metadata, sizes = pq.read_metadata(path), []
     for group in (metadata.row_group(number) for number in range(metadata.num_row_groups)):

@@ -1,7 +1,7 @@
 """`job=benchmark`: throughput and latency of every stage, next to a floor that is measured in the same run.
 
-The floor is the same measure for the part of the work that cannot be avoided. A ratio of 1 means that everything else
-is free. Each stage is a module of this package with a function `measures`.
+The floor is a reference value in the same unit: the unavoidable part of the work, a whole step, another renderer or
+another project. `ratio` is value / floor. Each stage is a module of this package with a function `measures`.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from vla.config.check import TRAINING, Job
 from vla.config.experiment import Experiment
 from vla.io.files import write_text
 from vla.io.types import Count
-from vla.jobs.benchmark.machine import Others, machine, spoilt
+from vla.jobs.benchmark.machine import OtherLoad, is_unreliable, machine
 from vla.jobs.benchmark.measure import Measure
 
 log = logging.getLogger(__name__)
@@ -51,11 +51,11 @@ def run(experiment: Experiment) -> dict[str, Measure]:
     measures: dict[str, Measure] = {}
     busy: dict[str, float] = {}
     for name in experiment["benchmark"]["names"]:
-        others = Others()
+        others = OtherLoad()
         found = import_module(f"vla.jobs.benchmark.{name}").measures(experiment)
         used = others.cores()
         measures |= {key: {**each, "others": None if used is None else round(used, 2)} for key, each in found.items()}
-        if used is not None and spoilt(used):
+        if used is not None and is_unreliable(used):
             busy[name] = used
     write_text(
         experiment.output / "benchmark.json", json.dumps({"machine": here, "measures": measures}, indent=2) + "\n"

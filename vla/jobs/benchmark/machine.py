@@ -27,8 +27,8 @@ def machine() -> dict[str, Any]:
     return {"processor": name, "instructions": [each for each in INSTRUCTIONS if each in flags], "cores": cores()}
 
 
-class Others:
-    """Clock of the processor time that other programs use, whose child processes have ended."""
+class OtherLoad:
+    """Meter of the CPU time of other programs; child processes of this one count as others until they have ended."""
 
     def __init__(self) -> None:
         self._start = self._now()
@@ -49,6 +49,6 @@ class Others:
         return (user + nice + system + irq + softirq + steal) / TICKS, sum(os.times()[:4]), time.monotonic()
 
 
-def spoilt(others: float) -> bool:
-    """Return whether other programs used so many cores that figures are worse than the machine."""
+def is_unreliable(others: float) -> bool:
+    """Return whether other programs used so many cores that the measurements are unreliable."""
     return others > BUSY * (os.cpu_count() or 1)

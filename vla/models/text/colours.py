@@ -16,9 +16,9 @@ TERMS = ("black", "white", "grey", "red", "green", "yellow", "blue", "brown", "o
 
 
 class NamedColours(NGrams):
-    """N-grams that know what names of colours mean, also those that training never had: crimson means red.
+    """N-grams of sentences whose colour names are replaced by basic colour terms: crimson by red.
 
-    What they mean is not learned: it is that of a survey, see `terms`.
+    The mapping is not learned but comes from a survey, see `terms`; it covers names that training does not contain.
     """
 
     def tokenize(self, sentences: list[str]) -> Tensor:
@@ -56,8 +56,8 @@ def in_basic_terms(words: Sequence[str]) -> list[str]:
 def terms() -> dict[str, str]:
     """Return name of a colour → basic term, for the names of the xkcd colour survey (xkcd.com/color/rgb).
 
-    A name such as "sky blue", whose last word is a term and the only one, means this term; any other name that of the
-    nearest such one in sRGB.
+    A name that contains exactly one basic term, as its last word, such as "sky blue", maps to this term. Any other name
+    maps to the term of the nearest such name in sRGB.
     """
     from matplotlib.colors import XKCD_COLORS, to_rgb
 

@@ -26,7 +26,7 @@ WEIGHTS = "model.safetensors"  # file name of timm's weights on the hub
 
 
 def synchronised(model: nn.Module) -> nn.Module:
-    """Return a model whose batch normalisation is over all processes, with the activations in timm's layers."""
+    """Convert batch normalisation to synchronised batch normalisation, and keep the activations in timm's layers."""
     from timm.layers import convert_sync_batchnorm
 
     return convert_sync_batchnorm(model)

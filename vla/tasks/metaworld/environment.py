@@ -70,8 +70,8 @@ class MetaWorld(Blindable):
             window: top, left, bottom and right of LeRobot's picture that "corner2" shows, as shares of its height and
                 width; None: all of it.
             hand_size: height and width of what "hand" shows, as shares of LeRobot's picture.
-            drawn: height and width at which all of a camera's picture is drawn; it is cut to its window, then averaged
-                to `image_size` [px]. None: images are drawn in their own size.
+            drawn: height and width in which a camera's full picture is rendered before it is cropped to its window and
+                averaged down to `image_size` [px]. None: the window is rendered directly in `image_size`.
             shadows: edge of the shadow map [texels]; 0: no shadows.
             steps: largest number of steps of an episode.
 

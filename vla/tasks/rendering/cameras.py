@@ -26,7 +26,7 @@ class Cameras:
         self._show(None)
 
     def _show(self, windows: Array | None) -> None:
-        """Choose the part of what each camera sees, as `Renderer.render` has it."""
+        """Set the crop of each camera's field of view, (cameras, 4), see `Renderer.render`."""
         lenses = self._whole if windows is None else _enlarging(windows) @ self._whole
         self._lenses, self._windows = UPSIDE_DOWN @ lenses, windows
         across, up, deep, ahead = self._lenses.swapaxes(0, 1)

@@ -33,7 +33,7 @@ from vla.tasks.rendering.textures import Textures
 log = logging.getLogger(__name__)
 BEHIND = 0.3  # factor on the alpha of a plane seen from behind, as in MuJoCo
 ALIGNMENT = 256  # of a camera's block in its buffer [bytes], enough for every machine
-GAP = 120  # most indices of elements out of sight that are drawn because another call takes longer
+GAP = 120  # largest number of invisible indices to draw between two runs, which is faster than a second draw call
 MARGIN = 1.01  # factor on the radius of elements, against rounding
 PACKAGES = "libegl1, libgl1 and libgl1-mesa-dri"
 
@@ -49,7 +49,7 @@ class Run:
 
 @dataclass(frozen=True)
 class Fast:
-    """The choice of the fast renderer."""
+    """Factory of the fast renderer, with its settings."""
 
     samples: Literal[1, 4]  # per pixel, which are averaged; 4 draws twice as many rows and columns, for smooth edges
     soft: Annotated[int, Ge(0), Le(4)]  # texels around the nearest one over which the edges of shadows are averaged

@@ -38,7 +38,7 @@ def rows(model: mujoco.MjModel) -> Array:
 
 
 def frustum(left: float, right: float, bottom: float, top: float, near: float, far: float) -> Array:
-    """Return the perspective projection (4, 4) through a rectangle at the near plane."""
+    """Return the perspective projection matrix (4, 4) of a frustum, given its rectangle at the near plane [m]."""
     across, up, deep = right - left, top - bottom, far - near
     return np.array(
         [
@@ -51,7 +51,7 @@ def frustum(left: float, right: float, bottom: float, top: float, near: float, f
 
 
 def box(half_width: float, half_height: float, near: float, far: float) -> Array:
-    """Return the parallel projection (4, 4) of a box around the optical axis."""
+    """Return the orthographic projection matrix (4, 4) of a box around the optical axis; lengths in [m]."""
     deep = far - near
     return np.array(
         [[1 / half_width, 0, 0, 0], [0, 1 / half_height, 0, 0], [0, 0, -2 / deep, -(far + near) / deep], [0, 0, 0, 1]]

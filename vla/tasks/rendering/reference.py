@@ -13,7 +13,7 @@ from vla.tasks.rendering.renderer import WHOLE, View
 
 
 class Reference:
-    """The choice of MuJoCo's own renderer; the model's `visual` element has its settings."""
+    """Factory of MuJoCo's own renderer, whose settings are in the model's `visual` element."""
 
     def open(self, model: mujoco.MjModel, view: View) -> ReferenceRenderer:
         """Make a renderer of `model`, with a GL context in this thread."""

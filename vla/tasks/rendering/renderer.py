@@ -41,8 +41,8 @@ class Renderer(Protocol):
 
         Args:
             data: the state.
-            windows: part of what each camera sees that its picture shows (cameras, 4): top, left, bottom and right as
-                shares of height and width; None: all of it.
+            windows: crop of each camera's field of view that its picture shows, (cameras, 4): top, left, bottom, right
+                as fractions of height and width; None: no crop.
 
         Returns:
             Colours (cameras, height, width, 3) uint8, and depth along the optical axis (cameras, height, width)

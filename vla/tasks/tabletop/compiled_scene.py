@@ -35,7 +35,7 @@ class Disturbance:
 
     kind: Kind
     times: int  # how often
-    delay: int  # control steps for which it must be possible before it happens
+    delay: int  # number of control steps whose preconditions hold before the disturbance happens
     distance: float  # of a push or a move [m]
     angle: float  # of its horizontal direction; if there is no room, the next free direction is taken [rad]
     low: tuple[float, float]  # corner x, y of the area in which a push or a move ends [m]

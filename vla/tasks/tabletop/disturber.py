@@ -1,7 +1,7 @@
 """Disturbances in the course of an episode: pushes, drops, and moves of objects, which the agent does not cause.
 
-It follows from the draws of the episode and from the states that it goes through, so a replay of the agent's actions
-reproduces it. The agent learns of it through its observations alone.
+A disturbance is determined by the episode's draws and states, so that a replay of the agent's actions reproduces it.
+The agent perceives it only through its observations.
 
 - push: for a few control steps the arm moves sideways instead of as commanded, within its limits.
 - drop: the gripper opens while it holds the named block above the table.
@@ -88,7 +88,7 @@ class Disturber:
         return self._drawn.kind.startswith("move")
 
     def _possible(self, state: WorldState, now: Subgoal) -> bool:
-        """Return whether it makes sense in this state."""
+        """Return whether the preconditions of the disturbance hold in this state."""
         kind, block = self._drawn.kind, now.block
         if kind == "push":
             return True
@@ -103,7 +103,7 @@ class Disturber:
         return bool(near) and state.resting(block)
 
     def _happen(self, state: WorldState, now: Subgoal) -> str:
-        """Do it and return its description; empty if there is no room."""
+        """Start the disturbance and return its description; an empty string if there is no free place."""
         kind, distance = self._drawn.kind, self._drawn.distance
         if kind == "drop":
             self.opens, self._steps_left = True, OPEN_STEPS

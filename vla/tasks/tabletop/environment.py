@@ -231,7 +231,7 @@ class Tabletop(Blindable):
         """Return the current observation."""
         compiled = self.simulation.compiled
         if self._blind:
-            if compiled.noise.image:  # images that follow are those that they would be otherwise
+            if compiled.noise.image:  # draw the noise of the omitted images, so that later images do not change
                 self._image_noise.bytes(3 * len(self.spec.cameras) * math.prod(self.spec.image_size))
             return Observation({}, self._state(), self.simulation.instruction, {}, self.simulation.truth())
         if self._changed:

@@ -167,7 +167,7 @@ class RobotFile(Robot):
         ]
 
     def _grip(self, name: str, opened: float, closed: float, force: float) -> str:
-        """Return the name of an actuator of the gripper, which a joint gets."""
+        """Return the name of the gripper's actuator `name`, or of a position servo added to the joint `name`."""
         if self._spec.actuator(name) is not None:
             return name
         known = [element.name for element in (*self._spec.actuators, *self._spec.joints)]

@@ -199,7 +199,7 @@ def add_tool(
     Args:
         spec: changed.
         name: of a site or body.
-        home: joint → position, at which x is the axis that points forward, z the one that points down.
+        home: joint → position; in this posture the tool's x axis is the one that points forward, its z axis down.
         base: (3, 3) rotation of the base.
         offset: (3,) from `name` in the frame of the tool [m].
 
@@ -262,7 +262,7 @@ def lighten(spec: mujoco.MjSpec, model: mujoco.MjModel) -> None:
 
 
 def _add_hull(spec: mujoco.MjSpec, model: mujoco.MjModel, mesh: str, name: str) -> bool:
-    """Add the hull of a mesh, unless it is flat; return whether."""
+    """Add the convex hull of a mesh as mesh `name`; return False, and add nothing, for a flat mesh."""
     index = model.mesh(mesh).id
     points = np.asarray(mesh_triangles(model, index)[0], float)
     if np.linalg.matrix_rank(points - points.mean(0), tol=1e-3) < 3:

@@ -124,7 +124,7 @@ class Simulation:
         held_out = self._held_out(goal, self.streams(seed, f"novelty{stream}"), seed)
         if referents is None:
             referents = self._choose(goal, held_out, self.streams(seed, "named"))
-            if self.compiled.skip and not goal.absent:  # the block may be new where that of the draw was not
+            if self.compiled.skip and not goal.absent:  # another block may change whether its colour is held out
                 held_out = self._held_out_for(goal, referents, held_out)
         words = self._slots(goal, referents, seed)
         said = goal.language.say(words, held_out, self.streams(seed, f"language{stream}"))
@@ -171,7 +171,7 @@ class Simulation:
         return kinds[random_state.randint(len(kinds))] if kinds else None
 
     def _held_out_for(self, goal: Goal, referents: Referents, drawn: HeldOut | None) -> HeldOut | None:
-        """Return what is held out when another block is named than that of the draw: again one thing only."""
+        """Adapt the drawn kind of held-out instruction to another named block, so that exactly one kind applies."""
         new = self.compiled.block_names[referents.blocks[0]] in goal.language.held_out_colours
         if new == (drawn == "combinations"):
             return drawn

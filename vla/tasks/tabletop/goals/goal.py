@@ -145,7 +145,7 @@ class Goal(ABC):
         """Return the subgoals in order; the goal is reached while all are done."""
 
     def after(self, arrangement: Arrangement, referents: Referents) -> Arrangement | None:
-        """Return what reaching the goal makes of an arrangement, or None if it cannot be reached from there.
+        """Return the arrangement after the goal is reached, or None if it cannot be reached from `arrangement`.
 
         A goal that does not define this takes no part in chains.
         """

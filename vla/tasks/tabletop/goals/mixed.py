@@ -8,7 +8,7 @@ import numpy as np
 
 from vla.io.types import Share
 from vla.tasks.tabletop.goals.goal import Goal
-from vla.tasks.tabletop.goals.stay import Stay, Wait, colours_left
+from vla.tasks.tabletop.goals.stay import Stay, Wait, absent_colours_needed
 
 
 class Mixed:
@@ -32,11 +32,11 @@ class Mixed:
             raise ValueError(f"task.goal.impossible and task.goal.silent are {impossible + silent:g} in all, at most 1")
         self.impossible, self.silent = impossible, silent
         self.blocks = max(goal.blocks for goal in self.goals.values())
-        kept = [colours_left(goal.language) for goal in self.goals.values() if impossible]
+        kept = [absent_colours_needed(goal.language) for goal in self.goals.values() if impossible]
         self.absent = max([goal.absent for goal in self.goals.values()] + kept)
 
     def draw(self, random_state: np.random.RandomState) -> Goal:
-        """Draw one of the goals; which does not depend on the two shares."""
+        """Draw a goal, then whether to replace it by `Stay` or `Wait`; the drawn goal does not depend on the shares."""
         goal = self.goals[str(random_state.choice(list(self.goals)))]
         lot = random_state.uniform()
         if lot < self.impossible:

@@ -13,8 +13,8 @@ REST_STEPS = 15  # consecutive control steps for which it must rest
 UNMOVED = 0.01  # largest displacement of a block that counts as none [m]
 
 
-def colours_left(language: Grammar) -> int:
-    """Return how many colours no block may have, so that one can be named that training may name, too."""
+def absent_colours_needed(language: Grammar) -> int:
+    """Return the number of colours to keep absent from the table, so that one of them is not held out from training."""
     return 1 + len(language.held_out_colours)
 
 
@@ -23,7 +23,7 @@ class Stay(Goal):
 
     def __init__(self, language: Grammar, pads: Count) -> None:
         """Args: grammar; number of pads on the table."""
-        self.pads, self.absent = pads, colours_left(language)
+        self.pads, self.absent = pads, absent_colours_needed(language)
         super().__init__(language, REST_STEPS)
 
     @classmethod

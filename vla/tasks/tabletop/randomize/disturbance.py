@@ -21,8 +21,8 @@ class Disturbances:
 
     kinds: Annotated[Sequence[Kind], MinLen(1), Predicate(unique)]  # to draw from
     times: NaturalRange  # range of how often it happens
-    start: NaturalRange  # range of the steps before a push, beside the first one
-    delay: NaturalRange  # of the steps for which anything else is possible before it happens
+    start: NaturalRange  # range of the number of control steps before a push, not counting the first step
+    delay: NaturalRange  # the same for other kinds: steps whose preconditions hold before the disturbance happens
     push: Lengths  # range of the distance by which the arm is pushed [m]
     move: Lengths  # of that by which an object is moved [m]
     x: Places  # area of the table in which a push or a move ends [m]
