@@ -75,9 +75,31 @@ def test_rendered_images_are_resized_and_components_numbered() -> None:
         assert world.reset(5).rgb == {}
 
 
+def test_images_are_cropped_as_those_of_demonstrations_are() -> None:
+    plain, wide = make().reset(5).rgb["eye"], make(image_size=[8, 16]).reset(5).rgb["eye"]
+    np.testing.assert_array_equal(wide, plain[4:12])  # the largest part of 16 by 16 pixels with this aspect ratio
+
+
+def test_bounds_and_units_are_those_of_the_user_where_told() -> None:
+    world = make(low=[-0.5, -0.1, 0.0], high=[0.5, 0.1, 1.0], units={"x": "m", "y": "m"})
+    assert world.spec.low == (-0.5, -0.1, 0.0) and world.spec.high == (0.5, 0.1, 1.0)
+    assert world.spec.units == ("m", "m", "1") and world.spec.state_units == ("1", "1")
+    assert make(low=-2, high=3.0, id="toy/Unbounded-v0").spec.high == (3.0,) * 3
+    own = make().spec
+    assert own.units == ("1",) * 3 and own.low[0] == -0.05
+
+
+def test_state_entries_with_one_name_are_told_apart_by_their_paths() -> None:
+    world = make(state={"observation.state": None, "info.truth.state": None}, id="toy/Twice-v0")
+    assert world.spec.state == ("state_0", "state_1", "truth.state_0", "truth.state_1")
+
+
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
+        ({"id": "toy/Unbounded-v0"}, "have no bounds: set task.low, a number, or one per component"),
+        ({"low": [0.0]}, "task.low has 1 numbers, an action has 3 components"),
+        ({"units": {"z": "m"}}, "task.units names z, the components are east, north, x, y, gripper"),
         ({"id": "toy/Endless-v0"}, "toy/Endless-v0 does not tell how long an episode lasts: set task.steps"),
         ({"success": "is_success"}, "task.success=is_success must be a path that begins with observation. or info."),
         ({"id": "toy/None-v0"}, "task.id=toy/None-v0 is not registered by toy_gym"),

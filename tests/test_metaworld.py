@@ -13,6 +13,7 @@ import psutil
 import pytest
 from command_line import here
 from composing import composed
+from hydra.utils import instantiate
 from PIL import Image
 
 from vla.config.experiment import Experiment
@@ -22,7 +23,7 @@ from vla.rollouts.collect import collect
 from vla.rollouts.rollout import rollout
 from vla.spec import Array, Multitask, Observation
 from vla.tasks.metaworld import package
-from vla.tasks.metaworld.environment import MetaWorld
+from vla.tasks.metaworld.environment import MetaWorld, _command
 from vla.tasks.metaworld.expert import Scripted
 
 LEROBOT = (0.75, 0.075, 0.7)  # where it puts the camera corner2 [m]
@@ -55,6 +56,14 @@ def same(one: list[Observation], other: list[Observation]) -> bool:
         and all(np.array_equal((a.truth or {})[name], (b.truth or {})[name]) for name in a.truth or {})
         for a, b in zip(one, other, strict=True)
     )
+
+
+def test_a_policy_trained_on_lerobots_data_gives_the_commands_of_meta_world() -> None:
+    asked = composed("task=metaworld", "agent=remote_metaworld").agent
+    theirs = np.array([1.0, -0.5, 0.25, 1.0])  # the last closes
+    ours = [each.scale * theirs[each.index] for each in map(instantiate, asked.actions.values())]
+    assert [*asked.actions] == list(world().spec.action) and asked.images.corner2 == "observation/image"
+    np.testing.assert_allclose(_command(np.array(ours)), theirs)
 
 
 def test_a_seed_is_the_same_episode_whatever_came_before() -> None:

@@ -118,7 +118,7 @@ def test_parts_of_a_dataset_are_chosen_by_name(dataset: Path) -> None:
         assert np.abs(seen.rgb["eye"].astype(int) - expected).max() <= 4
 
 
-def renamed(dataset: Path, folder: Path, names: list[str] | None) -> Path:
+def renamed(dataset: Path, folder: Path, names: Any) -> Path:
     """A copy of the dataset whose action has other names."""
     copy = Path(shutil.copytree(dataset, folder))
     info = json.loads((copy / "meta/info.json").read_text())
@@ -131,6 +131,21 @@ def test_components_of_one_name_are_told_apart(dataset: Path, tmp_path: Path) ->
     copy = renamed(dataset, tmp_path / "dataset", ["joint", "joint", "gripper"])
     spec = build(composed(copy)["task"], "task").spec
     assert spec.action == ("action.joint_0", "action.joint_1", "action.gripper_2")
+
+
+@pytest.mark.parametrize(
+    ("names", "expected"),
+    [
+        ({"motors": ["a", "b", "c"]}, ("a", "b", "c")),
+        ({"left": ["a", "b"], "right": ["c"]}, ("a", "b", "c")),
+        ({"left": ["waist", "elbow"], "right": ["waist"]}, ("left_waist", "left_elbow", "right_waist")),
+        ({"b": 1, "a": 0, "c": 2}, ("a", "b", "c")),
+        ({"left": [2], "right": [1]}, ("action_0", "action_1", "action_2")),
+    ],
+)
+def test_names_may_be_grouped(dataset: Path, tmp_path: Path, names: Any, expected: tuple[str, ...]) -> None:
+    copy = renamed(dataset, tmp_path / "dataset", names)
+    assert build(composed(copy)["task"], "task").spec.action == expected
 
 
 def test_unnamed_components_are_chosen_by_their_numbers(dataset: Path, tmp_path: Path) -> None:
@@ -232,6 +247,10 @@ def test_cameras_of_another_rate_are_named(dataset: Path, tmp_path: Path) -> Non
         (["expert.folder=nowhere"], "error: there is no LeRobot dataset in nowhere"),
         (["task.action=[elbow]"], r"error: task.action names elbow, the recording has joint1.pos"),
         (["task.units={elbow: rad}"], "error: task.units names elbow, the components are joint1.pos"),
+        (
+            ["agent=remote", "agent.images.top=top"],
+            "error: there is no agent.images.top: add a camera with +agent.images.top",
+        ),
         (["validate.episodes=3"], "validate.episodes=3: nothing can be played in a recording"),
         (["job=preview"], "the task has no simulator, only recordings, so nothing can be played in it"),
     ],
@@ -262,7 +281,9 @@ def test_a_policy_is_trained_and_its_errors_measured_without_a_simulator(dataset
     here(tmp_path, *again, *recording)
     repeated = json.loads((tmp_path / "again/errors.json").read_text())
     assert repeated["seeds"] == errors["seeds"] and repeated["components"] == errors["components"]
-    (kept,) = tmp_path.glob("outputs/episodes/*")  # both found it
+    forgot = here(tmp_path, *again, "task=recorded", f"expert.folder={dataset}", ok=False)
+    assert "has image_size = (24, 32), but the task, with the options given here, has (96, 128)" in forgot.stderr
+    (kept,) = tmp_path.glob("outputs/episodes/*")  # both found it, and the last one imported nothing
     here(tmp_path, *recording, *TRAINING, *TINY, f"collect.more=[{kept}]", "hydra.run.dir=more", "output=more")
     assert json.loads((tmp_path / "more/errors.json").read_text())["seeds"] == errors["seeds"]
     shutil.rmtree(kept)
@@ -394,5 +415,9 @@ def test_a_recorded_world_says_what_contradicts_itself() -> None:
     made = {"cameras": ["a"], "image_size": [8, 8], "control_hz": 5.0, "units": "1", "joints": None}
     with pytest.raises(ValueError, match=r"low of x is 1\.0, not less than high, 0\.0"):
         Recorded(**made, state=["x"], action=["x"], low=[1.0], high=[0.0])  # type: ignore[arg-type]
+    with pytest.raises(
+        ValueError, match=r"task\.joints names x without a unit of a position, rad, deg, m: name it with"
+    ):
+        Recorded(**{**made, "joints": "all"}, state=["x"], action=["x"], low=[0.0], high=[1.0])  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="joints must be a list of names, all or null, got some"):
         Recorded(**{**made, "joints": "some"}, state=["x"], action=["x"], low=[0.0], high=[1.0])  # type: ignore[arg-type]

@@ -106,6 +106,7 @@ def remote(url: str, **changes: Any) -> RemotePolicy:
     values: dict[str, Any] = {
         "url": url,
         "images": {"eye": "observation/image", "other": "observation/other"},
+        "channels_first": False,
         "image_size": None,
         "state": {"observation/state": None},
         "prompt": "prompt",
@@ -490,6 +491,40 @@ def test_somebody_elses_actions_become_ours() -> None:
             remote(url, images={"back": "observation/image", "eye": None})
         with pytest.raises(ValueError, match="failed: its actions have 3 components"):
             remote(url, actions={**swapped, "x": Component(3)}).act(observation)
+
+
+def test_images_are_sent_first_by_channel_and_in_maps_within_maps() -> None:
+    policy, observation = as_policy(make_bc()), observations(1)[0]
+    expected = policy.session().plan(observation)
+    with serving(policy) as url:
+        agent = remote(url, images={"eye": ["observation", "image"]}, channels_first=True)
+        sent = agent.message(observation)
+        np.testing.assert_array_equal(sent["observation"]["image"], observation.rgb["eye"].transpose(2, 0, 1))
+        agent.reset(observation.instruction, 0)
+        np.testing.assert_array_equal(agent.plan(observation), expected)
+        agent.close()
+
+
+def test_a_server_with_other_components_units_or_image_sizes_is_noticed(caplog: pytest.LogCaptureFixture) -> None:
+    policy, observation = as_policy(make_bc()), observations(1)[0]
+    slower = replace(SPEC, action=("y", "x", "gripper"), control_hz=7.0)
+    large = {"x": Component(0, scale=100.0), "y": Component(1, scale=100.0), "gripper": Component(2, offset=9.0)}
+    with serving(policy) as url:
+        with pytest.raises(ValueError, match=r"its actions are x, y, gripper, ours are y, x, gripper: set agent\.act"):
+            remote(url, spec=slower)
+        agent = remote(url, actions=large, image_size=[32, 32], spec=replace(SPEC, control_hz=7.0))
+        for _ in range(2):
+            agent.plan(observation)
+        agent.close()
+        two = replace(SPEC, action=("x", "y"), low=SPEC.low[:2], high=SPEC.high[:2], units=SPEC.units[:2])
+        fewer = remote(url, actions={"x": Component(0), "y": Component(1)}, spec=two)
+        fewer.actions = None
+        with pytest.raises(ValueError, match=r"its actions have 3 components, ours are x, y: set agent\.actions"):
+            fewer.plan(observation)
+        fewer.close()
+    assert "agent.image_size=[32,32] enlarges the images of the world: set task.image_size=[32,32]" in caplog.text
+    assert f"acts at {SPEC.control_hz:g} Hz, the world at 7 Hz" in caplog.text
+    assert caplog.text.count("are far beyond the bounds of the world: set agent.actions to its units") == 1
 
 
 def test_a_late_answer_is_not_taken_for_that_of_the_next_observation(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import gymnasium
+import numpy as np
 from toy import ToyEnvironment
 
 from vla.envs.gym import GymEnvironment
@@ -25,6 +26,24 @@ class Toy(GymEnvironment):
         return {**super()._info(), "truth": self._truth}
 
 
+class Twice(Toy):
+    """The toy world, which tells its state in `info`, too."""
+
+    def _info(self) -> dict[str, Any]:
+        info = super()._info()
+        return {**info, "truth": {**info["truth"], "state": info["truth"]["point"]}}
+
+
+class Unbounded(Toy):
+    """The toy world, which does not tell the bounds of its actions."""
+
+    def __init__(self, render_mode: str | None = None) -> None:
+        super().__init__(render_mode)
+        self.action_space = gymnasium.spaces.Box(-np.inf, np.inf, (3,), np.float32)
+
+
+gymnasium.register("toy/Twice-v0", "toy_gym:Twice", max_episode_steps=500)
+gymnasium.register("toy/Unbounded-v0", "toy_gym:Unbounded", max_episode_steps=500)
 gymnasium.register("toy/Toy-v0", "toy_gym:Toy", max_episode_steps=500)
 gymnasium.register("toy/Endless-v0", "toy_gym:Toy")
 gymnasium.register("toy/Elsewhere-v0", "vla.envs.gym:Task")

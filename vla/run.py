@@ -87,6 +87,8 @@ def _unknown_key(error: OmegaConfBaseException) -> str:
     known = [str(key) for key in parent if key != "hydra"] if isinstance(parent, DictConfig) else []
     if not known:
         return f"there is no {error.full_key}"
+    if str(error.full_key).rpartition(".")[0].endswith(".images"):
+        return f"there is no {error.full_key}: add a camera with +{error.full_key}=VALUE; there are {', '.join(known)}"
     adopted = str(error.full_key).startswith("task.") and any(part.startswith("checkpoint=") for part in sys.argv)
     hint = f"; a key of the checkpoint's own task is set by +{error.full_key}=VALUE" if adopted else ""
     return f"there is no {error.full_key}{suggestion(name, known) or ':'} there are {', '.join(known)}{hint}"

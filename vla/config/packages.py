@@ -85,7 +85,8 @@ def trust(packages: Any, chosen: Iterable[Any], used: Iterable[Any] = ()) -> Non
         if not isinstance(name, str) or not can_be_trusted(name):
             key = "package" if name in used else "trust"
             raise ValueError(
-                f"{key} cannot name {name!r}: it takes packages made for vla or gymnasium, which depend on one of them"
+                f"{key} cannot name {name!r}: it takes packages made for vla or gymnasium, by the name that "
+                "is imported, without a module: their distribution depends on one of these"
             )
     offering = {package for package, _ in option_folders()}
     classes = {each for each in chosen if isinstance(each, str) and each.partition(".")[0] in offering}

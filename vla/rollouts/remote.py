@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import asyncio
+import logging
 import threading
 import time
 from collections.abc import Coroutine, Iterator, Mapping, Sequence
@@ -25,7 +26,12 @@ if TYPE_CHECKING:
     from websockets.asyncio.client import ClientConnection
 
 
+log = logging.getLogger(__name__)
+
 Result = TypeVar("Result")
+
+# A server's units are wrong if more than this share of a chunk lies beyond the bounds by more than this share of them.
+BEYOND, CLEARLY = 0.25, 0.5
 
 
 @contextmanager
@@ -60,8 +66,9 @@ class RemotePolicy:
 
     Attributes:
         url: of the server, as in ws://127.0.0.1:8000.
-        images: camera → key of the server's observation, null if it is not sent; other cameras are not sent either,
-            and those that the world lacks are ignored.
+        images: camera → key of the server's observation, a list of keys for a map within maps, or null if it is not
+            sent; other cameras are not sent either, and those that the world lacks are ignored.
+        channels_first: send images as (3, H, W) instead of (H, W, 3).
         image_size: height and width to resize images to [px]; null: as they are.
         state: key of the server's observation → our state components; null: all of them.
         prompt: key of the instruction.
@@ -79,7 +86,8 @@ class RemotePolicy:
     """
 
     url: Text
-    images: dict[str, Text | None]
+    images: dict[str, Text | list[Text] | None]
+    channels_first: bool
     image_size: ImageSize | None
     state: dict[str, list[Text] | None]
     prompt: Text
@@ -103,13 +111,17 @@ class RemotePolicy:
         _require_known("agent.state", names, self.spec.state, "state components")
         if self.actions is not None and sorted(self.actions) != sorted(self.spec.action):
             raise ValueError(f"agent.actions must map {', '.join(self.spec.action)}, got {', '.join(self.actions)}")
+        if self.image_size is not None and max(np.divide(self.image_size, self.spec.image_size)) > 1:
+            size = f"[{self.image_size[0]},{self.image_size[1]}]"
+            log.warning("agent.image_size=%s enlarges the images of the world: set task.image_size=%s", size, size)
         self.info: dict[str, Any] = {}
-        self._broken = False
+        self._broken = self._warned = False
         self._low, self._high = np.array(self.spec.low, np.float32), np.array(self.spec.high, np.float32)
         with ExitStack() as opened:
             self._loop = opened.enter_context(event_loop())
             self._connection, self.metadata = self._connected(opened)
             self._open = opened.pop_all()
+        self._require_alike()
         told, history = (
             number if isinstance(number := self.metadata.get(name), int) and number >= 1 else None
             for name in ("execute", "history")
@@ -122,6 +134,20 @@ class RemotePolicy:
         else:
             link = SimulatedLink(self.plan, IDEAL, self.spec.control_hz)
         self._real_time = RealTime(self.spec, link, lambda: self.execute or 1, self.ensemble)
+
+    def _require_alike(self) -> None:
+        """Compare what the server tells of its actions, as `vla.deploy.server` does, with the spec.
+
+        Raises:
+            ValueError: its actions have other names, and no mapping is given.
+        """
+        action, rate = self.metadata.get("action"), self.metadata.get("control_hz")
+        names = action.get("names") if isinstance(action, dict) else None
+        if self.actions is None and isinstance(names, list) and names != list(self.spec.action):
+            theirs, ours = ", ".join(map(str, names)), ", ".join(self.spec.action)
+            raise self._error(f"its actions are {theirs[:200]}, ours are {ours[:200]}: set agent.actions")
+        if isinstance(rate, int | float) and abs(rate - self.spec.control_hz) > 0.01 * self.spec.control_hz:
+            log.warning("%s acts at %g Hz, the world at %g Hz", self.url, rate, self.spec.control_hz)
 
     def reset(self, instruction: str, seed: int) -> None:
         """Start an episode: drop all chunks, connect again if that broke, and tell a server that has episodes."""
@@ -163,8 +189,15 @@ class RemotePolicy:
             key: observation.state if names is None else observation.state[self.spec.indices(names)]
             for key, names in self.state.items()
         }
-        images = {key: _resized(observation.rgb[camera], self.image_size) for camera, key in self._images.items()}
-        return {**images, **state, self.prompt: observation.instruction}
+        sent: dict[str, Any] = {**state, self.prompt: observation.instruction}
+        for camera, key in self._images.items():
+            image = _resized(observation.rgb[camera], self.image_size)
+            *outer, name = [key] if isinstance(key, str) else key
+            place = sent
+            for each in outer:
+                place = place.setdefault(each, {})
+            place[name] = np.ascontiguousarray(image.transpose(2, 0, 1)) if self.channels_first else image
+        return sent
 
     def _translated(self, actions: Any) -> Array:
         """Convert the server's chunk to ours, (k, D)."""
@@ -172,13 +205,21 @@ class RemotePolicy:
             shape = getattr(actions, "shape", type(actions).__name__)
             raise self._error(f"actions are a chunk (k, D), not {shape}")
         wanted = self.actions or {name: Component(index) for index, name in enumerate(self.spec.action)}
-        if actions.shape[1] <= max(each.index for each in wanted.values()):
-            raise self._error(f"its actions have {actions.shape[1]} components: set agent.actions")
+        fits = actions.shape[1] > max(each.index for each in wanted.values())
+        if not fits or (self.actions is None and actions.shape[1] != len(wanted)):
+            names = ", ".join(self.spec.action)
+            raise self._error(f"its actions have {actions.shape[1]} components, ours are {names}: set agent.actions")
         columns = [wanted[name] for name in self.spec.action]
         mine = np.stack([each.scale * actions[:, each.index] + each.offset for each in columns], 1)
         if not np.isfinite(mine).all():
             raise self._error("an action is not finite")
-        return np.clip(mine.astype(np.float32), self._low, self._high)
+        clipped = np.clip(mine.astype(np.float32), self._low, self._high)
+        if not self._warned and (np.abs(mine - clipped) > CLEARLY * (self._high - self._low)).mean() > BEYOND:
+            self._warned = True
+            log.warning(
+                "actions of %s are far beyond the bounds of the world: set agent.actions to its units", self.url
+            )
+        return clipped
 
     def _connected(self, opened: ExitStack) -> tuple[ClientConnection, dict[str, Any]]:
         try:

@@ -13,12 +13,13 @@ from annotated_types import MinLen
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.error import Error
 from gymnasium.spaces import Box
-from PIL import Image
 
+from vla.io.images import resize
 from vla.io.types import Count, ImageSize, Names, Positive, Text
-from vla.spec import Array, Observation, Spec
+from vla.spec import Array, Numbers, Observation, Spec
 from vla.tasks.blind import Blindable
 from vla.tasks.gl import choose_backend
+from vla.tasks.recorded import units_of
 
 log = logging.getLogger(__name__)
 
@@ -47,6 +48,9 @@ class Gymnasium(Blindable):
         image_size: ImageSize,
         state: Annotated[Mapping[Text, Names | None], MinLen(1)],
         action: Names | None,
+        units: Text | dict[str, Text],
+        low: Numbers | float | None,
+        high: Numbers | float | None,
         success: Text,
         truth: Mapping[Text, Text] | None,
     ) -> None:
@@ -61,15 +65,19 @@ class Gymnasium(Blindable):
             control_hz: rate of actions [Hz]; None: the `render_fps` of the environment.
             instruction: of every episode, or a path that begins with "observation." or "info.".
             images: camera → path of its image, (H, W, 3) uint8 of any size.
-            image_size: height and width to which images are resized [px].
+            image_size: height and width to which images are resized [px], after a crop at the centre to this aspect
+                ratio, as imported demonstrations are.
             state: path of an array → names of its components; None: numbered.
             action: names of the components of an action; None: numbered.
+            units: of all components of state and action, or of some by name; "1" without a unit, or if unknown.
+            low, high: bounds of the action, to which it is clipped, of all components or one each; None: those of the
+                action space.
             success: path of what is true in a step that succeeds.
             truth: name → path of an array, for training and experts only.
 
         Raises:
-            ValueError: the package is not installed or does not contain the environment, an action has no bounds, or an
-                observation lacks a path.
+            ValueError: the package is not installed or does not contain the environment, an action has no bounds, an
+                observation lacks a path, or arguments do not fit each other.
         """
         truth = truth or {}
         self._environment = _make(package, id, options or {}, steps, render=RENDER in images.values())
@@ -79,10 +87,14 @@ class Gymnasium(Blindable):
         self.done, self.outcome = True, "timeout"
         self.draws: dict[str, Any] = {}
         space = self._environment.action_space
-        if not isinstance(space, Box) or len(space.shape) != 1 or not space.is_bounded():
-            raise ValueError(f"{id} has the actions {space}: task=gymnasium takes a bounded Box with one axis")
+        if not isinstance(space, Box) or len(space.shape) != 1:
+            raise ValueError(f"{id} has the actions {space}: task=gymnasium takes a Box with one axis")
+        bounds = _bounds(space, low, high)
         values = self._values(*self._environment.reset(seed=0))
-        names = [name for path, given in state.items() for name in _named(path, _get(values, path), given)]
+        alike = len({path.rpartition(".")[2] for path in state}) < len(state)  # then whole paths tell components apart
+        names = [name for path, given in state.items() for name in _named(path, _get(values, path), given, alike)]
+        actions = _named("action", space.low, action)
+        state_units, action_units = units_of(units, names, actions)
         rate = control_hz or self._environment.metadata.get("render_fps")
         if rate is None:
             raise ValueError(f"{id} does not tell its rate: set task.control_hz")
@@ -90,11 +102,11 @@ class Gymnasium(Blindable):
             cameras=tuple(images),
             image_size=self._size,
             state=tuple(names),
-            state_units=("1",) * len(names),
-            action=tuple(_named("action", space.low, action)),
-            units=("1",) * len(space.low),
-            low=tuple(float(str(value)) for value in space.low),  # 0.1, not the 0.10000000149 of float32
-            high=tuple(float(str(value)) for value in space.high),
+            state_units=state_units,
+            action=actions,
+            units=action_units,
+            low=bounds[0],
+            high=bounds[1],
             control_hz=float(rate),
             truth=tuple((name, np.size(_get(values, path))) for name, path in truth.items()),
         )
@@ -155,7 +167,10 @@ def _make(package: str, id: str, options: Mapping[str, object], steps: int | Non
     except Error as error:
         raise ValueError(f"task.id={id} is not registered by {package}: {error}") from error
     if spec is None or _home(spec) != package:
-        raise ValueError(f"task.id={id} is no environment of task.package={package}")
+        raise ValueError(
+            f"task.id={id} is no environment of task.package={package}: name the package that contains its class, and "
+            "the id without a module"
+        )
     if steps is None and spec.max_episode_steps is None:
         raise ValueError(f"{id} does not tell how long an episode lasts: set task.steps")
     if render:
@@ -164,6 +179,26 @@ def _make(package: str, id: str, options: Mapping[str, object], steps: int | Non
         return gymnasium.make(spec, max_episode_steps=steps, disable_env_checker=True, **options)
     except TypeError as error:
         raise ValueError(f"task.options={dict(options)} does not fit {id}: {error}") from error
+
+
+def _bounds(space: Box, low: Numbers | float | None, high: Numbers | float | None) -> list[tuple[float, ...]]:
+    """Return the low and high bounds of an action, as given or else of its space.
+
+    Raises:
+        ValueError: there is no bound, or more or fewer than components.
+    """
+    found = []
+    for name, given, own in (("low", low, space.low), ("high", high, space.high)):
+        if given is None:
+            bound = tuple(float(str(value)) for value in own)  # 0.1, not the 0.10000000149 of float32
+        else:
+            bound = (float(given),) * len(own) if isinstance(given, int | float) else tuple(given)
+        if len(bound) != len(own):
+            raise ValueError(f"task.{name} has {len(bound)} numbers, an action has {len(own)} components")
+        if not np.isfinite(bound).all():
+            raise ValueError(f"the actions {space} have no bounds: set task.{name}, a number, or one per component")
+        found.append(bound)
+    return found
 
 
 def _home(spec: EnvSpec) -> str:
@@ -190,15 +225,16 @@ def _get(values: Any, path: str, default: Any = None) -> Any:
     return found
 
 
-def _named(path: str, values: Any, names: Names | None) -> tuple[str, ...]:
-    """Return the names of the components of an array.
+def _named(path: str, values: Any, names: Names | None, whole: bool = False) -> tuple[str, ...]:
+    """Return the names of the components of an array, by default the last part of its path, or all, and numbers.
 
     Raises:
         ValueError: there are more or fewer components than names.
     """
     size = np.size(values)
     if names is None:
-        return tuple(f"{path.rpartition('.')[2]}_{index}" for index in range(size))
+        name = path.partition(".")[2] if whole else path.rpartition(".")[2]
+        return tuple(f"{name}_{index}" for index in range(size))
     if len(names) != size:
         raise ValueError(f"{path} has {size} components, and {len(names)} names: {', '.join(names)}")
     return tuple(names)
@@ -210,6 +246,4 @@ def _resized(camera: str, picture: Any, size: tuple[int, int]) -> Array:
         raise ValueError(
             f"task.images.{camera} names no (H, W, 3) image of uint8, but {picture.dtype} of {picture.shape}"
         )
-    if picture.shape[:2] == size:
-        return np.ascontiguousarray(picture)
-    return np.asarray(Image.fromarray(picture).resize(size[::-1], Image.Resampling.BOX))
+    return resize(np.ascontiguousarray(picture), size, "centre")

@@ -2,8 +2,32 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+
 from vla.io.types import ImageSize, Positive, Text
+from vla.robots.controllers import UNITS
 from vla.spec import Cameras, Names, Numbers, RobotModel, Spec, SpecOnly
+
+
+def units_of(
+    units: str | Mapping[str, str], state: Sequence[str], action: Sequence[str]
+) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Return the units of the components of state and action.
+
+    Args:
+        units: of all components, or of some by name; the others have "1".
+        state: names of its components.
+        action: names of its components.
+
+    Raises:
+        ValueError: a name is of no component.
+    """
+    if isinstance(units, str):
+        return (units,) * len(state), (units,) * len(action)
+    if unknown := [name for name in units if name not in (*state, *action)]:
+        known = ", ".join(dict.fromkeys((*state, *action)))
+        raise ValueError(f"task.units names {', '.join(unknown)}, the components are {known}")
+    return tuple(units.get(name, "1") for name in state), tuple(units.get(name, "1") for name in action)
 
 
 class Recorded(SpecOnly):
@@ -21,7 +45,7 @@ class Recorded(SpecOnly):
             deployment as a ROS 2 node.
 
     Raises:
-        ValueError: arguments contradict each other.
+        ValueError: arguments contradict each other, or a joint has no unit of a position.
     """
 
     def __init__(
@@ -36,23 +60,24 @@ class Recorded(SpecOnly):
         high: Numbers,
         joints: Names | Text | None,
     ) -> None:
-        def unit(name: str) -> str:
-            return units if isinstance(units, str) else units.get(name, "1")
-
-        if not isinstance(units, str) and (unknown := [name for name in units if name not in (*state, *action)]):
-            known = ", ".join(dict.fromkeys((*state, *action)))
-            raise ValueError(f"task.units names {', '.join(unknown)}, the components are {known}")
+        state_units, action_units = units_of(units, state, action)
         if isinstance(joints, str):
             if joints != "all":
                 raise ValueError(f"task.joints must be a list of names, all or null, got {joints}")
             joints = tuple(action)
+        known = {**dict(zip(state, state_units, strict=True)), **dict(zip(action, action_units, strict=True))}
+        if lacking := [name for name in joints or () if known.get(name, "rad") not in UNITS]:
+            raise ValueError(
+                f"task.joints names {', '.join(lacking)} without a unit of a position, {', '.join(UNITS)}: name "
+                "it with task.units, or leave the joint out"
+            )
         spec = Spec(
             cameras=tuple(cameras),
             image_size=(image_size[0], image_size[1]),
             state=tuple(state),
-            state_units=tuple(map(unit, state)),
+            state_units=state_units,
             action=tuple(action),
-            units=tuple(map(unit, action)),
+            units=action_units,
             low=tuple(low),
             high=tuple(high),
             control_hz=float(control_hz),

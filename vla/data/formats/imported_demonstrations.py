@@ -5,6 +5,7 @@ Shapes: N steps.
 
 from __future__ import annotations
 
+import logging
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -15,6 +16,8 @@ from rich.progress import track
 
 from vla.data.episodes import EpisodeStore
 from vla.spec import Array, Episode, Spec
+
+log = logging.getLogger(__name__)
 
 QUANTILES = (0.01, 0.99)
 MARGIN = 0.5  # by which bounds exceed the quantiles, as a fraction of the distance between these
@@ -65,6 +68,8 @@ class ImportedDemonstrations(ABC):
             raise ValueError(
                 f"there are only {len(self)} recorded episodes: set collect.episodes={len(self)}, or fewer"
             )
+        if episodes < len(self):
+            log.info("collect.episodes=%d of the %d recorded episodes are used", episodes, len(self))
         self.require_held(store)
         if len(store.episodes) >= episodes:
             return 0

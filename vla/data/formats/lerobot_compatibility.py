@@ -38,11 +38,11 @@ def out_of_bounds(actions: Array, spec: Spec) -> Iterator[str]:
     """Yield the components of which more than a few of the (N, D) actions exceed the bounds of the spec."""
     for index, (name, low, high) in enumerate(zip(spec.action, spec.low, spec.high, strict=True)):
         values, slack = actions[:, index], ROUNDING * (high - low)
-        if ((values < low - slack) | (values > high + slack)).mean() > OUTSIDE:
+        if (beyond := ((values < low - slack) | (values > high + slack)).mean()) > OUTSIDE:
             unit = "" if spec.units[index] == "1" else f" {spec.units[index]}"
             yield (
                 f"{name} in action from {values.min():.3g} to {values.max():.3g}, the task has {low:g} to "
-                f"{high:g}{unit} (other units, or absolute?)"
+                f"{high:g}{unit}, beyond which are {beyond:.0%} (other units, or absolute?)"
             )
 
 

@@ -61,11 +61,17 @@ class Feature:
 
     @property
     def components(self) -> list[str] | None:
-        """Names from a list, a list within a dictionary, or a dictionary of indices; None if unknown."""
+        """Names from a list, lists within a dictionary, one after the other, or a dictionary of indices.
+
+        None if unknown. Where several lists share a name, names begin with the key of their list.
+        """
         names = self.names
-        if isinstance(names, dict):
-            ordered = all(isinstance(index, int) for index in names.values())
-            names = sorted(names, key=names.__getitem__) if ordered else next(iter(names.values()))
+        if isinstance(names, dict) and all(isinstance(index, int) for index in names.values()):
+            names = sorted(names, key=names.__getitem__)
+        elif isinstance(names, dict) and all(isinstance(part, list) for part in names.values()):
+            parts = [(key, name) for key, part in names.items() for name in part]
+            apart = len({str(name) for _, name in parts}) == len(parts)
+            names = [name if apart or not isinstance(name, str) else f"{key}_{name}" for key, name in parts]
         known = isinstance(names, list) and all(isinstance(name, str) for name in names)
         return names if names and known and [len(names)] == list(self.shape) else None
 

@@ -73,6 +73,7 @@ def _serving(experiment: Experiment, policy: Policy) -> Iterator[RemotePolicy]:
         yield RemotePolicy(
             url=url,
             images=dict(cameras),
+            channels_first=False,
             image_size=None,
             state={keys.state[0]: None},
             prompt=keys.prompt,
