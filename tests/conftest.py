@@ -37,6 +37,7 @@ CONF = Path(__file__).parents[1] / "conf"
 # Read by libraries when they are first imported, which tests do after this file.
 for name, threads in THREAD_SETTINGS.items():
     os.environ.setdefault(name, threads)
+os.environ["CUDA_VISIBLE_DEVICES"] = ""  # the tests are of the CPU, also beside a GPU
 choose_backend()
 has_egl()  # once, for the programs that tests start
 without_triton()

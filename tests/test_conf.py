@@ -19,6 +19,7 @@ from hydra.utils import get_class
 from omegaconf import OmegaConf
 
 from vla.config.check import conditions
+from vla.config.differences import differences
 from vla.config.experiment import Experiment, plain
 from vla.deploy.bag import POLICY_INPUTS
 from vla.deploy.view import CAMERAS
@@ -26,6 +27,7 @@ from vla.robots.cartesian import LIMIT_MARGIN
 from vla.robots.panda import FINGER_TRAVEL, JOINT_HIGH, JOINT_LOW, JOINT_SPEED
 from vla.spec import FIRST_SEED
 from vla.tasks.tabletop.environment import Tabletop
+from vla.tasks.tabletop.goals.stay import REST_STEPS
 from vla.tasks.tabletop.simulation import WORKSPACE
 
 AXES = CONF / "task/randomize"  # a group for each, with levels of the same names
@@ -97,6 +99,24 @@ def test_every_variant_of_a_grid_is_a_model(experiment: str, variant: str, table
     chosen = (f"experiment={experiment}", f"variant={variant}")
     learner = Experiment.of(composed(*chosen)).learner(tabletop.spec)
     assert sum(weight.numel() for weight in learner.model.parameters()) > 10_000
+    first = plain(composed(f"experiment={experiment}", "variant=none"))
+    changed = [key for key, *_ in differences(first, plain(composed(*chosen))) if not key.startswith("chosen")]
+    assert (variant == "none") == (not changed)
+
+
+@pytest.mark.parametrize(
+    ("goal", "values"),
+    [
+        ("pick_place", {"radius": 0.04}),
+        ("lift", {"height": 0.1}),
+        ("push", {"radius": 0.04, "highest": 0.02}),
+        ("stack", {}),
+    ],
+)
+def test_success_is_what_the_documentation_says(goal: str, values: dict[str, float]) -> None:
+    asked = composed(f"task/goal={goal}").task.goal
+    assert {name: asked[name] for name in values} == values and asked.hold_steps == 3
+    assert REST_STEPS == 15
 
 
 @pytest.mark.parametrize("level", LEVELS)

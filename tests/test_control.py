@@ -67,7 +67,7 @@ def test_solve_reaches_the_workspace(position: tuple[float, float, float]) -> No
     assert np.linalg.norm(vector_from_rotation(target[:3, :3] @ pose[:3, :3].T)) < 1e-2
 
 
-def test_controller_keeps_joint_limits_speed_limits_and_the_workspace() -> None:
+def test_controller_keeps_joint_limits_and_speed_limits() -> None:
     low, high = np.array([0.25, -0.4, 0.01]), np.array([0.75, 0.4, 0.5])
     controller = CartesianController(PANDA, 0.1, low, high)
     controller.reset(HOME)

@@ -323,13 +323,18 @@ def test_in_a_dry_run_every_plan_starts_where_the_arm_is() -> None:
     assert 0.005 < away[:, 0].max() < 0.012 and np.abs(away[:, 1:]).max() < 0.002  # one action of 1 cm
 
 
-def test_the_tool_stays_in_the_workspace() -> None:
-    x, y, z = forward(HOME)[0][:3, 3]
-    world = World(replace(SAFETY, workspace=((x - 0.1, y - 0.1, z - 0.1), (x + 0.05, y + 0.1, z + 0.1))))
+@pytest.mark.parametrize("axis", range(3), ids="xyz")
+@pytest.mark.parametrize("sign", [-1, 1])
+def test_the_tool_stays_in_the_workspace(axis: int, sign: int) -> None:
+    middle = forward(HOME)[0][:3, 3]
+    world = World(replace(SAFETY, workspace=(tuple(middle - 0.05), tuple(middle + 0.05))))
+    move = np.zeros_like(FORWARD)
+    move[:, axis], move[:, -1] = 0.01 * sign, 1
+    world.answer = lambda observation: move
     world.run(0.1)
     world.loop.on_instruction("go", world.now)
     world.run(2.0)
-    assert world.tool[0] == pytest.approx(x + 0.05, abs=0.002)
+    assert world.tool[axis] == pytest.approx(middle[axis] + 0.05 * sign, abs=0.002)
 
 
 def test_an_arm_outside_its_limits_is_a_fault() -> None:
@@ -494,6 +499,8 @@ def test_a_policy_of_another_arm_or_action_is_refused(policy: tuple[Spec, Robot]
 
 def test_a_policy_and_its_own_arm_fit() -> None:
     ControlLoop(*with_chain(*CHAIN), SAFETY, 50.0)
+    with pytest.raises(ValueError, match="needs a box for the tool point"):
+        ControlLoop(SPEC, ROBOT, replace(SAFETY, workspace=None), 50.0)
     with pytest.raises(ValueError, match="command_hz"):
         ControlLoop(SPEC, ROBOT, SAFETY, 5.0)
     with pytest.raises(ValueError, match="trained with 7 joints, the robot has 6"):

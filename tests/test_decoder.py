@@ -10,12 +10,13 @@ import numpy as np
 import pytest
 import torch
 from defaults import defaults_of
-from fake_batch import Motions, as_policy, make_batch, make_decoder, overfit, with_text
+from fake_batch import Motions, as_policy, make_batch, make_decoder, make_rt1, overfit, with_text
 from small_training import loader, make_learner, make_trainer
 from toy import SPEC, ToyEnvironment
 
 from vla.models.checkpoint import read_checkpoint
 from vla.models.decoder import Decoder
+from vla.models.model import Model
 from vla.models.tokenizers.fast import Fast
 from vla.models.tokenizers.quantile import Quantile
 from vla.models.tokenizers.tokenizer import RT1Bins
@@ -176,3 +177,9 @@ def test_a_trained_decoder_of_fast_tokens_plays_an_episode_from_its_checkpoint(t
     assert episode.actions.shape == (40, 3)
     expected = rollout(ToyEnvironment(), as_policy(model), seed=3)
     assert episode.actions == pytest.approx(expected.actions, abs=1e-6)
+
+
+@pytest.mark.parametrize("make", [make_decoder, make_rt1])
+def test_a_model_that_would_see_nothing_is_refused(make: Callable[..., Model]) -> None:
+    with pytest.raises(ValueError, match="a frame needs a token"):
+        make(learned_tokens=0, keypoints=0, proprioception=False)

@@ -29,7 +29,7 @@ def test_cosines_are_the_transform_of_the_book() -> None:
 def test_fast_needs_fewer_tokens_than_there_are_components() -> None:
     tokenizer = TOKENIZER
     tokens = tokenizer.tokenize(torch.from_numpy(CHUNKS.copy()))
-    written = tokenizer.loss_mask(tokens, torch.ones(len(CHUNKS), 8, dtype=torch.bool)).sum(1)
+    written = tokenizer.loss_mask(tokens, *(torch.ones(len(CHUNKS), *k, dtype=torch.bool) for k in ((8,), ()))).sum(1)
     assert written.float().mean() < 0.6 * 8 * 3 and written.max() <= 25
     ends = tokens.gather(1, written[:, None] - 1)
     assert (ends == tokenizer.end).all()
@@ -76,11 +76,11 @@ def test_fast_takes_motions_that_the_data_never_had() -> None:
 
 def test_a_chunk_counts_as_a_whole() -> None:
     tokenizer = TOKENIZER
-    tokens = tokenizer.tokenize(torch.from_numpy(CHUNKS[:2].copy()))
-    valid = torch.zeros(2, 8, dtype=torch.bool)
-    valid[0, :3] = True
-    counted = tokenizer.loss_mask(tokens, valid)
-    assert counted[0].sum() == (tokens[0] != tokenizer.end).sum() + 1 and not counted[1].any()
+    tokens = tokenizer.tokenize(torch.from_numpy(CHUNKS[:3].copy()))
+    valid = torch.zeros(3, 8, dtype=torch.bool)
+    valid[:2, :3] = True  # the first one at the end of its episode, the second one until a disturbance
+    counted = tokenizer.loss_mask(tokens, valid, torch.tensor([True, False, True]))
+    assert counted[0].sum() == (tokens[0] != tokenizer.end).sum() + 1 and not counted[1:].any()
 
 
 def test_too_few_tokens_for_the_coefficients_are_refused() -> None:

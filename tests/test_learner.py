@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ from small_training import fit, loader, make_learner, make_trainer
 from torch.utils.data import DataLoader
 
 from vla.models.model import Model
+from vla.models.vision.timm_encoders import FilmBackbone
 from vla.training.checkpoints import AtomicCheckpointIO
 
 
@@ -112,6 +114,17 @@ def test_weight_decay_spares_biases_norms_and_embeddings() -> None:
     assert {"positions.weight", "text.embedding.weight", "head.bias", "layers.0.attention_norm.weight"} <= spared_names
     assert "head.weight" in {names[id(parameter)] for parameter in decayed["params"]}
     assert len(decayed["params"]) + len(spared["params"]) == len(names)
+
+
+def test_weight_decay_spares_the_embeddings_of_a_network_of_timm() -> None:
+    model = make_bc(image=partial(FilmBackbone, "test_vit", False, frozen=False, size=32, channels=8))
+    learner = make_learner(model, weight_decay=0.5)
+    learner.trainer = make_trainer(1)
+    decayed, spared = (
+        set(map(id, group["params"])) for group in learner.configure_optimizers()["optimizer"].param_groups
+    )
+    encoder: Any = model.images[0]
+    assert id(encoder.backbone.pos_embed) in spared and id(encoder.backbone.patch_embed.proj.weight) in decayed
 
 
 def test_compiling_keeps_the_names_in_the_checkpoint() -> None:

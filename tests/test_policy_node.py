@@ -71,6 +71,14 @@ def test_a_missing_camera_holds_the_arm_until_its_images_return(world: World) ->
     assert world.becomes(State.RUNNING)
 
 
+def test_a_bug_in_a_callback_stops_the_arm_and_not_the_process(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(world.agent.loop, "on_image", lambda *_: 1 / 0)
+    assert world.becomes(State.FAULT)
+    world.live(0.4)
+    assert world.commands[-1].position == world.commands[-5].position
+    assert "internal error of the agent" in world.statuses[-1].message
+
+
 def test_a_policy_server_that_goes_away_leaves_the_arm_at_rest(
     make_world: Callable[..., World], monkeypatch: pytest.MonkeyPatch
 ) -> None:

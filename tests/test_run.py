@@ -22,6 +22,7 @@ from command_line import SMALL, here, vla
 from PIL import Image
 from rerun.chunk import RrdReader
 
+from vla import jobs
 from vla.data.episodes import EpisodeStore
 from vla.models.checkpoint import read_checkpoint
 from vla.tasks.rendering.fast import Fast
@@ -280,6 +281,18 @@ def test_a_damaged_checkpoint_is_named(home: Path) -> None:
     (home / "flipped.ckpt").write_bytes(flipped)
     with pytest.raises(ValueError, match="damaged"):
         read_checkpoint(home / "flipped.ckpt")
+
+
+def test_a_bug_gives_a_traceback_and_so_does_a_mistake_where_asked(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with monkeypatch.context() as patched:
+        patched.setattr(jobs, "run", lambda experiment: int("x"))
+        with pytest.raises(ValueError, match="invalid literal for int"):
+            here(tmp_path, "job=plan", "plan.rates=[0.9,0.95]")
+    monkeypatch.setenv("HYDRA_FULL_ERROR", "1")
+    with pytest.raises(ValueError, match="name the runs to compare"):
+        here(tmp_path, "job=report")
 
 
 def test_resuming_refuses_a_changed_identity_and_archives_the_evaluation(home: Path) -> None:

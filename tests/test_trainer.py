@@ -24,6 +24,7 @@ from small_training import fit, make_learner
 from vla.models.diffusion import Diffusion
 from vla.models.learner import Learner
 from vla.models.model import Model
+from vla.spec import Array, Observation
 from vla.training.checkpoints import SAVE_EVERY, GracefulStop, PeriodicCheckpoint
 from vla.training.closed_loop import ClosedLoop
 from vla.training.trainer import explain_memory_errors, make_trainer
@@ -182,6 +183,48 @@ def test_an_episode_that_cannot_be_played_in_validation_costs_no_training(
     train(make_bc(), folder, tmp_path / "run", killer=closed_loop)
     assert closed_loop.success == pytest.approx(2 / 3)  # of the three that were played; seed 3 fails in this world
     assert "validation: seed 1 could not be played: RuntimeError: the simulation diverged" in caplog.text
+
+
+class Partial(toy.ToyExpert):
+    """Succeeds in the first episodes only."""
+
+    def __init__(self, successes: int) -> None:
+        super().__init__()
+        self._left = successes
+
+    def reset(self, instruction: str, seed: int) -> None:
+        super().reset(instruction, seed)
+        self._left -= 1
+
+    def act(self, observation: Observation) -> Array:
+        return super().act(observation) * (self._left >= 0)
+
+
+@pytest.mark.parametrize(("last", "chosen"), [(15, "last.ckpt"), (13, "best.ckpt")])
+def test_the_best_weights_are_chosen_if_the_last_ones_are_clearly_worse(
+    folder: Path, tmp_path: Path, last: int, chosen: str
+) -> None:
+    """The interval of 18 of 20 ends at 69.9 %; of equally good ones the newest are the best."""
+    seeds = [seed for seed in range(25) if seed % 5 != 3]  # which this world lets succeed
+    rates, checkpoints = iter([10, 18, 18, last]), tmp_path / "run/checkpoints"
+    played = ClosedLoop(toy.make_environment, lambda model: Partial(next(rates)), seeds, checkpoints)
+    train(make_bc(), folder, tmp_path / "run", killer=played, max_steps=4, val_check_interval=1)
+    assert (played.best, played.success) == (0.9, last / 20)
+    assert played.selected_checkpoint(checkpoints / "last.ckpt").name == chosen
+    assert torch.load(checkpoints / "best.ckpt", weights_only=True)["global_step"] == 3
+    for others, best in ((seeds, 0.9), (seeds[:-1], -1.0)):
+        restored = ClosedLoop(toy.make_environment, lambda model: toy.ToyExpert(), others, checkpoints)
+        restored.load_state_dict(played.state_dict())
+        assert restored.best == best
+
+
+def test_a_validation_without_a_played_episode_selects_nothing(folder: Path, tmp_path: Path) -> None:
+    agents, checkpoints = iter([toy.ToyExpert(), Stumbling()]), tmp_path / "run/checkpoints"
+    played = ClosedLoop(toy.make_environment, lambda model: next(agents), [1], checkpoints)
+    train(make_bc(), folder, tmp_path / "run", killer=played, max_steps=2, val_check_interval=1)
+    assert (played.best, played.success) == (1.0, 1.0)
+    assert torch.load(checkpoints / "best.ckpt", weights_only=True)["global_step"] == 1
+    assert played.selected_checkpoint(checkpoints / "last.ckpt").name == "last.ckpt"
 
 
 def test_between_validations_no_environment_is_held(folder: Path, tmp_path: Path) -> None:

@@ -122,7 +122,8 @@ class WindowBatcher:
 
         A frame before the start of the episode is zero, absent, and has no valid label. A label is also invalid if a
         step between its frame and itself was disturbed, or if it lies beyond the end of the episode, where it repeats
-        the last action. The valid labels of a frame therefore come first.
+        the last action. The valid labels of a frame therefore come first. `undisturbed` (B, T): no step
+        within a chunk was disturbed.
 
         Raises:
             ValueError: images of these episodes differ from their checksums, which are compared once per episode.
@@ -152,6 +153,7 @@ class WindowBatcher:
         batch["action"] = self._take(self._action, labels)
         batch["present"] = self._own(present)
         batch["valid"] = self._own(valid)
+        batch["undisturbed"] = self._own(self._disturbances[labels[:, :, -1]] == self._disturbances[frames])
         batch["instruction"] = [self._instructions[number] for number in episode.tolist()]
         return batch
 

@@ -68,6 +68,8 @@ def train(experiment: Experiment) -> Path | None:
     closed_loop = _closed_loop(experiment, checkpoints)
     if _endless(experiment):
         log.info("trainer.max_steps=-1: training runs until interrupted; Ctrl-C saves and stops")
+    if experiment["trainer"]["max_steps"] in (None, -1) and experiment["learner"]["schedule"] == "cosine":
+        log.warning("without trainer.max_steps learner.schedule=cosine has no end: the learning rate stays at its peak")
     with training_lock(checkpoints):
         # Before collection, so that missing devices are reported early.
         trainer = make_trainer(experiment.config, checkpoints, *([closed_loop] if closed_loop else []), graceful_stop)

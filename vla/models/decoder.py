@@ -71,7 +71,8 @@ class Decoder(FrameModel):
     The start token is an MLP of the newest frame and the instruction. Without it, with attention alone, training takes
     several times as long.
 
-    Training uses teacher forcing on the newest frame of a window. Decoding is greedy: each most likely token is fed
+    Training is on the newest frame of a window, with teacher forcing, or with inputs drawn near the labels if the
+    tokenizer has some (`sampled`). Decoding is greedy: each most likely token is fed
     back, and the tokenizer turns the logits into an action.
 
     Args:
@@ -127,7 +128,7 @@ class Decoder(FrameModel):
     def action_loss(self, output: dict[str, Tensor], batch: Batch) -> dict[str, Tensor]:
         """Return the tokenizer's loss over unmasked tokens and, outside training, their accuracy."""
         logits, tokens = output["logits"].float(), output["tokens"]
-        mask = self.tokenizer.loss_mask(tokens, batch["valid"][:, -1])  # (B, L)
+        mask = self.tokenizer.loss_mask(tokens, batch["valid"][:, -1], batch["undisturbed"][:, -1])  # (B, L)
         losses = self.tokenizer.token_losses(logits, tokens, batch["action"][:, -1])
         result = {"action_loss": mean_where(losses, mask)}
         if not self.training:

@@ -44,6 +44,10 @@ class FrameModel(Model):
         cameras, width = self.spec.cameras, self.width
         self.history, self.image_size = history, image_size
         self.tokens = len(cameras) * (learned_tokens + (keypoints > 0)) + proprioception  # N
+        if not self.tokens:
+            raise ValueError(
+                "a frame needs a token: raise model.learned_tokens or model.keypoints, or set model.proprioception=true"
+            )
         self.shift = RandomShift(*shift)
         self.image = image(text_width=self.text.width)
         self.token_learners = nn.ModuleList(TokenLearner(self.image.channels, learned_tokens) for _ in cameras)

@@ -98,8 +98,15 @@ class Learner(LightningModule):
                         state[name] = torch.empty_like(weight).copy_(value)
 
     def configure_optimizers(self) -> Any:
-        """Create AdamW, with weight decay on parameters of more than one dimension except embeddings."""
+        """Create AdamW, with weight decay on parameters of more than one dimension except embeddings.
+
+        A network of timm tells which parameters are embeddings, such as those of positions.
+        """
         embeddings = {id(m.weight) for m in self.model.modules() if isinstance(m, nn.Embedding)}
+        for module in self.model.modules():
+            if callable(told := getattr(module, "no_weight_decay", None)):
+                own = dict(module.named_parameters())
+                embeddings |= {id(own[name]) for name in told() if name in own}
         trained = [p for p in self.model.parameters() if p.requires_grad]
         decayed = [p for p in trained if p.dim() > 1 and id(p) not in embeddings]
         others = [p for p in trained if p.dim() <= 1 or id(p) in embeddings]
@@ -116,7 +123,7 @@ class Learner(LightningModule):
             return (step + 1) / (self._warmup + 1)
         if self._schedule == "constant":
             return 1.0
-        total = float(self.trainer.estimated_stepping_batches)
+        total = float(self.trainer.estimated_stepping_batches)  # infinite without a number of steps
         done = (step - self._warmup) / max(total - self._warmup, 1)
         return 0.5 * (1 + math.cos(math.pi * min(done, 1.0)))
 

@@ -72,10 +72,6 @@ class RT1(FrameModel, TokenModel):
         **inherited: Inherited,
     ) -> None:
         super().__init__(**inherited)
-        if not self.tokens:
-            raise ValueError(
-                "a frame needs a token: raise model.learned_tokens or model.keypoints, or set model.proprioception=true"
-            )
         width = self.width
         self.slots = self.chunk * len(self.spec.action)  # A
         self.positions = nn.Embedding(self.history * (self.tokens + self.slots), width)

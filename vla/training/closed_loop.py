@@ -61,7 +61,7 @@ class ClosedLoop(Callback):
     ) -> None:
         self._make_environment, self._make_policy, self._seeds = make_environment, make_policy, seeds
         self._path = checkpoints / BEST
-        self._plays = False
+        self._plays = self._played = False
         self.success, self.best = 0.0, -1.0
 
     def on_fit_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
@@ -88,13 +88,15 @@ class ClosedLoop(Callback):
         counts = [sum(result.success for result in results), sum(not result.error for result in results)]
         gathered = pl_module.all_gather(torch.tensor(counts, device=pl_module.device))
         assert isinstance(gathered, torch.Tensor)
-        won, completed = gathered.view(-1, 2).sum(0)  # of all processes
-        pl_module.log("val/success", won / completed.clamp(min=1), sync_dist=True)
+        won, completed = gathered.view(-1, 2).sum(0).tolist()  # of all processes
+        self._played = completed > 0
+        if self._played:
+            self.success = won / completed
+            pl_module.log("val/success", self.success, sync_dist=True)
 
     def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Save `best.ckpt` if the success rate is at least the best so far."""
-        self.success = float(trainer.callback_metrics.get("val/success", -1.0))
-        if self.success >= max(self.best, 0.0):
+        """Save `best.ckpt` if episodes were played, and their success rate is at least the best so far."""
+        if self._played and self.success >= self.best:
             self.best = self.success
             trainer.save_checkpoint(self._path, weights_only=False)
 

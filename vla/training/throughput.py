@@ -101,7 +101,7 @@ class TrainingProgressBar(RichProgressBar):
     ) -> None:
         """Advance the bar; read the loss every `READ_EVERY` batches."""
         if batch_idx % self.READ_EVERY == 0:
-            self._loss = outputs["loss"].item()
+            self._loss = outputs["loss"].item() * trainer.accumulate_grad_batches  # Lightning divides it by these
         super().on_train_batch_end(trainer, pl_module, outputs, batch, batch_idx)
 
     @property

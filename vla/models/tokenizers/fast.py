@@ -111,10 +111,14 @@ class Fast(ActionTokenizer):
         scaled = _exact(self.basis.T, coefficients.view(-1, self.chunk, self.components)) / self.scale
         return (scaled * self.spread + self.centre).view(*tokens.shape[:-1], self.chunk, self.components)
 
-    def loss_mask(self, tokens: Tensor, valid: Tensor) -> Tensor:
-        """Return the (…, L) bool loss mask: tokens up to the first end token of chunks whose first action is valid."""
+    def loss_mask(self, tokens: Tensor, valid: Tensor, undisturbed: Tensor) -> Tensor:
+        """Return the (…, L) bool loss mask: tokens up to the first end token of undisturbed chunks with a valid action.
+
+        Every token depends on all actions of a chunk. Actions that repeat the last one of an episode are meant to be.
+        """
         ended = (tokens == self.end).cumsum(-1)
-        return ((ended == 0) | ((ended == 1) & (tokens == self.end))) & valid[..., :1]
+        whole = valid[..., 0] & undisturbed
+        return ((ended == 0) | ((ended == 1) & (tokens == self.end))) & whole[..., None]
 
     def vocabulary_usage(self, tokens: Tensor) -> str:
         """Describe the number of distinct tokens."""

@@ -33,6 +33,7 @@ def describe_tokenization_error(tokenizer: ActionTokenizer, chunks: np.ndarray, 
         bias, largest = part.mean(0).abs().max(), part.abs().max()
         named = name or f"of {', '.join(spec.action[index] for index in of_unit)}"
         errors.append(f"{part.abs().mean(0).max():.3f} {named} (bias {bias:.3f}, at most {largest:.3f})")
-    length = tokenizer.loss_mask(tokens, torch.ones(actions.shape[:2], dtype=torch.bool)).sum()
+    valid = torch.ones(actions.shape[:2], dtype=torch.bool)
+    length = tokenizer.loss_mask(tokens, valid, valid[:, 0]).sum()
     per_action = f"{length / (len(chunks) * chunks.shape[1]):.3g} tokens per action"
     return f"{', '.join(errors)}; {tokenizer.vocabulary_usage(tokens)}; {per_action}"

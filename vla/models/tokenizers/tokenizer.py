@@ -82,8 +82,8 @@ class ActionTokenizer(nn.Module, ABC):
         """Decode any (…, L) tokens as (…, k, D) float actions."""
 
     @abstractmethod
-    def loss_mask(self, tokens: Tensor, valid: Tensor) -> Tensor:
-        """Return the (…, L) bool loss mask of tokens, given the (…, k) bool mask of actions."""
+    def loss_mask(self, tokens: Tensor, valid: Tensor, undisturbed: Tensor) -> Tensor:
+        """Return the (…, L) bool loss mask, given the (…, k) bool mask of actions and the (…) one of whole chunks."""
 
     @abstractmethod
     def vocabulary_usage(self, tokens: Tensor) -> str:
@@ -96,7 +96,7 @@ class ActionTokenizer(nn.Module, ABC):
     def sampled(self, tokens: Tensor, actions: Tensor) -> Tensor:
         """Sample (…, L) decoder inputs near the (…, L) tokens of (…, k, D) actions, by default the tokens themselves.
 
-        With such inputs instead of the labels, the decoder is trained on prefixes like its own (scheduled sampling).
+        Such noise makes the decoder robust to errors in its own prefix.
         """
         return tokens
 
@@ -136,7 +136,7 @@ class PerComponent(ActionTokenizer):
         """Decode (…, k·D) tokens as (…, k, D) float actions."""
         return self.decode(self._split(tokens, -1))
 
-    def loss_mask(self, tokens: Tensor, valid: Tensor) -> Tensor:
+    def loss_mask(self, tokens: Tensor, valid: Tensor, undisturbed: Tensor) -> Tensor:
         """Return the (…, k·D) bool loss mask: the tokens of valid actions."""
         return valid.repeat_interleave(self.components, -1)
 
