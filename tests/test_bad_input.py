@@ -18,8 +18,8 @@ from vla.tasks.gl import TRIED
 BAD_INPUT = {
     "misspelt key": (("colect.episodes=3",), "collect"),
     "misspelt option": (("model=rt2",), "rt1"),
-    "wrong type": (("trainer.max_steps=many",), "trainer.max_steps"),
-    "missing checkpoint": (("checkpoint=nowhere.ckpt",), "nowhere.ckpt"),
+    "wrong type": (("trainer.max_steps=many",), "trainer.max_steps must be "),
+    "missing checkpoint": (("checkpoint=nowhere.ckpt",), "there is no checkpoint"),
     "a folder as checkpoint": (("checkpoint=.",), ". is a folder, a checkpoint is a file; it has none"),
     "a deployment without a policy": (("job=deploy", "deploy=loop"), "this deployment needs a trained policy"),
     "a run that is no path": (("resume=true",), "resume=True is no path"),

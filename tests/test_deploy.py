@@ -349,15 +349,6 @@ def test_an_interrupted_instruction_is_not_sent(start: Callable[..., Started], p
     assert said.wait(5) == -signal.SIGINT  # and not after the ten seconds in which it waits for an agent
 
 
-def test_a_damaged_checkpoint_is_named_before_anything_starts(home: Path) -> None:
-    whole = (home / "run/checkpoints/last.ckpt").read_bytes()
-    (home / "cut.ckpt").write_bytes(whole[: len(whole) // 2])
-    for option in ("ros2", "loop"):
-        done = here(home, "job=deploy", f"deploy={option}", "checkpoint=cut.ckpt", "output=cut", ok=False)
-        assert done.returncode == 1 and done.stdout == "" and not (home / "cut").exists()
-        assert re.fullmatch(r"error: cut\.ckpt .*damaged.*\n", done.stderr)
-
-
 def test_without_ros_the_error_says_what_to_install(home: Path) -> None:
     (home / "without").mkdir()
     (home / "without/rclpy.py").write_text("raise ImportError('not here')")

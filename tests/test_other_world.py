@@ -72,7 +72,7 @@ def policy_of(model: str, store: Path, environment: Any = None) -> Policy:
 
 
 @pytest.mark.parametrize("model", TINY)
-def test_every_model_learns_and_acts(folder: Path, model: str) -> None:
+def test_every_model_is_trained_and_acts_without_a_robot(folder: Path, model: str) -> None:
     policy = policy_of(model, folder)
     action = policy.act(toy.make_environment().reset(FIRST_SEED))
     assert action.shape == (3,)

@@ -129,11 +129,6 @@ def test_simulated_time_stamps_the_images_and_holds_the_arm_when_it_is_frozen(
     assert world.state is State.HOLDING
 
 
-def test_joint_states_that_stop_hold_the_arm(world: World) -> None:
-    world.measures = False
-    assert world.becomes(State.HOLDING)
-
-
 def test_a_slow_policy_skips_ticks_and_a_stuck_one_holds_the_arm(world: World) -> None:
     world.policy.takes = 0.15
     world.live(1.0)

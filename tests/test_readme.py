@@ -169,7 +169,7 @@ def test_the_attacks_in_bulk_are_ready(main_job: Path, tmp_path: Path, capsys: p
     assert capsys.readouterr().out == "| headers | 2 | 2 |\n"
 
 
-def test_the_two_commands_are_what_ci_runs() -> None:
+def test_ci_runs_make_test_and_the_readme_names_both_commands() -> None:
     assert "make run" in README and "make test" in README
     assert "make test" in (ROOT / ".ci/run").read_text()
     assert re.search(r"^run:.*\n\t\.venv/bin/python -m vla\.run$", (ROOT / "Makefile").read_text(), re.MULTILINE)

@@ -157,9 +157,10 @@ def test_the_same_command_in_the_same_folder_does_nothing_twice(home: Path) -> N
 
 
 def test_runs_are_compared_in_one_page(home: Path) -> None:
+    before = {*home.glob("outputs/runs/*")}
     here(home, "job=report", "report.runs=[run]", "output=compared")
     assert 'href="../run/report.html"' in (home / "compared/comparison.html").read_text()
-    assert not [*home.glob("outputs/runs/*")]  # the folder of a command that writes elsewhere
+    assert {*home.glob("outputs/runs/*")} == before  # not the folder of a command that writes elsewhere
 
 
 def test_cells_run_at_the_same_time_and_one_that_fails_leaves_the_others_alone(home: Path) -> None:
@@ -274,8 +275,9 @@ def test_further_demonstrations_that_are_not_there_are_missed_before_any_are_col
 def test_a_damaged_checkpoint_is_named(home: Path) -> None:
     whole = (home / "run/checkpoints/last.ckpt").read_bytes()
     (home / "cut.ckpt").write_bytes(whole[: len(whole) // 2])
-    done = here(home, "checkpoint=cut.ckpt", ok=False)
-    assert "error: cut.ckpt" in done.stderr and "damaged" in done.stderr
+    done = here(home, "checkpoint=cut.ckpt", "output=cut", ok=False)
+    assert re.fullmatch(r"error: cut\.ckpt .*damaged.*\n", done.stderr)
+    assert done.stdout == "" and not (home / "cut").exists()
     flipped = bytearray(whole)
     flipped[len(whole) // 2] ^= 1
     (home / "flipped.ckpt").write_bytes(flipped)
