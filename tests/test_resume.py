@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import time
 from pathlib import Path
 from typing import Any
@@ -111,8 +112,10 @@ def test_a_run_continues_in_its_folder(tmp_path: Path, finished: bool, chosen: s
     assert training_progress(tmp_path, plain(composed("cluster.workers=1"))) == expected
     assert training_progress(tmp_path, plain(composed("trainer.max_steps=1"))) == expected
     assert training_progress(tmp_path, plain(composed("trainer.max_steps=99999"))) == TrainingProgress(resume_from=last)
-    with pytest.raises(ValueError, match=r"differs in model\.width: choose another output=DIR"):
-        training_progress(tmp_path, plain(composed("model.width=17")))
+    for other in ("model.width=17", "+trainer.sync_batchnorm=true", "+trainer.gradient_clip_algorithm=value"):
+        key = other.strip("+").partition("=")[0]
+        with pytest.raises(ValueError, match=rf"differs in {re.escape(key)}: choose another output=DIR"):
+            training_progress(tmp_path, plain(composed(other)))
 
 
 def test_a_report_of_weights_that_were_trained_for_longer_since_is_not_this_one(tmp_path: Path) -> None:

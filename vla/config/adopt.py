@@ -36,8 +36,9 @@ MACHINES = ("accelerator", "devices", "num_nodes", "strategy")
 IDENTITY = (  # keys that must not change in a resumed run: with other values it is another training
     *(group.name for group in GROUPS.values() if group.training == "part"),
     *("collect.episodes", "collect.seed", "collect.folder", "collect.more", "validate", "seed", "pretrained"),
-    *(f"trainer.{name}" for name in ("val_check_interval", "accumulate_grad_batches", "gradient_clip_val")),
-    *(f"trainer.{name}" for name in ("precision", "devices", "num_nodes")),
+    *(f"trainer.{name}" for name in ("val_check_interval", "accumulate_grad_batches", "precision")),
+    *(f"trainer.{name}" for name in ("gradient_clip_val", "gradient_clip_algorithm", "sync_batchnorm")),
+    *(f"trainer.{name}" for name in ("devices", "num_nodes")),
 )
 
 
