@@ -53,7 +53,7 @@ TOGETHER = {
     ],
     ("task", "gymnasium"): [
         *("task.package=gymnasium_robotics", "task.id=Any-v0", "task.images={top: render}"),
-        "task.state={observation: null}",
+        *("task.state={observation: null}", "task.instruction=go"),
     ],
 }
 

@@ -149,7 +149,8 @@ def test_more_components_than_memory_holds_are_refused(home: Path, tmp_path: Pat
         (replace(ARM_SPEC, action=("x", "z", "gripper")), r"action of 3 numbers \(x, y, .*has 3 \(x, z, gripper\)"),
         (
             replace(ARM_SPEC, high=(0.01, 0.01, 0.5)),
-            r"x in action from .* 0\.01 m \(other units, or absolute\?\); y .*; gripper .* has 0 to 0\.5 \(other units",
+            r"x in action from .* 0\.01 m, beyond which are \d+% \(other units, or absolute\?\); y .*; "
+            r"gripper .* has 0 to 0\.5, beyond which are \d+% \(other units",
         ),
     ],
     ids=["rate", "camera", "joints", "names", "units"],

@@ -282,7 +282,9 @@ def test_it_is_collected_learnt_and_reported_by_tier(tmp_path: Path) -> None:
         *("model.width=16", "model.keypoints=4", "model.text_width=8", "evaluate.episodes=2", "recorder=none"),
         "output=run",
     ).stdout
-    assert re.search(r"^easy \d/1 .*\nmedium \d/1 .*\nmean over tiers .*\nsuccess \d/2 ", printed, re.MULTILINE)
+    assert re.search(
+        r"^easy \d/1 .*\nmedium \d/1 .*\nmean over tiers, 2 of 50 tasks, .*\nsuccess \d/2 ", printed, re.MULTILINE
+    )
     report = json.loads((tmp_path / "run/report.json").read_text())
     assert {tier: [*part["tasks"]] for tier, part in report["tiers"].items()} == {
         "easy": ["handle-press"],

@@ -478,7 +478,7 @@ def test_it_serves_until_it_is_told_to_stop(number: signal.Signals, caplog: pyte
 
 def test_somebody_elses_actions_become_ours() -> None:
     policy = as_policy(make_bc())
-    swapped = {"x": Component(1), "y": Component(0, scale=-1.0), "gripper": Component(2, offset=2.0)}
+    swapped = {"x": Component(1, 1.0, 0.0), "y": Component(0, -1.0, 0.0), "gripper": Component(2, 1.0, 2.0)}
     observation = observations(1)[0]
     x, y, _ = policy.session().plan(observation)[0]
     with serving(policy) as url:
@@ -486,11 +486,11 @@ def test_somebody_elses_actions_become_ours() -> None:
         agent.reset(observation.instruction, 0)
         np.testing.assert_allclose(agent.act(observation), [y, -x, 1.0])
         with pytest.raises(ValueError, match=r"agent\.actions must map x, y, gripper, got x"):
-            remote(url, actions={"x": Component(0)})
+            remote(url, actions={"x": Component(0, 1.0, 0.0)})
         with pytest.raises(ValueError, match=r"no key for the world's cameras, eye: add \+agent\.images\.eye=KEY"):
             remote(url, images={"back": "observation/image", "eye": None})
         with pytest.raises(ValueError, match="failed: its actions have 3 components"):
-            remote(url, actions={**swapped, "x": Component(3)}).act(observation)
+            remote(url, actions={**swapped, "x": Component(3, 1.0, 0.0)}).act(observation)
 
 
 def test_images_are_sent_first_by_channel_and_in_maps_within_maps() -> None:
@@ -508,7 +508,7 @@ def test_images_are_sent_first_by_channel_and_in_maps_within_maps() -> None:
 def test_a_server_with_other_components_units_or_image_sizes_is_noticed(caplog: pytest.LogCaptureFixture) -> None:
     policy, observation = as_policy(make_bc()), observations(1)[0]
     slower = replace(SPEC, action=("y", "x", "gripper"), control_hz=7.0)
-    large = {"x": Component(0, scale=100.0), "y": Component(1, scale=100.0), "gripper": Component(2, offset=9.0)}
+    large = {"x": Component(0, 100.0, 0.0), "y": Component(1, 100.0, 0.0), "gripper": Component(2, 1.0, 9.0)}
     with serving(policy) as url:
         with pytest.raises(ValueError, match=r"its actions are x, y, gripper, ours are y, x, gripper: set agent\.act"):
             remote(url, spec=slower)
@@ -517,7 +517,7 @@ def test_a_server_with_other_components_units_or_image_sizes_is_noticed(caplog: 
             agent.plan(observation)
         agent.close()
         two = replace(SPEC, action=("x", "y"), low=SPEC.low[:2], high=SPEC.high[:2], units=SPEC.units[:2])
-        fewer = remote(url, actions={"x": Component(0), "y": Component(1)}, spec=two)
+        fewer = remote(url, actions={"x": Component(0, 1.0, 0.0), "y": Component(1, 1.0, 0.0)}, spec=two)
         fewer.actions = None
         with pytest.raises(ValueError, match=r"its actions have 3 components, ours are x, y: set agent\.actions"):
             fewer.plan(observation)

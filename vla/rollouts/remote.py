@@ -56,8 +56,8 @@ class Component:
     """A component of our action, computed from the server's: `scale` * value at `index` + `offset`, then clipped."""
 
     index: Natural
-    scale: float = 1.0
-    offset: float = 0.0
+    scale: float
+    offset: float
 
 
 @dataclass(kw_only=True)
@@ -204,7 +204,7 @@ class RemotePolicy:
         if not isinstance(actions, np.ndarray) or actions.ndim != 2 or 0 in actions.shape:
             shape = getattr(actions, "shape", type(actions).__name__)
             raise self._error(f"actions are a chunk (k, D), not {shape}")
-        wanted = self.actions or {name: Component(index) for index, name in enumerate(self.spec.action)}
+        wanted = self.actions or {name: Component(index, 1.0, 0.0) for index, name in enumerate(self.spec.action)}
         fits = actions.shape[1] > max(each.index for each in wanted.values())
         if not fits or (self.actions is None and actions.shape[1] != len(wanted)):
             names = ", ".join(self.spec.action)
