@@ -74,7 +74,7 @@ def test_tiers_weigh_the_same_whatever_the_number_of_their_tasks() -> None:
     report = Report(tuple(results), tiers)
     *_, easy, hard, mean, success = str(report).splitlines()
     assert easy.startswith("easy 18/20 (90.0 %, ") and hard.startswith("very hard 2/10 (20.0 %, ")
-    assert mean.startswith("mean over tiers, 3 of 4 tasks, 55.0 % (95 % CI ") and success.startswith(
+    assert mean.startswith("mean over tiers (3 of 4 tasks) 55.0 % (95 % CI ") and success.startswith(
         "success 20/30 (66.7 %, "
     )
     # Which task it is explains part of the outcomes: an interval for fixed tasks is narrower than Wilson's.

@@ -283,7 +283,7 @@ def test_it_is_collected_learnt_and_reported_by_tier(tmp_path: Path) -> None:
         "output=run",
     ).stdout
     assert re.search(
-        r"^easy \d/1 .*\nmedium \d/1 .*\nmean over tiers, 2 of 50 tasks, .*\nsuccess \d/2 ", printed, re.MULTILINE
+        r"^easy \d/1 .*\nmedium \d/1 .*\nmean over tiers \(2 of 50 tasks\) .*\nsuccess \d/2 ", printed, re.MULTILINE
     )
     report = json.loads((tmp_path / "run/report.json").read_text())
     assert {tier: [*part["tasks"]] for tier, part in report["tiers"].items()} == {

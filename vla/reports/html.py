@@ -211,7 +211,7 @@ def _rate_tables(run: Run) -> dict[str, dict[str, Rate]]:
         "condition": {name: (*_rate(report)[:2], compared.get(name, ())) for name, report in run.reports.items()},
         "tier": {
             **{name: _rate(part) for name, part in first.by_tier.items()},
-            **({first.mean_label.rstrip(","): (mean, "", ())} if mean else {}),
+            **({first.mean_label: (mean, "", ())} if mean else {}),
         },
         "task": {name: _rate(part) for name, part in first.by_task.items()},
         "milestone": {name: _rate(first, count) for name, count in first.milestones.items()},

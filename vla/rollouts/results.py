@@ -201,7 +201,7 @@ class Report:
         """Name of `mean_over_tiers`, which says so if tasks of the tiers are missing from it."""
         listed = {task for tasks in self.tiers.values() for task in tasks}
         known = sum(part.episodes > 0 for task, part in self.tasks.items() if task in listed)
-        return "mean over tiers" if known == len(listed) else f"mean over tiers, {known} of {len(listed)} tasks,"
+        return "mean over tiers" if known == len(listed) else f"mean over tiers ({known} of {len(listed)} tasks)"
 
     def compare(self, other: Report) -> Comparison:
         """Compare the success of another report, as the second, with this one, the first, on the same seeds.
