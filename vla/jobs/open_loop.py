@@ -40,19 +40,17 @@ def evaluate_open_loop(experiment: Experiment, checkpoint: Path | None) -> float
         ValueError: the checkpoint was trained on other episodes, or on all of them.
     """
     started, output = time.monotonic(), experiment.output
-    facts, policy = dict(experiment["chosen"]), None
+    facts = dict(experiment["chosen"])
     if checkpoint is not None:  # before an import
-        policy = experiment.make_policy(checkpoint)()
-        world = experiment.world().spec.without_truth
-        policy.spec.without_truth.require(
-            world, f"the checkpoint {checkpoint}", "the task, with the options given here,"
-        )
+        trained, world = (each.spec.without_truth for each in (read_header(checkpoint), experiment.world()))
+        trained.require(world, f"the checkpoint {checkpoint}", "the task, with the options given here,")
     store = _store(experiment)
-    if policy is None or checkpoint is None:
+    if checkpoint is None:
         make_agent: Any = experiment.make_agent()
         policy = make_agent(experiment.world())
         unseen = _held_out(store, experiment["data"]["validation_fraction"], "none of them is held out of a training")
     else:
+        policy = experiment.make_policy(checkpoint)()
         policy.spec.without_truth.require(store.spec.without_truth, f"the checkpoint {checkpoint}", f"{store.folder}")
         unseen = _unseen(store, [Path(folder) for folder in experiment["collect"]["more"] or ()], checkpoint)
         facts |= costs(policy)
