@@ -169,7 +169,7 @@ def test_an_instruction_moves_the_arm_and_a_signal_leaves_it_at_rest(
 
 
 @pytest.mark.realtime
-def test_when_the_agent_is_killed_the_simulator_holds_the_arm(
+def test_the_shell_stops_and_resumes_the_agent_and_when_that_is_killed_the_simulator_holds_the_arm(
     home: Path, start: Callable[..., Started], probe: Probe
 ) -> None:
     simulator = start("vla.run", "job=deploy", "deploy=simulator", CHECKPOINT)
@@ -186,6 +186,13 @@ def test_when_the_agent_is_killed_the_simulator_holds_the_arm(
     reset = start("vla.deploy.say", "--reset", "put the blue block on the pad")
     assert reset.printed(30).startswith('episode 1000001: "') and reset.wait() == 0
     probe.until(lambda: probe.moved() > 1e-3)
+    assert start("vla.deploy.say", "--hand-over").wait(30) == 0
+    probe.spin(0.1)
+    probe.commands.clear()
+    probe.spin(0.5)
+    assert probe.commands == []
+    assert start("vla.deploy.say", "--hand-back").wait(30) == 0
+    probe.until(lambda: probe.commands and probe.moved() > 1e-3)
     agent.kill()
     probe.spin(0.5)
     heard = len(probe.states)

@@ -10,6 +10,7 @@ import shutil
 import signal
 import time
 from pathlib import Path
+from socket import create_connection, create_server
 from typing import Any
 
 import numpy as np
@@ -108,6 +109,45 @@ def test_a_policy_sees_the_pictures_of_its_training_and_those_of_the_other_rende
     assert conditions["renderer_fast"]["outcomes"] == [result["outcome"] for result in report["per_episode"]]
     assert conditions["renderer_mujoco"]["episodes"] == 2
     assert "renderer_mujoco" in done.stdout
+
+
+def test_a_policy_behind_a_server_acts_as_it_does_from_its_checkpoint(home: Path) -> None:
+    with create_server(("127.0.0.1", 0)) as free:
+        port = free.getsockname()[1]
+    serve = ("job=deploy", "deploy=server", f"deploy.port={port}", "checkpoint=run/checkpoints/last.ckpt")
+    server = warm.Started(home, "vla.run", *serve, "output=served", environment={})
+    try:
+        until(lambda: _listens(port))
+        here(home, *SMALL, "agent=remote", f"agent.url=ws://127.0.0.1:{port}", "recorder=none", "output=remote")
+    finally:
+        server.send_signal(signal.SIGTERM)
+    assert server.wait(60) == 0, server.printed()
+    played = [json.loads((home / run / "report.json").read_text())["per_episode"] for run in ("run", "remote")]
+    first, second = ([(each["outcome"], each["motion"]) for each in episodes] for episodes in played)
+    assert len(first) == 2 and first == second
+
+
+def _listens(port: int) -> bool:
+    try:
+        create_connection(("127.0.0.1", port), 1).close()
+    except ConnectionRefusedError:
+        return False
+    return True
+
+
+def test_the_nearest_demonstration_is_evaluated_like_a_policy(home: Path) -> None:
+    done = here(home, *SMALL, "agent=nearest", "recorder=none", "output=nearest")
+    report = json.loads((home / "nearest/report.json").read_text())
+    assert (report["model"], report["checkpoint"], report["episodes"], report["errors"]) == ("nearest", None, 2, 0)
+    assert done.stdout.strip().splitlines()[-1].startswith(f"success {report['successes']}/2 (")
+
+
+def test_a_policy_is_exported_as_programs(home: Path) -> None:
+    policy = ("checkpoint=run/checkpoints/last.ckpt", "export=program", "export.folder=program")
+    here(home, "job=export", *policy)
+    written = json.loads((home / "program/program.json").read_text())
+    assert written["act"]["runs"].keys() == {"model", "act.pt2", "act.onnx"}
+    assert (home / "program/act.pt2").is_file() and (home / "program/act.onnx").is_file()
 
 
 def test_an_evaluation_ends_when_what_it_is_asked_is_decided(home: Path) -> None:
