@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +19,7 @@ from vla.rollouts.sequential import (
     anytime_difference,
     anytime_interval,
     anytime_p,
+    decided_after,
     excludes,
     is_decided,
     log_capital,
@@ -26,6 +28,7 @@ from vla.rollouts.statements import AgainstBar, AgainstRun
 from vla.rollouts.statistics import wilson_interval
 from vla.spec import FIRST_SEED
 
+SIMULATIONS = 10_000
 SEEDS = range(FIRST_SEED, FIRST_SEED + 60)
 
 
@@ -71,30 +74,42 @@ def test_what_is_decided_agrees_with_the_intervals() -> None:
 
 @pytest.mark.parametrize("bar", [0.5, 0.9])
 def test_a_bar_is_rarely_excluded_by_a_policy_that_is_at_it(bar: float) -> None:
-    random, wrong, naive = np.random.default_rng(0), 0, 0
-    for _ in range(400):
-        won = np.cumsum(random.random(300) < bar)
-        lost = np.arange(1, 301) - won
-        wrong += bool((log_capital(bar, won, lost) >= np.log(20)).any())
-        intervals = [wilson_interval(int(k), n) for n, k in enumerate(won[19:], 20)]
-        naive += any(not low <= bar <= high for low, high in intervals)
-    assert (
-        wrong <= 0.05 * 400 < 0.2 * 400 < naive
-    )  # an interval for a fixed number errs if it is looked at again and again
+    random, played = np.random.default_rng(0), np.arange(1, 301)
+    won = np.cumsum(random.random((SIMULATIONS, 300)) < bar, axis=1)
+    excluded, naive = np.zeros((301, 301), bool), np.zeros((301, 301), bool)  # by the numbers won and played
+    for number in played:
+        counts = np.arange(number + 1)
+        excluded[: number + 1, number] = [excludes(bar, int(k), int(number - k)) for k in counts]
+        if number >= 20:
+            ends = [wilson_interval(int(k), int(number)) for k in counts]
+            naive[: number + 1, number] = [not low <= bar <= high for low, high in ends]
+    wrong, often = (table[won, played].any(1).mean() for table in (excluded, naive))
+    assert wrong <= 0.05 < 0.2 < often  # an interval for a fixed number errs if it is looked at again and again
 
 
 @pytest.mark.parametrize("lost", [0.04, 0.02])
 def test_policies_that_are_equal_or_a_margin_apart_are_rarely_called_otherwise(lost: float) -> None:
-    random, wrong, won = np.random.default_rng(0), 0, 0.04
-    for _ in range(200):
+    random, won, looks = np.random.default_rng(0), 0.04, np.arange(50, 1501, 50)
+    decided, interval = cache(is_decided), cache(anytime_difference)
+    wrong = 0
+    for _ in range(SIMULATIONS):
         drawn = random.random(1500)
-        first, second = np.cumsum(drawn < lost), np.cumsum(drawn > 1 - won)
-        for n in range(50, 1501, 50):
-            if is_decided(int(first[n - 1]), int(second[n - 1]), n, 0.02):
-                low, high = anytime_difference(int(first[n - 1]), int(second[n - 1]), n)
+        counts = (np.cumsum(each)[looks - 1] for each in (drawn < lost, drawn > 1 - won))
+        for one, other, pairs in zip(*(each.tolist() for each in counts), looks.tolist(), strict=True):
+            if decided(one, other, pairs, 0.02):
+                low, high = interval(one, other, pairs)
                 wrong += not low <= won - lost <= high
                 break
-    assert wrong <= 0.05 * 200
+    assert wrong <= 0.05 * SIMULATIONS
+
+
+def test_a_comparison_is_decided_after_the_first_episode_or_round_that_tells() -> None:
+    outcomes = [(True, True), (False, True)] * 20
+    stop = decided_after(outcomes, 0.02)
+    assert stop is not None and stop % 2 == 0 and is_decided(0, stop // 2, stop, 0.02)
+    assert not is_decided(0, stop // 2 - 1, stop - 2, 0.02) and decided_after(outcomes[: stop - 1], 0.02) is None
+    assert decided_after(outcomes, 0.02, turns=stop + 2) == stop + 2
+    assert decided_after([(True, False), (False, True)] * 20, 0.02) is None
 
 
 def test_an_evaluation_stops_when_it_is_clear_whatever_the_number_of_workers() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import Annotated
@@ -13,7 +14,8 @@ from rich.table import Table
 from vla.config.check import Job
 from vla.config.experiment import Experiment
 from vla.io.types import Share, Text
-from vla.reports.comparison import compare_runs, read_runs
+from vla.reports.comparison import common_episodes, read_runs
+from vla.rollouts.comparison import compare_pairs
 from vla.rollouts.planning import (
     MOST,
     SIMULATIONS,
@@ -24,6 +26,8 @@ from vla.rollouts.planning import (
     power_of_samples,
     stopping,
 )
+from vla.rollouts.results import Result, pairs_of
+from vla.rollouts.sequential import decided_after
 from vla.spec import IN_DISTRIBUTION
 
 Between = Annotated[float, Gt(0), Lt(1)]
@@ -45,13 +49,16 @@ def run(experiment: Experiment) -> None:
     one, other = asked["rates"]
     if one == other:
         raise ValueError(f"plan.rates={asked['rates']} are equal: no number of episodes tells them apart")
-    share = _discordant(asked["runs"]) if asked["runs"] else asked["discordant"]
+    common = _common(asked["runs"]) if asked["runs"] else []
+    share = sum(one.success != two.success for one, two in common) / len(common) if common else asked["discordant"]
     show(plan_table(one, other, asked["power"], share))
     show(
         "Without early stopping the numbers are exact. With it, they and the false-positive rate come from "
         f"{SIMULATIONS} simulated evaluations, at the same power. evaluate.until=decided "
         "also stops when two policies differ by less than evaluate.margin: set that below the difference."
     )
+    if common:
+        show(_replayed(common, experiment["evaluate"]["margin"]))
 
 
 def plan_table(one: float, other: float, power: float, discordant: float | None) -> Table:
@@ -96,14 +103,28 @@ def _numbers(fixed: int | None, stops: Stopping | None) -> tuple[str, ...]:
     return str(fixed), str(stops.most), f"{stops.mean:.0f}", _percent(stops.wrong)
 
 
-def _discordant(runs: list[str]) -> float:
-    """Return the share of the common episodes in which only one of two runs succeeds."""
-    for each in compare_runs(read_runs([Path(folder) for folder in runs]), 0.0):
-        found = each.found
-        if each.condition == IN_DISTRIBUTION and found.only_first is not None and found.only_second is not None:
-            return (found.only_first + found.only_second) / found.episodes
+def _common(runs: Sequence[str]) -> list[tuple[Result, Result]]:
+    """Return the results of two runs in every episode that both completed."""
+    one, other = read_runs([Path(folder) for folder in runs]).values()
+    if common := common_episodes(one, other, IN_DISTRIBUTION):
+        return common
     raise ValueError(
         f"plan.runs={runs} have no episode in common: give the share of differing ones, plan.discordant=0.05"
+    )
+
+
+def _replayed(common: Sequence[tuple[Result, Result]], margin: float) -> str:
+    """Describe how early the evaluation of the second run could have stopped."""
+    tasks = [one.task for one, _ in common]
+    different = len({*tasks})
+    turns = different if tasks[different:] == tasks[:-different] else 1
+    stop = decided_after([(one.success, two.success) for one, two in common], margin, turns)
+    if stop is None:
+        return f"On the {len(common)} common episodes of these runs evaluate.until=decided never stops."
+    found = compare_pairs(pairs_of(common[:stop]), anytime=True)
+    return (
+        f"Of the {len(common)} common episodes of these runs evaluate.until=decided plays {stop}, which saves "
+        f"{_percent(1 - stop / len(common))}: the second is {found.conclude(found.p, margin).verdict}."
     )
 
 

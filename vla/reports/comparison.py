@@ -142,15 +142,20 @@ def course_rows(compared: Sequence[RunComparison]) -> Courses:
     return {(each.other, each.one, each.condition): each.course for each in compared if each.course}
 
 
-def _compared(one: Run, other: Run, condition: str) -> tuple[Comparison, dict[str, Comparison]] | None:
-    """Compare two runs under a condition, see `RunComparison`; None if they were evaluated in different worlds."""
+def common_episodes(one: Run, other: Run, condition: str) -> list[tuple[Result, Result]]:
+    """Return both results of every episode that two runs completed under a condition, in the order of seeds."""
     first, second = (_by_seed(run, condition) for run in (one, other))
     # The same seed gives another episode under another goal or level of randomisation.
     seeds = [seed for seed, (_, scene) in first.items() if seed in second and scene == second[seed][1]]
+    return [(first[seed][0], second[seed][0]) for seed in sorted(seeds)]
+
+
+def _compared(one: Run, other: Run, condition: str) -> tuple[Comparison, dict[str, Comparison]] | None:
+    """Compare two runs under a condition, see `RunComparison`; None if they were evaluated in different worlds."""
     anytime = any(run.reports[condition].anytime for run in (one, other) if condition in run.reports)
-    if seeds:
-        together = [(first[seed][0], second[seed][0]) for seed in seeds]
+    if together := common_episodes(one, other, condition):
         return compare_pairs(pairs_of(together), anytime), course_of(together, anytime)
+    first, second = (_by_seed(run, condition) for run in (one, other))
     alike = _scenes(one, condition) == _scenes(other, condition) and not first.keys() & second.keys()
     if not (first and second and alike) or anytime:
         return None

@@ -17,6 +17,8 @@ odds of the mean over tasks then lose.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from itertools import accumulate
 from math import log
 
 import numpy as np
@@ -115,3 +117,17 @@ def is_decided(first: int, second: int, pairs: int, margin: float, comparisons: 
     within = abs(second - first) < margin * pairs
     ends = ((1 - margin) / 2, (1 + margin) / 2)
     return within and all(log_capital(end, second, first, pairs - first - second) >= log(1 / LEVEL) for end in ends)
+
+
+def decided_after(outcomes: Sequence[tuple[bool, bool]], margin: float, turns: int = 1) -> int | None:
+    """Return the number of episodes after which the comparison of two success rates is decided; None if it never is.
+
+    Args:
+        outcomes: whether the first policy succeeded, and the second, in the order of the episodes.
+        margin: as in `is_decided`.
+        turns: number of tasks that take turns; decisions are made after whole rounds.
+    """
+    first = accumulate(one and not other for one, other in outcomes)
+    second = accumulate(other and not one for one, other in outcomes)
+    rounds = list(enumerate(zip(first, second, strict=True), start=1))[turns - 1 :: turns]
+    return next((pairs for pairs, (lost, won) in rounds if is_decided(lost, won, pairs, margin)), None)
