@@ -155,6 +155,7 @@ def test_the_suite_has_every_axis_by_itself_at_each_level() -> None:
     # The levels of phrasing are the same, and naming has none.
     axes = [axis for axis in levels["wide"] if axis not in ("phrasing", "naming")]
     assert {"swapped", "impossible", "empty", "phrasing"} < set(suite)
+    assert composed("evaluate=suite").evaluate.without == ["images", "instruction"]
     for axis, level in product(axes, levels):
         assert suite[f"{axis}_{level}"] == {"randomize": {axis: levels[level][axis]}}
     assert len(suite) == 4 + 2 * len(axes) + 4  # intensity and colour of the light

@@ -135,11 +135,19 @@ def _listens(port: int) -> bool:
     return True
 
 
-def test_the_nearest_demonstration_is_evaluated_like_a_policy(home: Path) -> None:
+def test_the_nearest_demonstration_is_evaluated_like_a_policy_and_beside_one(home: Path) -> None:
     done = here(home, *SMALL, "agent=nearest", "recorder=none", "output=nearest")
     report = json.loads((home / "nearest/report.json").read_text())
     assert (report["model"], report["checkpoint"], report["episodes"], report["errors"]) == ("nearest", None, 2, 0)
     assert done.stdout.strip().splitlines()[-1].startswith(f"success {report['successes']}/2 (")
+    policy = ("checkpoint=run/checkpoints/last.ckpt", "evaluate=memory", "evaluate.episodes=2", "cluster.workers=1")
+    (folder,) = (home / "outputs/episodes").iterdir()
+    done = here(home, *policy, f"evaluate.nearest={folder}", "recorder=none", "output=beside_nearest")
+    beside = json.loads((home / "beside_nearest/report.json").read_text())["conditions"]
+    assert beside.keys() == {"without_images", "without_instruction", "nearest"} and "nearest" in done.stdout
+    assert beside["nearest"]["outcomes"] == [each["outcome"] for each in report["per_episode"]]
+    refused = here(home, *policy, "evaluate.nearest=nowhere", "output=refused_nearest", ok=False)
+    assert refused.stderr.count("\n") == 1 and "no episode store in nowhere" in refused.stderr
 
 
 def test_a_policy_is_exported_as_programs(home: Path) -> None:

@@ -46,6 +46,7 @@ class Job:
 
 
 TRAINING = tuple(group.name for group in GROUPS.values() if group.training)
+NEAREST = "nearest"  # condition of an evaluation in which a demonstration is replayed
 
 # Nodes without a class.
 PLAIN: dict[str, Any] = {
@@ -71,6 +72,7 @@ PLAIN: dict[str, Any] = {
         "conditions": dict[str, dict[str, object]],
         "one_by_one": dict[str, dict[str, dict[str, object]]],
         "without": Annotated[list[Literal["images", "instruction"]], Predicate(unique)],
+        "nearest": Text | None,
         "networks": dict[str, object],
         "by_clock": bool,
     },
@@ -156,6 +158,7 @@ def conditions(evaluate: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
         for level, value in values.items():
             named.append((f"{part}_{level}" if level else part, {argument: {part: value}}))
     others = [IN_DISTRIBUTION, *(f"without_{sense}" for sense in evaluate["without"]), *evaluate["networks"]]
+    others += [NEAREST] if evaluate["nearest"] else []
     for name, count in Counter([*others, *(name for name, _ in named)]).items():
         if count > 1:
             raise ValueError(f"evaluate has {count} conditions with the name {name}: rename one")

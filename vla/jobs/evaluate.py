@@ -17,15 +17,16 @@ from typing import Any
 from rich import print as show
 
 from vla.config.build import Group, build
-from vla.config.check import Job, conditions, with_changes
+from vla.config.check import NEAREST, Job, conditions, with_changes
 from vla.config.experiment import Experiment
+from vla.data.episodes import EpisodeStore
 from vla.io.files import warn_on_error, writing
 from vla.policy import costs
 from vla.reports.conditions import Courses, conditions_table, course_table, plot_conditions
 from vla.reports.evaluation import plot_report, write_report
 from vla.reports.html import write_page
 from vla.rollouts.evaluate import RecorderFactory, evaluate, keep_recordings
-from vla.rollouts.memory import make_without
+from vla.rollouts.memory import make_nearest, make_without
 from vla.rollouts.realtime import Network, make_over_network
 from vla.rollouts.results import Report, compare_conditions, compare_courses
 from vla.rollouts.rollout import AgentFactory
@@ -85,7 +86,8 @@ def require_possible(experiment: Experiment) -> None:
     """Refuse, before any work, what an evaluation could not do at its end.
 
     Raises:
-        ValueError: there is no such run to compare with, nothing to decide, no such network, or no world to change.
+        ValueError: there is no such run to compare with, nothing to decide, no such network or store, or no world to
+            change.
     """
     _statements(experiment)
     _networks(experiment)
@@ -93,6 +95,8 @@ def require_possible(experiment: Experiment) -> None:
         raise ValueError("evaluate.by_clock is about evaluate.networks, and there are none: add evaluate=latency")
     if not experiment.playable and experiment["evaluate"]["conditions"]:
         raise ValueError("evaluate.conditions change a world, and a recording has none: omit them")
+    if (folder := experiment["evaluate"]["nearest"]) is not None:
+        EpisodeStore(Path(folder))
     output = Path(experiment["output"])  # not created yet
     if experiment["job"] != "improve" and any(output.glob(f"round_*/{CHECKPOINTS}")):
         raise ValueError(f"{output} has the rounds of a job=improve, whose report this would replace: add output=DIR")
@@ -161,14 +165,16 @@ def _statements(experiment: Experiment) -> list[Statement]:
         statement = AgainstRun(against, theirs, asked["margin"], report.anytime)
         statement.require_common(range(asked["seed"], asked["seed"] + asked["episodes"]))
         found.append(statement)
-    if asked["until"] and not found and not (conditions(asked) or asked["without"] or asked["networks"]):
+    others = asked["without"] or asked["nearest"] or asked["networks"]
+    if asked["until"] and not found and not (conditions(asked) or others):
         raise ValueError(
             "evaluate.until=decided needs something to decide: evaluate.bar=0.95, evaluate.against=RUN, or conditions, "
             "as in evaluate=suite"
         )
-    if not experiment.playable and (found or asked["until"] or asked["without"] or asked["networks"]):
+    if not experiment.playable and (found or asked["until"] or others):
         raise ValueError(
-            "evaluate.bar, against, until, without and networks need success, which recordings do not have: omit them"
+            "evaluate.bar, against, until, without, nearest and networks need success, which recordings do not have: "
+            "omit them"
         )
     return found
 
@@ -198,6 +204,8 @@ def _play(experiment: Experiment, checkpoint: Path | None, statements: Sequence[
     if recorder:
         recordings.mkdir(exist_ok=True)
         needs.append(recordings)
+    if asked["nearest"]:
+        needs.append(Path(asked["nearest"]).resolve())
 
     def played(
         name: str,
@@ -226,14 +234,17 @@ def _play(experiment: Experiment, checkpoint: Path | None, statements: Sequence[
 
 
 def _other_agents(experiment: Experiment, make_agent: AgentFactory) -> dict[str, AgentFactory]:
-    """Return condition → factory of the same agent without a modality, or at the other end of a network."""
+    """Return condition → factory of another agent: the same one without a modality or at the other end of a network, or
+    the nearest demonstration."""
     asked = experiment["evaluate"]
     impaired = {f"without_{each}": partial(make_without, make_agent, each) for each in asked["without"]}
     distant = {
         name: partial(make_over_network, make_agent, network, by_clock=asked["by_clock"])
         for name, network in _networks(experiment).items()
     }
-    return {**impaired, **distant}
+    folder = asked["nearest"]
+    replayed = {NEAREST: partial(make_nearest, Path(folder).resolve())} if folder else {}
+    return {**impaired, **replayed, **distant}
 
 
 def _write(

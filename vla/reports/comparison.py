@@ -177,6 +177,8 @@ def _scenes(run: Run, condition: str) -> tuple[Any, ...]:
     """Return what the scenes of all seeds depend on: the task, and how a condition changes it."""
     config = run.report.config if run.report else {}
     asked = at(config, "evaluate", {})
-    changes = conditions({"conditions": {}, "one_by_one": {}, "without": [], "networks": {}, **asked}).get(condition)
+    changes = conditions(
+        {"conditions": {}, "one_by_one": {}, "without": [], "nearest": None, "networks": {}, **asked}
+    ).get(condition)
     network = at(asked, "networks", {}).get(condition)
     return at(config, "task"), changes, network and (network, at(asked, "by_clock", None))

@@ -61,10 +61,10 @@ class NearestDemonstration:
     succeeds where remembering the demonstrations is enough.
     """
 
-    def __init__(self, folder: Path, episodes: Count, *, spec: Spec) -> None:
+    def __init__(self, folder: Path, episodes: Count | None, *, spec: Spec) -> None:
         """Args:
         folder: of the episode store.
-        episodes: the first ones to know.
+        episodes: the first ones to know; None: all.
         spec: of the environment.
 
         Raises:
@@ -101,6 +101,11 @@ class NearestDemonstration:
         candidates = known if len(known) else np.flatnonzero(self._others)
         distances = [np.abs(self._images[index] - seen).mean() for index in candidates]
         return int(candidates[np.argmin(distances)])
+
+
+def make_nearest(folder: Path, environment: Environment) -> NearestDemonstration:
+    """Build the agent that replays demonstrations of a store in an environment."""
+    return NearestDemonstration(folder, None, spec=environment.spec)
 
 
 def _subsampled(image: Array) -> Array:
