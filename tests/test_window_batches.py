@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import torch
 import toy
 
+from vla.data.scattered_rows import ScatteredRows
 from vla.data.window_batches import BufferPool, disturbed
 
 
@@ -32,3 +35,15 @@ def test_memory_is_used_again_once_nothing_refers_to_it() -> None:
     assert memory.empty((2, 3), np.uint8).__array_interface__["data"] != place
     del tensor
     assert memory.empty((2, 3), np.uint8).__array_interface__["data"] == place
+
+
+def test_rows_in_random_order_are_those_of_the_file(tmp_path: Path) -> None:
+    values = np.random.default_rng(0).integers(0, 255, (900, 7, 5, 3), np.uint8)
+    values.tofile(tmp_path / "rows.bin")
+    rows = ScatteredRows(tmp_path / "rows.bin", (850, 7, 5, 3), values.dtype)  # more are being written
+    index = np.array([[849, 0], [3, 500]])
+    np.testing.assert_array_equal(rows.take(index), values[index])
+    out = np.empty((2, 2, 7, 5, 3), np.uint8)
+    assert rows.take(index, 0, out, "clip") is out and np.array_equal(out, values[index])
+    np.testing.assert_array_equal(rows[840:900], values[840:850])
+    assert rows[5:5].shape == (0, 7, 5, 3)

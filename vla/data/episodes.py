@@ -27,6 +27,7 @@ from filelock import FileLock, Timeout
 from vla.data.header import fields_of, header_of, images_of, is_store, read_header, write_header
 from vla.data.image_codec import JPEG, PackedRows, whole_rows
 from vla.data.index import REMEDY, SALVAGE, Entry, dumps, index_line, listed, parse_line, read_index
+from vla.data.scattered_rows import ScatteredRows
 from vla.data.statistics import Statistics
 from vla.io.documents import canonical
 from vla.spec import FIRST_SEED, Array, Episode, Observation, Spec
@@ -145,6 +146,13 @@ class EpisodeStore:
             return PackedRows(self.folder, field, self.packed[field], (self._rows, *shape), dtype, self._changed_at)
         return np.asarray(np.memmap(self._path(field), dtype, mode="r", shape=(self._rows, *shape)))
 
+    def scattered(self, field: str) -> Rows | ScatteredRows:
+        """Return the same rows to take in random order."""
+        if field in self.packed or self._rows == 0:
+            return self.rows(field)
+        shape, dtype = self.fields[field]
+        return ScatteredRows(self._path(field), (self._rows, *shape), dtype)
+
     def read(self, entry: Entry) -> dict[str, Array]:
         """Read one episode as field → (steps, …) rows; a ValueError if a checksum differs."""
         sources = {field: self.rows(field) for field in self.fields}
@@ -156,7 +164,7 @@ class EpisodeStore:
                 raise self._changed([entry.seed])
         return rows
 
-    def verify(self, entries: Iterable[Entry], rows: Mapping[str, Rows]) -> None:
+    def verify(self, entries: Iterable[Entry], rows: Mapping[str, Rows | ScatteredRows]) -> None:
         """Compare the `rows` of episodes, by field, with their checksums.
 
         Raises:
@@ -170,7 +178,7 @@ class EpisodeStore:
         if changed:
             raise self._changed(changed)
 
-    def _intact(self, entry: Entry, field: str, rows: Rows) -> bool:
+    def _intact(self, entry: Entry, field: str, rows: Rows | ScatteredRows) -> bool:
         crc = 0
         try:
             for first in range(entry.start, entry.end, BLOCK):
@@ -338,9 +346,9 @@ def observations_of(spec: Spec, rows: Mapping[str, Array], instruction: str) -> 
     ]
 
 
-def stored(rows: Rows, span: slice) -> Array:
+def stored(rows: Rows | ScatteredRows, span: slice) -> Array:
     """Return consecutive rows as stored on disk: the rows, or compressed bytes (M,)."""
-    return rows[span] if isinstance(rows, np.ndarray) else rows.stored(span)
+    return rows.stored(span) if isinstance(rows, PackedRows) else rows[span]
 
 
 def checksums(rows: Mapping[str, Array]) -> dict[str, int]:

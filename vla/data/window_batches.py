@@ -15,6 +15,7 @@ import torch
 from numpy.typing import DTypeLike
 
 from vla.data.episodes import EpisodeStore, Rows
+from vla.data.scattered_rows import ScatteredRows
 from vla.spec import Array, Spec
 
 Batch = dict[str, Any]
@@ -99,7 +100,7 @@ class WindowBatcher:
         self._pin, self._buffers = pin, BufferPool()
         self._ages, self._aheads = np.arange(1 - history, 1), np.arange(chunk)
         cameras = {"rgb": store.spec.cameras, **({"depth": store.spec.depth} if depth else {})}
-        self._images = {kind: {name: store.rows(f"{kind}_{name}") for name in of} for kind, of in cameras.items()}
+        self._images = {kind: {name: store.scattered(f"{kind}_{name}") for name in of} for kind, of in cameras.items()}
         # One array: the row look-up costs more than the copy of a few numbers.
         names = ("state", *(("truth",) if store.spec.truth else ()))
         numbers = {name: store.rows(name) for name in (*names, "action", "executed")}
@@ -171,7 +172,7 @@ class WindowBatcher:
         self._store.verify(entries, images)
         self._verified[episodes] = True
 
-    def _take(self, rows: Rows, index: Array, absent: Array | None = None) -> torch.Tensor:
+    def _take(self, rows: Rows | ScatteredRows, index: Array, absent: Array | None = None) -> torch.Tensor:
         values = self._empty((*index.shape, *rows.shape[1:]), TYPES[rows.dtype])
         if values.dtype == rows.dtype:
             rows.take(index, axis=0, out=values, mode="clip")  # "clip" writes into `out` without a buffer
