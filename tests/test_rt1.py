@@ -9,12 +9,12 @@ from typing import Any
 import pytest
 import torch
 from defaults import defaults_of
-from fake_batch import TINY_TEXT, make_batch, make_rt1, with_text
+from fake_batch import TINY_IMAGE, TINY_TEXT, make_batch, make_rt1, with_text
 from toy import SPEC
 
 from vla.models.rt1 import RT1, attention_mask
 from vla.models.text.ngrams import NGrams
-from vla.models.tokenizers.tokenizer import RT1Bins
+from vla.models.tokenizers.tokenizer import RT1Bins, Uniform
 from vla.models.vision.timm_encoders import FilmEfficientNet
 
 
@@ -154,3 +154,26 @@ def test_the_paper_network_has_its_size_and_its_81_positions() -> None:
         tokens = model.encode(with_text(model, make_batch(1, size=1, spec=spec)))
     assert positions == [(1, 512, 9, 9)]
     assert tokens.shape == (1, 1, 8, 512)
+
+
+@pytest.mark.parametrize("option", ["model/rt1", "model/rt1_small"])
+def test_rt1_sees_images_and_the_instruction_only(option: str) -> None:
+    small = {
+        "image_size": None,
+        "width": 32,
+        "text_width": 16,
+        "layers": 1,
+        "heads": 2,
+        "key_width": 16,
+        "shift": (0, 0),
+    }
+    tokenizer = Uniform(spec=SPEC, **defaults_of("tokenizer/uniform"))
+    parts = {"image": TINY_IMAGE, "text": TINY_TEXT, "spec": SPEC, "tokenizer": tokenizer}
+    model = RT1(**parts, **defaults_of(option, **small, shift=(0, 0))).eval()
+    batch = with_text(model, make_batch(model.history))
+    logits = model(batch)["logits"]
+    numbers = {name: torch.randn_like(batch[name]) for name in ("state", "truth", "action")}
+    assert torch.equal(model({**batch, **numbers})["logits"], logits)
+    images = {name: 255 - image for name, image in batch["rgb"].items()}
+    assert not torch.equal(model({**batch, "rgb": images})["logits"], logits)
+    assert not torch.equal(model({**batch, "text": batch["text"].roll(1, 0)})["logits"], logits)
