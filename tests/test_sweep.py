@@ -116,6 +116,19 @@ def test_rows_are_compared_with_the_first_on_the_same_scenes(tmp_path: Path) -> 
     assert "Differences from bc" in page and page.count("<td>rt1</td>") == 2 and "McNemar" in page
 
 
+def test_single_trainings_are_compared_in_the_course_of_episodes(tmp_path: Path) -> None:
+    for number, milestones in enumerate((["grasped"], [])):
+        folder = tmp_path / str(number)
+        (folder / ".hydra").mkdir(parents=True)
+        (folder / ".hydra/overrides.yaml").write_text(f"- model={['bc', 'act'][number]}\n")
+        results = (Result(seed, "success", "lift", milestones=tuple(milestones)) for seed in range(8))
+        write_report(Report(tuple(results)), folder / "report.json", None, {})
+    (compared,) = compare_rows(tabulate(tmp_path), 0.02)
+    assert compared.found.verdict == "open" and compared.course["grasped"].difference == -1
+    page = (tmp_path / "sweep.html").read_text()
+    assert "Differences in the course of episodes" in page and "<b>-100.0</b>" in page
+
+
 def test_several_trainings_count_as_fewer_episodes_in_a_comparison(tmp_path: Path) -> None:
     for number, (model, successes) in enumerate([("bc", 9), ("bc", 9), ("rt1", 1), ("rt1", 9)]):
         cell(tmp_path, number, [f"model={model}", f"seed={number % 2}"], successes)

@@ -72,16 +72,14 @@ def compare_runs(runs: Mapping[str, Run], margin: float) -> list[RunComparison]:
         for condition in runs[one].reports
         if (compared := _compared(runs[one], runs[other], condition))
     ]
-    verdicts = concluded({number: each.found for number, each in enumerate(found)}, margin)
-    courses = concluded_courses({number: each.course for number, each in enumerate(found)})
-    return [replace(each, found=verdicts[number], course=courses[number]) for number, each in enumerate(found)]
+    return _with_verdicts(found, margin)
 
 
 def compare_rows(rows: Sequence[SweepRow], margin: float) -> list[RunComparison]:
     """Compare every row of a sweep with the first one under each condition, where both played the same scenes.
 
-    Rows of one training each are compared by paired tests, as runs are. Rows of several trainings are compared as
-    independent samples of size `effective_episodes`, which ignores the pairing by scenes.
+    Rows of one training each are compared as runs are: by paired tests, and in the course of episodes. Rows of several
+    trainings are compared as independent samples of size `effective_episodes`, which ignores the pairing by scenes.
 
     Args:
         rows: of the sweep, at least one.
@@ -89,28 +87,36 @@ def compare_rows(rows: Sequence[SweepRow], margin: float) -> list[RunComparison]
     """
     first, *others = rows
     found = [
-        RunComparison(first.name, other.name, condition, compared)
+        RunComparison(first.name, other.name, condition, *compared)
         for other in others
         for condition in first.played
         if condition in other.played and (compared := _compared_rows(first, other, condition))
     ]
+    return _with_verdicts(found, margin)
+
+
+def _with_verdicts(found: Sequence[RunComparison], margin: float) -> list[RunComparison]:
+    """Return comparisons with verdicts on success, and separately on the course of episodes."""
     verdicts = concluded({number: each.found for number, each in enumerate(found)}, margin)
-    return [replace(each, found=verdicts[number]) for number, each in enumerate(found)]
+    courses = concluded_courses({number: each.course for number, each in enumerate(found)})
+    return [replace(each, found=verdicts[number], course=courses[number]) for number, each in enumerate(found)]
 
 
-def _compared_rows(first: SweepRow, other: SweepRow, condition: str) -> Comparison | None:
+def _compared_rows(
+    first: SweepRow, other: SweepRow, condition: str
+) -> tuple[Comparison, Mapping[str, Comparison]] | None:
     """Compare two rows, see `compare_rows`; None in different worlds, or if one stopped when it was clear."""
     if any(run.reports[condition].anytime for row in (first, other) for run in row.runs if condition in run.reports):
         return None
     compared = _compared(first.runs[0], other.runs[0], condition)
     if compared is None or len(first.runs) == len(other.runs) == 1:
-        return compared and compared[0]
+        return compared
     one, two = (_by_seed(row.runs[0], condition) for row in (first, other))
     if any(seed in two and scene != two[seed][1] for seed, (_, scene) in one.items()):
         return None  # effective numbers are of all episodes, of which some are other scenes
     (won, played), (others_won, others_played) = (effective_episodes(row.played[condition]) for row in (first, other))
     episodes = first.episodes[condition] + other.episodes[condition]
-    return replace(compare_samples(won, played, others_won, others_played), episodes=episodes)
+    return replace(compare_samples(won, played, others_won, others_played), episodes=episodes), {}
 
 
 def remarks(runs: Mapping[str, Run], compared: Sequence[RunComparison]) -> list[str]:

@@ -139,6 +139,8 @@ def write_sweep(
         lines=lines,
         heads=(choices, ["each seed [%]", "parameters [M]", "action [ms]"], "cells"),
         compared=[(each, comparison_texts(each.found)) for each in compared],
+        course=_course(course_rows(compared)),
+        case=("row", "minus", "condition"),
         anytime=any(report.anytime for run in cells for report in run.reports.values()),
         curves=draw_runs({name: run.metrics for name, run in runs.items()}),
         cells=dict(zip(map(captions.get, runs), colours(len(runs)), strict=True)),
