@@ -271,6 +271,16 @@ def test_other_scenes_under_the_same_seeds_are_not_compared(tmp_path: Path) -> N
     assert "Not compared, because no episode is the same in both: plain and dark." in told
 
 
+def test_other_versions_of_a_library_are_told(tmp_path: Path) -> None:
+    runs = [a_run(tmp_path / name, "ssss") for name in ("old", "new", "newer")]
+    assert "versions" not in text(compared(runs, tmp_path / "page"))
+    for folder, mujoco in zip(runs, ("3.3.0", "3.17.0", "3.17.0"), strict=True):
+        report = json.loads((folder / "report.json").read_text())
+        (folder / "report.json").write_text(json.dumps({**report, "versions": {"mujoco": mujoco, "torch": "2.13"}}))
+    told = text(compared(runs, tmp_path / "page"))
+    assert "Evaluated with different versions: mujoco 3.3.0 and 3.17.0." in told
+
+
 def test_episodes_that_ended_in_errors_are_told_beside_the_rates_without_them(tmp_path: Path) -> None:
     whole, crashing = a_run(tmp_path / "whole", "ssssssdd"), a_run(tmp_path / "crashing", "sseeeeee")
     told = text(compared([whole, crashing], tmp_path / "new"))

@@ -13,6 +13,7 @@ from pathlib import Path
 from socket import create_connection, create_server
 from typing import Any
 
+import mujoco
 import numpy as np
 import pytest
 import torch
@@ -56,6 +57,7 @@ def test_the_main_job_collects_trains_evaluates_and_records(home: Path) -> None:
     training = json.loads((home / "run/training.json").read_text())
     assert report["wall_time_s"] > training["collection_s"] + training["seconds"] > training["collection_s"] > 0
     assert report["episodes"] == 2 and report["errors"] == 0
+    assert report["versions"]["mujoco"] == mujoco.__version__
     assert report["config"]["collect"]["episodes"] == 12
     names = ("report.html", "report.png", "rollouts.rrd", "samples.png", "metrics.csv", "checkpoints/last.ckpt")
     for name in (*names, "checkpoints/best.ckpt"):

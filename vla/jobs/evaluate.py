@@ -8,9 +8,10 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable, Sequence
-from contextlib import nullcontext
+from contextlib import nullcontext, suppress
 from dataclasses import asdict, replace
 from functools import partial
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
@@ -45,6 +46,8 @@ from vla.runs.folder import (
 )
 from vla.runs.resume import cached_success, training_lock
 from vla.spec import IN_DISTRIBUTION, Multitask
+
+LIBRARIES = ("vla", "mujoco", "dm-control", "metaworld", "gymnasium", "numpy", "torch")
 
 log = logging.getLogger(__name__)
 
@@ -288,15 +291,24 @@ def _write(
 
 def _facts(experiment: Experiment, checkpoint: Path | None, rounds: Sequence[Round], seconds: float) -> dict[str, Any]:
     """Return what a report says of the agent, given the duration of its evaluation [s]."""
+    chosen = {**experiment["chosen"], "versions": _versions()}
     if checkpoint is None:
-        chosen = experiment["chosen"]
         return {**chosen, "model": chosen["agent"], "wall_time_s": seconds}
     return {
-        **experiment["chosen"],
+        **chosen,
         **costs(experiment.make_policy(checkpoint)()),
         "wall_time_s": wall_time(checkpoint, seconds + _before_last_training(rounds)),
         "rounds": [asdict(one) for one in rounds],
     }
+
+
+def _versions() -> dict[str, str]:
+    """Return library → version of those that the outcome of an episode depends on."""
+    found = {}
+    for name in LIBRARIES:
+        with suppress(PackageNotFoundError):
+            found[name] = version(name)
+    return found
 
 
 def _before_last_training(rounds: Sequence[Round]) -> float:

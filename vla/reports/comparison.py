@@ -120,9 +120,17 @@ def _compared_rows(
 
 
 def remarks(runs: Mapping[str, Run], compared: Sequence[RunComparison]) -> list[str]:
-    """Return sentences on the runs that are not compared and why, and on episodes that ended in errors."""
+    """Return sentences on the runs that are not compared and why, on libraries of different versions, and on episodes
+    that ended in errors."""
     found = {(each.one, each.other) for each in compared}
     pairs = [f"{one} and {other}" for one, other in combinations(runs, 2) if (one, other) not in found]
+    versions = {name: run.report.versions for name, run in runs.items() if run.report and run.report.versions}
+    known = sorted(set.intersection(*map(set, versions.values()))) if versions else []
+    other = [
+        f"{library} {' and '.join(dict.fromkeys(each[library] for each in versions.values()))}"
+        for library in known
+        if len({each[library] for each in versions.values()}) > 1
+    ]
     failed = [
         f"{len(report.errors)} of {len(report.results)} in {name} ({condition})"
         for name, run in runs.items()
@@ -131,6 +139,7 @@ def remarks(runs: Mapping[str, Run], compared: Sequence[RunComparison]) -> list[
     ]
     return [
         *([f"not compared, because no episode is the same in both: {', '.join(pairs)}"] if pairs else []),
+        *([f"evaluated with different versions: {', '.join(other)}"] if other else []),
         *([f"episodes that ended in errors, which count nowhere: {', '.join(failed)}"] if failed else []),
     ]
 

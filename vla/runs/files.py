@@ -153,6 +153,7 @@ class ReportFile:
     latency_ms: Positive | None = None
     wall_time_s: NonNegative | None = None
     rounds: list[Round] = field(default_factory=list)  # of job=improve
+    versions: dict[str, str] = field(default_factory=dict)  # library → version
     statements: list[str] = field(default_factory=list)  # on what the evaluation was to decide
 
     def __post_init__(self) -> None:
