@@ -5,11 +5,14 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+import pytest
 import torch
 import toy
 
+from vla.data import episodes
+from vla.data.episodes import EpisodeStore
 from vla.data.scattered_rows import ScatteredRows
-from vla.data.window_batches import BufferPool, disturbed
+from vla.data.window_batches import BufferPool, WindowBatcher, disturbed
 
 
 def test_a_step_is_disturbed_if_the_executed_action_differs_from_the_label_by_more_than_noise() -> None:
@@ -47,3 +50,18 @@ def test_rows_in_random_order_are_those_of_the_file(tmp_path: Path) -> None:
     assert rows.take(index, 0, out, "clip") is out and np.array_equal(out, values[index])
     np.testing.assert_array_equal(rows[840:900], values[840:850])
     assert rows[5:5].shape == (0, 7, 5, 3)
+
+
+@pytest.mark.parametrize("history", [1, 3])
+def test_batches_of_a_store_that_is_larger_than_the_memory_are_the_same(
+    history: int, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    small = WindowBatcher(EpisodeStore(folder), history, 2)
+    monkeypatch.setattr(episodes, "memory", lambda: 1)
+    store = EpisodeStore(folder)
+    assert all(isinstance(store.scattered(f"rgb_{camera}"), ScatteredRows) for camera in store.spec.cameras)
+    large = WindowBatcher(store, history, 2)
+    large.verify()
+    windows = np.random.default_rng(0).integers(0, store.episodes[-1].end, 40)
+    for name, images in small(windows)["rgb"].items():
+        assert torch.equal(large(windows)["rgb"][name], images) and images.any()

@@ -18,6 +18,7 @@ import os
 import zlib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
+from math import prod
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -30,11 +31,13 @@ from vla.data.index import REMEDY, SALVAGE, Entry, dumps, index_line, listed, pa
 from vla.data.scattered_rows import ScatteredRows
 from vla.data.statistics import Statistics
 from vla.io.documents import canonical
+from vla.parallel.limits import memory
 from vla.spec import FIRST_SEED, Array, Episode, Observation, Spec
 
 Rows = Array | PackedRows
 
 BLOCK = 256  # rows per update of a checksum
+IN_MEMORY = 0.25  # largest share of the memory that a store takes that is expected to stay in it
 
 log = logging.getLogger(__name__)
 
@@ -147,11 +150,17 @@ class EpisodeStore:
         return np.asarray(np.memmap(self._path(field), dtype, mode="r", shape=(self._rows, *shape)))
 
     def scattered(self, field: str) -> Rows | ScatteredRows:
-        """Return the same rows to take in random order."""
-        if field in self.packed or self._rows == 0:
+        """Return the same rows to take in random order; if the store is large, only what is taken is read."""
+        if field in self.packed or not self._large:
             return self.rows(field)
         shape, dtype = self.fields[field]
         return ScatteredRows(self._path(field), (self._rows, *shape), dtype)
+
+    @property
+    def _large(self) -> bool:
+        """Whether the rows may not stay in memory."""
+        sizes = (prod(shape) * dtype.itemsize for shape, dtype in self.fields.values())
+        return self._rows * sum(sizes) > IN_MEMORY * memory()
 
     def read(self, entry: Entry) -> dict[str, Array]:
         """Read one episode as field → (steps, …) rows; a ValueError if a checksum differs."""

@@ -34,6 +34,12 @@ def free_memory() -> float:
     return min([machine.available / machine.total, *(share for folder in _groups() for share in _free(folder))])
 
 
+def memory() -> int:
+    """Return the memory [bytes] of the machine, or of the control group with least."""
+    limits = [limit for folder in _groups() for name, _, _ in MEMORY_FILES if (limit := _number(folder / name))]
+    return min([psutil.virtual_memory().total, *limits])
+
+
 def _groups() -> Iterator[Path]:
     """Yield the folders of the control groups of this process, their parents included."""
     lines = MEMBERSHIP.read_text().splitlines() if MEMBERSHIP.exists() else []
@@ -44,12 +50,18 @@ def _groups() -> Iterator[Path]:
             yield from (folder for folder in (group, *group.parents) if folder.is_relative_to(root))
 
 
+def _number(file: Path) -> int | None:
+    """Return the number in a file; None without one, as where nothing is limited."""
+    try:
+        return int(file.read_text())
+    except (OSError, ValueError):
+        return None
+
+
 def _free(group: Path) -> Iterator[float]:
     """Yield the free share of a control group's memory if it is limited."""
     for limit, used, droppable in MEMORY_FILES:
-        try:
-            most, now = int((group / limit).read_text()), int((group / used).read_text())
+        most, now = _number(group / limit), _number(group / used)
+        if most and now is not None:
             held = dict(line.split() for line in (group / "memory.stat").read_text().splitlines())
-        except (OSError, ValueError):  # the other version, or "max"
-            continue
-        yield max(0.0, 1 - (now - int(held.get(droppable, 0))) / most)
+            yield max(0.0, 1 - (now - int(held.get(droppable, 0))) / most)
