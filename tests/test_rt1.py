@@ -169,7 +169,7 @@ def test_rt1_sees_images_and_the_instruction_only(option: str) -> None:
     }
     tokenizer = Uniform(spec=SPEC, **defaults_of("tokenizer/uniform"))
     parts = {"image": TINY_IMAGE, "text": TINY_TEXT, "spec": SPEC, "tokenizer": tokenizer}
-    model = RT1(**parts, **defaults_of(option, **small, shift=(0, 0))).eval()
+    model = RT1(**parts, **defaults_of(option, **small)).eval()
     batch = with_text(model, make_batch(model.history))
     logits = model(batch)["logits"]
     numbers = {name: torch.randn_like(batch[name]) for name in ("state", "truth", "action")}
