@@ -30,7 +30,7 @@ def root(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def test_without_control_groups_the_memory_is_that_of_the_machine(root: Path) -> None:
-    assert limits.free_memory() == 0.9
+    assert limits.free_memory() == 0.9 and limits.memory() == 100
     limits.MEMBERSHIP.write_text("0::/user.slice\n")  # no such folder: the files are those of another container
     assert limits.free_memory() == 0.9
 
@@ -39,10 +39,11 @@ def test_the_tightest_of_nested_groups_counts(root: Path) -> None:
     limits.MEMBERSHIP.write_text("0::/job/step\n")
     unlimited = {"memory.max": "max\n", "memory.current": "70\n", "memory.stat": "anon 60\ninactive_file 10\n"}
     group(root / "job" / "step", unlimited)
-    assert limits.free_memory() == 0.9
+    assert limits.free_memory() == 0.9 and limits.memory() == 100
     (root / "job" / "memory.max").write_text("80\n")
     (root / "job" / "memory.current").write_text("70\n")
     (root / "job" / "memory.stat").write_text("anon 60\ninactive_file 10\n")
+    assert limits.memory() == 80
     assert limits.free_memory() == 0.25  # 60 of 80 are in use; the kernel drops files that nobody reads
 
 
@@ -51,6 +52,8 @@ def test_version_1_is_read_at_the_place_of_its_controller(root: Path) -> None:
     files = {"memory.limit_in_bytes": "200\n", "memory.usage_in_bytes": "150\n", "memory.stat": "inactive_file 1\n"}
     group(root / "memory" / "box", {**files, "memory.stat": "inactive_file 1\ntotal_inactive_file 50\n"})
     assert limits.free_memory() == 0.5
+    (root / "memory" / "box" / "memory.limit_in_bytes").write_text("40\n")
+    assert limits.memory() == 40
     (root / "memory" / "box" / "memory.limit_in_bytes").write_text("9223372036854771712\n")  # its way to say unlimited
     assert limits.free_memory() == 0.9
 

@@ -62,6 +62,9 @@ def _free(group: Path) -> Iterator[float]:
     """Yield the free share of a control group's memory if it is limited."""
     for limit, used, droppable in MEMORY_FILES:
         most, now = _number(group / limit), _number(group / used)
-        if most and now is not None:
+        try:
             held = dict(line.split() for line in (group / "memory.stat").read_text().splitlines())
+        except (OSError, ValueError):
+            held = {}
+        if most and now is not None:
             yield max(0.0, 1 - (now - int(held.get(droppable, 0))) / most)
