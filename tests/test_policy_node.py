@@ -36,7 +36,7 @@ def world(make_world: Callable[..., World]) -> World:
     """A world whose arm the agent moves."""
     world = make_world()
     world.start()
-    assert world.state is State.RUNNING, world.agent.loop and world.agent.loop.reason
+    assert world.becomes(State.RUNNING), world.agent.loop and world.agent.loop.reason
     return world
 
 
@@ -121,7 +121,7 @@ def test_simulated_time_stamps_the_images_and_holds_the_arm_when_it_is_frozen(
     world = make_world("joint_state", "--ros-args", "-p", "use_sim_time:=true")
     world.simulated = 50.0
     world.start()
-    assert world.state is State.RUNNING, world.agent.loop and world.agent.loop.reason
+    assert world.becomes(State.RUNNING), world.agent.loop and world.agent.loop.reason
     assert world.agent.get_clock().now().nanoseconds * 1e-9 == pytest.approx(world.simulated, abs=5)
     frozen = world.simulated
     world.changed = lambda image: setattr(image.header, "stamp", Time(sec=int(frozen)))
