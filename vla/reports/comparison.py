@@ -124,13 +124,10 @@ def remarks(runs: Mapping[str, Run], compared: Sequence[RunComparison]) -> list[
     that ended in errors."""
     found = {(each.one, each.other) for each in compared}
     pairs = [f"{one} and {other}" for one, other in combinations(runs, 2) if (one, other) not in found]
-    versions = {name: run.report.versions for name, run in runs.items() if run.report and run.report.versions}
-    known = sorted(set.intersection(*map(set, versions.values()))) if versions else []
-    other = [
-        f"{library} {' and '.join(dict.fromkeys(each[library] for each in versions.values()))}"
-        for library in known
-        if len({each[library] for each in versions.values()}) > 1
-    ]
+    versions = [run.report.versions for run in runs.values() if run.report]
+    libraries = dict.fromkeys(library for each in versions for library in each)
+    versions_of = {each: dict.fromkeys(one[each] for one in versions if each in one) for each in libraries}
+    other = [f"{library} {' and '.join(names)}" for library, names in versions_of.items() if len(names) > 1]
     failed = [
         f"{len(report.errors)} of {len(report.results)} in {name} ({condition})"
         for name, run in runs.items()
