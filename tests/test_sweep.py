@@ -129,6 +129,17 @@ def test_single_trainings_are_compared_in_the_course_of_episodes(tmp_path: Path)
     assert "Differences in the course of episodes" in page and "<b>-100.0</b>" in page
 
 
+def test_letters_tell_which_of_three_or_more_rows_differ(tmp_path: Path, figures: list[Figure]) -> None:
+    for number, (model, successes) in enumerate([("bad", 1), ("good", 9), ("best", 10), ("best", 10)]):
+        cell(tmp_path, number, [f"model={model}", f"seed={number}"], successes)
+    tabulate(tmp_path)
+    _, violins = figures
+    (axes,) = violins.axes
+    assert [label.get_text() for label in axes.get_yticklabels()] == ["best", "good", "bad"]
+    assert [each.get_text() for each in axes.texts] == ["a", "a", "b"]
+    assert "Rows that share no letter differ" in (tmp_path / "sweep.html").read_text()
+
+
 def test_several_trainings_count_as_fewer_episodes_in_a_comparison(tmp_path: Path) -> None:
     for number, (model, successes) in enumerate([("bc", 9), ("bc", 9), ("rt1", 1), ("rt1", 9)]):
         cell(tmp_path, number, [f"model={model}", f"seed={number % 2}"], successes)

@@ -95,6 +95,15 @@ def compare_rows(rows: Sequence[SweepRow], margin: float) -> list[RunComparison]
     return _with_verdicts(found, margin)
 
 
+def compare_all_rows(rows: Sequence[SweepRow]) -> list[RunComparison]:
+    """Compare every two rows in the training condition as `compare_rows` does, without verdicts."""
+    return [
+        RunComparison(one.name, other.name, IN_DISTRIBUTION, *compared)
+        for one, other in combinations(rows, 2)
+        if (compared := _compared_rows(one, other, IN_DISTRIBUTION))
+    ]
+
+
 def _with_verdicts(found: Sequence[RunComparison], margin: float) -> list[RunComparison]:
     """Return comparisons with verdicts on success, and separately on the course of episodes."""
     verdicts = concluded({number: each.found for number, each in enumerate(found)}, margin)

@@ -20,7 +20,7 @@ from vla.data.index import listed
 from vla.io.files import write_text
 from vla.reports.comparison import CASE, RunComparison, course_rows, remarks
 from vla.reports.conditions import Courses, comparison_texts, course_head, course_names, course_texts
-from vla.reports.posteriors import draw_posteriors
+from vla.reports.posteriors import Outcome, draw_posteriors
 from vla.reports.style import BLUE, GREEN, GREY, RED, Interval
 from vla.reports.training_curves import colours, draw_run, draw_runs
 from vla.rollouts.motion import AMOUNTS
@@ -93,14 +93,18 @@ def write_comparison(runs: Mapping[str, Run], compared: Sequence[RunComparison],
         )
         for (name, run), colour in zip(runs.items(), colours(len(runs)), strict=True)
     ]
-    reports = {name: run.reports[IN_DISTRIBUTION] for name, run in runs.items() if run.reports}
+    outcomes = {
+        line.words[0]: Outcome(report.successes, report.episodes, line.intervals[IN_DISTRIBUTION], line.colour)
+        for line, run in zip(lines, runs.values(), strict=True)
+        if (report := run.reports.get(IN_DISTRIBUTION))
+    }
     return _write(
         target / COMPARISON,
         "comparison.html",
         title=f"{len(runs)} runs" if len(runs) > 1 else next(iter(runs)),
         lines=lines,
         heads=(["run"], ["policy", "parameters [M]", "action [ms]", "steps", "time"], ""),
-        posteriors=draw_posteriors(reports, compared, colours(len(runs))) if len(reports) == len(runs) else None,
+        posteriors=draw_posteriors(outcomes, compared) if len(outcomes) == len(runs) else None,
         curves=draw_runs({name: run.metrics for name, run in runs.items()}),
         pairs=[(each, comparison_texts(each.found)) for each in compared],
         remarks=remarks(runs, compared),
@@ -119,8 +123,9 @@ def write_sweep(
     lines: Sequence[TableRow],
     cells: Sequence[Run],
     compared: Sequence[RunComparison],
+    posteriors: str | None,
 ) -> Path:
-    """Write the page of a sweep with its tables, plot and training curves, and return its path.
+    """Write the page of a sweep with its tables, plots and training curves, and return its path.
 
     Args:
         folder: of the sweep.
@@ -128,6 +133,7 @@ def write_sweep(
         lines: rows of the table; their links are named by cells.
         cells: of the sweep.
         compared: rows with the first one.
+        posteriors: figure of the rows' success, SVG.
     """
     runs = {cell.folder.name: cell for cell in cells}
     captions = {cell: f"{cell}: {' '.join(line.words)}" for line in lines for cell in line.links}
@@ -138,6 +144,7 @@ def write_sweep(
         title=f"Sweep {folder.resolve().name}",
         lines=lines,
         heads=(choices, ["each seed [%]", "parameters [M]", "action [ms]"], "cells"),
+        posteriors=posteriors,
         compared=[(each, comparison_texts(each.found)) for each in compared],
         course=_course(course_rows(compared)),
         case=("row", "minus", "condition"),

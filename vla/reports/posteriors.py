@@ -1,56 +1,62 @@
-"""Success of several runs as violins of its posterior distribution, with letters for what their differences decide."""
+"""Success of several policies as violins of its posterior distribution, and letters that tell which of them differ."""
 
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from string import ascii_lowercase
+from typing import NamedTuple
 
 import numpy as np
 from matplotlib.figure import Figure
 
 from vla.reports.comparison import RunComparison
-from vla.reports.style import as_svg, svg_style
+from vla.reports.style import Interval, as_svg, svg_style
 from vla.rollouts.comparison import concluded
-from vla.rollouts.results import Report
 from vla.rollouts.sequential import LEVEL
 from vla.spec import IN_DISTRIBUTION
 
-FEWEST, MOST = 3, len(ascii_lowercase)  # runs in one figure
+FEWEST, MOST = 3, len(ascii_lowercase)  # policies in one figure
 
 
-def draw_posteriors(
-    reports: Mapping[str, Report], compared: Sequence[RunComparison], colours: Sequence[str]
-) -> str | None:
-    """Draw the success of the runs, the highest first, as SVG; None if they are few or were not all compared.
+class Outcome(NamedTuple):
+    """Success of a policy under one condition."""
+
+    successes: float
+    episodes: float  # independent ones, see `effective_episodes`
+    interval: Interval
+    colour: str
+
+
+def draw_posteriors(outcomes: Mapping[str, Outcome], compared: Sequence[RunComparison]) -> str | None:
+    """Draw the success of policies, the highest first, as SVG; None if they are few or were not all compared.
 
     A violin is the posterior distribution of a success rate after a uniform prior, Beta(1 + successes, 1 + failures).
 
     Args:
-        reports: by run.
-        compared: all comparisons of the runs.
-        colours: of the runs.
+        outcomes: by name.
+        compared: comparisons of all pairs of names, among others.
     """
     found = {(each.one, each.other): each.found for each in compared if each.condition == IN_DISTRIBUTION}
-    if not FEWEST <= len(reports) <= MOST or len(found) < len(reports) * (len(reports) - 1) / 2:
+    if not FEWEST <= len(outcomes) <= MOST or len(found) < len(outcomes) * (len(outcomes) - 1) / 2:
         return None
     from scipy.stats import beta  # the import takes a second
 
-    colour_of = dict(zip(reports, colours, strict=True))
-    ordered = sorted(reports, key=lambda name: -reports[name].success)
+    ordered = sorted(outcomes, key=lambda name: -outcomes[name].interval[0])
     apart = [pair for pair, each in concluded(found, None).items() if (each.p_holm or 0) <= LEVEL]
     letters = compact_letters(ordered, apart)
     with svg_style("posteriors"):
         figure = Figure(figsize=(9, 0.6 + 0.45 * len(ordered)), layout="constrained")
         axes = figure.add_subplot()
         for row, name in enumerate(ordered):
-            report = reports[name]
-            posterior = beta(1 + report.successes, 1 + report.episodes - report.successes)
+            outcome = outcomes[name]
+            posterior = beta(1 + outcome.successes, 1 + outcome.episodes - outcome.successes)
             rates = posterior.ppf(np.linspace(0.0005, 0.9995, 200))
             reach = 0.42 * posterior.pdf(rates) / posterior.pdf(rates).max()
-            colour = colour_of[name]
+            colour = outcome.colour
             axes.fill_between(rates, row - reach, row + reach, color=colour, alpha=0.45, linewidth=0)
-            axes.plot(report.interval, [row, row], color=colour, linewidth=1.2)
-            axes.plot(report.success, row, "o", color=colour, markersize=5, clip_on=False)
+            success, *bounds = outcome.interval
+            axes.plot(bounds, [row, row], color=colour, linewidth=1.2)
+            axes.plot(success, row, "o", color=colour, markersize=5, clip_on=False)
             axes.annotate(letters[name], (1.02, row), xycoords=axes.get_yaxis_transform(), va="center", fontsize=11)
         axes.set_yticks(range(len(ordered)), ordered)
         axes.set_ylim(len(ordered) - 0.4, -0.6)

@@ -9,13 +9,16 @@ from urllib.parse import quote
 
 from vla.config.differences import at
 from vla.io.files import atomic_path, warn_on_error, write_text
-from vla.reports.comparison import RunComparison, compare_rows
+from vla.reports.comparison import RunComparison, compare_all_rows, compare_rows
 from vla.reports.conditions import comparison_texts
 from vla.reports.html import ABSENT, SWEEP, TableRow, write_sweep
+from vla.reports.posteriors import FEWEST, MOST, Outcome, draw_posteriors
 from vla.reports.style import markdown_table
 from vla.reports.sweep_plot import plot
+from vla.rollouts.statistics import effective_episodes
 from vla.runs.folder import PAGE
 from vla.runs.sweep import SweepRow, conditions_of, read_rows
+from vla.spec import IN_DISTRIBUTION
 
 
 def tabulate(folder: Path) -> list[SweepRow]:
@@ -79,8 +82,20 @@ def _write_page(rows: list[SweepRow], compared: Sequence[RunComparison], folder:
         )
         for row in rows
     ]
+    cells = [run for row in rows for run in row.runs]
     with warn_on_error(folder / SWEEP):
-        write_sweep(folder, list(rows[0].choices), lines, [run for row in rows for run in row.runs], compared)
+        write_sweep(folder, list(rows[0].choices), lines, cells, compared, _draw_posteriors(rows))
+
+
+def _draw_posteriors(rows: list[SweepRow]) -> str | None:
+    """Draw the success of the rows in the colours of the plot; see `draw_posteriors`."""
+    if not FEWEST <= len(rows) <= MOST:
+        return None
+    outcomes = {
+        row.name: Outcome(*effective_episodes(row.played[IN_DISTRIBUTION]), row.interval(IN_DISTRIBUTION), f"C{number}")
+        for number, row in enumerate(rows)
+    }
+    return draw_posteriors(outcomes, compare_all_rows(rows))
 
 
 def _write_csv(rows: list[SweepRow], path: Path) -> None:
