@@ -161,6 +161,20 @@ def test_the_fast_renderer_draws_what_mujocos_does() -> None:
     mujocos.close()
 
 
+def test_the_experiment_draws_what_lerobots_images_show() -> None:
+    chosen = experiment("experiment=metaworld", "task.tasks=[basketball,soccer]")
+    changes = experiment("evaluate=lerobot")["evaluate"]["conditions"]["lerobot"]
+    ours, theirs = chosen.make_environment()(), chosen.make_environment(changes)()
+    for seed in (0, 1):
+        one, other = (played(made, seed, 10)[-1].rgb for made in (ours, theirs))
+        for camera in ("corner2", "hand"):
+            apart = np.abs(one[camera].astype(int) - other[camera])
+            # Without the shadows, they are 11 apart.
+            assert apart.mean() < 4 and (apart > 40).mean() < 0.01
+    ours.close()
+    theirs.close()
+
+
 def lerobots_picture(task: str, seed: int) -> tuple[Array, Array]:
     """Its picture (480, 480, 3) after one step, drawn as it does, and the hand's position then."""
     classes = package.metaworld().ALL_V3_ENVIRONMENTS
