@@ -165,6 +165,7 @@ def test_the_experiment_draws_what_lerobots_images_show() -> None:
     chosen = experiment("experiment=metaworld", "task.tasks=[basketball,soccer]")
     changes = experiment("evaluate=lerobot")["evaluate"]["conditions"]["lerobot"]
     ours, theirs = chosen.make_environment()(), chosen.make_environment(changes)()
+    assert isinstance(ours, MetaWorld) and isinstance(theirs, MetaWorld)
     for seed in (0, 1):
         one, other = (played(made, seed, 10)[-1].rgb for made in (ours, theirs))
         for camera in ("corner2", "hand"):
