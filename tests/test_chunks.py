@@ -91,6 +91,19 @@ def test_without_weight_there_is_no_auxiliary_head(make: Callable[..., ChunkMode
     assert losses["loss"] == losses["action_loss"] and "truth_loss" not in losses
 
 
+@pytest.mark.parametrize("make", [make_bc, *MODELS.values()], ids=["bc", *MODELS])
+def test_without_proprioception_the_robot_state_does_not_matter(make: Callable[..., OneFrameModel]) -> None:
+    seeing = make()
+    batch = with_text(seeing, make_batch(1, seeing.chunk))
+    other = {**batch, "state": batch["state"].flip(0)}
+    seeing.loss(batch)  # gathers statistics
+    assert not torch.allclose(seeing.eval().predict(batch).actions, seeing.predict(other).actions)
+    model = make(proprioception=False)
+    assert model.loss(batch)["loss"].isfinite()
+    assert torch.equal(model.eval().predict(batch).actions, model.predict(other).actions)
+    assert not any("state" in name or "proprioception" in name for name in model.state_dict())
+
+
 @every_model
 def test_labels_that_are_not_valid_count_for_nothing(make: Callable[..., ChunkModel]) -> None:
     model = make()

@@ -175,7 +175,7 @@ def test_a_seed_that_brings_down_every_worker_is_reported(tmp_path: Path) -> Non
 def test_a_worker_with_other_versions_is_refused(
     two: DaskCluster, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("vla.parallel.dask._versions", lambda: {"numpy": "1.0", "mujoco": "1.0"})
+    monkeypatch.setattr("vla.parallel.dask.installed_versions", lambda: {"numpy": "1.0", "mujoco": "1.0"})
     # The world of the toy does not load MuJoCo.
     with pytest.raises(ValueError, match=r" has numpy \S+, not 1\.0: install the same versions everywhere"):
         gather(tmp_path / "episodes", two)

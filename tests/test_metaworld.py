@@ -149,6 +149,7 @@ def test_sentences_are_lerobots_and_can_be_told_apart() -> None:
     with environment.blind():
         assert environment.reset(0).instruction == "Push the puck back to a goal"
     assert world("task.tasks=mt10").tasks == package.tasks_of("mt10") and len(package.tasks_of("mt10")) == 10
+    assert world("task.tasks=mt1").tasks == ("reach",)
 
 
 def test_the_fast_renderer_draws_what_mujocos_does() -> None:

@@ -6,12 +6,10 @@ In a world of recordings there is no success to measure, only errors of actions:
 from __future__ import annotations
 
 import logging
-import time
 from collections.abc import Callable, Sequence
-from contextlib import nullcontext, suppress
+from contextlib import nullcontext
 from dataclasses import asdict, replace
 from functools import partial
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +20,7 @@ from vla.config.check import NEAREST, Job, conditions, with_changes
 from vla.config.experiment import Experiment
 from vla.data.episodes import EpisodeStore
 from vla.io.files import warn_on_error, writing
+from vla.io.versions import installed_versions
 from vla.policy import costs
 from vla.reports.conditions import Courses, conditions_table, course_table, plot_conditions
 from vla.reports.evaluation import plot_report, write_report
@@ -44,10 +43,9 @@ from vla.runs.folder import (
     save_config,
     wall_time,
 )
+from vla.runs.played import Played
 from vla.runs.resume import cached_success, training_lock
 from vla.spec import IN_DISTRIBUTION, Multitask
-
-LIBRARIES = ("vla", "mujoco", "dm-control", "metaworld", "gymnasium", "numpy", "torch")
 
 log = logging.getLogger(__name__)
 
@@ -131,15 +129,15 @@ def evaluate_trained(experiment: Experiment, checkpoint: Path, rounds: Sequence[
 
 def _evaluated(experiment: Experiment, checkpoint: Path | None, rounds: Sequence[Round] = ()) -> float:
     """Play the episodes, write the reports, and return the success rate; print it even if writing fails."""
-    started, output = time.monotonic(), experiment.output
-    statements = _statements(experiment)
-    reports = _play(experiment, checkpoint, statements)
-    report = reports[IN_DISTRIBUTION]
-    try:
-        with writing(output / REPORT):
-            _write(experiment, checkpoint, reports, statements, rounds, started)
-    finally:
-        print("\n".join([*(each.say(report) for each in statements), str(report)]))
+    output, statements = experiment.output, _statements(experiment)
+    with Played(output, checkpoint, experiment.config, installed_versions()) as played:
+        reports = _play(experiment, checkpoint, statements, played)
+        report = reports[IN_DISTRIBUTION]
+        try:
+            with writing(output / REPORT):
+                _write(experiment, checkpoint, reports, statements, rounds, played.seconds)
+        finally:
+            print("\n".join([*(each.say(report) for each in statements), str(report)]))
     # Conditions that are equal to the training condition share its report.
     different = {id(each): each for each in reports.values()}.values()
     errors = [error for each in different for error in each.errors]
@@ -192,11 +190,14 @@ def _networks(experiment: Experiment) -> dict[str, Network]:
     return {name: build(node, kind) for name, node in experiment["evaluate"]["networks"].items()}
 
 
-def _play(experiment: Experiment, checkpoint: Path | None, statements: Sequence[Statement]) -> dict[str, Report]:
+def _play(
+    experiment: Experiment, checkpoint: Path | None, statements: Sequence[Statement], kept: Played
+) -> dict[str, Report]:
     """Return condition → report on the same seeds; only the first, the training condition, is recorded.
 
-    Without a checkpoint the agent of the config acts. With `evaluate.until` the first condition stops when all
-    statements are clear. Every other one has the seeds of the first, and stops when its difference from it is clear.
+    Episodes in `kept` are not played again; others are added to it. Without a checkpoint the agent of the config acts.
+    With `evaluate.until` the first condition stops when all statements are clear. Every other one has the seeds of the
+    first, and stops when its difference from it is clear.
     """
     asked, task = experiment["evaluate"], experiment["task"]
     seeds: Sequence[int] = range(asked["seed"], asked["seed"] + asked["episodes"])
@@ -220,7 +221,11 @@ def _play(experiment: Experiment, checkpoint: Path | None, statements: Sequence[
     ) -> Report:
         environment, limit = experiment.make_environment(changes), asked["recordings"]
         until = until if asked["until"] else None
-        report = evaluate(environment, agent, recorder, seeds, cluster, name, needs, until, limit, turns)
+        report = evaluate(
+            *(environment, agent, recorder, seeds, cluster, name, needs, until, limit, turns),
+            known=kept.of(name),
+            keep=partial(kept.add, name),
+        )
         return replace(report, tiers=task.get("tiers") or {})  # of worlds that have them
 
     world = experiment.world() if asked["until"] else None
@@ -256,13 +261,13 @@ def _write(
     reports: dict[str, Report],
     statements: Sequence[Statement],
     rounds: Sequence[Round],
-    started: float,
+    seconds: float,
 ) -> None:
-    """Write all results of an evaluation that started at `started` [s]."""
+    """Write all results of an evaluation that took `seconds`."""
     output, report = experiment.output, reports[IN_DISTRIBUTION]
     others = {name: each for name, each in reports.items() if name != IN_DISTRIBUTION}
     compared, courses = compare_conditions(reports, experiment["evaluate"]["margin"]), compare_courses(reports)
-    facts = _facts(experiment, checkpoint, rounds, time.monotonic() - started)
+    facts = _facts(experiment, checkpoint, rounds, seconds)
     facts["statements"] = [each.say(report) for each in statements]
     save_config(output, experiment.config, experiment.changes)
     recording = output / RECORDING
@@ -291,7 +296,7 @@ def _write(
 
 def _facts(experiment: Experiment, checkpoint: Path | None, rounds: Sequence[Round], seconds: float) -> dict[str, Any]:
     """Return what a report says of the agent, given the duration of its evaluation [s]."""
-    chosen = {**experiment["chosen"], "versions": _versions()}
+    chosen = {**experiment["chosen"], "versions": installed_versions()}
     if checkpoint is None:
         return {**chosen, "model": chosen["agent"], "wall_time_s": seconds}
     return {
@@ -300,15 +305,6 @@ def _facts(experiment: Experiment, checkpoint: Path | None, rounds: Sequence[Rou
         "wall_time_s": wall_time(checkpoint, seconds + _before_last_training(rounds)),
         "rounds": [asdict(one) for one in rounds],
     }
-
-
-def _versions() -> dict[str, str]:
-    """Return library → version of those that the outcome of an episode depends on."""
-    found = {}
-    for name in LIBRARIES:
-        with suppress(PackageNotFoundError):
-            found[name] = version(name)
-    return found
 
 
 def _before_last_training(rounds: Sequence[Round]) -> float:

@@ -20,7 +20,7 @@ class CVAEEncoder(nn.Module):
     """Encoder of the conditional VAE: robot state and action chunk → normal distribution of the latent.
 
     Args:
-        robot_state_width: length of the robot state.
+        robot_state_width: length of the robot state; 0 omits it.
         components: D.
         chunk: k.
         width: E.
@@ -33,20 +33,24 @@ class CVAEEncoder(nn.Module):
     ) -> None:
         super().__init__()
         self.start = nn.Embedding(1, width)
-        self.robot_state = nn.Linear(robot_state_width, width)
+        if robot_state_width:
+            self.robot_state = nn.Linear(robot_state_width, width)
         self.action = nn.Linear(components, width)
-        self.positions = nn.Embedding(2 + chunk, width)
+        self.positions = nn.Embedding(1 + (robot_state_width > 0) + chunk, width)
         self.encoder = transformer_encoder(width, layers, heads)
         self.head = nn.Linear(width, 2 * latent)
 
-    def forward(self, robot_state: Tensor, action: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
+    def forward(self, robot_state: list[Tensor], action: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
         """Return mean and log variance, (B, Z) each, of the latent.
 
-        The inputs are (B, robot_state_width) states, (B, k, D) scaled actions and their (B, k) bool mask.
+        The inputs are the (B, robot_state_width) state, if it is used, (B, k, D) scaled actions and their (B, k) bool
+        mask.
         """
         start = self.start.weight.expand(len(action), 1, -1)
-        tokens = torch.cat([start, self.robot_state(robot_state).unsqueeze(1), self.action(action)], 1)  # (B, 2 + k, E)
-        padding = torch.cat([valid.new_zeros(len(valid), 2), ~valid], 1)
+        states = [self.robot_state(each).unsqueeze(1) for each in robot_state]
+        before = torch.cat([start, *states], 1)
+        tokens = torch.cat([before, self.action(action)], 1)
+        padding = torch.cat([valid.new_zeros(before.shape[:2]), ~valid], 1)
         hidden = self.encoder(tokens + self.positions.weight, src_key_padding_mask=padding)[:, 0]
         mean, log_variance = self.head(hidden).chunk(2, -1)
         return mean, log_variance
@@ -76,7 +80,7 @@ class ACT(ChunkModel):
         self.kl_weight, self.latent = kl_weight, latent
         if kl_weight > 0:
             self.cvae_encoder = CVAEEncoder(
-                self.robot_state_width, components, self.chunk, width, layers, heads, latent
+                sum(self.state_widths), components, self.chunk, width, layers, heads, latent
             )
             self.latent_token = nn.Linear(latent, width)
         self.token_types = nn.Embedding(1 + len(self.tokens) + (kl_weight > 0), width)  # type embeddings
@@ -90,7 +94,7 @@ class ACT(ChunkModel):
 
         In training also mean and log_variance: (B, Z) each; with an auxiliary head truth: (B, 1, S), normalised.
         """
-        robot_state = self.normalized_state(batch)
+        robot_state = self.state_features(batch)
         output = self.encode_context(batch, robot_state)
         context = output.pop("context")
         if self.kl_weight > 0:

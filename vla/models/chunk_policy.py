@@ -18,8 +18,8 @@ class ChunkModel(OneFrameModel):
 
     Actions are scaled to -1 … 1 between the bounds of the tokenizer, and are not tokenized.
 
-    Context tokens: one fused token, then one per camera, one for the robot state, one for the instruction. The
-    auxiliary head uses the features of the fused token.
+    Context tokens: one fused token, then one per camera, one for the robot state if it is used, one for the
+    instruction. The auxiliary head uses the features of the fused token.
     """
 
     TRUTH_INPUT = 2
@@ -28,15 +28,18 @@ class ChunkModel(OneFrameModel):
     def __init__(self, **inherited: Inherited) -> None:
         super().__init__(**inherited)
         hidden = self.TRUTH_INPUT * self.width
-        widths = [*self.image_widths, self.robot_state_width, self.text.width]
+        widths = [*self.image_widths, *self.state_widths, self.text.width]
         self.tokens = nn.ModuleList(nn.Linear(features, self.width) for features in widths)
         self.fuse = mlp(sum(widths), hidden)
         self.fused_token = nn.Linear(hidden, self.width)
 
-    def encode_context(self, batch: Batch, robot_state: Tensor) -> dict[str, Tensor]:
-        """Return context: (B, M, E) of the newest frame; with an auxiliary head, truth: (B, 1, S), normalised."""
+    def encode_context(self, batch: Batch, robot_state: list[Tensor]) -> dict[str, Tensor]:
+        """Return context: (B, M, E) of the newest frame; with an auxiliary head, truth: (B, 1, S), normalised.
+
+        `robot_state` is the result of `state_features`.
+        """
         text = self.text(batch["text"])  # (B, text_width)
-        features = [*self.image_features(batch, text), robot_state, text]
+        features = [*self.image_features(batch, text), *robot_state, text]
         hidden = self.fuse(torch.cat(features, -1))  # (B, 2 E)
         others = [linear(feature) for linear, feature in zip(self.tokens, features, strict=True)]
         context = torch.stack([self.fused_token(hidden), *others], 1)

@@ -111,7 +111,7 @@ class DenoisingModel(ChunkModel):
 
     def forward(self, batch: Batch) -> dict[str, Tensor]:
         """Return context: (B, M, E); with an auxiliary head, truth: (B, 1, S), normalised."""
-        return self.encode_context(batch, self.normalized_state(batch))
+        return self.encode_context(batch, self.state_features(batch))
 
     def action_loss(self, output: dict[str, Tensor], batch: Batch) -> dict[str, Tensor]:
         """Return the mean squared error of the denoiser on noisy copies of the chunks."""

@@ -21,10 +21,16 @@ class OneFrameModel(Model):
         image: factory of the image encoder, called with `text_width` once per camera.
         keypoints: keypoints per camera.
         shift: largest random shift of the training images, vertical and horizontal [1/256 of the image height].
+        proprioception: use the robot state.
     """
 
     def __init__(
-        self, image: Callable[..., ImageEncoder], keypoints: Width, shift: Shift, **inherited: Inherited
+        self,
+        image: Callable[..., ImageEncoder],
+        keypoints: Width,
+        shift: Shift,
+        proprioception: bool = True,  # not in the config of older checkpoints
+        **inherited: Inherited,
     ) -> None:
         super().__init__(**inherited)
         self.shift = RandomShift(*shift)
@@ -33,7 +39,8 @@ class OneFrameModel(Model):
         keypoint_heads = [Keypoints(encoder.channels, keypoints) for encoder in encoders]
         self.keypoints = nn.ModuleList(keypoint_heads)
         self.image_widths = [keypoints * head.width for head in keypoint_heads]  # C of each camera
-        self.proprioception = RunningNormalizer(self.robot_state_width)
+        self.proprioception = RunningNormalizer(self.robot_state_width) if proprioception else None
+        self.state_widths = [self.robot_state_width] if proprioception else []
 
     def image_features(self, batch: Batch, text: Tensor) -> list[Tensor]:
         """Return the (B, C) keypoint features of every camera, given the (B, text_width) instruction."""
@@ -42,6 +49,8 @@ class OneFrameModel(Model):
             features.append(keypoints(encoder(pixels(self.shift(batch["rgb"][camera][:, -1:])), text)).flatten(1))
         return features
 
-    def normalized_state(self, batch: Batch) -> Tensor:
-        """Return the (B, robot_state_width) normalised robot state."""
-        return self.proprioception(self.robot_state(batch)[:, -1:], batch["present"][:, -1:]).squeeze(1)
+    def state_features(self, batch: Batch) -> list[Tensor]:
+        """Return the (B, robot_state_width) normalised robot state, or nothing without proprioception."""
+        if self.proprioception is None:
+            return []
+        return [self.proprioception(self.robot_state(batch)[:, -1:], batch["present"][:, -1:]).squeeze(1)]

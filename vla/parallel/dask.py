@@ -12,7 +12,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import CancelledError
 from contextlib import contextmanager
 from functools import partial
-from importlib.metadata import distributions, packages_distributions, version
+from importlib.metadata import packages_distributions, version
 from importlib.util import find_spec
 from pathlib import Path
 from queue import Empty, SimpleQueue
@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Any
 from uuid import uuid4
 
 from vla.io.types import Positive
+from vla.io.versions import installed_versions, normal_name
 from vla.parallel.pool import Crashed, Pool, WorkersLost
 from vla.parallel.processes import Worker, WorkerFactory, one_thread
 
@@ -78,7 +79,7 @@ class DaskCluster:
                     f"the scheduler at {self.address} lacks a package ({error}): install vla[cluster] there and on the "
                     "machines of its workers"
                 ) from error
-            yield _DaskPool(client, partial(_make_checked, make, _versions(), tuple(needs)), self)
+            yield _DaskPool(client, partial(_make_checked, make, installed_versions(), tuple(needs)), self)
 
 
 async def _ping(address: str) -> None:
@@ -189,7 +190,7 @@ def _make_checked(make: WorkerFactory, versions: dict[str, str], needs: Sequence
         return make()
     finally:
         loaded = {
-            _normal(name)
+            normal_name(name)
             for package, names in packages_distributions().items()
             if package in sys.modules
             for name in names
@@ -200,21 +201,3 @@ def _make_checked(make: WorkerFactory, versions: dict[str, str], needs: Sequence
                     f"{gethostname()} has {name} {version(name)}, not {versions[name]}: install the same versions "
                     "everywhere"
                 )
-
-
-def _versions() -> dict[str, str]:
-    """Return name → version of the installed dependencies of vla and of packages made for it."""
-    installed: dict[str, Any] = {}
-    for each in distributions():
-        if each.name:  # an interrupted installation leaves nameless ones; of several copies the first one is imported
-            installed.setdefault(_normal(each.name), each)
-    needed = {
-        name: [_normal(re.split(r"[^\w.-]", text)[0]) for text in each.requires or ()]
-        for name, each in installed.items()
-    }
-    ours = [names for name, names in needed.items() if name == "vla" or "vla" in names]
-    return {name: installed[name].version for names in ours for name in names if name in installed}
-
-
-def _normal(name: str) -> str:
-    return re.sub(r"[-_.]+", "-", name).lower()

@@ -8,7 +8,7 @@ from __future__ import annotations
 import json
 import logging
 import traceback
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict
 from functools import partial
@@ -38,6 +38,8 @@ def evaluate(
     until: Callable[[Report], bool] | None = None,
     recordings: int | None = None,
     turns: int = 1,
+    known: Mapping[int, Result] | None = None,
+    keep: Callable[[Result], None] | None = None,
 ) -> Report:
     """Play the episodes of the seeds; `name` is the label of the progress bar.
 
@@ -51,6 +53,9 @@ def evaluate(
     `turns`, the number of tasks if seeds cycle through tasks. Results of later seeds are discarded, so that the report
     does not depend on the number of workers.
 
+    Episodes whose seeds are in `known`, seed → result, are not played again. `keep` is called with every other result
+    as soon as there is one, unless it is an error.
+
     Raises:
         ValueError: there are no seeds, seeds are in the range of collection, or the cluster raises one.
     """
@@ -59,29 +64,41 @@ def evaluate(
     make = partial(_RolloutWorker, make_environment, make_agent, None if recordings == 0 else make_recorder)
     at_once = recordings is None
     columns = (TextColumn(name), BarColumn(), MofNCompleteColumn(), TextColumn("{task.fields[note]}"))
-    results: dict[int, Result] = {}
-    counted, clear = 0, False
+    results = {seed: known[seed] for seed in seeds if seed in known} if known else {}
+    counted = 0
+
+    def reported() -> Report:
+        return Report(tuple(results[seed] for seed in seeds[:counted]), anytime=until is not None)
+
+    def clear() -> bool:
+        """Count the results that no missing one precedes; return whether they suffice."""
+        nonlocal counted
+        while counted < len(seeds) and seeds[counted] in results:
+            counted += 1
+            if until is not None and counted % turns == 0 and until(reported()):
+                return True
+        return False
+
     with cluster.pool(make, needs) as pool, Progress(*columns, TimeRemainingColumn()) as bar:
-        task = bar.add_task("", total=len(seeds), note="")
-        seed_of = {pool.submit((seed, at_once)): seed for seed in seeds}
+        task = bar.add_task("", total=len(seeds), completed=len(results), note="")
+        missing = [] if clear() else [seed for seed in seeds if seed not in results]
+        seed_of = {pool.submit((seed, at_once)): seed for seed in missing}
         for future in pool.as_completed(seed_of):
             seed = seed_of[future]
             try:
                 results[seed] = future.result()
             except Crashed as crash:
                 results[seed] = Result(seed, ERROR, error=str(crash))
+            if keep is not None and results[seed].outcome != ERROR:
+                keep(results[seed])
             so_far = Report(tuple(results.values()))
             errors = f", {len(so_far.errors)} errors" if so_far.errors else ""
             bar.update(task, advance=1, note=f"success {100 * so_far.success:.0f} %{errors}")
-            while counted < len(seeds) and seeds[counted] in results and not clear:
-                counted += 1
-                if until is not None and counted % turns == 0:
-                    clear = until(Report(tuple(results[seed] for seed in seeds[:counted]), anytime=True))
-            if clear:
+            if clear():
                 for later in seed_of:
                     later.cancel()
                 break
-        report = Report(tuple(results[seed] for seed in seeds[:counted]), anytime=until is not None)
+        report = reported()
         if make_recorder is not None and recordings:
             _record(pool, _kept(report, recordings))
     return report

@@ -45,7 +45,7 @@ class MetaWorld(Blindable):
 
     def __init__(
         self,
-        tasks: Literal["mt10", "mt25", "mt50"] | Names,
+        tasks: Literal["mt1", "mt10", "mt25", "mt50"] | Names,
         sentences: Mapping[str, Text],
         tiers: Mapping[str, Names],
         renderer: RendererFactory,

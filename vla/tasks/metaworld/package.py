@@ -43,7 +43,12 @@ def _reset_welds(simulator: Any) -> None:
 
 
 def tasks_of(benchmark: str) -> tuple[str, ...]:
-    """Return the names of the tasks of a benchmark, "mt10", "mt25" or "mt50", in the package's order."""
+    """Return the names of the tasks of a benchmark, "mt1", "mt10", "mt25" or "mt50", in the package's order.
+
+    MT1 is any single task; by this name it is the one of Meta-World's own example.
+    """
+    if benchmark == "mt1":
+        return ("reach",)
     return tuple(name.removesuffix(VERSION) for name in getattr(metaworld(), f"{benchmark.upper()}_V3"))
 
 
