@@ -81,7 +81,7 @@ def played(played_once: Path, tmp_path: Path) -> Path:
 
 def test_a_report_without_room_costs_no_episode(played: Path, whole: dict[str, Any]) -> None:
     done = here(played, *COMMAND, "output=run")
-    assert f"{2 * EPISODES} episodes are already played" in done.stdout + done.stderr
+    assert f"already played, {2 * EPISODES} in all" in done.stdout + done.stderr
     assert reported(played / "run") == whole
     assert not (played / "run" / PLAYED).exists()
 
@@ -92,9 +92,9 @@ def test_a_disk_that_fills_up_costs_only_the_episode_that_found_no_room(played: 
     with files_of_at_most(sum(map(len, lines[: 1 + EPISODES + 2])) + 100):
         failed = here(played, *COMMAND, "output=run", ok=False)
     assert f"{PLAYED} cannot be written (File too large)" in failed.stderr
-    assert f"{EPISODES + 2} episodes are kept in" in failed.stdout + failed.stderr
+    assert f"keeps what was played, {EPISODES + 2} in all" in failed.stdout + failed.stderr
     done = here(played, *COMMAND, "output=run")
-    assert f"{EPISODES + 2} episodes are already played" in done.stdout + done.stderr
+    assert f"already played, {EPISODES + 2} in all" in done.stdout + done.stderr
     assert reported(played / "run") == whole
 
 

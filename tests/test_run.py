@@ -246,7 +246,7 @@ def test_a_success_rate_is_printed_even_where_the_report_cannot_be_written(home:
     assert done.stdout.strip().splitlines()[-1].startswith("success ")
     errors = [line for line in done.stderr.splitlines() if line.startswith("error: ")]
     assert len(errors) == 1 and "blocked/report.json cannot be written (" in errors[0]
-    names = ["changes.yaml", "config.yaml", "report.json", "report.png"]
+    names = ["changes.yaml", "config.yaml", "played.jsonl", "report.json", "report.png"]
     assert sorted(path.name for path in (home / "blocked").iterdir()) == names
 
 

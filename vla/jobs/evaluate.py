@@ -129,15 +129,17 @@ def evaluate_trained(experiment: Experiment, checkpoint: Path, rounds: Sequence[
 
 def _evaluated(experiment: Experiment, checkpoint: Path | None, rounds: Sequence[Round] = ()) -> float:
     """Play the episodes, write the reports, and return the success rate; print it even if writing fails."""
-    output, statements = experiment.output, _statements(experiment)
-    with Played(output, checkpoint, experiment.config, installed_versions()) as played:
-        reports = _play(experiment, checkpoint, statements, played)
-        report = reports[IN_DISTRIBUTION]
-        try:
+    output, statements, result = experiment.output, _statements(experiment), list[str]()
+    try:
+        with Played(output, checkpoint, experiment.config, installed_versions()) as played:
+            reports = _play(experiment, checkpoint, statements, played)
+            report = reports[IN_DISTRIBUTION]
+            result += [*(each.say(report) for each in statements), str(report)]
             with writing(output / REPORT):
                 _write(experiment, checkpoint, reports, statements, rounds, played.seconds)
-        finally:
-            print("\n".join([*(each.say(report) for each in statements), str(report)]))
+    finally:
+        for line in result:  # last
+            print(line)
     # Conditions that are equal to the training condition share its report.
     different = {id(each): each for each in reports.values()}.values()
     errors = [error for each in different for error in each.errors]

@@ -79,7 +79,7 @@ class Played:
         for each in episodes:
             self.of(each.condition)[each.result.seed] = each.result
         if episodes:
-            log.info("%s: %d episodes are already played", self._path, len(self))
+            log.info("%s: already played, %d in all", self._path, len(self))
         write_text(self._path, "".join(map(_line, (evaluation, *episodes))))
 
     def __enter__(self) -> Played:
@@ -94,8 +94,8 @@ class Played:
             self._path.unlink(missing_ok=True)
         else:
             log.info(
-                "%d episodes are kept in %s: the same command with output=%s continues",
-                *(len(self), self._path, self._path.parent),
+                "%s keeps what was played, %d in all: the same command with output=%s continues",
+                *(self._path, len(self), self._path.parent),
             )
 
     def __len__(self) -> int:
