@@ -138,7 +138,7 @@ def _evaluated(experiment: Experiment, checkpoint: Path | None, rounds: Sequence
             with writing(output / REPORT):
                 _write(experiment, checkpoint, reports, statements, rounds, played.seconds)
     finally:
-        for line in result:  # last
+        for line in result:  # after whatever was logged, because scripts read the last line
             print(line)
     # Conditions that are equal to the training condition share its report.
     different = {id(each): each for each in reports.values()}.values()
@@ -223,10 +223,9 @@ def _play(
     ) -> Report:
         environment, limit = experiment.make_environment(changes), asked["recordings"]
         until = until if asked["until"] else None
+        known, keep = kept.of(name), partial(kept.add, name)
         report = evaluate(
-            *(environment, agent, recorder, seeds, cluster, name, needs, until, limit, turns),
-            known=kept.of(name),
-            keep=partial(kept.add, name),
+            environment, agent, recorder, seeds, cluster, name, needs, until, limit, turns, known=known, keep=keep
         )
         return replace(report, tiers=task.get("tiers") or {})  # of worlds that have them
 

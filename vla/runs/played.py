@@ -95,7 +95,9 @@ class Played:
         else:
             log.info(
                 "%s keeps what was played, %d in all: the same command with output=%s continues",
-                *(self._path, len(self), self._path.parent),
+                self._path,
+                len(self),
+                self._path.parent,
             )
 
     def __len__(self) -> int:
