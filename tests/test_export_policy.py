@@ -6,11 +6,13 @@ import json
 from collections.abc import Callable
 from copy import deepcopy
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from defaults import defaults_of
 from fake_batch import as_policy, make_bc, make_decoder, make_denoising, make_rt1
 from torch import Tensor
 from torch.export import ExportedProgram
@@ -21,6 +23,7 @@ from vla.models.decoder import Decoder
 from vla.models.diffusion import Diffusion
 from vla.models.model import Model
 from vla.models.rt1 import RT1
+from vla.models.text.known_words import KnownWords
 
 pytestmark = pytest.mark.usefixtures("faster_exports")
 
@@ -29,11 +32,12 @@ pytestmark = pytest.mark.usefixtures("faster_exports")
     "make",
     [
         lambda: make_bc(chunk=2),
+        lambda: make_bc(text=partial(KnownWords, **defaults_of("model/text/known_words"))),
         lambda: make_rt1(proprioception=True, layers=1),
         lambda: make_decoder(layers=1),
         lambda: make_denoising(Diffusion, layers=1, steps=2),
     ],
-    ids=["bc", "rt1 with kept tokens", "decoder", "diffusion"],
+    ids=["bc", "known words", "rt1 with kept tokens", "decoder", "diffusion"],
 )
 def test_the_programs_act_like_the_policy_for_any_instruction(make: Callable[[], Model], tmp_path: Path) -> None:
     from onnxruntime import InferenceSession

@@ -21,6 +21,7 @@ from vla.config.build import check_node
 from vla.models.text.both import Both
 from vla.models.text.colours import NamedColours, simplified
 from vla.models.text.huggingface import HuggingFace
+from vla.models.text.known_words import KnownWords, n_grams
 from vla.models.text.ngrams import NGrams
 from vla.models.text.tensor_cache import TensorCache
 from vla.tasks.tabletop.scene import COLOURS
@@ -98,13 +99,14 @@ def test_n_grams_of_many_goals_say_which_block_belongs_on_which_pad() -> None:
     cfg = composed("experiment=multitask")
     encoder = instantiate(cfg.model.text)(width=8)
 
-    def n_grams(phrasing: str, said: dict[str, str]) -> list[int]:
+    def hashes(phrasing: str, said: dict[str, str]) -> list[int]:
         turned = dict(block=said["other"], other=said["block"], pad=said["rest"], rest=said["pad"])
-        rows = encoder.tokenize([phrasing.format(put="put", **words) for words in (said, turned)])
+        tokens = encoder.tokenize([phrasing.format(put="put", **words) for words in (said, turned)])
+        rows = n_grams(tokens, encoder.words)
         return sorted(rows.flatten().tolist())
 
     for phrasing in cfg.task.goal.goals.pick_place_two.language.phrasings:
-        assert n_grams(phrasing, SAID) != n_grams(phrasing, {**SAID, "pad": SAID["rest"], "rest": SAID["pad"]})
+        assert hashes(phrasing, SAID) != hashes(phrasing, {**SAID, "pad": SAID["rest"], "rest": SAID["pad"]})
 
 
 def test_related_words_share_tokens() -> None:
@@ -132,6 +134,49 @@ def test_unknown_words_hardly_change_what_training_made_of_the_known_ones() -> N
         encoder.embedding.weight[known] *= 10  # as training does
         one, other = encoder(known[None]), encoder(new[None])
     assert torch.cosine_similarity(one, other).item() > 0.8
+
+
+def make_known_words(sentences: list[str], **changes: Any) -> KnownWords:
+    """An encoder that has heard some sentences in training."""
+    options = {"dropout": 0.0, "word_dropout": 0.0, **changes}
+    encoder = KnownWords(width=8, **defaults_of("model/text/known_words", **options))
+    encoder(encoder.tokenize(sentences))
+    return encoder.eval()
+
+
+def test_words_that_training_never_has_are_left_out() -> None:
+    encoder = make_known_words(["Put the red block on the pad", "lift it"])
+
+    def vector(sentence: str) -> torch.Tensor:
+        return encoder(encoder.tokenize(["any longer sentence of seven words altogether", sentence]))[1]
+
+    torch.testing.assert_close(vector("put the red brick on the round pad"), vector("put the red on the pad!"))
+    assert not torch.allclose(vector("put the red on the pad"), vector("put the red block on the pad"))
+    torch.testing.assert_close(vector("crimson brick"), vector(""))
+    assert not torch.allclose(vector("block red"), vector("red block"))
+
+
+def test_known_words_are_part_of_a_checkpoint() -> None:
+    encoder, other = make_known_words(["lift the red block"]), make_known_words(["push it"])
+    tokens = encoder.tokenize(["lift the new block", "push it"])
+    assert not torch.equal(encoder(tokens), other(tokens))
+    other.load_state_dict(encoder.state_dict())
+    assert torch.equal(encoder(tokens), other(tokens))
+
+
+def test_known_words_take_names_of_colours_for_basic_terms_if_asked() -> None:
+    plain, knowing = (make_known_words(["the red block"], basic_colours=asked) for asked in (False, True))
+    assert torch.equal(knowing.tokenize(["the crimson block"]), plain.tokenize(["the red block"]))
+    assert not torch.equal(plain.tokenize(["the crimson block"]), plain.tokenize(["the red block"]))
+
+
+@pytest.mark.parametrize("kind", ["dropout", "word_dropout"])
+def test_sentences_go_without_a_share_of_their_words_in_training_only(kind: str) -> None:
+    encoder = make_known_words(SENTENCES, **{kind: 0.5}).train()
+    tokens = encoder.tokenize(SENTENCES[1:2])
+    assert not torch.equal(encoder(tokens), encoder(tokens))
+    encoder.eval()
+    assert torch.equal(encoder(tokens), encoder(tokens))
 
 
 @pytest.mark.parametrize("name", ["words", "characters"])
