@@ -15,12 +15,12 @@ from torch import Tensor, nn
 
 from vla.io.types import Rate
 from vla.models.text.colours import simplified
-from vla.models.text.ngrams import INITIAL_STD, PADDING, TextEncoder
+from vla.models.text.ngrams import PADDING, HashEmbedding
 
 PRIME, FACTOR = 2**31 - 1, 1_000_003  # of the polynomial hash of n-grams; its products fit into 64 bits
 
 
-class KnownWords(TextEncoder):
+class KnownWords(HashEmbedding):
     """Mean of learned embeddings of the hashed n-grams of the words that training has heard.
 
     Any other word is left out before n-grams are taken: "put the red brick on the pad" becomes "put the red on the
@@ -47,13 +47,8 @@ class KnownWords(TextEncoder):
         *,
         width: int,
     ) -> None:
-        super().__init__(width)
-        self.vocabulary, self.words, self.basic_colours = vocabulary, words, basic_colours
-        self.dropout, self.word_dropout = dropout, word_dropout
-        self.embedding = nn.Embedding(vocabulary, width, padding_idx=PADDING)
-        with torch.no_grad():
-            self.embedding.weight.mul_(INITIAL_STD)
-        self.norm = nn.LayerNorm(width)
+        super().__init__(vocabulary, dropout, width)
+        self.words, self.word_dropout, self.basic_colours = words, word_dropout, basic_colours
         self.register_buffer("heard", torch.zeros(vocabulary, dtype=torch.bool))
 
     def tokenize(self, sentences: list[str]) -> Tensor:
@@ -67,15 +62,12 @@ class KnownWords(TextEncoder):
         """Return (B, width) vectors for (B, W) tokens; 0 is ignored at any position."""
         rows = self._rows(tokens)
         if self.training:
-            self.heard.index_fill_(0, rows.flatten(), True)  # several processes: each its own, saved are the first's
+            self.heard.index_fill_(0, rows.flatten(), True)  # each process its own; those of the first are saved
             left_out = torch.rand(tokens.shape, device=tokens.device) < self.word_dropout
         else:
             left_out = ~self.heard[rows]
-        grams = self._rows(n_grams(_shifted_left(tokens.masked_fill(left_out, PADDING)), self.words))
-        if self.training and self.dropout:
-            grams = grams * (torch.rand(grams.shape, device=grams.device) >= self.dropout)
-        count = (grams != PADDING).sum(1, keepdim=True).clamp(min=1)
-        return self.norm(self.embedding(grams).sum(1) / count)
+        known = _shifted_left(tokens.masked_fill(left_out, PADDING))
+        return self.average(self._rows(n_grams(known, self.words)))
 
     def _rows(self, hashes: Tensor) -> Tensor:
         """Return the rows of the embedding for hashes."""

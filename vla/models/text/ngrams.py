@@ -43,7 +43,32 @@ class TextEncoder(nn.Module, ABC):
         """Return (B, width) vectors for the (B, L) output of `tokenize`."""
 
 
-class NGrams(TextEncoder):
+class HashEmbedding(TextEncoder):
+    """Base class of encoders with learned embeddings of hashed n-grams.
+
+    Args:
+        vocabulary: number of embeddings.
+        dropout: rate at which n-grams are dropped in training.
+        width: length of the sentence vector.
+    """
+
+    def __init__(self, vocabulary: int, dropout: float, width: int) -> None:
+        super().__init__(width)
+        self.vocabulary, self.dropout = vocabulary, dropout
+        self.embedding = nn.Embedding(vocabulary, width, padding_idx=PADDING)
+        with torch.no_grad():
+            self.embedding.weight.mul_(INITIAL_STD)
+        self.norm = nn.LayerNorm(width)
+
+    def average(self, rows: Tensor) -> Tensor:
+        """Return the normalised means, (B, width), of the embeddings of (B, L) rows; 0 is ignored at any position."""
+        if self.training and self.dropout:
+            rows = rows * (torch.rand(rows.shape, device=rows.device) >= self.dropout)
+        count = (rows != PADDING).sum(1, keepdim=True).clamp(min=1)
+        return self.norm(self.embedding(rows).sum(1) / count)
+
+
+class NGrams(HashEmbedding):
     """Mean of learned embeddings of the hashed words and n-grams of a sentence; needs no download.
 
     Unseen words share character n-grams with known ones. Trigrams of words distinguish "put the red block on the blue
@@ -66,12 +91,8 @@ class NGrams(TextEncoder):
         *,
         width: int,
     ) -> None:
-        super().__init__(width)
-        self.vocabulary, self.words, self.characters, self.dropout = vocabulary, words, characters, dropout
-        self.embedding = nn.Embedding(vocabulary, width, padding_idx=PADDING)
-        with torch.no_grad():
-            self.embedding.weight.mul_(INITIAL_STD)
-        self.norm = nn.LayerNorm(width)
+        super().__init__(vocabulary, dropout, width)
+        self.words, self.characters = words, characters
 
     def tokenize(self, sentences: list[str]) -> Tensor:
         """Return (B, L) int64 hashes of the n-grams of B lower-cased sentences, padded with 0."""
@@ -81,10 +102,7 @@ class NGrams(TextEncoder):
 
     def forward(self, tokens: Tensor) -> Tensor:
         """Return (B, width) vectors for (B, L) tokens; 0 is ignored at any position."""
-        if self.training and self.dropout:
-            tokens = tokens * (torch.rand(tokens.shape, device=tokens.device) >= self.dropout)
-        count = (tokens != PADDING).sum(1, keepdim=True).clamp(min=1)
-        return self.norm(self.embedding(tokens).sum(1) / count)
+        return self.average(tokens)
 
 
 def _hashes(sentence: str, vocabulary: int, words: int, characters: int) -> Tensor:
