@@ -67,7 +67,7 @@ class KnownWords(HashEmbedding):
         else:
             left_out = ~self.heard[rows]
         known = _shifted_left(tokens.masked_fill(left_out, PADDING))
-        return self.average(self._rows(n_grams(known, self.words)))
+        return self.average(self._rows(_ngrams(known, self.words)))
 
     def _rows(self, hashes: Tensor) -> Tensor:
         """Return the rows of the embedding for hashes."""
@@ -87,7 +87,7 @@ def _shifted_left(tokens: Tensor) -> Tensor:
     return tokens.gather(1, torch.where(tokens == PADDING, places + length, places).argsort(1))
 
 
-def n_grams(tokens: Tensor, longest: int) -> Tensor:
+def _ngrams(tokens: Tensor, longest: int) -> Tensor:
     """Return hashes of the n-grams of up to `longest` of (B, W) tokens, (B, L); `PADDING` where a row is too short."""
     length = tokens.shape[1]
     padded = nn.functional.pad(tokens, (0, longest - 1), value=PADDING)
