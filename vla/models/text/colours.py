@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from functools import cache, lru_cache
 
 import numpy as np
 from torch import Tensor
 
-from vla.models.text.ngrams import NGrams
+from vla.models.text.ngrams import NGrams, words_of
 
 # The basic colour terms of English (Berlin and Kay, Basic Color Terms, 1969).
 TERMS = ("black", "white", "grey", "red", "green", "yellow", "blue", "brown", "orange", "pink", "purple")
@@ -29,7 +28,7 @@ class NamedColours(NGrams):
 @lru_cache(4096)
 def simplified(sentence: str) -> str:
     """Return the words of a sentence in lower case, with names of colours in basic terms."""
-    return " ".join(in_basic_terms(re.findall(r"\w+", sentence.lower())))
+    return " ".join(in_basic_terms(words_of(sentence)))
 
 
 def in_basic_terms(words: Sequence[str]) -> list[str]:

@@ -5,7 +5,6 @@ Shapes: B sentences, W words of the longest, L n-grams.
 
 from __future__ import annotations
 
-import re
 import zlib
 from typing import Annotated
 
@@ -15,7 +14,7 @@ from torch import Tensor, nn
 
 from vla.io.types import Rate
 from vla.models.text.colours import simplified
-from vla.models.text.ngrams import PADDING, HashEmbedding
+from vla.models.text.ngrams import PADDING, HashEmbedding, padded, words_of
 
 PRIME, FACTOR = 2**31 - 1, 1_000_003  # of the polynomial hash of n-grams; its products fit into 64 bits
 
@@ -55,8 +54,7 @@ class KnownWords(HashEmbedding):
         """Return (B, W) int64 hashes of the words of B lower-cased sentences, padded with 0."""
         if self.basic_colours:
             sentences = [simplified(sentence) for sentence in sentences]
-        rows = [torch.tensor(_hashes(sentence) or [PADDING]) for sentence in sentences]
-        return nn.utils.rnn.pad_sequence(rows, batch_first=True, padding_value=PADDING)
+        return padded(sentences, _hashes, KnownWords)
 
     def forward(self, tokens: Tensor) -> Tensor:
         """Return (B, width) vectors for (B, W) tokens; 0 is ignored at any position."""
@@ -77,7 +75,7 @@ class KnownWords(HashEmbedding):
 def _hashes(sentence: str) -> list[int]:
     """Return the hashes of the words of a sentence, from 1 to 2^31 - 2."""
     # crc32, because hash() differs between processes.
-    return [1 + zlib.crc32(word.encode()) % (PRIME - 1) for word in re.findall(r"\w+", sentence.lower())]
+    return [1 + zlib.crc32(word.encode()) % (PRIME - 1) for word in words_of(sentence)]
 
 
 def _shifted_left(tokens: Tensor) -> Tensor:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import re
 import zlib
 from abc import ABC, abstractmethod
-from functools import partial
+from collections.abc import Callable, Hashable
 from typing import Annotated
 
 import torch
@@ -97,20 +97,30 @@ class NGrams(HashEmbedding):
     def tokenize(self, sentences: list[str]) -> Tensor:
         """Return (B, L) int64 hashes of the n-grams of B lower-cased sentences, padded with 0."""
         sizes = self.vocabulary, self.words, self.characters
-        rows = [CACHE.get(sentence, partial(_hashes, sentence, *sizes), *sizes) for sentence in sentences]
-        return nn.utils.rnn.pad_sequence(rows, batch_first=True, padding_value=PADDING)
+        return padded(sentences, lambda sentence: _hashes(sentence, *sizes), *sizes)
 
     def forward(self, tokens: Tensor) -> Tensor:
         """Return (B, width) vectors for (B, L) tokens; 0 is ignored at any position."""
         return self.average(tokens)
 
 
-def _hashes(sentence: str, vocabulary: int, words: int, characters: int) -> Tensor:
-    """Return the (L,) int64 hashes of the n-grams of a sentence."""
-    found = re.findall(r"\w+", sentence.lower())
+def padded(sentences: list[str], hashes: Callable[[str], list[int]], *options: Hashable) -> Tensor:
+    """Return (B, L) int64 hashes of B sentences, padded with 0; they are cached by sentence and options."""
+    rows = [CACHE.get(each, lambda each=each: torch.tensor(hashes(each) or [PADDING]), *options) for each in sentences]
+    return nn.utils.rnn.pad_sequence(rows, batch_first=True, padding_value=PADDING)
+
+
+def words_of(sentence: str) -> list[str]:
+    """Return the words of a sentence in lower case."""
+    return re.findall(r"\w+", sentence.lower())
+
+
+def _hashes(sentence: str, vocabulary: int, words: int, characters: int) -> list[int]:
+    """Return the L hashes of the n-grams of a sentence."""
+    found = words_of(sentence)
     grams = [" ".join(found[i : i + n]) for n in range(1, words + 1) for i in range(len(found) - n + 1)]
     for word in found:
         marked = f"<{word}>"
         grams += [f"#{marked[i : i + characters]}" for i in range(len(marked) - characters + 1)]
     # crc32, because hash() differs between processes.
-    return torch.tensor([1 + zlib.crc32(gram.encode()) % (vocabulary - 1) for gram in grams] or [PADDING])
+    return [1 + zlib.crc32(gram.encode()) % (vocabulary - 1) for gram in grams]
