@@ -85,6 +85,12 @@ def test_option(group: str, option: str) -> None:
     check(composed(*TOGETHER.get((group, option), brought_by(group)), f"{group}={option}", *job))
 
 
+def test_every_encoder_can_be_chosen_with_every_model() -> None:
+    check(composed("model=rt1_small", "model/image=film_efficientnet_lite0"))
+    for path in (CONF / "model").glob("*.yaml"):  # values of an encoder in there would be set in any other one too
+        assert not {"image", "text"} & set(yaml.safe_load(path.read_text())), path.name
+
+
 def variants(experiment: str) -> list[str]:
     """What a grid compares."""
     file = yaml.safe_load((CONF / f"experiment/{experiment}.yaml").read_text())
