@@ -77,6 +77,22 @@ def test_a_training_from_weights_has_its_own_order_of_windows(tmp_path: Path, ta
     assert config.data.seed == 3
 
 
+def test_rounds_continue_the_training_of_their_policy(tmp_path: Path, tabletop: Tabletop) -> None:
+    own = ("task/goal=push", "expert=clean", "learner.weight_decay=0.3", "collect.episodes=60")
+    _, checkpoint = trained(tmp_path, tabletop, *own)
+    start = f"pretrained={checkpoint}"
+    rounds = finetune(composed("job=improve", start), [])
+    before = composed(*SMALL, *own)
+    assert (rounds.task, rounds.expert, rounds.learner) == (before.task, before.expert, before.learner)
+    assert rounds.collect == before.collect  # the folder too: the same demonstrations are used again
+    other = ["task/goal=lift", "learner.weight_decay=0.1", "collect.episodes=70"]
+    rounds = finetune(composed("job=improve", start, *other), other)
+    assert rounds.task.goal == composed("task/goal=lift").task.goal and rounds.task.image_size == [32, 32]
+    assert (rounds.learner.weight_decay, rounds.collect.episodes) == (0.1, 70)
+    training = finetune(composed(start), [])  # a training from weights is free to have another task
+    assert training.task == composed().task and training.collect.episodes == composed().collect.episodes
+
+
 def test_the_documented_program_acts_like_the_policy(tmp_path: Path, tabletop: Tabletop) -> None:
     policy, checkpoint = trained(tmp_path, tabletop)
     seen = tabletop.reset(0)

@@ -1,7 +1,8 @@
 """Merge of a composed config with the checkpoint or run that it names.
 
 `checkpoint=FILE` takes task, tokenizer and model from a policy, `pretrained=FILE` tokenizer, model and data for a new
-training, `resume=RUN` the whole config of a run. Overrides of these nodes on the command line apply on top.
+training (with job=improve also task, expert and learner), `resume=RUN` the whole config of a run. Overrides of these
+nodes on the command line apply on top.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ from vla.models.checkpoint import read_header
 
 OF_POLICY = ("task", "tokenizer", "model")
 OF_MODEL = ("tokenizer", "model", "data")  # the batch size depends on the model
+OF_TRAINING = (*OF_MODEL, "task", "expert", "learner", "validate")  # that rounds with the expert continue
 # Parts of a training that a report on its policy shows: whole nodes, which only an open-loop evaluation builds, and
 # single values of other nodes.
 REPORTED = ("expert", "data", "learner", "validate", "seed")
@@ -63,6 +65,9 @@ def adopt(cfg: DictConfig, overrides: Sequence[str]) -> DictConfig:
 def finetune(cfg: DictConfig, overrides: Sequence[str]) -> DictConfig:
     """Return `cfg` with tokenizer, model and data of the policy `cfg.pretrained`, the initial weights of a training.
 
+    Rounds with the expert continue the training of that policy: of job=improve also task, expert, learner, validation,
+    and number and seed of the demonstrations are that policy's.
+
     Raises:
         ValueError: the file does not exist, the job does not train, or an override contradicts the weights.
     """
@@ -75,9 +80,14 @@ def finetune(cfg: DictConfig, overrides: Sequence[str]) -> DictConfig:
     _require_own_parts(parsed, ("tokenizer", "model", *PRESETS))
     own = Path(cfg.output) / LAST  # of this training; `pretrained` may have been deleted since
     saved = read_header(own if own.exists() and not Path(cfg.pretrained).exists() else cfg.pretrained).config
-    require_no_paths(saved, OF_MODEL, cfg.pretrained)
+    improved = cfg.job == "improve"
+    parts = OF_TRAINING if improved else OF_MODEL
+    given = [_path(override) for override in parsed if not override.is_delete()] if improved else None
+    require_no_paths(saved, parts, cfg.pretrained, given)
     chosen = {**cfg.chosen, "model": saved.get("chosen", {}).get("model")}
-    nodes = {name: saved[name] for name in OF_MODEL if name in saved}
+    nodes = {name: saved[name] for name in parts if name in saved}
+    if improved:
+        nodes["collect"] = _with_values(cfg, saved, "collect")
     if "seed" in nodes.get("data", {}):
         nodes["data"] = {**nodes["data"], "seed": "${seed}"}  # of this training: it orders the windows
     return _on_top(cfg, {**nodes, "chosen": chosen}, parsed)
@@ -142,10 +152,13 @@ def _reported(cfg: DictConfig, saved: Mapping[str, Any]) -> dict[str, Any]:
         # Only texts can be paths, and those of this command are none of the author's: spare the import of Lightning.
         known = _texts(saved[name]) <= _texts(own.get(name))
         nodes[name] = saved[name] if known else without_paths(saved, name)
-    for name, keys in REPORTED_VALUES.items():
-        values = {key: value for key, value in saved.get(name, {}).items() if key in keys}
-        nodes[name] = {**(own[name] or {}), **values}
-    return nodes
+    return nodes | {name: _with_values(cfg, saved, name) for name in REPORTED_VALUES}
+
+
+def _with_values(cfg: DictConfig, saved: Mapping[str, Any], name: str) -> dict[str, Any]:
+    """Return the node `name` of `cfg` with those values of the saved one that `REPORTED_VALUES` lists."""
+    own: Any = OmegaConf.to_container(cfg[name]) if cfg[name] else {}
+    return {**own, **{key: value for key, value in saved.get(name, {}).items() if key in REPORTED_VALUES[name]}}
 
 
 def _texts(node: Any) -> set[str]:
