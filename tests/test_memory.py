@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import toy
+from exporting import exporter
 from toy_recordable import RecordableEnvironment
 
 from vla.data.episodes import EpisodeStore
@@ -70,6 +71,21 @@ def test_the_nearest_demonstration_of_a_known_scene_is_its_own_unless_that_is_sh
         _first_action(agent, replace(seen, instruction=said)) for said in (seen.instruction, other, "whatever")
     )
     assert np.array_equal(own, any_of_them) and not np.array_equal(own, theirs)
+
+
+def test_the_nearest_demonstration_is_found_in_a_packed_store_and_only_by_the_first_images(
+    folder: Path, tmp_path: Path
+) -> None:
+    packed = exporter("packed", tmp_path / "packed").export(EpisodeStore(folder))
+    environment, agent = toy.make_environment(), NearestDemonstration(packed, 20, spec=toy.SPEC)
+    entry = EpisodeStore(folder).episodes[0]
+    seen = environment.reset(entry.seed)
+    agent.reset(entry.instruction, FIRST_SEED)
+    assert agent.looks
+    np.testing.assert_array_equal(agent.act(seen), EpisodeStore(folder).rows("executed")[entry.span.start])
+    assert not agent.looks
+    agent.reset(entry.instruction, FIRST_SEED)
+    assert agent.looks
 
 
 def _first_action(agent: NearestDemonstration, observation: Observation) -> Array:

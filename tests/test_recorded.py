@@ -27,7 +27,7 @@ from vla.config.experiment import plain
 from vla.data.datamodule import held_out
 from vla.data.episodes import EpisodeStore
 from vla.data.formats.imported_demonstrations import action_bounds
-from vla.data.verification import find_episode
+from vla.data.verification import derive_store, find_episode
 from vla.deploy.control_loop import ControlLoop
 from vla.deploy.server import Keys
 from vla.io.images import resize
@@ -181,6 +181,9 @@ def test_a_repaired_import_goes_on(dataset: Path, tmp_path: Path) -> None:
     assert [entry.seed for entry in store.episodes] == [0, *range(2, EPISODES)]
     with pytest.raises(ValueError, match=rf"only {EPISODES - 1} episodes are whole"):
         recorded.fill(EpisodeStore(tmp_path / "store"), EPISODES)
+    derive_store([EpisodeStore(tmp_path / "store")], tmp_path / "chosen", {"seed": 0})
+    with pytest.raises(ValueError, match=r"cannot grow: set collect\.episodes=1"):
+        recorded.fill(EpisodeStore(tmp_path / "chosen"), EPISODES - 1)
 
 
 def test_outliers_do_not_widen_the_bounds_and_rare_events_do() -> None:

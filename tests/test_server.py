@@ -31,6 +31,7 @@ from fake_batch import as_policy, make_bc, make_rt1
 from toy import SPEC, ToyEnvironment
 from websockets.exceptions import ConnectionClosed, InvalidMessage, InvalidStatus
 from websockets.sync.client import ClientConnection, connect
+from websockets.sync.server import ServerConnection, serve
 
 from vla.config.experiment import Experiment
 from vla.deploy import server
@@ -510,8 +511,10 @@ def test_a_server_with_other_components_units_or_image_sizes_is_noticed(caplog: 
     slower = replace(SPEC, action=("y", "x", "gripper"), control_hz=7.0)
     large = {"x": Component(0, 100.0, 0.0), "y": Component(1, 100.0, 0.0), "gripper": Component(2, 1.0, 9.0)}
     with serving(policy) as url:
+        threads = threading.active_count()
         with pytest.raises(ValueError, match=r"its actions are x, y, gripper, ours are y, x, gripper: set agent\.act"):
             remote(url, spec=slower)
+        assert threading.active_count() <= threads
         agent = remote(url, actions=large, image_size=[32, 32], spec=replace(SPEC, control_hz=7.0))
         for _ in range(2):
             agent.plan(observation)
@@ -579,8 +582,38 @@ def test_a_server_that_goes_away_fails_the_episode_and_says_so() -> None:
         assert play(ToyEnvironment(), agent, FIRST_SEED).outcome in ("success", "timeout")
     failed = play(ToyEnvironment(), agent, FIRST_SEED)
     assert failed.outcome == "error" and f"the policy server at {url} failed: it closed the connection" in failed.error
-    with pytest.raises(ValueError, match=f"nobody serves a policy at {url} .*: start it"):
+    with pytest.raises(ValueError, match=f"no policy server at {url} .*: start it"):
         remote(url)
+
+
+def test_another_policy_after_a_restart_is_noticed() -> None:
+    one_frame, history = as_policy(make_bc()), as_policy(make_rt1())
+    seen = observations(1)[0]
+    with serving(one_frame) as url:
+        agent = remote(url)
+        agent.reset(seen.instruction, 0)
+        agent.act(seen)
+    with pytest.raises(ValueError, match="it closed the connection"):
+        agent.plan(seen)
+    with serving(history) as agent.url:
+        agent.reset(seen.instruction, 1)
+        assert (agent.metadata["history"], agent.history) == (history.model.history, history.model.history)
+        np.testing.assert_array_equal(agent.act(seen), history.session().plan(seen)[0])
+        agent.close()
+
+
+def test_a_server_that_describes_nothing_is_not_waited_for() -> None:
+    done = threading.Event()
+
+    def wait(connection: ServerConnection) -> None:
+        done.wait(30)
+
+    with serve(wait, "127.0.0.1", 0) as silent:
+        threading.Thread(target=silent.serve_forever, daemon=True).start()
+        url = f"ws://127.0.0.1:{silent.socket.getsockname()[1]}"
+        with pytest.raises(ValueError, match=rf"no policy server at {url} \(no answer within 0\.5 s\)"):
+            remote(url, timeout=0.5)
+        done.set()
 
 
 def test_whoever_acts_is_evaluated_by_the_same_job(tmp_path: Path) -> None:

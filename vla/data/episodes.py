@@ -111,6 +111,14 @@ class EpisodeStore:
             first = self.tried[0].seed
             raise ValueError(f"{self.folder} starts at seed {first}, not {seed}: set collect.seed={first}")
 
+    def require_growable(self) -> None:
+        """Raise a ValueError if no episodes may be added, because the present ones were copied from other stores."""
+        if self.derived:
+            most = len(self.episodes)
+            raise ValueError(
+                f"{self.folder} was derived from other stores and cannot grow: set collect.episodes={most}"
+            )
+
     def require_episodes(self) -> None:
         """Raise a ValueError if there are no episodes."""
         if not self.episodes:

@@ -132,7 +132,7 @@ class Decoder(FrameModel):
         losses = self.tokenizer.token_losses(logits, tokens, batch["action"][:, -1])
         result = {"action_loss": mean_where(losses, mask)}
         if not self.training:
-            result["token_accuracy"] = (logits.argmax(-1) == tokens)[mask].float().mean()
+            result["token_accuracy"] = mean_where((logits.argmax(-1) == tokens).float(), mask)
         return result
 
     def predict(self, batch: Batch) -> Prediction:

@@ -80,10 +80,9 @@ def collect(
     """
     started = time.monotonic()
     before = len(store.episodes)
-    if before < episodes and store.derived:
-        raise ValueError(f"{store.folder} was derived from other stores and cannot grow: set collect.episodes={before}")
     store.require_first_seed(seed)
     if before < episodes:
+        store.require_growable()
         with store.writing():
             before = len(store.episodes)  # another process may have added some meanwhile
             store.require_first_seed(seed)
@@ -156,7 +155,7 @@ class Attempts:
     def __init__(self, pool: Pool, multitask: Multitask | None, store: EpisodeStore, first: int) -> None:
         """Args:
         pool: of `DemonstrationWorker`s.
-        multitask: what tells the task of a seed, or None if all seeds are needed.
+        multitask: maps a seed to its task; None: all seeds are needed.
         store: of the episodes so far.
         first: seed of an empty store.
         """

@@ -20,7 +20,7 @@ STRIDE = 4  # of the pixels in which demonstrations are compared
 
 
 class WithoutModality:
-    """An agent that sees only grey images without depth, or hears only an empty instruction."""
+    """An agent whose images are grey and without depth, or whose instruction is empty."""
 
     def __init__(self, agent: Agent, missing: Modality) -> None:
         """Args: the agent, and the modality that it does without."""
@@ -75,8 +75,9 @@ class NearestDemonstration:
         self._entries, self._executed = store.episodes, store.rows("executed")
         self._instructions = np.array([entry.instruction for entry in self._entries])
         self._seeds = np.array([entry.seed for entry in self._entries])
-        starts = [entry.span.start for entry in self._entries]
-        images = [np.stack([_subsampled(rows[start]) for start in starts]) for rows in map(store.rows, _fields(spec))]
+        first = [slice(entry.span.start, entry.span.start + 1) for entry in self._entries]
+        rows = [store.rows(f"rgb_{camera}") for camera in spec.cameras]
+        images = [np.concatenate([_subsampled(each[span]) for span in first]) for each in rows]
         self._cameras, self._images = spec.cameras, np.stack(images, axis=1)  # (E, cameras, h, w, 3)
         self.info: dict[str, Any] = {}
         self.reset("", 0)
@@ -86,6 +87,11 @@ class NearestDemonstration:
         self._actions: Array | None = None
         self._step = 0
         self._others = self._seeds != seed  # a recording must not be its own memory
+
+    @property
+    def looks(self) -> bool:
+        """Whether the next action depends on the images: the first one does."""
+        return self._actions is None
 
     def act(self, observation: Observation) -> Array:
         """Return the next (D,) action of the demonstration."""
@@ -108,9 +114,6 @@ def make_nearest(folder: Path, environment: Environment) -> NearestDemonstration
     return NearestDemonstration(folder, None, spec=environment.spec)
 
 
-def _subsampled(image: Array) -> Array:
-    return image[::STRIDE, ::STRIDE]
-
-
-def _fields(spec: Spec) -> list[str]:
-    return [f"rgb_{camera}" for camera in spec.cameras]
+def _subsampled(images: Array) -> Array:
+    """Return every `STRIDE`th row and column of (…, H, W, 3) images."""
+    return images[..., ::STRIDE, ::STRIDE, :]

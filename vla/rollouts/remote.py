@@ -1,4 +1,4 @@
-"""A policy that somebody else serves, as an agent: a client of openpi's protocol.
+"""Client of a policy server that speaks openpi's protocol, as an agent.
 
 `vla.io.array_messages` describes the encoding, `vla.deploy.server` the protocol.
 """
@@ -30,8 +30,8 @@ log = logging.getLogger(__name__)
 
 Result = TypeVar("Result")
 
-# A server's units are wrong if more than this share of a chunk lies beyond the bounds by more than this share of them.
-BEYOND, CLEARLY = 0.25, 0.5
+# Units are wrong if more than this share of a chunk exceeds the bounds by more than this share of their range.
+MAX_OUTLIER_SHARE, OUTLIER_DISTANCE = 0.25, 0.5
 
 
 @contextmanager
@@ -82,7 +82,7 @@ class RemotePolicy:
         spec: of the environment.
 
     Raises:
-        ValueError: the mapping does not fit the spec, or nobody answers at the URL.
+        ValueError: the mapping does not fit the spec, or the server does not respond.
     """
 
     url: Text
@@ -116,18 +116,12 @@ class RemotePolicy:
             log.warning("agent.image_size=%s enlarges the images of the world: set task.image_size=%s", size, size)
         self.info: dict[str, Any] = {}
         self._broken = self._warned = False
+        self._configured_execute = self.execute
         self._low, self._high = np.array(self.spec.low, np.float32), np.array(self.spec.high, np.float32)
         with ExitStack() as opened:
             self._loop = opened.enter_context(event_loop())
-            self._connection, self.metadata = self._connected(opened)
+            self._connect(opened)
             self._open = opened.pop_all()
-        self._require_alike()
-        told, history = (
-            number if isinstance(number := self.metadata.get(name), int) and number >= 1 else None
-            for name in ("execute", "history")
-        )
-        self.history = history or 1  # frames that the policy looks back; with several it wants to see every one
-        self._wanted = self.execute or (1 if self.history > 1 else told)
         if self.asynchronous:
             link = BackgroundLink(self.plan, self.spec.control_hz)
             self._open.callback(link.close)
@@ -135,8 +129,19 @@ class RemotePolicy:
             link = SimulatedLink(self.plan, IDEAL, self.spec.control_hz)
         self._real_time = RealTime(self.spec, link, lambda: self.execute or 1, self.ensemble)
 
+    def _connect(self, opened: ExitStack) -> None:
+        """Connect, and adopt the metadata of the server's policy. Raises as the class does."""
+        self._connection, self.metadata = self._connected(opened)
+        self._require_alike()
+        advertised, history = (
+            number if isinstance(number := self.metadata.get(name), int) and number >= 1 else None
+            for name in ("execute", "history")
+        )
+        self.history = history or 1  # frames of a window; above 1 every observation is sent
+        self._wanted = self._configured_execute or (1 if self.history > 1 else advertised)
+
     def _require_alike(self) -> None:
-        """Compare what the server tells of its actions, as `vla.deploy.server` does, with the spec.
+        """Compare the server's metadata of its actions, as `vla.deploy.server` sends it, with the spec.
 
         Raises:
             ValueError: its actions have other names, and no mapping is given.
@@ -153,7 +158,7 @@ class RemotePolicy:
         """Start an episode: drop all chunks, connect again if that broke, and tell a server that has episodes."""
         self._real_time.reset(seed)
         if self._broken:
-            self._connection, self.metadata = self._connected(self._open)
+            self._connect(self._open)
             self._broken = False
         if self.metadata.get("reset") is True:
             self._ask({"reset": True, "prompt": instruction, "seed": seed})
@@ -214,7 +219,10 @@ class RemotePolicy:
         if not np.isfinite(mine).all():
             raise self._error("an action is not finite")
         clipped = np.clip(mine.astype(np.float32), self._low, self._high)
-        if not self._warned and (np.abs(mine - clipped) > CLEARLY * (self._high - self._low)).mean() > BEYOND:
+        if (
+            not self._warned
+            and (np.abs(mine - clipped) > OUTLIER_DISTANCE * (self._high - self._low)).mean() > MAX_OUTLIER_SHARE
+        ):
             self._warned = True
             log.warning(
                 "actions of %s are far beyond the bounds of the world: set agent.actions to its units", self.url
@@ -245,8 +253,9 @@ class RemotePolicy:
             raise self._error(
                 f"{said}: set VLA_API_KEY" if "API key" in said else said or f"HTTP status {error.response.status_code}"
             ) from error
-        except (OSError, WebSocketException) as error:
-            raise ValueError(f"nobody serves a policy at {self.url} ({error}): start it, or set agent.url") from error
+        except (OSError, WebSocketException) as error:  # a time-out is an OSError without a text
+            reason = error if str(error) else f"no answer within {self.timeout:g} s"
+            raise ValueError(f"no policy server at {self.url} ({reason}): start it, or set agent.url") from error
         return connection, metadata
 
     def _ask(self, message: Mapping[str, Any]) -> dict[str, Any]:

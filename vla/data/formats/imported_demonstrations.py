@@ -73,6 +73,7 @@ class ImportedDemonstrations(ABC):
         self.require_held(store)
         if len(store.episodes) >= episodes:
             return 0
+        store.require_growable()
         first = store.next_seed or 0
         if (possible := len(store.episodes) + len(self) - first) < episodes:  # damaged ones do not come back
             raise ValueError(f"only {possible} episodes are whole: set collect.episodes={possible}, or fewer")
