@@ -13,7 +13,7 @@ from composing import check, composed
 
 from vla.config.build import build
 from vla.config.experiment import plain
-from vla.tasks.gl import TRIED
+from vla.tasks.gl import WORKING_BACKEND
 
 BAD_INPUT = {
     "misspelt key": (("colect.episodes=3",), "collect"),
@@ -161,7 +161,7 @@ def test_an_experiment_may_have_options_of_another_job() -> None:
 
 def test_without_gl_the_error_says_what_to_install(tmp_path: Path) -> None:
     environment = {**os.environ, "MUJOCO_GL": "egl", "__EGL_VENDOR_LIBRARY_FILENAMES": "/nowhere.json"}
-    for name in (TRIED, "DISPLAY"):
+    for name in (WORKING_BACKEND, "DISPLAY"):
         environment.pop(name, None)
     done = subprocess.run(
         [sys.executable, "-m", "vla.run", "job=preview", "preview.episodes=1"],

@@ -368,7 +368,7 @@ def test_without_ros_the_error_says_what_to_install(home: Path) -> None:
 
 def test_a_policy_is_deployed_where_nothing_renders(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(backend, "PROBE", "raise SystemExit(1)")
-    for name in ("MUJOCO_GL", "DISPLAY", backend.TRIED, backend.FAILED):
+    for name in ("MUJOCO_GL", "DISPLAY", backend.WORKING_BACKEND, backend.FAILED_BACKENDS):
         monkeypatch.setenv(name, "")  # so that what the code sets is undone, too
         monkeypatch.delenv(name)
     backend.choose_backend()

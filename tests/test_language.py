@@ -73,20 +73,20 @@ def heard() -> set[str]:
     return {word for each in said for word in re.findall(r"\w+", re.sub(r"{\w+}", "", each))}
 
 
-UNHEARD = read_yaml(CONF / "task/randomize/phrasing/unheard.yaml", dict[str, Any])["words"]
+UNSEEN = read_yaml(CONF / "task/randomize/phrasing/unseen_names.yaml", dict[str, Any])["words"]
 GRAMMATICAL = {"the", "one", "that", "looks", "like", "a", "an"}
 
 
-def test_no_word_that_names_something_unheard_is_in_any_training_instruction() -> None:
-    new = {word for others in UNHEARD.values() for other in others for word in other.split()} - GRAMMATICAL
+def test_no_word_that_names_something_unseen_is_in_any_training_instruction() -> None:
+    new = {word for others in UNSEEN.values() for other in others for word in other.split()} - GRAMMATICAL
     assert {"crimson", "scarlet", "navy", "emerald", "golden", "cube", "brick", "disc", "spot", "tomato"} <= new
     assert {"red", "block", "pad", "black", "put"} <= heard() and not new & heard()
 
 
-def test_every_unheard_name_means_one_thing_of_the_scene() -> None:
-    named = [name for others in UNHEARD.values() for name in others]
+def test_every_unseen_name_means_one_thing_of_the_scene() -> None:
+    named = [name for others in UNSEEN.values() for name in others]
     assert len(named) == len(set(named))
-    assert {*UNHEARD} == {f"the {colour} block" for colour in COLOURS} | {
+    assert {*UNSEEN} == {f"the {colour} block" for colour in COLOURS} | {
         "the pad",
         *(f"the {pad} pad" for pad in PADS),
     }
@@ -96,7 +96,7 @@ def test_every_unheard_name_means_one_thing_of_the_scene() -> None:
 
     surveyed = 0  # by Munroe, see xkcd.com/color/rgb
     for colour in COLOURS:
-        for word in {word for name in UNHEARD[f"the {colour} block"] for word in name.split()} - {"brick"}:
+        for word in {word for name in UNSEEN[f"the {colour} block"] for word in name.split()} - {"brick"}:
             if f"xkcd:{word}" in XKCD_COLORS:
                 other = hue(to_rgb(f"xkcd:{word}"))
                 apart = {name: abs((hue(rgb) - other + 0.5) % 1 - 0.5) for name, rgb in COLOURS.items()}
@@ -105,11 +105,11 @@ def test_every_unheard_name_means_one_thing_of_the_scene() -> None:
     assert surveyed > 15
 
 
-def test_an_unheard_instruction_is_the_plain_one_with_other_names() -> None:
-    node = conditions(plain(composed("evaluate=unheard").evaluate))["unheard"]["randomize"]["phrasing"]
+def test_an_instruction_with_unseen_names_is_the_plain_one_with_other_names() -> None:
+    node = conditions(plain(composed("evaluate=unseen_names").evaluate))["unseen_names"]["randomize"]["phrasing"]
     environment = make_tabletop("task/goal=mixed", "task/randomize=none")
     task = environment.simulation
-    axes = {"heard": task.randomize, "unheard": {**task.randomize, "phrasing": instantiate(node)}}
+    axes = {"plain": task.randomize, "renamed": {**task.randomize, "phrasing": instantiate(node)}}
 
     def reset(seed: int, name: str) -> dict[str, Any]:
         task.randomize = axes[name]
@@ -118,18 +118,18 @@ def test_an_unheard_instruction_is_the_plain_one_with_other_names() -> None:
 
     with environment.blind():
         for seed in range(FIRST_SEED, FIRST_SEED + 30):
-            heard, unheard = reset(seed, "heard"), reset(seed, "unheard")
-            assert unheard["named"] == heard["named"] and unheard["language"]["held_out"] == "names"
-            said = heard["language"]["instruction"]
-            phrases = [phrase for phrase in UNHEARD if phrase in said]
+            plain_names, renamed = reset(seed, "plain"), reset(seed, "renamed")
+            assert renamed["named"] == plain_names["named"] and renamed["language"]["held_out"] == "names"
+            said = plain_names["language"]["instruction"]
+            phrases = [phrase for phrase in UNSEEN if phrase in said]
             possible = set()
-            for others in itertools.product(*(UNHEARD[phrase] for phrase in phrases)):
+            for others in itertools.product(*(UNSEEN[phrase] for phrase in phrases)):
                 other = said
                 for phrase, name in zip(phrases, others, strict=True):
                     other = other.replace(phrase, name)
                 possible.add(other)
-            assert unheard["language"]["instruction"] in possible
-        assert reset(0, "unheard")["language"] == reset(0, "heard")["language"]  # in training it changes nothing
+            assert renamed["language"]["instruction"] in possible
+        assert reset(0, "renamed")["language"] == reset(0, "plain")["language"]  # in training it changes nothing
     environment.close()
 
 

@@ -336,7 +336,7 @@ def test_without_egl_the_error_names_the_other_renderer(monkeypatch: pytest.Monk
 def test_without_egl_mujocos_renderer_is_chosen_and_named(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setenv(gl.EGL, "False")
+    monkeypatch.setenv(gl.EGL_WORKS, "False")
     config = compose_config("output=here")
     usable = with_substitutes(config, ["output=here"])
     assert "the fast renderer needs EGL, which this machine lacks" in caplog.text
@@ -346,12 +346,12 @@ def test_without_egl_mujocos_renderer_is_chosen_and_named(
     )
     assert usable.collect.folder == collected_with("mujoco")[0] != collected_with("fast")[0]
     assert with_substitutes(config, ["task/renderer=fast"]) is config  # and fails, in a sentence
-    monkeypatch.setenv(gl.EGL, "True")
+    monkeypatch.setenv(gl.EGL_WORKS, "True")
     assert with_substitutes(config, []) is config
 
 
 def test_a_machine_without_gl_is_told_from_others(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.delenv(gl.EGL, raising=False)
+    monkeypatch.delenv(gl.EGL_WORKS, raising=False)
     monkeypatch.setattr(gl, "EGL_PROBE", "raise SystemExit(1)")
     assert not gl.has_egl()
 

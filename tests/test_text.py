@@ -72,7 +72,7 @@ def test_names_of_colours_mean_basic_terms(said: str, meant: str) -> None:
 
 
 def test_every_name_of_a_block_that_training_never_has_means_its_colour() -> None:
-    names = OmegaConf.load(CONF / "task/randomize/phrasing/unheard.yaml").words
+    names = OmegaConf.load(CONF / "task/randomize/phrasing/unseen_names.yaml").words
     for colour in COLOURS:
         for name in names[f"the {colour} block"]:
             assert colour in simplified(name).split(), name

@@ -1,6 +1,6 @@
 """The contract between task, data, model and robot: the layout of one control step, and the interfaces between them.
 
-Tasks, data, models and deployment exchange only the types below: they import this module and never each other.
+Tasks, data and models exchange only the types below: they import this module and never each other.
 """
 
 from __future__ import annotations
@@ -335,7 +335,7 @@ class Eventful(Protocol):
 
     @property
     def events(self) -> Sequence[tuple[int, str]]:
-        """(index, description) per event so far; index of the last observation before it or the first that shows it."""
+        """Return (step, description) of every event so far; step is the observation just before or just after it."""
         ...
 
 

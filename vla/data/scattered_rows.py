@@ -16,8 +16,8 @@ class ScatteredRows:
     """Memory-mapped rows of which only those that are taken are read from the disk.
 
     When a page is missing the kernel reads ahead, on some machines by megabytes. Of a file that is larger than the free
-    memory, read in random order, most of that is evicted before it is used. Here the kernel is told which rows come
-    next, and reads nothing else.
+    memory, read in random order, most of that is evicted before it is used. Here `madvise` announces the
+    next rows, and the kernel reads nothing else.
 
     Args:
         path: of the file.

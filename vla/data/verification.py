@@ -28,7 +28,7 @@ Copy = tuple[EpisodeStore, Entry]
 
 
 class DamageError(ValueError):
-    """Difference of an episode from its checksums."""
+    """Error: an episode differs from its checksums."""
 
 
 @dataclass(frozen=True)

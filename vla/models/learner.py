@@ -104,9 +104,9 @@ class Learner(LightningModule):
         """
         embeddings = {id(m.weight) for m in self.model.modules() if isinstance(m, nn.Embedding)}
         for module in self.model.modules():
-            if callable(told := getattr(module, "no_weight_decay", None)):
+            if callable(excluded := getattr(module, "no_weight_decay", None)):
                 own = dict(module.named_parameters())
-                embeddings |= {id(own[name]) for name in told() if name in own}
+                embeddings |= {id(own[name]) for name in excluded() if name in own}
         trained = [p for p in self.model.parameters() if p.requires_grad]
         decayed = [p for p in trained if p.dim() > 1 and id(p) not in embeddings]
         others = [p for p in trained if p.dim() <= 1 or id(p) in embeddings]

@@ -99,7 +99,7 @@ def acts_on_joints(spec: Spec) -> bool:
 
 
 def recorded_controller(spec: Spec) -> CartesianController | JointController:
-    """Build the controller for actions that have been executed already, by the person who is responsible for them.
+    """Build the controller for recorded actions, without a limit of the workspace.
 
     Raises:
         ValueError: the arm or the actions are of another kind.

@@ -140,7 +140,7 @@ class RealTime:
 
 
 class SimulatedLink:
-    """Way to a policy, for one observation at a time, whose delays pass in control steps: a function of the seed."""
+    """Link to a policy with simulated delays in control steps, drawn from the seed; one request at a time."""
 
     def __init__(self, plan: Plan, network: Network, control_hz: float) -> None:
         """Args: the policy; the network; steps per second [Hz]."""
@@ -172,7 +172,7 @@ class SimulatedLink:
 
 
 class BackgroundLink:
-    """Way to a policy that plans in a thread, while control steps follow the clock; late ones are not made up for."""
+    """Link to a policy that plans in a background thread, in real time; late control steps are not caught up."""
 
     def __init__(self, plan: Plan, control_hz: float, network: Network = IDEAL) -> None:
         """Args: the policy; steps per second [Hz]; a network in front of it whose delays pass by the clock."""

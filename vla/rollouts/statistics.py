@@ -29,9 +29,9 @@ def wilson_interval(successes: float, trials: float) -> tuple[float, float]:
 def stratified_interval(strata: Sequence[tuple[int, int, float]]) -> tuple[float, float, float]:
     """Return the weighted mean of proportions and its 95 % confidence interval; (0, 0, 1) without trials.
 
-    Only chance within a stratum counts: strata, such as the tasks of a benchmark, are fixed. Wilson's interval for as
-    many trials as would give the mean the variance that it has; half a success and half a failure are added to every
-    stratum in estimating that variance, else one without failures would seem certain.
+    Only chance within a stratum counts: strata, such as the tasks of a benchmark, are fixed. Wilson's interval at
+    the effective sample size, at which the binomial variance equals the estimated one; half a success and half a
+    failure are added to every stratum in estimating it, else one without failures would seem certain.
 
     Args:
         strata: successes, trials (at least one) and weight of each; the weights sum to 1.
@@ -49,8 +49,8 @@ def stratified_interval(strata: Sequence[tuple[int, int, float]]) -> tuple[float
 def bounded_mean_interval(values: Sequence[float], largest: float) -> tuple[float, float]:
     """Return the 95 % confidence interval of the mean of values from 0 to `largest`, (0, `largest`) without any.
 
-    Wilson's interval for as many trials as would give the mean the variance that it has; half a zero and half a
-    `largest` are added in estimating that variance, else equal values would seem certain. If all values are 0 or
+    Wilson's interval at the effective sample size, at which the binomial variance equals the estimated one; half a zero
+    and half a `largest` are added in estimating it, else equal values would seem certain. If all values are 0 or
     `largest` it is Wilson's interval of their share.
     """
     shares = np.asarray(values, float) / largest

@@ -1,4 +1,4 @@
-"""A policy under the eyes of an expert, which labels every state that the policy reaches (DAgger, arXiv 1011.0686)."""
+"""DAgger (arXiv 1011.0686): a policy acts, and an expert labels every state that it reaches."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ class Supervised:
 
     def __init__(self, policy: Agent, expert: Agent, beta: float, segment: int) -> None:
         """Args:
-        policy: what acts.
-        expert: what labels; memoryless, see `require_memoryless`.
+        policy: agent that acts.
+        expert: agent that labels; memoryless, see `require_memoryless`.
         beta: probability that the expert acts in a segment, 0…1; 0 lets the policy act throughout.
         segment: length [steps].
 
@@ -39,7 +39,7 @@ class Supervised:
         self._acts: list[tuple[int, int]] = []  # first and last step of every segment in which the expert acts
 
     def act(self, observation: Observation) -> Array:
-        """Return the (D,) action to execute; the policy also sees what the expert acts on."""
+        """Return the (D,) action to execute; the policy also observes the steps in which the expert acts."""
         if self._step % self._segment == 0:
             self._expert_acts = bool(self._random.uniform() < self._beta)
             if self._expert_acts:

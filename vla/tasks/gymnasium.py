@@ -72,7 +72,7 @@ class Gymnasium(Blindable):
             units: of all components of state and action, or of some by name; "1" without a unit, or if unknown.
             low, high: bounds of the action, to which it is clipped, of all components or one each; None: those of the
                 action space.
-            success: path of what is true in a step that succeeds.
+            success: path of the flag that is true in a successful step.
             truth: name → path of an array, for training and experts only.
 
         Raises:

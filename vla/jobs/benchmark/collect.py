@@ -9,7 +9,7 @@ from tempfile import TemporaryDirectory
 from vla.config.experiment import Experiment
 from vla.data.episodes import EpisodeStore
 from vla.jobs.benchmark.baselines.peer import DURATION, peer
-from vla.jobs.benchmark.measure import Floored, Measure, measure, timed
+from vla.jobs.benchmark.measure import HasMinimalStep, Measure, measure, timed
 from vla.jobs.benchmark.rendering import renderings
 from vla.parallel.limits import cores
 from vla.parallel.pool import LocalCluster
@@ -22,7 +22,7 @@ from vla.spec import Agent, Environment, Episode
 def measures(experiment: Experiment) -> dict[str, Measure]:
     """Measure control steps per second.
 
-    - collect: rollouts of one process with all cameras; the floor is physics and rendering, for a `Floored` world.
+    - collect: rollouts of one process with all cameras; the floor is physics and rendering, with `minimal_step`.
     - breakdown of the time of a step, including replay and storage; the floor is the whole step.
     - the images of a step by each renderer; the floor is the fastest.
     - all processes, including verification; the floor is that of one process times their number.
@@ -33,7 +33,7 @@ def measures(experiment: Experiment) -> dict[str, Measure]:
     environment = makers[0]()
     expert = makers[1](environment)
     rollout(environment, expert, 0)  # warm-up: compiles shaders
-    calls = environment.floor() if isinstance(environment, Floored) else {}
+    calls = environment.minimal_step() if isinstance(environment, HasMinimalStep) else {}
     episodes, taken = _timed_parts(environment, expert, calls, asked["episodes"])
     steps = sum(len(episode.actions) for episode in episodes)
     floor, full, blind = {name: taken[name] for name in calls}, taken["full"], taken["blind"]

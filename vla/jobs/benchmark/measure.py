@@ -10,10 +10,10 @@ Measure = dict[str, Any]  # value, unit, n, floor, ratio, in this order
 
 
 @runtime_checkable
-class Floored(Protocol):
+class HasMinimalStep(Protocol):
     """A world that can run the unavoidable part of a control step by itself."""
 
-    def floor(self) -> dict[str, Callable[[], object]]:
+    def minimal_step(self) -> dict[str, Callable[[], object]]:
         """Return "physics" and "rendering" → a function that does this part of a control step, and changes no state."""
         ...
 

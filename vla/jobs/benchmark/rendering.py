@@ -8,7 +8,7 @@ from functools import partial
 
 from vla.config.experiment import Experiment
 from vla.config.substitutes import options
-from vla.jobs.benchmark.measure import Floored, Measure, measure, timed
+from vla.jobs.benchmark.measure import HasMinimalStep, Measure, measure, timed
 
 FRAMES = 10  # of a renderer before it is the next one's turn
 
@@ -17,7 +17,7 @@ def renderings(experiment: Experiment) -> dict[str, Measure]:
     """Measure the time of a step's images by every renderer, in turns and on the same scenes.
 
     The floor is the fastest one. A renderer with settings of the user's is "chosen", beside the others. Nothing is
-    measured of a world that is not `Floored` or has no such renderer.
+    measured of a world without `minimal_step` or such a renderer.
     """
     own, choice = experiment["task"].get("renderer"), options("task/renderer")
     if own is None or own["_target_"] not in [node["_target_"] for node in choice.values()]:
@@ -28,9 +28,9 @@ def renderings(experiment: Experiment) -> dict[str, Measure]:
     rounds = experiment["benchmark"]["episodes"]
     for seed in range(rounds):
         for name, world in worlds.items():
-            if isinstance(world, Floored):
+            if isinstance(world, HasMinimalStep):
                 world.reset(seed)
-                seconds[name] += timed(partial(_draw, world.floor()["rendering"]))[1]
+                seconds[name] += timed(partial(_draw, world.minimal_step()["rendering"]))[1]
     for world in worlds.values():
         world.close()
     steps = FRAMES * rounds

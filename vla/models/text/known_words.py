@@ -1,4 +1,4 @@
-"""N-grams of the words that training has, without those that it has not.
+"""N-grams of the words that occur in training; unseen words are left out.
 
 Shapes: B sentences, W words of the longest, L n-grams.
 """
@@ -20,10 +20,10 @@ PRIME, FACTOR = 2**31 - 1, 1_000_003  # of the polynomial hash of n-grams; its p
 
 
 class KnownWords(HashEmbedding):
-    """Mean of learned embeddings of the hashed n-grams of the words that training has heard.
+    """Mean of learned embeddings of the hashed n-grams of the words seen in training.
 
     Any other word is left out before n-grams are taken: "put the red brick on the pad" becomes "put the red on the
-    pad". Word dropout (Iyyer et al., Deep Unordered Composition, ACL 2015) makes training hear such sentences.
+    pad". Word dropout (Iyyer et al., Deep Unordered Composition, ACL 2015) produces such sentences in training.
 
     Args:
         vocabulary: number of embeddings; n-grams with the same hash share one.
@@ -34,7 +34,7 @@ class KnownWords(HashEmbedding):
         width: length of the sentence vector.
     """
 
-    heard: Tensor  # (vocabulary,) bool: hashes of the words of training
+    heard: Tensor  # (vocabulary,) bool: hashes of the words seen in training
 
     def __init__(
         self,

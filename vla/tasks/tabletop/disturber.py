@@ -57,7 +57,7 @@ class Disturber:
         self.opens = False
         self.events: list[tuple[int, str]] = []
 
-    def overrule(self, action: Array) -> Array:
+    def override(self, action: Array) -> Array:
         """Return the action (7,) to execute in place of `action`."""
         if self.motion is not None:
             action = np.array([*self.motion, 0, 0, 0, action[6]])
@@ -81,10 +81,10 @@ class Disturber:
         if len(self.events) == self._drawn.times or not self._possible(state, now):
             return False
         self._possible_for += 1
-        if self._possible_for <= self._drawn.delay or not (told := self._happen(state, now)):
+        if self._possible_for <= self._drawn.delay or not (description := self._happen(state, now)):
             return False
         self._possible_for = 0
-        self.events.append((step, told))
+        self.events.append((step, description))
         return self._drawn.kind.startswith("move")
 
     def _possible(self, state: WorldState, now: Subgoal) -> bool:

@@ -199,7 +199,7 @@ class Tabletop(Blindable):
         """Return body name → (7,) position [m] and quaternion wxyz in the world frame."""
         return self.simulation.compiled.poses()
 
-    def floor(self) -> dict[str, Callable[[], object]]:
+    def minimal_step(self) -> dict[str, Callable[[], object]]:
         """Return name → minimal work of a control step from the present state, as calls for the benchmark to time."""
         compiled = self.simulation.compiled
         copy = mujoco.MjData(compiled.model)

@@ -92,12 +92,12 @@ class Silence(Grammar):
         self.words, self.held_out_words, self.held_out_colours, self.slots = {}, {}, (), set()
 
     def renamed(self, slots: Mapping[str, str]) -> Silence:
-        """No slots."""
+        """Return the grammar itself: it has no slots."""
         return self
 
     @property
     def held_out_kinds(self) -> tuple[HeldOut, ...]:
-        """No kinds."""
+        """Return nothing: nothing can be held out."""
         return ()
 
 

@@ -97,7 +97,7 @@ class RobotFile(Robot):
         robot_spec.set_armature(self._spec, joints, ARMATURE)
         body, position, rotation = robot_spec.add_tool(self._spec, tool, start, rotation_z(yaw), np.array(offset))
         robot_spec.add_camera(body, position, rotation, np.array(camera), np.array(target))
-        tips = [robot_spec.soften(self._spec, side) for side in fingertips]
+        tips = [robot_spec.make_fingertips(self._spec, side) for side in fingertips]
         servos = self._add_servos(start)
         grips = [self._grip(name, open[name], closed[name], force) for name in open]
         self.joints, self.servos, self.grips = ([PREFIX + name for name in names] for names in (joints, servos, grips))
@@ -115,7 +115,7 @@ class RobotFile(Robot):
     def draw(self, meshes: Literal["light", "full"]) -> None:
         """Choose how meshes look: hulls of few vertices ("light"), or as they are ("full")."""
         if meshes == "light":
-            robot_spec.lighten(self._spec, robot_spec.compiled(self._spec))
+            robot_spec.use_convex_hulls(self._spec, robot_spec.compiled(self._spec))
 
     def _attached(self, scene: mujoco.MjSpec) -> mujoco.MjSpec:
         turn = (np.cos(self._yaw / 2), 0.0, 0.0, np.sin(self._yaw / 2))

