@@ -22,8 +22,8 @@ BAD_INPUT = {
     "missing checkpoint": (("checkpoint=nowhere.ckpt",), "there is no checkpoint"),
     "a folder as checkpoint": (("checkpoint=.",), ". is a folder, a checkpoint is a file; it has none"),
     "a deployment without a policy": (("job=deploy", "deploy=loop"), "this deployment needs a trained policy"),
-    "a run that is no path": (("resume=true",), "resume=True is no path"),
-    "a checkpoint that is no path": (("checkpoint=3",), "checkpoint=3 is no path"),
+    "a run that is no path": (("resume=true",), "resume=True is not a path"),
+    "a checkpoint that is no path": (("checkpoint=3",), "checkpoint=3 is not a path"),
     "nothing interrupted": (
         ("resume=last", "output=nowhere/now"),
         "none of the 0 trainings in nowhere was interrupted",
@@ -147,7 +147,7 @@ def test_a_job_that_takes_no_checkpoint_says_which_word_does(tmp_path: Path) -> 
         ("variant=no_transformer model=rt1_small", "variant=no_transformer is model=bc: omit model=rt1_small"),
         ("experiment=standard task=metaworld", "the option chosen for task has no randomize: choose another task"),
         ("task.image_size.height=64", "height"),
-        ("checkpoint=x.ckpt output=2", "output=2 is no path"),
+        ("checkpoint=x.ckpt output=2", "output=2 is not a path"),
     ],
 )
 def test_a_line_that_would_not_do_what_it_says_is_refused(tmp_path: Path, line: str, sentence: str) -> None:

@@ -61,6 +61,12 @@ def test_a_whole_bag_is_played_in_order(bag: Path) -> None:
     assert {message.data for message in heard if hasattr(message, "data")} == {"go on"}
 
 
+def test_a_topic_of_an_unknown_type_is_named(bag: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("vla.deploy.bag.message_class", lambda name: None if "String" in name else object)
+    with pytest.raises(ValueError, match=r"bag: the messages of /words are of a type that"):
+        played(bag)
+
+
 @pytest.mark.parametrize("name", ["bag.mcap", "metadata.yaml"])
 def test_a_damaged_bag_is_played_or_refused_in_a_sentence(bag: Path, tmp_path: Path, name: str) -> None:
     """Bits that flip in many places, ends that are missing, sizes that are huge."""

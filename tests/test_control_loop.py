@@ -279,6 +279,16 @@ def test_an_arm_in_the_hands_of_a_person_is_not_commanded_and_goes_on_from_where
     assert world.loop.state is State.RUNNING and np.abs(steps).sum() > 0.01
 
 
+def test_an_inference_that_fails_after_the_arm_was_handed_over_counts_for_nothing(world: World) -> None:
+    world.run(0.3)
+    world.loop.hold("a person takes over")
+    world.run(0.2)
+    world.loop.hand_over()
+    for _ in range(3):
+        world.loop.reject_plan("the policy failed")
+    assert world.loop.state is State.HANDED_OVER and world.loop.rejections == 0
+
+
 @pytest.mark.parametrize(
     ("move", "says"),
     [

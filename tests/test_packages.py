@@ -11,6 +11,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from importlib import import_module
+from importlib.metadata import EntryPoint
 from pathlib import Path
 from typing import Any
 
@@ -77,7 +78,7 @@ def importable(installed: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Non
     """Within, this process finds the package as well, and trusts nothing; commands need no processes of their own."""
     monkeypatch.syspath_prepend(installed)
     monkeypatch.setenv(packages.TRUSTED, "")
-    caches = (packages.option_folders, packages.can_be_trusted)
+    caches = (packages.option_packages, packages.option_folders, packages.can_be_trusted)
     for cached in caches:
         cached.cache_clear()
     yield
@@ -102,6 +103,16 @@ def test_installing_it_adds_its_options(home: Path, importable: None) -> None:
     for group in ("task", "expert", "model", "tokenizer", "recorder", "deploy", "experiment"):
         assert re.search(rf"^\W*{group}: .*\bmine\b", listed, re.MULTILINE), group
     assert f"_target_: {MODEL}" in here(home, "model=mine", "--cfg", "job").stdout
+
+
+def test_a_package_without_its_folder_of_options_is_named(
+    home: Path, importable: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    broken = EntryPoint("broken", "mypackage.missing", packages.ENTRY_POINTS)
+    monkeypatch.setattr(packages, "entry_points", lambda group: [broken])
+    said = here(home, "--help", ok=False).stderr
+    assert said.startswith("error: the installed package mypackage names mypackage.missing as its options")
+    assert len(said.splitlines()) == 1
 
 
 def test_a_job_with_a_group_of_its_own_is_two_options_and_a_module(home: Path, importable: None) -> None:

@@ -318,7 +318,7 @@ def test_runs_with_nothing_to_compare_are_refused(tmp_path: Path) -> None:
     for folders, says in (
         ([], r"report\.runs=\[RUN,RUN\]"),
         ([run, tmp_path / "empty"], "empty is no run: it has none of report.json, errors.json and metrics.csv"),
-        ([run, tmp_path / "run/../run"], "contains a folder twice"),
+        ([run, tmp_path / "run/../run"], "a run is named twice"),
     ):
         with pytest.raises(ValueError, match=says):
             compared(folders, tmp_path / "new")

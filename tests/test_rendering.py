@@ -20,9 +20,10 @@ from conftest import CONF, make_tabletop
 from gallery import gallery
 from hydra import compose, initialize_config_dir
 
+from vla import jobs
 from vla.config.compose import compose as compose_config
 from vla.config.experiment import plain
-from vla.config.substitutes import options, with_substitutes
+from vla.config.substitutes import builds_world, options, with_substitutes
 from vla.spec import Array
 from vla.tasks import gl
 from vla.tasks.rendering import shapes
@@ -348,6 +349,9 @@ def test_without_egl_mujocos_renderer_is_chosen_and_named(
     assert with_substitutes(config, ["task/renderer=fast"]) is config  # and fails, in a sentence
     monkeypatch.setenv(gl.EGL_WORKS, "True")
     assert with_substitutes(config, []) is config
+    for option, simulated in (("loop", True), ("simulator", True), ("ros2", False), ("server", False)):
+        deploying = compose_config("job=deploy", f"deploy={option}")
+        assert builds_world(deploying, jobs.find("deploy").JOB.needs(deploying)) == simulated
 
 
 def test_a_machine_without_gl_is_told_from_others(monkeypatch: pytest.MonkeyPatch) -> None:

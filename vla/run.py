@@ -24,10 +24,9 @@ from yaml import YAMLError
 from vla import jobs
 from vla.config.annotations import packages, targets
 from vla.config.check import Job, check, devices
-from vla.config.compose import CONF
 from vla.config.experiment import Experiment, plain
-from vla.config.packages import offer_options, option_folders, trust
-from vla.config.substitutes import with_substitutes
+from vla.config.packages import CONF, config_folders, offer_options, option_packages, trust
+from vla.config.substitutes import builds_world, with_substitutes
 from vla.deploy import ros
 from vla.io.suggestion import suggestion
 from vla.parallel.fast_exit import fast_exit
@@ -114,7 +113,7 @@ def _meant_for_user(error: Exception) -> bool:
     file, statement = lines[-1]
     if Path(file).name == "omegaconf.py":  # a key of a list that is no number
         return True
-    added = [find_spec(package) for package, _ in option_folders()]
+    added = [find_spec(package) for package in option_packages()]
     places = [Path(place) for spec in added if spec for place in spec.submodule_search_locations or ()]
     ours = any(Path(file).is_relative_to(folder) for folder in (PACKAGE, Path(hydra.__file__).parent, *places))
     return ours and statement.startswith("raise")
@@ -136,25 +135,27 @@ def _require_swept() -> None:
     """Refuse grids of which only one cell would run, and cells that share a folder."""
     hydra_config = HydraConfig.get()
     parts = [override.partition("=") for override in hydra_config.overrides.task]
-    said = {key: value for key, _, value in parts}
+    given = {key: value for key, _, value in parts}
     choices, swept = hydra_config.runtime.choices, hydra_config.mode == RunMode.MULTIRUN
     if not swept and hydra_config.sweeper.params:
         raise ValueError(f"experiment={choices['experiment']} is a grid of runs: add -m")
-    if not said.keys() >= (hydra_config.sweeper.params or {}).keys():
+    if not given.keys() >= (hydra_config.sweeper.params or {}).keys():
         raise ValueError(f"experiment={choices['experiment']} is a grid of its own: name no other one beside it")
-    if swept and "${" not in said.get("output", "${"):
+    if swept and "${" not in given.get("output", "${"):
         raise ValueError("with -m every cell has a folder of its own: name that of the sweep, hydra.sweep.dir=DIR")
 
 
 def _require_variant() -> None:
     """Refuse an option of the command line that replaces the one which makes the variant."""
     choices = HydraConfig.get().runtime.choices
-    file = CONF / f"variant/{choices.get('variant')}.yaml"
-    for entry in OmegaConf.select(OmegaConf.load(file), "defaults", default=[]) if file.is_file() else []:
+    variant = choices.get("variant")
+    paths = (folder / f"variant/{variant}.yaml" for folder in config_folders())
+    file = next((path for path in paths if path.is_file()), None)
+    for entry in OmegaConf.select(OmegaConf.load(file), "defaults", default=[]) if file else []:
         for key, option in entry.items() if isinstance(entry, DictConfig) else ():
             group = str(key).removeprefix("override /")
             if choices.get(group) != option:
-                raise ValueError(f"variant={file.stem} is {group}={option}: omit {group}={choices.get(group)}")
+                raise ValueError(f"variant={variant} is {group}={option}: omit {group}={choices.get(group)}")
 
 
 def _remove_unused() -> None:
@@ -177,7 +178,7 @@ def _do(cfg: DictConfig) -> float | None:
     job = jobs.find(cfg.job).JOB
     check(cfg, job)
     _require_sweepable(cfg, job)  # with the trainer that a run brings
-    if "task" in job.needs(cfg):
+    if builds_world(cfg, job.needs(cfg)):
         cfg = with_substitutes(cfg, overrides)
     return jobs.run(Experiment.of(cfg, compose("config")))
 
@@ -190,7 +191,9 @@ def _adopted(cfg: DictConfig, overrides: list[str]) -> DictConfig:
     """
     for key in ("resume", "checkpoint", "pretrained", "output"):
         if not isinstance(cfg[key], str | None) or (key == "output" and not cfg[key]):
-            raise ValueError(f"{key}={cfg[key]} is no path: give a folder or file, in quotes if it is called so")
+            raise ValueError(
+                f"{key}={cfg[key]} is not a path: give a folder or file; a number is quoted, {key}=\\'3\\'"
+            )
     if cfg.resume is cfg.pretrained is cfg.checkpoint is None:
         return cfg
     from vla.config.adopt import adopt, finetune, resume  # imports PyTorch, as the next one does
@@ -246,7 +249,7 @@ def _compose(cfg: DictConfig) -> float | None:
 def _menu() -> str:
     """Return the text of --help; Hydra's own search through its config sources takes most of a second."""
     groups: dict[str, list[str]] = {}
-    for folder in (CONF, *(folder for _, folder in option_folders())):
+    for folder in config_folders():
         for file in folder.rglob("*.yaml"):
             group = file.parent.relative_to(folder)
             if group.parts[:1] not in ((), ("hydra",)):

@@ -453,7 +453,8 @@ class Deployment(Protocol):
     """Execution of a policy outside training; built as `Deployment(**yaml, policy=…, environment=…, output=…)`.
 
     `policy` and `environment` are factories of the checkpoint's policy and of its task's environment, called on demand;
-    `output` is a folder to write to. A class with `needs_policy = False` runs without a checkpoint.
+    `output` is a folder to write to. A class with `needs_policy = False` runs without a checkpoint, one with
+    `needs_environment = True` always builds the environment.
     """
 
     def run(self) -> Any:

@@ -17,7 +17,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from vla.config.annotations import MissingLibrary, fits, locate
 from vla.config.build import GROUPS, Group, arguments, check_node, check_value, makes, require_known
-from vla.config.packages import CONF
+from vla.config.packages import config_folders
 from vla.io.documents import canonical
 from vla.io.types import Count, Natural, Seed, Shift, Text, unique
 from vla.spec import FIRST_SEED, IN_DISTRIBUTION
@@ -88,7 +88,8 @@ def check(cfg: DictConfig, job: Job) -> None:
     groups, plain = job.needs(cfg), dict(PLAIN)
     if job.options:
         plain[cfg.job.rpartition(".")[2]] = job.options
-    jobs = {file.stem for file in (CONF / "job").glob("*.yaml")}  # an experiment may have options of another job
+    files = (file for folder in config_folders() for file in (folder / "job").glob("*.yaml"))
+    jobs = {file.stem for file in files}  # an experiment may have options of another job
     for name in cfg:
         if name not in jobs:
             require_known("", str(name), (*plain, *GROUPS, *groups), "the config")

@@ -17,7 +17,7 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 import vla.config.check
 import vla.config.recorded  # noqa: F401  these two register the resolvers
 from vla.config.experiment import Node, plain
-from vla.config.packages import CONF, offer_options, option_folders
+from vla.config.packages import CONF, config_folders, offer_options
 
 
 def compose(*overrides: str) -> DictConfig:
@@ -73,8 +73,7 @@ def _hydra() -> Iterator[ConfigLoader]:
 
 def describe_jobs() -> str:
     """Resolve `${jobs:}`: a line per option of the group `job`, with the first comment of its file."""
-    folders = (CONF, *(folder for _, folder in option_folders()))
-    files = {file.stem: file for folder in reversed(folders) for file in (folder / "job").glob("*.yaml")}
+    files = {file.stem: file for folder in reversed(config_folders()) for file in (folder / "job").glob("*.yaml")}
     return "\n".join(f"  {name:11} {_comment(file)}" for name, file in sorted(files.items()))
 
 

@@ -44,6 +44,17 @@ def offer_options() -> None:
 
 
 @cache
+def option_packages() -> frozenset[str]:
+    """Return the installed packages that name a folder of options, even if it does not exist."""
+    return frozenset(entry.value.partition(".")[0] for entry in entry_points(group=ENTRY_POINTS))
+
+
+def config_folders() -> tuple[Path, ...]:
+    """Return the folders of all options, that of `vla` first. Raises as `option_folders`."""
+    return CONF, *(folder for _, folder in option_folders())
+
+
+@cache
 def option_folders() -> tuple[tuple[str, Path], ...]:
     """Return (package, folder of options) of installed packages, without importing them.
 
@@ -58,7 +69,7 @@ def option_folders() -> tuple[tuple[str, Path], ...]:
         folder = next((path for place in places if (path := Path(place, *parts)).is_dir()), None)
         if folder is None:
             raise ValueError(
-                f"the installed package {package} names {entry.value} as its options, which is no folder: its wheel "
+                f"the installed package {package} names {entry.value} as its options, which is not a folder: its wheel "
                 "must include the YAML files"
             )
         found.append((package, folder.resolve()))
@@ -88,7 +99,7 @@ def trust(packages: Any, chosen: Iterable[Any], used: Iterable[Any] = ()) -> Non
                 f"{key} cannot name {name!r}: it takes packages made for vla or gymnasium, by the name that "
                 "is imported, without a module: their distribution depends on one of these"
             )
-    offering = {package for package, _ in option_folders()}
+    offering = option_packages()
     classes = {each for each in chosen if isinstance(each, str) and each.partition(".")[0] in offering}
     os.environ[TRUSTED] = ",".join(sorted({*named, *classes}))
 

@@ -1,10 +1,10 @@
-"""Parts of a task that this machine cannot use, and what takes their place."""
+"""Fallbacks for options of a task that this machine cannot run."""
 
 from __future__ import annotations
 
 import copy
 import logging
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Any, cast
 
@@ -16,6 +16,13 @@ from vla.config.packages import CONF
 from vla.data.header import is_store
 
 log = logging.getLogger(__name__)
+
+
+def builds_world(cfg: DictConfig, groups: Collection[str]) -> bool:
+    """Return whether a job that builds `groups` of `cfg` builds the environment of its task."""
+    if "deploy" not in groups or cfg.deploy is None:
+        return "task" in groups
+    return getattr(locate("deploy._target_", cfg.deploy._target_), "needs_environment", False)
 
 
 def with_substitutes(cfg: DictConfig, overrides: Sequence[str]) -> DictConfig:

@@ -88,11 +88,13 @@ def play(node: Any, folder: Path, topics: Collection[str], stopped: Event, speed
     with opened(folder) as reader:
         connections = [connection for connection in reader.connections if connection.topic in topics]
         classes = {connection.topic: message_class(connection.msgtype) for connection in connections}
-        if missing := ", ".join(topic for topic in topics if classes.get(topic) is None):
+        if missing := ", ".join(topic for topic in topics if topic not in classes):
             there = ", ".join(sorted({connection.topic for connection in reader.connections})) or "nothing"
             raise ValueError(
                 f"{folder} has no topic {missing}, it has {shorten(there, 500)}: choose topics with --topics"
             )
+        if unknown := ", ".join(each.topic for each in connections if classes[each.topic] is None):
+            raise ValueError(f"{folder}: the messages of {unknown} are of a type that this machine does not have")
         publishers = {topic: node.create_publisher(kind, topic, 10) for topic, kind in classes.items()}
         deadline = time.monotonic() + 2.0  # for the discovery of these publishers
         while time.monotonic() < deadline and not all(p.get_subscription_count() for p in publishers.values()):

@@ -266,7 +266,9 @@ class ControlLoop:
         return None
 
     def reject_plan(self, reason: str) -> None:
-        """Count a failed inference."""
+        """Count a failed inference, unless the arm has been handed over since it began."""
+        if self._pending is None:
+            return
         self._pending = None
         self._count_rejection(reason)
 

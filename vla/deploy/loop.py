@@ -8,7 +8,7 @@ from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass
 from multiprocessing import get_context
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 from vla.deploy.bag import BagRecorder
 from vla.deploy.ros import plain_errors, ros
@@ -38,6 +38,8 @@ class Loop:
         policy, environment: factories of the checkpoint's policy and of its task's environment.
         output: folder of the report and the recordings.
     """
+
+    needs_environment: ClassVar[bool] = True
 
     agent: Callable[..., PolicyDeployment]
     simulator: Callable[..., SimulatorDeployment]

@@ -76,6 +76,7 @@ class SimulatorDeployment:
     """
 
     needs_policy: ClassVar[bool] = False
+    needs_environment: ClassVar[bool] = True
 
     robot: Robot
     network: RosNetwork

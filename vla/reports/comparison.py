@@ -53,7 +53,7 @@ def _names(folders: Sequence[Path]) -> list[str]:
         names = ["/".join(path[-length:]) for path in paths]
         if len(set(names)) == len(names):
             return names
-    raise ValueError("report.runs contains a folder twice")
+    raise ValueError(f"a run is named twice: {', '.join(map(str, folders))}")
 
 
 def compare_runs(runs: Mapping[str, Run], margin: float) -> list[RunComparison]:

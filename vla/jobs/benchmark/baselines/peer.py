@@ -31,8 +31,9 @@ def peer(name: str, python: str, script: str, arguments: Sequence[Any], processe
             started = [Popen(command, stdout=PIPE, stderr=PIPE, text=True) for _ in range(processes)]
         except OSError as error:
             raise ValueError(f"benchmark.{name} is {python}, which cannot be run: {error.strerror}") from error
-        told = [process.communicate() for process in started]
-    if any(process.returncode for process in started):
-        last = told[0][1].strip().splitlines()[-1:] or ["it says nothing"]
+        outputs = [process.communicate() for process in started]
+    failed = [errors for process, (_, errors) in zip(started, outputs, strict=True) if process.returncode]
+    if failed:
+        last = failed[0].strip().splitlines()[-1:] or ["no output"]
         raise ValueError(f"benchmark.{name} is {python}, with which {name} does not run: {last[0]}")
-    return sum(float(printed.split()[-1]) for printed, _ in told)
+    return sum(float(printed.split()[-1]) for printed, _ in outputs)
