@@ -88,7 +88,7 @@ def test_a_compressed_image_is_decoded(kind: str, mode: str) -> None:
 def test_a_compressed_image_that_is_none_is_refused(damage: Any) -> None:
     data = io.BytesIO()
     Image.fromarray(PIXELS.repeat(30, 0).repeat(30, 1)).save(data, "PNG")
-    with pytest.raises(ValueError, match="image of format 'png' is no JPEG or PNG, or damaged"):
+    with pytest.raises(ValueError, match="image of format 'png' is not a JPEG or PNG, or is damaged"):
         messages.image_from(SimpleNamespace(format="png", data=damage(data.getvalue())))
 
 

@@ -282,7 +282,7 @@ WRONG: dict[str, tuple[Any, str]] = {
     "range": (pack({**WHOLE, "observation/image": np.full((4, 4, 3), 255.0)}), "send uint8, or floats from 0 to 1"),
     "state": (pack({**WHOLE, "observation/state": np.zeros(3)}), "has 3 numbers, the policy needs 2: east, north"),
     "finite": (pack({**WHOLE, "observation/state": [np.nan, 0.0]}), "holds a number that is not finite"),
-    "words": (pack({**WHOLE, "observation/state": "far"}), "observation/state is no vector of numbers"),
+    "words": (pack({**WHOLE, "observation/state": "far"}), "observation/state is not a vector of numbers"),
     "prompt": (pack({**WHOLE, "prompt": "a" * (LONGEST_INSTRUCTION + 1)}), "of at most 1000 characters"),
     "seed": (pack({"reset": True, "seed": -1}), "seed is -1, expected an integer"),
     "objects": (
@@ -445,7 +445,9 @@ def test_beyond_this_machine_nobody_listens_without_a_key(tmp_path: Path) -> Non
         settings(policy, **files).run()
     with serving(policy) as url:
         client: Any = remote(url)
-        with pytest.raises(ValueError, match=r"deploy=server serves a trained policy, .* a RemotePolicy is none"):
+        with pytest.raises(
+            ValueError, match=r"deploy=server serves a trained policy, .* a RemotePolicy cannot be served"
+        ):
             settings(client).run()
         client.close()
         port = int(url.rpartition(":")[2])

@@ -54,7 +54,7 @@ class GoalSender:
         self.reset()
 
     def reset(self) -> None:
-        """Forget what has been sent."""
+        """Reset the state of the goals."""
         self._newest += 1
         self._handle: Any = None  # of the newest goal that was accepted and has not ended
         self._sent_at: float | None = None  # when the newest goal was sent, until it is answered
@@ -194,12 +194,12 @@ class GripperGoals:
         self.reset()
 
     def reset(self) -> None:
-        """Forget what was commanded: the next opening is sent in any case."""
+        """Reset the state: the next opening is sent even if it repeats the last."""
         self._wanted: bool | None = None  # open?
         self._sent: bool | None = None
 
     def command(self, opening: float) -> None:
-        """Open or close the gripper if an `opening` of 0 closed … 1 open differs clearly from what was commanded."""
+        """Open above `OPEN_ABOVE`, close below `CLOSE_BELOW`; `opening` is 0 closed … 1 open."""
         if opening > OPEN_ABOVE:
             self._wanted = True
         elif opening < CLOSE_BELOW:
@@ -211,7 +211,7 @@ class GripperGoals:
         self._wanted = None
 
     def _advance(self) -> None:
-        """Send what is wanted, after the goal before has ended: Franka's gripper takes one at a time."""
+        """Send the requested goal once the previous one has ended: Franka's gripper accepts one at a time."""
         if self._wanted is None or self._wanted == self._sent:
             return
         busy = [sender for sender in self.senders.values() if sender.active]

@@ -157,7 +157,7 @@ class BagDemonstrations(ImportedDemonstrations):
         return Episode(*what, observations, clipped, clipped)
 
     def fill(self, store: EpisodeStore, episodes: int) -> int:
-        """Append episodes, and log what the import changes."""
+        """Append episodes, and log the share of clipped actions."""
         if self._beyond:
             log.info("%.2g %% of the actions are clipped to the bounds of the task", 100 * self._beyond)
         return super().fill(store, episodes)

@@ -168,7 +168,7 @@ class _Reading:
         self.index.stretches = [*self._stretches()]
 
     def _handle(self, topics: Topics, status: str, reader: Any) -> dict[str, Callable[[int, float, Any], None]]:
-        """Return topic → what to do with its messages; a ValueError if one is missing or of another type."""
+        """Return topic → message handler; a ValueError if a topic is missing or of another type."""
         commands = {JOINTS: self._command, TRAJECTORY: self._trajectory, NUMBERS: self._numbers, TWIST: self._nothing}
         wanted: dict[str, dict[str, Any]] = {}  # topic → type → handler
         for camera, topic in topics.images.items():

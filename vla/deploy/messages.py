@@ -102,7 +102,7 @@ def _decompressed(message: Any) -> Array:
                 raise ValueError(f"image of format {quoted} has {image.width} by {image.height} pixels of {image.mode}")
             return np.array(image.convert("RGB"))
     except (OSError, SyntaxError, EOFError, struct.error, zlib.error, Image.DecompressionBombError) as error:
-        raise ValueError(f"image of format {quoted} is no JPEG or PNG, or damaged") from error
+        raise ValueError(f"image of format {quoted} is not a JPEG or PNG, or is damaged") from error
 
 
 def fill_image(message: Any, image: Array, frame: str) -> Any:

@@ -66,7 +66,7 @@ class OnnxPolicy(Policy):
 
 
 def digest(model: Model, spec: Spec) -> str:
-    """Return sixteen hexadecimal digits of what the programs are made of: versions, code, options and weights."""
+    """Return a digest of versions, code, options and weights, sixteen hexadecimal digits."""
     import onnxruntime
 
     content = hashlib.sha256(f"{torch.__version__} {onnxruntime.__version__} {spec.to_dict()}".encode())

@@ -26,7 +26,7 @@ def main() -> None:
     if options.instruction is None and not any((options.resume, options.reset, options.hand_over, options.hand_back)):
         parser.error("nothing to do: add an instruction, --resume, --hand-over, --hand-back or --reset")
     if not NAME.fullmatch(options.topic):
-        parser.error(f"--topic {options.topic!r} is no name in ROS")
+        parser.error(f"--topic {options.topic!r} is not a valid ROS name")
     instruction = options.instruction or ""
     if len(instruction) > LONGEST_INSTRUCTION:
         sys.exit(f"error: the instruction has {len(instruction)} characters, the limit is {LONGEST_INSTRUCTION}")

@@ -151,7 +151,7 @@ class PolicyServer:
         policy = self.policy()
         if not hasattr(policy, "session"):  # an agent in its place
             raise ValueError(
-                f"deploy=server serves a trained policy, checkpoint=FILE; a {type(policy).__name__} is none"
+                f"deploy=server serves a trained policy, checkpoint=FILE; a {type(policy).__name__} cannot be served"
             )
         if keyless := [camera for camera in policy.spec.cameras if camera not in self.keys.images]:
             raise ValueError(f"the policy sees {', '.join(keyless)}: add +deploy.keys.images.{keyless[0]}=KEY")
@@ -224,7 +224,7 @@ class Service:
         self._policy.session().plan(self._policy.spec.random_observation(np.random.default_rng(0)))
 
     def _answer_request(self, connection: ServerConnection, request: Request) -> Response | None:
-        """Answer a request for health, and refuse strangers and crowds before they can send anything."""
+        """Answer health checks; reject clients without the key, or beyond `connections`, during the handshake."""
         if request.path == "/healthz":
             return connection.respond(HTTPStatus.OK, "OK\n")
         key = self._settings.api_key
@@ -341,7 +341,7 @@ def _plan(sessions: Sequence[Policy], observations: Sequence[Observation]) -> li
 
 
 def _connection() -> type[ServerConnection]:
-    """Return a connection that answers a client of another protocol, which websockets would leave without a word."""
+    """Return a connection that answers a client of another protocol, which websockets would close silently."""
     from websockets.asyncio.server import ServerConnection
 
     class Connection(ServerConnection):
@@ -418,7 +418,7 @@ def _vector(key: str, value: Any) -> Array:
         with np.errstate(over="ignore"):
             vector = np.asarray(value, np.float32).reshape(-1)
     except (ValueError, TypeError) as error:
-        raise ValueError(f"{key} is no vector of numbers") from error
+        raise ValueError(f"{key} is not a vector of numbers") from error
     if not np.isfinite(vector).all():
         raise ValueError(f"{key} holds a number that is not finite")
     return vector

@@ -2,7 +2,7 @@
 
 python -m vla.deploy.view                   opens the viewer
 python -m vla.deploy.view --save FILE.rrd   writes a recording until interrupted
-python -m vla.deploy.view --expected STORE  also lays what the cameras saw in training over what they see
+python -m vla.deploy.view --expected STORE  also overlays the training images on the live ones
 
 The arm is drawn as the agent describes it: as lines between its joints, or with the surface named by --shell.
 """
@@ -239,7 +239,7 @@ def _shell(name: str) -> Shell:
 
 
 def expected_pictures(folder: Path, cameras: Iterable[str]) -> dict[str, Array]:
-    """Return topic → what a camera sees at the start of the episodes of a store, (H, W, 3) uint8.
+    """Return topic → median first image of the episodes of a store, (H, W, 3) uint8.
 
     The median over episodes keeps what is always at the same place, such as the table.
 

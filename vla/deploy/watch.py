@@ -16,7 +16,7 @@ def main() -> None:
     parser.add_argument("--network", choices=NETWORKS, default="loopback")
     options = parser.parse_args()
     if not NAME.fullmatch(options.agent):
-        parser.error(f"--agent {options.agent!r} is no name in ROS")
+        parser.error(f"--agent {options.agent!r} is not a valid ROS name")
     with command_node("vla_watch", options.network) as (node, stopped):
         from diagnostic_msgs.msg import DiagnosticStatus
 

@@ -84,7 +84,7 @@ def run(experiment: Experiment) -> float | None:
 
 
 def require_possible(experiment: Experiment) -> None:
-    """Refuse, before any work, what an evaluation could not do at its end.
+    """Check, before any work, that the evaluation can be completed.
 
     Raises:
         ValueError: there is no such run to compare with, nothing to decide, no such network or store, or no world to
@@ -149,7 +149,7 @@ def _evaluated(experiment: Experiment, checkpoint: Path | None, rounds: Sequence
 
 
 def _statements(experiment: Experiment) -> list[Statement]:
-    """Return what the evaluation is to decide about the training condition.
+    """Build the statements on the training condition that the evaluation must decide.
 
     Raises:
         ValueError: there is no such run to compare with, or nothing to decide.
@@ -296,7 +296,7 @@ def _write(
 
 
 def _facts(experiment: Experiment, checkpoint: Path | None, rounds: Sequence[Round], seconds: float) -> dict[str, Any]:
-    """Return what a report says of the agent, given the duration of its evaluation [s]."""
+    """Return the entries of a report that describe the agent, given the duration of its evaluation [s]."""
     chosen = {**experiment["chosen"], "versions": installed_versions()}
     if checkpoint is None:
         return {**chosen, "model": chosen["agent"], "wall_time_s": seconds}

@@ -95,7 +95,7 @@ def _save_config(experiment: Experiment) -> None:
 
 
 def _require_possible(experiment: Experiment) -> range:
-    """Return the seeds of all rounds, after refusing what would fail later on.
+    """Check the config, and return the seeds of all rounds.
 
     Raises:
         ValueError: seeds are of evaluation, training is to use several devices, or the expert cannot label.
@@ -172,7 +172,7 @@ def _trained(experiment: Experiment) -> Path:
 
 
 def _described(folder: Path, store: EpisodeStore | None) -> Round:
-    """Return what a finished round did; without a store it is the training on demonstrations alone."""
+    """Summarise a finished round; without a store, the training on demonstrations alone."""
     found, episodes = read_run(folder), store.episodes if store else []
     curve = found.metrics.get("val/success")
     return Round(
@@ -185,7 +185,7 @@ def _described(folder: Path, store: EpisodeStore | None) -> Round:
 
 
 def _digest(checkpoint: Path) -> str:
-    """Return what identifies the weights in a checkpoint: twelve hexadecimal digits."""
+    """Return a digest of the weights in a checkpoint, twelve hexadecimal digits."""
     digest = hashlib.sha256()
     for name, value in sorted(read_checkpoint(checkpoint).state.items()):
         tensor = isinstance(value, torch.Tensor)  # or what a module keeps besides, such as the rules of a tokenizer

@@ -1,4 +1,4 @@
-"""What a machine, container or batch job lets its processes use."""
+"""Cores and memory available to this process, as limited by the machine, its container or batch job."""
 
 from __future__ import annotations
 

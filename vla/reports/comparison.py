@@ -185,7 +185,7 @@ def _compared(one: Run, other: Run, condition: str) -> tuple[Comparison, dict[st
 
 
 def _by_seed(run: Run, condition: str) -> dict[int, tuple[Result, Any]]:
-    """Return seed → result under a condition, and what identifies its scene and instruction."""
+    """Return seed → result under a condition, and a key that is equal for equal scene and instruction."""
     results = [result for result in run.reports.get(condition, Report(())).results if result.outcome != ERROR]
     if condition == IN_DISTRIBUTION:
         # A world may tell nothing of what it drew.
@@ -195,7 +195,7 @@ def _by_seed(run: Run, condition: str) -> dict[int, tuple[Result, Any]]:
 
 
 def _scenes(run: Run, condition: str) -> tuple[Any, ...]:
-    """Return what the scenes of all seeds depend on: the task, and how a condition changes it."""
+    """Return the config values that determine the scenes: the task, and the changes of a condition."""
     config = run.report.config if run.report else {}
     asked = at(config, "evaluate", {})
     changes = conditions(

@@ -78,7 +78,7 @@ def course_table(rows: Courses, heads: Sequence[str]) -> Table:
 
 
 def course_names(rows: Courses) -> list[str]:
-    """Return what was compared: fields of `Motion`, then milestones."""
+    """Return the names of the compared metrics: fields of `Motion`, then milestones."""
     found = {name for course in rows.values() for name in course}
     return [*(name for name in AMOUNTS if name in found), *sorted(found - {*AMOUNTS})]
 

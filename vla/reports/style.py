@@ -38,7 +38,7 @@ def save(figure: Figure, path: Path, dpi: int = 110) -> None:
 
 @contextmanager
 def svg_style(title: str) -> Iterator[None]:
-    """Draw within this context what `as_svg` converts; the title makes its identifiers unique on a page."""
+    """Set the style of figures for `as_svg`; the title makes their identifiers unique on a page."""
     settings: Any = {"svg.fonttype": "none", "svg.hashsalt": title, "text.parse_math": False, "font.size": 9}
     settings |= {f"{part}.color": INK for part in ("text", "xtick", "ytick")}
     settings |= {"axes.edgecolor": INK, "axes.labelcolor": INK, "grid.color": INK, "axes.linewidth": 0.6}

@@ -138,7 +138,7 @@ class Tier:
 
 @dataclass(frozen=True, kw_only=True)
 class ReportFile:
-    """report.json, written by `vla.reports.evaluation.write_report`, without what follows from its episodes."""
+    """report.json, written by `vla.reports.evaluation.write_report`, without values derived from its episodes."""
 
     __pydantic_config__ = LENIENT
 

@@ -23,7 +23,7 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class _Evaluation:
-    """First line of the file: what the episodes depend on."""
+    """First line of the file: the inputs that determine the episodes."""
 
     __pydantic_config__ = STRICT
 

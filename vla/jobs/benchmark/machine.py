@@ -1,4 +1,4 @@
-"""The machine that a benchmark measures, and what else runs on it."""
+"""The benchmarked machine, and its load from other programs."""
 
 from __future__ import annotations
 
