@@ -26,7 +26,7 @@ from vla.deploy.observer import HISTORY, Observer
 from vla.deploy.settings import Topics
 from vla.io.images import Crop, resize
 from vla.io.types import Text
-from vla.robots.controllers import GRIPPER, recorded_controller
+from vla.robots.controllers import gripper_index, recorded_controller
 from vla.spec import Array, Episode, Observation, Spec
 
 MEASURED_WITHIN = 0.2  # largest time between an observation and its joint state [s]
@@ -85,7 +85,7 @@ class BagDemonstrations(ImportedDemonstrations):
         if missing := [camera for camera in spec.cameras if camera not in topics.images]:
             raise ValueError(f"no topic for the cameras {', '.join(missing)}: add +expert.topics.images.{missing[0]}")
         self._controller = recorded_controller(spec)
-        self._grip = spec.action.index(GRIPPER) if GRIPPER in {*spec.action} - {*model.joints} else None
+        self._gripper_index = gripper_index(spec)
         self._topics = {camera: topics.images[camera] for camera in spec.cameras}
         self._index = read_index(_folder_of(folder), replace(topics, images=self._topics), robot, status)
         self._stretches = _chosen(self._index, steps)
@@ -214,12 +214,12 @@ class BagDemonstrations(ImportedDemonstrations):
         index, end = self._index, at + 1 / self.spec.control_hz
         track = index.commands if index.commands.covers(at) and index.commands.covers(end) else index.measured
         motion = self._controller.motion_between(track.between(at), track.between(end))
-        if self._grip is None:
+        if self._gripper_index is None:
             return motion
-        opening = index.grips.last(end)
+        opening = index.gripper_commands.last(end)
         if opening is None:
             opening = float(index.openings.between(end)) / self._robot.stroke
-        return np.insert(motion, self._grip, opening)
+        return np.insert(motion, self._gripper_index, opening)
 
 
 def _folder_of(folder: Path | str | None) -> Path:

@@ -95,7 +95,7 @@ class BagIndex:
     measured: Track = field(default_factory=Track)  # joints (J,) [rad]
     openings: Track = field(default_factory=Track)  # measured, of the gripper [m]
     commands: Track = field(default_factory=Track)  # joints (J,) [rad]
-    grips: Track = field(default_factory=Track)  # commanded openings of the gripper, 0 … 1
+    gripper_commands: Track = field(default_factory=Track)  # commanded openings of the gripper, 0 … 1
     stretches: list[Stretch] = field(default_factory=list)
 
     def corrections(self) -> list[Stretch]:
@@ -162,7 +162,7 @@ class _Reading:
         self._usable: Counter[str] = Counter()  # topic → messages
         with opened(folder) as reader:
             self._handlers = self._handle(topics, status, reader)
-            self._read(reader, topics)
+            self._read(reader)
         self._require_usable(topics)
         self.index.inputs.sort(key=lambda each: each[0])
         self.index.stretches = [*self._stretches()]
@@ -195,7 +195,7 @@ class _Reading:
         self._person = None if self._has_status else True
         return {topic: kinds[there[topic]] for topic, kinds in wanted.items() if topic in there}
 
-    def _read(self, reader: Any, topics: Topics) -> None:
+    def _read(self, reader: Any) -> None:
         types = message_types()
         connections = [connection for connection in reader.connections if connection.topic in self._handlers]
         kinds = {connection.topic: connection.msgtype for connection in connections}
@@ -267,7 +267,7 @@ class _Reading:
         joints, opening = messages.command_from(message.name, message.position, self._robot)
         self.index.commands.add(at, joints)
         if opening is not None:
-            self.index.grips.add(at, opening)
+            self.index.gripper_commands.add(at, opening)
 
     def _trajectory(self, stamp: int, at: float, message: Any) -> None:
         for point in message.points:
@@ -281,7 +281,7 @@ class _Reading:
         opening = float(np.mean(message.data)) / self._robot.finger_travel if len(message.data) else np.nan
         if not np.isfinite(opening):
             raise ValueError("finger positions that are not finite")
-        self.index.grips.add(at, opening)
+        self.index.gripper_commands.add(at, opening)
 
     def _stretches(self) -> Iterator[Stretch]:
         """Yield every try, with the times in which a person moved the arm."""

@@ -16,7 +16,7 @@ from vla.deploy.joint_limiter import JointLimiter, Robot
 from vla.deploy.observer import HISTORY, Measured, Observer
 from vla.io.types import Count, Point, Positive
 from vla.robots.cartesian import CartesianController
-from vla.robots.controllers import GRIPPER, controller_for
+from vla.robots.controllers import controller_for, gripper_index
 from vla.spec import Array, Observation, Spec
 
 Waypoint = tuple[float, Array, float | None]  # when due, goal of the joints, opening
@@ -89,9 +89,9 @@ class ControlLoop:
             )
         limits = robot.min_position, robot.max_position, np.array(robot.speed)
         self._controller = controller_for(spec, safety.workspace, limits)
-        self._grip = spec.action.index(GRIPPER) if GRIPPER in {*spec.action} - {*model.joints} else None
-        self.grips = self._grip is not None
-        self._motion = [index for index in range(len(spec.action)) if index != self._grip]
+        self._gripper_index = gripper_index(spec)
+        self.has_gripper = self._gripper_index is not None
+        self._motion = [index for index in range(len(spec.action)) if index != self._gripper_index]
         if model.gripper in spec.state and not robot.fingers:
             raise ValueError("the policy sees how far its gripper is open: name the joints in deploy.robot.fingers")
         if command_hz < spec.control_hz:
@@ -257,7 +257,9 @@ class ControlLoop:
         actions = np.clip(actions, self.spec.low, self.spec.high)
         self._controller.reset(anchor)
         goals = [self._controller.step(action[self._motion]).copy() for action in actions]
-        openings = [self._opening] * len(actions) if self._grip is None else actions[:, self._grip].tolist()
+        openings = (
+            [self._opening] * len(actions) if self._gripper_index is None else actions[:, self._gripper_index].tolist()
+        )
         if not self._follows_positions and (measured := self._observer.newest) is not None:
             self.limiter.position = np.array(measured.joints, float)
         ends = observed + period * np.arange(1, len(actions) + 1)

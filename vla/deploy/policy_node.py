@@ -143,8 +143,10 @@ class PolicyNode(GuardedLifecycleNode):
             raise ValueError("command=twist needs a policy of Cartesian actions, this one's are joint positions")
         rate, follows = self.get_parameter("command_hz").value, not (dry_run or twist)
         loop = ControlLoop(spec, robot, self.settings.safety, rate, follows)
-        if self.settings.gripper is not None and (topics.gripper is None or not loop.grips):
-            missing = "its action server in deploy.topics.gripper" if loop.grips else "a policy that moves a gripper"
+        if self.settings.gripper is not None and (topics.gripper is None or not loop.has_gripper):
+            missing = (
+                "its action server in deploy.topics.gripper" if loop.has_gripper else "a policy that moves a gripper"
+            )
             raise ValueError(f"deploy/gripper needs {missing}")
         self._pool.submit(self._warm_up).result()  # in the thread of inference: compiled programs are kept per thread
         best_effort = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)

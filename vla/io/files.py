@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import logging
 import os
 import shutil
@@ -42,6 +43,11 @@ def write_text(target: Path, text: str) -> None:
     with atomic_path(target) as draft:
         target.parent.mkdir(parents=True, exist_ok=True)
         draft.write_text(text, encoding="utf-8")
+
+
+def write_json(target: Path, content: object) -> None:
+    """Write strict JSON atomically, creating its folder; see `atomic_path`."""
+    write_text(target, json.dumps(content, indent=1, allow_nan=False, ensure_ascii=False) + "\n")
 
 
 def require_file(path: Path) -> None:

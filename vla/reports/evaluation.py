@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -12,7 +11,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from vla.io.files import write_text
+from vla.io.files import write_json
 from vla.reports.factors import association, factors, groups, numeric
 from vla.reports.style import GREEN, GREY, RED, error_bars, save
 from vla.rollouts.comparison import Comparison
@@ -63,7 +62,7 @@ def write_report(
         "config": config,
         "per_episode": [asdict(result) for result in report.results],
     }
-    write_text(path, json.dumps(content, indent=1, allow_nan=False, ensure_ascii=False) + "\n")
+    write_json(path, content)
 
 
 def summary(report: Report, of_tier: bool = False) -> dict[str, Any]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
@@ -13,7 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from rich.table import Table
 
-from vla.io.files import write_text
+from vla.io.files import write_json
 from vla.reports.style import BLUE, GREEN, GREY, save
 from vla.rollouts.open_loop import OpenLoop
 from vla.runs.files import ComponentError
@@ -54,7 +53,7 @@ def write_errors(
         "config": config,
         "per_episode": [{"seed": seed, "steps": len(steps), "errors": errors} for seed, steps, errors in per_episode],
     }
-    write_text(path, json.dumps(content, indent=1, allow_nan=False, ensure_ascii=False) + "\n")
+    write_json(path, content)
 
 
 def errors_table(result: OpenLoop) -> Table:

@@ -107,6 +107,16 @@ def recorded_controller(spec: Spec) -> CartesianController | JointController:
     return controller_for(spec, None if acts_on_joints(spec) else ((-math.inf,) * 3, (math.inf,) * 3))
 
 
+def gripper_index(spec: Spec) -> int | None:
+    """Return the index of the gripper's opening in an action; None if there is none or it is a joint of the arm.
+
+    Raises:
+        ValueError: the spec has no robot.
+    """
+    joints = spec.require_robot("deployment").joints
+    return spec.action.index(GRIPPER) if GRIPPER in spec.action and GRIPPER not in joints else None
+
+
 def joint_factors(spec: Spec) -> Array:
     """Return the (J,) factors from the units of the joints in the state to [rad].
 
@@ -127,15 +137,14 @@ def _joint_controller(spec: Spec, model: RobotModel, workspace: tuple[Point, Poi
             "deploy.safety.workspace cannot be kept by a policy that acts with joint positions: set it to null, and "
             "narrow deploy.robot.low and high where the arm must not go"
         )
-    if GRIPPER in spec.action and GRIPPER not in model.joints:
-        place = spec.action.index(GRIPPER)
-        if spec.low[place] < -SLACK or spec.high[place] > 1 + SLACK:
-            raise ValueError(
-                f"the action {GRIPPER} must be an opening, 0 closed to 1 open, and is from {spec.low[place]:g} to "
-                f"{spec.high[place]:g}: scale it before training"
-            )
+    gripper = gripper_index(spec)
+    if gripper is not None and (spec.low[gripper] < -SLACK or spec.high[gripper] > 1 + SLACK):
+        raise ValueError(
+            f"the action {GRIPPER} must be an opening, 0 closed to 1 open, and is from {spec.low[gripper]:g} to "
+            f"{spec.high[gripper]:g}: scale it before training"
+        )
     units = dict(zip(spec.action, spec.units, strict=True))
-    motion = [name for name in spec.action if name != GRIPPER or name in model.joints]
+    motion = [name for index, name in enumerate(spec.action) if index != gripper]
     order = [motion.index(name) for name in model.joints]
     return JointController(order, _factors([(name, units[name]) for name in model.joints]))
 

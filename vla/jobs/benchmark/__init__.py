@@ -6,7 +6,6 @@ another project. `ratio` is value / floor. Each stage is a module of this packag
 
 from __future__ import annotations
 
-import json
 import logging
 from importlib import import_module
 from typing import Annotated, Literal
@@ -17,7 +16,7 @@ from rich.table import Table
 
 from vla.config.check import TRAINING, Job
 from vla.config.experiment import Experiment
-from vla.io.files import write_text
+from vla.io.files import write_json
 from vla.io.types import Count
 from vla.jobs.benchmark.machine import OtherLoad, is_unreliable, machine
 from vla.jobs.benchmark.measure import Measure
@@ -57,9 +56,7 @@ def run(experiment: Experiment) -> dict[str, Measure]:
         measures |= {key: {**each, "others": None if used is None else round(used, 2)} for key, each in found.items()}
         if used is not None and is_unreliable(used):
             busy[name] = used
-    write_text(
-        experiment.output / "benchmark.json", json.dumps({"machine": here, "measures": measures}, indent=2) + "\n"
-    )
+    write_json(experiment.output / "benchmark.json", {"machine": here, "measures": measures})
     table = Table("stage", "value", "unit", "n", "floor", "ratio", r"others \[cores]")
     for name, each in measures.items():
         table.add_row(name, *map(str, each.values()))
