@@ -24,8 +24,9 @@ from yaml import YAMLError
 from vla import jobs
 from vla.config.annotations import packages, targets
 from vla.config.check import Job, check, devices
+from vla.config.compose import CONF  # registers the resolver `jobs` of --help
 from vla.config.experiment import Experiment, plain
-from vla.config.packages import CONF, config_folders, offer_options, option_packages, trust
+from vla.config.packages import config_folders, offer_options, option_packages, trust
 from vla.config.substitutes import builds_world, with_substitutes
 from vla.deploy import ros
 from vla.io.suggestion import suggestion
