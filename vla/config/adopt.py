@@ -23,7 +23,7 @@ from vla.models.checkpoint import read_header
 
 OF_POLICY = ("task", "tokenizer", "model")
 OF_MODEL = ("tokenizer", "model", "data")  # the batch size depends on the model
-OF_TRAINING = (*OF_MODEL, "task", "expert", "learner", "validate")  # that rounds with the expert continue
+OF_TRAINING = (*OF_MODEL, "task", "expert", "learner", "validate")  # of job=improve pretrained=FILE
 # Parts of a training that a report on its policy shows: whole nodes, which only an open-loop evaluation builds, and
 # single values of other nodes.
 REPORTED = ("expert", "data", "learner", "validate", "seed")
