@@ -13,7 +13,7 @@ from omegaconf import OmegaConf
 
 from vla.config.build import build
 from vla.rollouts.rollout import rollout
-from vla.spec import Observation, Spec
+from vla.spec import Array, Observation, Spec
 from vla.tasks.perturb import Perturbation, Perturbed
 from vla.tasks.tabletop.expert import Waypoint
 
@@ -70,6 +70,28 @@ def test_wide_fingers_push_with_their_upright_side_and_are_not_led_astray_while_
             away = np.hypot(*(truth["commanded"][:2, 3] - truth["block"][:2]))
             assert away > truth["half_size"][0] or truth["commanded"][2, 3] > 0.04
     assert any((np.abs(episode.executed[:, 5]) > 0.05).any() for episode in episodes)
+
+
+class Uncertain(Waypoint):
+    """A policy of one frame that knows positions up to 8 mm: the median of the labels of all that it may be seeing."""
+
+    def reset(self, instruction: str, seed: int) -> None:
+        self.errors = np.random.default_rng(seed).normal(0, 0.008, (25, 2, 3)) * [1, 1, 0.3]
+
+    def act(self, observation: Observation) -> Array:
+        truth: Any = observation.truth
+        block, target = truth["block"], truth["destination"]
+        possible = [{**truth, "block": block + a, "destination": target + b} for a, b in self.errors]
+        labels = [super(Uncertain, self).act(dataclasses.replace(observation, truth=truth)) for truth in possible]
+        return np.median(labels, axis=0)
+
+
+def test_a_policy_that_knows_positions_up_to_8_mm_does_not_stall_in_a_push() -> None:
+    environment = make_tabletop("task/goal=push")
+    policy = Uncertain(environment.spec)
+    with environment.blind():
+        assert sum(rollout(environment, policy, seed).success for seed in range(8)) >= 7
+    environment.close()
 
 
 def test_the_clean_action_is_recorded_where_another_one_is_executed(tabletop: Tabletop) -> None:
