@@ -15,7 +15,7 @@ from vla.reports.evaluation import write_report
 from vla.reports.html import write_page
 from vla.rollouts.evaluate import evaluate
 from vla.rollouts.motion import Motion, log_dimensionless_jerk, path_length
-from vla.rollouts.results import Report, compare_conditions, compare_courses
+from vla.rollouts.results import Report, compare_conditions, compare_secondary_metrics
 from vla.runs.folder import read_run
 from vla.spec import FIRST_SEED, Array
 
@@ -70,8 +70,8 @@ def test_conditions_are_compared_in_motion_and_milestones(tmp_path: Path) -> Non
         )
     )
     reports = {"seen": first, "slow": slow}
-    courses, compared = compare_courses(reports), compare_conditions(reports, 0.02)
-    found = courses["slow"]
+    secondary, compared = compare_secondary_metrics(reports), compare_conditions(reports, 0.02)
+    found = secondary["slow"]
     assert list(found) == ["time_s", "path_m", "jerk", "near"] and compared["slow"].verdict == "open"
     assert {name: each.verdict for name, each in found.items()} == {
         **{"time_s": "more", "near": "less"},
@@ -79,20 +79,20 @@ def test_conditions_are_compared_in_motion_and_milestones(tmp_path: Path) -> Non
     }
     assert (found["time_s"].difference, found["time_s"].episodes) == (pytest.approx(0.5), first.successes)
     stayed = Report(tuple(replace(each, task="stay", milestones=()) for each in first.results))
-    assert "near" not in compare_courses({"seen": first, "empty": stayed})["empty"]  # another task
+    assert "near" not in compare_secondary_metrics({"seen": first, "empty": stayed})["empty"]  # another task
     # Pairs that never differ cannot find anything: of four comparisons two count.
     assert found["near"].p_holm == pytest.approx(2 * found["near"].p)
-    write_report(first, tmp_path / "report.json", None, {}, None, {"slow": slow}, compared, courses)
+    write_report(first, tmp_path / "report.json", None, {}, None, {"slow": slow}, compared, secondary)
     read = read_run(tmp_path)
     assert [each.motion for each in read.reports["slow"].results] == [each.motion for each in slow.results]
     assert read.report is not None and read.reports["seen"].medians == first.medians
-    assert read.report.conditions["slow"].course == found
+    assert read.report.conditions["slow"].secondary == found
     page = write_page(tmp_path).read_text()
     assert "<b>+0.5</b>" in page and "log jerk" in page and "<b>-100.0</b>" in page
     old = json.loads((tmp_path / "report.json").read_text())
     for part in (old, old["conditions"]["slow"]):
         del part["motion"]
-    for name in ("course", "reached", "motions"):
+    for name in ("secondary", "reached", "motions"):
         del old["conditions"]["slow"][name]
     (tmp_path / "report.json").write_text(json.dumps(old))
     assert read_run(tmp_path).reports["slow"].results[0].motion is None

@@ -124,9 +124,9 @@ def test_single_trainings_are_compared_in_the_course_of_episodes(tmp_path: Path)
         results = (Result(seed, "success", "lift", milestones=tuple(milestones)) for seed in range(8))
         write_report(Report(tuple(results)), folder / "report.json", None, {})
     (compared,) = compare_rows(tabulate(tmp_path), 0.02)
-    assert compared.found.verdict == "open" and compared.course["grasped"].difference == -1
+    assert compared.found.verdict == "open" and compared.secondary["grasped"].difference == -1
     page = (tmp_path / "sweep.html").read_text()
-    assert "Differences in the course of episodes" in page and "<b>-100.0</b>" in page
+    assert "Differences in secondary metrics" in page and "<b>-100.0</b>" in page
 
 
 def test_letters_tell_which_of_three_or_more_rows_differ(tmp_path: Path, figures: list[Figure]) -> None:

@@ -22,13 +22,13 @@ from vla.data.episodes import EpisodeStore
 from vla.io.files import warn_on_error, writing
 from vla.io.versions import installed_versions
 from vla.policy import costs
-from vla.reports.conditions import Courses, conditions_table, course_table, plot_conditions
+from vla.reports.conditions import SecondaryRows, conditions_table, plot_conditions, secondary_table
 from vla.reports.evaluation import plot_report, write_report
 from vla.reports.html import write_page
 from vla.rollouts.evaluate import RecorderFactory, evaluate, keep_recordings
 from vla.rollouts.memory import make_nearest, make_without
 from vla.rollouts.realtime import Network, make_over_network
-from vla.rollouts.results import Report, compare_conditions, compare_courses
+from vla.rollouts.results import Report, compare_conditions, compare_secondary_metrics
 from vla.rollouts.rollout import AgentFactory
 from vla.rollouts.statements import AgainstBar, AgainstRun, Statement, differs_clearly
 from vla.runs.files import Round
@@ -267,7 +267,10 @@ def _write(
     """Write all results of an evaluation that took `seconds`."""
     output, report = experiment.output, reports[IN_DISTRIBUTION]
     others = {name: each for name, each in reports.items() if name != IN_DISTRIBUTION}
-    compared, courses = compare_conditions(reports, experiment["evaluate"]["margin"]), compare_courses(reports)
+    compared, secondary = (
+        compare_conditions(reports, experiment["evaluate"]["margin"]),
+        compare_secondary_metrics(reports),
+    )
     facts = _facts(experiment, checkpoint, rounds, seconds)
     facts["statements"] = [each.say(report) for each in statements]
     save_config(output, experiment.config, experiment.changes)
@@ -284,12 +287,12 @@ def _write(
         with warn_on_error(output / SUITE):
             plot_conditions(reports, output / SUITE)
         show(conditions_table(reports, compared))
-        rows: Courses = {(name,): course for name, course in courses.items() if course}
+        rows: SecondaryRows = {(name,): metrics for name, metrics in secondary.items() if metrics}
         if rows:
-            show(course_table(rows, ["condition"]))
+            show(secondary_table(rows, ["condition"]))
     used = str(checkpoint) if checkpoint else None
     # Last, because its existence marks the evaluation as finished.
-    write_report(report, output / REPORT, used, experiment.config, facts, others, compared, courses)
+    write_report(report, output / REPORT, used, experiment.config, facts, others, compared, secondary)
     with warn_on_error(output / PAGE):
         write_page(output)
     log.info("wrote %s, report.json, report.png%s", output / PAGE, f" and {RECORDING}" if recording.exists() else "")

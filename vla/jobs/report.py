@@ -10,8 +10,8 @@ from rich import print as show
 from vla.config.check import Job
 from vla.config.experiment import Experiment
 from vla.io.types import Text
-from vla.reports.comparison import CASE, compare_runs, course_rows, read_runs, remarks, runs_table
-from vla.reports.conditions import course_table
+from vla.reports.comparison import CASE, compare_runs, read_runs, remarks, runs_table, secondary_rows
+from vla.reports.conditions import secondary_table
 from vla.reports.html import write_comparison
 
 log = logging.getLogger(__name__)
@@ -27,6 +27,6 @@ def run(experiment: Experiment) -> None:
         show(runs_table(compared))
     for remark in remarks(runs, compared):
         log.info("%s", remark)
-    if rows := course_rows(compared):
-        show(course_table(rows, CASE))
+    if rows := secondary_rows(compared):
+        show(secondary_table(rows, CASE))
     log.info("wrote %s", write_comparison(runs, compared, Path(experiment["output"])))

@@ -12,9 +12,9 @@ from rich.table import Table
 
 from vla.config.check import conditions
 from vla.config.differences import at
-from vla.reports.conditions import COMPARED, NARROW, Courses, short_texts
+from vla.reports.conditions import COMPARED, NARROW, SecondaryRows, short_texts
 from vla.rollouts.comparison import Comparison, compare_pairs, compare_samples, concluded
-from vla.rollouts.results import ERROR, Report, Result, concluded_courses, course_of, pairs_of
+from vla.rollouts.results import ERROR, Report, Result, concluded_secondary, pairs_of, secondary_of
 from vla.rollouts.statistics import effective_episodes
 from vla.runs.folder import Run, require_run
 from vla.runs.sweep import SweepRow
@@ -25,13 +25,13 @@ CASE = ("second run", "minus first", "condition")  # heads of what was compared
 
 @dataclass(frozen=True)
 class RunComparison:
-    """Comparison of two runs under a condition, in success and in the course of episodes that both played."""
+    """Comparison of two runs under a condition, in success and in secondary metrics of episodes that both played."""
 
     one: str
     other: str
     condition: str
     found: Comparison
-    course: Mapping[str, Comparison] = field(default_factory=dict)  # milestone or field of `Motion` → the same
+    secondary: Mapping[str, Comparison] = field(default_factory=dict)  # milestone or field of `Motion` → the same
 
 
 def read_runs(folders: Sequence[Path]) -> dict[str, Run]:
@@ -59,8 +59,8 @@ def _names(folders: Sequence[Path]) -> list[str]:
 def compare_runs(runs: Mapping[str, Run], margin: float) -> list[RunComparison]:
     """Compare every two runs under each condition: on their common episodes, or without any on different ones.
 
-    Runs in different worlds are not compared. Verdicts take all comparisons into account, those on the course of
-    episodes separately.
+    Runs in different worlds are not compared. Verdicts take all comparisons into account, those on secondary
+    metrics separately.
 
     Args:
         runs: by name.
@@ -78,7 +78,7 @@ def compare_runs(runs: Mapping[str, Run], margin: float) -> list[RunComparison]:
 def compare_rows(rows: Sequence[SweepRow], margin: float) -> list[RunComparison]:
     """Compare every row of a sweep with the first one under each condition, where both played the same scenes.
 
-    Rows of one training each are compared as runs are: by paired tests, and in the course of episodes. Rows of several
+    Rows of one training each are compared as runs are: by paired tests, and in secondary metrics. Rows of several
     trainings are compared as independent samples of size `effective_episodes`, which ignores the pairing by scenes.
 
     Args:
@@ -105,10 +105,10 @@ def compare_all_rows(rows: Sequence[SweepRow]) -> list[RunComparison]:
 
 
 def _with_verdicts(found: Sequence[RunComparison], margin: float) -> list[RunComparison]:
-    """Return comparisons with verdicts on success, and separately on the course of episodes."""
+    """Return comparisons with verdicts on success, and separately on secondary metrics."""
     verdicts = concluded({number: each.found for number, each in enumerate(found)}, margin)
-    courses = concluded_courses({number: each.course for number, each in enumerate(found)})
-    return [replace(each, found=verdicts[number], course=courses[number]) for number, each in enumerate(found)]
+    secondary = concluded_secondary({number: each.secondary for number, each in enumerate(found)})
+    return [replace(each, found=verdicts[number], secondary=secondary[number]) for number, each in enumerate(found)]
 
 
 def _compared_rows(
@@ -158,9 +158,9 @@ def runs_table(compared: Sequence[RunComparison]) -> Table:
     return table
 
 
-def course_rows(compared: Sequence[RunComparison]) -> Courses:
-    """Return second run, first run and condition → comparisons of the course of episodes."""
-    return {(each.other, each.one, each.condition): each.course for each in compared if each.course}
+def secondary_rows(compared: Sequence[RunComparison]) -> SecondaryRows:
+    """Return second run, first run and condition → comparisons of secondary metrics."""
+    return {(each.other, each.one, each.condition): each.secondary for each in compared if each.secondary}
 
 
 def common_episodes(one: Run, other: Run, condition: str) -> list[tuple[Result, Result]]:
@@ -175,7 +175,7 @@ def _compared(one: Run, other: Run, condition: str) -> tuple[Comparison, dict[st
     """Compare two runs under a condition, see `RunComparison`; None if they were evaluated in different worlds."""
     anytime = any(run.reports[condition].anytime for run in (one, other) if condition in run.reports)
     if together := common_episodes(one, other, condition):
-        return compare_pairs(pairs_of(together), anytime), course_of(together, anytime)
+        return compare_pairs(pairs_of(together), anytime), secondary_of(together, anytime)
     first, second = (_by_seed(run, condition) for run in (one, other))
     alike = _scenes(one, condition) == _scenes(other, condition) and not first.keys() & second.keys()
     if not (first and second and alike) or anytime:

@@ -24,7 +24,7 @@ COMPARED = ("points (95 % CI)", "p Holm", "verdict")  # heads of `short_texts`
 NARROW: dict[str, Any] = {"box": SIMPLE_HEAD, "collapse_padding": True, "pad_edge": False}  # fits 80 columns
 DECIDED = "p Holm of at most 0.05"
 
-Courses = Mapping[tuple[str, ...], Mapping[str, Comparison]]  # words that begin a row → comparisons by name
+SecondaryRows = Mapping[tuple[str, ...], Mapping[str, Comparison]]  # words that begin a row → comparisons by name
 
 
 def conditions_table(reports: Mapping[str, Report], compared: Mapping[str, Comparison]) -> Table:
@@ -62,33 +62,33 @@ def short_texts(compared: Comparison) -> tuple[str, str, str]:
     return f"{difference} ({interval})", together, verdict
 
 
-def course_table(rows: Courses, heads: Sequence[str]) -> Table:
-    """Tabulate differences in milestones and motion, as `course_of` returns them; `heads` are those of the words."""
-    names = course_names(rows)
+def secondary_table(rows: SecondaryRows, heads: Sequence[str]) -> Table:
+    """Tabulate differences in milestones and motion, as `secondary_of` returns them; `heads` are those of the words."""
+    names = secondary_names(rows)
     table = Table(
         *heads,
-        *(escape(course_head(name)) for name in names),
+        *(escape(secondary_head(name)) for name in names),
         **NARROW,
-        caption=f"differences in the course of episodes; * {DECIDED}",
+        caption=f"differences in secondary metrics; * {DECIDED}",
     )
-    for words, course in rows.items():
-        texts = [course_texts(name, course[name]) if name in course else ("", "", False) for name in names]
+    for words, metrics in rows.items():
+        texts = [secondary_texts(name, metrics[name]) if name in metrics else ("", "", False) for name in names]
         table.add_row(*words, *(f"{difference} *" if decided else difference for difference, _, decided in texts))
     return table
 
 
-def course_names(rows: Courses) -> list[str]:
+def secondary_names(rows: SecondaryRows) -> list[str]:
     """Return the names of the compared metrics: fields of `Motion`, then milestones."""
-    found = {name for course in rows.values() for name in course}
+    found = {name for metrics in rows.values() for name in metrics}
     return [*(name for name in AMOUNTS if name in found), *sorted(found - {*AMOUNTS})]
 
 
-def course_head(name: str) -> str:
+def secondary_head(name: str) -> str:
     """Return the head of a column of differences, with the unit."""
     return AMOUNTS.get(name) or f"{name.replace('_', ' ')} [points]"
 
 
-def course_texts(name: str, compared: Comparison) -> tuple[str, str, bool]:
+def secondary_texts(name: str, compared: Comparison) -> tuple[str, str, bool]:
     """Format a difference and its interval, and tell whether it is decided."""
     factor, digits = (1, "+.2g") if name in AMOUNTS else (100, "+.1f")
     difference, low, high = (

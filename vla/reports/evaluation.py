@@ -29,7 +29,7 @@ def write_report(
     facts: Mapping[str, Any] | None = None,
     conditions: Mapping[str, Report] | None = None,
     compared: Mapping[str, Comparison] | None = None,
-    courses: Mapping[str, Mapping[str, Comparison]] | None = None,
+    secondary: Mapping[str, Mapping[str, Comparison]] | None = None,
 ) -> None:
     """Write a report as JSON atomically.
 
@@ -41,7 +41,7 @@ def write_report(
         facts: further entries, such as chosen options, parameters and latency.
         conditions: condition → report on the same seeds.
         compared: condition → comparison of its success with the first.
-        courses: condition → comparisons of its milestones and motion with the first.
+        secondary: condition → comparisons of its milestones and motion with the first.
     """
     content = {
         **summary(report),
@@ -52,7 +52,7 @@ def write_report(
             name: {
                 **summary(other),
                 "comparison": asdict(compared[name]) if compared else None,
-                "course": {key: asdict(each) for key, each in (courses or {}).get(name, {}).items()},
+                "secondary": {key: asdict(each) for key, each in (secondary or {}).get(name, {}).items()},
                 "outcomes": [result.outcome for result in other.results],
                 "reached": [result.milestones for result in other.results],
                 "motions": [result.motion and asdict(result.motion) for result in other.results],

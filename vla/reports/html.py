@@ -18,8 +18,8 @@ from markupsafe import Markup
 from vla.config.differences import ABSENT, at, differences
 from vla.data.index import listed
 from vla.io.files import write_text
-from vla.reports.comparison import CASE, RunComparison, course_rows, remarks
-from vla.reports.conditions import Courses, comparison_texts, course_head, course_names, course_texts
+from vla.reports.comparison import CASE, RunComparison, remarks, secondary_rows
+from vla.reports.conditions import SecondaryRows, comparison_texts, secondary_head, secondary_names, secondary_texts
 from vla.reports.posteriors import Outcome, draw_posteriors
 from vla.reports.style import BLUE, GREEN, GREY, RED, Interval
 from vla.reports.training_curves import colours, draw_run, draw_runs
@@ -36,7 +36,7 @@ COMPARED = 3  # failures per run on a comparison
 Rate = tuple[Interval, str, Sequence[str]]  # count of episodes, and comparison with the first condition
 
 # Heads of the columns, and rows of words and cells, which are difference, interval and whether that is decided.
-CourseTable = tuple[list[str], list[tuple[Sequence[str], list[tuple[str, str, bool] | None]]]]
+SecondaryTable = tuple[list[str], list[tuple[Sequence[str], list[tuple[str, str, bool] | None]]]]
 
 
 @dataclass(frozen=True)
@@ -69,7 +69,9 @@ def write_page(folder: Path) -> Path:
         tables=_rate_tables(run),
         report=run.reports.get(IN_DISTRIBUTION),
         amounts=AMOUNTS,
-        course=_course({(name,): part.course for name, part in run.report.conditions.items()} if run.report else {}),
+        secondary=_secondary(
+            {(name,): part.secondary for name, part in run.report.conditions.items()} if run.report else {}
+        ),
         errors=_error_table(run),
         curves=draw_run(run.metrics),
         strips=_filmstrips(run, FAILURES, SUCCESSES),
@@ -108,7 +110,7 @@ def write_comparison(runs: Mapping[str, Run], compared: Sequence[RunComparison],
         curves=draw_runs({name: run.metrics for name, run in runs.items()}),
         pairs=[(each, comparison_texts(each.found)) for each in compared],
         remarks=remarks(runs, compared),
-        course=_course(course_rows(compared)),
+        secondary=_secondary(secondary_rows(compared)),
         case=CASE,
         anytime=any(report.anytime for run in runs.values() for report in run.reports.values()),
         differences=_config_differences(runs),
@@ -146,7 +148,7 @@ def write_sweep(
         heads=(choices, ["each seed [%]", "parameters [M]", "action [ms]"], "cells"),
         posteriors=posteriors,
         compared=[(each, comparison_texts(each.found)) for each in compared],
-        course=_course(course_rows(compared)),
+        secondary=_secondary(secondary_rows(compared)),
         case=("row", "minus", "condition"),
         anytime=any(report.anytime for run in cells for report in run.reports.values()),
         curves=draw_runs({name: run.metrics for name, run in runs.items()}),
@@ -235,12 +237,12 @@ def _rate(report: Report, count: int | None = None) -> Rate:
     return (count / max(report.episodes, 1), *interval), f"{count}/{report.episodes}", ()
 
 
-def _course(rows: Courses) -> CourseTable:
-    names = course_names(rows)
-    return [course_head(name) for name in names], [
-        (words, [course_texts(name, course[name]) if name in course else None for name in names])
-        for words, course in rows.items()
-        if course
+def _secondary(rows: SecondaryRows) -> SecondaryTable:
+    names = secondary_names(rows)
+    return [secondary_head(name) for name in names], [
+        (words, [secondary_texts(name, metrics[name]) if name in metrics else None for name in names])
+        for words, metrics in rows.items()
+        if metrics
     ]
 
 

@@ -213,9 +213,9 @@ class Report:
         """
         return compare_pairs(pairs_of(self._together(other)), self.anytime or other.anytime)
 
-    def compare_course(self, other: Report) -> dict[str, Comparison]:
-        """Compare milestones and motion of another report with those of this one, see `compare` and `course_of`."""
-        return course_of(self._together(other), self.anytime or other.anytime)
+    def compare_secondary(self, other: Report) -> dict[str, Comparison]:
+        """Compare milestones and motion of another report with those of this one, see `compare` and `secondary_of`."""
+        return secondary_of(self._together(other), self.anytime or other.anytime)
 
     def _together(self, other: Report) -> list[tuple[Result, Result]]:
         together = list(zip(self.results, other.results, strict=False))
@@ -268,7 +268,7 @@ def pairs_of(
     return Pairs(counts[True, True], counts[True, False], counts[False, True], counts[False, False])
 
 
-def course_of(together: Sequence[tuple[Result, Result]], anytime: bool) -> dict[str, Comparison]:
+def secondary_of(together: Sequence[tuple[Result, Result]], anytime: bool) -> dict[str, Comparison]:
     """Compare, in pairs of episodes, motion where both succeeded, and how often each milestone was reached in the same
     task.
 
@@ -302,17 +302,17 @@ def compare_conditions(reports: Mapping[str, Report], margin: float) -> dict[str
     return concluded({name: first.compare(report) for name, report in others}, margin)
 
 
-def compare_courses(reports: Mapping[str, Report]) -> dict[str, dict[str, Comparison]]:
+def compare_secondary_metrics(reports: Mapping[str, Report]) -> dict[str, dict[str, Comparison]]:
     """Return condition → comparisons of milestones and motion with those of the first condition, which has none.
 
     Verdicts take all of them into account, but not the comparisons of success.
     """
     (_, first), *others = reports.items()
-    return concluded_courses({name: first.compare_course(report) for name, report in others})
+    return concluded_secondary({name: first.compare_secondary(report) for name, report in others})
 
 
-def concluded_courses(courses: Mapping[Key, Mapping[str, Comparison]]) -> dict[Key, dict[str, Comparison]]:
-    """Return what `course_of` found in several cases, with verdicts that take all of it into account."""
-    flat = {(case, name): compared for case, course in courses.items() for name, compared in course.items()}
+def concluded_secondary(secondary: Mapping[Key, Mapping[str, Comparison]]) -> dict[Key, dict[str, Comparison]]:
+    """Return what `secondary_of` found in several cases, with verdicts that take all of it into account."""
+    flat = {(case, name): compared for case, metrics in secondary.items() for name, compared in metrics.items()}
     found = concluded(flat, None)
-    return {case: {name: found[case, name] for name in course} for case, course in courses.items()}
+    return {case: {name: found[case, name] for name in metrics} for case, metrics in secondary.items()}

@@ -109,7 +109,7 @@ class Condition:
 
     outcomes: list[str]  # with `anytime`, of the first seeds
     comparison: Comparison | None = None  # with the training condition
-    course: dict[str, Comparison] = field(default_factory=dict)  # milestone or field of `Motion` → the same
+    secondary: dict[str, Comparison] = field(default_factory=dict)  # milestone or field of `Motion` → the same
     # Per episode, as `outcomes`; empty in reports written before these were stored.
     reached: list[tuple[str, ...]] = field(default_factory=list)  # milestones
     motions: list[Motion | None] = field(default_factory=list)
