@@ -12,6 +12,7 @@ from arm import ARM, FORWARD, ROBOT, SAFETY, SPEC
 
 from vla.deploy.control_loop import REPEATED, Command, ControlLoop, Safety, State
 from vla.deploy.joint_limiter import Robot
+from vla.deploy.workspace import LEEWAY
 from vla.robots.panda import CHAIN, HOME, JOINT_HIGH, forward
 from vla.spec import Observation, Spec
 
@@ -264,6 +265,25 @@ def test_an_arm_that_is_moved_while_it_is_stopped_is_not_pulled_back(world: Worl
     np.testing.assert_array_equal(world.run(0.1)[-1].position, HOME + 0.4)
 
 
+@pytest.mark.parametrize("measures", [True, False], ids=["seen", "unseen"])
+def test_an_arm_that_is_moved_after_a_fault_is_not_pulled_back(world: World, measures: bool) -> None:
+    world.loop.fail("the policy failed three times")
+    world.run(0.5)
+    world.measures, world.follows = measures, False
+    world.run(0.6)
+    world.joints, world.measures = HOME + 0.4, True
+    world.run(SAFETY.tracking_for + 0.1)
+    np.testing.assert_array_equal(world.run(0.1)[-1].position, HOME + 0.4)
+    assert world.loop.state is State.FAULT and "failed three times" in world.loop.reason
+
+
+def test_an_arm_that_meets_an_obstacle_does_not_go_on_pushing(world: World) -> None:
+    world.follows = False
+    world.run(3.0)
+    assert world.loop.state is State.FAULT and "away from its command" in world.loop.reason
+    np.testing.assert_array_equal(world.run(0.1)[-1].position, world.joints)
+
+
 def test_an_arm_in_the_hands_of_a_person_is_not_commanded_and_goes_on_from_where_it_is_left(world: World) -> None:
     world.run(0.3)
     handed_over(world)
@@ -345,6 +365,41 @@ def test_the_tool_stays_in_the_workspace(axis: int, sign: int) -> None:
     world.loop.on_instruction("go", world.now)
     world.run(2.0)
     assert world.tool[axis] == pytest.approx(middle[axis] + 0.05 * sign, abs=0.002)
+
+
+@pytest.mark.parametrize("fast", [False, True])
+@pytest.mark.parametrize("motion", [(0, 0, -0.04), (0.04, 0, -0.04), (0, 0.04, -0.04), (0.04, 0.04, -0.04)], ids=str)
+def test_the_tool_stays_in_the_workspace_where_joints_at_their_limits_bend_its_path(
+    motion: tuple[float, ...], fast: bool
+) -> None:
+    low, high = np.array([0.25, -0.4, 0.008]), np.array([0.75, 0.4, 0.5])
+    world = World(replace(SAFETY, workspace=(tuple(low), tuple(high))))
+    if fast:
+        world.loop.limit(replace(ROBOT, acceleration=[100.0] * 7, speed_share=1.0, acceleration_share=1.0))
+    random = np.random.default_rng(0)
+    world.run(0.1)
+    world.loop.on_instruction("go", world.now)
+    turns: list[float] = []
+
+    def answer(observation: Observation) -> np.ndarray:
+        turns.append(random.choice([-1.0, 1.0]))
+        return np.array([[*motion, 0, 0, 0.25 * turns[-1], 1]], np.float32)
+
+    world.answer = answer
+    tools = np.array([forward(command.position)[0][:3, 3] for command in world.run(6.0)])
+    assert len(turns) > 20 and world.loop.state is State.RUNNING
+    assert np.max([low - tools, tools - high]) <= LEEWAY
+    assert tools[:, 2].min() < 0.03  # it gets there
+
+
+def test_an_arm_outside_the_workspace_may_come_back() -> None:
+    tool = forward(HOME)[0][:3, 3]
+    world = World(replace(SAFETY, workspace=(tuple(tool - 0.3), tuple(tool + np.array([0.3, 0.3, -0.05])))))
+    world.run(0.1)
+    world.loop.on_instruction("go", world.now)
+    world.answer = lambda observation: np.array([[0.0, 0, 0.01, 0, 0, 0, 1]], np.float32)  # away from it
+    heights = [forward(command.position)[0][2, 3] for command in world.run(3.0)]
+    assert max(heights) <= tool[2] + 1e-6 and abs(heights[-1] - (tool[2] - 0.05)) < LEEWAY
 
 
 def test_an_arm_outside_its_limits_is_a_fault() -> None:

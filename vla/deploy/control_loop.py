@@ -14,6 +14,7 @@ import numpy as np
 
 from vla.deploy.joint_limiter import JointLimiter, Robot
 from vla.deploy.observer import HISTORY, Measured, Observer
+from vla.deploy.workspace import Workspace
 from vla.io.types import Count, Point, Positive
 from vla.robots.cartesian import CartesianController
 from vla.robots.controllers import controller_for, gripper_index
@@ -88,7 +89,10 @@ class ControlLoop:
                 f"the policy was trained with {len(model.joints)} joints, the robot has {len(robot.joints)}"
             )
         limits = robot.min_position, robot.max_position, np.array(robot.speed)
-        self._controller = controller_for(spec, safety.workspace, limits)
+        self._controller = controller = controller_for(spec, safety.workspace, limits)
+        self._workspace = None
+        if isinstance(controller, CartesianController):
+            self._workspace = Workspace(controller.arm.forward, controller.low, controller.high)
         self._gripper_index = gripper_index(spec)
         self.has_gripper = self._gripper_index is not None
         self._motion = [index for index in range(len(spec.action)) if index != self._gripper_index]
@@ -297,7 +301,14 @@ class ControlLoop:
             self.limiter.brake()
             return
         end, goal, self._opening = _next_of(self._schedule, now)
-        self.limiter.step(goal, end - now)
+        self._step(self.limiter, goal, end - now)
+
+    def _step(self, limiter: JointLimiter, goal: Array, remaining: float) -> None:
+        """Move towards a goal that is due in `remaining` seconds, within the limits and the workspace."""
+        if self._workspace is None:
+            limiter.step(goal, remaining)
+        else:
+            self._workspace.step(limiter, goal, remaining)
 
     def horizon(self, now: float) -> list[Command]:
         """Return the commands after this tick's if no further input arrives; the last one is at rest."""
@@ -307,7 +318,7 @@ class ControlLoop:
         while schedule and now < schedule[-1][0]:
             now += self.tick
             end, goal, opening = _next_of(schedule, now)
-            limiter.step(goal, end - now)
+            self._step(limiter, goal, end - now)
             commands.append(Command(limiter.position.copy(), limiter.velocity.copy(), opening))
         while not limiter.resting or not commands:
             limiter.brake()
@@ -355,10 +366,13 @@ class ControlLoop:
             self._take_over(newest, now)
         off_track, lost, self._lost = self._off_track(newest, now), self._lost, now - newest.at > self.safety.joints_age
         returned = lost and not self._lost and self._away(newest)
-        if self.state is not State.FAULT and (returned or (off_track and self.state is State.STOPPED)):
-            self.limiter.position, self.limiter.velocity = newest.joints.copy(), np.zeros(len(newest.joints))
-            self._sent, self._sent_valid = None, False
-            return self.fail("the arm was moved while it was held")
+        halted = self.state is State.STOPPED or (
+            self.state is State.FAULT and self.limiter.resting and self._observer.moved(STILL_FOR) <= STILL
+        )
+        if returned or (off_track and halted):
+            self._hold_measured(newest)
+            if self.state is not State.FAULT:
+                self.fail("the arm was moved while it was held")
         if self.state in (State.STOPPED, State.FAULT):
             return None
         problem = self._input_problem(newest, now)
@@ -377,6 +391,11 @@ class ControlLoop:
         if self.state is State.WAITING or recovered:
             self._set_state(State.RUNNING, "")
         return None
+
+    def _hold_measured(self, measured: Measured) -> None:
+        """Command the measured pose, so that an arm that is elsewhere is not pulled back."""
+        self.limiter.position, self.limiter.velocity = measured.joints.copy(), np.zeros(len(measured.joints))
+        self._sent, self._sent_valid = None, False
 
     def _take_over(self, measured: Measured, now: float) -> None:
         try:
