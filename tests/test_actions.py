@@ -12,10 +12,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+import rclpy
 from action_servers import Controller, TrajectoryController
 from arm import FORWARD, ROBOT, SAFETY, SPEC
 from defaults import defaults_of
 from lifecycle_msgs.msg import Transition
+from rclpy.action import ActionServer
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from std_srvs.srv import SetBool
@@ -150,10 +152,44 @@ def test_a_server_that_fails_stops_the_policy_with_its_name_and_the_reason(
     assert not world.change(Transition.TRANSITION_ACTIVATE)
 
 
+def test_a_server_that_answers_nothing_is_noticed_while_goals_follow_each_other(
+    make_world: Callable[..., World],
+) -> None:
+    from control_msgs.action import FollowJointTrajectory
+
+    world = make_world(FOLLOW)
+    never_spun = rclpy.create_node("silent", context=world.contexts[1])
+    server = ActionServer(never_spun, FollowJointTrajectory, "/commands", lambda handle: None)
+    world.follow = lambda joints: joints
+    world.policy.action = lambda: np.array([[0, 0, 0, 0, 0, 0, 1]], np.float32)
+    world.start()
+    world.live(5.0, until=lambda: world.state is State.FAULT)
+    assert world.agent.loop is not None and "has not answered a goal for 1 s" in world.agent.loop.reason
+    server.destroy()
+    never_spun.destroy_node()
+
+
 GRIPPERS = {
     "GripperCommand": GripperCommand(**defaults_of("deploy/gripper/gripper_command")),
     "franka": FrankaGripper(**defaults_of("deploy/gripper/franka")),
 }
+
+
+def test_a_gripper_goal_that_was_cancelled_before_the_activation_is_no_failure_after_it(
+    make_world: Callable[..., World],
+) -> None:
+    from control_msgs.action import GripperCommand as Kind
+
+    world = make_world("joint_state", gripper=GRIPPERS["GripperCommand"])
+    gripper = Controller(world.node, Kind, "/gripper")
+    world.start()
+    world.live(2.0, until=lambda: gripper.running)
+    assert world.change(Transition.TRANSITION_DEACTIVATE)
+    world.live(2.0, until=lambda: gripper.cancelled)
+    assert world.change(Transition.TRANSITION_ACTIVATE)
+    gripper.obey()
+    world.live(0.5)
+    assert gripper.ended == ["canceled"] and world.state is not State.FAULT
 
 
 @pytest.mark.parametrize("name", GRIPPERS)

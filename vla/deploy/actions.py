@@ -54,10 +54,11 @@ class GoalSender:
         self.reset()
 
     def reset(self) -> None:
-        """Reset the state of the goals."""
+        """Reset the state of the goals; what becomes of those sent so far no longer counts."""
         self._newest += 1
+        self._first = self._newest + 1  # number of the first goal that counts
         self._handle: Any = None  # of the newest goal that was accepted and has not ended
-        self._sent_at: float | None = None  # when the newest goal was sent, until it is answered
+        self._unanswered: dict[int, float] = {}  # number of a goal → when it was sent
         self._cancelled = self._rejected = self._given_up = False
 
     def require_server(self) -> None:
@@ -72,14 +73,14 @@ class GoalSender:
     @property
     def active(self) -> bool:
         """True from when a goal is sent until it has ended."""
-        return self._sent_at is not None or self._handle is not None
+        return self._newest in self._unanswered or self._handle is not None
 
     def send(self, goal: Any) -> None:
         """Send a goal, unless the server has failed."""
         if self._given_up:
             return
         self._newest += 1
-        self._sent_at, self._cancelled = time.monotonic(), False
+        self._unanswered[self._newest], self._cancelled = time.monotonic(), False
         answered = self._node.guard(partial(self._on_answer, self._newest))
         self._client.send_goal_async(goal).add_done_callback(answered)
 
@@ -87,7 +88,7 @@ class GoalSender:
         """Cancel the newest goal as soon as it is known to the server, if it has not ended by then."""
         if self.active and not self._cancelled:
             self._cancelled = True
-            if self._sent_at is None:
+            if self._newest not in self._unanswered:
                 self._handle.cancel_goal_async()
 
     def check(self) -> None:
@@ -96,7 +97,7 @@ class GoalSender:
             return
         if not self._client.server_is_ready():
             self._give_up("has vanished")
-        elif self._sent_at is not None and time.monotonic() - self._sent_at > ANSWER:
+        elif self._unanswered and time.monotonic() - min(self._unanswered.values()) > ANSWER:
             self._give_up(f"has not answered a goal for {ANSWER:g} s")
 
     def destroy(self) -> None:
@@ -106,16 +107,15 @@ class GoalSender:
     def _give_up(self, what: str) -> None:
         if self._handle is not None:
             self._handle.cancel_goal_async()
-        self._given_up, self._handle, self._sent_at = True, None, None
+        self._given_up, self._handle, self._unanswered = True, None, {}
         self._fail(f"the action server {self.name} {what}")
 
     def _on_answer(self, number: int, future: Any) -> None:
         handle, newest = future.result(), number == self._newest
-        if newest:
-            self._sent_at = None
+        self._unanswered.pop(number, None)
         if not handle.accepted:
             return self._on_rejection() if newest and not self._given_up else None
-        if self._given_up:  # accepted too late
+        if self._given_up or number < self._first:  # accepted too late
             handle.cancel_goal_async()
             return None
         handle.get_result_async().add_done_callback(self._node.guard(partial(self._on_result, number)))
@@ -134,6 +134,8 @@ class GoalSender:
             self._handle.cancel_goal_async()
 
     def _on_result(self, number: int, future: Any) -> None:
+        if number < self._first:
+            return
         answer, newest = future.result(), number == self._newest
         if newest:
             self._handle = None
