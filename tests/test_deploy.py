@@ -386,6 +386,15 @@ def test_the_networks_have_their_options() -> None:
         assert vars(RosNetwork(**option)) == vars(RosNetwork.named(name))
 
 
+def test_a_middleware_that_ignores_the_profile_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("RMW_IMPLEMENTATION", "rmw_cyclonedds_cpp")
+    with pytest.raises(ValueError, match="rmw_cyclonedds_cpp, which ignores the profile"):
+        RosNetwork.named("loopback").apply()
+    RosNetwork.named("localhost").apply()
+    monkeypatch.setenv("RMW_IMPLEMENTATION", "rmw_fastrtps_cpp")
+    RosNetwork.named("loopback").apply()
+
+
 def test_a_ros_installation_finds_the_node() -> None:
     prefix = Path(sysconfig.get_path("data"))
     assert (prefix / "share/ament_index/resource_index/packages/vla").is_file()

@@ -557,6 +557,15 @@ def test_a_late_answer_is_not_taken_for_that_of_the_next_observation(monkeypatch
         agent.close()
 
 
+def test_a_message_over_the_limit_is_named_on_both_sides(caplog: pytest.LogCaptureFixture) -> None:
+    with serving(as_policy(make_bc()), largest_message=700) as url:
+        agent = remote(url)
+        with pytest.raises(ValueError, match=r"it closed the connection .*exceeds limit of 700 bytes"):
+            agent.plan(observations(1)[0])
+        agent.close()
+    assert "more than deploy.largest_message bytes" in caplog.text
+
+
 def test_an_error_of_the_server_costs_one_episode(monkeypatch: pytest.MonkeyPatch) -> None:
     policy, plan, asked = as_policy(make_bc()), server._plan, list[Any]()
 

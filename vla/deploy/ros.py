@@ -34,6 +34,7 @@ def split_arguments(argv: Sequence[str]) -> tuple[list[str], list[str]]:
     return [*argv[:start], *argv[end + 1 :]], list(argv[start:end])
 
 
+FAST_DDS = "rmw_fastrtps"  # first part of the names of its middleware
 Range = Literal["SYSTEM_DEFAULT", "LOCALHOST", "SUBNET", "OFF"]
 NETWORKS: dict[str, tuple[Range, str | None]] = {  # discovery range and profile of the options of `deploy/network`
     "loopback": ("SYSTEM_DEFAULT", "loopback"),
@@ -65,12 +66,18 @@ class RosNetwork:
         """Set the environment variables that ROS reads at start.
 
         Raises:
-            ValueError: the profile or the domain does not exist.
+            ValueError: the profile or the domain does not exist, or the middleware ignores the profile.
         """
         os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = self.discovery
         if self.profile is not None:
             if not Path(self.profile).is_file():
                 raise ValueError(f"deploy.network.profile: there is no file {self.profile}")
+            middleware = os.environ.get("RMW_IMPLEMENTATION") or FAST_DDS
+            if not middleware.startswith(FAST_DDS):
+                raise ValueError(
+                    f"RMW_IMPLEMENTATION is {middleware}, which ignores the profile of Fast DDS that keeps others out: "
+                    "unset it, or choose deploy/network=localhost or site"
+                )
             os.environ["FASTRTPS_DEFAULT_PROFILES_FILE"] = self.profile
         if self.domain is not None:
             os.environ["ROS_DOMAIN_ID"] = str(self.domain)

@@ -46,7 +46,7 @@ SENTENCE = b"this is a policy server: connect to it by WebSocket with openpi's p
 NO_WEBSOCKET = b"HTTP/1.1 405 Method Not Allowed\r\nAllow: GET\r\nConnection: close\r\n" + (
     b"Content-Type: text/plain\r\nContent-Length: %d\r\n\r\n%s" % (len(SENTENCE), SENTENCE)
 )
-INVALID, INTERNAL = 1007, 1011  # WebSocket close codes: invalid data, error in the server
+INVALID, TOO_BIG, INTERNAL = 1007, 1009, 1011  # WebSocket close codes: invalid data, too large, error in the server
 
 log = logging.getLogger(__name__)
 
@@ -251,8 +251,9 @@ class Service:
                     timing["prev_total_ms"] = last
                 await connection.send(pack(answer))
                 last = 1000 * (time.perf_counter() - began)
-        except ConnectionClosed:
-            pass
+        except ConnectionClosed as closed:
+            if closed.sent and closed.sent.code == TOO_BIG:
+                log.warning("a client's message has more than deploy.largest_message bytes: %s", closed.sent.reason)
         except ValueError as error:
             await self._refuse(connection, str(error), INVALID)
         except Exception:

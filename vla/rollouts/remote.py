@@ -269,7 +269,8 @@ class RemotePolicy:
         try:
             answer = self._wait(asyncio.wait_for(answered(), self.timeout))
         except ConnectionClosed as error:
-            raise self._error("it closed the connection") from error
+            reason = f" ({error.rcvd.reason})" if error.rcvd and error.rcvd.reason else ""
+            raise self._error(f"it closed the connection{reason}") from error
         except TimeoutError as error:
             self._loop.call_soon_threadsafe(self._connection.transport.abort)  # a late answer would be the next one's
             raise self._error(f"no answer within {self.timeout:g} s") from error
