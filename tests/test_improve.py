@@ -184,6 +184,18 @@ def test_a_folder_with_other_rounds_is_left_alone(tmp_path: Path) -> None:
     assert (tmp_path / "config.yaml").read_bytes() == before
 
 
+@pytest.mark.parametrize("longer", ["trainer.max_steps=5", "+trainer.max_time={hours: 1}"])
+def test_the_training_that_rounds_continue_does_not_get_longer(tmp_path: Path, longer: str) -> None:
+    there = (f"output={tmp_path}", "job=improve")
+    save_config(tmp_path, plain(composed(*there)), [])
+    (tmp_path / "round_1/episodes").mkdir(parents=True)
+    (tmp_path / "round_1/episodes/store.json").write_text("{}")
+    before = (tmp_path / "config.yaml").read_bytes()
+    with pytest.raises(ValueError, match=f"the rounds in {tmp_path} continue round_0, which was trained with"):
+        improve.run(Experiment.of(composed(*there, longer)))
+    assert (tmp_path / "config.yaml").read_bytes() == before
+
+
 def test_the_last_interrupted_run_may_be_one_in_rounds(tmp_path: Path) -> None:
     last = tmp_path / "run/round_1/checkpoints/last.ckpt"
     last.parent.mkdir(parents=True)

@@ -14,7 +14,7 @@ from toy_recordable import RecordableEnvironment
 
 from vla.data.episodes import EpisodeStore
 from vla.rollouts.evaluate import evaluate
-from vla.rollouts.memory import NearestDemonstration, WithoutModality, make_without
+from vla.rollouts.memory import NearestDemonstration, WithoutModality, make_without, open_memory
 from vla.rollouts.rollout import rollout
 from vla.spec import FIRST_SEED, Array, Observation
 
@@ -103,3 +103,9 @@ def test_new_scenes_are_mostly_failed_and_other_stores_refused(folder: Path) -> 
         NearestDemonstration(folder, 20, spec=toy.ARM_SPEC)
     with pytest.raises(ValueError, match="30 of 31 episodes"):
         NearestDemonstration(folder, 31, spec=toy.SPEC)
+
+
+def test_a_store_without_episodes_is_refused(tmp_path: Path) -> None:
+    EpisodeStore.create_or_open(tmp_path, toy.SPEC, {})
+    with pytest.raises(ValueError, match="holds no episodes yet"):
+        open_memory(tmp_path, None, toy.SPEC)

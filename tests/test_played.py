@@ -14,6 +14,7 @@ import pytest
 import toy_recordable as toy
 from command_line import here
 
+from vla.io.documents import MAX_BYTES
 from vla.parallel.pool import LocalCluster
 from vla.rollouts.evaluate import evaluate
 from vla.rollouts.results import Report, Result
@@ -119,6 +120,17 @@ def test_a_line_that_a_killed_process_left_unfinished_is_played_again(tmp_path: 
     with Played(tmp_path, None, {}, {}) as last:
         assert last.of("seen")[SEEDS[-1]].outcome == "dropped" and len(last) == len(SEEDS)
     assert not file.exists()
+
+
+def test_an_evaluation_of_any_length_goes_on(tmp_path: Path) -> None:
+    long = Result(FIRST_SEED, "success", "x" * (1 << 20))
+    with pytest.raises(KeyboardInterrupt), Played(tmp_path, None, {}, {}) as first:
+        for number in range(70):
+            first.add(f"condition_{number}", long)
+        raise KeyboardInterrupt
+    assert (tmp_path / PLAYED).stat().st_size > MAX_BYTES
+    with Played(tmp_path, None, {}, {}) as again:
+        assert len(again) == 70
 
 
 def test_weights_that_changed_since_start_anew(tmp_path: Path) -> None:

@@ -128,3 +128,15 @@ def test_a_report_of_weights_that_were_trained_for_longer_since_is_not_this_one(
     assert cached_success(tmp_path, plain(composed("evaluate.episodes=9")), checkpoint) is None
     os.utime(checkpoint, (time.time() + 10, time.time() + 10))
     assert cached_success(tmp_path, asked, checkpoint) is None
+
+
+def test_a_report_that_compares_with_a_run_which_was_evaluated_again_is_not_this_one(tmp_path: Path) -> None:
+    checkpoint, other = tmp_path / "last.ckpt", tmp_path / "other/report.json"
+    checkpoint.touch()
+    other.parent.mkdir()
+    other.touch()
+    asked = plain(composed(f"evaluate.against={other.parent}"))
+    write_report(Report((Result(1_000_000, "success"),)), tmp_path / "report.json", str(checkpoint), asked)
+    assert cached_success(tmp_path, asked, checkpoint) == 1.0
+    os.utime(other, (time.time() + 10, time.time() + 10))
+    assert cached_success(tmp_path, asked, checkpoint) is None

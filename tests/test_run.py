@@ -204,6 +204,20 @@ def test_the_same_command_in_the_same_folder_does_nothing_twice(home: Path) -> N
     done = here(home, *arguments, "output=copy", "evaluate.episodes=1")  # its evaluation is another
     assert "training is already finished" in done.stdout and "training BC" not in done.stdout
     assert json.loads((home / "copy/report.json").read_text())["episodes"] == 1
+    evaluation = ("checkpoint=copy/checkpoints/last.ckpt", "evaluate.episodes=1", "recorder=none", "output=alone")
+    assert "wrote alone/report.html" in here(home, *evaluation).stdout
+    assert "evaluation is already finished" in here(home, *evaluation).stdout
+
+
+def test_a_training_that_cannot_be_resumed_stays_as_it_was(home: Path) -> None:
+    run = Path(shutil.copytree(home / "run", home / "refused_run"))
+    last = run / "checkpoints/last.ckpt"
+    torch.save({**torch.load(last), "WindowDataModule": {"windows": "others"}}, last)
+    names = ("report.json", "report.html", "training.json", "config.yaml", "metrics.csv")
+    before = {name: (run / name).read_bytes() for name in names}
+    refused = here(home, "resume=refused_run", "output=refused_run", "trainer.max_steps=50", ok=False)
+    assert "was started with other demonstrations" in refused.stderr
+    assert before == {name: (run / name).read_bytes() for name in names}
 
 
 def test_runs_are_compared_in_one_page(home: Path) -> None:

@@ -18,7 +18,6 @@ from rich import print as show
 from vla.config.build import Group, build
 from vla.config.check import NEAREST, Job, conditions, with_changes
 from vla.config.experiment import Experiment
-from vla.data.episodes import EpisodeStore
 from vla.io.files import warn_on_error, writing
 from vla.io.versions import installed_versions
 from vla.policy import costs
@@ -26,7 +25,7 @@ from vla.reports.conditions import SecondaryRows, conditions_table, plot_conditi
 from vla.reports.evaluation import plot_report, write_report
 from vla.reports.html import write_page
 from vla.rollouts.evaluate import RecorderFactory, evaluate, keep_recordings
-from vla.rollouts.memory import make_nearest, make_without
+from vla.rollouts.memory import make_nearest, make_without, open_memory
 from vla.rollouts.realtime import Network, make_over_network
 from vla.rollouts.results import Report, compare_conditions, compare_secondary_metrics
 from vla.rollouts.rollout import AgentFactory
@@ -80,7 +79,10 @@ def run(experiment: Experiment) -> float | None:
         with training_lock(output / CHECKPOINTS) if trained_here else nullcontext():
             return evaluate_open_loop(experiment, checkpoint)
     assert checkpoint is not None
-    return (evaluate_trained if trained_here else _evaluated)(experiment, checkpoint)
+    if trained_here:
+        return evaluate_trained(experiment, checkpoint)
+    known = cached_success(output, experiment.config, checkpoint)
+    return _evaluated(experiment, checkpoint) if known is None else known
 
 
 def require_possible(experiment: Experiment) -> None:
@@ -97,7 +99,7 @@ def require_possible(experiment: Experiment) -> None:
     if not experiment.playable and experiment["evaluate"]["conditions"]:
         raise ValueError("evaluate.conditions change a world, and a recording has none: omit them")
     if (folder := experiment["evaluate"]["nearest"]) is not None:
-        EpisodeStore(Path(folder))
+        open_memory(Path(folder), None, experiment.world().spec)
     output = Path(experiment["output"])  # not created yet
     if experiment["job"] != "improve" and any(output.glob(f"round_*/{CHECKPOINTS}")):
         raise ValueError(f"{output} has the rounds of a job=improve, whose report this would replace: add output=DIR")

@@ -10,9 +10,10 @@ from __future__ import annotations
 
 import hashlib
 import logging
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -20,6 +21,7 @@ from vla.config.adopt import require_identity
 from vla.config.check import TRAINING, Job, devices, with_changes
 from vla.config.experiment import Experiment
 from vla.data.episodes import EpisodeStore
+from vla.data.header import is_store
 from vla.data.index import listed
 from vla.io.types import Count, Seed, Share
 from vla.jobs.collect import demonstrations
@@ -30,7 +32,7 @@ from vla.rollouts.collect import collect, collection_time
 from vla.rollouts.supervised import make_supervised, require_memoryless
 from vla.runs.files import Round
 from vla.runs.folder import read_run, save_config
-from vla.runs.resume import training_lock
+from vla.runs.resume import LENGTHS, training_lock
 from vla.spec import FIRST_SEED
 
 log = logging.getLogger(__name__)
@@ -85,13 +87,24 @@ def _save_config(experiment: Experiment) -> None:
     """Save the config for `resume=`.
 
     Raises:
-        ValueError: the folder has rounds of another training.
+        ValueError: the folder has rounds of another training, or they begin where this one would not end.
     """
     saved = read_run(experiment.output).config
     if saved.get("job") == "improve":
         require_identity(saved, experiment.config, experiment.output)
+        if experiment.pretrained is None and is_store(experiment.output / "round_1" / EPISODES):
+            _require_same_length(saved["trainer"], experiment["trainer"], experiment.output)
     if saved != experiment.config:  # else its date would tell that the rounds began again
         save_config(experiment.output, experiment.config, experiment.changes)
+
+
+def _require_same_length(saved: Mapping[str, Any], asked: Mapping[str, Any], output: Path) -> None:
+    for name in LENGTHS:
+        if asked.get(name) != saved.get(name):
+            raise ValueError(
+                f"trainer.{name}={asked.get(name)}: the rounds in {output} continue round_0, which was trained with "
+                f"{saved.get(name)}: leave it at that, or choose another output=DIR"
+            )
 
 
 def _require_possible(experiment: Experiment) -> range:

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import lightning
 import torch
-from lightning import Trainer
+from lightning import Callback, LightningModule, Trainer
 
 from vla.config.check import TRAINING, Job
 from vla.config.experiment import Experiment, training_policy
@@ -30,6 +30,7 @@ from vla.runs.folder import (
     PAGE,
     SAMPLES,
     archive_evaluation,
+    read_training,
     save_choice,
     save_config,
     save_training,
@@ -72,7 +73,8 @@ def train(experiment: Experiment) -> Path | None:
         log.warning("without trainer.max_steps learner.schedule=cosine has no end: the learning rate stays at its peak")
     with training_lock(checkpoints):
         # Before collection, so that missing devices are reported early.
-        trainer = make_trainer(experiment.config, checkpoints, *([closed_loop] if closed_loop else []), graceful_stop)
+        callbacks = [_Begun(experiment), *([closed_loop] if closed_loop else []), graceful_stop]
+        trainer = make_trainer(experiment.config, checkpoints, *callbacks)
         if not trainer.is_global_zero:
             logging.getLogger("vla").setLevel(logging.WARNING)  # only the first process logs
         _fit(experiment, state, trainer, graceful_stop)
@@ -118,8 +120,8 @@ def _fit(experiment: Experiment, state: TrainingProgress, trainer: Trainer, grac
     if state.resume_from:
         restore_metrics(trainer, state.resume_from)
     collection_s = collection_time(store, experiment["collect"]["episodes"])
-    if trainer.is_global_zero:
-        archive_evaluation(output)
+    if not state.resume_from:
+        save_config(output, experiment.config, experiment.changes)  # also of a training that fails at its start
     with writing(output), _reported(experiment, trainer, graceful_stop, learner, collection_s):
         try:
             with (
@@ -135,6 +137,19 @@ def _fit(experiment: Experiment, state: TrainingProgress, trainer: Trainer, grac
             trainer.save_checkpoint(output / CHECKPOINTS / LAST, weights_only=False)
         if graceful_stop.requested and trainer.is_global_zero:
             raise KeyboardInterrupt
+
+
+class _Begun(Callback):
+    """Archives the evaluation of a run and saves its config, once its training continues."""
+
+    def __init__(self, experiment: Experiment) -> None:
+        self._experiment = experiment
+
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """All state is restored."""
+        if trainer.is_global_zero:
+            archive_evaluation(self._experiment.output)
+            save_config(self._experiment.output, self._experiment.config, self._experiment.changes)
 
 
 def _endless(experiment: Experiment) -> bool:
@@ -174,7 +189,6 @@ def _reported(
 ) -> Iterator[None]:
     """Write the report page and the log summary however training ends, including the runs it resumed from."""
     output = experiment.output
-    save_config(output, experiment.config, experiment.changes)
     parameters = sum(parameter.numel() for parameter in learner.model.parameters())
     start = f", starting from {experiment.pretrained}" if experiment.pretrained else ""
     log.info("training %s with %.2f M parameters%s", type(learner.model).__name__, parameters / 1e6, start)
@@ -186,7 +200,8 @@ def _reported(
         raise
     finally:
         seconds = graceful_stop.seconds
-        if trainer.is_global_zero:
+        # A training that cannot be resumed stays as it was.
+        if trainer.is_global_zero and (graceful_stop.started or read_training(output) is None):
             collected = collection_s and round(collection_s, 1)
             save_training(output, Training(parameters, trainer.global_step, round(seconds, 1), ended, collected))
             with warn_on_error(output / PAGE):

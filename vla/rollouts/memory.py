@@ -68,10 +68,9 @@ class NearestDemonstration:
         spec: of the environment.
 
         Raises:
-            ValueError: there is no such store, it has fewer episodes, or another spec.
+            ValueError: as of `open_memory`.
         """
-        store = EpisodeStore(folder, episodes)
-        store.spec.without_truth.require(spec.without_truth, f"the episode store {folder}", "the task")
+        store = open_memory(folder, episodes, spec)
         self._entries, self._executed = store.episodes, store.rows("executed")
         self._instructions = np.array([entry.instruction for entry in self._entries])
         self._seeds = np.array([entry.seed for entry in self._entries])
@@ -107,6 +106,18 @@ class NearestDemonstration:
         candidates = known if len(known) else np.flatnonzero(self._others)
         distances = [np.abs(self._images[index] - seen).mean() for index in candidates]
         return int(candidates[np.argmin(distances)])
+
+
+def open_memory(folder: Path, episodes: int | None, spec: Spec) -> EpisodeStore:
+    """Open the store of the demonstrations to replay in a world with a spec.
+
+    Raises:
+        ValueError: there is no such store, it has no or fewer episodes, or another spec.
+    """
+    store = EpisodeStore(folder, episodes)
+    store.require_episodes()
+    store.spec.without_truth.require(spec.without_truth, f"the episode store {folder}", "the task")
+    return store
 
 
 def make_nearest(folder: Path, environment: Environment) -> NearestDemonstration:

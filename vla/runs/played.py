@@ -17,6 +17,7 @@ from vla.io.files import write_text, writing
 from vla.rollouts.results import Result
 
 PLAYED = "played.jsonl"  # exists in a run's folder while an evaluation has no report yet
+LARGEST = 4 << 30  # of that file [bytes], millions of episodes
 
 log = logging.getLogger(__name__)
 
@@ -132,7 +133,7 @@ def _read(path: Path, evaluation: _Evaluation) -> list[_Episode]:
     """Return the episodes in a file, up to the first damaged line, if they are of this evaluation."""
     if not path.is_file():
         return []
-    head, *lines = read_bounded(path).splitlines() or [b""]
+    head, *lines = read_bounded(path, LARGEST).splitlines() or [b""]
     found = list[_Episode]()
     try:
         if not parse_json(head, _Evaluation, str(path)).continues(evaluation):

@@ -68,7 +68,10 @@ def cached_success(folder: Path, config: Mapping[str, Any], checkpoint: Path) ->
     report = read_report(folder)
     if report is None or report.checkpoint != str(checkpoint):
         return None
-    if (folder / REPORT).stat().st_mtime < checkpoint.stat().st_mtime:  # the training continued afterwards
+    against = config["evaluate"]["against"]
+    # Since the report the training may have continued, or the run that it compares with have been evaluated again.
+    newer = [checkpoint] if against is None else [checkpoint, Path(against) / REPORT]
+    if (folder / REPORT).stat().st_mtime < max(path.stat().st_mtime for path in newer):
         return None
     if any(part.errors for part in report.reports.values()) or differences(report.config, config):
         return None

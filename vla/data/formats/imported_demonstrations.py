@@ -74,10 +74,10 @@ class ImportedDemonstrations(ABC):
         if len(store.episodes) >= episodes:
             return 0
         store.require_growable()
-        first = store.next_seed or 0
-        if (possible := len(store.episodes) + len(self) - first) < episodes:  # damaged ones do not come back
-            raise ValueError(f"only {possible} episodes are whole: set collect.episodes={possible}, or fewer")
-        with store.writing():
+        with store.writing():  # another process may have added some meanwhile
+            first = store.next_seed or 0
+            if (possible := len(store.episodes) + len(self) - first) < episodes:  # damaged ones do not come back
+                raise ValueError(f"only {possible} episodes are whole: set collect.episodes={possible}, or fewer")
             missing = range(first, first + episodes - len(store.episodes))
             for number in track(missing, "importing"):
                 store.append(self.episode(number))
