@@ -107,29 +107,29 @@ def test_episodes_of_another_evaluation_are_not_used(played: Path, change: str) 
 
 
 def test_a_line_that_a_killed_process_left_unfinished_is_played_again(tmp_path: Path) -> None:
-    with pytest.raises(KeyboardInterrupt), Played(tmp_path, None, {}, {}) as first:
+    with pytest.raises(KeyboardInterrupt), Played(tmp_path, [], {}, {}) as first:
         for seed in SEEDS:
             first.add("seen", Result(seed, "success"))
         raise KeyboardInterrupt
     file = tmp_path / PLAYED
     file.write_bytes(file.read_bytes()[:-20])
-    with pytest.raises(KeyboardInterrupt), Played(tmp_path, None, {}, {}) as again:
+    with pytest.raises(KeyboardInterrupt), Played(tmp_path, [], {}, {}) as again:
         assert list(again.of("seen")) == list(SEEDS[:-1])
         again.add("seen", Result(SEEDS[-1], "dropped"))
         raise KeyboardInterrupt
-    with Played(tmp_path, None, {}, {}) as last:
+    with Played(tmp_path, [], {}, {}) as last:
         assert last.of("seen")[SEEDS[-1]].outcome == "dropped" and len(last) == len(SEEDS)
     assert not file.exists()
 
 
 def test_an_evaluation_of_any_length_goes_on(tmp_path: Path) -> None:
     long = Result(FIRST_SEED, "success", "x" * (1 << 20))
-    with pytest.raises(KeyboardInterrupt), Played(tmp_path, None, {}, {}) as first:
+    with pytest.raises(KeyboardInterrupt), Played(tmp_path, [], {}, {}) as first:
         for number in range(70):
             first.add(f"condition_{number}", long)
         raise KeyboardInterrupt
     assert (tmp_path / PLAYED).stat().st_size > MAX_BYTES
-    with Played(tmp_path, None, {}, {}) as again:
+    with Played(tmp_path, [], {}, {}) as again:
         assert len(again) == 70
 
 
@@ -137,17 +137,31 @@ def test_weights_that_changed_since_start_anew(tmp_path: Path) -> None:
     checkpoint = tmp_path / "last.ckpt"
     checkpoint.write_bytes(b"weights")
     for expected in (0, 1):
-        with pytest.raises(KeyboardInterrupt), Played(tmp_path, checkpoint, {}, {}) as played:
+        with pytest.raises(KeyboardInterrupt), Played(tmp_path, [checkpoint], {}, {}) as played:
             assert len(played) == expected
             played.add("seen", Result(FIRST_SEED, "success"))
             raise KeyboardInterrupt
     for versions in ({"mujoco": "3.3.0"}, {}):
-        with pytest.raises(KeyboardInterrupt), Played(tmp_path, checkpoint, {}, versions) as played:
+        with pytest.raises(KeyboardInterrupt), Played(tmp_path, [checkpoint], {}, versions) as played:
             assert len(played) == 0
             played.add("seen", Result(FIRST_SEED, "success"))
             raise KeyboardInterrupt
     checkpoint.touch()
-    with Played(tmp_path, checkpoint, {}, {}) as played:
+    with Played(tmp_path, [checkpoint], {}, {}) as played:
+        assert len(played) == 0
+
+
+def test_a_policy_in_a_folder_that_changed_since_starts_anew(tmp_path: Path) -> None:
+    weights = tmp_path / "model/shards/weights.safetensors"
+    weights.parent.mkdir(parents=True)
+    weights.write_bytes(b"weights")
+    for expected in (0, 1):
+        with pytest.raises(KeyboardInterrupt), Played(tmp_path, [tmp_path / "model"], {}, {}) as played:
+            assert len(played) == expected
+            played.add("seen", Result(FIRST_SEED, "success"))
+            raise KeyboardInterrupt
+    weights.touch()
+    with Played(tmp_path, [tmp_path / "model"], {}, {}) as played:
         assert len(played) == 0
 
 

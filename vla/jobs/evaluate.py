@@ -133,7 +133,7 @@ def _evaluated(experiment: Experiment, checkpoint: Path | None, rounds: Sequence
     """Play the episodes, write the reports, and return the success rate; print it even if writing fails."""
     output, statements, result = experiment.output, _statements(experiment), list[str]()
     try:
-        with Played(output, checkpoint, experiment.config, installed_versions()) as played:
+        with Played(output, _sources(experiment, checkpoint), experiment.config, installed_versions()) as played:
             reports = _play(experiment, checkpoint, statements, played)
             report = reports[IN_DISTRIBUTION]
             result += [*(each.say(report) for each in statements), str(report)]
@@ -148,6 +148,12 @@ def _evaluated(experiment: Experiment, checkpoint: Path | None, rounds: Sequence
     if errors:
         raise ValueError(f"{len(errors)} episodes ended in an error, see {output / REPORT}")
     return report.success
+
+
+def _sources(experiment: Experiment, checkpoint: Path | None) -> list[Path]:
+    """Return the files and folders that agents are read from."""
+    named = [checkpoint, (experiment["agent"] or {}).get("folder"), experiment["evaluate"]["nearest"]]
+    return [Path(each) for each in named if each is not None]
 
 
 def _statements(experiment: Experiment) -> list[Statement]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import logging
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from types import TracebackType
@@ -28,14 +28,13 @@ class _Evaluation:
 
     __pydantic_config__ = STRICT
 
-    checkpoint: str | None
-    changed_ns: int | None  # time of the checkpoint's last change
+    changed_ns: dict[str, int | None]  # file or folder of the policy → time of its last change; None: there is none
     config: dict[str, Any]
     versions: dict[str, str]
 
     def continues(self, other: _Evaluation) -> bool:
         """Return whether both play the same episodes."""
-        mine, theirs = ((each.checkpoint, each.changed_ns, each.versions) for each in (self, other))
+        mine, theirs = ((each.changed_ns, each.versions) for each in (self, other))
         return mine == theirs and not differences(self.config, other.config)
 
 
@@ -58,21 +57,20 @@ class Played:
     """
 
     def __init__(
-        self, folder: Path, checkpoint: Path | None, config: Mapping[str, Any], versions: dict[str, str]
+        self, folder: Path, sources: Sequence[Path], config: Mapping[str, Any], versions: dict[str, str]
     ) -> None:
         """Read the results of the same evaluation, if an earlier one left any, and start the file.
 
         Args:
             folder: of the run.
-            checkpoint: the evaluated policy; None: an agent of the config.
+            sources: files and folders that the policy or agent is read from.
             config: the resolved config.
             versions: library → version.
 
         Raises:
             OSError: the file cannot be written.
         """
-        weights = (str(checkpoint), checkpoint.stat().st_mtime_ns) if checkpoint else (None, None)
-        evaluation = _Evaluation(*weights, dict(config), versions)
+        evaluation = _Evaluation({str(path): _changed_ns(path) for path in sources}, dict(config), versions)
         self._path = folder / PLAYED
         episodes = _read(self._path, evaluation)
         self._started = time.monotonic() - max((each.seconds for each in episodes), default=0.0)
@@ -123,6 +121,12 @@ class Played:
         with writing(self._path), self._path.open("a", encoding="utf-8") as file:
             file.write(_line(_Episode(condition, self.seconds, result)))
         self.of(condition)[result.seed] = result
+
+
+def _changed_ns(path: Path) -> int | None:
+    """Return the time of the last change of a file, or of any file in a folder; None if there is none."""
+    files = [path, *path.rglob("*")] if path.is_dir() else [path]
+    return max((file.stat().st_mtime_ns for file in files if file.exists()), default=None)
 
 
 def _line(content: _Evaluation | _Episode) -> str:
