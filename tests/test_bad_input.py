@@ -26,7 +26,7 @@ BAD_INPUT = {
     "a checkpoint that is no path": (("checkpoint=3",), "checkpoint=3 is not a path"),
     "nothing interrupted": (
         ("resume=last", "output=nowhere/now"),
-        "none of the 0 trainings in nowhere was interrupted",
+        "no run in nowhere was interrupted",
     ),
     "no room on the table": (("job=preview", "task.blocks=4", "task.randomize.placement.x=[0.5,0.5]"), "no room"),
     "no dataset": (("job=collect", "expert=lerobot", "expert.folder=nowhere"), "no LeRobot dataset in nowhere"),

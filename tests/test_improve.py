@@ -196,15 +196,16 @@ def test_the_training_that_rounds_continue_does_not_get_longer(tmp_path: Path, l
     assert (tmp_path / "config.yaml").read_bytes() == before
 
 
-def test_the_last_interrupted_run_may_be_one_in_rounds(tmp_path: Path) -> None:
-    last = tmp_path / "run/round_1/checkpoints/last.ckpt"
+@pytest.mark.parametrize("file", ["checkpoints/last.ckpt", "episodes/index.jsonl"])
+def test_the_last_interrupted_run_may_be_one_in_rounds(tmp_path: Path, file: str) -> None:
+    last = tmp_path / "run/round_1" / file
     last.parent.mkdir(parents=True)
     last.touch()
     assert interrupted_run(tmp_path) == tmp_path / "run"
-    with training_lock(tmp_path / "run"), pytest.raises(ValueError, match="none of the 1 trainings"):
+    with training_lock(tmp_path / "run"), pytest.raises(ValueError, match="no run in"):
         interrupted_run(tmp_path)
     (tmp_path / "run/report.json").touch()
-    with pytest.raises(ValueError, match="none of the 1 trainings"):
+    with pytest.raises(ValueError, match="no run in"):
         interrupted_run(tmp_path)
 
 

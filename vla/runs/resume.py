@@ -96,15 +96,16 @@ def interrupted_run(runs: Path) -> Path:
 
 
 def _newest_interrupted(runs: Path) -> Path:
-    found = (runs.glob(f"{run}/{CHECKPOINTS}/{LAST}") for run in ("*", "*/round_*"))
-    files = sorted(chain(*found), key=lambda path: path.stat().st_mtime, reverse=True)
+    # Rounds begin with episodes, before there is a checkpoint.
+    patterns = (f"*/{CHECKPOINTS}/{LAST}", f"*/round_*/{CHECKPOINTS}/{LAST}", "*/round_*/episodes/index.jsonl")
+    files = sorted(chain(*map(runs.glob, patterns)), key=lambda path: path.stat().st_mtime, reverse=True)
     for last in files:
         training = last.parent.parent
         in_rounds = training.parent != runs
         run, lock = (training.parent, training.parent) if in_rounds else (training, last.parent)
         if not _locked(lock) and (not _evaluated(run, last, run / CONFIG) if in_rounds else _unfinished(run)):
             return run
-    raise ValueError(f"resume=last: none of the {len(files)} trainings in {runs} was interrupted; resume=DIR names one")
+    raise ValueError(f"resume=last: no run in {runs} was interrupted; resume=DIR names one")
 
 
 def _evaluated(run: Path, *since: Path) -> bool:
