@@ -140,7 +140,7 @@ OF_ONE_WORLD = {
     *("generalisation", "language", "levels", "paper", "suite", "tabletop"),
     *("no_excursions", "no_noise", "coarse_images"),
     *("unseen_names", "renderer", "lerobot", "metaworld", "metaworld_disturbed", "metaworld_improved", "few_improved"),
-    "multitask_improved",
+    *("multitask_improved", "standard_improved"),
 }
 
 
