@@ -39,6 +39,22 @@ def test_with_chroma_alone_a_dimmer_lamp_changes_little() -> None:
     assert (features - dim).norm() < 0.2 * (features - other).norm()
 
 
+@pytest.mark.parametrize(("log_pixels", "at_least", "at_most"), [(False, 0.1, 0.15), (True, 0.5, 0.8)])
+def test_logarithms_keep_contrasts_on_a_dark_table(log_pixels: bool, at_least: float, at_most: float) -> None:
+    encoder = FilmConv([8], [5], [2], text_width=8, chroma=False, positions=False, log_pixels=log_pixels)
+    table = torch.full((1, 3, 16, 16), 0.8)
+    pad = table.clone()
+    pad[:, :, 4:12, 4:12] = 0.4
+    with torch.no_grad():
+        first = encoder.get_submodule("convs.0")
+        seen = []
+        first.register_forward_hook(lambda module, inputs, output: seen.append(output))
+        for images in (table, pad, table / 8, pad / 8):
+            encoder(images, torch.zeros(1, 8))
+    bright, dark = (seen[1] - seen[0]).norm(), (seen[3] - seen[2]).norm()
+    assert at_least < dark / bright < at_most
+
+
 def test_features_can_tell_their_position() -> None:
     encoder = FilmConv([4], [3], [1], text_width=8, chroma=True, positions=True)
     features = encoder(torch.rand(2, 3, 5, 7), torch.randn(2, 8))

@@ -19,6 +19,7 @@ BRIGHTNESS_OFFSET = 0.1  # of a brightness up to 3; suppresses the chromaticity 
 INITIAL_CONTRAST = 2.0  # standard deviation of the scores of a token or keypoint; a few of 576 positions dominate
 GELU_STD = 0.35  # standard deviation of the output of TokenLearner's first layer at initialisation
 MIN_SCORE_STD = 1e-3
+DARK = 0.05  # pixel value below which the logarithm of `log_pixels` becomes linear, so that noise in black stays small
 
 
 class FiLM(nn.Module):
@@ -72,6 +73,8 @@ class FilmConv(ImageEncoder):
         chroma: add colours relative to their brightness as input, which depend less on light and shadows.
         positions: append the position x, y of every feature, in ±POSITION_SCALE (CoordConv, arXiv 1807.03247). Without
             it, a weighted mean of features, such as a token of TokenLearner, does not tell where in the image they are.
+        log_pixels: input logarithms of the pixel values, so that the same relative contrast counts as much on a dark
+            surface as on a bright one.
         text_width: length of the text vector.
     """
 
@@ -82,6 +85,7 @@ class FilmConv(ImageEncoder):
         strides: Kernels,
         chroma: bool,
         positions: bool,
+        log_pixels: bool = False,  # not in the config of older checkpoints
         *,
         text_width: int,
     ) -> None:
@@ -90,7 +94,7 @@ class FilmConv(ImageEncoder):
                 f"channels, kernels and strides need one entry per convolution, got {channels}, {kernels}, {strides}"
             )
         super().__init__(channels[-1] + 2 * positions)
-        self.positions = positions
+        self.positions, self.log_pixels = positions, log_pixels
         inputs = [3, *channels[:-1]]
         convs = [
             nn.Conv2d(i, o, kernel, stride, kernel // 2)
@@ -109,7 +113,8 @@ class FilmConv(ImageEncoder):
     def forward(self, images: Tensor, text: Tensor) -> Tensor:
         """Encode (N, 3, H, W) float images in 0 … 1 with (N, text_width) text as (N, channels, h, w)."""
         scale = 1.0 if self.chroma is None else math.sqrt(0.5)  # keeps the variance of the sum of both inputs
-        x = self.convs[0]((images - 0.5).mul_(4 * scale))  # about unit variance
+        values = _logarithm(images) if self.log_pixels else images
+        x = self.convs[0]((values - 0.5).mul_(4 * scale))  # about unit variance
         if self.chroma is not None:
             x = x + self.chroma(_chromaticity(images).mul_(6 * scale))
         x = F.silu(self.films[0](x, text))
@@ -120,6 +125,11 @@ class FilmConv(ImageEncoder):
             where = (POSITION_SCALE * grid(x)).to(x.dtype).T.view(1, 2, height, width)
             x = torch.cat([x, where.expand(len(x), -1, -1, -1)], 1)
         return x
+
+
+def _logarithm(images: Tensor) -> Tensor:
+    """Return the logarithm of pixel values, scaled so that 0 and 1 stay as they are."""
+    return (images / DARK).log1p_().div_(math.log1p(1 / DARK))
 
 
 def _chromaticity(images: Tensor) -> Tensor:
