@@ -62,6 +62,19 @@ def test_plots_are_drawn_whatever_happened(report: Report, tmp_path: Path, figur
     assert Image.open(tmp_path / "report.png").width > 1000
 
 
+def test_rates_share_a_scale_that_shows_their_intervals(tmp_path: Path, figures: list[Figure]) -> None:
+    mass = np.random.default_rng(0).uniform(0.5, 2, 1000).tolist()
+    played = [
+        Result(FIRST_SEED + index, "success" if index % 50 else "dropped", draws={"mass": factor, "even": index % 2})
+        for index, factor in enumerate(mass)
+    ]
+    plot_report(Report(tuple(played)), tmp_path / "report.png")
+    panels = figures[0].axes[2:]
+    lowest = min(axes.dataLim.y0 for axes in panels)
+    assert len(panels) == 2 and 0.9 < lowest < 0.96  # 20 of 500 in one half, whose interval begins at 94 %
+    assert {axes.get_ylim() for axes in panels} == {(0.9, 1.0)}
+
+
 def test_contact_sheet_shows_the_observations() -> None:
     environment, seeds = make_environment(), [FIRST_SEED, FIRST_SEED + 1, FIRST_SEED + 2]
     observations = [environment.reset(seed) for seed in seeds]

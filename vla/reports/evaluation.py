@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -116,7 +117,7 @@ def plot_report(report: Report, path: Path) -> None:
     inch = 1 / (3.1 * rows)
     figure.suptitle(str(report).splitlines()[-1], y=1 - 0.15 * inch, va="top", fontsize=15, fontweight="bold")
     edges = {"right": 0.985, "bottom": 0.65 * inch, "top": 1 - 0.8 * inch}
-    grid = figure.add_gridspec(rows, 4, **edges, wspace=0.24, hspace=0.4)
+    grid = figure.add_gridspec(rows, 4, **edges, wspace=0.3, hspace=0.4)
     outcomes = figure.add_subplot(grid[0, :2])
     _plot_outcomes(outcomes, report)
     # Only the left margin depends on what is drawn; a layout engine takes as long as drawing the figure twice.
@@ -124,11 +125,18 @@ def plot_report(report: Report, path: Path) -> None:
     grid.update(left=max(0.01 + names / figure.bbox.width, 0.06))
     outcomes.set_position(grid[0, :2].get_position(figure))
     _plot_lengths(figure.add_subplot(grid[0, 2:]), played)
+    scales = list[Axes]()
     for index, (name, values) in enumerate(shown):
         axes = figure.add_subplot(grid[1 + index // 4, index % 4])
         axes.set_title(name, fontsize=10)
-        plot = _plot_points if isinstance(values[0], tuple) else _plot_groups
-        plot(axes, values, played)
+        if isinstance(values[0], tuple):
+            _plot_points(axes, values, played)
+        else:
+            _plot_groups(axes, values, played)
+            scales.append(axes)
+    lowest = min((axes.dataLim.y0 for axes in scales), default=0.0)  # of an interval
+    for axes in scales:
+        axes.set_ylim(math.floor(10 * lowest) / 10, 1)  # one scale, on which differences of high rates are visible
     save(figure, path)
 
 
@@ -187,6 +195,5 @@ def _plot_groups(axes: Axes, values: Sequence[Any], played: Sequence[Result]) ->
     counts = [(good, len(group)) for good, group in zip(won, split, strict=True)]
     rates, reach = error_bars((good / count, *wilson_interval(good, count)) for good, count in counts)
     axes.errorbar(places, rates, reach, fmt="o-", color=GREEN, ecolor=GREY, linewidth=0.7, capsize=3, clip_on=False)
-    axes.set_ylim(0, 1)
     axes.set_ylabel("success")
     axes.grid(axis="y", alpha=0.3)
