@@ -9,9 +9,11 @@ import signal
 import subprocess
 import sys
 import sysconfig
+import threading
 import time
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Callable, Iterator
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -23,6 +25,7 @@ import rclpy
 import yaml
 from arm import ROBOT
 from command_line import SMALL, here, vla
+from composing import composed
 from defaults import defaults_of
 from documented import TEXT
 from rclpy.context import Context
@@ -32,16 +35,20 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from warm import Started
 
+from vla.config.experiment import Experiment
 from vla.data.episodes import EpisodeStore
 from vla.deploy import messages
 from vla.deploy.bag import POLICY_INPUTS
 from vla.deploy.demo_operator import DemoOperator
+from vla.deploy.loop import Loop
 from vla.deploy.messages import SimulatedEpisode
 from vla.deploy.ros import NETWORKS, RosNetwork, split_arguments
 from vla.io.images import resize
+from vla.jobs import deploy as job
 from vla.models.checkpoint import read_header
 from vla.robots.panda import forward
 from vla.rollouts.recorder import VIEWER
+from vla.rollouts.results import Result
 from vla.tasks import gl as backend
 
 WORKER = int(os.environ.get("PYTEST_XDIST_WORKER", "gw0").removeprefix("gw"))
@@ -254,6 +261,22 @@ def test_the_whole_loop_reports_and_its_bag_moves_an_agent_again(
     probe.spin(0.2)
     assert np.ptp([command.position[:7] for command in probe.commands], axis=0).max() > 0.01
     learn_from_the_bag(home)
+
+
+def test_an_episode_that_breaks_off_is_an_error_of_the_loop(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def play() -> Result:
+        if results:
+            return results.pop()
+        raise ValueError("timed out after 60 s")
+
+    results = [Result(5, "success")]
+    operator = SimpleNamespace(play=play, stopped=threading.Event(), status={})
+    monkeypatch.setattr(Loop, "running", lambda loop: nullcontext(operator))
+    experiment = Experiment.of(composed("job=deploy", "deploy=loop", "checkpoint=last.ckpt", f"output={tmp_path}"))
+    with pytest.raises(ValueError, match=r"ended with an error, see .*report.json: timed out after 60 s"):
+        job.run(experiment)
+    report = json.loads((tmp_path / "report.json").read_text())
+    assert (report["successes"], report["episodes"], report["errors"], report["seeds"]) == (1, 1, 1, [5, 6])
 
 
 def learn_from_the_bag(home: Path) -> None:

@@ -15,7 +15,7 @@ from vla.deploy.ros import plain_errors, ros
 from vla.deploy.ros2 import PolicyDeployment, SimulatorDeployment
 from vla.io.types import Count
 from vla.parallel.processes import leave_with_parent, without_triton
-from vla.rollouts.results import Report, Result
+from vla.rollouts.results import ERROR, Report, Result
 from vla.spec import Shell
 
 if TYPE_CHECKING:
@@ -51,7 +51,7 @@ class Loop:
     output: Path
 
     def run(self) -> Report:
-        """Play all episodes.
+        """Play all episodes, up to the first one that ends in an error.
 
         Raises:
             ValueError: a node exited or does not respond in the first episode, or is not to move the arm.
@@ -65,7 +65,7 @@ class Loop:
                 except ValueError as error:
                     if not results:
                         raise
-                    log.error("%s: the report has the %d episodes before", error, len(results))
+                    results.append(Result(results[-1].seed + 1, ERROR, error=str(error)))
                     break
                 if result:
                     results.append(result)

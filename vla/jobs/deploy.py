@@ -15,13 +15,19 @@ JOB = Job(("tokenizer", "model", "policy", "agent", "deploy"), adopts=True)
 
 
 def run(experiment: Experiment) -> None:
-    """Run the deployment until done or interrupted; report a measured success rate like an evaluation."""
+    """Run the deployment until done or interrupted; report a measured success rate like an evaluation.
+
+    Raises:
+        ValueError: an episode ended in an error; the report is written and contains it.
+    """
     report = deployment(experiment).run()
     if report is not None:
         output = experiment.output
         write_report(report, output / REPORT, experiment["checkpoint"], experiment.config)
         plot_report(report, output / PLOT)
         print(report)
+        if report.errors:
+            raise ValueError(f"the episodes ended with an error, see {output / REPORT}: {report.errors[0].error}")
 
 
 def deployment(experiment: Experiment) -> Any:
