@@ -224,6 +224,8 @@ def result(folder: Path) -> tuple[dict[str, bytes], dict[str, float]]:
 
 def test_rounds_that_were_killed_go_on_to_the_same_result(home: Path) -> None:
     here(home, *ROUNDS, *FEW, "output=rounds", "improve.rounds=1")
+    changes = (home / "rounds/changes.yaml").read_text()
+    assert "key: improve.steps" in changes and "improve.beta" not in changes
     first, second = (home / "rounds" / name for name in ("round_1", "round_2"))
     whole = result(first)
     page, report = (home / "rounds" / name for name in ("report.html", "report.json"))

@@ -197,6 +197,8 @@ def test_the_same_command_in_the_same_folder_does_nothing_twice(home: Path) -> N
     assert "training is already finished" in done.stdout and "evaluation is already finished" in done.stdout
     refused = here(home, *arguments, "output=run", "learner.lr=1e-4", "trainer.max_steps=5", ok=False)
     assert "run holds a training that differs in learner.lr: choose" in refused.stderr
+    refused = here(home, "resume=run", "output=run", "learner.lr=1e-4", ok=False)
+    assert "run holds a training that differs in learner.lr: omit that to continue it" in refused.stderr
     done = here(home, "resume=run", "output=run")
     assert "training is already finished" in done.stdout and "evaluation is already finished" in done.stdout
     assert made == {path: path.stat().st_mtime_ns for path in made}
@@ -206,6 +208,7 @@ def test_the_same_command_in_the_same_folder_does_nothing_twice(home: Path) -> N
     assert json.loads((home / "copy/report.json").read_text())["episodes"] == 1
     evaluation = ("checkpoint=copy/checkpoints/last.ckpt", "evaluate.episodes=1", "recorder=none", "output=alone")
     assert "wrote alone/report.html" in here(home, *evaluation).stdout
+    assert "${" not in (home / "alone/changes.yaml").read_text()
     assert "evaluation is already finished" in here(home, *evaluation).stdout
 
 

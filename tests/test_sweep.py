@@ -78,6 +78,9 @@ def test_cells_that_failed_are_left_out_and_a_sweep_without_any_writes_nothing(t
     (tmp_path / "2/error.txt").write_text("holds a training that differs in model")  # the report is of another sweep
     (row,) = tabulate(tmp_path)
     assert row.choices == {} and row.name == "all"
+    failed = "2 model=rt1: holds a training that differs in model"
+    assert (tmp_path / "sweep.md").read_text().endswith(f"\n\n- failed: {failed}\n")
+    assert f"<li>{failed}</li>" in (tmp_path / "sweep.html").read_text()
 
 
 def test_agents_without_a_model_are_rows_too(tmp_path: Path) -> None:

@@ -174,9 +174,10 @@ def require_identity(saved: Mapping[str, Any], config: Mapping[str, Any], folder
     changed = [key for key, _, _ in differences(before, now)]
     if changed:
         weights = f"; pretrained={folder / LAST} starts another from its weights" if (folder / LAST).exists() else ""
+        way_out = f"choose another output=DIR (hydra.sweep.dir=DIR of a sweep), or continue it with resume={folder}"
         raise ValueError(
-            f"{folder} holds a training that differs in {', '.join(changed[:3])}{', …' if changed[3:] else ''}: choose "
-            f"another output=DIR (hydra.sweep.dir=DIR of a sweep), or continue it with resume={folder}{weights}"
+            f"{folder} holds a training that differs in {', '.join(changed[:3])}{', …' if changed[3:] else ''}: "
+            f"{'omit that to continue it' if config.get('resume') else way_out}{weights}"
         )
 
 

@@ -59,6 +59,7 @@ class Experiment:
             for key, value, before in differences(chosen, standard)
             if not at(here, key) == at(there, key) != ABSENT  # else one is an interpolation of the same value
             and key.rpartition(".")[2] != SECRET
+            and not key.startswith("chosen.")  # names of options, whose values are compared
         ]
         return cls(here, _without_secrets(changes))
 

@@ -20,6 +20,7 @@ from vla.rollouts.results import ERROR, Report, Result
 from vla.rollouts.statistics import wilson_interval
 
 PANELS = 8  # maximum number of factors on the page
+LENGTH_BINS = 30  # approximate number of bars in the histogram of lengths
 
 
 def write_report(
@@ -161,11 +162,13 @@ def _plot_outcomes(axes: Axes, report: Report) -> None:
 def _plot_lengths(axes: Axes, played: Sequence[Result]) -> None:
     """Plot a histogram of the steps until success or failure."""
     steps = [[result.steps for result in played if result.success == good] for good in (True, False)]
-    edges = np.histogram_bin_edges(steps[0] + steps[1] or [0], bins=30)
+    lengths = steps[0] + steps[1] or [0]
+    width = max(1, round((max(lengths) - min(lengths)) / LENGTH_BINS))
+    edges = np.arange(min(lengths), max(lengths) + width + 1, width) - 0.5  # whole numbers lie inside the bins
     axes.hist(steps, bins=list(edges), stacked=True, color=[GREEN, RED], label=["success", "failure"])
     axes.legend(frameon=False, ncols=2, loc="lower right", bbox_to_anchor=(1, 1), borderaxespad=0)
     axes.set_xlabel("steps")
-    axes.locator_params(axis="y", integer=True)
+    axes.locator_params(integer=True)
     axes.set_ylabel("episodes")
     axes.set_title("length of episodes", fontsize=10, loc="left")
 
@@ -184,7 +187,8 @@ def _plot_groups(axes: Axes, values: Sequence[Any], played: Sequence[Result]) ->
     split = groups(values)
     if numeric(values):
         places = [float(np.mean([values[index] for index in group])) for group in split]
-        axes.locator_params(axis="x", nbins=4)  # long tick labels would overlap
+        whole = all(isinstance(value, int) for value in values)
+        axes.locator_params(axis="x", nbins=4, integer=whole)  # long tick labels would overlap
     else:
         places = list(range(len(split)))
         names = [str(values[group[0]]) for group in split]

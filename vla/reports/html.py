@@ -126,6 +126,7 @@ def write_sweep(
     cells: Sequence[Run],
     compared: Sequence[RunComparison],
     posteriors: str | None,
+    failed: Sequence[str],
 ) -> Path:
     """Write the page of a sweep with its tables, plots and training curves, and return its path.
 
@@ -136,6 +137,7 @@ def write_sweep(
         cells: of the sweep.
         compared: rows with the first one.
         posteriors: figure of the rows' success, SVG.
+        failed: name, choices and reason of every failed cell.
     """
     runs = {cell.folder.name: cell for cell in cells}
     captions = {cell: f"{cell}: {' '.join(line.words)}" for line in lines for cell in line.links}
@@ -152,6 +154,7 @@ def write_sweep(
         case=("row", "minus", "condition"),
         anytime=any(report.anytime for run in cells for report in run.reports.values()),
         curves=draw_runs({name: run.metrics for name, run in runs.items()}),
+        failed=failed,
         cells=dict(zip(map(captions.get, runs), colours(len(runs)), strict=True)),
         pictures={overview.name: overview} if overview.is_file() else {},
     )

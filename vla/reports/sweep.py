@@ -16,6 +16,7 @@ from vla.reports.posteriors import FEWEST, MOST, Outcome, draw_posteriors
 from vla.reports.style import markdown_table
 from vla.reports.sweep_plot import plot
 from vla.rollouts.statistics import effective_episodes
+from vla.runs.cells import failures
 from vla.runs.folder import PAGE
 from vla.runs.sweep import SweepRow, conditions_of, read_rows
 from vla.spec import IN_DISTRIBUTION
@@ -28,9 +29,10 @@ def tabulate(folder: Path) -> list[SweepRow]:
         compared = compare_rows(rows, at(rows[0].runs[0].config, "evaluate.margin", 0.0))
         with atomic_path(folder / "sweep.csv") as draft:
             _write_csv(rows, draft)
-        write_text(folder / "sweep.md", markdown(rows) + markdown_differences(compared))
+        failed = failures(folder)
+        write_text(folder / "sweep.md", markdown(rows) + markdown_differences(compared) + markdown_failures(failed))
         plot(rows, folder / "sweep.png")
-        _write_page(rows, compared, folder)
+        _write_page(rows, compared, failed, folder)
     return rows
 
 
@@ -44,6 +46,11 @@ def markdown_differences(compared: Sequence[RunComparison]) -> str:
         difference, interval, *rest = comparison_texts(each.found)
         lines.append([each.other, each.condition, f"{difference} ({interval})", *rest])
     return "\n" + markdown_table(head, lines)
+
+
+def markdown_failures(failed: Sequence[str]) -> str:
+    """Format the failed cells as a Markdown list, below an empty line; nothing without any."""
+    return "\n" + "".join(f"- failed: {line}\n" for line in failed) if failed else ""
 
 
 def markdown(rows: list[SweepRow]) -> str:
@@ -72,7 +79,7 @@ def _costs(row: SweepRow) -> list[str]:
     ]
 
 
-def _write_page(rows: list[SweepRow], compared: Sequence[RunComparison], folder: Path) -> None:
+def _write_page(rows: list[SweepRow], compared: Sequence[RunComparison], failed: Sequence[str], folder: Path) -> None:
     lines = [
         TableRow(
             list(row.choices.values()),
@@ -84,7 +91,7 @@ def _write_page(rows: list[SweepRow], compared: Sequence[RunComparison], folder:
     ]
     cells = [run for row in rows for run in row.runs]
     with warn_on_error(folder / SWEEP):
-        write_sweep(folder, list(rows[0].choices), lines, cells, compared, _draw_posteriors(rows))
+        write_sweep(folder, list(rows[0].choices), lines, cells, compared, _draw_posteriors(rows), failed)
 
 
 def _draw_posteriors(rows: list[SweepRow]) -> str | None:

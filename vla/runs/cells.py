@@ -19,16 +19,16 @@ def save_failure(cell: Path, reason: str) -> None:
     write_text(cell / FAILURE, f"{reason}\n")
 
 
-def failures(folder: Path) -> str:
-    """Describe the failed cells of a sweep: their number, then choices and reason of each."""
+def failures(folder: Path) -> list[str]:
+    """Describe the failed cells of a sweep: name, choices and reason of each."""
     choices_of = {cell: overrides_of(cell) for cell in cells(folder, OVERRIDES)}
     varied = varied_keys(list(choices_of.values()))
     lines = []
     for cell in cells(folder, FAILURE):
         choices = "".join(f" {key}={choices_of[cell][key]}" for key in varied if key in choices_of[cell])
         reason = read_bounded(cell / FAILURE).decode("utf-8", "replace").partition("\n")[0]
-        lines.append(f"\n  {cell.name}{choices}: {reason}")
-    return f"{len(lines)} of {len(choices_of)} cells failed, see {FAILURE} of each in {folder}{''.join(lines)}"
+        lines.append(f"{cell.name}{choices}: {reason}")
+    return lines
 
 
 def cells(folder: Path, having: str) -> list[Path]:
