@@ -138,6 +138,8 @@ def _listens(port: int) -> bool:
 
 
 def test_the_nearest_demonstration_is_evaluated_like_a_policy_and_beside_one(home: Path) -> None:
+    here(home, *SMALL, "agent=nearest", "collect.folder=nowhere", "hydra.run.dir=late", ok=False)
+    assert not (home / "late").exists()
     done = here(home, *SMALL, "agent=nearest", "recorder=none", "output=nearest")
     report = json.loads((home / "nearest/report.json").read_text())
     assert (report["model"], report["checkpoint"], report["episodes"], report["errors"]) == ("nearest", None, 2, 0)

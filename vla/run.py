@@ -160,10 +160,11 @@ def _require_variant() -> None:
 
 
 def _remove_unused() -> None:
-    """Remove the folder that Hydra created for this run, if no results are in it."""
+    """Remove the folder that Hydra created for this run, if no files are in it but those of Hydra."""
     folder = Path(HydraConfig.get().runtime.output_dir)
     created = HydraConfig.get().mode == RunMode.RUN and folder.resolve() != Path.cwd()
-    if created and {path.name for path in folder.glob("*")} <= {".hydra"}:
+    files = (path.relative_to(folder) for path in folder.rglob("*") if not path.is_dir())
+    if created and {path.parts[0] for path in files} <= {".hydra"}:
         shutil.rmtree(folder, ignore_errors=True)
 
 

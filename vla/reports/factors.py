@@ -13,14 +13,14 @@ from vla.rollouts.results import Result
 
 BINS = 5  # quantile groups of a numeric factor
 GROUPS = 8  # maximum number of groups in a factor's panel
-COLOURS = ("rgb", "diffuse")  # draws of three numbers whose mean is a brightness
+COLOURS = (".rgb", ".diffuse")  # draws of three numbers whose mean is a brightness
 
 
 def factors(played: Sequence[Result]) -> dict[str, list[Any]]:
     """Return title → value per episode, of every draw that all episodes have and that forms a few groups.
 
-    A pair of numbers is one factor, a point; each item of another list is a factor, and so is the brightness of a
-    colour. Of draws that are equal in all episodes the first counts.
+    A pair of numbers is one factor, a point, and of a colour its brightness; each item of another list is a factor.
+    Of draws that are equal in all episodes the first counts.
     """
     rows = [
         {name: value for axis, draw in flat(result.draws).items() for name, value in _items(axis, draw)}
@@ -42,10 +42,9 @@ def _items(name: str, value: Any) -> Iterator[tuple[str, Any]]:
         yield name, value
     elif _is_point(value):
         yield name, tuple(value)
+    elif name.endswith(COLOURS) and len(value) == 3 and numeric(value):
+        yield f"{name.rpartition('.')[0]}.brightness", sum(value) / 3
     else:
-        axis, _, leaf = name.rpartition(".")
-        if leaf in COLOURS and len(value) == 3 and numeric(value):
-            yield f"{axis}.brightness", sum(value) / 3
         for index, item in enumerate(value):
             yield from _items(f"{name}[{index}]", item)
 
