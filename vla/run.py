@@ -32,7 +32,7 @@ from vla.deploy import ros
 from vla.io.suggestion import suggestion
 from vla.parallel.fast_exit import fast_exit
 from vla.parallel.processes import raise_gc_thresholds, without_triton
-from vla.runs.cells import FAILURE, OVERRIDES, cells, failures, save_failure
+from vla.runs.cells import describe_failures, save_failure
 
 PACKAGE = Path(__file__).resolve().parent
 SWEEP = "in the sweep "  # prefix of a note on a cell's error
@@ -229,12 +229,7 @@ def _fail(error: Exception) -> NoReturn:
 def _end(error: Exception) -> NoReturn:
     for note in getattr(error, "__notes__", ()):
         if note.startswith(SWEEP):
-            folder = Path(note.removeprefix(SWEEP))
-            failed = failures(folder)
-            counted = (
-                f"{len(failed)} of {len(cells(folder, OVERRIDES))} cells failed, see {FAILURE} of each in {folder}"
-            )
-            print("\n  ".join([f"error: {counted}", *failed]), file=sys.stderr)
+            print(f"error: {describe_failures(Path(note.removeprefix(SWEEP)))}", file=sys.stderr)
             sys.exit(1)
     if os.environ[TRACEBACKS] == "1" or not _meant_for_user(error):
         raise error

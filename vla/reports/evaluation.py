@@ -135,9 +135,10 @@ def plot_report(report: Report, path: Path) -> None:
         else:
             _plot_groups(axes, values, played)
             scales.append(axes)
-    lowest = min((axes.dataLim.y0 for axes in scales), default=0.0)  # of an interval
+    # One scale, on which differences of high rates are visible; the limits of the data are those of the intervals.
+    lowest = max(0.0, min((axes.dataLim.y0 for axes in scales), default=0.0))
     for axes in scales:
-        axes.set_ylim(math.floor(10 * lowest) / 10, 1)  # one scale, on which differences of high rates are visible
+        axes.set_ylim(math.floor(10 * lowest) / 10, 1)
     save(figure, path)
 
 

@@ -19,6 +19,12 @@ def save_failure(cell: Path, reason: str) -> None:
     write_text(cell / FAILURE, f"{reason}\n")
 
 
+def describe_failures(folder: Path) -> str:
+    """Return the number of failed cells of a sweep, and a line for each."""
+    failed, started = failures(folder), len(cells(folder, OVERRIDES))
+    return "\n  ".join([f"{len(failed)} of {started} cells failed, see {FAILURE} of each in {folder}", *failed])
+
+
 def failures(folder: Path) -> list[str]:
     """Describe the failed cells of a sweep: name, choices and reason of each."""
     choices_of = {cell: overrides_of(cell) for cell in cells(folder, OVERRIDES)}
