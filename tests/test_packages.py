@@ -204,7 +204,8 @@ def test_its_demonstrations_are_described_replayed_and_exported(home: Path, impo
 
 def test_its_runs_are_compared_and_swept(home: Path, importable: None) -> None:
     small = (*TINY, "cluster.workers=1", "validate.episodes=0", "evaluate.episodes=2", "collect.folder=episodes")
-    here(home, "-m", "hydra.sweep.dir=grid", "experiment=mine", *small, "learner.lr=0.1,0.2")
+    done = here(home, "-m", "hydra.sweep.dir=grid", "experiment=mine", *small, "learner.lr=0.1,0.2")
+    assert "seen % (95 % CI)" in done.stdout and done.stdout.endswith("wrote grid/sweep.html\n")
     rates, differences = (home / "grid/sweep.md").read_text().split("\n\n")
     head, _, *lines = rates.splitlines()
     assert differences.startswith("| minus 0.1 | condition |") and "\n| 0.2 | seen |" in differences

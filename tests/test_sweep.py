@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import io
 import json
 import re
 from pathlib import Path
@@ -10,15 +11,18 @@ from pathlib import Path
 import pytest
 from figures import curves, panels, points, spans, texts
 from matplotlib.figure import Figure
+from rich.console import Console
+from rich.table import Table
 
 from vla.reports.comparison import compare_rows
 from vla.reports.evaluation import write_report
-from vla.reports.sweep import tabulate
+from vla.reports.sweep import console_table, tabulate
 from vla.reports.sweep_plot import pareto, validated
 from vla.rollouts.comparison import compare_samples
 from vla.rollouts.results import Report, Result
 from vla.rollouts.sequential import anytime_interval
 from vla.rollouts.statistics import pooled_interval
+from vla.runs.sweep import read_rows
 
 
 def cell(
@@ -41,6 +45,13 @@ def cell(
     )
     size = {"parameters": 2_000_000, "latency_ms": latency}
     write_report(plain, folder / "report.json", None, {}, size, {"dark": other})
+
+
+def printed(table: Table) -> str:
+    """The table as text."""
+    console = Console(file=io.StringIO(), width=120, record=True)
+    console.print(table)
+    return console.export_text()
 
 
 def test_seeds_are_put_together_and_the_rest_is_told_apart(tmp_path: Path, figures: list[Figure]) -> None:
@@ -67,6 +78,16 @@ def test_seeds_are_put_together_and_the_rest_is_told_apart(tmp_path: Path, figur
     assert spans(seen)[0] == (round(low / 100, 3), round(high / 100, 3))
     assert {"bc, 2.00 M", "rt1, 2.00 M"} <= texts(seen)
     assert not list(tmp_path.glob(".*"))
+
+
+def test_the_console_has_a_row_per_choice_and_of_many_conditions_the_first(tmp_path: Path) -> None:
+    cell(tmp_path, 0, ["model=bc"], 9)
+    cell(tmp_path, 1, ["model=[rt1]"], 7, dark=0)
+    rows = read_rows(tmp_path)
+    shown = printed(console_table(rows))
+    assert "90.0 (59.6-98.2)" in shown and "0.0 (0.0-43.4)" in shown and "[rt1]" in shown and "dark" in shown
+    rows[0].played |= {f"dark_{number}": rows[0].played["dark"] for number in range(3)}
+    assert "seen % (95 % CI)" in (shown := printed(console_table(rows))) and "dark" not in shown
 
 
 def test_cells_that_failed_are_left_out_and_a_sweep_without_any_writes_nothing(tmp_path: Path) -> None:
@@ -219,7 +240,7 @@ def test_over_the_number_of_demonstrations_success_is_a_curve_under_each_conditi
     (seen,), (dark,) = (panels(figures[0], title) for title in ("seen", "dark"))
     assert points(seen) == [(50, 0.8), (1000, 0.9), (50, 0.3), (1000, 0.4)]
     assert points(dark) == [(50, 0.2), (1000, 0.2)] * 2
-    assert {"default", "wide"} <= texts(seen) and {"50", "1000", "demonstrations"} <= texts(dark)
+    assert {"task/randomize", "default", "wide"} <= texts(seen) and {"50", "1000", "demonstrations"} <= texts(dark)
 
 
 def test_a_cell_that_does_not_name_its_demonstrations_has_those_of_its_config(tmp_path: Path) -> None:

@@ -10,8 +10,10 @@ from hydra.core.utils import JobReturn, JobStatus
 from hydra.experimental.callback import Callback
 from hydra.types import RunMode
 from omegaconf import DictConfig
+from rich import print as show
 
 from vla.runs.cells import FAILURE
+from vla.runs.sweep import read_rows
 
 
 class SweepTable(Callback):
@@ -33,8 +35,12 @@ class SweepTable(Callback):
                 tabulate(folder)
 
     def on_multirun_end(self, config: DictConfig, **kwargs: Any) -> None:
-        """Name the page of the sweep."""
+        """Print the table of the sweep, and name its page."""
         from vla.reports.html import SWEEP  # imports matplotlib
+        from vla.reports.sweep import console_table
 
-        if (page := Path(config.hydra.sweep.dir) / SWEEP).exists():
+        folder = Path(config.hydra.sweep.dir)
+        if rows := read_rows(folder):
+            show(console_table(rows))
+        if (page := folder / SWEEP).exists():
             print(f"wrote {page}")

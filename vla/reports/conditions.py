@@ -11,7 +11,7 @@ from rich.box import SIMPLE_HEAD
 from rich.markup import escape
 from rich.table import Table
 
-from vla.reports.style import BLUE, GREEN, GREY, RED, error_bars, save
+from vla.reports.style import BLUE, GREEN, GREY, RED, error_bars, rate_limits, save
 from vla.rollouts.comparison import Comparison
 from vla.rollouts.motion import AMOUNTS
 from vla.rollouts.results import Report
@@ -109,13 +109,13 @@ def plot_conditions(reports: Mapping[str, Report], path: Path) -> None:
         }
         rates, reach = error_bars((report.success, *report.interval) for report in chosen.values())
         rows = [len(lines) - 1 - lines.index(axis) - below for axis in chosen]
-        name = level or None
+        name = level or "one level"
         axes.errorbar(rates, rows, None, reach, "o", color=colour, ecolor=GREY, capsize=3, label=name, clip_on=False)
     axes.set_yticks(range(len(lines)), [axis.replace("_", " ") for axis in reversed(lines)])
-    axes.set_xlim(0, 1)
+    axes.set_xlim(rate_limits(min(report.interval[0] for report in reports.values())))
     axes.set_ylim(-0.6, len(lines) - 0.4)
     if len(lines) < len(reports):
-        axes.legend(frameon=False, ncols=2, loc="lower right", bbox_to_anchor=(1, 1), borderaxespad=0)
+        axes.legend(frameon=False, ncols=3, loc="lower right", bbox_to_anchor=(1, 1), borderaxespad=0)
     axes.set_xlabel("success, 95 % CI")
     axes.grid(axis="x", alpha=0.3)
     save(figure, path)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -14,7 +13,7 @@ from matplotlib.figure import Figure
 
 from vla.io.files import write_json
 from vla.reports.factors import association, factors, groups, numeric
-from vla.reports.style import GREEN, GREY, RED, error_bars, save
+from vla.reports.style import GREEN, GREY, RED, error_bars, rate_limits, save
 from vla.rollouts.comparison import Comparison
 from vla.rollouts.results import ERROR, Report, Result
 from vla.rollouts.statistics import wilson_interval
@@ -135,10 +134,9 @@ def plot_report(report: Report, path: Path) -> None:
         else:
             _plot_groups(axes, values, played)
             scales.append(axes)
-    # One scale, on which differences of high rates are visible; the limits of the data are those of the intervals.
-    lowest = max(0.0, min((axes.dataLim.y0 for axes in scales), default=0.0))
+    limits = rate_limits(min((axes.dataLim.y0 for axes in scales), default=0.0))  # data are the intervals
     for axes in scales:
-        axes.set_ylim(math.floor(10 * lowest) / 10, 1)
+        axes.set_ylim(limits)
     save(figure, path)
 
 

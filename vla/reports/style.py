@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import math
 import re
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
@@ -26,6 +27,14 @@ def error_bars(rates: Iterable[Interval]) -> tuple[Array, Array]:
     """Return the rates (N,) and the lengths (2, N) of their error bars, below and above."""
     middle, low, high = np.array([*rates]).reshape(-1, 3).T
     return middle, np.abs([middle - low, high - middle])
+
+
+def rate_limits(lowest: float) -> tuple[float, float]:
+    """Return the limits of an axis of rates, on which differences between high rates stay visible.
+
+    `lowest` is the smallest lower bound of the intervals shown.
+    """
+    return max(0.0, math.floor(10 * lowest) / 10), 1.0
 
 
 def save(figure: Figure, path: Path, dpi: int = 110) -> None:

@@ -7,10 +7,13 @@ from collections.abc import Sequence
 from pathlib import Path
 from urllib.parse import quote
 
+from rich.markup import escape
+from rich.table import Table
+
 from vla.config.differences import at
 from vla.io.files import atomic_path, warn_on_error, write_text
 from vla.reports.comparison import RunComparison, compare_all_rows, compare_rows
-from vla.reports.conditions import comparison_texts
+from vla.reports.conditions import NARROW, comparison_texts
 from vla.reports.html import ABSENT, SWEEP, TableRow, write_sweep
 from vla.reports.posteriors import FEWEST, MOST, Outcome, draw_posteriors
 from vla.reports.style import markdown_table
@@ -20,6 +23,8 @@ from vla.runs.cells import failures
 from vla.runs.folder import PAGE
 from vla.runs.sweep import SweepRow, conditions_of, read_rows
 from vla.spec import IN_DISTRIBUTION
+
+CONDITIONS = 4  # maximum number of conditions on the console
 
 
 def tabulate(folder: Path) -> list[SweepRow]:
@@ -57,17 +62,29 @@ def markdown(rows: list[SweepRow]) -> str:
     """Format the table in Markdown: success per condition with its interval, then costs."""
     conditions = conditions_of(rows)
     head = [*rows[0].choices, *(f"{name} [%]" for name in conditions), "each seed [%]", "parameters [M]", "action [ms]"]
-    lines = []
+    return markdown_table(head, [[*row.choices.values(), *_rates(row, conditions), *_costs(row)] for row in rows])
+
+
+def console_table(rows: Sequence[SweepRow]) -> Table:
+    """Tabulate success and its interval per row and condition; of many conditions only the first."""
+    conditions = conditions_of(list(rows))
+    shown = conditions if len(conditions) <= CONDITIONS else conditions[:1]
+    table = Table(*rows[0].choices, *(f"{name} % (95 % CI)" for name in shown), **NARROW)
     for row in rows:
-        shares = []
-        for condition in conditions:
-            if condition not in row.played:
-                shares.append("-")
-                continue
-            rate, low, high = (100 * value for value in row.interval(condition))
-            shares.append(f"{rate:.1f} ({low:.1f}-{high:.1f})")
-        lines.append([*row.choices.values(), *shares, *_costs(row)])
-    return markdown_table(head, lines)
+        table.add_row(*map(escape, row.choices.values()), *_rates(row, shown))
+    return table
+
+
+def _rates(row: SweepRow, conditions: Sequence[str]) -> list[str]:
+    """Format success and its interval in percent under each condition."""
+    texts = []
+    for condition in conditions:
+        if condition not in row.played:
+            texts.append(ABSENT)
+            continue
+        rate, low, high = (100 * value for value in row.interval(condition))
+        texts.append(f"{rate:.1f} ({low:.1f}-{high:.1f})")
+    return texts
 
 
 def _costs(row: SweepRow) -> list[str]:

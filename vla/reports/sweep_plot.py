@@ -50,6 +50,8 @@ def _draw_numbers(figure: Figure, rows: list[SweepRow]) -> None:
     panels = figure.subplots(2 if trained else 1, columns, squeeze=False)
     for axes, condition in zip(panels[0], conditions, strict=False):
         _plot_curves(axes, lines, condition)
+    if len(lines) > 1:  # the lines are the same in every panel
+        panels[0][0].legend(title=", ".join(key for key in rows[0].choices if key != DEMONSTRATIONS), frameon=False)
     for axes, (name, each) in zip(panels[-1], trained.items(), strict=False):
         _plot_training(axes, name, each, sorted({_demonstrations(row) for row in rows}))
     if trained:
@@ -128,8 +130,6 @@ def _plot_curves(axes: Axes, lines: dict[str, list[SweepRow]], condition: str) -
         axes.errorbar(counts, rates, reach, fmt="o-", capsize=3, label=name, clip_on=False)
     _label_rates(axes, condition, "demonstrations")
     axes.set_xticks(sorted({_demonstrations(row) for line in lines.values() for row in line}))
-    if len(lines) > 1:
-        axes.legend(frameon=False)
 
 
 def _plot_training(axes: Axes, name: str, curves: dict[str, Points], counts: list[int]) -> None:

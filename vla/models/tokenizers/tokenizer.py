@@ -270,7 +270,10 @@ def data_bounds(spec: Spec, statistics: ActionStatistics | None, margin: float =
     min_span = MIN_SPAN * (allowed_high - allowed_low)
     constant = [name for name, narrow in zip(spec.action, high - low < min_span, strict=True) if narrow]
     if constant:
-        log.info("%s: hardly vary in the demonstrations; bins cover %g of the range", ", ".join(constant), MIN_SPAN)
+        names = ", ".join(constant)
+        log.info(
+            "components that hardly vary in the demonstrations, with bins over %g of the range: %s", MIN_SPAN, names
+        )
     span = np.maximum(high - low, min_span)
     half = (0.5 + margin) * span
     return (low + high) / 2 - half, (low + high) / 2 + half
