@@ -172,14 +172,18 @@ def test_conditions_over_other_networks_are_not_compared(tmp_path: Path) -> None
     assert [each.condition for each in found] == ["seen"]
 
 
-def test_axes_of_success_end_at_one_and_small_numbers_keep_their_digits(tmp_path: Path) -> None:
-    curves = "step,val/success,val/error_gripper,pace/waiting\n9,0.5,0.01001,5e-5\n19,1.0,0.01003,7e-5\n"
+def test_axes_of_success_end_at_one_those_of_errors_begin_at_zero_and_small_numbers_keep_their_digits(
+    tmp_path: Path,
+) -> None:
+    head = "step,val/success,val/error_gripper,val/token_accuracy,pace/waiting"
+    curves = f"{head}\n9,0.5,0.01001,0.01001,5e-5\n19,1.0,0.01003,0.01003,7e-5\n"
     panels = draw_run(read_run(a_run(tmp_path / "run", curves=curves)).metrics)
     minus = "\N{MINUS SIGN}"
     tick = rf'text-anchor: end[^>]* x="([\d.-]+)"[^>]*>([\d.e{minus}]+)<'
     labels = {title: re.findall(tick, panel) for title, panel in panels.items()}
     ticks = {title: {label.replace(minus, "-") for _, label in found} for title, found in labels.items()}
-    assert {"0.01001", "0.01003"} <= ticks["error gripper"] and {"5e-05", "7e-05"} <= ticks["waiting"]
+    assert "0" in ticks["error gripper"]
+    assert {"0.01001", "0.01003"} <= ticks["token accuracy"] and {"5e-05", "7e-05"} <= ticks["waiting"]
     assert max(map(float, ticks["success"])) == 1
     steps = re.findall(r"text-anchor: middle[^>]*>(\d+)<", panels["waiting"])
     assert steps[0] == "0"  # although the first value is of step 9

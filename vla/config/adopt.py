@@ -19,9 +19,8 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 from vla.config.build import GROUPS, require_no_paths, require_trust, without_paths
 from vla.config.differences import at, differences
 from vla.io.documents import read_yaml
-from vla.models.checkpoint import read_header
+from vla.models.checkpoint import REQUIRED_NODES, read_header
 
-OF_POLICY = ("task", "tokenizer", "model")
 OF_MODEL = ("tokenizer", "model", "data")  # the batch size depends on the model
 OF_TRAINING = (*OF_MODEL, "task", "expert", "learner", "validate")  # of job=improve pretrained=FILE
 # Parts of a training that a report on its policy shows: whole nodes, which only an open-loop evaluation builds, and
@@ -56,10 +55,10 @@ def adopt(cfg: DictConfig, overrides: Sequence[str]) -> DictConfig:
     _require_own_parts(parsed, ("tokenizer", "model", *PRESETS))
     saved = read_header(cfg.checkpoint).config
     given = [_path(override) for override in parsed if not override.is_delete()]
-    require_no_paths(saved, OF_POLICY, cfg.checkpoint, given)
+    require_no_paths(saved, REQUIRED_NODES, cfg.checkpoint, given)
     chosen = {group: saved.get("chosen", {}).get(group) for group in CHOSEN}
     reported = _reported(cfg, saved) if cfg.job == "evaluate" else {}
-    return _on_top(cfg, {**{name: saved[name] for name in OF_POLICY}, **reported, "chosen": chosen}, parsed)
+    return _on_top(cfg, {**{name: saved[name] for name in REQUIRED_NODES}, **reported, "chosen": chosen}, parsed)
 
 
 def finetune(cfg: DictConfig, overrides: Sequence[str]) -> DictConfig:

@@ -133,13 +133,7 @@ def fits(found: type, expected: Any) -> bool:
 
 
 def matches(value: Any, annotation: Any) -> bool:
-    """Return whether a plain value, with nodes in place of objects, is valid for `annotation`.
-
-    Raises:
-        ValueError: a node names a class that is not allowed.
-    """
-    for target in targets(value):
-        locate("_target_", target)
+    """Return whether a plain value, with checked nodes in place of objects, is valid for `annotation`."""
     try:
         _adapter(annotation).validate_json(json.dumps(value), strict=True)
     except ValidationError:

@@ -25,7 +25,7 @@ from typing import Any, BinaryIO
 import numpy as np
 from filelock import FileLock, Timeout
 
-from vla.data.header import fields_of, header_of, images_of, is_store, read_header, write_header
+from vla.data.header import fields_of, images_of, is_store, read_header, write_header
 from vla.data.image_codec import JPEG, PackedRows, whole_rows
 from vla.data.index import REMEDY, SALVAGE, Entry, dumps, index_line, listed, parse_line, read_index
 from vla.data.scattered_rows import ScatteredRows
@@ -87,7 +87,7 @@ class EpisodeStore:
         if not is_store(folder):
             folder.mkdir(parents=True, exist_ok=True)
             with FileLock(folder / "lock"):
-                write_header(folder, header_of(spec, plain))
+                write_header(folder, spec, plain)
         store = cls(folder)
         spec.require(store.spec, "this task", f"the episode store {folder}")
         store.require(plain)

@@ -88,11 +88,6 @@ def images_of(spec: Spec) -> list[str]:
     return [*(f"rgb_{camera}" for camera in spec.cameras), *(f"depth_{camera}" for camera in spec.depth)]
 
 
-def header_of(spec: Spec, config: dict[str, Any]) -> Header:
-    """Return the description of an unpacked store."""
-    return Header(FORMAT, spec.to_dict(), config, _layouts(spec))
-
-
 def is_store(folder: Path) -> bool:
     """Return whether a folder holds an episode store, which may be empty or damaged."""
     return (folder / NAME).exists()
@@ -128,8 +123,8 @@ def _parsed(content: bytes, path: Path) -> tuple[Header, Spec]:
     return header, spec
 
 
-def write_header(folder: Path, header: Header) -> None:
-    """Write the description unless it exists: another process may have been faster.
+def write_header(folder: Path, spec: Spec, config: dict[str, Any]) -> None:
+    """Write the description of an unpacked store unless it exists: another process may have been faster.
 
     Raises:
         ValueError: the folder holds episodes without a description.
@@ -141,7 +136,7 @@ def write_header(folder: Path, header: Header) -> None:
     orphans = sorted(file.name for file in folder.iterdir() if file.suffix in (".bin", ".jsonl"))
     if orphans:
         raise ValueError(f"{folder} holds {orphans[0]} without {NAME}, which says what it means: {REMEDY}")
-    write_text(path, header.text())
+    write_text(path, Header(FORMAT, spec.to_dict(), config, _layouts(spec)).text())
 
 
 def _layouts(spec: Spec) -> dict[str, Layout]:

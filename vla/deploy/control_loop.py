@@ -349,7 +349,8 @@ class ControlLoop:
     def tool_velocity(self, command: Command) -> Array:
         """Return the (6,) velocity of the tool [m/s], [rad/s] in the base frame, of a Cartesian policy's command."""
         assert isinstance(self._controller, CartesianController)
-        return self._controller.velocity_of(command.position, command.velocity)
+        _, jacobian = self._controller.arm.forward(command.position)
+        return jacobian @ command.velocity
 
     def limit(self, robot: Robot) -> None:
         """Replace the limits."""

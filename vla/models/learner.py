@@ -52,7 +52,7 @@ class Learner(LightningModule):
         super().__init__()
         self.model, self._spec, self._config = model, spec, config
         self._lr, self._weight_decay, self._warmup, self._schedule = lr, weight_decay, warmup_steps, schedule
-        self._compile, self.ema = compile, ema
+        self._compile = compile
         self._before: tuple[bool, str] | None = None  # flash attention and precision outside training
         self._non_finite_step: Tensor | None = None  # () on the device of the loss
         self.errors = nn.ModuleList(MeanMetric() for _ in spec.action)

@@ -93,8 +93,7 @@ def plot_errors(result: OpenLoop, path: Path) -> None:
 def _plot_relative(axes: Axes, result: OpenLoop) -> None:
     """Plot the errors as fractions of those of the constant action."""
     names, places = list(result.spec.action)[::-1], np.arange(len(result.spec.action))
-    span = np.array(result.spec.high) - np.array(result.spec.low)
-    scale = np.maximum(result.constant_errors, 1e-3 * span)[::-1]  # as in `OpenLoop.relative`
+    scale = result.scale[::-1]
     error = result.errors.mean(0)[::-1] / scale
     low, high = (bound[::-1] / scale for bound in result.interval)
     axes.barh(places, error, color=GREEN, height=0.6)

@@ -100,6 +100,8 @@ def _draw(title: str, lines: tuple[Line, ...]) -> str:
         axes.set_xlim(left=0)  # a metric of one step would otherwise have an axis of its surroundings
         if title == "success":
             axes.set_ylim(0, 1)
+        elif title.startswith("error"):
+            axes.set_ylim(bottom=0)  # a small change of a small error would otherwise fill the panel
         if any(label for label, _, _, _ in lines):
             axes.legend(frameon=False, fontsize=8, ncols=3)
         axes.grid(alpha=0.12)

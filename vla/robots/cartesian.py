@@ -121,10 +121,6 @@ class CartesianController:
         self._command(self.joints + np.minimum(np.maximum(solution - self.joints, -reach), reach))
         return self.joints
 
-    def velocity_of(self, joints: Array, velocities: Array) -> Array:
-        """Return the (6,) velocity of the tool [m/s], [rad/s] in the base frame, from joints (J,) and theirs (J,)."""
-        return self.arm.forward(joints)[1] @ velocities
-
     def motion_between(self, before: Array, after: Array) -> Array:
         """Return the (6,) translation [m] and rotation vector [rad] of the tool between joints (J,) [rad]."""
         start, end = self.arm.forward(before)[0], self.arm.forward(after)[0]

@@ -48,10 +48,14 @@ class OpenLoop:
         return mean_interval(self.errors)
 
     @property
+    def scale(self) -> Array:
+        """(D,) errors of the constant prediction, at least a thousandth of a component's range."""
+        return np.maximum(self.constant_errors, 1e-3 * (np.array(self.spec.high) - np.array(self.spec.low)))
+
+    @property
     def relative(self) -> float:
         """Mean over the components of the error as a fraction of the constant prediction's."""
-        scale = np.maximum(self.constant_errors, 1e-3 * (np.array(self.spec.high) - np.array(self.spec.low)))
-        return float((self.errors.mean(0) / scale).mean())
+        return float((self.errors.mean(0) / self.scale).mean())
 
 
 def open_loop(agent: Agent, spec: Spec, episodes: Iterable[Episode], constant: Array) -> OpenLoop:

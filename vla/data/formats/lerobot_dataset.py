@@ -120,7 +120,7 @@ class LeRobotDataset:
             raise ValueError(f"{self.folder} has several tasks in episode {number}: only one is supported")
         return rows, self._tasks[tasks.pop()]
 
-    def numbers(self, key: str, rows: slice = slice(None)) -> Array:
+    def numbers(self, key: str, rows: slice) -> Array:
         """Return rows of a feature, (N, D) float32."""
         return self._matrices[key][rows]
 
