@@ -44,14 +44,18 @@ def test_reports_on_different_seeds_are_not_compared() -> None:
 
 def test_the_table_and_the_picture_show_every_condition(tmp_path: Path, figures: list[Figure]) -> None:
     hard, wide = (a_report("1" * count + "0" * (20 - count)) for count in (10, 15))
-    reports = {"seen": a_report("1" * 20), "light_hard": hard, "light_wide": wide}
+    seen = a_report("1" * 20)
+    reports = {"seen": seen, "light_hard": hard, "light_wide": wide}
     console = Console(file=io.StringIO(), width=80)
     console.print(conditions_table(reports, compare_conditions(reports, 0.02)))
     told = console.file.getvalue()  # type: ignore[attr-defined]
     assert "light_hard" in told and "50.0" in told and "29.9-70.1" in told
     # ten lost, none won, and of two comparisons the clearer one counts twice
     assert "-50.0" in told and "0.0039" in told and "worse" in told
-    assert told.count("pick_place") == 0
+    assert told.count("pick_place") == 0 and "as in training" not in told
+    console.print(conditions_table({"seen": seen, "light_hard": hard, "mass_wide": seen}, {}))
+    told = console.file.getvalue().removeprefix(told)  # type: ignore[attr-defined]
+    assert "as seen, because they are as in training: mass_wide" in told and told.count("20/20") == 1
     plot_conditions(reports, tmp_path / "suite.png")
     (axes,) = figures[0].axes
     assert points(axes) == [(1.0, 1.0), (0.75, 0.13), (0.5, -0.13)]

@@ -295,7 +295,9 @@ def _write(
         with warn_on_error(output / SUITE):
             plot_conditions(reports, output / SUITE)
         show(conditions_table(reports, compared))
-        rows: SecondaryRows = {(name,): metrics for name, metrics in secondary.items() if metrics}
+        rows: SecondaryRows = {
+            (name,): metrics for name, metrics in secondary.items() if metrics and reports[name] is not report
+        }
         if rows:
             show(secondary_table(rows, ["condition"]))
     used = str(checkpoint) if checkpoint else None

@@ -30,11 +30,17 @@ SecondaryRows = Mapping[tuple[str, ...], Mapping[str, Comparison]]  # words that
 def conditions_table(reports: Mapping[str, Report], compared: Mapping[str, Comparison]) -> Table:
     """Tabulate success and its interval per condition, and its comparison with the first condition.
 
-    Rows below a condition are about each of its tasks, if it has several and the table stays short.
+    Rows below a condition are about each of its tasks, if it has several and the table stays short. Conditions that
+    share the report of the first one, because they are the training's own, are named below the table.
     """
+    first, *others = reports
+    equal = [name for name in others if reports[name] is reports[first]]
     detailed = sum(len(report.tasks) for report in reports.values()) <= TASKS
-    table = Table("condition", "success", "% (95 % CI)", *COMPARED, **NARROW)
+    caption = f"as {first}, because they are as in training: {', '.join(equal)}" if equal else None
+    table = Table("condition", "success", "% (95 % CI)", *COMPARED, **NARROW, caption=caption)
     for name, report in reports.items():
+        if name in equal:
+            continue
         table.add_row(name, *_rate(report), *(short_texts(compared[name]) if name in compared else ()))
         for task, part in report.tasks.items() if detailed and len(report.tasks) > 1 else ():
             table.add_row(f"  {task}", *_rate(part))
