@@ -95,7 +95,12 @@ NONSENSE = {
             "trainer.max_epochs=null",
         ),
         *("trainer.devices=abc", "trainer.devices='1,x'"),
-        *("trainer.gradient_clip_val=-1", "trainer.limit_val_batches=-1", "trainer.precision=17"),
+        *(
+            "trainer.gradient_clip_val=-1",
+            "trainer.limit_val_batches=-1",
+            "+trainer.limit_train_batches=0",
+            "trainer.precision=17",
+        ),
     ),
     "evaluate": ("evaluate.episodes=0", "evaluate.seed=3", "policy.precision=16"),
     "benchmark": (

@@ -95,11 +95,13 @@ def test_a_condition_of_a_benchmark_keeps_its_interval_on_the_page(tmp_path: Pat
     played = [Result(n, "success" if n < won else "lost", task=task) for task, won in asked for n in range(10)]
     report = Report(
         tuple(replace(result, seed=FIRST_SEED + n) for n, result in enumerate(played)),
-        {"easy": ["reach"], "hard": ["stack"]},
+        {"easy": ["reach", "push"], "hard": ["stack"]},
     )
-    write_report(report, tmp_path / "report.json", None, {}, conditions={"dark": report})
+    config = {"task": {"tiers": report.tiers}}
+    write_report(report, tmp_path / "report.json", None, config, conditions={"dark": report})
     written = read_report(tmp_path)
     assert written and written.reports["dark"].interval == written.reports["seen"].interval == report.interval
+    assert written.reports["seen"].mean_label == report.mean_label == "mean over tiers (2 of 3 tasks)"
 
 
 def test_milestones_have_a_rate_of_their_own() -> None:

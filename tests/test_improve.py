@@ -159,6 +159,17 @@ def test_the_episodes_of_a_round_may_have_another_task() -> None:
         check(composed("job=improve", "+improve.changes.time=5.0"))
 
 
+@pytest.mark.parametrize(
+    ("changes", "sentence"),
+    [("blocks=50", "task.blocks"), ("image_size=[64,64]", "the task has image_size = .* with improve.changes has")],
+)
+def test_a_task_that_rounds_cannot_play_is_refused_before_any_work(tmp_path: Path, changes: str, sentence: str) -> None:
+    nowhere = (f"output={tmp_path}/run", f"collect.folder={tmp_path}/episodes")
+    with pytest.raises(ValueError, match=sentence):
+        improve.run(Experiment.of(composed("job=improve", *nowhere, f"+improve.changes.{changes}")))
+    assert not list(tmp_path.iterdir())
+
+
 def test_a_round_validates_once_at_its_end(tmp_path: Path) -> None:
     asked = composed("job=improve", "improve.steps=50", "trainer.accumulate_grad_batches=3")
     trainer = improve._round(Experiment.of(asked), tmp_path / "last.ckpt", tmp_path, [])["trainer"]
@@ -184,14 +195,14 @@ def test_a_folder_with_other_rounds_is_left_alone(tmp_path: Path) -> None:
     assert (tmp_path / "config.yaml").read_bytes() == before
 
 
-@pytest.mark.parametrize("longer", ["trainer.max_steps=5", "+trainer.max_time={hours: 1}"])
-def test_the_training_that_rounds_continue_does_not_get_longer(tmp_path: Path, longer: str) -> None:
+@pytest.mark.parametrize("longer", ["trainer.max_steps=5", "+trainer.max_time={hours: 1}", "improve.steps=5"])
+def test_the_trainings_of_rounds_do_not_get_longer(tmp_path: Path, longer: str) -> None:
     there = (f"output={tmp_path}", "job=improve")
     save_config(tmp_path, plain(composed(*there)), [])
     (tmp_path / "round_1/episodes").mkdir(parents=True)
     (tmp_path / "round_1/episodes/store.json").write_text("{}")
     before = (tmp_path / "config.yaml").read_bytes()
-    with pytest.raises(ValueError, match=f"the rounds in {tmp_path} continue round_0, which was trained with"):
+    with pytest.raises(ValueError, match=f"the rounds in {tmp_path} were trained with"):
         improve.run(Experiment.of(composed(*there, longer)))
     assert (tmp_path / "config.yaml").read_bytes() == before
 
@@ -240,10 +251,16 @@ def test_rounds_that_were_killed_go_on_to_the_same_result(home: Path) -> None:
     here(home, "resume=rounds", "output=rounds", "job=improve", "improve.rounds=2")
     assert result(first) == whole
     assert [entry.seed for entry in EpisodeStore(second / "episodes").tried] == [500002, 500003]
+    assert (home / "rounds/evaluation_1/report.json").exists()  # of the policy after one round
     trained = read_checkpoint(second / "checkpoints/last.ckpt").config
     assert trained["collect"]["more"] == ["rounds/round_1/episodes", "rounds/round_2/episodes"]
     assert trained["pretrained"] == "rounds/round_1/checkpoints/last.ckpt"
     assert len(json.loads(report.read_text())["rounds"]) == 2
+    further = [*ROUNDS, *FEW, "output=further", "pretrained=rounds/round_2/checkpoints/last.ckpt"]
+    stores = "rounds/round_1/episodes,rounds/round_2/episodes"
+    assert f"collect.more=[{stores}] to train on these episodes again" in here(home, *further, ok=False).stderr
+    again = here(home, *further, f"collect.more=[{stores}]", ok=False)
+    assert "have 500000, 500001: set improve.seed=500002, or higher" in again.stderr
 
 
 def test_weights_are_told_apart_with_all_that_modules_keep_beside_them(monkeypatch: pytest.MonkeyPatch) -> None:

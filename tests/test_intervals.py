@@ -75,13 +75,17 @@ def test_what_differs_between_strata_is_not_chance() -> None:
     assert 0 < narrow < wide < np.diff(wilson_interval(10, 20)) * 1.1
 
 
-def test_without_a_failure_it_is_as_wide_as_that_of_one_task() -> None:
-    assert stratified_interval([(10, 10, 0.02)] * 50) == pytest.approx((1, *wilson_interval(500, 500)))
+def test_without_a_failure_it_is_a_little_wider_than_that_of_one_task() -> None:
+    rate, low, high = stratified_interval([(10, 10, 0.02)] * 50)
+    assert rate == pytest.approx(1) == high and wilson_interval(450, 450)[0] < low < wilson_interval(500, 500)[0]
 
 
-@pytest.mark.parametrize("rates", [(0.95, 0.4, 0.3, 0.4), (1.0, 0.98, 0.9, 0.95), (0.3, 0.02, 0.0, 0.05)])
-def test_it_covers_the_mean_over_tiers_of_fixed_tasks(rates: tuple[float, ...]) -> None:
-    random, sizes, episodes = np.random.default_rng(0), (28, 11, 6, 5), 10
+@pytest.mark.parametrize("episodes", [10, 2, 1])
+@pytest.mark.parametrize(
+    "rates", [(0.95, 0.4, 0.3, 0.4), (1.0, 0.98, 0.9, 0.95), (0.3, 0.02, 0.0, 0.05), (0.7, 0.7, 0.7, 0.7)]
+)
+def test_it_covers_the_mean_over_tiers_of_fixed_tasks(rates: tuple[float, ...], episodes: int) -> None:
+    random, sizes = np.random.default_rng(0), (28, 11, 6, 5)
     spread = [np.clip(rate + random.normal(0, 0.1, size), 0, 1) for rate, size in zip(rates, sizes, strict=True)]
     truth, true = np.mean([tier.mean() for tier in spread]), np.concatenate(spread)
     weights = np.concatenate([np.full(size, 1 / (4 * size)) for size in sizes])

@@ -103,6 +103,8 @@ def test_the_command_prints_a_row_per_design(tmp_path: Path, monkeypatch: pytest
     told = here(tmp_path, *where[:3], "plan.rates=[0.5,0.9]", "plan.runs=[worse,better]").stdout
     saved = "Of the 50 common episodes of these runs evaluate.until=decided plays 14, which saves 72 %"
     assert f"{saved}: the second is better." in " ".join(told.split())
+    both = here(tmp_path, *where, "plan.runs=[one,other]", "plan.discordant=0.2", ok=False)
+    assert "plan.discordant is measured on plan.runs: omit one of the two" in both.stderr
     wrong = here(tmp_path, *where, "plan.discordant=0.1", ok=False)
     assert "differ in 15 % to 25 % of the same episodes, not in 10 %" in wrong.stderr
     assert "are equal" in here(tmp_path, *where, "plan.rates=[0.5,0.5]", ok=False).stderr

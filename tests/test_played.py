@@ -19,7 +19,8 @@ from vla.parallel.pool import LocalCluster
 from vla.rollouts.evaluate import evaluate
 from vla.rollouts.results import Report, Result
 from vla.runs.played import PLAYED, Played
-from vla.spec import FIRST_SEED
+from vla.spec import FIRST_SEED, Array, Observation
+from vla.tasks.perturb import Perturbed
 
 SEEDS = range(FIRST_SEED, FIRST_SEED + 6)
 EPISODES = 4
@@ -97,6 +98,24 @@ def test_a_disk_that_fills_up_costs_only_the_episode_that_found_no_room(played: 
     done = here(played, *COMMAND, "output=run")
     assert f"already played, {EPISODES + 2} in all" in done.stdout + done.stderr
     assert reported(played / "run") == whole
+
+
+def test_only_episodes_that_ended_in_an_error_are_played_again(tmp_path: Path, whole: dict[str, Any]) -> None:
+    act = Perturbed.act
+
+    def act_once(self: Perturbed, observation: Observation) -> Array:
+        if not (tmp_path / "failed").exists():
+            (tmp_path / "failed").touch()
+            raise RuntimeError("a cable is loose")
+        return act(self, observation)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Perturbed, "act", act_once)
+        failed = here(tmp_path, *COMMAND, "output=run", ok=False)
+    assert "1 episodes ended in an error, see run/report.json" in failed.stderr
+    done = here(tmp_path, *COMMAND, "output=run")
+    assert f"already played, {2 * EPISODES - 1} in all" in done.stdout + done.stderr
+    assert reported(tmp_path / "run") == whole
 
 
 @pytest.mark.parametrize("change", ["evaluate.seed=1000001", "task.time_limit=3"])

@@ -462,6 +462,8 @@ def test_training_that_is_interrupted_saves_and_goes_on(home: Path) -> None:
     steps = interrupted(signal.SIGTERM, *SMALL, *endless, *rest)
     more = interrupted(signal.SIGINT, "resume=last")
     assert more > steps
-    done = vla(home, "resume=last", f"trainer.max_steps={more + 2}")
+    here(home, "resume=last", f"trainer.max_steps={more}")  # nothing is left to train
+    assert json.loads((run / "training.json").read_text())["ended"] == "done"
+    done = vla(home, f"resume={run.relative_to(home)}", f"trainer.max_steps={more + 2}")
     assert f"trained {more + 2} steps" in done.stdout and done.stdout.strip().splitlines()[-1].startswith("success ")
     assert (run / "report.json").exists()

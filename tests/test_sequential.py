@@ -156,6 +156,8 @@ def test_a_run_is_compared_on_the_episodes_that_both_played() -> None:
     )
     stopped, some = replace(other, anytime=True), a_report("1" * 6, anytime=False)
     assert ": better, " in other.say(some) and ": open, " in stopped.say(some)  # six pairs, chosen by when it stopped
+    ended = replace(other, results={FIRST_SEED: a_report("0").results[0]})
+    assert ended.is_decided(a_report("1"))  # no later episode can decide
     failed = AgainstRun("A", {result.seed: result for result in a_report("e" + "0" * 12).results}, 0.02)
     assert not failed.is_decided(a_report("1"))  # the other run did not complete that episode
     failed.require_common([FIRST_SEED, FIRST_SEED + 1])

@@ -140,6 +140,17 @@ def test_rows_are_compared_with_the_first_on_the_same_scenes(tmp_path: Path) -> 
     assert "Differences from bc" in page and page.count("<td>rt1</td>") == 2 and "McNemar" in page
 
 
+def test_a_condition_that_repeats_the_training_condition_is_no_further_comparison(tmp_path: Path) -> None:
+    for number, (model, successes) in enumerate([("bc", 10), ("rt1", 3)]):
+        cell(tmp_path, number, [f"model={model}"], successes)
+    for light, expected in ((1, ["seen", "dark"]), (0, ["seen"])):
+        for number in range(2):
+            report = json.loads((tmp_path / f"{number}/report.json").read_text())
+            report["config"] = {"task": {"light": light}, "evaluate": {"conditions": {"dark": {"light": 0}}}}
+            (tmp_path / f"{number}/report.json").write_text(json.dumps(report))
+        assert [each.condition for each in compare_rows(tabulate(tmp_path), 0.02)] == expected
+
+
 def test_single_trainings_are_compared_in_the_course_of_episodes(tmp_path: Path) -> None:
     for number, milestones in enumerate((["grasped"], [])):
         folder = tmp_path / str(number)

@@ -19,7 +19,7 @@ from importlib import import_module
 from operator import or_
 from typing import Annotated, Any, Literal, get_args, get_origin
 
-from annotated_types import MinLen, Predicate
+from annotated_types import Gt, Le, MinLen, Predicate
 from hydra.errors import InstantiationException
 from hydra.utils import instantiate
 
@@ -117,7 +117,7 @@ NARROWER: dict[str, dict[str, Any]] = {
         "gradient_clip_val": NonNegative | None,
         "val_check_interval": Count,
         "limit_val_batches": Natural | Share | None,
-        "limit_train_batches": Natural | Share | None,
+        "limit_train_batches": Count | Annotated[float, Gt(0), Le(1)] | None,
         "log_every_n_steps": Count,
         "precision": Literal["fp32", "bf16"],
     }

@@ -6,7 +6,7 @@ In a world of recordings there is no success to measure, only errors of actions:
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import asdict, replace
 from functools import partial
@@ -139,15 +139,17 @@ def _evaluated(experiment: Experiment, checkpoint: Path | None, rounds: Sequence
             result += [*(each.say(report) for each in statements), str(report)]
             with writing(output / REPORT):
                 _write(experiment, checkpoint, reports, statements, rounds, played.seconds)
+            if errors := _errors(reports):  # what was played is kept, so that the same command plays only these again
+                raise ValueError(f"{errors} episodes ended in an error, see {output / REPORT}")
     finally:
         for line in result:  # after whatever was logged, because scripts read the last line
             print(line)
-    # Conditions that are equal to the training condition share its report.
-    different = {id(each): each for each in reports.values()}.values()
-    errors = [error for each in different for error in each.errors]
-    if errors:
-        raise ValueError(f"{len(errors)} episodes ended in an error, see {output / REPORT}")
     return report.success
+
+
+def _errors(reports: Mapping[str, Report]) -> int:
+    """Return the number of errors; conditions that are equal to the training condition share its report."""
+    return sum(len(each.errors) for each in {id(each): each for each in reports.values()}.values())
 
 
 def _sources(experiment: Experiment, checkpoint: Path | None) -> list[Path]:
@@ -212,6 +214,9 @@ def _play(
     asked, task = experiment["evaluate"], experiment["task"]
     seeds: Sequence[int] = range(asked["seed"], asked["seed"] + asked["episodes"])
     cluster, needs = experiment.cluster(), [checkpoint.resolve()] if checkpoint else []
+    named = (experiment["agent"] or {}).get("folder")
+    if folder := named and Path(named).resolve():  # workers may be in another folder
+        experiment = experiment.with_values({"agent.folder": str(folder)})
     make_agent = experiment.make_agent() or experiment.make_policy(needs[0])
     recordings = experiment.output.resolve() / "recordings"
     recorder = experiment.make_recorder(recordings)
@@ -220,6 +225,8 @@ def _play(
         needs.append(recordings)
     if asked["nearest"]:
         needs.append(Path(asked["nearest"]).resolve())
+    if folder:
+        needs.append(folder)
 
     def played(
         name: str,
@@ -286,7 +293,8 @@ def _write(
     recording.unlink(missing_ok=True)  # of an earlier evaluation
     if experiment["recorder"]:
         with warn_on_error(recording):
-            keep_recordings(report, output / "recordings", recording, experiment["evaluate"]["recordings"])
+            again = _errors(reports) > 0  # this evaluation is then continued
+            keep_recordings(report, output / "recordings", recording, experiment["evaluate"]["recordings"], again)
     with warn_on_error(output / PLOT):
         (output / PLOT).unlink(missing_ok=True)  # of an earlier evaluation
         plot_report(report, output / PLOT)

@@ -11,6 +11,7 @@ from __future__ import annotations
 import hashlib
 import logging
 from collections.abc import Mapping, Sequence
+from contextlib import closing
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,7 @@ import torch
 
 from vla.config.adopt import require_identity
 from vla.config.check import TRAINING, Job, devices, with_changes
+from vla.config.differences import at
 from vla.config.experiment import Experiment
 from vla.data.episodes import EpisodeStore
 from vla.data.header import is_store
@@ -29,9 +31,10 @@ from vla.jobs.evaluate import evaluate_trained, require_possible
 from vla.jobs.train import train
 from vla.models.checkpoint import read_checkpoint, read_header
 from vla.rollouts.collect import collect, collection_time
+from vla.rollouts.rollout import close_agent
 from vla.rollouts.supervised import make_supervised, require_memoryless
 from vla.runs.files import Round
-from vla.runs.folder import read_run, save_config
+from vla.runs.folder import archive_evaluation, read_report, read_run, save_config
 from vla.runs.resume import LENGTHS, training_lock
 from vla.spec import FIRST_SEED
 
@@ -70,6 +73,9 @@ def run(experiment: Experiment) -> float:
 def _improved(experiment: Experiment, seeds: range) -> float:
     asked, output = experiment["improve"], experiment.output
     checkpoint, rounds, stores = experiment.pretrained, list[Round](), list[Path]()
+    report = read_report(output)
+    if report and len(report.rounds) <= asked["rounds"] - (checkpoint is not None):  # round_0 counts without one
+        archive_evaluation(output, len(report.rounds) - (checkpoint is None))
     if checkpoint is None:
         checkpoint = _trained(experiment.with_values({"job": "train", "output": str(output / "round_0")}))
         rounds.append(_described(output / "round_0", None))
@@ -92,18 +98,21 @@ def _save_config(experiment: Experiment) -> None:
     saved = read_run(experiment.output).config
     if saved.get("job") == "improve":
         require_identity(saved, experiment.config, experiment.output)
-        if experiment.pretrained is None and is_store(experiment.output / "round_1" / EPISODES):
-            _require_same_length(saved["trainer"], experiment["trainer"], experiment.output)
+        if is_store(experiment.output / "round_1" / EPISODES):
+            _require_same_length(saved, experiment)
     if saved != experiment.config:  # else its date would tell that the rounds began again
         save_config(experiment.output, experiment.config, experiment.changes)
 
 
-def _require_same_length(saved: Mapping[str, Any], asked: Mapping[str, Any], output: Path) -> None:
-    for name in LENGTHS:
-        if asked.get(name) != saved.get(name):
+def _require_same_length(saved: Mapping[str, Any], experiment: Experiment) -> None:
+    """Raise a ValueError if a training that later ones continue would get another length."""
+    lengths = [f"trainer.{name}" for name in LENGTHS] if experiment.pretrained is None else []
+    for key in (*lengths, "improve.steps"):
+        before, now = at(saved, key, None), at(experiment.config, key, None)
+        if before != now:
             raise ValueError(
-                f"trainer.{name}={asked.get(name)}: the rounds in {output} continue round_0, which was trained with "
-                f"{saved.get(name)}: leave it at that, or choose another output=DIR"
+                f"{key}={now}: the rounds in {experiment.output} were trained with {before}: leave it at that, or "
+                "choose another output=DIR"
             )
 
 
@@ -120,15 +129,30 @@ def _require_possible(experiment: Experiment) -> range:
         raise ValueError(f"improve.seed={seeds.start}: seeds from {FIRST_SEED} on are reserved for evaluation")
     if devices(experiment["trainer"]) > 1:
         raise ValueError("job=improve trains on one device, because its trainings follow each other: trainer.devices=1")
-    environment = experiment.make_environment()()
-    try:
-        require_memoryless(experiment.make_expert()(environment))
+    if experiment.pretrained is not None:
+        _require_further_episodes(experiment, experiment.pretrained)
+    with closing(experiment.make_environment()()) as environment:
+        expert = experiment.make_expert()(environment)
+        close_agent(expert)
+        require_memoryless(expert)
         if (policy := experiment.pretrained) is not None:
             known = read_header(policy).spec.without_truth
             known.require(environment.spec.without_truth, f"the checkpoint {policy}", "the task")
-    finally:
-        environment.close()
+        with closing(experiment.make_environment(asked["changes"])()) as changed:
+            environment.spec.require(changed.spec, "the task", "the task with improve.changes")
+            with changed.blind():
+                changed.reset(seeds.start)
     return seeds
+
+
+def _require_further_episodes(experiment: Experiment, policy: Path) -> None:
+    """Raise a ValueError if the policy was trained on further stores, such as rounds, that nothing is said about."""
+    further = at(read_header(policy).config, "collect.more", None)
+    if further and experiment["collect"]["more"] is None:
+        raise ValueError(
+            f"{policy} was also trained on {', '.join(further)}: add collect.more=[{','.join(further)}] to train on "
+            "these episodes again, or collect.more=[] to leave them out"
+        )
 
 
 def require_new(seeds: range, store: EpisodeStore) -> None:

@@ -49,6 +49,8 @@ def run(experiment: Experiment) -> None:
     one, other = asked["rates"]
     if one == other:
         raise ValueError(f"plan.rates={asked['rates']} are equal: no number of episodes tells them apart")
+    if asked["runs"] and asked["discordant"] is not None:
+        raise ValueError("plan.discordant is measured on plan.runs: omit one of the two")
     common = _common(asked["runs"]) if asked["runs"] else []
     share = sum(one.success != two.success for one, two in common) / len(common) if common else asked["discordant"]
     show(plan_table(one, other, asked["power"], share))

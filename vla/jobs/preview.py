@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from contextlib import closing
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -14,7 +15,7 @@ from vla.io.files import atomic_path, writing
 from vla.io.types import Count, Seed
 from vla.reports.resets import contact_sheet, draws_table
 from vla.rollouts.recorder import RerunRecorder, merge
-from vla.rollouts.rollout import rollout
+from vla.rollouts.rollout import close_agent, rollout
 
 log = logging.getLogger(__name__)
 
@@ -24,17 +25,19 @@ JOB = Job(("task", "expert"), {"episodes": Count, "seed": Seed})
 def run(experiment: Experiment) -> None:
     """Roll out the expert on a few seeds; write contact sheet and recording, print the draws."""
     output, asked = experiment.output, experiment["preview"]
-    environment = experiment.make_environment()()
-    expert = experiment.make_expert()(environment)
     seeds = range(asked["seed"], asked["seed"] + asked["episodes"])
-    with writing(output / "preview.rrd"), TemporaryDirectory(prefix=".recordings-", dir=output) as folder:
-        recorder = RerunRecorder(folder)
+    with (
+        writing(output / "preview.rrd"),
+        TemporaryDirectory(prefix=".recordings-", dir=output) as folder,
+        closing(experiment.make_environment()()) as environment,
+    ):
+        expert, recorder = experiment.make_expert()(environment), RerunRecorder(folder)
         first, draws = [], []  # of every episode; all of their images might not fit into memory
         for seed in seeds:
             episode = rollout(environment, expert, seed, recorder)
             first.append(episode.observations[0])
             draws.append(episode.draws)
-        environment.close()
+        close_agent(expert)
         merge(sorted(Path(folder).glob("*.rrd")), output / "preview.rrd")
     with atomic_path(output / "preview.png") as draft:
         contact_sheet(list(seeds), first).save(draft)

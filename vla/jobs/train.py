@@ -148,7 +148,8 @@ class _Begun(Callback):
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """All state is restored."""
         if trainer.is_global_zero:
-            archive_evaluation(self._experiment.output)
+            training = read_training(self._experiment.output)
+            archive_evaluation(self._experiment.output, training.steps if training else 0)
             save_config(self._experiment.output, self._experiment.config, self._experiment.changes)
 
 
@@ -200,8 +201,11 @@ def _reported(
         raise
     finally:
         seconds = graceful_stop.seconds
-        # A training that cannot be resumed stays as it was.
-        if trainer.is_global_zero and (graceful_stop.started or read_training(output) is None):
+        # A training that cannot be resumed stays as it was. One that was interrupted after its last step has nothing
+        # to do, and does not start.
+        if trainer.is_global_zero and (
+            graceful_stop.started or (saved := read_training(output)) is None or ended == "done" != saved.ended
+        ):
             collected = collection_s and round(collection_s, 1)
             save_training(output, Training(parameters, trainer.global_step, round(seconds, 1), ended, collected))
             with warn_on_error(output / PAGE):

@@ -10,7 +10,7 @@ from typing import Any
 
 from rich.table import Table
 
-from vla.config.check import conditions
+from vla.config.check import conditions, with_changes
 from vla.config.differences import at
 from vla.reports.conditions import COMPARED, NARROW, SecondaryRows, short_texts
 from vla.rollouts.comparison import Comparison, compare_pairs, compare_samples, concluded
@@ -59,8 +59,8 @@ def _names(folders: Sequence[Path]) -> list[str]:
 def compare_runs(runs: Mapping[str, Run], margin: float) -> list[RunComparison]:
     """Compare every two runs under each condition: on their common episodes, or without any on different ones.
 
-    Runs in different worlds are not compared. Verdicts take all comparisons into account, those on secondary
-    metrics separately.
+    Runs in different worlds are not compared, nor conditions that repeat the training condition. Verdicts take all
+    comparisons into account, those on secondary metrics separately.
 
     Args:
         runs: by name.
@@ -70,13 +70,16 @@ def compare_runs(runs: Mapping[str, Run], margin: float) -> list[RunComparison]:
         RunComparison(one, other, condition, *compared)
         for one, other in combinations(runs, 2)
         for condition in runs[one].reports
-        if (compared := _compared(runs[one], runs[other], condition))
+        if not _repeats_training_condition((runs[one], runs[other]), condition)
+        and (compared := _compared(runs[one], runs[other], condition))
     ]
     return _with_verdicts(found, margin)
 
 
 def compare_rows(rows: Sequence[SweepRow], margin: float) -> list[RunComparison]:
     """Compare every row of a sweep with the first one under each condition, where both played the same scenes.
+
+    Conditions that repeat the training condition are left out.
 
     Rows of one training each are compared as runs are: by paired tests, and in secondary metrics. Rows of several
     trainings are compared as independent samples of size `effective_episodes`, which ignores the pairing by scenes.
@@ -90,9 +93,17 @@ def compare_rows(rows: Sequence[SweepRow], margin: float) -> list[RunComparison]
         RunComparison(first.name, other.name, condition, *compared)
         for other in others
         for condition in first.played
-        if condition in other.played and (compared := _compared_rows(first, other, condition))
+        if condition in other.played
+        and not _repeats_training_condition((*first.runs, *other.runs), condition)
+        and (compared := _compared_rows(first, other, condition))
     ]
     return _with_verdicts(found, margin)
+
+
+def _repeats_training_condition(runs: Sequence[Run], condition: str) -> bool:
+    """Return whether a condition changes the task of none of the runs, so that its episodes are those of `seen`."""
+    tasks = [(at(run.report.config, "task", {}), _changes(run, condition)) for run in runs if run.report]
+    return all(changes is not None and with_changes(task, changes) == task for task, changes in tasks)
 
 
 def compare_all_rows(rows: Sequence[SweepRow]) -> list[RunComparison]:
@@ -197,9 +208,13 @@ def _by_seed(run: Run, condition: str) -> dict[int, tuple[Result, Any]]:
 def _scenes(run: Run, condition: str) -> tuple[Any, ...]:
     """Return the config values that determine the scenes: the task, and the changes of a condition."""
     config = run.report.config if run.report else {}
-    asked = at(config, "evaluate", {})
-    changes = conditions(
-        {"conditions": {}, "one_by_one": {}, "without": [], "nearest": None, "networks": {}, **asked}
-    ).get(condition)
-    network = at(asked, "networks", {}).get(condition)
-    return at(config, "task"), changes, network and (network, at(asked, "by_clock", None))
+    network = at(config, "evaluate.networks", {}).get(condition)
+    distant = network and (network, at(config, "evaluate.by_clock", None))
+    return at(config, "task"), _changes(run, condition), distant
+
+
+def _changes(run: Run, condition: str) -> dict[str, Any] | None:
+    """Return what a condition changes in the task; None if it is another agent's, or unknown."""
+    asked = at(run.report.config if run.report else {}, "evaluate", {})
+    absent = {"conditions": {}, "one_by_one": {}, "without": [], "nearest": None, "networks": {}}
+    return conditions({**absent, **asked}).get(condition)

@@ -123,10 +123,11 @@ def _record(pool: Pool, results: Sequence[Result]) -> None:
             log.warning("seed %d has no recording: when played again it ended with %s", result.seed, again)
 
 
-def keep_recordings(report: Report, folder: Path, target: Path, limit: int | None) -> int:
+def keep_recordings(report: Report, folder: Path, target: Path, limit: int | None, continues: bool = False) -> int:
     """Merge the recordings of an evaluation into one file, failures first, at most `limit`; returns their number.
 
-    The single files are removed, those of episodes that do not count included, and their folder if it is empty.
+    Unless the evaluation `continues`, the single files are removed, those of episodes that do not count included, and
+    their folder if it is empty.
     """
     from vla.rollouts.recorder import merge, recording_name  # imports the viewer's library
 
@@ -134,10 +135,11 @@ def keep_recordings(report: Report, folder: Path, target: Path, limit: int | Non
     files = [file for name in names if (file := folder / f"{name}.rrd").exists()]
     if files:
         merge(files, target)
-    for file in folder.glob("*.rrd"):
-        file.unlink()
-    with suppress(OSError):
-        folder.rmdir()
+    if not continues:
+        for file in folder.glob("*.rrd"):
+            file.unlink()
+        with suppress(OSError):
+            folder.rmdir()
     return len(files)
 
 

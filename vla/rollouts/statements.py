@@ -39,7 +39,9 @@ class AgainstRun:
     anytime: bool = False  # whether the other run stopped when something was clear
 
     def is_decided(self, report: Report) -> bool:
-        """Return whether the episodes of a report decide the statement; valid after any number of episodes.
+        """Return whether the episodes of a report decide the statement, or the other run has no later ones.
+
+        It is valid after any number of episodes.
 
         Raises:
             ValueError: the other run has other episodes with the same seeds.
@@ -48,6 +50,8 @@ class AgainstRun:
         if not found.episodes and self._completed(report):
             raise self._apart()
         assert found.only_first is not None and found.only_second is not None
+        if report.results and report.results[-1].seed >= max(self.results):
+            return True
         return is_decided(found.only_first, found.only_second, found.episodes, self.margin)
 
     def require_common(self, seeds: Iterable[int]) -> None:

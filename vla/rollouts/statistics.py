@@ -30,8 +30,9 @@ def stratified_interval(strata: Sequence[tuple[int, int, float]]) -> tuple[float
     """Return the weighted mean of proportions and its 95 % confidence interval; (0, 0, 1) without trials.
 
     Only chance within a stratum counts: strata, such as the tasks of a benchmark, are fixed. Wilson's interval at
-    the effective sample size, at which the binomial variance equals the estimated one; half a success and half a
-    failure are added to every stratum in estimating it, else one without failures would seem certain.
+    the effective sample size, at which the binomial variance equals the estimated one. In estimating the variance,
+    half a success and half a failure are added to every stratum, else one without failures would seem certain; the
+    estimate is scaled to be unbiased at a rate of one half, else few trials per stratum would give too small ones.
 
     Args:
         strata: successes, trials (at least one) and weight of each; the weights sum to 1.
@@ -40,7 +41,9 @@ def stratified_interval(strata: Sequence[tuple[int, int, float]]) -> tuple[float
         return 0.0, 0.0, 1.0
     won, trials, weights = np.array(strata, float).T
     smooth = (won + 0.5) / (trials + 1)
-    mean, variance = weights @ smooth, np.square(weights) @ (smooth * (1 - smooth) / trials)
+    # With n trials the expectation of smooth * (1 - smooth) is (n^2 + n + 1) / (n + 1)^2 of p (1 - p) at p = 1/2.
+    unbiased = smooth * (1 - smooth) * np.square(trials + 1) / (np.square(trials) + trials + 1)
+    mean, variance = weights @ smooth, np.square(weights) @ (unbiased / trials)
     effective = float(mean * (1 - mean) / variance)
     rate = float(weights @ (won / trials))
     return rate, *wilson_interval(rate * effective, effective)

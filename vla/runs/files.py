@@ -10,6 +10,7 @@ from typing import Annotated, Any
 
 from pydantic import StringConstraints
 
+from vla.config.differences import at
 from vla.io.documents import LENIENT, STRICT
 from vla.io.types import Count, Natural, NonNegative, Positive, Share
 from vla.rollouts.comparison import Comparison
@@ -127,15 +128,6 @@ class Condition:
         return Report(tuple(results), tiers, self.anytime)
 
 
-@dataclass(frozen=True)
-class Tier:
-    """Tier of a benchmark."""
-
-    __pydantic_config__ = LENIENT
-
-    tasks: Node  # by name
-
-
 @dataclass(frozen=True, kw_only=True)
 class ReportFile:
     """report.json, written by `vla.reports.evaluation.write_report`, without values derived from its episodes."""
@@ -147,7 +139,6 @@ class ReportFile:
     conditions: dict[str, Condition]
     config: Node
     per_episode: list[Result]
-    tiers: dict[str, Tier] = field(default_factory=dict)
     anytime: bool = False  # as of a condition
     parameters: Count | None = None
     latency_ms: Positive | None = None
@@ -170,7 +161,7 @@ class ReportFile:
     @cached_property
     def reports(self) -> dict[str, Report]:
         """Condition → report, the training condition first."""
-        tiers = {tier: [*part.tasks] for tier, part in self.tiers.items()}
+        tiers = at(self.config, "task.tiers", None) or {}  # also with tasks that were not played
         # Without tiers a condition may change what an episode asks for; a benchmark's task follows from the seed.
         tasks = [result.task if tiers else "" for result in self.per_episode]
         others = {name: part.report(self.seeds, tasks, tiers) for name, part in self.conditions.items()}

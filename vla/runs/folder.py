@@ -33,6 +33,7 @@ METRICS, REPORT = "metrics.csv", "report.json"
 PAGE, RECORDING = "report.html", "rollouts.rrd"
 SAMPLES, PLOT, SUITE = "samples.png", "report.png", "suite.png"
 ERRORS, ERRORS_PLOT = "errors.json", "errors.png"  # of an open-loop evaluation, in place of a report
+LARGEST_REPORT = 4 << 30  # [bytes], a million episodes
 CHECKPOINTS, LAST = "checkpoints", "last.ckpt"  # the folder of weights, and those of the newest save
 
 
@@ -88,7 +89,7 @@ def read_run(folder: Path) -> Run:
 
 def read_report(folder: Path) -> ReportFile | None:
     """Read the report of a run's folder, or return None; a ValueError if the file is damaged."""
-    return _read(folder / REPORT, partial(read_json, kind=ReportFile), None)
+    return _read(folder / REPORT, partial(read_json, kind=ReportFile, largest=LARGEST_REPORT), None)
 
 
 def read_training(folder: Path) -> Training | None:
@@ -106,16 +107,16 @@ def chosen_checkpoint(folder: Path) -> str | None:
     return training.checkpoint if training else None
 
 
-def archive_evaluation(folder: Path) -> None:
-    """Archive the evaluation in a run's folder as `evaluation_STEPS`, because further training changes the policy.
+def archive_evaluation(folder: Path, number: int) -> None:
+    """Archive the evaluation in a run's folder as `evaluation_NUMBER`, because further training changes the policy.
 
-    Raises:
-        ValueError: training.json is damaged.
+    Args:
+        folder: of the run.
+        number: steps, or rounds, after which the policy was evaluated.
     """
     names = (REPORT, ERRORS, PLOT, SUITE, ERRORS_PLOT, RECORDING)
     if files := [file for name in names if (file := folder / name).exists()]:
-        training = read_training(folder)
-        target = folder / f"evaluation_{training.steps if training else 0}"
+        target = folder / f"evaluation_{number}"
         target.mkdir(exist_ok=True)
         for file in files:
             file.replace(target / file.name)

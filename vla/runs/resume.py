@@ -124,10 +124,10 @@ def _unfinished(run: Path) -> bool:
 
 @contextmanager
 def training_lock(folder: Path) -> Iterator[None]:
-    """Lock a folder of checkpoints, or of rounds, against other trainings; only the first process takes the lock.
+    """Lock a folder of checkpoints, or of rounds, against other processes; only the first of a training takes the lock.
 
     Raises:
-        ValueError: another training holds the lock.
+        ValueError: another process holds the lock.
     """
     if not first_process():
         yield
@@ -138,7 +138,7 @@ def training_lock(folder: Path) -> Iterator[None]:
         lock.acquire()
     except Timeout as error:
         raise ValueError(
-            f"another process is training into {folder}: wait for it, or choose another output=DIR"
+            f"another process is training or evaluating in {folder}: wait for it, or choose another output=DIR"
         ) from error
     try:
         yield

@@ -24,8 +24,7 @@ log = logging.getLogger(__name__)
 
 BEST = "best.ckpt"
 
-# Success rate, -1: not measured. The sum of the shares of several processes may exceed 1 by rounding.
-Success = Annotated[float, Ge(-1), Le(1.001)]
+Success = Annotated[float, Ge(-1), Le(1)]  # success rate; -1: not measured
 
 
 @dataclass(frozen=True)
