@@ -17,7 +17,7 @@ from reading import fit, windows
 from vla.data.datamodule import Prefetcher, held_out
 from vla.data.episodes import EpisodeStore, observations_of
 from vla.data.verification import derive_store
-from vla.data.window_batches import WindowBatcher, disturbed
+from vla.data.window_batches import WindowBatcher, perturbed
 from vla.parallel.pool import LocalCluster
 from vla.rollouts.collect import collect
 from vla.spec import Array, Episode
@@ -36,11 +36,11 @@ def naive(store: EpisodeStore, row: int, history: int, chunk: int) -> dict[str, 
         seen = {name: values[max(step, 0)] * present for name, values in rows.items()}
         labels = [min(max(step + ahead, 0), entry.steps - 1) if present else 0 for ahead in range(chunk)]
         seen["labels"] = [rows["action"][label] for label in labels]
-        off = disturbed(rows["action"], rows["executed"], store.spec)
+        off = perturbed(rows["action"], rows["executed"], store.spec)
         seen["valid"] = [
             present and step + ahead < entry.steps and not off[step : step + ahead].any() for ahead in range(chunk)
         ]
-        seen["undisturbed"] = not off[max(step, 0) : min(max(step + chunk - 1, 0), entry.steps - 1)].any()
+        seen["unperturbed"] = not off[max(step, 0) : min(max(step + chunk - 1, 0), entry.steps - 1)].any()
         seen["present"] = present
         frames.append(seen)
     return {name: np.stack([frame[name] for frame in frames]) for name in frames[0]} | {"text": entry.instruction}
@@ -62,7 +62,7 @@ def test_a_batch_is_what_a_loop_over_the_episodes_gives(arms: Path, history: int
         for camera in toy.ARM_SPEC.cameras:
             np.testing.assert_array_equal(batch["rgb"][camera][place], expected[f"rgb_{camera}"])
             np.testing.assert_array_equal(batch["depth"][camera][place], expected[f"depth_{camera}"])
-        for name in ("state", "truth", "present", "valid", "undisturbed"):
+        for name in ("state", "truth", "present", "valid", "unperturbed"):
             np.testing.assert_array_equal(batch[name][place], expected[name])
         usable = expected["valid"]
         np.testing.assert_array_equal(batch["action"][place].numpy()[usable], expected["labels"][usable])
@@ -103,7 +103,7 @@ def test_shapes_and_types_are_those_of_the_contract(folder: Path, arms: Path) ->
 
 def test_nothing_is_labelled_before_the_start_or_beyond_the_end(folder: Path) -> None:
     store = EpisodeStore(folder)
-    off = disturbed(store.rows("action")[:], store.rows("executed")[:], store.spec)
+    off = perturbed(store.rows("action")[:], store.rows("executed")[:], store.spec)
     entry = next(
         entry
         for entry in store.episodes

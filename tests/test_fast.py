@@ -78,7 +78,7 @@ def test_a_chunk_counts_as_a_whole() -> None:
     tokenizer = TOKENIZER
     tokens = tokenizer.tokenize(torch.from_numpy(CHUNKS[:3].copy()))
     valid = torch.zeros(3, 8, dtype=torch.bool)
-    valid[:2, :3] = True  # the first one at the end of its episode, the second one until a disturbance
+    valid[:2, :3] = True  # the first one at the end of its episode, the second one until a perturbation
     counted = tokenizer.loss_mask(tokens, valid, torch.tensor([True, False, True]))
     assert counted[0].sum() == (tokens[0] != tokenizer.end).sum() + 1 and not counted[1:].any()
 

@@ -275,9 +275,9 @@ def test_without_the_package_a_sentence_says_how_to_install_it(monkeypatch: pyte
     assert len(world().tasks) == 50
 
 
-def test_disturbed_demonstrations_are_clean_labels_in_equal_shares(tmp_path: Path) -> None:
+def test_perturbed_demonstrations_are_clean_labels_in_equal_shares(tmp_path: Path) -> None:
     tasks = "task.tasks=[handle-press,coffee-button]"
-    asked = experiment(tasks, "task.image_size=[16,16]", "expert=metaworld_disturbed")
+    asked = experiment(tasks, "task.image_size=[16,16]", "expert=metaworld_perturbed")
     environment = asked.make_environment()()
     assert isinstance(environment, Multitask)
     store = EpisodeStore.create_or_open(tmp_path, environment.spec, {})

@@ -139,7 +139,7 @@ OF_ONE_WORLD = {
     *("ablation", "few", "images_alone", "learning_curve", "multitask", "recipe", "standard"),
     *("generalisation", "language", "levels", "paper", "suite", "tabletop"),
     *("no_excursions", "no_noise", "coarse_images"),
-    *("unseen_names", "renderer", "lerobot", "metaworld", "metaworld_disturbed", "metaworld_improved", "few_improved"),
+    *("unseen_names", "renderer", "lerobot", "metaworld", "metaworld_perturbed", "metaworld_improved", "few_improved"),
     *("multitask_improved", "standard_improved"),
 }
 

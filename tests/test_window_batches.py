@@ -12,10 +12,10 @@ import toy
 from vla.data import episodes
 from vla.data.episodes import EpisodeStore
 from vla.data.scattered_rows import ScatteredRows
-from vla.data.window_batches import BufferPool, WindowBatcher, disturbed
+from vla.data.window_batches import BufferPool, WindowBatcher, perturbed
 
 
-def test_a_step_is_disturbed_if_the_executed_action_differs_from_the_label_by_more_than_noise() -> None:
+def test_a_step_is_perturbed_if_the_executed_action_differs_from_the_label_by_more_than_noise() -> None:
     label = np.array([0.04, -0.01, 1.0])
     executed = [
         label,
@@ -25,7 +25,7 @@ def test_a_step_is_disturbed_if_the_executed_action_differs_from_the_label_by_mo
         label * [1, -1, 1],
         [0.04, 0, 0],
     ]
-    off = disturbed(np.tile(label, (6, 1)), np.array(executed), toy.SPEC)
+    off = perturbed(np.tile(label, (6, 1)), np.array(executed), toy.SPEC)
     assert off.tolist() == [False, False, False, True, True, True]
 
 

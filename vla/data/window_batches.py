@@ -26,15 +26,15 @@ NUMPY = {torch.uint8: np.uint8, torch.int32: np.int32, torch.float32: np.float32
 
 CACHE_LINE = 64  # bytes
 
-# An executed action counts as disturbed if it differs from the label by more than this share of the label, and of the
+# An executed action counts as perturbed if it differs from the label by more than this share of the label, and of the
 # action range.
 SHARE_OF_LABEL, SHARE_OF_RANGE = 0.6, 0.05
 
 
-def disturbed(action: Array, executed: Array, spec: Spec) -> Array:
+def perturbed(action: Array, executed: Array, spec: Spec) -> Array:
     """Return (N,) bool: the executed action differs from the (N, D) label by more than proportional noise.
 
-    Later labels react to a disturbance that a policy cannot predict, so the loss masks them.
+    Later labels react to a perturbation that a policy cannot predict, so the loss masks them.
     """
     least = SHARE_OF_RANGE * (np.array(spec.high) - np.array(spec.low))
     off = np.abs(executed - action) > np.maximum(SHARE_OF_LABEL * np.abs(action), least)
@@ -110,8 +110,8 @@ class WindowBatcher:
         unknown = np.full((len(known[0]), self._truth_size - store.spec.truth_size), np.nan, np.float32)
         self._numbers = np.concatenate([*known, unknown], axis=1)
         self._action = numbers["action"]
-        off = disturbed(self._action[:], numbers["executed"][:], store.spec)
-        self._disturbances = np.append(0, off.cumsum())  # before each row
+        off = perturbed(self._action[:], numbers["executed"][:], store.spec)
+        self._perturbations = np.append(0, off.cumsum())  # before each row
         self._store, self._entries = store, (entries := store.episodes)
         self._verified = np.zeros(len(entries), bool)  # images only
         self._instructions = [entry.instruction for entry in entries]
@@ -122,9 +122,9 @@ class WindowBatcher:
         """Return the batch of `windows` (B,), row numbers.
 
         A frame before the start of the episode is zero, absent, and has no valid label. A label is also invalid if a
-        step between its frame and itself was disturbed, or if it lies beyond the end of the episode, where it repeats
-        the last action. The valid labels of a frame therefore come first. `undisturbed` (B, T): no step
-        within a chunk was disturbed.
+        step between its frame and itself was perturbed, or if it lies beyond the end of the episode, where it repeats
+        the last action. The valid labels of a frame therefore come first. `unperturbed` (B, T): no step
+        within a chunk was perturbed.
 
         Raises:
             ValueError: images of these episodes differ from their checksums, which are compared once per episode.
@@ -140,7 +140,7 @@ class WindowBatcher:
         labels = np.minimum(np.maximum(labels, first[:, :, None]), last[:, :, None])
         frames = np.maximum(frames, first)
         if len(self._aheads) > 1:  # no step lies between a frame and its first label
-            valid &= self._disturbances[labels] == self._disturbances[frames][:, :, None]
+            valid &= self._perturbations[labels] == self._perturbations[frames][:, :, None]
         absent = None if present.all() else ~present
         batch: Batch = {
             kind: {camera: self._take(rows, frames, absent) for camera, rows in cameras.items()}
@@ -154,7 +154,7 @@ class WindowBatcher:
         batch["action"] = self._take(self._action, labels)
         batch["present"] = self._own(present)
         batch["valid"] = self._own(valid)
-        batch["undisturbed"] = self._own(self._disturbances[labels[:, :, -1]] == self._disturbances[frames])
+        batch["unperturbed"] = self._own(self._perturbations[labels[:, :, -1]] == self._perturbations[frames])
         batch["instruction"] = [self._instructions[number] for number in episode.tolist()]
         return batch
 

@@ -95,7 +95,7 @@ class Model(nn.Module, ABC):
     A batch is a dict:
         rgb: camera → (B, T, H, W, 3) uint8; state: (B, T, P) float32; present: (B, T) bool, false for padding;
         text: from `model.text.tokenize`. For training also action: (B, T, k, D) float32; valid: (B, T, k) bool, the
-        loss mask, true for a prefix of each chunk; undisturbed: (B, T) bool, false where a disturbance falls within the
+        loss mask, true for a prefix of each chunk; unperturbed: (B, T) bool, false where a perturbation falls in the
         chunk; truth: (B, T, S) float32. For generative models optionally noise: (B, k, D) float32, standard normal.
 
     A policy executes the first `execute` of the k actions before it predicts again.

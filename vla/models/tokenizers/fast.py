@@ -111,13 +111,13 @@ class Fast(ActionTokenizer):
         scaled = _exact(self.basis.T, coefficients.view(-1, self.chunk, self.components)) / self.scale
         return (scaled * self.spread + self.centre).view(*tokens.shape[:-1], self.chunk, self.components)
 
-    def loss_mask(self, tokens: Tensor, valid: Tensor, undisturbed: Tensor) -> Tensor:
-        """Return the (…, L) bool loss mask: tokens up to the first end token of undisturbed chunks with a valid action.
+    def loss_mask(self, tokens: Tensor, valid: Tensor, unperturbed: Tensor) -> Tensor:
+        """Return the (…, L) bool loss mask: tokens up to the first end token of unperturbed chunks with a valid action.
 
         Every token depends on all actions of a chunk. Actions that repeat the last one of an episode are meant to be.
         """
         ended = (tokens == self.end).cumsum(-1)
-        whole = valid[..., 0] & undisturbed
+        whole = valid[..., 0] & unperturbed
         return ((ended == 0) | ((ended == 1) & (tokens == self.end))) & whole[..., None]
 
     def vocabulary_usage(self, tokens: Tensor) -> str:

@@ -82,7 +82,7 @@ class ActionTokenizer(nn.Module, ABC):
         """Decode any (…, L) tokens as (…, k, D) float actions."""
 
     @abstractmethod
-    def loss_mask(self, tokens: Tensor, valid: Tensor, undisturbed: Tensor) -> Tensor:
+    def loss_mask(self, tokens: Tensor, valid: Tensor, unperturbed: Tensor) -> Tensor:
         """Return the (…, L) bool loss mask, given the (…, k) bool mask of actions and the (…) one of whole chunks."""
 
     @abstractmethod
@@ -136,7 +136,7 @@ class PerComponent(ActionTokenizer):
         """Decode (…, k·D) tokens as (…, k, D) float actions."""
         return self.decode(self._split(tokens, -1))
 
-    def loss_mask(self, tokens: Tensor, valid: Tensor, undisturbed: Tensor) -> Tensor:
+    def loss_mask(self, tokens: Tensor, valid: Tensor, unperturbed: Tensor) -> Tensor:
         """Return the (…, k·D) bool loss mask: the tokens of valid actions."""
         return valid.repeat_interleave(self.components, -1)
 
