@@ -88,12 +88,13 @@ def test_a_policy_that_runs_on_from_the_hand_of_a_person_is_one_episode(tmp_path
 def test_an_arm_that_is_guided_by_hand_moves_as_measured(tmp_path: Path) -> None:
     parts = (
         bags.Part("running", bags.moving(5, 0), instruction="lift it"),
-        bags.Part("handed over", bags.moving(10, 1), person=True, commands=False),
+        bags.Part("handed over", bags.moving(10, 1, gripper=0.0), person=True, commands=False),
         bags.Part("holding", np.repeat(bags.RESTING, 3, 0)),
     )
     episode = imported(bags.write(tmp_path / "bag", parts)).episode(0)
     first = brightness(episode).index(6)
     np.testing.assert_allclose(episode.actions[first : first + 8, :6], bags.moving(8, 1)[:, :6], atol=2e-4)
+    assert (episode.actions[first : first + 8, 6] == 0).all()  # as measured, not as the policy last commanded
 
 
 @pytest.mark.parametrize("storage", [StoragePlugin.MCAP, StoragePlugin.SQLITE3], ids=["mcap", "sqlite3"])
@@ -135,6 +136,7 @@ def test_joint_positions_of_any_robot_are_learned_from_a_bag_alone(bag: Path) ->
         ({"topics": replace(TOPICS, joint_states="/front")}, "/front is of type sensor_msgs/msg/Image, expect"),
         ({"robot": replace(ROBOT, joints=[f"fr3_joint{n}" for n in range(1, 8)])}, "lacks fr3_joint1, .* has"),
         ({"robot": replace(ROBOT, fingers=["thumb"])}, "can be used: joint state lacks thumb; it has left"),
+        ({"status": "/status"}, "no topic /status, .* choose it with expert.status=/vla_agent/status"),
         ({"spec": replace(SPEC, robot=None)}, "expert=bag needs a robot"),
         ({"spec": replace(SPEC, cameras=("top",))}, r"no topic for the cameras top: add \+expert\.topics"),
     ],

@@ -93,6 +93,17 @@ def test_actions_move_the_tool_as_far_as_they_say(world: World) -> None:
     np.testing.assert_allclose(world.tool - start, [0.08, 0, 0], atol=0.002)
 
 
+def test_the_gripper_neither_opens_nor_closes_beyond_its_stroke(monkeypatch: pytest.MonkeyPatch) -> None:
+    wider = replace(SPEC, low=(*SPEC.low[:6], -0.1), high=(*SPEC.high[:6], 1.1))
+    monkeypatch.setattr("test_control_loop.SPEC", wider)  # bounds that follow from data
+    for gripper, opening in ((1.1, 1.0), (-0.1, 0.0)):
+        world = World()
+        world.run(0.1)
+        world.loop.on_instruction("put the red block on the pad", world.now)
+        world.answer = lambda observation, gripper=gripper: np.array([[*[0.0] * 6, gripper]])
+        assert world.run(1.0)[-1].opening == opening
+
+
 def test_a_chunk_is_executed_to_its_end_before_the_policy_is_asked_again() -> None:
     world, asked = World(), []
 

@@ -70,7 +70,7 @@ class Spec:
     cameras: Cameras
     image_size: tuple[Pixels, Pixels]  # height, width [px]
     state: Names  # (P,) measured components beside the images
-    state_units: Units  # (P,) "m" | "rad" | "m/s" | "rad/s" | "1"
+    state_units: Units  # (P,) such as "m", "rad", "deg", "m/s", "rad/s" or "1"
     action: Names  # (D,) components
     units: Units  # (D,) of the action
     low: Numbers  # (D,) smallest action

@@ -6,9 +6,10 @@ All times are seconds since the first message. Shapes: J joints, N samples.
 from __future__ import annotations
 
 import json
+import logging
 from bisect import bisect_right
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from functools import lru_cache
 from itertools import groupby
@@ -24,6 +25,8 @@ from vla.deploy.joint_limiter import Robot
 from vla.deploy.observer import Measured, age_of
 from vla.deploy.settings import Topics
 from vla.spec import LONGEST_INSTRUCTION, Array
+
+log = logging.getLogger(__name__)
 
 IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 JOINTS = "sensor_msgs/msg/JointState"
@@ -95,7 +98,8 @@ class BagIndex:
     measured: Track = field(default_factory=Track)  # joints (J,) [rad]
     openings: Track = field(default_factory=Track)  # measured, of the gripper [m]
     commands: Track = field(default_factory=Track)  # joints (J,) [rad]
-    gripper_commands: Track = field(default_factory=Track)  # commanded openings of the gripper, 0 … 1
+    # Commanded openings of the gripper, 0 … 1; None from a hand-over until the person's first command.
+    gripper_commands: Track = field(default_factory=Track)
     stretches: list[Stretch] = field(default_factory=list)
 
     def corrections(self) -> list[Stretch]:
@@ -184,6 +188,7 @@ class _Reading:
             raise ValueError(
                 f"{self.index.folder} has no topic {missing}, it has {known}: choose others with expert.topics"
             )
+        self._tell_missing(topics, status, there)
         wanted |= optional
         for topic, kinds in wanted.items():
             if topic in there and there[topic] not in kinds:
@@ -194,6 +199,27 @@ class _Reading:
         self._has_status = status in there
         self._person = None if self._has_status else True
         return {topic: kinds[there[topic]] for topic, kinds in wanted.items() if topic in there}
+
+    def _tell_missing(self, topics: Topics, status: str, there: Mapping[str, str]) -> None:
+        """Log what replaces optional topics that are missing.
+
+        Raises:
+            ValueError: the topic `status` is missing, but the bag has one of an agent in a namespace.
+        """
+        missing = {
+            topics.commands: "actions follow the measured motion",
+            topics.gripper: "actions have the measured opening of the gripper, unless commands contain fingers",
+            topics.finger_states: f"fingers are expected on {topics.joint_states}",
+            status: "all motion counts as a person's",
+        }
+        if others := [topic for topic in there if topic.endswith(status) and status not in there]:
+            raise ValueError(
+                f"{self.index.folder} has no topic {status}, which tells who moves the arm, but {others[0]}: choose it "
+                f"with expert.status={others[0]}"
+            )
+        for topic, instead in missing.items():
+            if topic and topic not in there:
+                log.info("%s has no topic %s: %s", self.index.folder, topic, instead)
 
     def _read(self, reader: Any) -> None:
         types = message_types()
@@ -256,6 +282,8 @@ class _Reading:
         values = {pair.key: pair.value for pair in message.values}
         before = self._person
         self._person = True if values.get(messages.HANDED_OVER) == "yes" else None
+        if self._person and not before:
+            self.index.gripper_commands.add(at, None)  # the policy's last command is not the person's
         if self._person is None and values.get("state") == State.RUNNING:
             self._person = False
         self._number += before is not None and self._person is None

@@ -8,6 +8,7 @@ from typing import Any
 import rclpy
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
+from rclpy.duration import Duration
 from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
 
@@ -21,7 +22,7 @@ def say(node: Any, topic: str, instruction: str) -> None:
     """Publish an instruction once all subscribers are discovered.
 
     Raises:
-        ValueError: there is no subscriber.
+        ValueError: there is no subscriber, or one does not confirm the message.
     """
     publisher = node.create_publisher(String, topic, 1)
     subscribers, since = 0, time.monotonic()
@@ -33,7 +34,8 @@ def say(node: Any, topic: str, instruction: str) -> None:
     if publisher.get_subscription_count() == 0:
         raise ValueError(f"no subscriber on {topic}: is the agent running, and on the same network and domain?")
     publisher.publish(String(data=instruction))
-    publisher.wait_for_all_acked()
+    if not publisher.wait_for_all_acked(Duration(seconds=TIMEOUT)):
+        raise ValueError(f"a subscriber on {topic} does not confirm the instruction: does one of the nodes hang?")
 
 
 def resume(node: Any) -> None:

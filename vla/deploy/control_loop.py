@@ -261,9 +261,9 @@ class ControlLoop:
         actions = np.clip(actions, self.spec.low, self.spec.high)
         self._controller.reset(anchor)
         goals = [self._controller.step(action[self._motion]).copy() for action in actions]
-        openings = (
-            [self._opening] * len(actions) if self._gripper_index is None else actions[:, self._gripper_index].tolist()
-        )
+        openings = [self._opening] * len(actions)
+        if self._gripper_index is not None:  # bounds that follow from data may be beyond 0 and 1
+            openings = np.clip(actions[:, self._gripper_index], 0, 1).tolist()
         if not self._follows_positions and (measured := self._observer.newest) is not None:
             self.limiter.position = np.array(measured.joints, float)
         ends = observed + period * np.arange(1, len(actions) + 1)

@@ -76,7 +76,8 @@ class GuardedLifecycleNode(LifecycleNode):
         """Create a publisher that publishes always or only `while_active`."""
         create = self.create_lifecycle_publisher if while_active else super(LifecycleNode, self).create_publisher
         publisher = create(kind, topic, 1 if while_active else 10)
-        self._created.append((self.destroy_publisher, publisher))
+        destroy = self.destroy_lifecycle_publisher if while_active else self.destroy_publisher
+        self._created.append((destroy, publisher))
         return publisher
 
     def add_service(self, kind: Any, name: str, callback: Callable[[Any, Any], Any]) -> None:

@@ -129,7 +129,7 @@ class Mcap(FolderExporter):
     def _joint_state(self, stamp: int, spec: Spec, state: Array) -> Any:
         robot = spec.require_robot("export=mcap")
         joints, velocities = (state[spec.indices(names)] for names in (robot.joints, robot.velocities))
-        joints = joints * joint_factors(spec)
+        joints, velocities = joints * joint_factors(spec), velocities * joint_factors(spec, velocities=True)
         fingers = self._robot.fingers if robot.gripper else []
         opening = (
             [float(state[spec.indices([robot.gripper])[0]]) / len(fingers) for _ in fingers] if robot.gripper else []

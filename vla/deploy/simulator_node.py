@@ -81,6 +81,7 @@ class SimulatorNode(Node):
         self._commanded_at: float | None = None
         self._running, self._ticks = False, 0
         self._until_frame = 0.0
+        self._delayed.clear()  # images of the episode before
         self.get_logger().info(self.description)
         self._publish_episode()
 

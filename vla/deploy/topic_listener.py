@@ -42,7 +42,10 @@ class TopicListener(ABC):
             self.node.destroy_subscription(subscription)
 
     def _discover(self) -> None:
-        from rclpy.qos import QoSProfile, ReliabilityPolicy
+        from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+
+        best_effort = QoSProfile(depth=50, reliability=ReliabilityPolicy.BEST_EFFORT)  # matches every publisher
+        latched = QoSProfile(depth=50, durability=DurabilityPolicy.TRANSIENT_LOCAL)  # also what was published before
 
         for topic, kinds in self.node.get_topic_names_and_types():
             message = message_class(kinds[0]) if topic not in self._known else None
@@ -50,5 +53,9 @@ class TopicListener(ABC):
             callback = self.callback_for(topic, kinds[0]) if message is not None else None
             if callback is None:
                 continue
-            qos = QoSProfile(depth=50, reliability=ReliabilityPolicy.BEST_EFFORT)  # matches every publisher
+            offered = [info.qos_profile for info in self.node.get_publishers_info_by_topic(topic)]
+            all_latched = {(each.durability, each.reliability) for each in offered} == {
+                (latched.durability, latched.reliability)
+            }
+            qos = latched if all_latched else best_effort
             self._subscriptions.append(self.node.create_subscription(message, topic, callback, qos, raw=self.raw))

@@ -117,15 +117,16 @@ def gripper_index(spec: Spec) -> int | None:
     return spec.action.index(GRIPPER) if GRIPPER in spec.action and GRIPPER not in joints else None
 
 
-def joint_factors(spec: Spec) -> Array:
-    """Return the (J,) factors from the units of the joints in the state to [rad].
+def joint_factors(spec: Spec, velocities: bool = False) -> Array:
+    """Return the (J,) factors from the units of the joints in the state to [rad], or of their velocities to [rad/s].
 
     Raises:
         ValueError: there is no robot, or a joint has another unit.
     """
-    joints = spec.require_robot("a position in rad").joints
+    robot = spec.require_robot("a position in rad")
     units = dict(zip(spec.state, spec.state_units, strict=True))
-    return _factors([(name, units[name]) for name in joints])
+    names = robot.velocities if velocities else robot.joints
+    return _factors([(name, units[name].removesuffix("/s")) for name in names])
 
 
 def _joint_controller(spec: Spec, model: RobotModel, workspace: tuple[Point, Point] | None) -> JointController:
