@@ -487,16 +487,17 @@ def test_the_horizon_ends_at_rest(world: World) -> None:
     assert (np.abs(moved) <= ROBOT.max_speed + 1e-9).all()
 
 
-def test_the_horizon_is_continuous_with_the_commands() -> None:
+@pytest.mark.parametrize(("actions", "longest"), [(1, np.inf), (8, np.inf), (8, 0.3)])
+def test_the_horizon_is_continuous_with_the_commands(actions: int, longest: float) -> None:
     """A controller that is sent a new trajectory every tick, and one that is sent no more, keep to the limits."""
     world = World()
     generator = np.random.default_rng(0)
-    world.answer = lambda observation: generator.uniform(SPEC.low, SPEC.high, (1, 7))
+    world.answer = lambda observation: generator.uniform(SPEC.low, SPEC.high, (actions, 7))
     world.run(0.1)
     world.loop.on_instruction("go", world.now)
     sent: list[np.ndarray] = []
     for command in world.ticks(2.0):
-        ahead = [each.position for each in world.loop.horizon(world.now)]
+        ahead = [each.position for each in world.loop.horizon(world.now, longest)]
         sent.append(command.position)
         speeds = np.diff([*sent[-3:], *ahead], axis=0) / 0.02
         assert (np.abs(speeds) <= ROBOT.max_speed + 1e-9).all()

@@ -6,6 +6,7 @@ All times are seconds on one monotonic clock. Shapes: J joints, D action compone
 from __future__ import annotations
 
 import copy
+import math
 from collections import deque
 from dataclasses import dataclass
 from enum import StrEnum
@@ -310,12 +311,17 @@ class ControlLoop:
         else:
             self._workspace.step(limiter, goal, remaining)
 
-    def horizon(self, now: float) -> list[Command]:
-        """Return the commands after this tick's if no further input arrives; the last one is at rest."""
+    def horizon(self, now: float, longest: float = math.inf) -> list[Command]:
+        """Return the commands after this tick's if no further input arrives; the last one is at rest.
+
+        Args:
+            now: the time of this tick [s].
+            longest: time [s] after which the arm brakes, if the plan has not ended before.
+        """
         limiter, opening = copy.copy(self.limiter), self._opening
-        commands = []
+        commands, until = [], now + longest
         schedule = list(self._schedule) if self.state is State.RUNNING else []
-        while schedule and now < schedule[-1][0]:
+        while schedule and now < min(schedule[-1][0], until):
             now += self.tick
             end, goal, opening = _next_of(schedule, now)
             self._step(limiter, goal, end - now)

@@ -49,6 +49,9 @@ LEVELS = {
     State.FAULT: DiagnosticStatus.ERROR,
 }
 DELIVERED = Delay(seconds=1.0)  # longest wait for the last commands to arrive
+AHEAD = (
+    0.3  # of a plan in every trajectory, which the next tick replaces; all of a long one takes longer than a tick [s]
+)
 MAX_MESSAGE = 300  # length of a log line or status message [characters]
 COMMANDS = {
     "joint_state": JointState,
@@ -429,7 +432,7 @@ class PolicyNode(GuardedLifecycleNode):
             message = messages.fill_joint_state(JointState(), robot, command)
             message.header.stamp = self.get_clock().now().to_msg()
         elif self._command_type == "trajectory":
-            ahead = [command, *self.loop.horizon(now)]  # the next trajectory replaces all points after the first
+            ahead = [command, *self.loop.horizon(now, AHEAD)]  # the next trajectory replaces all points after the first
             message = self._fill_trajectory(JointTrajectory(), ahead)
         elif self._command_type == "twist":
             frame = self.settings.twist_frame or self.policy.spec.require_robot("deployment").frame
