@@ -49,9 +49,8 @@ LEVELS = {
     State.FAULT: DiagnosticStatus.ERROR,
 }
 DELIVERED = Delay(seconds=1.0)  # longest wait for the last commands to arrive
-AHEAD = (
-    0.3  # of a plan in every trajectory, which the next tick replaces; all of a long one takes longer than a tick [s]
-)
+# Time of a plan in every trajectory [s]. The next tick replaces it, and all of a long plan would take more than a tick.
+AHEAD = 0.3
 MAX_MESSAGE = 300  # length of a log line or status message [characters]
 COMMANDS = {
     "joint_state": JointState,

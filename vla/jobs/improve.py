@@ -73,9 +73,10 @@ def run(experiment: Experiment) -> float:
 def _improved(experiment: Experiment, seeds: range) -> float:
     asked, output = experiment["improve"], experiment.output
     checkpoint, rounds, stores = experiment.pretrained, list[Round](), list[Path]()
-    report = read_report(output)
-    if report and len(report.rounds) <= asked["rounds"] - (checkpoint is not None):  # round_0 counts without one
-        archive_evaluation(output, len(report.rounds) - (checkpoint is None))
+    if report := read_report(output):
+        evaluated = len(report.rounds) - (checkpoint is None)  # without a policy to begin with, round_0 is there, too
+        if evaluated < asked["rounds"]:
+            archive_evaluation(output, evaluated)
     if checkpoint is None:
         checkpoint = _trained(experiment.with_values({"job": "train", "output": str(output / "round_0")}))
         rounds.append(_described(output / "round_0", None))
