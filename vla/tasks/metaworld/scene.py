@@ -18,6 +18,7 @@ CAMERA, CAMERA_PLACE = "corner2", (0.75, 0.075, 0.7)  # [m]
 LEROBOT = 480  # height and width of its pictures [px]
 HAND = "hand"  # the part of CAMERA's picture around the fingertips, in place of a camera
 MIDDLE = (0.0, 0.0, -0.075)  # of that part, 3 cm below the fingertips, from the position of the hand [m]
+CURRENT, BEFORE = slice(18), slice(18, 36)  # of an observation (39,): hand, gripper, objects now and one step before
 
 
 class Scene:
@@ -80,8 +81,11 @@ class Scene:
         goal."""
         self.simulator.seed(seed)
         observation, _ = self.simulator.reset()
-        # Goals are marked by sites of the model, which have moved: without this the first picture shows the old goal.
+        # Some tasks move bodies after the last step of physics: without this the first observation and picture still
+        # have objects and goals where the episode before, or the model's file, has them.
         mujoco.mj_kinematics(self.model, self.simulator.data)
+        current = self.simulator._get_curr_obs_combined_no_goal()
+        observation[CURRENT] = observation[BEFORE] = self.simulator._prev_obs = current
         self._changed = True
         return observation
 
