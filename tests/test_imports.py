@@ -28,7 +28,7 @@ LAYERS = (
     ("vla.policy", "vla.rollouts"),
     ("vla.config", "vla.deploy"),
     ("vla.runs", "vla.envs"),
-    ("vla.training", "vla.reports"),
+    ("vla.training", "vla.reports", "vla.api"),
     ("vla.jobs",),
     ("vla.run",),
 )

@@ -21,12 +21,14 @@ import torch
 import toy
 from clusters import PLACES, address_in, dask
 from collecting import content
-from command_line import here, vla
+from command_line import here
+from command_line import vla as vla_process
 from composing import CONF, RT1_VARIANTS, check, composed
 from conftest import made_once
 from hydra.errors import ConfigCompositionException
 
 from vla import jobs
+from vla.api import load_environment, load_policy
 from vla.config import packages
 from vla.config.adopt import adopt, finetune, resume
 from vla.config.annotations import locate
@@ -67,7 +69,7 @@ def home(installed: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder to work in, with the outcome of the main job in `run`, done by two workers in each stage."""
 
     def work(folder: Path) -> None:
-        vla(folder, "experiment=mine", *TINY, "collect.folder=episodes", "output=run")
+        vla_process(folder, "experiment=mine", *TINY, "collect.folder=episodes", "output=run")
 
     done = made_once(tmp_path_factory, "package_job", work)
     return Path(shutil.copytree(done, tmp_path_factory.mktemp("home") / "home"))
@@ -227,7 +229,7 @@ def test_workers_of_a_cluster_give_the_same_results(home: Path, importable: None
         with dask("worker", address, *local, "--nthreads", "1", "--no-nanny", PYTHONPATH=os.environ["PYTHONPATH"]):
             arguments = shlex.split(command.replace("tcp://HOST:8786", address))
             tiny = [item for item in TINY if not item.startswith("cluster.")]
-            vla(home, *arguments, *tiny, "collect.folder=remote")
+            vla_process(home, *arguments, *tiny, "collect.folder=remote")
             report = json.loads((home / "run/report.json").read_text())
             evaluating = (f"checkpoint={report['checkpoint']}", "trust=[mypackage]", "evaluate.episodes=3")
             here(home, *evaluating, *(item for item in arguments if item.startswith("cluster")), "output=evaluated")
@@ -251,6 +253,21 @@ def test_a_checkpoint_is_refused_until_the_package_is_trusted(home: Path, import
     assert json.loads((home / "again/report.json").read_text())["per_episode"] == report["per_episode"]
     here(home, *deploying, "deploy.episodes=2", "output=deployed")
     assert json.loads((home / "deployed/report.json").read_text())["episodes"] == 2
+
+
+def test_what_was_trained_here_needs_no_trust_when_it_is_used(home: Path, importable: None) -> None:
+    tiny = (*TINY, "cluster.workers=1", "validate.episodes=0", "collect.folder=episodes", "output=regression")
+    here(home, "experiment=mine", "model=regression", *tiny)
+    file = home / "regression/checkpoints/last.ckpt"
+    policy, world = load_policy(file), load_environment(file)
+    assert type(policy.model).__name__ == "Regression" and not policy.model.uses_tokens
+    observation, _ = world.reset(seed=1_000_000)
+    policy.reset(observation["instruction"], 0)
+    assert world.action_space.contains(policy.act(observation))
+    here(home, f"checkpoint={file}", "evaluate.episodes=1", "cluster.workers=1", "output=used")
+    shutil.copytree(home / "regression", home / "somebody_elses")
+    with pytest.raises(ValueError, match=r"names mypackage\.\w+\.\w+, which is not trusted"):
+        load_environment(home / "somebody_elses/checkpoints/last.ckpt")
 
 
 def test_a_checkpoint_never_trusts_itself(importable: None, tmp_path: Path) -> None:

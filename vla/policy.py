@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from copy import copy
 from typing import Any, Literal
 
@@ -81,12 +81,16 @@ class Policy:
         self._instruction = instruction
         self._text = self.model.text.tokenize([instruction, *self._padding_sentences])[:1].to(self.device)
 
-    def act(self, observation: Observation) -> Array:
+    def act(self, observation: Observation | Mapping[str, Any]) -> Array:
         """Return the action to execute, (D,) float32, clipped to the spec; `info` may have token probabilities (D, K).
+
+        An observation may also be that of `vla.api.load_environment`.
 
         Raises:
             ValueError: the observation does not match the spec.
         """
+        if not isinstance(observation, Observation):
+            observation = Observation.from_mapping(observation, self.spec)
         self._follow(observation.instruction)
         if self.looks:
             self._observe(observation)

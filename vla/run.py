@@ -26,7 +26,7 @@ from vla.config.annotations import packages, targets
 from vla.config.check import Job, check, devices
 from vla.config.compose import CONF  # registers the resolver `jobs` of --help
 from vla.config.experiment import Experiment, plain
-from vla.config.packages import config_folders, offer_options, option_packages, trust
+from vla.config.packages import config_folders, offer_options, option_packages, trust, trust_own
 from vla.config.substitutes import builds_world, with_substitutes
 from vla.deploy import ros
 from vla.io.suggestion import suggestion
@@ -199,6 +199,9 @@ def _adopted(cfg: DictConfig, overrides: list[str]) -> DictConfig:
             )
     if cfg.resume is cfg.pretrained is cfg.checkpoint is None:
         return cfg
+    for file in (cfg.resume, cfg.pretrained, cfg.checkpoint):
+        if file is not None:
+            trust_own(Path(file))
     from vla.config.adopt import adopt, finetune, resume  # imports PyTorch, as the next one does
     from vla.runs.resume import interrupted_run
 

@@ -208,6 +208,18 @@ class Observation:
     depth: dict[str, Array] = field(default_factory=dict)  # camera → (H, W) uint16 [mm], 0: no return (ROS 16UC1)
     truth: dict[str, Array] | None = None  # simulator only: for experts, never for policies
 
+    @classmethod
+    def from_mapping(cls, values: Mapping[str, Any], spec: Spec) -> Observation:
+        """Take an observation of an environment of gymnasium: an image per camera, "state" and "instruction".
+
+        Raises:
+            ValueError: one of them is missing.
+        """
+        if missing := [name for name in (*spec.cameras, "state", "instruction") if name not in values]:
+            raise ValueError(f"the observation has {', '.join(map(str, values))}, but lacks {', '.join(missing)}")
+        rgb = {camera: values[camera] for camera in spec.cameras}
+        return cls(rgb, values["state"], values["instruction"])
+
 
 @dataclass(frozen=True)
 class Shape:

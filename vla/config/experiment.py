@@ -277,23 +277,6 @@ def make_policy(policy: Node, checkpoint: Path, environment: Environment | None 
         ) from error
 
 
-def load_policy(checkpoint: Path | str, device: str = "auto", precision: str = "fp32") -> Policy:
-    """Load the policy in a checkpoint, for programs of one's own.
-
-    It contains no code, but names classes: of other packages only those that `VLA_TRUST` lists are built.
-
-    Args:
-        checkpoint: the file.
-        device: such as "cpu" or "cuda"; "auto": a GPU if there is one.
-        precision: "fp32" or "bf16".
-
-    Raises:
-        ValueError: there is no such file, it is damaged, or it names a class that is not trusted.
-    """
-    options = {"device": device, "precision": precision, "compile": False}
-    return make_policy({"_target_": "vla.policy.Policy", **options}, Path(checkpoint))
-
-
 def training_policy(precision: str, model: Model) -> Policy:
     """Build the policy of a model in training, on the model's device and without a second compilation or an export."""
     here = {"device": next(model.parameters()).device.type, "precision": precision, "compile": False}

@@ -6,19 +6,27 @@ are built only if the user trusts the package by name, or chooses the class on t
 
 from __future__ import annotations
 
+import logging
 import os
 import re
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from functools import cache
 from importlib.metadata import entry_points, packages_distributions, requires
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
+from filelock import FileLock
 from hydra.core.config_search_path import ConfigSearchPath
 from hydra.core.plugins import Plugins
 from hydra.plugins.search_path_plugin import SearchPathPlugin
+
+from vla.io.documents import read_json
+from vla.io.files import write_json
+
+log = logging.getLogger(__name__)
 
 TRUST = "VLA_TRUST"  # environment variable of the user: packages, separated by commas
 TRUSTED = "VLA_TRUSTED"  # environment variable that passes trusted packages and classes to child processes
@@ -93,15 +101,65 @@ def trust(packages: Any, chosen: Iterable[Any], used: Iterable[Any] = ()) -> Non
     used = [name for name in used if name != MISSING]
     named = [*packages, *_names(TRUST), *used]
     for name in named:
-        if not isinstance(name, str) or not can_be_trusted(name):
-            key = "package" if name in used else "trust"
-            raise ValueError(
-                f"{key} cannot name {name!r}: it takes packages made for vla or gymnasium, by the name that "
-                "is imported, without a module: their distribution depends on one of these"
-            )
+        _require_trustworthy("package" if name in used else "trust", name)
     offering = option_packages()
     classes = {each for each in chosen if isinstance(each, str) and each.partition(".")[0] in offering}
     os.environ[TRUSTED] = ",".join(sorted({*named, *classes}))
+
+
+@contextmanager
+def trusting(packages: Sequence[str], checkpoint: Path) -> Iterator[None]:
+    """Trust further packages within the context, and what this user trusted in the training of a checkpoint.
+
+    Raises:
+        ValueError: a package cannot be trusted.
+    """
+    if isinstance(packages, str):
+        raise ValueError(f"trust must be a list of packages, as in trust=[{packages!r}], got {packages!r}")
+    for name in packages:
+        _require_trustworthy("trust", name)
+    before = os.environ.get(TRUSTED)
+    os.environ[TRUSTED] = ",".join(sorted({*trusted(), *packages}))
+    try:
+        trust_own(checkpoint)
+        yield
+    finally:
+        del os.environ[TRUSTED]
+        if before is not None:
+            os.environ[TRUSTED] = before
+
+
+def _own_trainings() -> Path:
+    """Return the file, outside all runs, that says what this user trusted in which folder of a training."""
+    state = os.environ.get("XDG_STATE_HOME") or Path.home() / ".local/state"
+    return Path(state) / "vla" / "trusted.json"
+
+
+def remember_trust(run: Path) -> None:
+    """Note what is trusted for the training in a folder: its policies are trusted as much when they are used."""
+    file = _own_trainings()
+    try:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        with FileLock(f"{file}.lock"):
+            known = read_json(file, dict[str, list[str]]) if file.exists() else {}
+            if trusted() != known.get(str(run.resolve()), []):
+                known = {folder: names for folder, names in known.items() if Path(folder).is_dir()}
+                write_json(file, known | {str(run.resolve()): trusted()})
+    except (OSError, ValueError) as error:
+        log.warning("policies of this training need trust=[…] when they are used: %s", error)
+
+
+def trust_own(path: Path) -> None:
+    """Trust what this user trusted in the training whose folder is, or holds, `path`; else nothing further."""
+    try:
+        known = read_json(_own_trainings(), dict[str, list[str]]) if _own_trainings().exists() else {}
+    except (OSError, ValueError) as error:
+        log.warning("what was trusted in earlier trainings is unknown: %s", error)
+        return
+    folders = [path.resolve(), *path.resolve().parents]
+    os.environ[TRUSTED] = ",".join(
+        sorted({*trusted(), *(name for each in folders for name in known.get(str(each), []))})
+    )
 
 
 def trusted() -> list[str]:
@@ -113,6 +171,14 @@ def is_trusted(target: str) -> bool:
     """Return whether the third-party class `target` may be built."""
     matches = any(f"{target}.".startswith(f"{name}.") for name in trusted())
     return matches and can_be_trusted(target.partition(".")[0])
+
+
+def _require_trustworthy(key: str, name: Any) -> None:
+    if not isinstance(name, str) or not can_be_trusted(name):
+        raise ValueError(
+            f"{key} cannot name {name!r}: it takes packages made for vla or gymnasium, by the name that "
+            "is imported, without a module: their distribution depends on one of these"
+        )
 
 
 @cache

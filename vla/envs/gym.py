@@ -17,6 +17,16 @@ UNBOUNDED = np.finfo(np.float32).max
 LETTERS = "".join(filter(str.isprintable, map(chr, range(0x10000))))  # of an instruction in most languages
 
 
+class Sentence(Text):
+    """Space of instructions; its text names no characters, of which there are 60 000."""
+
+    def __init__(self) -> None:
+        super().__init__(LONGEST_INSTRUCTION, min_length=0, charset=LETTERS)
+
+    def __repr__(self) -> str:
+        return f"Text({self.min_length}, {self.max_length})"
+
+
 class GymEnvironment(gymnasium.Env[dict[str, Any], Array]):
     """Adapter of an `Environment` to gymnasium.
 
@@ -36,7 +46,7 @@ class GymEnvironment(gymnasium.Env[dict[str, Any], Array]):
             {
                 **{camera: Box(0, 255, (*spec.image_size, 3), np.uint8) for camera in spec.cameras},
                 "state": Box(-UNBOUNDED, UNBOUNDED, (len(spec.state),), np.float32),
-                "instruction": Text(LONGEST_INSTRUCTION, min_length=0, charset=LETTERS),
+                "instruction": Sentence(),
             }
         )
         self.action_space = Box(np.array(spec.low, np.float32), np.array(spec.high, np.float32), dtype=np.float32)

@@ -14,6 +14,7 @@ from lightning import Callback, LightningModule, Trainer
 
 from vla.config.check import TRAINING, Job
 from vla.config.experiment import Experiment, training_policy
+from vla.config.packages import remember_trust
 from vla.data.episodes import EpisodeStore
 from vla.io.files import warn_on_error, writing
 from vla.jobs.collect import demonstration_spec, demonstrations
@@ -151,6 +152,7 @@ class _Begun(Callback):
             training = read_training(self._experiment.output)
             archive_evaluation(self._experiment.output, training.steps if training else 0)
             save_config(self._experiment.output, self._experiment.config, self._experiment.changes)
+            remember_trust(self._experiment.output)
 
 
 def _endless(experiment: Experiment) -> bool:

@@ -45,16 +45,6 @@ class ChunkModel(OneFrameModel):
         context = torch.stack([self.fused_token(hidden), *others], 1)
         return {"context": context, **self.predict_truth(hidden.unsqueeze(1))}
 
-    def scaled(self, action: Tensor) -> Tensor:
-        """Scale (…, D) actions so that the bounds of the tokenizer become -1 and 1; nothing is clipped."""
-        low, high = self.tokenizer.low, self.tokenizer.high
-        return 2 * (action - low) / (high - low) - 1
-
-    def unscaled(self, scaled: Tensor) -> Tensor:
-        """Invert `scaled`: (…, D) numbers to float32 actions."""
-        low, high = self.tokenizer.low, self.tokenizer.high
-        return (scaled.float() + 1) / 2 * (high - low) + low
-
 
 def transformer_decoder(width: int, layers: int, heads: int) -> nn.Module:
     """Build a pre-norm transformer decoder without dropout."""

@@ -175,6 +175,16 @@ class Model(nn.Module, ABC):
         """Return truth: (B, T', S), normalised, given (B, T', …) features; nothing without an auxiliary head."""
         return {} if self.truth_head is None else {"truth": self.truth_head(features)}
 
+    def scaled(self, action: Tensor) -> Tensor:
+        """Scale (…, D) actions so that the bounds of the tokenizer become -1 and 1; nothing is clipped."""
+        low, high = self.tokenizer.low, self.tokenizer.high
+        return 2 * (action - low) / (high - low) - 1
+
+    def unscaled(self, scaled: Tensor) -> Tensor:
+        """Invert `scaled`: (…, D) numbers to float32 actions."""
+        low, high = self.tokenizer.low, self.tokenizer.high
+        return (scaled.float() + 1) / 2 * (high - low) + low
+
     @abstractmethod
     def forward(self, batch: Batch) -> dict[str, Tensor]:
         """Return the inputs of `action_loss` for the last T' of the T frames; this part is compiled.

@@ -1,0 +1,106 @@
+"""The page on Python: its programs run one after the other, and trust is an argument."""
+
+from __future__ import annotations
+
+import os
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from documented import ROOT
+
+from vla.api import load_environment, load_policy
+from vla.config import packages
+from vla.data.episodes import EpisodeStore
+from vla.envs.gym import GymEnvironment
+from vla.policy import Policy
+from vla.spec import Observation
+
+PAGE = (ROOT / "docs/python.md").read_text(encoding="utf-8")
+CHECKPOINT = "run/checkpoints/last.ckpt"
+
+
+@pytest.fixture
+def state(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder of what this user trusted, and nothing that is trusted now."""
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
+    monkeypatch.setenv(packages.TRUSTED, "")
+    return tmp_path / "state"
+
+
+def test_the_page_is_short_and_its_programs_run(
+    home: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert len(PAGE.splitlines()) <= 80
+    monkeypatch.chdir(home)
+    store = next(path for path in home.rglob("index.jsonl")).parent
+    names: dict[str, object] = {}
+    blocks = re.findall(r"^```python\n(.*?)^```", PAGE, re.MULTILINE | re.DOTALL)
+    assert len(blocks) == 3
+    for block in blocks:
+        exec(block.replace("RUN", "run").replace("STORE", str(store)), names)
+    assert (home / "loss.png").stat().st_size > 10_000
+    printed = capsys.readouterr().out
+    assert re.search(r" of \d+, \d+-\d+ %", printed) and "Dict(" in printed and len(printed) < 5000
+    world, policy = names["world"], names["policy"]
+    assert isinstance(world, GymEnvironment) and isinstance(policy, Policy)
+    world.close()
+    with pytest.raises(ValueError, match=r"^the observation has state, but lacks front, wrist, instruction$"):
+        policy.act({"state": np.zeros(3)})
+
+
+def test_the_policy_acts_in_the_world_as_it_was_evaluated(home: Path) -> None:
+    policy, world = load_policy(home / CHECKPOINT), load_environment(home / CHECKPOINT)
+    observation, _ = world.reset(seed=1_000_000)
+    policy.reset(observation["instruction"], 1_000_000)
+    same = Observation.from_mapping(observation, policy.spec)
+    acted = policy.act(observation)
+    policy.reset(observation["instruction"], 1_000_000)
+    np.testing.assert_array_equal(acted, policy.act(same))
+    world.close()
+    changed = load_environment(home / CHECKPOINT, changes={"time_limit": 0.1})
+    changed.reset(seed=1_000_000)
+    assert changed.step(acted)[3]  # truncated
+    changed.close()
+
+
+def test_trust_is_an_argument_of_packages(home: Path, state: Path) -> None:
+    for load in (load_policy, load_environment):
+        for wrong in ("torch", "os"):
+            with pytest.raises(ValueError, match=f"^trust cannot name '{wrong}': it takes packages made for vla"):
+                load(home / CHECKPOINT, trust=[wrong])
+        with pytest.raises(ValueError, match=r"^trust must be a list of packages"):
+            load(home / CHECKPOINT, trust="documented")
+    load_policy(home / CHECKPOINT, trust=["documented"])  # without a distribution, as a module of one's own
+    assert os.environ[packages.TRUSTED] == "" and not state.exists()
+
+
+def test_what_was_trusted_in_a_training_is_trusted_for_its_policies_only(state: Path, tmp_path: Path) -> None:
+    mine, theirs = tmp_path / "mine", tmp_path / "theirs"
+    for folder in (mine, theirs):
+        (folder / "checkpoints").mkdir(parents=True)
+    with packages.trusting(["documented"], theirs):
+        packages.remember_trust(mine)
+    packages.trust_own(theirs / "checkpoints/last.ckpt")
+    assert packages.trusted() == []
+    with packages.trusting([], mine / "checkpoints/last.ckpt"):
+        assert packages.trusted() == ["documented"]
+    packages.remember_trust(mine)  # a later training there that trusts nothing
+    packages.trust_own(mine)
+    assert packages.trusted() == []
+
+
+def test_a_damaged_list_of_what_was_trusted_trusts_nothing(
+    state: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    (state / "vla").mkdir(parents=True)
+    (state / "vla/trusted.json").write_text('{"": 3}')
+    packages.trust_own(tmp_path)
+    assert packages.trusted() == [] and "what was trusted in earlier trainings is unknown" in caplog.text
+
+
+def test_a_store_is_arrays(folder: Path) -> None:
+    store = EpisodeStore(folder)
+    rows = store.read(store.episodes[-1])
+    np.testing.assert_array_equal(rows["action"], store.rows("action")[store.episodes[-1].span])
