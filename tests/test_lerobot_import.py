@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import io
-import json
 import os
 import shutil
-from collections.abc import Callable
 from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
@@ -18,6 +15,20 @@ import pyarrow.parquet as pq
 import pytest
 from defaults import defaults_of
 from exporting import exporter, stored
+from lerobot_files import (
+    EPISODES,
+    PICTURE,
+    ROWS,
+    VIDEO,
+    as_pictures,
+    changed_info,
+    changed_table,
+    copied,
+    demonstrations,
+    imported,
+    made,
+    png,
+)
 from PIL import Image
 from toy import ARM, ARM_SPEC, make_arm
 from toy_episodes import content
@@ -25,7 +36,6 @@ from toy_episodes import content
 from vla.config.experiment import make_expert
 from vla.data.episodes import EpisodeStore
 from vla.data.formats import lerobot_tables as tables
-from vla.data.formats.lerobot_import import LeRobotDemonstrations
 from vla.data.formats.video import encode
 from vla.spec import Spec
 
@@ -34,21 +44,8 @@ OTHER = replace(ARM_SPEC, state=("north", "south"), state_units=("m", "m"), robo
 
 @pytest.fixture(scope="module")
 def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A `store` of three episodes, and the `dataset` made of it."""
-    home = tmp_path_factory.mktemp("home")
-    exporter("lerobot", home / "dataset", "export.crf=5").export(stored(home / "store", seeds=range(3))[0])
-    return home
-
-
-def demonstrations(folder: Path | str | None, spec: Spec, **options: Any) -> LeRobotDemonstrations:
-    return LeRobotDemonstrations(**defaults_of("expert/lerobot", folder=folder, **options), spec=spec)
-
-
-def imported(dataset: Path, folder: Path, episodes: int = 3) -> EpisodeStore:
-    expert = demonstrations(str(dataset), ARM_SPEC)
-    store = EpisodeStore.create_or_open(folder, expert.spec, {})
-    expert.fill(store, episodes)
-    return store
+    """See `made`."""
+    return made(tmp_path_factory.mktemp("home"))
 
 
 def test_what_was_exported_comes_back(home: Path, tmp_path: Path) -> None:
@@ -62,7 +59,7 @@ def test_what_was_exported_comes_back(home: Path, tmp_path: Path) -> None:
         for camera in ARM_SPEC.cameras:
             assert np.abs(rows[f"rgb_{camera}"].astype(float) - expected[f"rgb_{camera}"]).mean() < 10
             assert not rows[f"depth_{camera}"].any()
-        assert here.draws == {"recorded": {"episode": here.seed, "lacks": ["depth"]}}
+        assert here.draws == {"recorded": {"episode": here.seed, "lacks": ["depth"], "first_step": 0}}
 
 
 def test_depth_comes_back_bit_for_bit_if_it_was_exported(home: Path, tmp_path: Path) -> None:
@@ -85,28 +82,6 @@ def test_an_import_goes_on_where_it_was(home: Path, tmp_path: Path) -> None:
     other = exporter("lerobot", tmp_path / "other").export(stored(tmp_path / "another", seeds=range(4, 7))[0])
     with pytest.raises(ValueError, match=r"holds other episodes than these: choose another collect\.folder"):
         imported(other, tmp_path / "store")
-
-
-def copied(home: Path, folder: Path) -> Path:
-    """A copy of the dataset as others would write it, without checksums."""
-    dataset = Path(shutil.copytree(home / "dataset", folder))
-    (dataset / "meta/checksums.json").unlink()
-    return dataset
-
-
-def changed_info(home: Path, tmp_path: Path, change: Callable[[Any], None]) -> Path:
-    """A copy of the dataset whose description was changed."""
-    dataset = copied(home, tmp_path / "dataset")
-    info = json.loads((dataset / "meta/info.json").read_text())
-    change(info)
-    (dataset / "meta/info.json").write_text(json.dumps(info))
-    return dataset
-
-
-def changed_table(path: Path, name: str, values: Callable[[pa.Table], pa.Array]) -> None:
-    """Replace a column of a table."""
-    table = pq.read_table(path)
-    pq.write_table(table.set_column(table.column_names.index(name), name, values(table)), path)
 
 
 def test_what_other_people_leave_out_is_made_up_and_said(home: Path, tmp_path: Path) -> None:
@@ -178,31 +153,6 @@ def test_all_differences_are_named_at_once(home: Path, tmp_path: Path) -> None:
         demonstrations(str(changed_info(home, tmp_path, foreign)), ARM_SPEC)
 
 
-def as_pictures(home: Path, folder: Path, size: tuple[int, int] = (16, 16)) -> Path:
-    """The dataset of `home` with its images as PNG within the table, as LeRobot writes it with `use_videos=False`."""
-    dataset, store = copied(home, folder), EpisodeStore(home / "store")
-    shutil.rmtree(dataset / "videos")
-    info = json.loads((dataset / "meta/info.json").read_text())
-    path = dataset / "data/chunk-000/file-000.parquet"
-    table = pq.read_table(path)
-    for camera in ARM_SPEC.cameras:
-        key = f"observation.images.{camera}"
-        info["features"][key] = {"dtype": "image", "shape": [3, 16, 16], "names": ["channels", "height", "width"]}
-        pictures = []
-        for step, image in enumerate(np.asarray(store.rows(f"rgb_{camera}"))):
-            file = io.BytesIO()
-            Image.fromarray(image).resize(size).save(file, "PNG")
-            pictures.append({"bytes": file.getvalue(), "path": f"../../frame-{step:06d}.png"})
-        kind = pa.struct({"bytes": pa.binary(), "path": pa.string()})
-        table = table.append_column(key, pa.array(pictures, kind))
-    pq.write_table(table, path)
-    (dataset / "meta/info.json").write_text(json.dumps(info))
-    path = dataset / "meta/episodes/chunk-000/file-000.parquet"
-    table = pq.read_table(path)
-    pq.write_table(table.drop_columns([name for name in table.column_names if name.startswith("videos/")]), path)
-    return dataset
-
-
 def test_pictures_in_the_table_come_back_bit_for_bit(home: Path, tmp_path: Path) -> None:
     before, after = EpisodeStore(home / "store"), imported(as_pictures(home, tmp_path / "data"), tmp_path / "store")
     for there, here in zip(before.episodes, after.episodes, strict=True):
@@ -213,20 +163,28 @@ def test_pictures_in_the_table_come_back_bit_for_bit(home: Path, tmp_path: Path)
 
 def test_pictures_of_another_kind_are_refused_by_name(home: Path, tmp_path: Path) -> None:
     path, key = "data/chunk-000/file-000.parquet", "observation.images.front"
-    with pytest.raises(ValueError, match=rf"{path}: {key} of episode 0: the image is 300 x 400 pixels of RGB"):
-        demonstrations(str(as_pictures(home, tmp_path / "large", (400, 300))), ARM_SPEC).episode(0)
-    kinds: dict[str, Callable[[pa.Table], pa.Array]] = {
-        "lacks images": lambda table: pa.array(
-            [{"bytes": None, "path": "a.png"}] * len(table), pa.struct({"bytes": pa.binary(), "path": pa.string()})
-        ),
-        "cannot be decoded": lambda table: pa.array([{"bytes": b"\x89PNG", "path": ""}] * len(table)),
-        "does not hold images": lambda table: pa.array(["a.png"] * len(table)),
+    with pytest.raises(ValueError, match=rf"{key} of episode 0, step 0: the image is 300 x 400 pixels of RGB, not 16"):
+        demonstrations(as_pictures(home, tmp_path / "large", lambda image: png(image.resize((400, 300)))), ARM_SPEC)
+    deep = as_pictures(home, tmp_path / "deep", lambda image: png(image.convert("I;16")))
+    with pytest.raises(ValueError, match=r"16 x 16 pixels of I;16, not 16 x 16 of RGB, RGBA, L, LA, P"):
+        demonstrations(deep, ARM_SPEC)
+    cells: dict[str, Any] = {
+        "there is no image: correct the dataset": {"bytes": None, "path": None},
+        r"no image but the path 'a\.png', which is no file in the folder of the dataset": {"path": "a.png"},
+        r"no image but the path '\.\./a\.png'": {"path": "../a.png"},
+        r"cannot be decoded: it is not PNG or JPEG or WEBP$": {"bytes": b"GIF89a"},
+        r"cannot be decoded \(": {"bytes": png(Image.new("RGB", (16, 16)))[:45]},
     }
-    for number, (says, values) in enumerate(kinds.items()):
-        dataset = as_pictures(home, tmp_path / f"data{number}")
-        changed_table(dataset / path, key, values)
-        with pytest.raises(ValueError, match=rf"{path}.*{says}"):
-            demonstrations(str(dataset), ARM_SPEC).episode(0)
+    (tmp_path / "a.png").write_bytes(png(Image.new("RGB", (16, 16))))
+    dataset = as_pictures(home, tmp_path / "data")
+    for says, cell in cells.items():
+        changed_table(dataset / path, key, lambda table, cell=cell: pa.array([cell] * len(table), PICTURE))
+        with pytest.raises(ValueError, match=rf"{key} of episode 0, step 0: .*{says}") as caught:
+            demonstrations(dataset, ARM_SPEC)
+        assert "copy the dataset" not in str(caught.value)
+    changed_table(dataset / path, key, lambda table: pa.array(["a.png"] * len(table)))
+    with pytest.raises(ValueError, match=rf"{path}: {key} does not hold images"):
+        demonstrations(dataset, ARM_SPEC)
 
 
 def test_a_recording_does_not_act(home: Path) -> None:
@@ -241,9 +199,15 @@ def test_what_cannot_be_read_is_named(home: Path, tmp_path: Path) -> None:
         demonstrations(None, ARM_SPEC)
     with pytest.raises(ValueError, match=r"no LeRobot dataset in .*nowhere"):
         demonstrations(str(tmp_path / "nowhere"), ARM_SPEC)
-    old = changed_info(home, tmp_path / "old", lambda info: info.update(codebase_version="v2.1"))
-    with pytest.raises(ValueError, match=r"info\.json has version v2\.1: convert the dataset to v3\.0"):
-        demonstrations(str(old), ARM_SPEC)
+    for number, (version, says) in enumerate({
+        "v2.1": r"has version v2\.1: convert the dataset to v3\.0 with lerobot",
+        "v3.1": r"has version v3\.1, newer than v3\.0, which is read here: look for a newer vla",
+        "v10.0": r"has version v10\.0, newer than v3\.0",
+        None: r"has no version, but None: write or convert the dataset to v3\.0",
+    }.items()):  # fmt: skip
+        other = changed_info(home, tmp_path / str(number), lambda info, new=version: info.update(codebase_version=new))
+        with pytest.raises(ValueError, match=rf"info\.json {says}"):
+            demonstrations(str(other), ARM_SPEC)
     with pytest.raises(ValueError, match=r"info\.json is damaged or of another kind: features: Field required"):
         demonstrations(str(changed_info(home, tmp_path / "bare", lambda info: info.pop("features"))), spec=ARM_SPEC)
     for name, says in {
@@ -255,7 +219,7 @@ def test_what_cannot_be_read_is_named(home: Path, tmp_path: Path) -> None:
         dataset = copied(home, tmp_path / name.replace("/", "_"))
         (dataset / name).write_bytes((dataset / name).read_bytes()[:100])
         with pytest.raises(ValueError, match=says):
-            demonstrations(str(dataset), ARM_SPEC).episode(0)
+            demonstrations(str(dataset), ARM_SPEC)
 
 
 @pytest.mark.parametrize(
@@ -275,10 +239,15 @@ def test_a_pipe_is_not_read(home: Path, tmp_path: Path, name: str) -> None:
 
 def test_an_episode_that_the_data_does_not_hold_is_refused(home: Path, tmp_path: Path) -> None:
     dataset = copied(home, tmp_path / "dataset")
-    path = dataset / "data/chunk-000/file-000.parquet"
-    rows = pq.read_table(path)
-    pq.write_table(rows.slice(0, len(rows) - 1), path)
-    with pytest.raises(ValueError, match="metadata of episode 2 contradicts the data"):
+    rows = pq.read_table(dataset / ROWS)
+    steps = int(np.sum(np.array(rows["episode_index"]) == 2))
+    pq.write_table(rows.slice(0, len(rows) - 1), dataset / ROWS)
+    with pytest.raises(ValueError, match=rf"holds {steps - 1} of the {steps} steps of episode 2: copy the dataset aga"):
+        demonstrations(str(dataset), ARM_SPEC)
+    pq.write_table(pa.concat_tables([rows, rows.slice(0, 1)]), dataset / ROWS)
+    with pytest.raises(
+        ValueError, match=r"steps of episode 0, for which meta/episodes counts \d+: correct the dataset"
+    ):
         demonstrations(str(dataset), ARM_SPEC)
 
 
@@ -298,7 +267,8 @@ def test_an_episode_that_the_data_does_not_hold_is_refused(home: Path, tmp_path:
             {"features": {"a" * 10_000: {"dtype": "float32", "shape": [3]}}},
             r"no vector observation\.state, it has a{500}$",
         ),
-        ({"codebase_version": ["v3.0"] * 1000}, r"version \['v3\.0', .{1,12}: convert"),
+        ({"codebase_version": ["v3.0"] * 1000}, r"has no version, but \['v3\.0', .{1,12}: write or convert"),
+        ({"total_frames": -1}, r"total_frames: Input should be greater than or equal to 0"),
     ],
 )
 def test_nonsense_in_the_description_is_refused_by_name(
@@ -316,20 +286,14 @@ def test_a_description_nested_without_end_is_refused(home: Path, tmp_path: Path)
         demonstrations(str(dataset), ARM_SPEC)
 
 
-VIDEO, EPISODES, ROWS = (
-    "videos/observation.images.front/",
-    "meta/episodes/chunk-000/file-000.parquet",
-    "data/chunk-000/file-000.parquet",
-)
-
-
 @pytest.mark.parametrize(
     ("file", "column", "value", "says"),
     [
         (EPISODES, f"{VIDEO}chunk_index", None, "integers from 0 on"),
         (EPISODES, f"{VIDEO}chunk_index", "../../x", "integers from 0 on"),
         (EPISODES, f"{VIDEO}file_index", -1, "integers from 0 on"),
-        (EPISODES, "data/file_index", 1.5, "integers from 0 on"),
+        (EPISODES, "episode_index", 1.5, "integers from 0 on"),
+        (EPISODES, "episode_index", 0, "lists episode 0 more than once"),
         (EPISODES, "dataset_to_index", 2**62, "integers from 0 on"),
         (EPISODES, f"{VIDEO}from_timestamp", float("nan"), "seconds"),
         (EPISODES, f"{VIDEO}from_timestamp", float("inf"), "seconds"),
@@ -337,8 +301,8 @@ VIDEO, EPISODES, ROWS = (
         (EPISODES, f"{VIDEO}from_timestamp", "0", "seconds"),
         (ROWS, "action", "push", "lists of numbers"),
         (ROWS, "action", ["a", "b", "c"], "lists of numbers"),
-        (ROWS, "action", [0.0, float("nan"), 0.0], "3 finite numbers"),
-        (ROWS, "action", [0.0, 0.0], "3 finite numbers"),
+        (ROWS, "action", [0.0, 0.0], r"without the 3 numbers that meta/info\.json states"),
+        (ROWS, "action", [], r"without the 3 numbers|lists of numbers"),
         (ROWS, "episode_index", None, "integers from 0 on"),
         ("meta/tasks.parquet", "task", None, "text"),
         ("meta/tasks.parquet", "task", "a" * 1001, "tasks of more than 1000 characters: 0"),
@@ -350,8 +314,9 @@ def test_nonsense_in_a_table_is_refused_by_name(
 ) -> None:
     dataset = copied(home, tmp_path / "dataset")
     changed_table(dataset / file, column, lambda table: pa.array([value] * len(table)))
-    with pytest.raises(ValueError, match=rf"{file.split('/chunk')[0]}.*{says}"):
+    with pytest.raises(ValueError, match=rf"{file.split('/chunk')[0]}.*{says}") as caught:
         demonstrations(str(dataset), ARM_SPEC)
+    assert "copy the dataset" not in str(caught.value)  # which would not help
 
 
 @pytest.mark.parametrize(

@@ -32,9 +32,12 @@ from vla.spec import Array, Spec
 GOLDEN = 2654435769
 
 
-def held_out(seed: Seed, fraction: float) -> bool:
-    """Return whether the episode of `seed` is held out for validation, independently of other episodes."""
-    return seed * GOLDEN % 2**32 < fraction * 2**32
+def held_out(recording: int, fraction: float) -> bool:
+    """Return whether an episode is held out for validation, independently of others, by its `Entry.recording`.
+
+    Parts of one recorded episode, which show the same scene, are thus held out together.
+    """
+    return recording * GOLDEN % 2**32 < fraction * 2**32
 
 
 def digest_of(episodes: Sequence[Entry]) -> str:
@@ -146,7 +149,7 @@ class WindowDataModule(LightningDataModule):
             there = store.spec if store.spec.truth else replace(store.spec, truth=self._spec.truth)
             self._spec.require(there, "the model", f"the episode store {store.folder}")
             for entry in store.episodes:
-                side = unseen if held_out(entry.seed, self._fraction) else trained
+                side = unseen if held_out(entry.recording, self._fraction) else trained
                 side.append(first + np.arange(entry.start, entry.end))
         episodes = [entry for store in stores for entry in store.episodes]
         if not trained or (self._fraction > 0 and not unseen):

@@ -15,12 +15,13 @@ from functools import cache
 from pathlib import Path
 
 import numpy as np
-from PIL import Image
+from PIL import Image, UnidentifiedImageError
 
 from vla.parallel.limits import cores
 from vla.spec import Array
 
 JPEG, ZLIB = "jpeg", "zlib"
+MODES = ("RGB", "RGBA", "L", "LA", "P")  # of Pillow, with 8 bits per channel
 OFFSET = np.dtype("<u8")
 LEVEL = 6  # of zlib: 9 takes four times as long to save 2 %
 
@@ -94,7 +95,7 @@ class PackedRows:
     def _decode(self, packed: Array) -> Array:
         shape = self.shape[1:]
         if self._codec != ZLIB:
-            return decode_image(packed.data, "JPEG", shape)
+            return decode_image(packed.data, ("JPEG",), shape)
         size, stream = int(np.prod(shape)) * self.dtype.itemsize, zlib.decompressobj()
         rows = stream.decompress(packed.data, size + 1)  # bounded, against decompression bombs
         if len(rows) != size or not stream.eof or stream.unused_data:
@@ -102,17 +103,22 @@ class PackedRows:
         return np.frombuffer(rows, self.dtype).reshape(shape)
 
 
-def decode_image(packed: bytes | memoryview, format: str, shape: tuple[int, ...]) -> Array:
-    """Decode an RGB image (H, W, 3) uint8 of Pillow's `format`, only if its header has this `shape`.
+def decode_image(packed: bytes | memoryview, formats: tuple[str, ...], shape: tuple[int, ...]) -> Array:
+    """Decode an image (H, W, 3) uint8 of one of Pillow's `formats`, only if its header has this `shape`.
+
+    Grey becomes equal colours; transparency is dropped.
 
     Raises:
-        ValueError: the shape differs, or the image is damaged.
+        ValueError: the shape differs, the image is of another kind, or it is damaged.
     """
     try:
-        with Image.open(io.BytesIO(packed), formats=[format]) as image:
-            if image.mode != "RGB" or (image.height, image.width, 3) != shape:
-                raise ValueError(f"the image is {image.height} x {image.width} pixels of {image.mode}")
-            return np.asarray(image)
+        with Image.open(io.BytesIO(packed), formats=formats) as image:
+            if image.mode not in MODES or (image.height, image.width, 3) != shape:
+                size = f"{shape[0]} x {shape[1]} of {', '.join(MODES)}"
+                raise ValueError(f"the image is {image.height} x {image.width} pixels of {image.mode}, not {size}")
+            return np.asarray(image if image.mode == "RGB" else image.convert("RGB"))
+    except UnidentifiedImageError as error:  # whose text has an address in memory
+        raise ValueError(f"the image cannot be decoded: it is not {' or '.join(formats)}") from error
     except (OSError, SyntaxError, EOFError, struct.error, zlib.error, Image.DecompressionBombError) as error:
         raise ValueError(f"the image cannot be decoded ({str(error)[:200]})") from error
 

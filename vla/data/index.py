@@ -70,6 +70,13 @@ class Entry:
         return self.start + self.steps
 
     @property
+    def recording(self) -> int:
+        """Number of the recorded episode that it was or is a part of; its seed if it was not recorded."""
+        recorded = self.draws.get("recorded")
+        number = recorded.get("episode") if isinstance(recorded, dict) else None
+        return number if isinstance(number, int) else self.seed
+
+    @property
     def span(self) -> slice:
         """The rows of the episode in every field file."""
         return slice(self.start, self.end)

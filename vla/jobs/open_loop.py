@@ -99,7 +99,7 @@ def _unseen(store: EpisodeStore, more: Sequence[Path], checkpoint: Path) -> list
 
 
 def _held_out(store: EpisodeStore, fraction: float, otherwise: str) -> list[Entry]:
-    unseen = [entry for entry in store.episodes if held_out(entry.seed, fraction)]
+    unseen = [entry for entry in store.episodes if held_out(entry.recording, fraction)]
     if not unseen:
         raise ValueError(
             f"there are {len(store.episodes)} episodes in {store.folder}, but {otherwise}: record more, or set "

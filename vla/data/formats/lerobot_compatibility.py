@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping
 
 from vla.data.formats.lerobot_dataset import LeRobotDataset
+from vla.data.formats.lerobot_layout import RATE_TOLERANCE
 from vla.spec import Array, Spec
 
 # Largest share of a component's actions beyond its bounds, and tolerance relative to its range. A larger share means
@@ -20,7 +21,7 @@ Places = Mapping[str, tuple[str, int]]  # component → feature and index
 
 def mismatches(dataset: LeRobotDataset, state: Places, action: Places, spec: Spec, every: int) -> Iterator[str]:
     """Yield the differences between the spec and the metadata of a dataset of which every `every`-th frame is kept."""
-    if abs(dataset.info.fps / every - spec.control_hz) > 1e-6 * spec.control_hz:
+    if abs(dataset.info.fps / every - spec.control_hz) > RATE_TOLERANCE * spec.control_hz:
         kept = f" and expert.every={every}" if every > 1 else ""
         yield f"a rate of {dataset.info.fps:g} Hz{kept}, the task has {spec.control_hz:g} Hz"
     if missing := [camera for camera in spec.cameras if camera not in dataset.images]:

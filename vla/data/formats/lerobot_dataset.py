@@ -5,6 +5,7 @@ Shapes: N steps, D components, H by W pixels.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -14,16 +15,16 @@ import pyarrow as pa
 
 from vla.data.formats import lerobot_layout as layout
 from vla.data.formats import lerobot_tables as tables
-from vla.data.formats.lerobot_tables import REMEDY, counts, numbers
+from vla.data.formats.lerobot_episodes import OWNER, Part, read_parts, require_finite
+from vla.data.formats.lerobot_tables import MEND, REMEDY, counts, numbers
 from vla.data.formats.video import decode, require_video
 from vla.data.image_codec import decode_image
-from vla.data.index import listed
-from vla.io.documents import read_json
+from vla.io.documents import read_bounded, read_json
 from vla.io.images import resize
-from vla.spec import LONGEST_INSTRUCTION, Array
+from vla.spec import Array
 
-COLUMNS = {"episode_index": counts, "task_index": counts, "frame_index": counts, "timestamp": numbers}
 IMAGES = ("video", "image")
+PICTURES = ("PNG", "JPEG", "WEBP")  # formats of images in tables
 MOST_COMPONENTS = 10_000  # of a feature; a damaged or hostile file may name any number
 
 
@@ -34,13 +35,15 @@ class LeRobotDataset:
         folder: of the dataset.
         info: rate and features.
         images: camera → key of its colour images.
+        parts: the episodes in order, of which those with several instructions are several parts.
 
     Args:
         folder: of the dataset.
         images: camera → key; None: every feature of images, named without `observation.images.`.
 
     Raises:
-        ValueError: the dataset is missing, damaged, of another version, or names images that it does not have.
+        ValueError: the dataset is missing, incomplete, damaged, of another version, contradicts itself, names images
+            that it does not have, or has several rates.
     """
 
     def __init__(self, folder: Path, images: Mapping[str, str] | None) -> None:
@@ -51,6 +54,7 @@ class LeRobotDataset:
         self.images = {camera_of(key): key for key in there} if images is None else dict(images)
         if unknown := [key for key in self.images.values() if key not in there]:
             raise ValueError(f"expert.images: {folder} has no images {', '.join(unknown)}, it has {', '.join(there)}")
+        self.parts = read_parts(folder, self.info, [key for key in self.images.values() if self._is_video(key)])
 
     def components(self, keys: Sequence[str], anonymous: Sequence[str] = ()) -> dict[str, tuple[str, int]]:
         """Return component → its feature and index, of several features in order.
@@ -79,121 +83,124 @@ class LeRobotDataset:
         return dict(zip(names, places, strict=True))
 
     def read(self, keys: Sequence[str]) -> dict[str, Array]:
-        """Read the numbers of features, each (N, D) float32, before anything else is checked."""
-        rows = self.table("data", dict.fromkeys(keys, numbers))
-        return {key: self.matrix(rows, key) for key in keys}
-
-    def open(self, cameras: Sequence[str], keys: Sequence[str]) -> None:
-        """Load the features `keys`, whose rows `numbers` returns, and check all files that the episodes need.
+        """Read the numbers of features, each (N, D) float32, in the order of the tables.
 
         Raises:
-            ValueError: a file is missing, damaged or contradicts others; or the frames have several rates.
+            ValueError: rows are no vectors of finite numbers.
         """
-        self._videos = [
-            key for key in (self.images[camera] for camera in cameras) if self.info.features[key].dtype == "video"
-        ]
-        self._require_one_rate()
-        self._rows_of_episodes = self._read_episodes()
-        self._require_files()
-        rows = self.table("data", dict.fromkeys(keys, numbers) | COLUMNS)
-        self._matrices = {key: self.matrix(rows, key) for key in keys}
-        self._owner, self._task = (rows[name].to_numpy() for name in ("episode_index", "task_index"))
-        self._require_even(rows)
-        self._tasks = self._read_tasks()
-        for number in range(len(self)):
-            self.place(number)
-        self._require_videos()
+        rows = tables.read(tables.files(self.folder / "data"), dict.fromkeys(keys, numbers) | {OWNER: counts})
+        return {key: self._matrix(rows, key) for key in keys}
 
-    def __len__(self) -> int:
-        """Return the number of episodes."""
-        return len(self._rows_of_episodes)
+    def open(self, cameras: Sequence[str], keys: Sequence[str], depth: Sequence[str]) -> None:
+        """Load the features `keys`, which `numbers` returns, and check images and the features `depth`.
 
-    def place(self, number: int) -> tuple[slice, str]:
-        """Return the row range and the instruction of an episode."""
-        row = self._rows_of_episodes[number]
-        rows = slice(row["dataset_from_index"], row["dataset_to_index"])
-        tasks = set(self._task[rows].tolist())
-        whole = 0 <= rows.start < rows.stop <= len(self._owner) and (self._owner[rows] == number).all()
-        if row["episode_index"] != number or not whole or not tasks <= set(self._tasks):
-            raise ValueError(f"{self.folder}: the metadata of episode {number} contradicts the data: {REMEDY}")
-        if len(tasks) > 1:
-            raise ValueError(f"{self.folder} has several tasks in episode {number}: only one is supported")
-        return rows, self._tasks[tasks.pop()]
+        Of images in tables and of frames of videos, this decodes the first one of each camera.
 
-    def numbers(self, key: str, rows: slice) -> Array:
-        """Return rows of a feature, (N, D) float32."""
-        return self._matrices[key][rows]
+        Raises:
+            ValueError: a file is missing or damaged, or contradicts others.
+        """
+        self._matrices = self.read(keys)
+        images = [self.images[camera] for camera in cameras]
+        self._require_videos([key for key in images if self._is_video(key)])
+        columns = {key: tables.pictures for key in images if not self._is_video(key)}
+        for path in tables.files(self.folder / "data"):
+            tables.require(path, columns | dict.fromkeys(depth, tables.pixels))
+        for key in images:
+            next(self._decoded(self.parts[0], key, 1))
 
-    def frames(self, number: int, camera: str, size: tuple[int, int], every: int) -> Array:
-        """Return every `every`-th image of an episode, (N, H, W, 3) uint8, cropped at the centre and resized to `size`.
+    def numbers(self, key: str, part: Part) -> Array:
+        """Return a feature of the whole episode of a part, (N, D) float32."""
+        return self._matrices[key][part.rows]
+
+    def frames(self, part: Part, camera: str, size: tuple[int, int], every: int) -> Array:
+        """Return every `every`-th image of a part, (N, H, W, 3) uint8, cropped at the centre and resized to `size`.
 
         Raises:
             ValueError: images are missing or damaged.
         """
-        key, (rows, _) = self.images[camera], self.place(number)
-        images = self._decoded(number, key, rows.stop - rows.start, every)
+        images = self._decoded(part, self.images[camera], every)
         return np.stack([resize(image, size, "centre") for image in images])
 
-    def column(self, number: int, key: str, kind: tables.Kind) -> tuple[Path, pa.ChunkedArray]:
-        """Return the rows of an episode in a column that is too large for memory, and their file."""
-        path = self.folder / _place(layout.DATA, self._rows_of_episodes[number], "data")
-        return path, tables.read([path], {key: kind}, [("episode_index", "=", number)])[key]
+    def column(self, part: Part, key: str, kind: tables.Kind) -> pa.ChunkedArray:
+        """Return the rows of a part in a column that is too large for memory."""
+        column = tables.read(part.files, {key: kind}, [(OWNER, "=", part.episode)])[key]
+        return column[part.steps]
 
-    def table(self, name: str, columns: Mapping[str, tables.Kind]) -> pa.Table:
-        """Return columns of all files of a table, `data` or `meta/episodes`."""
-        paths = sorted((self.folder / name).glob("chunk-*/file-*.parquet"))
-        if not paths:
-            raise ValueError(f"{self.folder / name} holds no tables: {REMEDY}")
-        return tables.read(paths, columns)
-
-    def matrix(self, rows: pa.Table, name: str) -> Array:
+    def _matrix(self, rows: pa.Table, name: str) -> Array:
         """Return a column of lists as (N, D) float32."""
         size = self.info.features[name].shape[0]
         values = tables.matrix(rows[name], size)
         if values is None or not len(values):
-            raise ValueError(f"{self.folder}/data has rows of {name} that are not {size} finite numbers: {REMEDY}")
+            raise ValueError(
+                f"{self.folder}/data has rows of {name} without the {size} numbers that meta/info.json states: {MEND}"
+            )
+        require_finite(self.folder, name, values, rows[OWNER].to_numpy())
         return values
 
-    def _decoded(self, number: int, key: str, steps: int, every: int) -> Iterator[Array]:
-        size = self.info.features[key].image_size
-        if key not in self._videos:
-            yield from self._pictures(number, key, steps, size, every)
+    def _is_video(self, key: str) -> bool:
+        return self.info.features[key].dtype == "video"
+
+    def _decoded(self, part: Part, key: str, every: int) -> Iterator[Array]:
+        size, count = self.info.features[key].image_size, part.steps.stop - part.steps.start
+        if self._is_video(key):
+            start = self._begin(part, key) + part.steps.start / self.info.fps
+            yield from decode(self._video(part, key), start, count, layout.fraction(self.info.fps), size, every)
             return
-        row = self._rows_of_episodes[number]
-        start = row[f"videos/{key}/from_timestamp"]
-        yield from decode(self._video(row, key), start, steps, layout.fraction(self.info.fps), size, every)
-
-    def _pictures(self, number: int, key: str, steps: int, size: tuple[int, int], every: int) -> Iterator[Array]:
-        """Yield images in the table; their paths are not followed."""
-        path, column = self.column(number, key, tables.pictures)
-        if len(column) != steps:
-            raise ValueError(f"{path} lacks images {key} of episode {number}: {REMEDY}")
-        for step in range(0, steps, every):
-            content = (column[step].as_py() or {}).get("bytes")
-            if not content:
-                raise ValueError(f"{path} lacks images {key} of episode {number}: {REMEDY}")
+        column = self.column(part, key, tables.pictures)
+        for step in range(0, count, every):
             try:
-                yield decode_image(content, "PNG", (*size, 3))
+                yield decode_image(self._content(column[step].as_py() or {}), PICTURES, (*size, 3))
             except ValueError as error:
-                raise ValueError(f"{path}: {key} of episode {number}: {error}: {REMEDY}") from error
+                step += part.steps.start
+                raise ValueError(f"{self.folder}: {key} of episode {part.episode}, step {step}: {error}") from error
 
-    def _video(self, row: Mapping[str, Any], key: str) -> Path:
+    def _begin(self, part: Part, key: str) -> float:
+        """Return the time of the first step of an episode in a video [s].
+
+        Time stamps count from where the episode begins in the video. If they begin later than at 0, its first images
+        were left out, or the stamps are of another clock: then the video does not reach as far as they do.
+        """
+        begin, end = part.place[f"videos/{key}/from_timestamp"], part.place[f"videos/{key}/to_timestamp"]
+        reaches = begin + part.time + (len(part.rows) - 0.5) / self.info.fps <= end
+        return begin + part.time if reaches else begin
+
+    def _content(self, picture: Mapping[str, Any]) -> bytes:
+        """Return an image file that a cell of a table holds, or names by its path in the folder of the dataset."""
+        if picture.get("bytes"):
+            return picture["bytes"]
+        if not (path := picture.get("path")):
+            raise ValueError(f"there is no image: {MEND}")
+        folder = self.folder.resolve()
+        file = (folder / path).resolve()  # read from an untrusted file, it could lead anywhere
+        if not file.is_relative_to(folder) or not file.is_file():
+            raise ValueError(
+                f"the table has no image but the path {str(path)[:200]!r}, which is no file in the folder of the "
+                "dataset: copy the images there, or embed them in the tables"
+            )
+        return read_bounded(file)
+
+    def _video(self, part: Part, key: str) -> Path:
         # The standard path: one that is read from an untrusted file could lead anywhere.
-        return self.folder / _place(layout.VIDEOS, row, f"videos/{key}", video_key=key)
+        chunk, file = (part.place[f"videos/{key}/{name}_index"] for name in ("chunk", "file"))
+        return self.folder / layout.VIDEOS.format(video_key=key, chunk_index=chunk, file_index=file)
 
     def _read_info(self) -> layout.Info:
         path = self.folder / "meta/info.json"
         if not path.exists():
             raise ValueError(f"there is no LeRobot dataset in {self.folder} (no meta/info.json)")
         try:
-            version = read_json(path, dict[str, Any]).get("codebase_version")
-            if version == layout.VERSION:
-                return read_json(path, layout.Info)
+            version = str(read_json(path, dict[str, Any]).get("codebase_version"))
         except ValueError as error:
             raise ValueError(f"{error}: {REMEDY}") from error
-        raise ValueError(
-            f"{path} has version {str(version)[:20]}: convert the dataset to {layout.VERSION} with lerobot"
-        )
+        if version == layout.VERSION:
+            return read_json(path, layout.Info)
+        known, found = (re.fullmatch(r"v(\d{1,4})\.(\d{1,4})", text) for text in (layout.VERSION, version))
+        if found and known and [*map(int, found.groups())] > [*map(int, known.groups())]:
+            raise ValueError(
+                f"{path} has version {version}, newer than {layout.VERSION}, which is read here: look for a newer vla"
+            )
+        what = f"has version {version}: convert" if found else f"has no version, but {version[:20]}: write or convert"
+        raise ValueError(f"{path} {what} the dataset to {layout.VERSION} with lerobot")
 
     def _require_unchanged(self) -> None:
         """Compare the files with their checksums, if the dataset has any."""
@@ -210,79 +217,21 @@ class LeRobotDataset:
                 f"{layout.CHECKSUMS} if this was intended"
             )
 
-    def _require_one_rate(self) -> None:
-        rates = {key: self.info.features[key].video_rate for key in self._videos}
-        if others := [f"{key} {str(rate)[:20]} Hz" for key, rate in rates.items() if rate not in (None, self.info.fps)]:
-            raise ValueError(
-                f"{self.folder} has {self.info.fps:g} Hz, but {', '.join(others)}: record all cameras at one rate"
-            )
-
-    def _require_even(self, rows: pa.Table) -> None:
-        """Require the time stamps to follow the rate."""
-        times, frames = tables.matrix(rows["timestamp"], 1), rows["frame_index"].to_numpy()
-        if times is None:
-            raise ValueError(f"{self.folder}/data has rows of timestamp that are not finite numbers: {REMEDY}")
-        off = np.flatnonzero(np.abs(times[:, 0] - frames / self.info.fps) > 0.5 / self.info.fps)
-        if len(off):
-            raise ValueError(
-                f"{self.folder} has time stamps in episode {self._owner[off[0]]} that do not follow its rate of "
-                f"{self.info.fps:g} Hz: record all episodes at one rate"
-            )
-
-    def _require_files(self) -> None:
-        """Require the files that the episodes name."""
-        needed = {
-            **{_place(layout.DATA, row, "data"): None for row in self._rows_of_episodes},
-            **{
-                self._video(row, key).relative_to(self.folder).as_posix(): None
-                for key in self._videos
-                for row in self._rows_of_episodes
-            },
-        }
-        if missing := [name for name in needed if not (self.folder / name).exists()]:
+    def _require_videos(self, keys: Sequence[str]) -> None:
+        """Require the videos of all episodes to be there, with the size, the rate and the images that these need."""
+        frames: dict[tuple[Path, str], int] = {}
+        for part in self.parts:
+            for key in keys:
+                end = round(self._begin(part, key) * self.info.fps) + len(part.rows)
+                place = self._video(part, key), key
+                frames[place] = max(frames.get(place, 0), end)
+        if missing := [str(path.relative_to(self.folder)) for path, _ in frames if not path.exists()]:
             more = f" and {len(missing) - 3} more" if len(missing) > 3 else ""
             raise ValueError(f"{self.folder} lacks {', '.join(missing[:3])}{more}: {REMEDY}")
-
-    def _require_videos(self) -> None:
-        """Require size, rate and length of the videos."""
-        frames: dict[tuple[Path, str], int] = {}
-        for row in self._rows_of_episodes:
-            steps = row["dataset_to_index"] - row["dataset_from_index"]
-            for key in self._videos:
-                end = round(row[f"videos/{key}/from_timestamp"] * self.info.fps) + steps
-                place = self._video(row, key), key
-                frames[place] = max(frames.get(place, 0), end)
         for (path, key), count in frames.items():
             require_video(path, self.info.features[key].image_size, layout.fraction(self.info.fps), count)
-
-    def _read_episodes(self) -> list[dict[str, Any]]:
-        """Return the rows of `meta/episodes`, in the order of the episodes."""
-        names = ("episode_index", "dataset_from_index", "dataset_to_index", "data/chunk_index", "data/file_index")
-        columns = dict.fromkeys(names, counts)
-        for video in (f"videos/{key}" for key in self._videos):
-            columns |= {f"{video}/chunk_index": counts, f"{video}/file_index": counts}
-            columns |= {f"{video}/from_timestamp": tables.times}
-        return self.table("meta/episodes", columns).sort_by("episode_index").to_pylist()
-
-    def _read_tasks(self) -> dict[int, str]:
-        """Return index → instruction; the name of the column of instructions depends on the writer."""
-        path = self.folder / layout.TASKS
-        columns = tables.columns_of(path)
-        names = [name for name in columns if name != "task_index"]
-        if len(names) != 1:
-            raise ValueError(f"{path} has the columns {', '.join(columns)[:200]}, not one of tasks and task_index")
-        table = tables.read([path], {"task_index": counts, names[0]: tables.texts})
-        found = dict(zip(table["task_index"].to_pylist(), table[names[0]].to_pylist(), strict=True))
-        if longer := [index for index, text in found.items() if len(text) > LONGEST_INSTRUCTION]:
-            raise ValueError(f"{path} has tasks of more than {LONGEST_INSTRUCTION} characters: {listed(longer)}")
-        return found
 
 
 def camera_of(key: str) -> str:
     """Return the camera of a feature of images: its name without `observation.` and `images.`."""
     return key.removeprefix("observation.").removeprefix("images.")
-
-
-def _place(pattern: str, row: Mapping[str, Any], of: str, **names: str) -> str:
-    """Return the path of the file in which an episode's part `of` is, given its row of metadata."""
-    return pattern.format(chunk_index=row[f"{of}/chunk_index"], file_index=row[f"{of}/file_index"], **names)

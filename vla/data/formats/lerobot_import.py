@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
+import pyarrow.compute as pc
 from annotated_types import MinLen, Predicate
 
 from vla.data.episodes import EpisodeStore, observations_of
@@ -19,7 +20,8 @@ from vla.data.formats import lerobot_tables as tables
 from vla.data.formats.imported_demonstrations import ImportedDemonstrations, Recording, action_bounds
 from vla.data.formats.lerobot_compatibility import mismatches, out_of_bounds
 from vla.data.formats.lerobot_dataset import LeRobotDataset
-from vla.data.formats.lerobot_tables import REMEDY
+from vla.data.formats.lerobot_episodes import Part
+from vla.data.formats.lerobot_tables import MEND
 from vla.io.images import describe_resize
 from vla.io.types import Count, Text, unique
 from vla.spec import Array, Episode, Spec
@@ -32,10 +34,13 @@ log = logging.getLogger(__name__)
 class LeRobotDemonstrations(ImportedDemonstrations):
     """Episodes of a LeRobot dataset, version 3.0, that has the cameras, state, action and rate of the task.
 
-    Images are videos, or PNG within the tables; those of another size are cropped at the centre to the aspect ratio of
-    the task, and resized. Actions beyond the bounds of the task are clipped. Every episode is a success. Missing
+    Images are videos, or PNG, JPEG or WebP in tables or files; those of another size are cropped at the centre
+    to the aspect ratio of the task, and resized. Actions beyond the bounds of the task are clipped. Every episode is a
+    success. An episode in which the task changes becomes several episodes, one per instruction: what is done after a
+    change is no answer to the instruction before it, so neither a chunk of actions nor a history may cross it. Missing
     features are filled in: depth by 0 (no return), `velocities` of the robot by differences of its joint positions,
-    `executed` by the actions to imitate. The draws of the episode list them.
+    `executed` by the actions to imitate. The draws of the episode list them, and its number and first step in the
+    dataset.
 
     Args:
         folder: of the dataset.
@@ -75,7 +80,8 @@ class LeRobotDemonstrations(ImportedDemonstrations):
         self._lacks += [] if self._has_executed else [layout.EXECUTED]
         self._lacks += [] if all(name in self._state for name in spec.state) else [layout.RATES]
         executed = [layout.EXECUTED] if self._has_executed else []
-        dataset.open(spec.cameras, list(dict.fromkeys([*state, *action, *extra, *executed])))
+        depth = [layout.depth_key(camera) for camera in spec.depth if self._has_depth]
+        dataset.open(spec.cameras, list(dict.fromkeys([*state, *action, *extra, *executed])), depth)
 
     @classmethod
     def recording(
@@ -91,12 +97,12 @@ class LeRobotDemonstrations(ImportedDemonstrations):
             state=tuple(states),
             action=tuple(actions),
             bounds={name: action_bounds(values[key][:, at]) for name, (key, at) in actions.items()},
-            episodes=len(dataset.table("meta/episodes", {"episode_index": tables.counts})),
+            episodes=len(dataset.parts),
         )
 
     def __len__(self) -> int:
         """Return the number of episodes."""
-        return len(self._dataset)
+        return len(self._dataset.parts)
 
     def episode(self, number: int) -> Episode:
         """Return one episode, with its images.
@@ -104,19 +110,18 @@ class LeRobotDemonstrations(ImportedDemonstrations):
         Raises:
             ValueError: images are damaged.
         """
-        spec, (rows, instruction) = self.spec, self._dataset.place(number)
-        steps, every = rows.stop - rows.start, self._every
-        first = np.arange(0, steps, every)
-        last = np.minimum(first + every - 1, steps - 1)  # the target at the end of the period
-        actions = np.clip(self._columns(spec.action, self._action, rows)[last], self._low, self._high)
-        executed = self._dataset.numbers(layout.EXECUTED, rows)[last] if self._has_executed else actions
+        spec, dataset, part = self.spec, self._dataset, self._dataset.parts[number]
+        first = np.arange(part.steps.start, part.steps.stop, self._every)
+        last = np.minimum(first + self._every - 1, part.steps.stop - 1)  # the target at the end of the period
+        actions = np.clip(self._columns(spec.action, self._action, part)[last], self._low, self._high)
+        executed = dataset.numbers(layout.EXECUTED, part)[last] if self._has_executed else actions
         images = {
-            f"rgb_{camera}": self._dataset.frames(number, camera, spec.image_size, every) for camera in spec.cameras
+            f"rgb_{camera}": dataset.frames(part, camera, spec.image_size, self._every) for camera in spec.cameras
         }
-        images |= {f"depth_{camera}": self._depth(number, camera, steps)[first] for camera in spec.depth}
-        observations = observations_of(spec, {**images, "state": self._states(rows)[first]}, instruction)
-        draws = {"recorded": {"episode": number, "lacks": self._lacks}}
-        what = (number, "recorded", instruction, "success", frozenset[str](), draws)
+        images |= {f"depth_{camera}": self._depth(part, camera)[:: self._every] for camera in spec.depth}
+        observations = observations_of(spec, {**images, "state": self._states(part)[first]}, part.instruction)
+        draws = {"recorded": {"episode": part.episode, "first_step": part.steps.start, "lacks": self._lacks}}
+        what = (number, "recorded", part.instruction, "success", frozenset[str](), draws)
         return Episode(*what, observations, actions, executed)
 
     def _require_fit(self, keys: Keys) -> None:
@@ -132,41 +137,51 @@ class LeRobotDemonstrations(ImportedDemonstrations):
         if found:
             raise ValueError(f"{dataset.folder} does not match the task: {'; '.join(found)}")
 
-    def _states(self, rows: slice) -> Array:
+    def _states(self, part: Part) -> Array:
         """Return (N, P) float32; joint velocities are differences of positions if the dataset has none."""
         spec = self.spec
-        state = self._columns([name for name in spec.state if name in self._state], self._state, rows)
+        state = self._columns([name for name in spec.state if name in self._state], self._state, part)
         if state.shape[1] == len(spec.state) or spec.robot is None:
             return state
-        joints = self._columns(spec.robot.joints, self._state, rows)
+        joints = self._columns(spec.robot.joints, self._state, part)
         rates = np.diff(joints, axis=0, prepend=joints[:1]) * np.float32(self._dataset.info.fps)
         known = dict(zip(spec.robot.velocities, rates.T, strict=True))
         found = dict(zip((name for name in spec.state if name in self._state), state.T, strict=True))
         return np.stack([{**known, **found}[name] for name in spec.state], axis=1)
 
-    def _columns(self, names: Iterable[str], places: Mapping[str, tuple[str, int]], rows: slice) -> Array:
-        """Return components by name, (N, …) float32."""
+    def _columns(self, names: Iterable[str], places: Mapping[str, tuple[str, int]], part: Part) -> Array:
+        """Return components by name, (N, …) float32, of the whole episode of a part."""
         found = [places[name] for name in names]
-        return np.stack([self._dataset.numbers(key, rows)[:, at] for key, at in found], axis=1)
+        return np.stack([self._dataset.numbers(key, part)[:, at] for key, at in found], axis=1)
 
-    def _depth(self, number: int, camera: str, steps: int) -> Array:
-        """Return (N, H, W) uint16 [mm]."""
-        shape = (steps, *self.spec.image_size)
+    def _depth(self, part: Part, camera: str) -> Array:
+        """Return the steps of a part, (N, H, W) uint16 [mm]."""
+        shape = (part.steps.stop - part.steps.start, *self.spec.image_size)
         if not self._has_depth:
             return np.zeros(shape, np.uint16)
-        path, column = self._dataset.column(number, layout.depth_key(camera), tables.pixels)
-        values = np.asarray(column.combine_chunks().flatten().flatten())
+        column = self._dataset.column(part, layout.depth_key(camera), tables.pixels)
+        values = np.asarray(pc.list_flatten(pc.list_flatten(column)).combine_chunks())
         regular = tables.lists_have(column, *self.spec.image_size) and len(values) == np.prod(shape)
         if values.dtype != np.uint16 or not regular:
-            raise ValueError(f"{path} has {layout.depth_key(camera)} of another size in episode {number}: {REMEDY}")
+            raise ValueError(
+                f"{self._dataset.folder} has {layout.depth_key(camera)} of another size in episode {part.episode}: "
+                f"{MEND}"
+            )
         return values.reshape(shape)
 
     def fill(self, store: EpisodeStore, episodes: int) -> int:
-        """Append episodes, and log what an import changes: the size of images, and actions beyond the bounds."""
+        """Append episodes, and log what an import changes: images, episodes of several tasks, actions beyond bounds."""
         for camera in self.spec.cameras:
             shape = self._dataset.info.features[self._dataset.images[camera]].image_size
             if resizing := describe_resize(shape, self.spec.image_size, "centre"):
                 log.info("camera %s: %s", camera, resizing)
+        whole = len({part.episode for part in self._dataset.parts})
+        if whole < len(self):
+            log.info(
+                "%d episodes become %d, one for each instruction in turn: the task changes within some",
+                whole,
+                len(self),
+            )
         if self._beyond:
             log.info("%.2g %% of the actions are clipped to the bounds of the task", 100 * self._beyond)
         return super().fill(store, episodes)

@@ -28,7 +28,7 @@ from annotated_types import Ge, MaxLen
 
 from vla.data.formats.video import PIXELS
 from vla.io.documents import LENIENT
-from vla.io.types import Count, Positive
+from vla.io.types import Count, Natural, Positive
 from vla.spec import Array, Spec
 
 VERSION = "v3.0"
@@ -39,6 +39,8 @@ EPISODES = f"meta/episodes/{FILE}.parquet"
 TASKS = "meta/tasks.parquet"
 CHECKSUMS = "meta/checksums.json"
 FILES_PER_CHUNK = 1000
+CHANNELS = (1, 3, 4)  # of images: grey, colours, colours and transparency
+RATE_TOLERANCE = 0.01  # relative; cameras of 29.97 Hz are said to have 30
 
 # LeRobot's policies use every feature "observation…" as an input, every "action…" as an output, and every image as a
 # colour image: other features have other names, and depth is an array.
@@ -77,25 +79,16 @@ class Feature:
 
     @property
     def image_size(self) -> tuple[int, int]:
-        """Height and width [px], for colours first or last."""
-        first = len(self.shape) == 3 and self.shape[0] == 3 and self.shape[-1] != 3
+        """Height and width [px], for channels first or last."""
+        first = len(self.shape) == 3 and self.shape[0] in CHANNELS and self.shape[-1] not in CHANNELS
         height, width = (*self.shape[1:], 1, 1)[:2] if first else (*self.shape, 1, 1)[:2]
         return height, width
 
     @property
     def is_depth(self) -> bool:
         """True if the images are depth."""
-        return True in (self._about("is_depth_map"), self._about("video.is_depth_map"))
-
-    @property
-    def video_rate(self) -> Any:
-        """Images per second of a video [Hz], None if unknown."""
-        return self._about("video.fps")
-
-    def _about(self, name: str) -> Any:
-        return next(
-            (part[name] for part in (self.info, self.video_info) if isinstance(part, dict) and name in part), None
-        )
+        told = [part for part in (self.info, self.video_info) if isinstance(part, dict)]
+        return any(True in (part.get("is_depth_map"), part.get("video.is_depth_map")) for part in told)
 
 
 @dataclass
@@ -106,6 +99,8 @@ class Info:
 
     fps: Positive
     features: dict[str, Feature]
+    total_episodes: Natural = 0  # those of a part of a dataset are larger than what it holds
+    total_frames: Natural = 0
 
 
 Checksums = dict[str, Annotated[int, Ge(0)]]  # path in the dataset → CRC-32

@@ -14,7 +14,8 @@ import pyarrow.parquet as pq
 from vla.io.files import require_file
 from vla.spec import Array
 
-REMEDY = "copy the dataset again from where it is whole"
+REMEDY = "copy the dataset again from where it is whole"  # where a copy may be damaged or incomplete
+MEND = "correct the dataset, or write it again"  # where a copy cannot help
 MOST_ROWS = 10_000_000  # of a file: 280 hours at 10 Hz
 MOST_BYTES = 2**33  # to unpack at once
 LONGEST = 1e6  # video [s]
@@ -57,6 +58,17 @@ def pictures(column: pa.ChunkedArray) -> bool:
     return pa.types.is_binary(content) or pa.types.is_large_binary(content)
 
 
+def files(folder: Path) -> list[Path]:
+    """Return the files of a table, in their order.
+
+    Raises:
+        ValueError: there are none.
+    """
+    if found := sorted(folder.glob("chunk-*/file-*.parquet")):
+        return found
+    raise ValueError(f"{folder} holds no tables: {REMEDY}")
+
+
 def read(paths: Sequence[Path], columns: Mapping[str, Kind], only: Any = None) -> pa.Table:
     """Read the named columns of Parquet files, concatenated; `only` filters rows.
 
@@ -67,11 +79,11 @@ def read(paths: Sequence[Path], columns: Mapping[str, Kind], only: Any = None) -
     try:
         return pa.concat_tables(found, promote_options="permissive")
     except pa.ArrowException as error:
-        raise ValueError(f"{paths[0]} and others beside it differ ({str(error)[:200]}): {REMEDY}") from error
+        raise ValueError(f"{paths[0]} and others beside it differ ({str(error)[:200]}): {MEND}") from error
 
 
-def columns_of(path: Path) -> list[str]:
-    """Return the names of the columns of a Parquet file.
+def schema_of(path: Path) -> pa.Schema:
+    """Return the columns of a Parquet file.
 
     Raises:
         ValueError: it is damaged, no ordinary file, or has too many rows.
@@ -79,18 +91,34 @@ def columns_of(path: Path) -> list[str]:
     require_file(path)
     try:
         with pq.ParquetFile(path) as file:
-            rows, names = file.metadata.num_rows, file.schema_arrow.names
+            rows, schema = file.metadata.num_rows, file.schema_arrow
     except (pa.ArrowException, OSError, UnicodeDecodeError) as error:
         raise ValueError(f"{path} cannot be read ({str(error)[:200]}): {REMEDY}") from error
     if rows > MOST_ROWS:
         raise ValueError(f"{path} has {rows} rows, more than the {MOST_ROWS} that such a file can have")
-    return list(names)
+    return schema
+
+
+def require(path: Path, columns: Mapping[str, Kind]) -> None:
+    """Require a Parquet file to have columns of the expected types; their values are not read.
+
+    Raises:
+        ValueError: it has not, or cannot be read.
+    """
+    empty = schema_of(path).empty_table()
+    if missing := [name for name in columns if name not in empty.column_names]:
+        raise ValueError(f"{path} lacks the columns {', '.join(missing)}: {MEND}")
+    _require_kinds(path, empty, columns)
+
+
+def _require_kinds(path: Path, table: pa.Table, columns: Mapping[str, Kind]) -> None:
+    for name, is_kind in columns.items():
+        if not is_kind(table[name]):
+            raise ValueError(f"{path}: {name} does not hold {is_kind.__doc__}: {MEND}")
 
 
 def _read(path: Path, columns: Mapping[str, Kind], only: Any) -> pa.Table:
-    present = columns_of(path)
-    if missing := [name for name in columns if name not in present]:
-        raise ValueError(f"{path} lacks the columns {', '.join(missing)}: {REMEDY}")
+    require(path, columns)
     if (unpacked := _unpacked_size(path, columns, only is not None)) > MOST_BYTES:
         raise ValueError(f"{path} unpacks to {unpacked / 1e9:.0f} GB, more than the {MOST_BYTES / 1e9:.0f} GB it may")
     try:
@@ -98,9 +126,7 @@ def _read(path: Path, columns: Mapping[str, Kind], only: Any) -> pa.Table:
         table.validate(full=True)
     except (pa.ArrowException, OSError) as error:
         raise ValueError(f"{path} cannot be read ({str(error)[:200]}): {REMEDY}") from error
-    for name, is_kind in columns.items():
-        if not is_kind(table[name]):
-            raise ValueError(f"{path}: {name} does not hold {is_kind.__doc__}: {REMEDY}")
+    _require_kinds(path, table, columns)
     return table
 
 
@@ -117,13 +143,13 @@ def _unpacked_size(path: Path, columns: Collection[str], filtered: bool) -> int:
     return (max if filtered else sum)([0, *sizes])
 
 
-def matrix(column: pa.ChunkedArray, size: int) -> Array | None:
-    """Return a column of `numbers` as (N, size) float32; None if rows have another size or are not finite."""
+def matrix(column: pa.ChunkedArray, size: int, dtype: type[np.floating] = np.float32) -> Array | None:
+    """Return a column of `numbers` as (N, size); None if rows have another size. Missing numbers become NaN."""
     if _is_list(column.type) and not lists_have(column, size):
         return None
     flat = pc.list_flatten(column) if _is_list(column.type) else column
-    values = np.asarray(flat.combine_chunks(), np.float32)
-    return values.reshape(-1, size) if len(values) == len(column) * size and np.isfinite(values).all() else None
+    values = np.asarray(flat.combine_chunks(), dtype)
+    return values.reshape(-1, size) if len(values) == len(column) * size else None
 
 
 def lists_have(column: pa.ChunkedArray, *sizes: int) -> bool:

@@ -17,7 +17,6 @@ from vla.spec import Array
 
 CODEC = "libsvtav1"
 PIXELS = "yuv420p"  # the only layout that the encoder supports
-RATE_TOLERANCE = 0.01  # relative; the rate in a header may be measured
 
 
 def encode(path: Path, clips: Iterable[Array], size: tuple[int, int], fps: Fraction, crf: int) -> None:
@@ -87,16 +86,22 @@ def decode(
 
 
 def require_video(path: Path, size: tuple[int, int], fps: Fraction, count: int) -> None:
-    """Require the header of a video to give images of `size` (H, W), their rate and a number of at least `count`.
+    """Require the header of a video to give images of `size` (H, W), at least `count` of them, and their rate.
+
+    The rate may differ as long as the first `count` images are the right ones.
 
     Raises:
         ValueError: it does not, or cannot be read.
     """
     with _opened(path) as (_, stream):
         _require_size(path, stream, size)
-        rate, frames = stream.average_rate, stream.frames
-    if rate is not None and abs(rate - fps) > RATE_TOLERANCE * fps:
-        raise ValueError(f"{path} has {float(rate):g} images per second, the dataset {float(fps):g}")
+        rates, frames = [rate for rate in (stream.average_rate, stream.base_rate) if rate], stream.frames
+    rate = min(rates, key=lambda each: abs(each - fps), default=fps)  # the average may count the last image less
+    if abs(rate - fps) * count > 0.5 * fps:
+        raise ValueError(
+            f"{path} has {float(rate):.5g} images per second, the dataset {float(fps):.5g}: encode the video again at "
+            "that rate, or write its own as fps into meta/info.json"
+        )
     if 0 < frames < count:  # 0: unknown
         raise ValueError(f"{path} has {frames} images of the {count} that the dataset needs")
 
