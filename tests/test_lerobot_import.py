@@ -172,6 +172,7 @@ def test_pictures_of_another_kind_are_refused_by_name(home: Path, tmp_path: Path
         "there is no image: correct the dataset": {"bytes": None, "path": None},
         r"no image but the path 'a\.png', which is no file in the folder of the dataset": {"path": "a.png"},
         r"no image but the path '\.\./a\.png'": {"path": "../a.png"},
+        r"no image but the path 'a{200}', which is no file": {"path": "a" * 5000},
         r"cannot be decoded: it is not PNG or JPEG or WEBP$": {"bytes": b"GIF89a"},
         r"cannot be decoded \(": {"bytes": png(Image.new("RGB", (16, 16)))[:45]},
     }

@@ -214,7 +214,7 @@ def slower(dataset: Path) -> None:
     [
         (without("videos/observation.images.top/chunk-000/file-000.mp4"), r"lacks videos/observation\.images\.top/chu"),
         (without("data/chunk-000/file-000.parquet"), r"data holds no tables: copy the dataset again"),
-        (slower, r"step 1 of episode 3 comes 0\.06667 s after the step before, but at 30 Hz, the rate in meta/inf"),
+        (slower, r"step 1 of episode 3 comes 0\.06667 s after its first one, but at 30 Hz, the rate in meta/info\.js"),
     ],
     ids=["video", "table", "rates"],
 )

@@ -5,6 +5,7 @@ Shapes: N steps, D components, H by W pixels.
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -157,12 +158,12 @@ class LeRobotDataset:
     def _begin(self, part: Part, key: str) -> float:
         """Return the time of the first step of an episode in a video [s].
 
-        Time stamps count from where the episode begins in the video. If they begin later than at 0, its first images
-        were left out, or the stamps are of another clock: then the video does not reach as far as they do.
+        Time stamps count from where the episode begins in the video. If they begin later than at 0, its first steps
+        were cut off, or the stamps are of another clock: then the video does not reach as far as they do.
         """
         begin, end = part.place[f"videos/{key}/from_timestamp"], part.place[f"videos/{key}/to_timestamp"]
-        reaches = begin + part.time + (len(part.rows) - 0.5) / self.info.fps <= end
-        return begin + part.time if reaches else begin
+        cut, steps = max(round(part.time * self.info.fps), 0), len(part.rows)
+        return begin + cut / self.info.fps if begin + (cut + steps - 0.5) / self.info.fps <= end else begin
 
     def _content(self, picture: Mapping[str, Any]) -> bytes:
         """Return an image file that a cell of a table holds, or names by its path in the folder of the dataset."""
@@ -170,9 +171,9 @@ class LeRobotDataset:
             return picture["bytes"]
         if not (path := picture.get("path")):
             raise ValueError(f"there is no image: {MEND}")
-        folder = self.folder.resolve()
-        file = (folder / path).resolve()  # read from an untrusted file, it could lead anywhere
-        if not file.is_relative_to(folder) or not file.is_file():
+        folder = os.path.realpath(self.folder)
+        file = Path(os.path.realpath(os.path.join(folder, str(path))))  # untrusted, it could lead anywhere
+        if not file.is_relative_to(folder) or not os.path.isfile(file):
             raise ValueError(
                 f"the table has no image but the path {str(path)[:200]!r}, which is no file in the folder of the "
                 "dataset: copy the images there, or embed them in the tables"

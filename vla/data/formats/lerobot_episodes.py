@@ -148,17 +148,12 @@ def _require_whole(folder: Path, row: Mapping[str, Any], there: int) -> None:
 def _require_even(folder: Path, fps: float, number: int, times: Array) -> None:
     """Require the times of an episode, those since its first step, to follow the rate, without gaps."""
     steps = np.arange(len(times))
-    gaps = np.abs(np.diff(times, prepend=-1 / fps) - 1 / fps) > 0.5 / fps
-    drift = np.abs(times - steps / fps) > (0.5 + layout.RATE_TOLERANCE * steps) / fps
-    if gaps.any():
-        step = int(np.argmax(gaps))
+    off = np.abs(times - steps / fps) > (0.5 + layout.RATE_TOLERANCE * steps) / fps
+    off |= np.abs(np.diff(times, prepend=-1 / fps) - 1 / fps) > 0.5 / fps  # a step that was left out
+    if off.any():
+        step = int(np.argmax(off))
         raise ValueError(
-            f"{folder}: step {step} of episode {number} comes {times[step] - times[step - 1]:.4g} s after the step "
-            f"before, but at {fps:g} Hz, the rate in meta/info.json, it is {1 / fps:.4g} s: record all episodes "
-            "without gaps at one rate, or correct fps there if it is another one"
-        )
-    if drift.any():
-        raise ValueError(
-            f"{folder}: the time stamps of episode {number} have {(len(times) - 1) / times[-1]:.4g} Hz, meta/info.json "
-            f"has {fps:g} Hz: correct fps there, or record all episodes at one rate"
+            f"{folder}: step {step} of episode {number} comes {times[step]:.4g} s after its first one, but at {fps:g} "
+            f"Hz, the rate in meta/info.json, it is {step / fps:.4g} s: correct fps there, or record all episodes at "
+            "one rate without gaps"
         )
