@@ -59,15 +59,9 @@ def test_a_peak_of_memory_is_remembered_until_it_is_forgotten() -> None:
     assert peak(device) - held < 0.5 * size
 
 
-@pytest.mark.parametrize(
-    ("precisions", "compiled", "problem"), [([], [True], "both need an entry"), (["fp32"], [True], r"install g\+\+")]
-)
-def test_what_cannot_be_timed_is_refused_before_any_work(
-    precisions: list[str], compiled: list[bool], problem: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("CXX", "no-such-compiler")
-    asked = {"benchmark": {"precisions": precisions, "compile": compiled}, "trainer": {"accelerator": "cpu"}}
-    with pytest.raises(ValueError, match=problem):
+def test_training_without_a_precision_is_refused_before_any_work() -> None:
+    asked = {"benchmark": {"precisions": [], "compile": [True]}, "trainer": {"accelerator": "cpu"}}
+    with pytest.raises(ValueError, match="both need an entry"):
         measures(Experiment(asked))
 
 

@@ -75,6 +75,16 @@ def test_an_unknown_key_is_named_with_what_was_probably_meant() -> None:
     assert problem(sed=1).startswith("sed is unknown, did you mean seed?")
 
 
+def test_a_list_of_what_there_is_names_nothing_twice() -> None:
+    for job in ("collect", "train", "evaluate", "improve", "deploy", "benchmark"):
+        cfg = composed(f"job={job}", *(["deploy=server"] if job == "deploy" else []))
+        OmegaConf.update(cfg, "bogus", 3, force_add=True)
+        with pytest.raises(ValueError, match="bogus is unknown: the config takes ") as caught:
+            check(cfg)
+        names = str(caught.value).partition(" takes ")[2].split(", ")
+        assert {"job", "task", "cluster", "trainer"} <= {*names} and len(names) == len({*names})
+
+
 @pytest.mark.parametrize(
     ("key", "value", "expected"),
     [

@@ -28,6 +28,7 @@ from vla.spec import Array, Observation
 from vla.training import throughput
 from vla.training.checkpoints import SAVE_EVERY, GracefulStop, PeriodicCheckpoint
 from vla.training.closed_loop import ClosedLoop
+from vla.training.throughput import TrainingProgressBar
 from vla.training.trainer import explain_memory_errors, make_trainer
 
 MODELS: dict[str, Callable[[], Model]] = {
@@ -325,3 +326,17 @@ def test_where_gradients_are_accumulated_nothing_is_saved_within_a_step(tmp_path
         trainer.global_step = step
         checkpoint.on_train_batch_end(trainer, nothing, None, None, 0)
     assert saved == [2 * SAVE_EVERY]
+
+
+def test_the_progress_bar_shows_the_loss_of_the_first_step_after_resuming_and_nothing_before(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("lightning.pytorch.callbacks.RichProgressBar.on_train_batch_end", lambda *_: None)
+    trainer: Any = SimpleNamespace(callback_metrics={}, accumulate_grad_batches=2)
+    bar, module = TrainingProgressBar(), make_learner()
+    assert bar.get_metrics(trainer, module) == {}
+    shown = []
+    for batch in (5, 6, 10):
+        bar.on_train_batch_end(trainer, module, {"loss": torch.tensor(batch / 8)}, {}, batch)
+        shown.append(bar.get_metrics(trainer, module)["loss"])
+    assert shown == ["1.250", "1.250", "2.500"]

@@ -92,7 +92,7 @@ def check(cfg: DictConfig, job: Job) -> None:
     jobs = {file.stem for file in files}  # an experiment may have options of another job
     for name in cfg:
         if name not in jobs:
-            require_known("", str(name), (*plain, *GROUPS, *groups), "the config")
+            require_known("", str(name), {**plain, **GROUPS, **groups}, "the config")
     for name, annotation in plain.items():
         node = OmegaConf.to_container(cfg[name], resolve=True) if OmegaConf.is_config(cfg[name]) else cfg[name]
         _check_plain(name, node, annotation)

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 from vla.config.annotations import require_trusted
 from vla.config.packages import is_trusted
 from vla.jobs.bfloat16 import warn_of_bfloat16
+from vla.jobs.compiler import require_compiler
 
 if TYPE_CHECKING:
     from vla.config.experiment import Experiment
@@ -36,7 +37,13 @@ def find(name: str) -> Any:
 
 
 def run(experiment: Experiment) -> float | None:
-    """Run the job of an experiment; evaluation returns the success rate, which sweeps maximise."""
+    """Run the job of an experiment; evaluation returns the success rate, which sweeps maximise.
+
+    Raises:
+        ValueError: the config compiles a model, and this machine cannot; or an error of the job.
+    """
     job = find(experiment["job"])
-    warn_of_bfloat16(experiment.config, job.JOB.needs(experiment.config))
+    groups = job.JOB.needs(experiment.config)
+    require_compiler(experiment.config, groups)
+    warn_of_bfloat16(experiment.config, groups)
     return job.run(experiment)

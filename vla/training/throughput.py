@@ -94,13 +94,13 @@ class TrainingProgressBar(RichProgressBar):
 
     def __init__(self) -> None:
         super().__init__(refresh_rate=4)  # a second: painting takes milliseconds, in a thread that the model waits for
-        self._loss = float("nan")
+        self._loss: float | None = None  # unknown before the first step, also after resuming
 
     def on_train_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
     ) -> None:
         """Advance the bar; read the loss every `READ_EVERY` batches."""
-        if batch_idx % self.READ_EVERY == 0:
+        if self._loss is None or batch_idx % self.READ_EVERY == 0:
             self._loss = outputs["loss"].item() * trainer.accumulate_grad_batches  # Lightning divides it by these
         super().on_train_batch_end(trainer, pl_module, outputs, batch, batch_idx)
 
@@ -115,7 +115,9 @@ class TrainingProgressBar(RichProgressBar):
     ) -> dict[str, int | str | float | dict[str, float]]:
         """Return the columns beside the bar: loss, samples per second, share of waiting for data, success."""
         logged = trainer.callback_metrics
-        shown: dict[str, int | str | float | dict[str, float]] = {"loss": f"{self._loss:.3f}"}
+        shown: dict[str, int | str | float | dict[str, float]] = {}
+        if self._loss is not None:
+            shown["loss"] = f"{self._loss:.3f}"
         if "pace/samples_per_s" in logged:
             shown["samples/s"] = f"{logged['pace/samples_per_s']:.0f}"
             shown["waiting"] = f"{logged['pace/waiting']:.0%}"
