@@ -7,15 +7,17 @@ from typing import Any
 
 import numpy as np
 from matplotlib import colormaps
-from PIL import Image, ImageDraw, ImageFont
+from PIL import Image, ImageDraw
 from rich.markup import escape
 from rich.table import Table
 
 from vla.data.draws import flat, leaves
+from vla.reports.fonts import image_fonts
 from vla.spec import Array, Observation
 
 TILE = 144  # minimum height of an image on a contact sheet [px]
 CAPTION = 18  # height of a text line on a contact sheet [px]
+LETTERS = 13  # size of its font [px]
 WIDEST = 420  # most of a caption beyond its images [px]
 
 
@@ -35,23 +37,25 @@ def contact_sheet(seeds: Sequence[int], observations: Sequence[Observation], col
         enlarged = [tile.repeat(factor, 0).repeat(factor, 1) for tile in tiles]
         framed = [np.pad(tile, ((0, 4), (0, 4), (0, 0)), constant_values=255) for tile in enlarged]
         blocks.append(np.concatenate(framed, axis=1))
-    font = ImageFont.load_default(13)
     captions = [f"seed {seed}: {each.instruction}" for seed, each in zip(seeds, observations, strict=True)]
-    room = max(blocks[0].shape[1], min(WIDEST, int(max(map(font.getlength, captions))) + 1))
+    fonts = image_fonts(captions, LETTERS)
+    lengths = [font.getlength(caption) for font, caption in zip(fonts, captions, strict=True)]
+    room = max(blocks[0].shape[1], min(WIDEST, int(max(lengths)) + 1))
     height, width = blocks[0].shape[0] + CAPTION, room + CAPTION
     columns = min(columns, len(blocks))
     rows = -(-len(blocks) // columns)
     sheet = Image.new("RGB", (columns * width + CAPTION, rows * (height + CAPTION // 2) + 2 * CAPTION), "white")
     draw = ImageDraw.Draw(sheet)
-    for index, (caption, block) in enumerate(zip(captions, blocks, strict=True)):
+    for index, (caption, font, block) in enumerate(zip(captions, fonts, blocks, strict=True)):
         left, top = CAPTION + index % columns * width, CAPTION // 2 + index // columns * (height + CAPTION // 2)
         strip = Image.new("RGB", (room, CAPTION), "white")  # cuts off what is longer
         ImageDraw.Draw(strip).text((0, 0), caption, fill="black", font=font)
         sheet.paste(strip, (left, top))
         sheet.paste(Image.fromarray(block), (left, top + CAPTION))
     legend = [f"{name} depth {low / 1000:.2f}-{high / 1000:.2f} m" for name, (low, high) in ranges.items()]
-    names = ", ".join([f"{name} colour" for name in observations[0].rgb] + legend)
-    draw.text((CAPTION, sheet.height - CAPTION - 4), f"from left to right: {names}", fill="black", font=font)
+    names = "from left to right: " + ", ".join([f"{name} colour" for name in observations[0].rgb] + legend)
+    (font,) = image_fonts([names], LETTERS)
+    draw.text((CAPTION, sheet.height - CAPTION - 4), names, fill="black", font=font)
     return sheet
 
 

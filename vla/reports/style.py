@@ -15,6 +15,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from vla.io.files import atomic_path
+from vla.reports.fonts import use_fonts, without_glyph_warnings
 from vla.spec import Array
 
 Interval = tuple[float, float, float]  # success rate and its 95 % confidence interval
@@ -38,10 +39,11 @@ def rate_limits(lowest: float) -> tuple[float, float]:
 
 
 def save(figure: Figure, path: Path, dpi: int = 110) -> None:
-    """Write a figure as PNG atomically, with axes that have no upper and right border."""
+    """Write a figure as PNG atomically, with axes that have no upper and right border, in fonts of the system."""
     for axes in figure.axes:
         axes.spines[["top", "right"]].set_visible(False)
-    with atomic_path(path) as draft:
+    use_fonts(figure)
+    with atomic_path(path) as draft, without_glyph_warnings():
         figure.savefig(draft, format="png", dpi=dpi)
 
 
@@ -58,7 +60,8 @@ def svg_style(title: str) -> Iterator[None]:
 def as_svg(figure: Figure) -> str:
     """Convert a figure to SVG in the page's text colour, without external references, not even XML namespaces."""
     file = io.StringIO()
-    figure.savefig(file, format="svg", transparent=True, metadata={"Date": None})
+    with without_glyph_warnings():  # the browser draws texts in fonts of its own
+        figure.savefig(file, format="svg", transparent=True, metadata={"Date": None})
     svg = file.getvalue()
     svg = re.sub(r"<metadata>.*?</metadata>", "", svg[svg.index("<svg") :], flags=re.DOTALL)
     return re.sub(r' xmlns(:\w+)?="[^"]*"', "", svg).replace(INK, "currentColor")
