@@ -290,6 +290,24 @@ def test_a_policy_is_trained_and_its_errors_measured_without_a_simulator(dataset
     assert torch.load(checkpoint, weights_only=True)["spec"]["action"] == list(NAMES)
 
 
+def test_a_training_on_all_episodes_ends_with_success_and_is_complete(dataset: Path, tmp_path: Path) -> None:
+    recording = ("task=recorded", f"expert.folder={dataset}", "task.image_size=[24,32]", "data.validation_fraction=0")
+    options = [option for option in TRAINING if not option.startswith("data.validation_fraction")]
+    run = ("hydra.run.dir=outputs/runs/all", "output=outputs/runs/all")
+    done = here(tmp_path, *recording, *options, *TINY, *run)
+    said = "data.validation_fraction=0 trains on all episodes and leaves none to evaluate the policy on"
+    assert 0 <= done.stdout.find(said) < done.stdout.find("importing") < done.stdout.find("trained 4 steps")
+    checkpoint = tmp_path / "outputs/runs/all/checkpoints/last.ckpt"
+    assert checkpoint.is_file() and not (tmp_path / "outputs/runs/all/errors.json").exists()
+    assert "outputs/runs was interrupted; resume=DIR" in here(tmp_path, "resume=last", ok=False).stderr
+    kept = [*tmp_path.glob("outputs/episodes/*")]
+    shutil.rmtree(kept[0])
+    for whose in ((f"checkpoint={checkpoint}",), ("agent=remote", "agent.url=ws://127.0.0.1:1")):
+        refused = here(tmp_path, *recording, *whose, "output=again", ok=False)
+        assert "data.validation_fraction=0: " in refused.stderr and "train with a larger fraction" in refused.stderr
+        assert not kept[0].exists() and not (tmp_path / "again").exists()
+
+
 def test_a_served_policy_is_compared_with_the_episodes_that_a_training_holds_out(dataset: Path, tmp_path: Path) -> None:
     recording = ("task=recorded", f"expert.folder={dataset}", "task.image_size=[24,32]")
     spec = build(composed(dataset, "task.image_size=[24,32]")["task"], "task").spec

@@ -113,6 +113,25 @@ def test_a_policy_sees_the_pictures_of_its_training_and_those_of_the_other_rende
     assert "renderer_mujoco" in done.stdout
 
 
+@pytest.mark.parametrize(
+    "overrides",
+    [
+        ("job=train", "trainer.devices=999", "trainer.accelerator=cpu"),  # refused with the folder locked
+        ("job=train", "collect.seed=2000000", "trainer.accelerator=cpu"),
+        ("job=deploy", "deploy=server"),
+    ],
+)
+def test_a_refused_run_leaves_no_folder(tmp_path: Path, overrides: tuple[str, ...]) -> None:
+    here(tmp_path, *overrides, "output=named", ok=False)
+    assert not (tmp_path / "named").exists() and not [*tmp_path.glob("outputs/*/*")]
+
+
+def test_a_folder_that_was_there_before_a_refused_run_stays(tmp_path: Path) -> None:
+    (tmp_path / "mine").mkdir()
+    here(tmp_path, "checkpoint=nowhere.ckpt", "output=mine", ok=False)
+    assert not [*(tmp_path / "mine").iterdir()]
+
+
 def test_a_policy_behind_a_server_acts_as_it_does_from_its_checkpoint(home: Path) -> None:
     with create_server(("127.0.0.1", 0)) as free:
         port = free.getsockname()[1]

@@ -7,6 +7,8 @@ import re
 import shutil
 import sys
 import traceback
+from collections.abc import Iterator
+from contextlib import contextmanager
 from importlib.util import find_spec
 from pathlib import Path
 from string import Template
@@ -159,13 +161,23 @@ def _require_variant() -> None:
                 raise ValueError(f"variant={variant} is {group}={option}: omit {group}={choices.get(group)}")
 
 
-def _remove_unused() -> None:
-    """Remove the folder that Hydra created for this run, if no files are in it but those of Hydra."""
-    folder = Path(HydraConfig.get().runtime.output_dir)
-    created = HydraConfig.get().mode == RunMode.RUN and folder.resolve() != Path.cwd()
-    files = (path.relative_to(folder) for path in folder.rglob("*") if not path.is_dir())
-    if created and {path.parts[0] for path in files} <= {".hydra"}:
-        shutil.rmtree(folder, ignore_errors=True)
+@contextmanager
+def _without_empty_folders(cfg: DictConfig) -> Iterator[None]:
+    """Remove the folder that Hydra created for this run, and `output` if it is new, if nothing is in them at the end.
+
+    Files of Hydra count as nothing.
+    """
+    folder, output = Path(HydraConfig.get().runtime.output_dir), Path(str(cfg.output))
+    created = [output] if not output.exists() else []
+    if HydraConfig.get().mode == RunMode.RUN and folder.resolve() != Path.cwd():
+        created.append(folder)
+    try:
+        yield
+    finally:
+        for each in created:
+            files = (path.relative_to(each) for path in each.rglob("*") if not path.is_dir())
+            if {path.parts[0] for path in files} <= {".hydra"}:
+                shutil.rmtree(each, ignore_errors=True)
 
 
 def _do(cfg: DictConfig) -> float | None:
@@ -243,13 +255,12 @@ def _end(error: Exception) -> NoReturn:
 @hydra.main(version_base="1.3", config_path=str(CONF), config_name="config")
 def _compose(cfg: DictConfig) -> float | None:
     try:
-        return _do(cfg)
+        with _without_empty_folders(cfg):
+            return _do(cfg)
     except Exception as error:
         if HydraConfig.get().mode == RunMode.MULTIRUN:
             _fail(error)  # a sweeper may continue with the next job
         _end(error)
-    finally:
-        _remove_unused()
 
 
 def _menu() -> str:

@@ -59,6 +59,8 @@ JOB = Job(
 def run(experiment: Experiment) -> float | None:
     """Measure the success rate, or open-loop errors; return None in all but the first process of a training.
 
+    A policy that is trained on all episodes of a recording is not evaluated, as none is left: the result is None, too.
+
     Raises:
         ValueError: an episode ended in an error; the report is written and contains it.
     """
@@ -70,6 +72,10 @@ def run(experiment: Experiment) -> float | None:
     if (checkpoint := experiment.checkpoint) is None and not experiment["agent"]:
         from vla.jobs.train import train
 
+        if not experiment.playable and not experiment["data"]["validation_fraction"]:
+            log.warning("data.validation_fraction=0 trains on all episodes and leaves none to evaluate the policy on")
+            train(experiment.with_values({"job": "train"}))  # else resume=last would wait for an evaluation
+            return None
         if (checkpoint := train(experiment)) is None:
             return None
     trained_here = checkpoint is not None and checkpoint.resolve().parent == (output / CHECKPOINTS).resolve()

@@ -26,7 +26,7 @@ from vla.data.episodes import EpisodeStore
 from vla.data.header import is_store
 from vla.data.index import listed
 from vla.io.types import Count, Seed, Share
-from vla.jobs.collect import demonstrations
+from vla.jobs.collect import complete_store, demonstrations
 from vla.jobs.evaluate import evaluate_trained, require_possible
 from vla.jobs.train import train
 from vla.models.checkpoint import read_checkpoint, read_header
@@ -62,11 +62,12 @@ def run(experiment: Experiment) -> float:
         ValueError: the expert cannot label, seeds are not fresh, or a round of another policy lies in the folder.
     """
     seeds = _require_possible(experiment)
+    known = complete_store(experiment)
+    for store in (*([known] if known else ()), *map(EpisodeStore, experiment["collect"]["more"] or ())):
+        require_new(seeds, store)
     with training_lock(experiment.output):
         _save_config(experiment)
-        more = [EpisodeStore(folder) for folder in experiment["collect"]["more"] or ()]
-        for store in (demonstrations(experiment), *more):
-            require_new(seeds, store)
+        require_new(seeds, demonstrations(experiment))
         return _improved(experiment, seeds)
 
 

@@ -41,14 +41,23 @@ def evaluate_open_loop(experiment: Experiment, checkpoint: Path | None) -> float
     """
     started, output = time.monotonic(), experiment.output
     facts = dict(experiment["chosen"])
+    fraction = experiment["data"]["validation_fraction"]
     if checkpoint is not None:  # before an import
-        trained, world = (each.spec.without_truth for each in (read_header(checkpoint), experiment.world()))
+        header = read_header(checkpoint)
+        trained, world = header.spec.without_truth, experiment.world().spec.without_truth
         trained.require(world, f"the checkpoint {checkpoint}", "the task, with the options given here,")
+        fraction = header.config["data"]["validation_fraction"]
+    if not fraction:
+        whose = f"{checkpoint} was trained" if checkpoint else "a training would be"
+        raise ValueError(
+            f"data.validation_fraction=0: {whose} on all episodes, and errors on these say nothing about others: train "
+            "with a larger fraction"
+        )
     store = _store(experiment)
     if checkpoint is None:
         make_agent: Any = experiment.make_agent()
         policy = make_agent(experiment.world())
-        unseen = _held_out(store, experiment["data"]["validation_fraction"], "none of them is held out of a training")
+        unseen = _held_out(store, fraction)
     else:
         policy = experiment.make_policy(checkpoint)()
         policy.spec.without_truth.require(store.spec.without_truth, f"the checkpoint {checkpoint}", f"{store.folder}")
@@ -95,15 +104,15 @@ def _unseen(store: EpisodeStore, more: Sequence[Path], checkpoint: Path) -> list
         log.warning(
             "%s began with the weights of %s: whether these were trained on its episodes is unknown", checkpoint, origin
         )
-    return _held_out(store, header.config["data"]["validation_fraction"], f"{checkpoint} was trained on all of them")
+    return _held_out(store, header.config["data"]["validation_fraction"])
 
 
-def _held_out(store: EpisodeStore, fraction: float, otherwise: str) -> list[Entry]:
+def _held_out(store: EpisodeStore, fraction: float) -> list[Entry]:
     unseen = [entry for entry in store.episodes if held_out(entry.recording, fraction)]
     if not unseen:
         raise ValueError(
-            f"there are {len(store.episodes)} episodes in {store.folder}, but {otherwise}: record more, or set "
-            "data.validation_fraction above 0, in the training as well"
+            f"data.validation_fraction={fraction} holds none of the {len(store.episodes)} episodes in {store.folder} "
+            "out of training: train with a larger fraction, or with more episodes"
         )
     return unseen
 

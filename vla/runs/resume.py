@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
+import shutil
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -143,6 +144,8 @@ def training_lock(folder: Path) -> Iterator[None]:
     try:
         yield
     finally:
+        if [path.name for path in folder.glob("*")] == [LOCK]:  # refused before any work
+            shutil.rmtree(folder)
         lock.release()
 
 
