@@ -18,7 +18,7 @@ from vla.config.compose import compose
 from vla.config.packages import TRUSTED, trusted
 
 # Variants that change an option of RT-1.
-RT1_VARIANTS = {"as_published", "dropout", "smaller", "no_history", "small_embeddings", "two_tokens"}
+RT1_VARIANTS = {"images_and_text", "dropout", "smaller", "no_history", "small_embeddings", "two_tokens"}
 
 
 def composed(*overrides: str) -> DictConfig:
