@@ -15,11 +15,13 @@ from defaults import defaults_of
 from hydra.errors import MissingConfigException
 from omegaconf import DictConfig, OmegaConf
 
+from vla import jobs
 from vla.config.adopt import adopt
 from vla.config.build import build
 from vla.config.check import digest
-from vla.config.experiment import plain
+from vla.config.experiment import Experiment, plain
 from vla.io.suggestion import suggestion
+from vla.models.checkpoint import require_unseen
 from vla.run import sentence
 
 GRAMMAR = {
@@ -385,6 +387,44 @@ def test_a_report_says_what_the_training_of_its_checkpoint_was(checkpoint: Path)
 def test_evaluation_seeds_used_for_training_or_selection_are_refused(override: dict[str, Any], says: str) -> None:
     with pytest.raises(ValueError, match=says):
         check(config(**override))
+
+
+@pytest.mark.parametrize(
+    ("overrides", "key", "shared"),
+    [
+        (("checkpoint=FILE", "evaluate.seed=2000010"), "evaluate.seed", "2000010 to 2000019"),
+        (("checkpoint=FILE", "evaluate.seed=1999000", "evaluate.episodes=1001"), "evaluate.seed", "2000000 to 2000000"),
+        (("pretrained=FILE", "evaluate.seed=2000000"), "evaluate.seed", "2000000 to 2000019"),
+        (("job=improve", "pretrained=FILE", "evaluate.seed=2000000"), "evaluate.seed", "2000000 to 2000019"),
+        (
+            ("job=deploy", "deploy=loop", "checkpoint=FILE", "deploy.simulator.seed=2000019"),
+            "deploy.simulator.seed",
+            "2000019 to 2000019",
+        ),
+    ],
+)
+def test_a_checkpoint_is_not_evaluated_on_what_selected_it_whatever_is_validated_now(
+    overrides: tuple[str, ...], key: str, shared: str, tmp_path: Path
+) -> None:
+    """The episodes of its own training count, not `validate` of the command."""
+    path = tmp_path / "a.ckpt"
+    selected = {"validate": {"episodes": 20, "seed": 2_000_000, "changes": {}}}
+    torch.save({"config": {**SAVED, **selected}, "spec": toy.SPEC.to_dict(), "state_dict": {}}, path)
+    for validated in ("validate.seed=3000000", "validate.episodes=0"):
+        cfg = composed(*(each.replace("FILE", str(path)) for each in overrides), validated, f"output={tmp_path}/out")
+        check(cfg)
+        with pytest.raises(ValueError, match=rf"^{key}=\d+: episodes {shared} selected the weights in .*a\.ckpt"):
+            jobs.run(Experiment.of(cfg))
+
+
+def test_a_checkpoint_may_be_evaluated_on_all_that_did_not_select_it(tmp_path: Path) -> None:
+    path = tmp_path / "a.ckpt"
+    for validate in ({"episodes": 20, "seed": 2_000_000}, {"episodes": 0, "seed": 1_000_000}, {"episodes": "x"}, {}):
+        saved = {**SAVED, "validate": validate}
+        torch.save({"config": saved, "spec": toy.SPEC.to_dict(), "state_dict": {}}, path)
+        require_unseen(path, "evaluate.seed", range(1_000_000, 2_000_000))
+        require_unseen(path, "evaluate.seed", range(2_000_020, 2_000_040))
+    check(config(job="evaluate", checkpoint=str(path), **{"validate.seed": 1_000_000}))  # nothing is validated
 
 
 def test_any_error_is_one_line() -> None:

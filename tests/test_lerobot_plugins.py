@@ -53,6 +53,19 @@ def test_an_episode_is_that_of_the_world_under_the_names_of_lerobot() -> None:
     vector.close()
 
 
+def test_no_episode_of_lerobot_is_one_of_training() -> None:
+    """Its default seed is 1000, its environments are reset without one when an episode ends, and ours keep theirs."""
+    world = LeRobotEnvironment("tabletop", 50, SMALL)
+    inner, played = world.env.unwrapped.environment, list[int]()  # type: ignore[attr-defined]
+    really = inner.reset
+    inner.reset = lambda seed: (played.append(seed), really(seed))[1]
+    for seed in (1000, FIRST_SEED + 7, None, None):
+        world.reset(seed=seed)
+    world.close()
+    assert played[:2] == [FIRST_SEED + 1000, FIRST_SEED + 7]
+    assert played[2] != played[3] and all(seed >= FIRST_SEED for seed in played)
+
+
 @pytest.mark.parametrize("spec", [SPEC, ARM_SPEC])
 def test_names_and_back_is_the_same_observation(spec: Any) -> None:
     random = np.random.default_rng(0)

@@ -96,7 +96,8 @@ def check(cfg: DictConfig, job: Job) -> None:
     for name, annotation in plain.items():
         node = OmegaConf.to_container(cfg[name], resolve=True) if OmegaConf.is_config(cfg[name]) else cfg[name]
         _check_plain(name, node, annotation)
-    _require_apart(cfg)
+    if cfg.checkpoint is None:  # else the seeds of its own training count
+        _require_apart(cfg)
     if cfg.agent is not None and "agent" not in groups:
         raise ValueError(f"job={cfg.job} takes no agent: agent=OPTION goes with job=evaluate and deploy")
     if cfg.agent is not None and cfg.checkpoint is not None:

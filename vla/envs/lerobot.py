@@ -16,7 +16,7 @@ import numpy as np
 from gymnasium.spaces import Box, Dict
 
 from vla.envs.gym import Task
-from vla.spec import Array, Observation, Spec
+from vla.spec import FIRST_SEED, Array, Observation, Spec
 
 IMAGES, STATE, RATES = "observation.images.", "observation.state", "observation.velocities"
 TASK = "task"  # the instructions
@@ -49,8 +49,12 @@ class LeRobotEnvironment(gymnasium.Wrapper[dict[str, Any], Array, dict[str, Any]
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Start the episode of `seed`."""
-        observation, info = self.env.reset(seed=seed, options=options)
+        """Start an episode of evaluation: that of `seed`; a seed of training, as LeRobot's default, counts from there.
+
+        Without a seed one is drawn.
+        """
+        asked = int(self.np_random.integers(FIRST_SEED)) if seed is None else seed
+        observation, info = self.env.reset(seed=asked + FIRST_SEED * (asked < FIRST_SEED), options=options)
         return self._renamed(observation), _success(info)
 
     def step(self, action: Array) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:

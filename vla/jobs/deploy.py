@@ -7,7 +7,9 @@ from typing import Any
 
 from vla.config.build import build
 from vla.config.check import Job
+from vla.config.differences import at
 from vla.config.experiment import Experiment
+from vla.models.checkpoint import require_unseen
 from vla.reports.evaluation import plot_report, write_report
 from vla.runs.folder import PLOT, REPORT
 
@@ -18,8 +20,12 @@ def run(experiment: Experiment) -> None:
     """Run the deployment until done or interrupted; report a measured success rate like an evaluation.
 
     Raises:
-        ValueError: an episode ended in an error; the report is written and contains it.
+        ValueError: an episode ended in an error; the report is written and contains it. Or, before anything is started,
+            an episode that is to be played selected the weights.
     """
+    seed, episodes = (at(experiment["deploy"], key, None) for key in ("simulator.seed", "episodes"))
+    if experiment.checkpoint is not None and seed is not None and episodes is not None:
+        require_unseen(experiment.checkpoint, "deploy.simulator.seed", range(seed, seed + episodes))
     report = deployment(experiment).run()
     if report is not None:
         output = experiment.output

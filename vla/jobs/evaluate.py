@@ -96,8 +96,9 @@ def require_possible(experiment: Experiment) -> None:
 
     Raises:
         ValueError: there is no such run to compare with, nothing to decide, no such network or store, or no world to
-            change.
+            change; or its episodes selected the weights.
     """
+    _require_unseen(experiment)
     _statements(experiment)
     _networks(experiment)
     if experiment["evaluate"]["by_clock"] and not experiment["evaluate"]["networks"]:
@@ -112,6 +113,18 @@ def require_possible(experiment: Experiment) -> None:
     if experiment.playable:
         for name, changes in conditions(experiment["evaluate"]).items():
             _require_world(experiment, name, changes)
+
+
+def _require_unseen(experiment: Experiment) -> None:
+    """Raise a ValueError if an episode of the evaluation selected given weights, whatever `validate` is now."""
+    asked, files = experiment["evaluate"], [experiment.checkpoint, experiment.pretrained]
+    if not any(files):
+        return
+    from vla.models.checkpoint import require_unseen  # imports PyTorch
+
+    for file in files:
+        if file is not None and file.exists():  # initial weights may have been deleted since
+            require_unseen(file, "evaluate.seed", range(asked["seed"], asked["seed"] + asked["episodes"]))
 
 
 def _require_world(experiment: Experiment, name: str, changes: dict[str, Any]) -> None:

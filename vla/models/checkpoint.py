@@ -93,6 +93,28 @@ def read_checkpoint(path: str | Path) -> Checkpoint:
     return Checkpoint(**vars(header), state=state)
 
 
+def require_unseen(path: Path, key: str, seeds: range) -> None:
+    """Refuse to evaluate the weights in a checkpoint on episodes that selected them, in validations of its training.
+
+    Args:
+        path: the checkpoint.
+        key: the dotted key that sets the first of the seeds, for the error.
+        seeds: of the episodes that are to evaluate.
+
+    Raises:
+        ValueError: an episode is among those of the validations; or as of `read_header`.
+    """
+    validated = read_header(path).config.get("validate", {})
+    first, count = (validated.get(name) for name in ("seed", "episodes"))
+    if not isinstance(first, int) or not isinstance(count, int):  # unknown
+        return
+    if shared := range(max(first, seeds.start), min(first + count, seeds.stop)):
+        raise ValueError(
+            f"{key}={seeds.start}: episodes {shared.start} to {shared.stop - 1} selected the weights in {path} when it "
+            f"was trained, and cannot evaluate them: set {key}={first + count} or another"
+        )
+
+
 def _header(path: Path, content: dict[str, Any]) -> Header:
     config, spec, steps = (content.get(name) for name in ("config", "spec", "global_step"))
     if config is None or spec is None:
