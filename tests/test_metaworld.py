@@ -18,6 +18,7 @@ from PIL import Image
 
 from vla.config.experiment import Experiment
 from vla.data.episodes import EpisodeStore
+from vla.deploy.server import Keys
 from vla.parallel.pool import THIS_PROCESS
 from vla.rollouts.collect import collect
 from vla.rollouts.rollout import rollout
@@ -247,6 +248,20 @@ def test_a_window_is_a_part_of_the_whole_picture() -> None:
     assert np.abs(part.reset(0).rgb["corner2"] - expected).mean() < 0.1
     whole.close()
     part.close()
+
+
+def test_images_that_are_parts_of_a_picture_are_not_taken_from_whole_ones() -> None:
+    spec = world(
+        "task.cameras=[corner2,hand,topview]", "task.window=[0.25,0.29,0.95,0.99]", "task.image_size=[96,96]"
+    ).spec
+    assert spec.cut == ("corner2", "hand") and world("task.cameras=[corner2]").spec.cut == ()
+    keys = Keys({"corner2": "image", "hand": "hand", "topview": "top"}, ["state"], "prompt")
+    whole, part = np.zeros((480, 480, 3), np.uint8), np.zeros((96, 96, 3), np.uint8)
+    sent = {"image": part, "hand": part, "top": whole, "state": np.zeros(4), "prompt": "Reach a goal position"}
+    assert {image.shape for image in keys.observation(sent, spec, "centre").rgb.values()} == {(96, 96, 3)}
+    for key, camera in (("image", "corner2"), ("hand", "hand")):
+        with pytest.raises(ValueError, match=f"^{key} has 480 by 480 pixels, but {camera} shows a part of .*96 by 96"):
+            keys.observation({**sent, key: whole}, spec, "centre")
 
 
 def test_the_hands_picture_is_a_part_of_lerobots_that_moves_along() -> None:

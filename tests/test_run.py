@@ -23,9 +23,11 @@ from clusters import until
 from command_line import SMALL, here, vla
 from PIL import Image
 from rerun.chunk import RrdReader
+from websockets.sync.client import connect
 
 from vla import jobs
 from vla.data.episodes import EpisodeStore
+from vla.io.array_messages import pack
 from vla.models.checkpoint import read_checkpoint
 from vla.tasks.rendering.fast import Fast
 from vla.tasks.rendering.reference import Reference
@@ -140,9 +142,15 @@ def test_a_policy_behind_a_server_acts_as_it_does_from_its_checkpoint(home: Path
     try:
         until(lambda: _listens(port))
         here(home, *SMALL, "agent=remote", f"agent.url=ws://127.0.0.1:{port}", "recorder=none", "output=remote")
+        with connect(f"ws://127.0.0.1:{port}", proxy=None) as hostile:
+            hostile.recv()
+            hostile.send(pack({"\x1b]0;evil\x07\r\nerror: forged": 1}))
+            hostile.recv()
     finally:
         server.send_signal(signal.SIGTERM)
     assert server.wait(60) == 0, server.printed()
+    printed = server.printed()
+    assert "prompt: it has \\x1b]0;evil\\x07 error: forged\n" in printed and not {"\x1b", "\x07"} & {*printed}
     played = [json.loads((home / run / "report.json").read_text())["per_episode"] for run in ("run", "remote")]
     first, second = ([(each["outcome"], each["motion"]) for each in episodes] for episodes in played)
     assert len(first) == 2 and first == second

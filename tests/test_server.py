@@ -12,8 +12,9 @@ import ssl
 import threading
 import time
 from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, ExitStack
 from dataclasses import replace
+from functools import partial
 from itertools import cycle, takewhile
 from pathlib import Path
 from typing import Any
@@ -29,7 +30,10 @@ from command_line import SMALL, here
 from composing import composed
 from fake_batch import as_policy, make_bc, make_rt1
 from toy import SPEC, ToyEnvironment
+from websockets.asyncio import server as asyncio_server
+from websockets.datastructures import Headers
 from websockets.exceptions import ConnectionClosed, InvalidMessage, InvalidStatus
+from websockets.http11 import Request, Response
 from websockets.sync.client import ClientConnection, connect
 from websockets.sync.server import ServerConnection, serve
 
@@ -56,6 +60,7 @@ def settings(policy: Policy, **changes: Any) -> PolicyServer:
         "connections": 4,
         "largest_message": 1_000_000,
         "api_key": None,
+        "origins": [],
         "certificate": None,
         "private_key": None,
         "policy": lambda: policy,
@@ -271,6 +276,20 @@ def test_images_of_other_sizes_kinds_and_places_are_taken() -> None:
     np.testing.assert_array_equal(parts.observation(split, SPEC, "none").state, [1, 2])
 
 
+def test_scalars_of_numpy_are_numbers() -> None:
+    for scalar in (np.int64(5), np.uint8(5), np.array(5)):
+        assert type(unpack(pack({"seed": scalar}))["seed"]) is int
+    assert unpack(pack([np.float32(0.1), np.bool_(True), np.array(2.0)])) == [np.float32(0.1), True, 2.0]
+    policy = as_policy(make_bc())
+    seen = {**message(observations(1)[0]), "observation/state": [np.float32(0.5), np.int8(1)]}
+    with serving(policy) as url, client(url) as connection:
+        connection.recv()
+        connection.send(pack({"reset": np.bool_(True), "prompt": "go", "seed": np.int64(5)}))
+        assert received(connection) == {"reset": True}
+        connection.send(pack(seen))
+        assert received(connection)["actions"].dtype == np.float32
+
+
 WHOLE = message(observations(1)[0])
 WRONG: dict[str, tuple[Any, str]] = {
     "text": ("hello", "is a binary message in msgpack, not text"),
@@ -284,8 +303,18 @@ WRONG: dict[str, tuple[Any, str]] = {
     "state": (pack({**WHOLE, "observation/state": np.zeros(3)}), "has 3 numbers, the policy needs 2: east, north"),
     "finite": (pack({**WHOLE, "observation/state": [np.nan, 0.0]}), "holds a number that is not finite"),
     "words": (pack({**WHOLE, "observation/state": "far"}), "observation/state is not a vector of numbers"),
-    "prompt": (pack({**WHOLE, "prompt": "a" * (LONGEST_INSTRUCTION + 1)}), "of at most 1000 characters"),
+    "digits": (pack({**WHOLE, "observation/state": ["1", "1"]}), "observation/state is not a vector of numbers"),
+    "rows": (pack({**WHOLE, "observation/state": [[1.0], [1.0, 2.0]]}), "observation/state is not a vector of numbers"),
+    "nothing": (pack({**WHOLE, "observation/state": [None, 1.0]}), "observation/state is not a vector of numbers"),
+    "prompt": (
+        pack({**WHOLE, "prompt": "a" * (LONGEST_INSTRUCTION + 1)}),
+        "has 1001 characters, an instruction at most",
+    ),
+    "prompts": (pack({**WHOLE, "prompt": ["go"]}), "prompt is an instruction, a text, not list"),
     "seed": (pack({"reset": True, "seed": -1}), "seed is -1, expected an integer"),
+    "seed as a text": (pack({"reset": True, "prompt": "go", "seed": "5"}), "seed is '5', expected an integer"),
+    "half a seed": (pack({"reset": True, "prompt": "go", "seed": np.float32(0.5)}), "seed is 0.5, expected an integer"),
+    "escapes": (pack({"\x1b]0;evil\x07\nerror: none": 1}), "the observation lacks"),
     "objects": (
         msgpack.packb({b"__ndarray__": True, b"dtype": "|O", b"data": b"cos\nsystem\n", b"shape": [1]}),
         r"has the type \|O, expected one of",
@@ -369,6 +398,21 @@ def test_only_so_many_come_in_and_only_with_the_key() -> None:
             with pytest.raises(ValueError, match="failed: 1 clients are connected"):
                 remote(url, api_key="open")
         remote(url, api_key="open").close()
+
+
+def test_web_pages_come_in_only_from_where_they_may() -> None:
+    key = {"Authorization": "Api-Key öpen"}
+    with serving(as_policy(make_bc()), api_key="öpen", origins=["http://localhost:3000"], connections=1) as url:
+        for origin in ("http://evil.example", "null", "", "http://localhost:3000.evil.example"):
+            with pytest.raises(InvalidStatus, match="403"):
+                client(url, additional_headers={"Origin": origin, **key})
+        with pytest.raises(InvalidStatus, match="403"):
+            client(url, additional_headers=[("Origin", "http://localhost:3000"), ("Origin", "null"), *key.items()])
+        for wrong in ({"Authorization": "Api-Key \xff"}, [*key.items(), *key.items()], None):
+            with pytest.raises(InvalidStatus, match="401"):
+                client(url, additional_headers=wrong)
+        with client(url, additional_headers={"Origin": "http://localhost:3000", **key}) as page:
+            assert received(page)["server"] == "vla"
 
 
 def test_with_a_certificate_only_clients_of_tls_are_served(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -478,6 +522,25 @@ def test_it_serves_until_it_is_told_to_stop(number: signal.Signals, caplog: pyte
         settings(as_policy(make_bc())).run()
         thread.join(60)
     assert asked == [b"OK\n"]
+
+
+def test_it_does_not_wait_for_clients_that_do_not_answer(monkeypatch: pytest.MonkeyPatch) -> None:
+    patient = partial(asyncio_server.serve, open_timeout=None, close_timeout=None)  # else 10 s each
+    monkeypatch.setattr(asyncio_server, "serve", patient)
+    rescued = threading.Event()
+    hello = b"GET / HTTP/1.1\r\nHost: here\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
+    hello += b"Sec-WebSocket-Version: 13\r\nSec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\n\r\n"
+    with ExitStack() as opened, serving(as_policy(make_bc())) as url:
+        address = urlsplit(url)
+        for said in (b"", b"GET / HT", hello, hello + b"\x82\xff"):  # the last one began an observation
+            silent = opened.enter_context(socket.create_connection((address.hostname, address.port)))
+            silent.sendall(said)
+            if said.startswith(hello):
+                assert silent.recv(12) == b"HTTP/1.1 101"
+        rescue = threading.Timer(60, lambda: (rescued.set(), opened.close()))
+        rescue.start()
+    rescue.cancel()
+    assert not rescued.is_set()
 
 
 def test_somebody_elses_actions_become_ours() -> None:
@@ -612,6 +675,49 @@ def test_another_policy_after_a_restart_is_noticed() -> None:
         assert (agent.metadata["history"], agent.history) == (history.model.history, history.model.history)
         np.testing.assert_array_equal(agent.act(seen), history.session().plan(seen)[0])
         agent.close()
+
+
+def test_an_address_is_reached_directly_whatever_proxy_the_environment_names(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("http_proxy", "https_proxy", "ws_proxy", "all_proxy"):
+        monkeypatch.setenv(name, "http://127.0.0.1:9")
+    monkeypatch.setenv("socks_proxy", "socks5h://127.0.0.1:9")
+    with serving(as_policy(make_bc())) as url:
+        remote(url).close()
+        remote(url.replace("127.0.0.1", "localhost")).close()
+
+
+@pytest.mark.parametrize(
+    ("url", "why"),
+    [
+        ("ws://127.0.0.1:99999", "Port out of range 0-65535"),
+        ("ws://127.0.0.1:http", "Port could not be cast"),
+        (f"ws://{'a' * 300}:8000", "label too long"),
+        ("ws://[::1", "Invalid IPv6 URL"),
+        ("http://127.0.0.1:8000", "scheme isn't ws or wss"),
+        ("127.0.0.1:8000", "scheme isn't ws or wss"),
+    ],
+)
+def test_what_is_no_address_is_said_to_be_none(url: str, why: str) -> None:
+    with pytest.raises(ValueError, match=rf"^agent\.url=.* leads to no policy server \(.*{why}.*it looks like ws://"):
+        remote(url)
+
+
+def test_a_key_and_images_go_to_the_named_server_only() -> None:
+    asked: list[str] = []
+
+    def elsewhere(connection: ServerConnection, request: Request) -> Response:
+        asked.append(request.headers.get("Authorization", "no key"))
+        return Response(302, "Found", Headers({"Location": other, "Content-Length": "0"}))
+
+    with (
+        serving(as_policy(make_bc())) as other,
+        serve(lambda _: None, "127.0.0.1", 0, process_request=elsewhere) as named,
+    ):
+        threading.Thread(target=named.serve_forever, daemon=True).start()
+        url = f"ws://127.0.0.1:{named.socket.getsockname()[1]}"
+        with pytest.raises(ValueError, match=rf"agent\.url={url} leads to no policy server \(cannot follow .*{other}"):
+            remote(url, api_key="s3cret")
+    assert asked == ["Api-Key s3cret"]
 
 
 def test_a_server_that_describes_nothing_is_not_waited_for() -> None:

@@ -31,6 +31,7 @@ from vla.config.experiment import Experiment, plain
 from vla.config.packages import config_folders, offer_options, option_packages, trust, trust_own
 from vla.config.substitutes import builds_world, with_substitutes
 from vla.deploy import ros
+from vla.io.printable import printable
 from vla.io.suggestion import suggestion
 from vla.parallel.fast_exit import fast_exit
 from vla.parallel.processes import raise_gc_thresholds, without_triton
@@ -42,7 +43,11 @@ TRACEBACKS = "VLA_TRACEBACKS"  # environment variable that passes the user's HYD
 
 
 def sentence(error: Exception) -> str:
-    """Describe an error in one line, with a suggestion where possible."""
+    """Describe an error in one printable line, with a suggestion where possible."""
+    return printable(" ".join(_described(error).split()))
+
+
+def _described(error: Exception) -> str:
     cause = error.__cause__
     if isinstance(error, MissingConfigException) and error.missing_cfg_file and error.options is not None:
         group, _, option = error.missing_cfg_file.rpartition("/")
@@ -66,7 +71,7 @@ def sentence(error: Exception) -> str:
     if type(error).__name__ == "FatalError" and "OpenGL" in str(error):
         backend = os.environ.get("MUJOCO_GL", "glfw")
         return f"MuJoCo cannot render here with MUJOCO_GL={backend}: set it to egl, or osmesa"
-    text = " ".join(str(error).split())
+    text = str(error).strip()
     if "failed to map segment" in text:
         return f"the memory that this process may use is too little to load its libraries ({text}): raise ulimit -v"
     return text or type(error).__name__
@@ -244,7 +249,7 @@ def _fail(error: Exception) -> NoReturn:
 def _end(error: Exception) -> NoReturn:
     for note in getattr(error, "__notes__", ()):
         if note.startswith(SWEEP):
-            print(f"error: {describe_failures(Path(note.removeprefix(SWEEP)))}", file=sys.stderr)
+            print(printable(f"error: {describe_failures(Path(note.removeprefix(SWEEP)))}"), file=sys.stderr)
             sys.exit(1)
     if os.environ[TRACEBACKS] == "1" or not _meant_for_user(error):
         raise error
@@ -279,6 +284,7 @@ def _menu() -> str:
 def main() -> None:
     """Run the command line; errors that the user can fix end in one sentence unless HYDRA_FULL_ERROR=1."""
     raise_gc_thresholds()
+    sys.excepthook = lambda _, bug, __: sys.stderr.write(printable("".join(traceback.format_exception(bug))))
     os.environ.setdefault(TRACEBACKS, os.environ.get("HYDRA_FULL_ERROR", "0"))
     os.environ["HYDRA_FULL_ERROR"] = "1"  # otherwise Hydra prints errors itself
     sys.argv[1:], ros.arguments[:] = ros.split_arguments(sys.argv[1:])

@@ -77,6 +77,8 @@ class Spec:
     high: Numbers  # (D,) largest action
     control_hz: Positive  # [Hz]
     depth: Annotated[tuple[Camera, ...], MaxLen(100), Predicate(unique)] = ()  # the cameras that also give depth
+    # The cameras whose images the world cuts out of larger pictures, which others cannot take their place.
+    cut: Annotated[tuple[Camera, ...], MaxLen(100), Predicate(unique)] = ()
     # simulator state kept as an auxiliary training target: name, size
     truth: Annotated[tuple[tuple[Name, Count], ...], MaxLen(100)] = ()
     robot: RobotModel | None = None  # None: no kinematics and no deployment
@@ -118,6 +120,15 @@ class Spec:
             )
         return self.robot
 
+    def require_cut(self, camera: str, shape: Sequence[int], what: str) -> None:
+        """Raise a ValueError if the image `what` (H, W, …) may be a whole picture of which `camera` shows a part."""
+        if camera in self.cut and (shape[0], shape[1]) != tuple(self.image_size):
+            height, width = self.image_size
+            raise ValueError(
+                f"{what} has {shape[1]} by {shape[0]} pixels, but {camera} shows a part of a larger picture: cut that "
+                f"out as the world of the policy does, {width} by {height} pixels"
+            )
+
     def random_observation(self, random: np.random.Generator) -> Observation:
         """Return an observation with random images and state, a fixed instruction and no truth."""
         rgb = {camera: random.integers(256, size=(*self.image_size, 3), dtype=np.uint8) for camera in self.cameras}
@@ -144,11 +155,11 @@ class Spec:
     def require(self, other: Spec, what: str, against: str) -> None:
         """Raise a ValueError naming the first field in which the spec of `what` (self) differs from `against`.
 
-        A chain or home that is unknown to one of them is no difference.
+        What is unknown to one of them, chain, home or cut cameras, is no difference.
         """
         mine, theirs = _fields(self), _fields(other)
         for name, value in mine.items():
-            unknown = name in ("robot.chain", "robot.home") and () in (value, theirs.get(name))
+            unknown = name in ("robot.chain", "robot.home", "cut") and () in (value, theirs.get(name))
             if value != theirs.get(name) and not unknown:
                 raise ValueError(
                     f"{what} has {name} = {str(value)[:200]}, but {against} has {str(theirs.get(name))[:200]}"
@@ -179,8 +190,9 @@ def _contradictions(spec: Spec) -> Iterator[str]:
     for name, low, high in zip(spec.action, spec.low, spec.high, strict=False):
         if not low < high:
             yield f"low of {name} is {low}, not less than high, {high}"
-    if unknown := [camera for camera in spec.depth if camera not in spec.cameras]:
-        yield f"depth names {', '.join(unknown)}, which is not among the cameras"
+    for name in ("depth", "cut"):
+        if unknown := [camera for camera in getattr(spec, name) if camera not in spec.cameras]:
+            yield f"{name} names {', '.join(unknown)}, which is not among the cameras"
     if not unique([name for name, _ in spec.truth]) or spec.truth_size > 4096:
         yield "truth has a name twice, or more than 4096 numbers"
     if spec.robot is not None:

@@ -22,6 +22,7 @@ from PIL import Image
 from vla.deploy.control_loop import Command
 from vla.deploy.joint_limiter import Robot
 from vla.io.documents import STRICT, parse_json
+from vla.io.printable import printable
 from vla.io.types import Natural, NonNegative, Seed
 from vla.spec import LONGEST_INSTRUCTION, Array, Name, Names, Numbers, RobotModel
 
@@ -67,7 +68,8 @@ class SimulatedEpisode:
 
 
 def shorten(text: str, longest: int = 80) -> str:
-    """Truncate text to at most `longest` characters, for logs."""
+    """Truncate text to at most `longest` characters, printable for logs."""
+    text = printable(text)
     return text if len(text) <= longest else f"{text[: longest - 1]}…"
 
 

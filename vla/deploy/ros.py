@@ -18,6 +18,8 @@ from typing import Annotated, Any, Literal
 
 from annotated_types import Ge, Le
 
+from vla.io.printable import printable
+
 MAX_DOMAIN = 232  # larger domains have no UDP ports
 LOOPBACK = Path(__file__).with_name("loopback.xml")
 
@@ -151,7 +153,7 @@ def plain_errors() -> Iterator[None]:
     try:
         yield
     except (ValueError, ImportError) as error:
-        sys.exit(f"error: {error}")
+        sys.exit(printable(f"error: {error}"))
     except OSError as error:
         sys.exit(f"error: {error.filename}: {error.strerror}" if error.filename else f"error: {error}")
 

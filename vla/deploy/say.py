@@ -8,6 +8,7 @@ import sys
 
 from vla.deploy.ros import NETWORKS, command_node
 from vla.deploy.settings import NAME
+from vla.io.printable import printable
 from vla.spec import LONGEST_INSTRUCTION
 
 
@@ -36,7 +37,7 @@ def main() -> None:
         from vla.deploy.calls import hand_over, next_episode, resume, say
 
         if options.reset:
-            print(next_episode(node))
+            print(printable(next_episode(node)))
         if options.hand_over:
             hand_over(node, to_person=True)
         if options.instruction is not None:

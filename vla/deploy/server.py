@@ -25,6 +25,7 @@ from http import HTTPStatus
 from ipaddress import ip_address
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
+from weakref import WeakSet
 
 import numpy as np
 from annotated_types import Ge, Le, MinLen
@@ -46,6 +47,7 @@ SENTENCE = b"this is a policy server: connect to it by WebSocket with openpi's p
 NO_WEBSOCKET = b"HTTP/1.1 405 Method Not Allowed\r\nAllow: GET\r\nConnection: close\r\n" + (
     b"Content-Type: text/plain\r\nContent-Length: %d\r\n\r\n%s" % (len(SENTENCE), SENTENCE)
 )
+GOODBYE = 1.0  # patience with clients when the server ends [s]
 INVALID, TOO_BIG, INTERNAL = 1007, 1009, 1011  # WebSocket close codes: invalid data, too large, error in the server
 
 log = logging.getLogger(__name__)
@@ -74,10 +76,10 @@ class Keys:
         if missing := [key for key, value in found.items() if value is None]:
             present = ", ".join(str(key)[:50] for key in list(message)[:20])
             raise ValueError(f"the observation lacks {', '.join(missing)}: it has {present or 'nothing'}")
-        rgb = {
-            camera: resize(_image(self.images[camera], found[self.images[camera]]), spec.image_size, crop)
-            for camera in spec.cameras
-        }
+        images = {camera: _image(self.images[camera], found[self.images[camera]]) for camera in spec.cameras}
+        for camera, image in images.items():
+            spec.require_cut(camera, image.shape, self.images[camera])
+        rgb = {camera: resize(image, spec.image_size, crop) for camera, image in images.items()}
         state = np.concatenate([_vector(key, found[key]) for key in self.state])
         if len(state) != len(spec.state):
             raise ValueError(
@@ -99,6 +101,7 @@ class PolicyServer:
         connections: largest number of clients at a time.
         largest_message: of a client [bytes].
         api_key: what clients must send; needed to listen beyond this machine.
+        origins: of web pages that may use the policy, such as http://localhost:3000.
         certificate, private_key: PEM files for TLS.
         policy, environment: factories of the policy and of the task's environment.
         output: folder of results, unused.
@@ -115,6 +118,7 @@ class PolicyServer:
     connections: Count
     largest_message: Count
     api_key: Text | None
+    origins: list[Text]
     certificate: str | None
     private_key: str | None
     policy: Callable[[], Policy]
@@ -178,16 +182,19 @@ class Service:
         """Serve within the context, which is entered with the URL once the first client can be answered."""
         from websockets.asyncio.server import serve
 
-        settings, context = self._settings, self._tls
+        settings, context, loop = self._settings, self._tls, asyncio.get_running_loop()
+        opened: WeakSet[ServerConnection] = WeakSet()
         limits = {"compression": None, "max_size": settings.largest_message, "max_queue": 1}
-        request = {"process_request": self._answer_request, "create_connection": _connection(), "ssl": context}
+        request = {"process_request": self._answer_request, "create_connection": _connection(opened), "ssl": context}
         with ThreadPoolExecutor(1, "inference") as thread:
-            await asyncio.get_running_loop().run_in_executor(thread, self._warm_up)
+            await loop.run_in_executor(thread, self._warm_up)
             async with serve(self._talk, settings.host, settings.port, **limits, **request) as server:
                 inference = asyncio.create_task(self._infer(thread))
                 port = server.sockets[0].getsockname()[1]
                 host = f"[{settings.host}]" if ":" in settings.host else settings.host
                 yield f"{'wss' if context else 'ws'}://{host}:{port}"
+                hang_up = loop.call_later(GOODBYE, lambda: [each.transport.abort() for each in opened])
+            hang_up.cancel()
             inference.cancel()
 
     @contextmanager
@@ -224,12 +231,16 @@ class Service:
         self._policy.session().plan(self._policy.spec.random_observation(np.random.default_rng(0)))
 
     def _answer_request(self, connection: ServerConnection, request: Request) -> Response | None:
-        """Answer health checks; reject clients without the key, or beyond `connections`, during the handshake."""
+        """Answer health checks; reject web pages, clients without the key, or beyond `connections`."""
         if request.path == "/healthz":
             return connection.respond(HTTPStatus.OK, "OK\n")
-        key = self._settings.api_key
-        given = request.headers.get("Authorization", "")
-        if key is not None and not hmac.compare_digest(given.encode(), f"Api-Key {key}".encode()):
+        # Browsers name the page that connects, and let any page connect to this machine.
+        if not {*request.headers.get_all("Origin")} <= {*self._settings.origins}:
+            return connection.respond(HTTPStatus.FORBIDDEN, "web pages may connect from deploy.origins only\n")
+        key, given = self._settings.api_key, "".join(request.headers.get_all("Authorization"))
+        if key is not None and not hmac.compare_digest(
+            given.encode(errors="surrogateescape"), f"Api-Key {key}".encode()
+        ):
             return connection.respond(HTTPStatus.UNAUTHORIZED, "send the API key as Authorization: Api-Key …\n")
         if self._connected >= self._settings.connections:
             return connection.respond(HTTPStatus.SERVICE_UNAVAILABLE, f"{self._connected} clients are connected\n")
@@ -265,7 +276,7 @@ class Service:
     async def _refuse(self, connection: ServerConnection, sentence: str, code: int) -> None:
         from websockets.exceptions import ConnectionClosed
 
-        log.warning("refused a client at %s: %s", connection.remote_address[0], sentence[:500])
+        log.warning("refused a client at %s: %s", connection.remote_address[0], " ".join(sentence.split())[:500])
         with suppress(ConnectionClosed):
             await connection.send(sentence)
             await connection.close(code, sentence.encode()[:120].decode(errors="ignore"))
@@ -274,10 +285,10 @@ class Service:
         if isinstance(data, str):
             raise ValueError("an observation is a binary message in msgpack, not text")
         message = unpack(data)
-        if isinstance(message, Mapping) and message.get("reset"):
+        if isinstance(message, Mapping) and message.get("reset") is True:
             seed = message.get("seed", 0)
             if type(seed) is not int or not 0 <= seed < 2**32:
-                raise ValueError(f"seed is {str(seed)[:50]}, expected an integer from 0 to 2**32 - 1")
+                raise ValueError(f"seed is {repr(seed)[:50]}, expected an integer from 0 to 2**32 - 1")
             session.reset(_prompt("prompt", message.get("prompt")), seed)
             return {"reset": True}
         observation = self._settings.keys.observation(message, session.spec, self._settings.image_crop)
@@ -341,12 +352,19 @@ def _plan(sessions: Sequence[Policy], observations: Sequence[Observation]) -> li
     return plan_together(sessions, observations)
 
 
-def _connection() -> type[ServerConnection]:
-    """Return a connection that answers a client of another protocol, which websockets would close silently."""
+def _connection(opened: WeakSet[ServerConnection]) -> type[ServerConnection]:
+    """Return a connection that answers a client of another protocol, which websockets would close silently.
+
+    Connections are added to `opened`, even before they speak any protocol.
+    """
     from websockets.asyncio.server import ServerConnection
 
     class Connection(ServerConnection):
         _known = False  # the protocol
+
+        def connection_made(self, transport: asyncio.BaseTransport) -> None:
+            super().connection_made(transport)
+            opened.add(self)
 
         def data_received(self, data: bytes) -> None:
             if not self._known and not data.startswith(WEBSOCKET[: len(data)]):
@@ -416,16 +434,21 @@ def _image(key: str, value: Any) -> Array:
 def _vector(key: str, value: Any) -> Array:
     """Return numbers as (N,) float32."""
     try:
-        with np.errstate(over="ignore"):
-            vector = np.asarray(value, np.float32).reshape(-1)
-    except (ValueError, TypeError) as error:
+        given = np.asarray(value).reshape(-1)
+    except ValueError as error:  # rows of different lengths
         raise ValueError(f"{key} is not a vector of numbers") from error
+    if given.dtype.kind not in "biuf":
+        raise ValueError(f"{key} is not a vector of numbers")
+    with np.errstate(over="ignore"):
+        vector = given.astype(np.float32)
     if not np.isfinite(vector).all():
         raise ValueError(f"{key} holds a number that is not finite")
     return vector
 
 
 def _prompt(key: str, value: Any) -> str:
-    if not isinstance(value, str) or len(value) > LONGEST_INSTRUCTION:
-        raise ValueError(f"{key} is an instruction of at most {LONGEST_INSTRUCTION} characters")
+    if not isinstance(value, str):
+        raise ValueError(f"{key} is an instruction, a text, not {type(value).__name__}")
+    if len(value) > LONGEST_INSTRUCTION:
+        raise ValueError(f"{key} has {len(value)} characters, an instruction at most {LONGEST_INSTRUCTION}")
     return value

@@ -7,6 +7,7 @@ from typing import Any
 
 from vla.deploy.ros import NETWORKS, command_node, spin
 from vla.deploy.settings import NAME
+from vla.io.printable import printable
 
 
 def main() -> None:
@@ -26,7 +27,7 @@ def main() -> None:
                 f"{key} {value}" for key, value in values.items() if key not in ("state", "instruction")
             )
             state, instruction = values.get("state", "?"), values.get("instruction", "")
-            print(f"{state:8} {status.message:40} '{instruction}'  {latencies}", flush=True)
+            print(printable(f"{state:8} {status.message:40} '{instruction}'  {latencies}"), flush=True)
 
         node.create_subscription(DiagnosticStatus, f"{options.agent}/status", show, 10)
         spin(node, stopped)

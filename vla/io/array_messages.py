@@ -31,7 +31,7 @@ def pack(message: Any) -> bytes:
 
 
 def unpack(data: bytes) -> Any:
-    """Decode a message; arrays are read-only views of `data`.
+    """Decode a message; arrays are read-only views of `data`, and those without a dimension are Python's numbers.
 
     Raises:
         ValueError: it is damaged, too large, or holds something else than plain values and arrays of numbers.
@@ -81,14 +81,15 @@ def _array(values: dict[Any, Any]) -> np.ndarray:
         raise ValueError("an array has no valid shape")
     if not isinstance(data, bytes) or len(data) != math.prod(shape) * dtype.itemsize:
         raise ValueError(f"an array of shape {shape} has too many or too few bytes")
-    return np.frombuffer(data, dtype).reshape(shape)
+    array = np.frombuffer(data, dtype).reshape(shape)
+    return array if shape else array.item()
 
 
 def _scalar(values: dict[Any, Any]) -> Any:
     dtype, data = _dtype(values), values.get(b"data")
     if not isinstance(data, (bool, int, float)):
         raise ValueError("a NumPy scalar is no number")
-    return np.array(data, dtype)[()]
+    return np.array(data, dtype).item()
 
 
 def _dtype(values: dict[Any, Any]) -> np.dtype[Any]:

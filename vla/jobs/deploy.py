@@ -9,6 +9,7 @@ from vla.config.build import build
 from vla.config.check import Job
 from vla.config.differences import at
 from vla.config.experiment import Experiment
+from vla.io.printable import printable
 from vla.models.checkpoint import require_unseen
 from vla.reports.evaluation import plot_report, write_report
 from vla.runs.folder import PLOT, REPORT
@@ -31,7 +32,7 @@ def run(experiment: Experiment) -> None:
         output = experiment.output
         write_report(report, output / REPORT, experiment["checkpoint"], experiment.config)
         plot_report(report, output / PLOT)
-        print(report)
+        print(printable(str(report)))
         if report.errors:
             raise ValueError(f"the episodes ended with an error, see {output / REPORT}: {report.errors[0].error}")
 

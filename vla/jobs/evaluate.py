@@ -13,12 +13,11 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from rich import print as show
-
 from vla.config.build import Group, build
 from vla.config.check import NEAREST, Job, conditions, with_changes
 from vla.config.experiment import Experiment
 from vla.io.files import warn_on_error, writing
+from vla.io.printable import printable, show
 from vla.io.versions import installed_versions
 from vla.policy import costs
 from vla.reports.conditions import SecondaryRows, conditions_table, plot_conditions, secondary_table
@@ -162,7 +161,7 @@ def _evaluated(experiment: Experiment, checkpoint: Path | None, rounds: Sequence
                 raise ValueError(f"{errors} episodes ended in an error, see {output / REPORT}")
     finally:
         for line in result:  # after whatever was logged, because scripts read the last line
-            print(line)
+            print(printable(line))
     return report.success
 
 

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from annotated_types import MinLen
-from rich import print as show
 
 from vla.config.build import require_no_paths
 from vla.config.check import Job
@@ -17,6 +16,7 @@ from vla.data.episodes import EpisodeStore
 from vla.data.index import listed
 from vla.data.verification import derive_store, find_episode, require_whole, verify_store
 from vla.io.files import warn_on_error
+from vla.io.printable import show
 from vla.io.types import Natural, Text
 from vla.reports.dataset_card import store_table, write_card
 from vla.rollouts.recorder import RerunRecorder, recording_name

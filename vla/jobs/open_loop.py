@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rich import print as show
 from rich.progress import track
 
 from vla.config.experiment import Experiment
@@ -19,6 +18,7 @@ from vla.data.header import is_store
 from vla.data.index import Entry
 from vla.data.verification import episode_of
 from vla.io.files import warn_on_error, writing
+from vla.io.printable import show
 from vla.jobs.collect import demonstrations
 from vla.models.checkpoint import read_header
 from vla.policy import costs

@@ -8,11 +8,11 @@ from pathlib import Path
 from typing import Annotated
 
 from annotated_types import Gt, Lt
-from rich import print as show
 from rich.table import Table
 
 from vla.config.check import Job
 from vla.config.experiment import Experiment
+from vla.io.printable import show
 from vla.io.types import Share, Text
 from vla.reports.comparison import common_episodes, read_runs
 from vla.rollouts.comparison import compare_pairs

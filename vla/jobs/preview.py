@@ -7,11 +7,10 @@ from contextlib import closing
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from rich import print as show
-
 from vla.config.check import Job
 from vla.config.experiment import Experiment
 from vla.io.files import atomic_path, writing
+from vla.io.printable import show
 from vla.io.types import Count, Seed
 from vla.reports.resets import contact_sheet, draws_table
 from vla.rollouts.recorder import RerunRecorder, merge

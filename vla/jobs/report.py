@@ -5,10 +5,9 @@ from __future__ import annotations
 import logging
 from pathlib import Path
 
-from rich import print as show
-
 from vla.config.check import Job
 from vla.config.experiment import Experiment
+from vla.io.printable import show
 from vla.io.types import Text
 from vla.reports.comparison import CASE, compare_runs, read_runs, remarks, runs_table, secondary_rows
 from vla.reports.conditions import secondary_table

@@ -10,8 +10,8 @@ from hydra.core.utils import JobReturn, JobStatus
 from hydra.experimental.callback import Callback
 from hydra.types import RunMode
 from omegaconf import DictConfig
-from rich import print as show
 
+from vla.io.printable import show
 from vla.runs.cells import FAILURE
 from vla.runs.sweep import read_rows
 

@@ -78,7 +78,7 @@ class RemotePolicy:
             computes the next one; else wait for it.
         ensemble: as of `vla.rollouts.realtime.Schedule`; null: only the newest chunk counts.
         timeout: longest time to wait for an answer [s].
-        api_key: sent as Authorization: Api-Key …
+        api_key: sent to `url` alone, as Authorization: Api-Key …
         spec: of the environment.
 
     Raises:
@@ -232,7 +232,8 @@ class RemotePolicy:
     def _connected(self, opened: ExitStack) -> tuple[ClientConnection, dict[str, Any]]:
         try:
             from websockets.asyncio.client import connect
-            from websockets.exceptions import InvalidStatus, WebSocketException
+            from websockets.exceptions import InvalidStatus, InvalidURI, WebSocketException
+            from websockets.uri import parse_uri
         except ImportError as error:
             raise ValueError(
                 "agent=remote needs websockets: install this package with its extra server, as in "
@@ -242,7 +243,15 @@ class RemotePolicy:
         headers = {"Authorization": f"Api-Key {self.api_key}"} if self.api_key else None
 
         async def connected() -> ClientConnection:
-            return await connect(self.url, compression=None, max_size=2**26, additional_headers=headers, **times)
+            try:
+                # No proxy of the environment; and where host and port are given, redirections elsewhere are refused.
+                place = {"host": parse_uri(self.url).host, "port": parse_uri(self.url).port, "proxy": None}
+                options = {"compression": None, "max_size": 2**26, "additional_headers": headers}
+                return await connect(self.url, **place, **options, **times)
+            except (ValueError, InvalidURI) as error:
+                raise ValueError(
+                    f"agent.url={self.url[:200]} leads to no policy server ({error}): it looks like ws://127.0.0.1:8000"
+                ) from error
 
         try:
             connection = self._wait(connected())

@@ -74,6 +74,9 @@ class LeRobotDemonstrations(ImportedDemonstrations):
             self._state.setdefault(name, place)
         self._low, self._high = np.array(spec.low, np.float32), np.array(spec.high, np.float32)
         self._require_fit(action)
+        for camera in spec.cameras:
+            key = dataset.images[camera]
+            spec.require_cut(camera, features[key].image_size, f"{key} of {dataset.folder}")
         self._has_depth = all(features.get(key) == known[key] for key in map(layout.depth_key, spec.depth))
         self._has_executed = features.get(layout.EXECUTED) == known[layout.EXECUTED]
         self._lacks = [] if self._has_depth else ["depth"]

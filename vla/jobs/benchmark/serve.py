@@ -63,6 +63,7 @@ def _serving(experiment: Experiment, policy: Policy) -> Iterator[RemotePolicy]:
         connections=1,
         largest_message=2**26,
         api_key=None,
+        origins=[],
         certificate=None,
         private_key=None,
         policy=lambda: policy,

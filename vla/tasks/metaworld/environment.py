@@ -14,7 +14,7 @@ from vla.parallel.limits import free_memory
 from vla.spec import Array, Observation, Spec
 from vla.tasks.blind import Blindable
 from vla.tasks.metaworld.package import tasks_of
-from vla.tasks.metaworld.scene import Scene
+from vla.tasks.metaworld.scene import CAMERA, HAND, Scene
 from vla.tasks.rendering.renderer import RendererFactory
 
 CONTROL_HZ = 80.0  # five substeps of 2.5 ms
@@ -96,6 +96,7 @@ class MetaWorld(Blindable):
             high=(REACH, REACH, REACH, 1.0),
             control_hz=CONTROL_HZ,
             truth=(("object", 3), ("goal", 3)),
+            cut=tuple(name for name in cameras if name == HAND or (name == CAMERA and window is not None)),
         )
         self._sentences, self._steps = sentences, steps
         self._make_scene = partial(
