@@ -18,7 +18,7 @@ from PIL import Image
 
 from vla.config.experiment import Experiment
 from vla.data.episodes import EpisodeStore
-from vla.deploy.server import Keys
+from vla.deploy.client_observation import Keys
 from vla.parallel.pool import THIS_PROCESS
 from vla.rollouts.collect import collect
 from vla.rollouts.rollout import rollout

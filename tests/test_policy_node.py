@@ -22,8 +22,8 @@ from test_server import remote, serving
 from world import KINDS, World, positions
 
 from vla.deploy import messages
+from vla.deploy.client_observation import Keys
 from vla.deploy.control_loop import State
-from vla.deploy.server import Keys
 from vla.robots.panda import HOME, forward
 
 pytestmark = pytest.mark.realtime

@@ -30,8 +30,8 @@ from vla.data.episodes import EpisodeStore
 from vla.data.formats.imported_demonstrations import action_bounds
 from vla.data.formats.video import encode
 from vla.data.verification import derive_store, find_episode
+from vla.deploy.client_observation import Keys
 from vla.deploy.control_loop import ControlLoop
-from vla.deploy.server import Keys
 from vla.io.images import resize
 from vla.reports.open_loop import components
 from vla.robots.controllers import controller_for

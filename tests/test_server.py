@@ -9,6 +9,7 @@ import re
 import signal
 import socket
 import ssl
+import sys
 import threading
 import time
 from collections.abc import Callable, Sequence
@@ -30,17 +31,18 @@ from command_line import SMALL, here
 from composing import composed
 from fake_batch import as_policy, make_bc, make_rt1
 from toy import SPEC, ToyEnvironment
-from websockets.asyncio import server as asyncio_server
 from websockets.datastructures import Headers
 from websockets.exceptions import ConnectionClosed, InvalidMessage, InvalidStatus
 from websockets.http11 import Request, Response
 from websockets.sync.client import ClientConnection, connect
 from websockets.sync.server import ServerConnection, serve
 
+from vla.config.annotations import MissingLibrary, locate
 from vla.config.experiment import Experiment
 from vla.deploy import server
-from vla.deploy.server import Keys, PolicyServer, Service
-from vla.io.array_messages import LARGEST_MAP, LONGEST_LIST, pack, unpack
+from vla.deploy.client_observation import Keys
+from vla.deploy.server import PolicyServer, Service
+from vla.io.array_messages import DTYPES, LARGEST_MAP, LONGEST_LIST, pack, unpack
 from vla.policy import Policy, plan_together
 from vla.rollouts.evaluate import play
 from vla.rollouts.remote import Component, RemotePolicy
@@ -86,7 +88,7 @@ def certified(folder: Path) -> dict[str, str]:
 
 
 def client(url: str, **options: Any) -> ClientConnection:
-    return connect(url, compression=None, max_size=None, **options)
+    return connect(url, compression=None, max_size=None, proxy=None, **options)
 
 
 def received(connection: ClientConnection) -> Any:
@@ -274,6 +276,27 @@ def test_images_of_other_sizes_kinds_and_places_are_taken() -> None:
     parts = Keys(KEYS.images, ["east", "north"], "prompt")
     split = {"observation/image": image, "east": np.float32(1), "north": [2.0], "prompt": "go"}
     np.testing.assert_array_equal(parts.observation(split, SPEC, "none").state, [1, 2])
+
+
+def test_the_encoding_is_documented() -> None:
+    page = (Path(__file__).parents[1] / "docs/serving.md").read_text()
+    assert all(f'"{name}"' in page for name in DTYPES)
+    image = {b"__ndarray__": True, b"data": bytes(range(12)), b"dtype": "|u1", b"shape": [1, 4, 3]}
+    seed = {b"__npgeneric__": True, b"data": 5, b"dtype": "<i8"}
+    given = unpack(bytes(msgpack.packb({"image": image, "seed": seed}) or b""))
+    assert given["seed"] == 5 and given["image"].tolist() == [[[0, 1, 2], [3, 4, 5], [6, 7, 8], [9, 10, 11]]]
+
+
+@pytest.mark.parametrize("library", ["msgpack", "websockets"])
+@pytest.mark.parametrize("target", ["vla.deploy.server.PolicyServer", "vla.rollouts.remote.RemotePolicy"])
+def test_what_is_missing_is_said_with_how_to_install_it(
+    monkeypatch: pytest.MonkeyPatch, library: str, target: str
+) -> None:
+    for module in ("vla.io.array_messages", target.rpartition(".")[0]):
+        monkeypatch.delitem(sys.modules, module)
+    monkeypatch.setitem(sys.modules, library, None)
+    with pytest.raises(MissingLibrary, match=rf"pip install -e '\.\[server\]' \(.*{library}"):
+        locate("here", target)
 
 
 def test_scalars_of_numpy_are_numbers() -> None:
@@ -525,8 +548,7 @@ def test_it_serves_until_it_is_told_to_stop(number: signal.Signals, caplog: pyte
 
 
 def test_it_does_not_wait_for_clients_that_do_not_answer(monkeypatch: pytest.MonkeyPatch) -> None:
-    patient = partial(asyncio_server.serve, open_timeout=None, close_timeout=None)  # else 10 s each
-    monkeypatch.setattr(asyncio_server, "serve", patient)
+    monkeypatch.setattr(server, "serve", partial(server.serve, open_timeout=None, close_timeout=None))  # else 10 s each
     rescued = threading.Event()
     hello = b"GET / HTTP/1.1\r\nHost: here\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
     hello += b"Sec-WebSocket-Version: 13\r\nSec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\n\r\n"

@@ -15,78 +15,37 @@ import hmac
 import logging
 import queue
 import signal
-import ssl
 import time
 from collections.abc import AsyncIterator, Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor
 from contextlib import asynccontextmanager, contextmanager, suppress
 from dataclasses import dataclass
 from http import HTTPStatus
-from ipaddress import ip_address
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
-from weakref import WeakSet
 
 import numpy as np
-from annotated_types import Ge, Le, MinLen
+from annotated_types import Ge, Le
+from websockets.asyncio.server import ServerConnection, serve
+from websockets.exceptions import ConnectionClosed
+from websockets.http11 import Request, Response
 
+from vla.deploy.client_observation import Keys, instruction
+from vla.deploy.connection import Connection, is_loopback, tls
 from vla.io.array_messages import pack, unpack
-from vla.io.images import Crop, resize
+from vla.io.images import Crop
 from vla.io.types import Count, Text
-from vla.spec import LONGEST_INSTRUCTION, Array, Environment, Observation, Spec
+from vla.spec import Array, Environment, Observation
 
 if TYPE_CHECKING:
-    from websockets.asyncio.server import ServerConnection
-    from websockets.http11 import Request, Response
-
     from vla.policy import Policy
 
-LARGEST_IMAGE = 4096  # pixels in a row or column
-WEBSOCKET = b"GET "  # how every WebSocket connection begins (RFC 6455, section 4.1)
-SENTENCE = b"this is a policy server: connect to it by WebSocket with openpi's protocol\n"
-NO_WEBSOCKET = b"HTTP/1.1 405 Method Not Allowed\r\nAllow: GET\r\nConnection: close\r\n" + (
-    b"Content-Type: text/plain\r\nContent-Length: %d\r\n\r\n%s" % (len(SENTENCE), SENTENCE)
-)
 GOODBYE = 1.0  # patience with clients when the server ends [s]
 INVALID, TOO_BIG, INTERNAL = 1007, 1009, 1011  # WebSocket close codes: invalid data, too large, error in the server
 
 log = logging.getLogger(__name__)
 
 Port = Annotated[int, Ge(0), Le(65535)]  # 0: any free one
-
-
-@dataclass(frozen=True)
-class Keys:
-    """Keys of a client's observation; a key that is absent is also looked up as a path of nested maps."""
-
-    images: dict[str, Text]  # camera → image
-    state: Annotated[list[Text], MinLen(1)]  # vectors to concatenate
-    prompt: Text  # instruction
-
-    def observation(self, message: Any, spec: Spec, crop: Crop) -> Observation:
-        """Convert a client's observation; images are resized, and all components are checked.
-
-        Raises:
-            ValueError: it does not match the spec; all missing keys are named at once.
-        """
-        if not isinstance(message, Mapping):
-            raise ValueError(f"an observation is a map, not {type(message).__name__}")
-        wanted = [*(self.images[camera] for camera in spec.cameras), *self.state, self.prompt]
-        found = {key: _find(message, key) for key in wanted}
-        if missing := [key for key, value in found.items() if value is None]:
-            present = ", ".join(str(key)[:50] for key in list(message)[:20])
-            raise ValueError(f"the observation lacks {', '.join(missing)}: it has {present or 'nothing'}")
-        images = {camera: _image(self.images[camera], found[self.images[camera]]) for camera in spec.cameras}
-        for camera, image in images.items():
-            spec.require_cut(camera, image.shape, self.images[camera])
-        rgb = {camera: resize(image, spec.image_size, crop) for camera, image in images.items()}
-        state = np.concatenate([_vector(key, found[key]) for key in self.state])
-        if len(state) != len(spec.state):
-            raise ValueError(
-                f"the state in {' and '.join(self.state)} has {len(state)} numbers, "
-                f"the policy needs {len(spec.state)}: {', '.join(spec.state)}"
-            )
-        return Observation(rgb, state, _prompt(self.prompt, found[self.prompt]))
 
 
 @dataclass(kw_only=True)
@@ -126,7 +85,7 @@ class PolicyServer:
     output: Path
 
     def __post_init__(self) -> None:
-        if self.api_key is None and not _is_loopback(self.host):
+        if self.api_key is None and not is_loopback(self.host):
             raise ValueError(
                 f"deploy.host={self.host} lets other machines use the policy: set the environment variable "
                 "VLA_API_KEY, which clients must then know, or deploy.host=127.0.0.1"
@@ -142,16 +101,8 @@ class PolicyServer:
         """Serve until interrupted.
 
         Raises:
-            ValueError: websockets is not installed, there is no policy, its cameras have no keys, or the address cannot
-                be used.
+            ValueError: there is no policy, its cameras have no keys, or the address cannot be used.
         """
-        try:
-            import websockets  # noqa: F401
-        except ImportError as error:
-            raise ValueError(
-                "deploy=server needs websockets: install this package with its extra server, as in "
-                "pip install -e '.[server]'"
-            ) from error
         policy = self.policy()
         if not hasattr(policy, "session"):  # an agent in its place
             raise ValueError(
@@ -173,19 +124,16 @@ class Service:
     def __init__(self, settings: PolicyServer, policy: Policy) -> None:
         self._settings, self._policy = settings, policy
         self._metadata = pack(metadata(policy, settings.keys))
-        self._tls = None if settings.certificate is None else _tls(settings.certificate, settings.private_key)
+        self._tls = None if settings.certificate is None else tls(settings.certificate, settings.private_key)
         self._waiting: asyncio.Queue[tuple[Policy, Observation, asyncio.Future[Array]]] = asyncio.Queue()
         self._connected = 0
 
     @asynccontextmanager
     async def listening(self) -> AsyncIterator[str]:
         """Serve within the context, which is entered with the URL once the first client can be answered."""
-        from websockets.asyncio.server import serve
-
         settings, context, loop = self._settings, self._tls, asyncio.get_running_loop()
-        opened: WeakSet[ServerConnection] = WeakSet()
         limits = {"compression": None, "max_size": settings.largest_message, "max_queue": 1}
-        request = {"process_request": self._answer_request, "create_connection": _connection(opened), "ssl": context}
+        request = {"process_request": self._answer_request, "create_connection": Connection, "ssl": context}
         with ThreadPoolExecutor(1, "inference") as thread:
             await loop.run_in_executor(thread, self._warm_up)
             async with serve(self._talk, settings.host, settings.port, **limits, **request) as server:
@@ -193,7 +141,7 @@ class Service:
                 port = server.sockets[0].getsockname()[1]
                 host = f"[{settings.host}]" if ":" in settings.host else settings.host
                 yield f"{'wss' if context else 'ws'}://{host}:{port}"
-                hang_up = loop.call_later(GOODBYE, lambda: [each.transport.abort() for each in opened])
+                hang_up = loop.call_later(GOODBYE, Connection.abort_all, server)
             hang_up.cancel()
             inference.cancel()
 
@@ -248,8 +196,6 @@ class Service:
 
     async def _talk(self, connection: ServerConnection) -> None:
         """Serve one client until it leaves or sends something invalid."""
-        from websockets.exceptions import ConnectionClosed
-
         session, last = self._policy.session(), 0.0
         self._connected += 1
         try:
@@ -274,8 +220,6 @@ class Service:
             self._connected -= 1
 
     async def _refuse(self, connection: ServerConnection, sentence: str, code: int) -> None:
-        from websockets.exceptions import ConnectionClosed
-
         log.warning("refused a client at %s: %s", connection.remote_address[0], " ".join(sentence.split())[:500])
         with suppress(ConnectionClosed):
             await connection.send(sentence)
@@ -289,7 +233,7 @@ class Service:
             seed = message.get("seed", 0)
             if type(seed) is not int or not 0 <= seed < 2**32:
                 raise ValueError(f"seed is {repr(seed)[:50]}, expected an integer from 0 to 2**32 - 1")
-            session.reset(_prompt("prompt", message.get("prompt")), seed)
+            session.reset(instruction("prompt", message.get("prompt")), seed)
             return {"reset": True}
         observation = self._settings.keys.observation(message, session.spec, self._settings.image_crop)
         began = time.perf_counter()
@@ -350,105 +294,3 @@ def _plan(sessions: Sequence[Policy], observations: Sequence[Observation]) -> li
     from vla.policy import plan_together
 
     return plan_together(sessions, observations)
-
-
-def _connection(opened: WeakSet[ServerConnection]) -> type[ServerConnection]:
-    """Return a connection that answers a client of another protocol, which websockets would close silently.
-
-    Connections are added to `opened`, even before they speak any protocol.
-    """
-    from websockets.asyncio.server import ServerConnection
-
-    class Connection(ServerConnection):
-        _known = False  # the protocol
-
-        def connection_made(self, transport: asyncio.BaseTransport) -> None:
-            super().connection_made(transport)
-            opened.add(self)
-
-        def data_received(self, data: bytes) -> None:
-            if not self._known and not data.startswith(WEBSOCKET[: len(data)]):
-                log.warning("refused a client at %s: it does not speak WebSocket", self.remote_address[0])
-                self.transport.write(NO_WEBSOCKET)
-                self.transport.close()
-                return
-            self._known = True
-            super().data_received(data)
-
-    return Connection
-
-
-def _tls(certificate: str, private_key: str | None) -> ssl.SSLContext:
-    """Return the TLS context of two PEM files.
-
-    Raises:
-        ValueError: one is damaged, or they do not belong together.
-    """
-    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
-    try:
-        context.load_cert_chain(certificate, private_key)
-    except ssl.SSLError as error:
-        raise ValueError(
-            f"deploy.certificate={certificate} and deploy.private_key={private_key} are not a certificate and its key "
-            f"in PEM format ({error.reason})"
-        ) from error
-    # Clients with threads, such as openpi's, lose a request in twenty beside the tickets of TLS 1.3.
-    context.num_tickets = 0
-    return context
-
-
-def _is_loopback(host: str) -> bool:
-    if host == "localhost":
-        return True
-    try:
-        return ip_address(host).is_loopback
-    except ValueError:  # a name
-        return False
-
-
-def _find(message: Mapping[Any, Any], key: str) -> Any:
-    """Look up a key, or a path of nested maps such as observation/image."""
-    if key in message:
-        return message[key]
-    value: Any = message
-    for part in key.split("/"):
-        value = value.get(part) if isinstance(value, Mapping) else None
-    return value
-
-
-def _image(key: str, value: Any) -> Array:
-    """Return an image as (H, W, 3) uint8."""
-    if not isinstance(value, np.ndarray) or value.ndim != 3 or 3 not in (value.shape[0], value.shape[2]):
-        shape = getattr(value, "shape", type(value).__name__)
-        raise ValueError(f"{key} is an image (H, W, 3) or (3, H, W), not {shape}")
-    image = value if value.shape[2] == 3 else value.transpose(1, 2, 0)
-    if not 1 <= min(image.shape[:2]) <= max(image.shape[:2]) <= LARGEST_IMAGE:
-        raise ValueError(f"{key} has {image.shape[1]} by {image.shape[0]} pixels, at most {LARGEST_IMAGE} each")
-    if image.dtype == np.uint8:
-        return np.ascontiguousarray(image)
-    if image.dtype.kind != "f" or not (np.min(image) >= 0 and np.max(image) <= 1):  # NaN fails both
-        raise ValueError(f"{key} is {image.dtype}: send uint8, or floats from 0 to 1")
-    return np.ascontiguousarray(np.round(255 * image).astype(np.uint8))
-
-
-def _vector(key: str, value: Any) -> Array:
-    """Return numbers as (N,) float32."""
-    try:
-        given = np.asarray(value).reshape(-1)
-    except ValueError as error:  # rows of different lengths
-        raise ValueError(f"{key} is not a vector of numbers") from error
-    if given.dtype.kind not in "biuf":
-        raise ValueError(f"{key} is not a vector of numbers")
-    with np.errstate(over="ignore"):
-        vector = given.astype(np.float32)
-    if not np.isfinite(vector).all():
-        raise ValueError(f"{key} holds a number that is not finite")
-    return vector
-
-
-def _prompt(key: str, value: Any) -> str:
-    if not isinstance(value, str):
-        raise ValueError(f"{key} is an instruction, a text, not {type(value).__name__}")
-    if len(value) > LONGEST_INSTRUCTION:
-        raise ValueError(f"{key} has {len(value)} characters, an instruction at most {LONGEST_INSTRUCTION}")
-    return value

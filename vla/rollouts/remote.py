@@ -12,19 +12,18 @@ import time
 from collections.abc import Coroutine, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from PIL import Image, ImageOps
+from websockets.asyncio.client import ClientConnection, connect
+from websockets.exceptions import ConnectionClosed, InvalidStatus, InvalidURI, WebSocketException
+from websockets.uri import parse_uri
 
 from vla.io.array_messages import pack, unpack
 from vla.io.types import Count, ImageSize, Natural, NonNegative, Positive, Text
 from vla.rollouts.realtime import IDEAL, BackgroundLink, RealTime, SimulatedLink
 from vla.spec import Array, Observation, Spec
-
-if TYPE_CHECKING:
-    from websockets.asyncio.client import ClientConnection
-
 
 log = logging.getLogger(__name__)
 
@@ -219,26 +218,14 @@ class RemotePolicy:
         if not np.isfinite(mine).all():
             raise self._error("an action is not finite")
         clipped = np.clip(mine.astype(np.float32), self._low, self._high)
-        if (
-            not self._warned
-            and (np.abs(mine - clipped) > OUTLIER_DISTANCE * (self._high - self._low)).mean() > MAX_OUTLIER_SHARE
-        ):
+        outlying = np.abs(mine - clipped) > OUTLIER_DISTANCE * (self._high - self._low)
+        if not self._warned and outlying.mean() > MAX_OUTLIER_SHARE:
             self._warned = True
-            log.warning(
-                "actions of %s are far beyond the bounds of the world: set agent.actions to its units", self.url
-            )
+            where = f"actions of {self.url} are far beyond the bounds of the world"
+            log.warning("%s: set agent.actions to its units", where)
         return clipped
 
     def _connected(self, opened: ExitStack) -> tuple[ClientConnection, dict[str, Any]]:
-        try:
-            from websockets.asyncio.client import connect
-            from websockets.exceptions import InvalidStatus, InvalidURI, WebSocketException
-            from websockets.uri import parse_uri
-        except ImportError as error:
-            raise ValueError(
-                "agent=remote needs websockets: install this package with its extra server, as in "
-                "pip install -e '.[server]'"
-            ) from error
         times = {"open_timeout": self.timeout, "close_timeout": self.timeout, "ping_timeout": self.timeout}
         headers = {"Authorization": f"Api-Key {self.api_key}"} if self.api_key else None
 
@@ -268,8 +255,6 @@ class RemotePolicy:
         return connection, metadata
 
     def _ask(self, message: Mapping[str, Any]) -> dict[str, Any]:
-        from websockets.exceptions import ConnectionClosed
-
         async def answered() -> dict[str, Any]:
             await self._connection.send(pack(message))
             return await self._received(self._connection)

@@ -10,7 +10,8 @@ from threading import Thread
 import numpy as np
 
 from vla.config.experiment import Experiment
-from vla.deploy.server import Keys, PolicyServer, Service
+from vla.deploy.client_observation import Keys
+from vla.deploy.server import PolicyServer, Service
 from vla.io.array_messages import pack
 from vla.jobs.benchmark.measure import Measure, measure, timed
 from vla.policy import Policy
@@ -102,7 +103,7 @@ def _echo() -> Iterator[Callable[[bytes], object]]:
         thread = Thread(target=server.serve_forever)
         thread.start()
         address = f"ws://127.0.0.1:{server.socket.getsockname()[1]}"
-        with connect(address, compression=None, max_size=2**26) as connection:
+        with connect(address, compression=None, max_size=2**26, proxy=None) as connection:
 
             def echo(data: bytes) -> object:
                 connection.send(data)
