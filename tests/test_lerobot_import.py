@@ -84,15 +84,6 @@ def test_an_import_goes_on_where_it_was(home: Path, tmp_path: Path) -> None:
         imported(other, tmp_path / "store")
 
 
-def test_a_whole_picture_does_not_become_a_part_of_one(home: Path) -> None:
-    cut = replace(ARM_SPEC, cut=("wrist",))
-    assert len(demonstrations(str(home / "dataset"), cut)) == 3  # of the size of the task: it was cut
-    with pytest.raises(
-        ValueError, match=r"wrist of \S+ has 16 by 16 pixels, but wrist shows a part of a larger picture"
-    ):
-        demonstrations(str(home / "dataset"), replace(cut, image_size=(8, 8)))
-
-
 def test_what_other_people_leave_out_is_made_up_and_said(home: Path, tmp_path: Path) -> None:
     def change(info: Any) -> None:
         features = info["features"]
@@ -195,6 +186,15 @@ def test_pictures_of_another_kind_are_refused_by_name(home: Path, tmp_path: Path
     changed_table(dataset / path, key, lambda table: pa.array(["a.png"] * len(table)))
     with pytest.raises(ValueError, match=rf"{path}: {key} does not hold images"):
         demonstrations(dataset, ARM_SPEC)
+
+
+def test_a_whole_picture_does_not_become_a_part_of_one(home: Path) -> None:
+    cut = replace(ARM_SPEC, cut=("wrist",))
+    assert len(demonstrations(str(home / "dataset"), cut)) == 3  # of the size of the task: it was cut
+    with pytest.raises(
+        ValueError, match=r"wrist of \S+ has 16 by 16 pixels, but wrist shows a part of a larger picture"
+    ):
+        demonstrations(str(home / "dataset"), replace(cut, image_size=(8, 8)))
 
 
 def test_a_recording_does_not_act(home: Path) -> None:
