@@ -1,7 +1,8 @@
-"""Make the README's pictures anew, with the README's commands: python docs/pictures.py RUN_FOLDER
+"""Make the pictures of the README and of the pages anew: python docs/pictures.py RUN_FOLDER
 
-RUN_FOLDER is what an evaluation left, `outputs/runs/<time>`. The viewer is photographed without a display, for which it
-needs Vulkan: on Debian the packages libvulkan1 and mesa-vulkan-drivers. Pages are photographed by chromium.
+RUN_FOLDER is what an evaluation left, `outputs/runs/<time>`. Pictures of sweeps and suites are the `sweep.png` and
+`suite.png` of the commands beside them. The viewer is photographed without a display, for which it needs Vulkan: on
+Debian the packages libvulkan1 and mesa-vulkan-drivers. Pages are photographed by chromium.
 """
 
 from __future__ import annotations
@@ -26,12 +27,27 @@ from vla.rollouts.recorder import VIEWER
 from vla.spec import FIRST_SEED, Array
 
 DOCS = Path(__file__).parent
+RESULTS = DOCS / "results"
 HEIGHT = 2080  # of the page, as far as it is shown [px]
 STEP = 12  # at which the rollout is shown: about to grasp
 FILM_SIZE, FILM_EPISODES, FILM_PAUSE = 320, 5, 8  # of the moving picture: pixels, episodes, frames after each
 ARM_VIEW, ARM_TARGET, ARM_STEPS = (1.1, -0.75, 0.6), (0.3, 0.0, 0.2), (4, 11, 16, 20)  # of the pictures of arms [m]
 LEROBOT_STEP = 24  # at which the images of Meta-World are shown: the hand is near the object
 SCENES, SCENE_SIZE = 3, 200  # of the picture of both renderers: scenes, edge of an image [px]
+# Of the picture of the parts: x, y, colour, title and what it holds; then which follows which. Middle tones without a
+# background read on a light and on a dark page.
+BLUE, GREEN, ORANGE, GREY = "#3b6fb5", "#2f855a", "#b7621b", "#808890"
+PARTS = (
+    (0, 3, BLUE, "world", "task=tabletop,\nmetaworld, gymnasium"),
+    (0, 1, BLUE, "recordings", "task=recorded: LeRobot\ndatasets, ROS 2 bags"),
+    (1, 3, BLUE, "expert", "expert=waypoint: a script\nthat acts and labels"),
+    (1, 1, GREEN, "demonstrations", "job=collect: verified,\nshared by all runs"),
+    (2, 1, GREEN, "training", "job=train: model, text,\nimage, learner, trainer"),
+    (3, 1, GREEN, "policy", "checkpoint=FILE"),
+    (2, 3, ORANGE, "evaluation", "job=evaluate: intervals,\nreport, recording"),
+    (3, 3, ORANGE, "robot", "job=deploy: ROS 2 node,\npolicy server"),
+)
+PART_ARROWS = ((0, 2), (2, 3), (1, 3), (3, 4), (4, 5), (5, 6), (5, 7))
 
 
 def vla(*arguments: str) -> None:
@@ -188,16 +204,41 @@ def arm(option: str, picture: Path) -> None:
     environment.close()
 
 
+def parts(picture: Path) -> None:
+    """Save the parts of an experiment and what flows between them."""
+    from matplotlib import rc_context
+    from matplotlib.figure import Figure
+    from matplotlib.patches import FancyBboxPatch
+
+    figure = Figure(figsize=(10, 3.4))
+    axes = figure.add_axes((0, 0, 1, 1), xlim=(-0.5, 3.5), ylim=(0.1, 4.2))
+    axes.axis("off")
+    middle = [(column, row) for column, row, *_ in PARTS]
+    for (x, y), (_, _, colour, title, content) in zip(middle, PARTS, strict=True):
+        axes.add_patch(FancyBboxPatch((x - 0.4, y - 0.6), 0.8, 1.2, "round,pad=0.02", mutation_aspect=2, color=colour))
+        axes.text(x, y + 0.3, title, color="white", ha="center", va="center", weight="bold", size=12)
+        axes.text(x, y - 0.2, content, color="white", ha="center", va="center", size=10)
+    for start, end in PART_ARROWS:
+        (x, y), (to_x, to_y) = middle[start], middle[end]
+        beside = 0.43 * np.sign(to_x - x)
+        upward = 0.66 * np.sign(to_y - y)
+        tail, head = ((x, y + upward), (to_x, to_y - upward)) if to_y != y else ((x + beside, y), (to_x - beside, to_y))
+        axes.annotate(
+            "", head, tail, arrowprops={"arrowstyle": "-|>", "color": GREY, "lw": 2, "shrinkA": 0, "shrinkB": 0}
+        )
+    with rc_context({"svg.hashsalt": "parts"}):  # else every picture would have other names in it
+        figure.savefig(picture, transparent=True, metadata={"Date": None})
+
+
 def main(run: Path) -> None:
     """Previews, one rollout in the viewer, the card of a small store, the report of `run` and its page."""
     film(run, DOCS / "rollouts.webp")
-    renderers(DOCS / "renderers.webp")
+    parts(DOCS / "parts.svg")
+    renderers(RESULTS / "renderers.webp")
     fifty_tasks(DOCS / "metaworld.webp")
-    lerobots_images(DOCS / "metaworld_images.webp")
+    lerobots_images(RESULTS / "metaworld_images.webp")
     arm("jaco", DOCS / "jaco.webp")  # and so ur5e.webp, with the option that worlds.md describes
     with tempfile.TemporaryDirectory() as folder:
-        vla("job=preview", "preview.episodes=6", f"output={folder}")
-        shutil.copy(Path(folder) / "preview.png", DOCS / "preview.png")
         vla("job=preview", "task/goal=mixed", "task/randomize=wide", "preview.seed=1000000", f"output={folder}")
         shutil.copy(Path(folder) / "preview.png", DOCS / "wide.png")
         checkpoint = run / "checkpoints/last.ckpt"

@@ -1,4 +1,4 @@
-"""Attacks in bulk, for the table in docs/safety.md: `python tests/abuse.py FOLDER [commands|checkpoints:2|kills …]`.
+"""Attacks in bulk, for docs/results/safety.md: `python tests/abuse.py FOLDER [commands|checkpoints:2|kills …]`.
 
 Every trial is a command in a process of its own, in a folder that is made. A trial holds when the command ends in time,
 and either succeeds or says in one line what is wrong, and when nothing that a file asked for was done.

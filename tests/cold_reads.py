@@ -1,4 +1,4 @@
-"""Windows per second out of a store that is not in memory, for docs/speed.md: `python tests/cold_reads.py DIR`,
+"""Windows per second out of a store that is not in memory, for docs/results/speed.md: `python tests/cold_reads.py DIR`,
 where DIR is larger than a quarter of the memory.
 
 Reads the same random rows of all images as memory-mapped arrays, and as training reads them. Before each, the store's

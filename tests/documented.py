@@ -1,4 +1,4 @@
-"""The commands that the README and the pages beside it name."""
+"""The README, the pages of help in docs/, the records in docs/results/, and the commands that they name."""
 
 from __future__ import annotations
 
@@ -6,12 +6,11 @@ import re
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
-README = (ROOT / "README.md").read_text(encoding="utf-8")
 # Their commands need what the pages let a reader write or install, see their own tests.
-OTHERS = ("lerobot.md", "packages.md", "tutorial.md")
-NAMES = sorted(path for path in (ROOT / "docs").glob("*.md") if path.name not in OTHERS)
-PAGES = (README, *(page.read_text(encoding="utf-8") for page in NAMES))
-TEXT = "\n".join(PAGES).replace("\\\n", " ")  # commands that go over several lines
+OTHERS = {ROOT / "docs" / name for name in ("lerobot.md", "packages.md", "tutorial.md")}
+PAGES = (ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md")))
+TEXT = "\n".join(page.read_text(encoding="utf-8") for page in PAGES if page not in OTHERS)
+TEXT = TEXT.replace("\\\n", " ")  # commands that go over several lines
 
 
 def commands(program: str) -> list[str]:

@@ -1,4 +1,4 @@
-"""Early stopping beside STEP, for the table in docs/evaluation.md: `python tests/step.py`, where
+"""Early stopping beside STEP, for the table in docs/results/deciding.md: `python tests/step.py`, where
 sequentialized-barnard-tests 0.0.9 is installed.
 
 Two policies play up to 500 episodes, on different seeds or on the same ones; on the same, four of five episodes are

