@@ -1,4 +1,4 @@
-"""The pages in docs/ and the README: their links lead somewhere."""
+"""The pages in docs/ and the README: their links lead somewhere, and they stay short."""
 
 from __future__ import annotations
 
@@ -8,6 +8,8 @@ from pathlib import Path
 import pytest
 from documented import PAGES, ROOT
 
+HELP, ALL = 15_000, 35_000  # words: of the README and docs/*.md, and with docs/results/
+CELL = 25  # words in a cell of a table
 PICTURES = {".png", ".svg", ".webp"}
 
 
@@ -41,3 +43,16 @@ def test_every_page_is_linked_and_every_picture_shown() -> None:
     named = {(page.parent / link.partition("#")[0]).resolve() for page in PAGES for link in links(page)}
     files = {path for path in (ROOT / "docs").rglob("*") if path.suffix in PICTURES | {".md"}}
     assert files <= named
+
+
+def test_pages_keep_to_their_lengths() -> None:
+    words = {page: len(page.read_text(encoding="utf-8").split()) for page in PAGES}
+    assert sum(count for page, count in words.items() if page.parent.name != "results") <= HELP
+    assert sum(words.values()) <= ALL
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.relative_to(ROOT).as_posix())
+def test_cells_of_tables_are_short(page: Path) -> None:
+    rows = re.findall(r"^\|(.*)\|$", prose(page), re.MULTILINE)
+    long = [cell for row in rows for cell in re.split(r"(?<!\\)\|", row) if len(cell.split()) > CELL]
+    assert not long
