@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import shutil
 from collections.abc import Callable
 from dataclasses import replace
@@ -33,7 +32,6 @@ from vla.training.ema import EMA
 if TYPE_CHECKING:
     from vla.tasks.tabletop.environment import Tabletop
 
-DOCS = Path(__file__).parents[1] / "docs"
 CPU = {"_target_": "vla.policy.Policy", **defaults_of("policy/default", device="cpu")}
 SMALL = ("task.image_size=[32,32]", "trainer=cpu", "recorder=none")
 
@@ -91,17 +89,6 @@ def test_rounds_continue_the_training_of_their_policy(tmp_path: Path, tabletop: 
     assert (rounds.learner.weight_decay, rounds.collect.episodes) == (0.1, 70)
     training = finetune(composed(start), [])  # a training from weights is free to have another task
     assert training.task == composed().task and training.collect.episodes == composed().collect.episodes
-
-
-def test_the_documented_program_acts_like_the_policy(tmp_path: Path, tabletop: Tabletop) -> None:
-    policy, checkpoint = trained(tmp_path, tabletop)
-    seen = tabletop.reset(0)
-    (code,) = re.findall(r"```python\n(from vla\.config.*?)```", (DOCS / "models.md").read_text(), re.DOTALL)
-    names: dict[str, Any] = {**seen.rgb, "state": seen.state}
-    exec(code.replace("FILE", str(checkpoint)), names)
-    policy.reset("put the red block on the pad", 0)
-    expected = policy.act(replace(seen, instruction="put the red block on the pad"))
-    np.testing.assert_array_equal(names["action"], expected)
 
 
 @pytest.mark.parametrize(("option", "part"), [("minilm", "name"), ("both", "sentence.name")])
