@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import math
 import os
+from collections import OrderedDict
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
-from vla.io.documents import MAX_DEPTH, STRICT, parse_json, parse_yaml, read_json, read_yaml, require_resolved
+from vla.io.documents import MAX_DEPTH, STRICT, parse_json, parse_yaml, read_json, read_yaml, resolved
 from vla.io.types import Range
 
 
@@ -78,14 +81,18 @@ def test_a_file_that_is_too_large_is_not_read(tmp_path: Path) -> None:
 
 
 def test_a_configuration_out_of_a_file_is_plain_and_resolved() -> None:
-    require_resolved({"model": [1, None, {"a": ("$", "{}")}]}, "store.json")
+    value = {"model": [1, None, {"a": ("$", "{}")}]}
+    assert repr(resolved(value, "store.json")) == repr({"model": [1, None, {"a": ["$", "{}"]}]})  # without tuples
     for value in ("a ${b}", {"${b}": 1}, {"a": [(1, {"b": "${c}"})]}, "${" + "x" * 10_000):
         with pytest.raises(ValueError, match=r"^store\.json holds the reference '.*\$\{.*': only resolved") as caught:
-            require_resolved(value, "store.json")
+            resolved(value, "store.json")
         assert len(str(caught.value)) < 300
-    for unusual in ({"a": object()}, [b"x"], {1j: 2}):
+    for unusual in ({"a": object()}, [b"x"], OrderedDict(a=1), np.float64(1)):
         with pytest.raises(ValueError, match="which is no plain data"):
-            require_resolved(unusual, "store.json")
+            resolved(unusual, "store.json")
+    for key in (5, True, math.nan, None, 1j):
+        with pytest.raises(ValueError, match=f"^store.json holds the key {key}, which is no text$"):
+            resolved({"a": {key: 1}}, "store.json")
 
 
 def test_a_configuration_that_refers_to_itself_or_grows_without_bound_is_refused() -> None:
@@ -96,4 +103,4 @@ def test_a_configuration_that_refers_to_itself_or_grows_without_bound_is_refused
         doubling = [doubling, doubling]
     for value in (endless, doubling):
         with pytest.raises(ValueError, match="holds more than"):
-            require_resolved(value, "store.json")
+            resolved(value, "store.json")

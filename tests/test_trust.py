@@ -174,7 +174,7 @@ def test_a_path_in_somebody_elses_checkpoint_is_refused(tmp_path: Path) -> None:
     config, path = plain(composed()), tmp_path / "last.ckpt"
     config["task"]["goal"] = node("vla.data.formats.lerobot_import.LeRobotDemonstrations", folder="/nowhere")
     torch.save({"config": config, "spec": toy.SPEC.to_dict(), "state_dict": {}}, path)
-    with pytest.raises(ValueError, match=r"last\.ckpt names a path in task\.goal\.folder"):
+    with pytest.raises(ValueError, match=r"last\.ckpt names a path or an address in task\.goal\.folder"):
         adopt(composed(f"checkpoint={path}"), [])
 
 

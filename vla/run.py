@@ -39,6 +39,7 @@ from vla.runs.cells import describe_failures, save_failure
 
 PACKAGE = Path(__file__).resolve().parent
 SWEEP = "in the sweep "  # prefix of a note on a cell's error
+PICKLE = "--experimental-rerun"  # option of Hydra
 TRACEBACKS = "VLA_TRACEBACKS"  # environment variable that passes the user's HYDRA_FULL_ERROR to child processes
 
 
@@ -281,6 +282,12 @@ def _menu() -> str:
     return Template(template).substitute(APP_CONFIG_GROUPS="".join(lines))
 
 
+def _require_no_pickle(arguments: list[str]) -> None:
+    """Refuse Hydra's option that takes a config from a pickle, which may run anything; it can be abbreviated."""
+    if any(len(name := each.partition("=")[0]) > 2 and PICKLE.startswith(name) for each in arguments):
+        raise ValueError(f"{PICKLE} runs whatever a file says: compose the run again from its command line")
+
+
 def main() -> None:
     """Run the command line; errors that the user can fix end in one sentence unless HYDRA_FULL_ERROR=1."""
     raise_gc_thresholds()
@@ -289,6 +296,7 @@ def main() -> None:
     os.environ["HYDRA_FULL_ERROR"] = "1"  # otherwise Hydra prints errors itself
     sys.argv[1:], ros.arguments[:] = ros.split_arguments(sys.argv[1:])
     try:
+        _require_no_pickle(sys.argv[1:])
         if sys.argv[1:] in (["--help"], ["-h"]):  # with further arguments Hydra composes the help itself
             print(_menu())
             return

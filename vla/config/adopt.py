@@ -18,7 +18,7 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 
 from vla.config.build import GROUPS, require_no_paths, require_trust, without_paths
 from vla.config.differences import at, differences
-from vla.io.documents import read_yaml
+from vla.io.documents import read_yaml, resolved
 from vla.models.checkpoint import REQUIRED_NODES, read_header
 
 OF_MODEL = ("tokenizer", "model", "data")  # the batch size depends on the model
@@ -46,7 +46,7 @@ IDENTITY = (  # keys that must not change in a resumed run: with other values it
 def adopt(cfg: DictConfig, overrides: Sequence[str]) -> DictConfig:
     """Return `cfg` with task, tokenizer and model of `cfg.checkpoint`; for job=evaluate also its training settings.
 
-    A path in these nodes is an error; in the training settings it becomes null. Devices are not taken over.
+    A path or address in these nodes is an error; in the training settings it becomes null. Devices are not taken over.
 
     Raises:
         ValueError: the file does not exist, or an override contradicts its weights.
@@ -139,12 +139,12 @@ def _saved(run: Path) -> tuple[Path, Mapping[str, Any]]:
         return run / LAST, read_header(run / LAST).config
     file = run / "config.yaml"
     if file.is_file() and (config := read_yaml(file, dict[str, Any])).get("job") == "improve":
-        return file, config
+        return file, resolved(config, str(file))
     raise ValueError(f"resume={run}: nothing was trained in that folder, there is no {run / LAST}")
 
 
 def _reported(cfg: DictConfig, saved: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the training settings of a checkpoint for the report of `cfg`, without the paths of their author."""
+    """Return the training settings of a checkpoint for the report of `cfg`, without paths and addresses."""
     own = cast("dict[str, Any]", OmegaConf.to_container(cfg))
     nodes = {}
     for name in (name for name in REPORTED if name in saved):

@@ -36,11 +36,12 @@ from vla.config.annotations import (
     takes_path,
     targets,
 )
-from vla.io.documents import require_resolved
+from vla.io.documents import resolved
 from vla.io.suggestion import suggestion
 from vla.io.types import Count, Inherited, Natural, NonNegative, Share
 
 HYDRA_KEYS = ("_target_", "_partial_")
+ADDRESSES = ("url", "uri", "host", "address", "api_key")  # arguments that say whom to connect with, and with which key
 
 
 @dataclass(frozen=True)
@@ -139,10 +140,10 @@ def build(node: Mapping[str, Any], group: str | Group, **runtime: Any) -> Any:
         ValueError: a class that is not allowed or of another kind, wrong arguments, or an error of the constructor.
     """
     group = GROUPS[group] if isinstance(group, str) else group
-    require_resolved(node, group.name)
+    node = resolved(node, group.name)
     check_node(group.name, node, makes(group), tuple(runtime))
     try:
-        factory = instantiate(dict(node), _convert_="all", _partial_=True)
+        factory = instantiate(node, _convert_="all", _partial_=True)
     except InstantiationException as error:
         if isinstance(error.__cause__, ValueError):
             raise ValueError(str(error.__cause__)) from error
@@ -207,7 +208,7 @@ def require_trust(config: Mapping[str, Any], names: Iterable[Any], source: objec
 def require_no_paths(
     config: Mapping[str, Any], names: Collection[str], source: object, given: Collection[str] | None = None
 ) -> None:
-    """Refuse nodes out of a file in which a class is given a file or folder to read or write.
+    """Refuse nodes out of a file in which a class is given a file or folder, or an address or key of a connection.
 
     Args:
         config: plain, with the nodes `names`, as far as there are any.
@@ -222,12 +223,13 @@ def require_no_paths(
         if not any(f"{key}.".startswith(f"{name}.") for name in given or ()):
             hint = "" if given is None else f"; {key.rpartition('.')[0].replace('.', '/')}=OPTION gives yours"
             raise ValueError(
-                f"{source} names a path in {key}: paths are taken from your own runs and commands only{hint}"
+                f"{source} names a path or an address in {key}: these are taken from your own runs and commands only"
+                f"{hint}"
             )
 
 
 def without_paths(config: Mapping[str, Any], name: str) -> Any:
-    """Return the node `name` of a config out of a file with null in place of the files and folders that it names.
+    """Return the node `name` of a config out of a file with null in place of the paths and addresses that it names.
 
     Of a class that may not be built only the name is returned.
     """
@@ -247,7 +249,7 @@ def _part(node: Any, key: str) -> Any:
 
 
 def _paths_in(node: Any, key: str) -> Iterator[str]:
-    """Dotted names of the arguments in a node, called `key`, that name a file or folder.
+    """Dotted names of the arguments in a node, called `key`, that name a file, a folder or an address.
 
     A class that this machine cannot import yields no paths, because jobs that build it fail in any case.
     """
@@ -259,7 +261,7 @@ def _paths_in(node: Any, key: str) -> Iterator[str]:
         yield from (
             f"{key}.{name}"
             for name, value in node.items()
-            if value and name in known and takes_path(known[name].annotation)
+            if value and name in known and (name in ADDRESSES or takes_path(known[name].annotation))
         )
     for name, part in node.items() if isinstance(node, dict) else enumerate(node) if isinstance(node, list) else ():
         yield from _paths_in(part, f"{key}.{name}")

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 from omegaconf import DictConfig, OmegaConf
 
 from vla.config.annotations import locate
-from vla.config.build import build
+from vla.config.build import build, require_no_paths
 from vla.config.check import with_changes
 from vla.config.differences import ABSENT, at, differences
 from vla.config.packages import trusted, with_trust
@@ -128,7 +128,7 @@ class Experiment:
         checkpoint = checkpoint or self.checkpoint
         if checkpoint is None:
             raise ValueError("this needs a trained policy: checkpoint=FILE")
-        return partial(with_trust, trusted(), make_policy, self["policy"], checkpoint)
+        return partial(with_trust, trusted(), make_policy, self["policy"], checkpoint, own=True)
 
     def make_agent(self) -> Callable[[Environment], Agent] | None:
         """Return the factory of the agent that acts in place of a checkpoint, or None."""
@@ -252,19 +252,28 @@ def make_agent(agent: Node, environment: Environment) -> Agent:
     return build(agent, "agent", spec=environment.spec)
 
 
-def make_policy(policy: Node, checkpoint: Path, environment: Environment | None = None) -> Policy:
+def make_policy(policy: Node, checkpoint: Path, environment: Environment | None = None, *, own: bool = False) -> Policy:
     """Build the policy in a checkpoint with the options of a policy node.
 
+    Args:
+        policy: the node.
+        checkpoint: the file.
+        environment: that the policy is to act in.
+        own: the checkpoint may name paths and addresses, because it is of this run, or was looked through before.
+
     Raises:
-        ValueError: there is no checkpoint, or its spec differs from the environment's.
+        ValueError: there is no checkpoint, its spec differs from the environment's, or it names what it may not.
     """
     from vla.models.checkpoint import read_checkpoint
 
     saved = read_checkpoint(checkpoint)
     if environment is not None:
         saved.spec.without_truth.require(environment.spec.without_truth, f"the checkpoint {checkpoint}", "the task")
-    tokenizer = build(saved.config["tokenizer"], "tokenizer", spec=saved.spec)
-    model = _model(_without_pretraining(saved.config["model"]), saved.spec, tokenizer, saved)
+    nodes = {"tokenizer": saved.config["tokenizer"], "model": _without_pretraining(saved.config["model"])}
+    if not own:
+        require_no_paths(nodes, nodes, checkpoint)
+    tokenizer = build(nodes["tokenizer"], "tokenizer", spec=saved.spec)
+    model = _model(nodes["model"], saved.spec, tokenizer, saved)
     saved.restore(model)
     try:
         return build(policy, "policy", model=model, spec=saved.spec)

@@ -10,6 +10,7 @@ from omegaconf import DictConfig, ListConfig, OmegaConf
 
 from vla.config.annotations import locate
 from vla.config.build import GROUPS, check_node, makes
+from vla.io.documents import resolved
 
 if TYPE_CHECKING:
     from vla.data.formats.imported_demonstrations import Recording
@@ -23,8 +24,8 @@ def recorded(name: str, *, _root_: DictConfig) -> Any:
     """
     found = _recording(json.dumps(OmegaConf.to_container(_root_.expert, resolve=True)))
     if name not in ("low", "high"):
-        value = getattr(found, name)
-        return ListConfig(list(value)) if isinstance(value, tuple) else value
+        value = resolved(getattr(found, name), "the recording")
+        return ListConfig(value) if isinstance(value, list) else value
     action = list(_root_.task.action)
     if unknown := [each for each in action if each not in found.bounds]:
         raise ValueError(f"task.action names {', '.join(unknown)}, the recording has {', '.join(found.bounds)}")

@@ -31,6 +31,7 @@ from vla.data.index import REMEDY, SALVAGE, Entry, dumps, index_line, listed, pa
 from vla.data.scattered_rows import ScatteredRows
 from vla.data.statistics import Statistics
 from vla.io.documents import canonical
+from vla.io.files import require_file
 from vla.parallel.limits import memory
 from vla.spec import FIRST_SEED, Array, Episode, Observation, Spec
 
@@ -234,8 +235,10 @@ class EpisodeStore:
         with ExitStack() as stack:
             stack.callback(lock.release)
             self._refresh()
-            for name in ("index", *self.fields):
-                self._files[name] = stack.enter_context(self._path(name).open("ab", buffering=0))
+            paths = {name: self._path(name) for name in ("index", *self.fields)}
+            _require_own_files(paths.values())
+            for name, path in paths.items():
+                self._files[name] = stack.enter_context(path.open("ab", buffering=0))
             stack.callback(self._files.clear)
             self._cut()
             yield
@@ -294,9 +297,9 @@ class EpisodeStore:
 
     def _cut(self) -> None:
         # The index first: no line may refer to truncated rows at any moment.
-        os.truncate(self._path("index"), self._index_size)
+        self._files["index"].truncate(self._index_size)
         for field in self.fields:
-            os.truncate(self._path(field), self._size(field))
+            self._files[field].truncate(self._size(field))
 
     def _refresh(self) -> None:
         index = self._path("index")
@@ -371,6 +374,14 @@ def stored(rows: Rows | ScatteredRows, span: slice) -> Array:
 def checksums(rows: Mapping[str, Array]) -> dict[str, int]:
     """Compute field → CRC-32 of rows."""
     return {field: zlib.crc32(values.data) for field, values in rows.items()}
+
+
+def _require_own_files(paths: Iterable[Path]) -> None:
+    """Refuse links, which an archive keeps: what is behind them would be overwritten. Raises a ValueError."""
+    for path in paths:
+        require_file(path)
+        if path.is_symlink():
+            raise ValueError(f"{path} is a link, and nothing is added behind a link: copy the file to this place")
 
 
 def _write(file: BinaryIO, data: memoryview) -> None:

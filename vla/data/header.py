@@ -10,7 +10,7 @@ import numpy as np
 from annotated_types import Ge, Le
 
 from vla.data.index import REMEDY, Plain, dumps
-from vla.io.documents import STRICT, parse_json, parse_plain, read_bounded, require_resolved
+from vla.io.documents import STRICT, parse_json, parse_plain, read_bounded, resolved
 from vla.io.files import write_text
 from vla.spec import Spec
 
@@ -117,7 +117,7 @@ def _parsed(content: bytes, path: Path) -> tuple[Header, Spec]:
     spec = Spec.from_dict(header.spec, f"{path}: spec")
     if "parts" in header.config:
         parse_plain(header.config, Derived, f"{path}: config")
-    require_resolved(header.config, str(path))
+    resolved(header.config, str(path))
     if header.fields != _layouts(spec) or (header.packed and set(header.packed) != set(images_of(spec))):
         raise ValueError(f"{path} is damaged or of another kind: its fields are not those of its spec")
     return header, spec

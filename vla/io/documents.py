@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 from collections.abc import Iterator
 from functools import cache
@@ -86,27 +87,31 @@ def _is_shallow(text: str | bytes) -> bool:
     return True
 
 
-def require_resolved(value: Any, name: str) -> None:
-    """Require a configuration from a file, called `name`, to be plain data without references.
+def resolved(value: Any, name: str) -> Any:
+    """Return a copy of a configuration from a file, called `name`: dicts with texts as keys, lists, and plain values.
 
     Raises:
-        ValueError: a value is no mapping, list, text, number or null; a text contains `${`, which would be resolved
-            later; or there are more than `MAX_VALUES` values or `MAX_DEPTH` levels.
+        ValueError: a value is no mapping, list, text, number or null; a key is no text; a text contains `${`, which
+            would be resolved later; or there are more than `MAX_VALUES` values or `MAX_DEPTH` levels.
     """
-    pending, count = [(value, 0)], 0
-    while pending:
-        item, depth = pending.pop()
-        count += 1
-        if count > MAX_VALUES or depth > MAX_DEPTH:  # a pickle can refer to the same list many times, or to itself
+    count = itertools.count(1)
+
+    def copied(item: Any, depth: int) -> Any:
+        if next(count) > MAX_VALUES or depth > MAX_DEPTH:  # a file can refer to a list many times, or to itself
             raise ValueError(f"{name} holds more than {MAX_VALUES} values, or more than {MAX_DEPTH} levels of them")
-        if isinstance(item, str):
-            if "${" in item:
-                raise ValueError(f"{name} holds the reference {item[:200]!r}: only resolved values are read from files")
-        elif isinstance(item, (dict, list, tuple)):
-            parts = [*item, *item.values()] if isinstance(item, dict) else item
-            pending += [(part, depth + 1) for part in parts]
-        elif item is not None and not isinstance(item, (bool, int, float)):
+        if type(item) in (list, tuple):
+            return [copied(part, depth + 1) for part in item]
+        if type(item) is dict:
+            if other := [key for key in item if type(key) is not str]:
+                raise ValueError(f"{name} holds the key {str(other[0])[:200]}, which is no text")
+            return {copied(key, depth + 1): copied(part, depth + 1) for key, part in item.items()}
+        if type(item) is str and "${" in item:
+            raise ValueError(f"{name} holds the reference {item[:200]!r}: only resolved values are read from files")
+        if item is not None and type(item) not in (bool, int, float, str):
             raise ValueError(f"{name} holds a {type(item).__name__}, which is no plain data")
+        return item
+
+    return copied(value, 0)
 
 
 def mappings(value: Any) -> Iterator[dict[Any, Any]]:

@@ -10,9 +10,9 @@ import torch
 from torch import Tensor
 from torch.overrides import TorchFunctionMode
 
-from vla.io.documents import lines_of, require_resolved
+from vla.io.documents import lines_of, resolved
 from vla.models.model import Model
-from vla.models.pickles import require_stored, require_tensor_archive
+from vla.models.pickles import read_archive
 from vla.spec import Spec
 
 REQUIRED_NODES = ("task", "tokenizer", "model")  # of the config in a checkpoint
@@ -73,7 +73,7 @@ def read_header(path: str | Path) -> Header:
         ValueError: there is no file, it is damaged, or it is not a checkpoint of this project.
         OSError: the file cannot be read.
     """
-    return _header(Path(path), _load(Path(path), weights=False))
+    return _header(Path(path), read_content(Path(path), weights=False))
 
 
 def read_checkpoint(path: str | Path) -> Checkpoint:
@@ -83,7 +83,7 @@ def read_checkpoint(path: str | Path) -> Checkpoint:
         ValueError: there is no file, it is damaged, or it is not a checkpoint of this project.
         OSError: the file cannot be read.
     """
-    content = _load(Path(path), weights=True)
+    content = read_content(Path(path))
     header = _header(Path(path), content)
     state = content.get("state_dict")
     if not isinstance(state, dict) or not all(isinstance(key, str) for key in state):
@@ -119,7 +119,7 @@ def _header(path: Path, content: dict[str, Any]) -> Header:
     config, spec, steps = (content.get(name) for name in ("config", "spec", "global_step"))
     if config is None or spec is None:
         raise ValueError(f"{path} is no checkpoint of this project: it carries no configuration and spec")
-    require_resolved(config, f"the configuration in {path}")
+    config, spec = resolved(config, f"the configuration in {path}"), resolved(spec, f"{path}: spec")
     nodes = config if isinstance(config, dict) else {}
     present = [nodes[name] for name in (*REQUIRED_NODES, *OPTIONAL_NODES) if name in nodes]
     if not nodes.keys() >= {*REQUIRED_NODES} or not all(isinstance(node, dict) for node in present):
@@ -139,22 +139,24 @@ def _header(path: Path, content: dict[str, Any]) -> Header:
     )
 
 
-def _load(path: Path, weights: bool) -> dict[str, Any]:
-    """Read the content of a checkpoint; without `weights` tensors are memory-mapped, neither read nor verified."""
+def read_content(path: Path, weights: bool = True) -> dict[Any, Any]:
+    """Read a checkpoint as plain values and tensors; without `weights` the tensors have no numbers.
+
+    Raises:
+        ValueError: there is no file, or it is damaged or something else.
+        OSError: the file cannot be read.
+    """
     if path.is_dir():
         files = [str(file) for pattern in ("*.ckpt", "checkpoints/*.ckpt") for file in sorted(path.glob(pattern))]
         raise ValueError(f"{path} is a folder, a checkpoint is a file; it has {' and '.join(files) or 'none'}")
     if not path.is_file():
         raise ValueError(f"there is no checkpoint {path}: those of a run lie in outputs/runs/…/checkpoints")
     try:
-        # Only the zip format: legacy pickles raise arbitrary exceptions.
         with path.open("rb") as file:
-            require_tensor_archive(file, path.stat().st_size, checksums=weights)
-        content = torch.load(path, map_location="cpu", weights_only=True, mmap=not weights)
-        require_stored(content, path.stat().st_size)
+            content = read_archive(file, path.stat().st_size, weights)
     except OSError:
         raise
-    except Exception as error:  # a pickle can raise nearly anything
+    except Exception as error:  # a damaged pickle can raise nearly anything
         raise ValueError(f"{path} cannot be read as a checkpoint, it is damaged or something else") from error
     return content if isinstance(content, dict) else {}
 

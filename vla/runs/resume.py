@@ -55,6 +55,7 @@ def training_progress(folder: Path, config: Mapping[str, Any]) -> TrainingProgre
         chosen_checkpoint(folder) if saved.finished else None
     )  # None if the process was killed before the selection
     if chosen is not None and not longer:
+        require_identity(read_header(last.with_name(chosen)).config, config, folder)  # which is the one that is built
         log.info("training is already finished: %s", last.with_name(chosen))
         return TrainingProgress(chosen=last.with_name(chosen))
     if isinstance(trainer.get("strategy"), dict) and not isinstance(before.get("strategy"), dict):

@@ -22,6 +22,7 @@ from lightning.pytorch.utilities.exceptions import MisconfigurationException
 from vla.io.documents import parse_plain
 from vla.io.files import atomic_path
 from vla.io.types import NonNegative
+from vla.models.checkpoint import read_content
 from vla.runs.folder import LAST
 
 log = logging.getLogger(__name__)
@@ -161,7 +162,11 @@ def _validates(trainer: Trainer) -> bool:
 
 
 class AtomicCheckpointIO(TorchCheckpointIO):
-    """Writes checkpoints atomically: a complete file replaces the previous one."""
+    """Writes checkpoints atomically: a complete file replaces the previous one. Reads them as data."""
+
+    def load_checkpoint(self, path: Any, map_location: Any = None, weights_only: bool | None = None) -> dict[str, Any]:
+        """Return plain values and tensors, on the CPU. Raises as `read_content` does."""
+        return read_content(Path(path))
 
     def save_checkpoint(self, checkpoint: dict[str, Any], path: Any, storage_options: Any = None) -> None:
         """Write a temporary file, then rename it to `path`.

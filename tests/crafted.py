@@ -1,0 +1,92 @@
+"""Checkpoints and archives that no program of this project writes: what they hide acted when it was read or built."""
+
+from __future__ import annotations
+
+import socket
+from collections import OrderedDict
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import torch
+from composing import composed
+from hostile import node
+from toy import SPEC
+
+from vla.config.build import build
+from vla.config.experiment import plain
+
+
+class Hiding:
+    """A mapping whose methods are those that the file says, as PyTorch's reader makes it."""
+
+    def __init__(self, shown: dict[str, Any], *methods: str) -> None:
+        self._shown, self._hidden = shown, dict.fromkeys(methods, OrderedDict)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickle as an OrderedDict with attributes."""
+        return OrderedDict, (), self._hidden, None, iter(self._shown.items())
+
+
+def python(mark: Path) -> dict[str, Any]:
+    """A node that runs Python when it is built."""
+    return node("torch._inductor.codecache.PyCodeCache.load", _args_=[f"open({str(mark)!r}, 'w')"])
+
+
+def remote(port: int, key: str | None = None) -> dict[str, Any]:
+    """An agent that connects with this port."""
+    return plain(composed("agent=remote"))["agent"] | {"url": f"ws://127.0.0.1:{port}", "api_key": key, "timeout": 1.0}
+
+
+def recorded() -> dict[str, Any]:
+    """A world of recordings, as a checkpoint describes it."""
+    names: dict[str, Any] = {"cameras": ["front"], "state": ["a", "b"], "action": ["a", "b"], "low": [-1.0, -1.0]}
+    further = {"image_size": [16, 16], "control_hz": 5.0, "units": "1", "high": [1.0, 1.0], "joints": None}
+    return node("vla.tasks.recorded.Recorded", **names, **further)
+
+
+def hiding(config: dict[str, Any], mark: Path, port: int) -> dict[str, Any]:
+    """Attack → the configuration of a checkpoint that ran code, or connected with a port, when it was used."""
+    perturbed = config["expert"] | {"expert": remote(port) | {"_partial_": True}}
+    methods = ("items", "values", "keys", "get", "__class__", "__iter__", "copy")
+    bins = config["tokenizer"] | {"bins": python(mark)}
+    secret = {**config, "task": recorded(), "expert": remote(port, "${oc.env:ATTACK_SECRET}")}
+    return {
+        "python in a mapping that hides it": {**config, "tokenizer": Hiding(bins, "items", "values")},
+        "python in a mapping without methods": {**config, "tokenizer": Hiding(bins, *methods)},
+        "python in the mapping of all": Hiding({**config, "tokenizer": Hiding(bins, *methods)}, *methods),
+        "python in a tuple": {**config, "model": {**config["model"], "image": (python(mark),)}},
+        "a secret for a stranger": Hiding(secret, "values"),
+        "a secret in the report": Hiding({**config, "chosen": {"experiment": "${oc.env:ATTACK_SECRET}"}}, "values"),
+        "a connection of a recording": {**config, "task": recorded(), "expert": remote(port)},
+        "a connection of an expert": {**config, "expert": remote(port)},
+        "a connection within an expert": {**config, "expert": perturbed},
+        "a key that is no text": {**config, "model": {**config["model"], 5: 1}},
+        "keys that are no text": {**config, "model": {True: 1, float("nan"): 2}},
+    }
+
+
+def save(path: Path, config: Any, **further: Any) -> Path:
+    """Write a checkpoint without weights, of the world that its configuration describes."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    shown = config._shown if isinstance(config, Hiding) else config
+    spec = build(shown["task"], "task").spec if shown["task"] == recorded() else SPEC
+    torch.save({"config": config, "spec": spec.to_dict(), "state_dict": {}, **further}, path)
+    return path
+
+
+@contextmanager
+def listener() -> Iterator[tuple[int, Callable[[], bool]]]:
+    """A port of this machine, and whether somebody has connected with it."""
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        server.setblocking(False)
+
+        def connected() -> bool:
+            try:
+                server.accept()[0].close()
+            except BlockingIOError:
+                return False
+            return True
+
+        yield server.getsockname()[1], connected
