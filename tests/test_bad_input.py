@@ -40,6 +40,15 @@ BAD_INPUT = {
     "another world's expert": (("job=preview", "expert=metaworld"), "expert=metaworld acts in task=metaworld only"),
     "another world's goal": (("task=metaworld", "task/goal=lift"), "the option chosen for task has no goal"),
     "no environment": (("job=preview", "task=gymnasium"), "task.package is missing: the options chosen need"),
+    "a config out of a pickle": (
+        ("--experimental-rerun", "x.pickle"),
+        "--experimental-rerun runs whatever a file says",
+    ),
+    "the same, abbreviated": (("--exp=x.pickle",), "--experimental-rerun runs whatever a file says"),
+    "a store twice": (("job=train", "collect.folder=s", "collect.more=[a,./a]"), "/a twice: its episodes would count"),
+    "the store of all twice": (("job=train", "collect.folder=s", "collect.more=[s]"), "/s twice: its episodes would"),
+    "no cells": (("-m", "seed=range(0,0)"), "the sweep has no cells: one of its ranges or choices is empty"),
+    "brackets": ((f"seed={'[' * 200}{']' * 200}",), "nested too deep"),
     "no GPU": (("trainer=gpu", *(item for item in SMALL if "accelerator" not in item)), "gpu"),
 }
 
@@ -57,7 +66,13 @@ def test_bad_input_ends_in_one_clear_sentence(tmp_path: Path, name: str) -> None
 # Job → values that no experiment can have, each of which is refused by the name of its key before any work.
 NONSENSE = {
     "collect": (
-        *("task.time_limit=nan", "task.time_limit=inf", "task.goal.radius=nan", "task.image_size=[1,1]"),
+        *(
+            "task.time_limit=nan",
+            "task.time_limit=inf",
+            "task.time_limit=1e300",
+            "task.goal.radius=nan",
+            "task.image_size=[1,1]",
+        ),
         *("task.image_size=[4096,4096]", "task.cameras=[front,front]", "task.randomize.mass.factor=[nan,nan]"),
         *("task.randomize.mass.factor=[0,0]", "task.randomize.mass.factor=[2,1]", "task.randomize.camera.fovy=500"),
         *("task.randomize.size.half_size=[0,0]", "task.randomize.size.half_size=[10,10]"),
@@ -176,3 +191,10 @@ def test_without_gl_the_error_says_what_to_install(tmp_path: Path) -> None:
         text=True,
     )
     assert done.returncode == 1 and "libegl1" in done.stderr and "Traceback" not in done.stderr
+
+
+@pytest.mark.parametrize("name", ["RANK", "LOCAL_RANK", "SLURM_STEP_NUM_TASKS"])
+def test_a_rank_that_is_no_number_is_named(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(name, "x")
+    done = here(tmp_path, "resume=last", "output=nowhere/now", ok=False)
+    assert done.stderr == f"error: the environment variable {name} must be a number of a launcher, got 'x': unset it\n"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import resource
 import shutil
 from collections.abc import Callable
@@ -215,3 +216,19 @@ def test_a_garbled_description_is_named_with_the_way_out(tmp_path: Path, content
     (store.folder / "store.json").write_bytes(content)
     with pytest.raises(ValueError, match=r"store\.json is damaged or of another kind: .*collect again"):
         EpisodeStore(store.folder)
+
+
+@pytest.mark.parametrize("name", ["index.jsonl", "executed.bin", "rgb_front.bin"])
+def test_nothing_is_written_behind_a_link(name: str, tmp_path: Path) -> None:
+    add(tmp_path / "store", EPISODES)
+    victim = tmp_path / "victim"
+    victim.write_bytes((tmp_path / "store" / name).read_bytes())
+    (tmp_path / "store" / name).unlink()
+    (tmp_path / "store" / name).symlink_to(victim)
+    victim.open("ab").write(b"x" * 9000)
+    before = victim.read_bytes()
+    store = EpisodeStore(tmp_path / "store", damaged=True)
+    assert [entry.seed for entry in store.episodes] == [0, 1, 2, 4]
+    with pytest.raises(ValueError, match=rf"{re.escape(name)} is a link"), EpisodeStore(tmp_path / "store").writing():
+        pass
+    assert victim.read_bytes() == before

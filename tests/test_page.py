@@ -357,3 +357,54 @@ def test_the_page_of_a_sweep_leads_to_every_cell(tmp_path: Path) -> None:
     assert f"bc 87.5 ({low:.1f}-{high:.1f})" in told and "0: bc 1: bc 2: rt1" in told
     assert markup.count("<svg") == 6 and len(pictures(tmp_path / "sweep.html")) == 1
     assert json.loads((tmp_path / "0/report.json").read_text())["success"] == 1.0
+
+
+def test_numbers_that_no_axis_can_hold_are_not_drawn(tmp_path: Path) -> None:
+    run = a_run(tmp_path / "run", curves="step,train/loss,lr\n9,1e308,1\n19,-1e308,2\n29,2.5,3\n")
+    assert read_run(run).metrics["train/loss"][1].tolist() == [2.5]
+    assert "<svg" in write_page(run).read_text()
+
+
+def test_a_table_of_very_many_metrics_is_refused(tmp_path: Path) -> None:
+    names = ",".join(f"loss{number}" for number in range(3000))
+    run = a_run(tmp_path / "run", curves=f"step,{names}\n9{',1' * 3000}\n")
+    with pytest.raises(ValueError, match=r"metrics\.csv is damaged in line 1: there are more than 300 columns"):
+        write_page(run)
+
+
+ODD = {
+    "config.task": 5,
+    "config.task.tiers": {"easy": 5},
+    "config.evaluate": "y",
+    "config.evaluate.conditions": {"dark": [1]},
+    "config.evaluate.one_by_one": [1],
+    "config.evaluate.without": None,
+    "config.evaluate.networks": [1],
+    "per_episode": [],
+    "seeds": [],
+}
+
+
+@pytest.mark.parametrize("key", ODD)
+def test_a_report_of_odd_values_is_refused_by_their_name(key: str, tmp_path: Path) -> None:
+    runs = [a_run(tmp_path / name) for name in "ab"]
+    content = json.loads((runs[0] / "report.json").read_text())
+    *parents, name = key.split(".")
+    node = content
+    for parent in parents:
+        node = node[parent]
+    node[name] = ODD[key]
+    (runs[0] / "report.json").write_text(json.dumps(content))
+    with pytest.raises(ValueError, match=rf"report\.json is damaged or of another kind: .*{re.escape(key)}"):
+        compared(runs, tmp_path / "page")
+
+
+@pytest.mark.parametrize("episodes", [0, 2])
+def test_a_report_of_no_episode_or_of_one_twice_is_refused(episodes: int, tmp_path: Path) -> None:
+    run = a_run(tmp_path / "run", "s")
+    content = json.loads((run / "report.json").read_text())
+    content |= {"seeds": content["seeds"] * episodes, "per_episode": content["per_episode"] * episodes}
+    content["conditions"] = {}
+    (run / "report.json").write_text(json.dumps(content))
+    with pytest.raises(ValueError, match=r"report\.json is damaged .* seeds has none, or one of them twice"):
+        read_run(run)

@@ -34,7 +34,7 @@ from vla.deploy import ros
 from vla.io.printable import printable
 from vla.io.suggestion import suggestion
 from vla.parallel.fast_exit import fast_exit
-from vla.parallel.processes import raise_gc_thresholds, without_triton
+from vla.parallel.processes import raise_gc_thresholds, require_ranks, without_triton
 from vla.runs.cells import describe_failures, save_failure
 
 PACKAGE = Path(__file__).resolve().parent
@@ -50,6 +50,8 @@ def sentence(error: Exception) -> str:
 
 def _described(error: Exception) -> str:
     cause = error.__cause__
+    if isinstance(error, RecursionError):
+        return "a value or a folder is nested too deep: HYDRA_FULL_ERROR=1 shows where"
     if isinstance(error, MissingConfigException) and error.missing_cfg_file and error.options is not None:
         group, _, option = error.missing_cfg_file.rpartition("/")
         hint = suggestion(option, error.options) or ":"
@@ -108,7 +110,7 @@ def _meant_for_user(error: Exception) -> bool:
     Libraries also raise ValueError and RuntimeError for bugs. The traceback of a deliberate error, here or in a worker
     process, ends with a `raise` in this package or one that adds options, or in Hydra for the command line.
     """
-    if isinstance(error, (OSError, HydraException, OmegaConfBaseException)):
+    if isinstance(error, (OSError, HydraException, OmegaConfBaseException, RecursionError)):
         return True
     # By name, because importing Lightning takes seconds; MuJoCo raises FatalError without a display.
     if type(error).__name__ in ("MisconfigurationException", "FatalError") or isinstance(error, YAMLError):
@@ -297,6 +299,7 @@ def main() -> None:
     sys.argv[1:], ros.arguments[:] = ros.split_arguments(sys.argv[1:])
     try:
         _require_no_pickle(sys.argv[1:])
+        require_ranks()
         if sys.argv[1:] in (["--help"], ["-h"]):  # with further arguments Hydra composes the help itself
             print(_menu())
             return

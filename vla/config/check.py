@@ -9,6 +9,7 @@ from collections.abc import Mapping
 from contextlib import nullcontext, suppress
 from dataclasses import dataclass, field
 from inspect import Parameter
+from pathlib import Path
 from typing import Annotated, Any, Literal, cast
 
 from annotated_types import Ge, Gt, Lt, Predicate
@@ -98,6 +99,7 @@ def check(cfg: DictConfig, job: Job) -> None:
         _check_plain(name, node, annotation)
     if cfg.checkpoint is None:  # else the seeds of its own training count
         _require_apart(cfg)
+    _require_different_stores(cfg)
     if cfg.agent is not None and "agent" not in groups:
         raise ValueError(f"job={cfg.job} takes no agent: agent=OPTION goes with job=evaluate and deploy")
     if cfg.agent is not None and cfg.checkpoint is not None:
@@ -200,6 +202,12 @@ def _require_apart(cfg: DictConfig) -> None:
             f"validate.seed={one.start} and evaluate.seed={other.start} share episodes, but episodes that select the "
             "weights must not evaluate them: change one of the two"
         )
+
+
+def _require_different_stores(cfg: DictConfig) -> None:
+    stores = Counter(Path(folder).resolve() for folder in (cfg.collect.folder, *(cfg.collect.more or ())))
+    if twice := [str(folder) for folder, count in stores.items() if count > 1]:
+        raise ValueError(f"collect.folder and collect.more name {twice[0]} twice: its episodes would count twice")
 
 
 def _require_together(tokenizer: type, model: type) -> None:

@@ -329,9 +329,11 @@ def _write(
     used = str(checkpoint) if checkpoint else None
     # Last, because its existence marks the evaluation as finished.
     write_report(report, output / REPORT, used, experiment.config, facts, others, compared, secondary)
+    page = None
     with warn_on_error(output / PAGE):
-        write_page(output)
-    log.info("wrote %s, report.json, report.png%s", output / PAGE, f" and {RECORDING}" if recording.exists() else "")
+        page = write_page(output)
+    written = [path for path in (page, output / REPORT, output / PLOT, recording) if path and path.is_file()]
+    log.info("wrote %s", ", ".join([str(written[0]), *(path.name for path in written[1:])]))
 
 
 def _facts(experiment: Experiment, checkpoint: Path | None, rounds: Sequence[Round], seconds: float) -> dict[str, Any]:

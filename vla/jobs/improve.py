@@ -150,9 +150,10 @@ def _require_possible(experiment: Experiment) -> range:
 def _require_further_episodes(experiment: Experiment, policy: Path) -> None:
     """Raise a ValueError if the policy was trained on further stores, such as rounds, that nothing is said about."""
     further = at(read_header(policy).config, "collect.more", None)
-    if further and experiment["collect"]["more"] is None:
+    if isinstance(further, list) and further and experiment["collect"]["more"] is None:
+        names = ",".join(map(str, further))
         raise ValueError(
-            f"{policy} was also trained on {', '.join(further)}: add collect.more=[{','.join(further)}] to train on "
+            f"{policy} was also trained on {names}: add collect.more=[{names}] to train on "
             "these episodes again, or collect.more=[] to leave them out"
         )
 

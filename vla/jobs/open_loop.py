@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from rich.progress import track
 
+from vla.config.differences import at
 from vla.config.experiment import Experiment
 from vla.data.datamodule import digest_of, held_out
 from vla.data.episodes import EpisodeStore
@@ -73,13 +74,17 @@ def evaluate_open_loop(experiment: Experiment, checkpoint: Path | None) -> float
     with writing(output / ERRORS):
         save_config(output, experiment.config, experiment.changes)
         with warn_on_error(output / ERRORS_PLOT):
+            (output / ERRORS_PLOT).unlink(missing_ok=True)  # of an earlier evaluation
             plot_errors(result, output / ERRORS_PLOT)
         # Last, because its existence marks the evaluation as finished.
         write_errors(result, output / ERRORS, str(checkpoint) if checkpoint else None, experiment.config, facts)
+        page = None
         with warn_on_error(output / PAGE):
-            write_page(output)
+            page = write_page(output)
     show(errors_table(result))
-    log.info("wrote %s, %s and %s: open-loop errors, which are not a success rate", output / PAGE, ERRORS, ERRORS_PLOT)
+    written = [path for path in (page, output / ERRORS, output / ERRORS_PLOT) if path and path.is_file()]
+    names = ", ".join([str(written[0]), *(path.name for path in written[1:])])
+    log.info("wrote %s: open-loop errors, which are not a success rate", names)
     return -result.relative
 
 
@@ -104,7 +109,10 @@ def _unseen(store: EpisodeStore, more: Sequence[Path], checkpoint: Path) -> list
         log.warning(
             "%s began with the weights of %s: whether these were trained on its episodes is unknown", checkpoint, origin
         )
-    return _held_out(store, header.config["data"]["validation_fraction"])
+    fraction = at(header.config, "data.validation_fraction", None)
+    if not isinstance(fraction, float | int):
+        raise ValueError(f"{checkpoint} does not say which share of the episodes its training held out")
+    return _held_out(store, fraction)
 
 
 def _held_out(store: EpisodeStore, fraction: float) -> list[Entry]:

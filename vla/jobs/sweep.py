@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig
 
 from vla.io.printable import show
-from vla.runs.cells import FAILURE
+from vla.runs.cells import FAILURE, OVERRIDES, cells
 from vla.runs.sweep import read_rows
 
 
@@ -35,11 +36,14 @@ class SweepTable(Callback):
                 tabulate(folder)
 
     def on_multirun_end(self, config: DictConfig, **kwargs: Any) -> None:
-        """Print the table of the sweep, and name its page."""
+        """Print the table of the sweep, and name its page; end the process with an error if there are no cells."""
         from vla.reports.html import SWEEP  # imports matplotlib
         from vla.reports.sweep import console_table
 
         folder = Path(config.hydra.sweep.dir)
+        if not (folder.is_dir() and cells(folder, OVERRIDES)):
+            print("error: the sweep has no cells: one of its ranges or choices is empty", file=sys.stderr)
+            sys.exit(1)
         if rows := read_rows(folder):
             show(console_table(rows))
         if (page := folder / SWEEP).exists():

@@ -22,6 +22,9 @@ PATIENCE = 5.0  # [s] for an idle process to free its resources
 # LP_NUM_THREADS is of Mesa's renderer, which counts only threads beside the calling one.
 THREAD_SETTINGS = {"OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "LP_NUM_THREADS": "0"}
 
+RANKS = ("RANK", "LOCAL_RANK", "NODE_RANK", "WORLD_SIZE", "SLURM_PROCID", "SLURM_LOCALID", "SLURM_NODEID")
+RANKS += ("SLURM_NTASKS", "SLURM_STEP_NUM_TASKS", "JSM_NAMESPACE_RANK")
+
 
 class Worker(Protocol):
     """Sequential processor of items."""
@@ -163,6 +166,17 @@ def one_thread() -> None:
 def raise_gc_thresholds() -> None:
     """Raise the thresholds of the cyclic garbage collector: its passes during imports take a second and free little."""
     gc.set_threshold(50_000, 20, 100)
+
+
+def require_ranks() -> None:
+    """Require numbers in the variables by which launchers number processes; libraries read them as they are imported.
+
+    Raises:
+        ValueError: one is no number.
+    """
+    for name in RANKS:
+        if not (value := os.environ.get(name, "0")).isdecimal():
+            raise ValueError(f"the environment variable {name} must be a number of a launcher, got {value!r}: unset it")
 
 
 def without_triton() -> None:

@@ -8,9 +8,11 @@ from functools import cached_property
 from itertools import repeat
 from typing import Annotated, Any
 
-from pydantic import StringConstraints
+from pydantic import AfterValidator, StringConstraints
 
-from vla.config.differences import at
+from vla.config.annotations import describe, matches
+from vla.config.check import PLAIN
+from vla.config.differences import ABSENT, at
 from vla.io.documents import LENIENT, STRICT
 from vla.io.types import Count, Natural, NonNegative, Positive, Share
 from vla.rollouts.comparison import Comparison
@@ -19,6 +21,21 @@ from vla.rollouts.results import Report, Result
 from vla.spec import IN_DISTRIBUTION, readable
 
 Node = dict[str, Any]
+# What reports read of a config, key → type; everything else is only shown.
+READ: dict[str, Any] = {"task": dict[str, object], "task.tiers": dict[str, list[str]] | None}
+READ |= {"evaluate": dict[str, object]}
+READ |= {f"evaluate.{name}": kind for name, kind in PLAIN["evaluate"].items()}
+
+
+def readable_config(config: Node) -> Node:
+    """Return a config that reports can read; a ValueError if one of its values is none of this project."""
+    for key, kind in READ.items():
+        if (value := at(config, key)) != ABSENT and not matches(value, kind):
+            raise ValueError(f"config.{key} is not {describe(kind)}")
+    return config
+
+
+Config = Annotated[Node, AfterValidator(readable_config)]
 CheckpointName = Annotated[str, StringConstraints(pattern=r"^\w[\w.-]*\.ckpt$")]  # in the run's own folder
 
 
@@ -137,7 +154,7 @@ class ReportFile:
     seeds: list[int]
     checkpoint: str | None
     conditions: dict[str, Condition]
-    config: Node
+    config: Config
     per_episode: list[Result]
     anytime: bool = False  # as of a condition
     parameters: Count | None = None
@@ -151,6 +168,8 @@ class ReportFile:
         """Require the same episodes in every part."""
         if [result.seed for result in self.per_episode] != self.seeds:
             raise ValueError("per_episode has other episodes than seeds")
+        if not self.seeds or len(set(self.seeds)) < len(self.seeds):
+            raise ValueError("seeds has none, or one of them twice")
         for name, condition in self.conditions.items():
             played = len(condition.outcomes)
             if played > len(self.seeds) or (played < len(self.seeds) and not condition.anytime):

@@ -9,7 +9,6 @@ import logging
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, replace
 from functools import partial
-from math import isfinite
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -33,6 +32,7 @@ METRICS, REPORT = "metrics.csv", "report.json"
 PAGE, RECORDING = "report.html", "rollouts.rrd"
 SAMPLES, PLOT, SUITE = "samples.png", "report.png", "suite.png"
 ERRORS, ERRORS_PLOT = "errors.json", "errors.png"  # of an open-loop evaluation, in place of a report
+LARGEST_METRIC, MOST_METRICS = 1e100, 300  # that curves are drawn of; a training has about 20
 LARGEST_REPORT = 4 << 30  # [bytes], a million episodes
 CHECKPOINTS, LAST = "checkpoints", "last.ckpt"  # the folder of weights, and those of the newest save
 
@@ -181,7 +181,7 @@ def _curves(path: Path) -> dict[str, Curve]:
     points: dict[str, dict[int, float]] = {}
     for row in metric_rows(path):
         for name, value in row.items():
-            if name not in ("step", "epoch") and isfinite(float(value)):
+            if name not in ("step", "epoch") and abs(float(value)) < LARGEST_METRIC:
                 points.setdefault(name, {})[int(row["step"])] = float(value)
     return {name: (np.array(sorted(at)), np.array([at[step] for step in sorted(at)])) for name, at in points.items()}
 
@@ -198,6 +198,8 @@ def metric_rows(path: Path) -> list[dict[str, str]]:
         names = next(rows, ["step"])
         if "step" not in names or len(set(names)) < len(names):
             raise ValueError("there is no column step, or a column twice")
+        if len(names) > MOST_METRICS:
+            raise ValueError(f"there are more than {MOST_METRICS} columns")
         for row in rows:
             if len(row) < len(names):  # truncated by a killed process
                 continue

@@ -5,10 +5,11 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from statistics import NormalDist
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import mujoco
 import numpy as np
+from annotated_types import Le
 
 from vla.io.types import Count, ImageSize, Names, Point, Positive
 from vla.spec import FIRST_SEED, Array, Observation, Shape, Spec
@@ -51,7 +52,7 @@ class Tabletop(Blindable):
         blocks: Count,
         image_size: ImageSize,
         cameras: Names,
-        time_limit: Positive,
+        time_limit: Annotated[Positive, Le(3600)],
         meshes: Literal["light", "full"],
         shadows: bool,
         robot: RobotFile | None = None,
