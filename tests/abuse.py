@@ -22,6 +22,7 @@ import torch
 from abuse_files import bags, datasets, runs
 from abuse_kills import kills
 from abuse_messages import messages
+from crafted import hiding, listener, save
 from hostile import hostile
 from trials import CHECKPOINT, EVALUATE, TRAIN, Trials, last, run
 
@@ -168,7 +169,7 @@ def headers(root: Path) -> Trials:
 
 
 def checkpoints(root: Path) -> Trials:
-    """Checkpoints that name something to run, through every job that reads one."""
+    """Checkpoints that name or hide something to run or to connect with, through every job that reads one."""
     mark = root / "mark"
     evil = root / "evil/checkpoints/last.ckpt"
     evil.parent.mkdir(parents=True, exist_ok=True)
@@ -181,16 +182,21 @@ def checkpoints(root: Path) -> Trials:
         "deploy": (named, "job=deploy", "deploy=ros2", "output=wrong"),
     }
     content = torch.load(root / CHECKPOINT, weights_only=True)
-    for attack, (key, value) in hostile(mark).items():
-        config = json.loads(json.dumps(content["config"]))
-        put(config, key, value)
-        torch.save({**content, "config": config}, evil)
-        for way, arguments in ways.items():
-            how, printed = run(root, *arguments)
-            shutil.rmtree(root / "wrong", ignore_errors=True)
-            runs = how == "late" and way == "deploy" and "waiting: " in printed  # until it is stopped
-            held = not mark.exists() and (runs or how in ("sentence", "done"))
-            yield f"{attack}, {way}", held, f"{how}: {last(printed)}"
+    own = content.pop("config")
+    os.environ["ATTACK_SECRET"] = "hunter2secret"
+    with listener() as (port, connected):
+        attacks: dict[str, Any] = {}
+        for attack, (key, value) in hostile(mark).items():
+            attacks[attack] = json.loads(json.dumps(own))
+            put(attacks[attack], key, value)
+        for attack, config in (attacks | hiding(own, mark, port)).items():
+            save(evil, config, **content)
+            for way, arguments in ways.items():
+                how, printed = run(root, *arguments)
+                shutil.rmtree(root / "wrong", ignore_errors=True)
+                runs = how == "late" and way == "deploy" and "waiting: " in printed  # until it is stopped
+                acted = mark.exists() or connected() or "hunter2secret" in printed
+                yield f"{attack}, {way}", not acted and (runs or how in ("sentence", "done")), f"{how}: {last(printed)}"
 
 
 def disks(root: Path) -> Trials:

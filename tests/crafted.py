@@ -68,11 +68,13 @@ def hiding(config: dict[str, Any], mark: Path, port: int) -> dict[str, Any]:
 
 
 def save(path: Path, config: Any, **further: Any) -> Path:
-    """Write a checkpoint without weights, of the world that its configuration describes."""
+    """Write a checkpoint, without weights unless given, of the world that its configuration describes."""
     path.parent.mkdir(parents=True, exist_ok=True)
+    content = {"spec": SPEC.to_dict(), "state_dict": {}, **further, "config": config}
     shown = config._shown if isinstance(config, Hiding) else config
-    spec = build(shown["task"], "task").spec if shown["task"] == recorded() else SPEC
-    torch.save({"config": config, "spec": spec.to_dict(), "state_dict": {}, **further}, path)
+    if shown["task"] == recorded():
+        content["spec"] = build(shown["task"], "task").spec.to_dict()
+    torch.save(content, path)
     return path
 
 

@@ -60,18 +60,19 @@ def test_nothing_that_is_hidden_acts(attack: str, tmp_path: Path, monkeypatch: p
 @pytest.mark.parametrize("attack", [attack for attack in ATTACKS if "secret" in attack])
 def test_no_reference_is_read(attack: str, tmp_path: Path) -> None:
     path = save(tmp_path / "last.ckpt", hiding(plain(composed("expert=waypoint")), tmp_path / "mark", 0)[attack])
-    with pytest.raises(ValueError, match=r"last\.ckpt holds the reference .*ATTACK_SECRET.*only resolved values"):
+    with pytest.raises(ValueError, match=r"last\.ckpt cannot be read as a checkpoint"):
         read_header(path)
 
 
 def test_the_policy_that_a_run_names_is_the_one_that_is_checked(tmp_path: Path) -> None:
     mark, config = tmp_path / "mark", plain(composed("expert=waypoint", f"output={tmp_path}"))
     attack = hiding(config, mark, 0)["python in a mapping that hides it"]
-    for theirs in (attack, {**config, "tokenizer": dict(attack["tokenizer"]._shown)}):
+    plainly = {**config, "tokenizer": attack["tokenizer"]._shown}
+    for theirs, says in ((attack, "cannot be read as a checkpoint"), (plainly, r"differs in tokenizer\.bins")):
         save(tmp_path / "checkpoints/last.ckpt", config, finished=True)
         save(tmp_path / "checkpoints/best.ckpt", theirs, finished=True)
         ended = {"parameters": 1, "steps": 0, "seconds": 1.0, "ended": "done", "checkpoint": "best.ckpt"}
         (tmp_path / "training.json").write_text(json.dumps(ended))
-        with pytest.raises(ValueError, match=r"holds a training that differs in tokenizer\.bins"):
+        with pytest.raises(ValueError, match=says):
             training_progress(tmp_path, config)
         assert not mark.exists()

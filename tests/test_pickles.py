@@ -12,6 +12,7 @@ from zipfile import ZIP_DEFLATED, ZIP_STORED, BadZipFile, ZipFile
 
 import pytest
 import torch
+from crafted import Hiding
 from torch import Tensor, nn
 
 from vla.models.pickles import load_tensors, read_archive
@@ -120,6 +121,7 @@ VALUES: dict[str, tuple[Callable[[], Any], str]] = {
     "a tensor with a fraction as its size": (lambda: rebuilt(0, (2.0,), (1,)), "it calls something else"),
     "a tensor with attributes": (lambda: rebuilt(0, (4,), (1,), a=1), "it has the instruction BUILD"),
     "a parameter of nothing": (lambda: Call(PARTS._rebuild_parameter, [1], True, {}), "it calls something else"),
+    "a mapping with methods": (lambda: Hiding({"a": 1}, "items"), "it has the instruction BUILD"),
     "a key that is a tuple": (lambda: {(1, 2): 3}, "a key is no text"),
     "bytes": (lambda: b"a", "it names _codecs encode"),
 }

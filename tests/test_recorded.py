@@ -256,6 +256,16 @@ def test_what_a_recording_cannot_do_is_said(dataset: Path, tmp_path: Path, overr
     assert says in done.stderr
 
 
+def test_names_out_of_a_recording_are_no_references(
+    dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("ATTACK_SECRET", "hunter2secret")
+    copy = renamed(dataset, tmp_path / "dataset", ["a", "${oc.env:ATTACK_SECRET}", "c"])
+    done = here(tmp_path, "task=recorded", f"expert.folder={copy}", "job=collect", "output=run", ok=False)
+    assert "the recording holds the reference '${oc.env:ATTACK_SECRET}'" in done.stderr
+    assert "hunter2secret" not in done.stderr and not (tmp_path / "outputs/episodes").exists()
+
+
 def test_an_expert_that_acts_has_no_recording(tmp_path: Path) -> None:
     done = here(tmp_path, "task=recorded", "expert=waypoint", ok=False)
     assert done.stderr.startswith(
@@ -280,7 +290,8 @@ def test_a_policy_is_trained_and_its_errors_measured_without_a_simulator(dataset
     forgot = here(tmp_path, *again, "task=recorded", f"expert.folder={dataset}", ok=False)
     assert "has image_size = (24, 32), but the task, with the options given here, has (96, 128)" in forgot.stderr
     (kept,) = tmp_path.glob("outputs/episodes/*")  # both found it, and the last one imported nothing
-    here(tmp_path, *recording, *TRAINING, *TINY, f"collect.more=[{kept}]", "hydra.run.dir=more", "output=more")
+    shutil.copytree(kept, tmp_path / "further")
+    here(tmp_path, *recording, *TRAINING, *TINY, "collect.more=[further]", "hydra.run.dir=more", "output=more")
     assert json.loads((tmp_path / "more/errors.json").read_text())["seeds"] == errors["seeds"]
     shutil.rmtree(kept)
     assert "name its folder with expert=lerobot expert.folder=DIR" in here(tmp_path, *again, ok=False).stderr

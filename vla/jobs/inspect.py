@@ -101,7 +101,7 @@ def replay_episode(output: Path, folder: Path, seed: int, robot: dict[str, Any] 
     """
     store = EpisodeStore(folder, damaged=True)
     config, episode = find_episode(store, seed)
-    if "task" not in config:
+    if not isinstance(config.get("task"), dict):
         raise ValueError(f"{folder} does not contain the task of seed {seed}, so there is no scene to replay it in")
     if robot:
         config["task"]["robot"] = robot

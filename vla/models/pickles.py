@@ -161,8 +161,8 @@ def _interpreted(pickled: BinaryIO, storage: Storage) -> Any:
             stack.append(_numbers(storage, *stack.pop()))
         elif name == "REDUCE":
             stack.append(_made(*taken(name)))
-        elif name == "BUILD" and type(stack[-2]) is dict:
-            stack.pop()  # attributes, such as the versions of modules
+        elif name == "BUILD" and type(stack[-2]) is type(stack[-1]) is dict and [*stack[-1]] == ["_metadata"]:
+            stack.pop()  # versions of the modules in a state
         elif name not in ("PROTO", "STOP"):
             raise UnpicklingError(f"it has the instruction {name}")
     return stack.pop()
