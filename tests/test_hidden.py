@@ -14,7 +14,7 @@ from omegaconf import DictConfig
 
 from vla import jobs
 from vla.config.adopt import adopt, finetune
-from vla.config.experiment import Experiment, load_policy, plain
+from vla.config.experiment import Experiment, make_policy, plain
 from vla.models.checkpoint import read_header
 from vla.runs.resume import training_progress
 
@@ -42,7 +42,7 @@ def test_nothing_that_is_hidden_acts(attack: str, tmp_path: Path, monkeypatch: p
             return lambda: run_job(adopt(composed(*small, f"checkpoint={path}", *options), []))
 
         ways: dict[str, Callable[[], Any]] = {
-            "load_policy": lambda: load_policy(path),
+            "policy": lambda: make_policy(plain(composed().policy), path),  # as programs do
             "evaluate": adopted(),
             "export": adopted("job=export", "export=program", "export.folder=new"),
             "deploy": adopted("job=deploy", "deploy=ros2"),

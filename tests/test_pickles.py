@@ -159,6 +159,10 @@ def short(name: str, data: bytes) -> list[tuple[str, bytes]]:
     return [(name, data[:4] if name.endswith("data/0") else data)]
 
 
+def many_mappings(name: str, data: bytes) -> list[tuple[str, bytes]]:
+    return [(name, b"}" * (1 << 24) if name.endswith("data.pkl") else data)]
+
+
 def big_endian(name: str, data: bytes) -> list[tuple[str, bytes]]:
     return [(name, b"big" if name.endswith("byteorder") else data)]
 
@@ -170,6 +174,7 @@ def as_it_is(name: str, data: bytes) -> list[tuple[str, bytes]]:
 ARCHIVES: dict[str, tuple[Callable[[], bytes], str]] = {
     "a pickle in capitals": (lambda: rewritten(in_capitals), "'data.pkl'"),
     "numbers that are fewer than the pickle says": (lambda: rewritten(short), "another size than the archive says"),
+    "a pickle of mappings only": (lambda: rewritten(many_mappings), "its pickle has more than 8388608 bytes"),
     "compressed parts": (lambda: rewritten(as_it_is, ZIP_DEFLATED), "compressed or overlap"),
     "parts that overlap": (lambda: overlapping(), "compressed or overlap"),
     "something before it": (lambda: b"\x80\x02" + rewritten(as_it_is), "something precedes the archive"),

@@ -25,26 +25,18 @@ TYPES = {
     **{"Int": torch.int32, "Long": torch.int64},
 }
 STORAGES = {f"torch {name}Storage": dtype for name, dtype in TYPES.items()}
-MAPPING, TENSOR, PARAMETER = (
-    "collections OrderedDict",
-    "torch._utils _rebuild_tensor_v2",
-    "torch._utils _rebuild_parameter",
-)
+MAPPING = "collections OrderedDict"
+TENSOR, PARAMETER = "torch._utils _rebuild_tensor_v2", "torch._utils _rebuild_parameter"
 KNOWN = (*STORAGES, MAPPING, TENSOR, PARAMETER)
 
 EMPTY: dict[str, Callable[[], Any]] = {"EMPTY_DICT": dict, "EMPTY_LIST": list, "EMPTY_TUPLE": tuple}
 CONSTANTS = {"NONE": None, "NEWTRUE": True, "NEWFALSE": False}
-TAKEN = {
-    "TUPLE1": 1,
-    "TUPLE2": 2,
-    "TUPLE3": 3,
-    "APPEND": 1,
-    "SETITEM": 2,
-    "REDUCE": 2,
-}  # from the stack; else to a mark
+# The values that instructions take from the stack; others take those since the last mark.
+TAKEN = {"TUPLE1": 1, "TUPLE2": 2, "TUPLE3": 3, "APPEND": 1, "SETITEM": 2, "REDUCE": 2}
 LITERALS = ("GLOBAL", "BINUNICODE", "BINFLOAT", "BININT", "BININT1", "BININT2", "LONG1")
 
 ZIP = b"PK\x03\x04"  # begins an archive; files of PyTorch before 1.6 are none
+LARGEST = 8 << 20  # of its pickle [bytes], of which every one may make an object; that of a training has less than 1 MB
 OLD_PICKLES = 3  # before the content of such a file
 
 # (name of the type, key, number of elements) → a tensor of all elements, (N,)
@@ -80,6 +72,8 @@ def read_archive(file: BinaryIO, size: int, numbers: bool = True) -> Any:
         if any(part.compress_type != ZIP_STORED for part in parts) or sum(part.file_size for part in parts) > size:
             raise BadZipFile("its parts are compressed or overlap")
         entries = {part.filename.partition("/")[2]: part for part in parts}
+        if entries["data.pkl"].file_size > LARGEST:
+            raise BadZipFile(f"its pickle has more than {LARGEST} bytes")
         if "byteorder" in entries and archive.read(entries["byteorder"]) != b"little":
             raise BadZipFile("its numbers are in another order of bytes")
         read: dict[str, Tensor] = {}
