@@ -106,7 +106,7 @@ def test_a_list_of_what_there_is_names_nothing_twice() -> None:
             ["front", "front"],
             "task.cameras must be a list of texts, each not empty, not empty, without",
         ),
-        ("task.time_limit", float("nan"), "task.time_limit must be a number, more than 0, got nan"),
+        ("task.time_limit", float("nan"), "task.time_limit must be a number, more than 0, at most 3600, got nan"),
         ("task.randomize.mass.factor", [2.0, 1.0], "task.randomize.mass.factor must be a list of 2 numbers, each more"),
         (
             "expert.perturb.steps",
