@@ -2,15 +2,30 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
+import mujoco
 import numpy as np
 import pytest
 from arm import SAFETY
+from arm_models import (
+    ARM,
+    FINGERS,
+    GRIPS,
+    HINGED,
+    HOME,
+    MESHES,
+    arguments_of,
+    chosen,
+    hinged,
+    make,
+    mjcf,
+    successes,
+    urdf,
+)
 from command_line import here
 from composing import composed
 from conftest import make_tabletop
@@ -21,87 +36,13 @@ from vla.config.experiment import plain
 from vla.deploy.control_loop import ControlLoop
 from vla.deploy.joint_limiter import Robot
 from vla.robots.chain import frame_positions
-from vla.rollouts.rollout import rollout
 from vla.spec import Spec
-from vla.tasks.tabletop.expert import Waypoint
-from vla.tasks.tabletop.robot_file import RobotFile
+from vla.tasks.tabletop.file_robot import FileRobot
+from vla.tasks.tabletop.robot_file import InstalledRobot, RobotFile
+from vla.tasks.tabletop.scene import Scene
 
 if TYPE_CHECKING:
     from vla.tasks.tabletop.environment import Tabletop
-
-# An arm of six hinges: axis, and offset from the joint before along z [m].
-HINGES = (("0 0 1", 0.1), ("0 1 0", 0.2), ("0 1 0", 0.4), ("0 0 1", 0.2), ("0 1 0", 0.2), ("0 0 1", 0.05))
-HOME = [0.0, 0.37, 1.82, 0.0, 0.95, 0.0]
-FINGERS = {"left": "0 1 0", "right": "0 -1 0"}
-ARM: dict[str, Any] = {
-    "joints": [f"j{index}" for index in range(6)],
-    "home": HOME,
-    "tool": "hand",
-    "offset": [0.0, 0.0, 0.08],
-    "open": dict.fromkeys(FINGERS, 0.04),
-    "closed": dict.fromkeys(FINGERS, 0.0),
-    "fingertips": [["left_link"], ["right_link"]],
-}
-
-
-def mjcf() -> str:
-    """The arm in degrees, with motors, an actuator per finger, a joint that nobody asked for, a lamp and a floor."""
-    text, ends = "", ""
-    for index, (axis, height) in enumerate(HINGES):
-        text += f'<body name="b{index}" pos="0 0 {height}"><joint name="j{index}" axis="{axis}"/>'
-        text += '<geom type="capsule" size="0.03" fromto="0 0 0 0 0 0.05"/>'
-        ends += "</body>"
-    hand = '<frame pos="0 0 0.05"><body name="hand"><geom type="box" size="0.02 0.06 0.01"/>'
-    for name, axis in FINGERS.items():
-        side = 0.004 * float(axis.split()[1])
-        hand += f'<body name="{name}_link" pos="0 {side} 0.08"><geom type="box" size="0.008 0.004 0.01"/>'
-        hand += f'<joint name="{name}" type="slide" axis="{axis}" range="0 0.04" armature="0.05"/></body>'
-    motors = "".join(f'<motor joint="j{index}"/>' for index in range(6))
-    grips = "".join(
-        f'<position name="{name}" joint="{name}" kp="1000" kv="40" forcerange="-20 20"/>' for name in FINGERS
-    )
-    return f"""<mujoco><default><joint range="-175 175" limited="true"/></default><worldbody><light/><geom type="plane"
-        size="1 1 1"/><body name="base"><joint name="lift" type="slide"/><geom size="0.05"/>{text}{hand}</body></frame>
-        {ends}</body></worldbody><actuator>{motors}{grips}</actuator></mujoco>"""
-
-
-def urdf() -> str:
-    """The same arm; the hand is a link that does not move, and nothing has an actuator."""
-
-    def link(name: str, size: str, height: float = 0.0) -> str:
-        shape = f'<origin xyz="0 0 {height}"/><geometry><box size="{size}"/></geometry>'
-        turning = " ".join(f'i{axes}="{0.01 * (axes[0] == axes[1])}"' for axes in ("xx", "yy", "zz", "xy", "xz", "yz"))
-        inertia = f'<inertial><mass value="0.5"/><inertia {turning}/></inertial>'
-        return f'<link name="{name}">{inertia}<collision>{shape}</collision></link>'
-
-    def joint(name: str, kind: str, links: tuple[str, str], place: str, axis: str, high: float) -> str:
-        low = 0.0 if kind == "prismatic" else -high
-        return f"""<joint name="{name}" type="{kind}"><parent link="{links[0]}"/><child link="{links[1]}"/><origin
-            xyz="{place}"/><axis xyz="{axis}"/><limit lower="{low}" upper="{high}" effort="100"
-            velocity="1"/></joint>"""
-
-    parts, before = [link("base", "0.1 0.1 0.1")], "base"
-    for index, (axis, height) in enumerate(HINGES):
-        parts += [link(f"b{index}", "0.06 0.06 0.04")]
-        parts += [joint(f"j{index}", "revolute", (before, f"b{index}"), f"0 0 {height}", axis, 3.05)]
-        before = f"b{index}"
-    parts += [link("hand", "0.04 0.12 0.02"), joint("wrist", "fixed", (before, "hand"), "0 0 0.05", "0 0 1", 0.0)]
-    for name, axis in FINGERS.items():
-        side = f"0 {0.004 * float(axis.split()[1])} 0.08"
-        parts += [link(f"{name}_link", "0.016 0.008 0.02")]
-        parts += [joint(name, "prismatic", ("hand", f"{name}_link"), side, axis, 0.04)]
-    return f'<robot name="arm">{"".join(parts)}</robot>'
-
-
-def chosen(file: Path) -> list[str]:
-    """Arguments of the command line that choose the arm in `file`."""
-    values = {f"task.robot.{name}": json.dumps(value).replace('"', "") for name, value in ARM.items()}
-    return ["task/robot=file", f"task.robot.file={file}", *(f"{key}={value}" for key, value in values.items())]
-
-
-def make(file: Path) -> Tabletop:
-    """The tabletop with the arm in `file`, as the command line makes it."""
-    return make_tabletop("task.image_size=[64,64]", *chosen(file))
 
 
 @pytest.fixture(scope="module")
@@ -110,11 +51,6 @@ def jaco() -> Iterator[Tabletop]:
     environment = make_tabletop("task/robot=jaco", "task/randomize=wide", "task.image_size=[48,48]")
     yield environment
     environment.close()
-
-
-def successes(environment: Tabletop, seeds: range) -> int:
-    with environment.blind():
-        return sum(rollout(environment, Waypoint(environment.spec), seed).success for seed in seeds)
 
 
 def test_the_expert_acts_with_an_arm_of_a_package() -> None:
@@ -134,6 +70,76 @@ def test_the_expert_acts_with_an_arm_from_a_file(tmp_path: Path, kind: str) -> N
     assert environment.simulation.scene.robot.widest == pytest.approx(0.08, abs=2e-3)
     assert successes(environment, range(4)) == 4
     assert environment.reset(0).rgb["wrist"].std() > 5
+    environment.close()
+
+
+@pytest.mark.parametrize("goal", ["pick_place", "push"])
+def test_the_expert_acts_with_a_jaw_on_a_hinge(tmp_path: Path, goal: str) -> None:
+    """Its shapes have no names, and collide as convex hulls that touch those of the other jaw, even when open."""
+    (tmp_path / "arm.xml").write_text(mjcf(hinged(), actuators="", more=MESHES))
+    environment = make(tmp_path / "arm.xml", f"task/goal={goal}", **HINGED)
+    assert successes(environment, range(4)) == 4
+    environment.close()
+
+
+def test_jaws_on_a_hinge_are_measured_at_their_far_ends(tmp_path: Path) -> None:
+    (tmp_path / "arm.xml").write_text(mjcf(hinged(), actuators="", more=MESHES))
+    robot = FileRobot(RobotFile(**arguments_of(tmp_path / "arm.xml", **HINGED)), "full")
+    # Nearest to the fixed jaw, from 90 to 120 mm, is the inner corner at 90 mm, turned about the hinge at (12, 20) mm.
+    sine, cosine = np.sin(HINGED["open"]["jaw"]), np.cos(HINGED["open"]["jaw"])
+    corner = [0.012 - 0.016 * cosine + 0.07 * sine, 0.02 + 0.07 * cosine + 0.016 * sine]
+    assert robot.widest == pytest.approx(np.hypot(corner[0] + 0.006, 0.09 - corner[1]), abs=1e-3)
+    assert robot.narrowest == pytest.approx(0.002, abs=1e-3)
+    # The tool point has the middle of a block's place between them, 12 mm above their ends.
+    model = Scene(robot, blocks=0).compile().model.ptr
+    tool = model.site(robot.tool)
+    np.testing.assert_allclose(tool.pos, [0, -0.006 + 0.03, 0.12 - 0.012], atol=3e-3)
+    np.testing.assert_allclose(robot.tip, [0.012, 0.017, 0.012, tool.pos[1] + 0.005], atol=1e-3)  # y is to the right
+    # What is cut off collides with the world as well, and the whole shapes are drawn only.
+    for body, whole in (("robot/fixed_jaw", 1), ("robot/jaw", 1)):
+        geoms = [index for index in range(model.ngeom) if model.body(model.geom_bodyid[index]).name == body]
+        assert sorted(bool(model.geom_contype[index]) for index in geoms) == [False] * whole + [True, True]
+
+
+def test_sites_become_fingertips_of_their_own_shape(tmp_path: Path) -> None:
+    tips = '<site name="tip" pos="0 -0.001 0.095" size="0.005"/>'
+    hand = hinged(tips, tips.replace("tip", "jaw_tip").replace("-0.001", "-0.011").replace("0.095", "0.075"))
+    (tmp_path / "arm.xml").write_text(mjcf(hand, actuators="", more=MESHES))
+    sites = {**HINGED, "fingertips": [["tip"], ["jaw_tip"]], "offset": [0.0, 0.02, 0.1]}
+    robot = FileRobot(RobotFile(**arguments_of(tmp_path / "arm.xml", **sites)), "full")
+    angle = HINGED["open"]["jaw"]
+    opened = np.array([0.012 - 0.011 * np.cos(angle) + 0.075 * np.sin(angle), 0.02])
+    opened[1] += 0.075 * np.cos(angle) + 0.011 * np.sin(angle)
+    assert robot.widest == pytest.approx(np.linalg.norm(opened - [-0.001, 0.095]) - 0.01, abs=1e-3)
+
+
+SECOND = """<body name="other" pos="0 0.5 0"><geom size="0.02"/>
+    <body name="other_left"><joint name="other_left" type="slide"/><geom size="0.02"/><site name="other_tip"/></body>
+    <body name="other_right"><joint name="other_right" type="slide"/><geom size="0.02"/></body>
+    <body name="other_bar"><joint/><geom size="0.02"/></body></body>"""
+COUPLED = """<tendon><fixed name="other"><joint joint="other_left" coef="1"/><joint joint="other_right" coef="1"/>
+    </fixed><spatial name="cord"><site site="other_tip"/><site site="base_tip"/></spatial></tendon>
+    <equality><joint joint1="left" joint2="right"/><joint joint1="other_left" joint2="other_right"/>
+    <joint joint1="other_left"/><tendon tendon1="other"/><connect body1="other_left" body2="other_bar" anchor="0 0 0"/>
+    <weld site1="other_tip" site2="base_tip"/></equality>"""
+
+
+@pytest.mark.parametrize("kind", ["mjcf", "urdf"])
+def test_couplings_of_a_second_gripper_go_and_those_of_the_first_stay(tmp_path: Path, kind: str) -> None:
+    (tmp_path / "arm.xml").write_text(
+        urdf(second=True)
+        if kind == "urdf"
+        else mjcf(
+            actuators=GRIPS.partition(">")[0] + '><position name="other" tendon="other"/>',
+            base=SECOND + '<site name="base_tip"/>',
+            more=COUPLED,
+        )
+    )
+    environment = make(tmp_path / "arm.xml", open={"left": 0.04}, closed={"left": 0.0})
+    model = environment.simulation.compiled.model
+    assert (model.neq, model.ntendon, model.eq_type[0]) == (1, 0, mujoco.mjtEq.mjEQ_JOINT)
+    assert environment.simulation.scene.robot.widest == pytest.approx(0.08, abs=2e-3)  # both fingers open
+    assert successes(environment, range(4)) == 4
     environment.close()
 
 
@@ -196,7 +202,7 @@ def test_every_axis_of_randomisation_is_applied(jaco: Tabletop) -> None:
     nominal = None
     for seed in range(5):
         observation = jaco.reset(seed)
-        compiled, robot = jaco.simulation.compiled, cast(RobotFile, jaco.simulation.compiled.robot)
+        compiled, robot = jaco.simulation.compiled, cast(FileRobot, jaco.simulation.compiled.robot)
         drawn: Any = jaco.draws["arm"]
         assert observation.truth is not None
         assert np.linalg.norm(observation.truth["tcp"] - drawn["tcp"]) < 2e-3
@@ -227,7 +233,10 @@ WRONG: tuple[tuple[dict[str, Any], str], ...] = (
     ({"tool": "tcp"}, r"task\.robot\.tool names tcp, which is no site or body"),
     ({"open": {"claw": 1.0}, "closed": {"claw": 0.0}}, r"task\.robot\.open names claw, which is no actuator or joint"),
     ({"open": {"left": 0.04}}, r"task\.robot\.open names left, task\.robot\.closed left, right"),
-    ({"fingertips": [["left_link"], ["thumb"]]}, r"task\.robot\.fingertips names thumb, which is no geom or body"),
+    (
+        {"fingertips": [["left_link"], ["thumb"]]},
+        r"task\.robot\.fingertips names thumb, which is no geom, body or",
+    ),
     ({"home": [4.0, *HOME[1:]]}, r"task\.robot\.home has j0 at 4\.0, outside its limits, -3\.054 to 3\.054"),
     ({"home": HOME[1:]}, r"task\.robot\.home has 5 positions for 6 joints"),
     ({"home": [0.0] * 6}, r"task\.robot\.offset: the middle between the fingertips is at \[0\.0, 0\.0, -0\.16\]"),
@@ -239,54 +248,47 @@ WRONG: tuple[tuple[dict[str, Any], str], ...] = (
 
 @pytest.mark.parametrize(("changes", "message"), WRONG, ids=[message[12:40] for _, message in WRONG])
 def test_what_does_not_fit_the_model_is_named(tmp_path: Path, changes: dict[str, Any], message: str) -> None:
-    from vla.tasks.tabletop.robot_file import RobotFile
-
-    file = tmp_path / "arm.xml"
-    file.write_text(mjcf())
-    arguments: dict[str, Any] = {**defaults_of("task/robot/file"), **ARM, "file": file, **changes}
+    (tmp_path / "arm.xml").write_text(mjcf())
     with pytest.raises(ValueError, match=message):
-        RobotFile(**arguments)
+        FileRobot(RobotFile(**arguments_of(tmp_path / "arm.xml", **changes)), "light")
 
 
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        (None, r"arm\.xml: there is no such file"),
-        ("<mujoco><worldbody>", r"arm\.xml does not compile: XML"),
-        ("<mujoco><include file='/etc/hostname'/></mujoco>", r"arm\.xml does not compile"),
-        (mjcf().replace("<mujoco>", '<mujoco><asset><mesh file="link.stl"/></asset>'), r"link\.stl"),
-        (mjcf().replace('name="j5"', 'name="j4"'), r"arm\.xml does not compile: .*repeated name 'j4'"),
-    ],
-)
-def test_a_file_that_does_not_compile_is_named(tmp_path: Path, text: str | None, message: str) -> None:
-    from vla.tasks.tabletop.robot_file import RobotFile
-
-    if text is not None:
-        (tmp_path / "arm.xml").write_text(text)
-    arguments: dict[str, Any] = {**defaults_of("task/robot/file"), **ARM, "file": tmp_path / "arm.xml"}
-    with pytest.raises(ValueError, match=message) as raised:
-        RobotFile(**arguments)
-    assert "\n" not in str(raised.value)
-
-
-@pytest.mark.parametrize(
-    "path", ["/etc/passwd", "nowhere/arm.xml", "dm_control/../../a.xml", "dm_control//etc/passwd", "arm.xml"]
-)
-def test_an_installed_arm_is_within_its_package(path: str) -> None:
-    from vla.tasks.tabletop.robot_file import InstalledRobot
-
-    arguments: dict[str, Any] = {**defaults_of("task/robot/jaco"), "file": path}
-    with pytest.raises(ValueError, match="must begin with the name of an installed package and stay within it"):
-        InstalledRobot(**arguments)
-
-
-def test_a_checkpoint_names_no_file_but_of_a_package() -> None:
-    named = [f"task.robot.{name}={json.dumps(value)}".replace('"', "") for name, value in ARM.items()]
-    config: Any = {"task": plain(composed("task/robot=file", "task.robot.file=arm.xml", *named))["task"]}
-    with pytest.raises(ValueError, match=r"last\.ckpt names a path .* in task\.robot\.file: .*; task/robot=OPTION"):
+def test_a_checkpoint_names_no_file_but_of_a_package(tmp_path: Path) -> None:
+    config: Any = {"task": plain(composed(*chosen(tmp_path / "arm.xml")))["task"]}
+    with pytest.raises(
+        ValueError, match=r"last\.ckpt names a path .* in task\.robot\.file: .*; task/robot=OPTION gives yours"
+    ):
         require_no_paths(config, ("task",), "last.ckpt", ())
     require_no_paths(config, ("task",), "last.ckpt", ("task.robot",))
     require_no_paths({"task": plain(composed("task/robot=jaco"))["task"]}, ("task",), "last.ckpt", ())
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        "/etc/passwd",
+        "nowhere/arm.xml",
+        "dm_control/../../a.xml",
+        "dm_control//etc/passwd",
+        "arm.xml",
+        "sys/arm.xml",  # built in
+        "zipimport/arm.xml",  # frozen
+        "typing_extensions/arm.xml",  # no package
+        "folder/arm.xml",
+        "package/arm.xml",
+    ],
+)
+def test_an_installed_arm_is_within_its_package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, path: str) -> None:
+    """Also if the working folder, which Python searches as well, has a file of such a name."""
+    for folder in (".", "folder", "package"):
+        (tmp_path / folder).mkdir(exist_ok=True)
+        (tmp_path / folder / "arm.xml").write_text(mjcf())
+    (tmp_path / "package" / "__init__.py").touch()
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
+    for name in ("file", "hand"):
+        with pytest.raises(ValueError, match="must begin with the name of an installed package and stay within it"):
+            InstalledRobot(**defaults_of("task/robot/jaco", **{name: path}))
 
 
 def test_the_panda_is_the_tabletop_without_a_file() -> None:

@@ -17,12 +17,13 @@ from vla.tasks.blind import Blindable
 from vla.tasks.gl import require_backend
 from vla.tasks.rendering.renderer import Renderer, RendererFactory, View
 from vla.tasks.tabletop.expert import Waypoint
+from vla.tasks.tabletop.file_robot import FileRobot
 from vla.tasks.tabletop.goals.chain import Chain
 from vla.tasks.tabletop.goals.goal import Goal
 from vla.tasks.tabletop.goals.mixed import Mixed
 from vla.tasks.tabletop.panda import Panda
 from vla.tasks.tabletop.randomize.randomizer import Randomizer
-from vla.tasks.tabletop.robot import VISIBLE, Robot
+from vla.tasks.tabletop.robot import VISIBLE
 from vla.tasks.tabletop.robot_file import RobotFile
 from vla.tasks.tabletop.scene import COLOURS, Scene
 from vla.tasks.tabletop.simulation import CONTROL_HZ, Simulation
@@ -79,11 +80,7 @@ class Tabletop(Blindable):
         most = len(COLOURS) - goal.absent
         if not goal.blocks <= blocks <= most:
             raise ValueError(f"task.blocks must be from {goal.blocks} to {most}, one colour each, got {blocks}")
-        if robot is None:
-            chosen: Robot = Panda(meshes=meshes)
-        else:
-            robot.draw(meshes)
-            chosen = robot
+        chosen = FileRobot(robot, meshes) if robot else Panda(meshes=meshes)
         arm, joints = chosen.arm, len(chosen.joints)
         low = np.array([-TRANSLATION] * 3 + [-ROTATION] * 3 + [0.0])
         high = np.array([TRANSLATION] * 3 + [ROTATION] * 3 + [1.0])

@@ -113,8 +113,10 @@ class Waypoint:
         Wide fingers close to a wedge, which presses a block down or lifts it. They push with their narrow, upright
         side, leave the block sideways before they rise, and are not led astray while they touch it.
         """
-        tool, block, (half, _, half_height) = truth["commanded"][:3, 3], truth["block"], truth["half_size"]
-        fingertip, breadth, below = truth["tip"]
+        block, (half, _, half_height) = truth["block"], truth["half_size"]
+        fingertip, breadth, below, middle = truth["tip"]
+        beside = truth["commanded"][:3, 1] * middle  # from the tool point to the middle of the closed fingertips
+        tool = truth["commanded"][:3, 3] + beside
         way = (truth["destination"] - block)[:2]
         distance = float(np.hypot(*way))
         ahead = way / max(distance, 1e-6)
@@ -133,14 +135,18 @@ class Waypoint:
         if tool[2] < height + PUSH_Z and -behind - 0.03 < along < -half and abs(across) < LANE:
             forward = min(distance, PUSH) * (1 - SLOWER * (across / LANE) ** 2)
             offset = np.append(forward * ahead - across * aside, height - tool[2])
-            return self._action(truth, offset, yaw, 0.0)
+            return self._action(truth, offset + self._swing(beside, yaw), yaw, 0.0)
         if touches:
             offset = np.append((tool - block)[:2] / max(away, 1e-6) * PUSH, 0.0)
             return self._action(truth, offset, 0.0, 0.0)
         offset = np.append(block[:2] - (behind + 0.004) * ahead, height) - tool
         away = float(np.hypot(offset[0], offset[1]))
         offset[2] += min(FUNNEL * max(away - BEHIND, 0.0), HOVER)
-        return self._action(truth, _rising_first(offset), yaw, 0.0)
+        return self._action(truth, _rising_first(offset) + self._swing(beside, yaw), yaw, 0.0)
+
+    def _swing(self, beside: Array, yaw: float) -> Array:
+        """Return the motion (3,) of the tool which keeps the point at `beside` it in place in a step that turns it."""
+        return beside - rotation_z(float(np.clip(yaw, self._low[5], self._high[5]))) @ beside
 
     def _action(self, truth: dict[str, Array], offset: Array, yaw: float, gripper: float) -> Array:
         """Return the action that moves by `offset`, scaled uniformly to the bounds of a step, and turns by `yaw`."""

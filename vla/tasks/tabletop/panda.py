@@ -97,7 +97,7 @@ class Panda(Robot):
     joints = servos = tuple(f"panda/joint{index}" for index in range(1, 8))
     fingers, grips, tool = ("panda/left_finger", "panda/right_finger"), ("panda/fingers",), "panda/tcp"
     fingertips = (("panda/left_pad",), ("panda/right_pad",))
-    tip = (0.012, 0.012, 0.008)  # half the diagonal of the square fingertips
+    tip = (0.012, 0.012, 0.008, 0.0)  # half the diagonal of the square fingertips
     closed, opened = np.zeros(1), np.array([FINGER_TRAVEL])
     travel, finger_speed, widest = FINGER_TRAVEL, FINGER_SPEED, MAX_OPENING
 

@@ -23,7 +23,8 @@ FINGERTIP_CONTACT = {
     "solref": (0.01, 1),
     "solimp": (0.95, 0.99, 0.001),
 }
-TIMESTEP = 0.004  # of physics [s]
+# Options of MuJoCo; elliptic cones and `impratio` prevent slip of held blocks.
+PHYSICS = {"timestep": 0.004, "integrator": "implicitfast", "cone": "elliptic", "impratio": 10}
 VISIBLE, HIDDEN = 2, 3  # groups of geoms: in pictures, for collisions only
 CORNERS = 64  # vertices of every "light" mesh
 
@@ -78,7 +79,7 @@ class Robot:
     finger_speed: float  # largest change of the command per second
     widest: float  # opening of an open gripper [m]
     fingertips: Sequence[Sequence[str]]  # geoms of either side
-    # Half extents of the closed fingertips along x and y, and how far they reach below the tool [m].
+    # Half extents of the closed fingertips along x and y, how far they reach below the tool, and their middle on y [m].
     tip: Sequence[float]
     tool: str  # site
 

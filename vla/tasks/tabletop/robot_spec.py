@@ -1,24 +1,19 @@
-"""Robot models in MJCF or URDF: read, and made alike for the tabletop.
-
-The files are data, which MuJoCo compiles. Names that they lack, files that are missing and models that do not compile
-end in one sentence.
-"""
+"""Models of robots, made alike for the tabletop."""
 
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Sequence
-from itertools import product
-from pathlib import Path
 from typing import Any
 
 import mujoco
 import numpy as np
 
-from vla.io.suggestion import suggestion
+from vla.io.types import Names
 from vla.robots.cartesian import DOWN
 from vla.spec import Array
 from vla.tasks.rendering.shapes import mesh_triangles
-from vla.tasks.tabletop.robot import CORNERS, FINGERTIP_CONTACT, HIDDEN, ROBOT_CONTACT, VISIBLE, look_at, spread
+from vla.tasks.tabletop.model_file import compiled, require
+from vla.tasks.tabletop.robot import CORNERS, HIDDEN, ROBOT_CONTACT, VISIBLE, look_at, spread
 
 HAND = "hand_"  # in front of the names in a hand's own file
 TOOL, SERVO, WRIST = "vla_tool", "vla_servo_", "wrist"  # names of what is added
@@ -26,53 +21,31 @@ ALIGNED = 0.9  # smallest cosine between the axes of the tool's site and forward
 FOVY = 75.0  # of the wrist camera [degrees]
 SEEN_GROUPS = 3  # the first groups, which MuJoCo draws
 UNCOLOURED = (0.5, 0.5, 0.5, 1.0)  # what MuJoCo gives geoms without a colour
-LISTED = 30  # names in an error
+TENDON = mujoco.mjtTrn.mjTRN_TENDON
 
 
-def read(key: str, file: Path) -> mujoco.MjSpec:
-    """Read a model, with absolute paths of its meshes; `key` names the file in errors.
-
-    Raises:
-        ValueError: there is no such file, or MuJoCo does not compile it.
-    """
-    path = Path(file).absolute()
-    if not path.is_file():
-        raise ValueError(f"task.robot.{key}={file}: there is no such file")
-    try:
-        spec = mujoco.MjSpec.from_file(str(path))
-        folder = path.parent / (spec.compiler.meshdir or "")
-        for mesh in spec.meshes:
-            if mesh.file:
-                mesh.file = str(folder / (Path(mesh.file).name if spec.strippath else mesh.file))
-        spec.compiler.meshdir = ""
-        # URDF: keep shapes that do not collide, and links that do not move, which the tool may be one of.
-        spec.compiler.discardvisual = spec.compiler.fusestatic = False
-        spec.compile()
-    except (ValueError, mujoco.FatalError) as error:
-        raise ValueError(f"task.robot.{key}={file} does not compile: {' '.join(str(error).split())}") from error
-    return spec
-
-
-def compiled(spec: mujoco.MjSpec) -> mujoco.MjModel:
-    """Compile a model that was changed.
+def checked_home(spec: mujoco.MjSpec, joints: Names, home: Sequence[float]) -> dict[str, float]:
+    """Return joint → position at home.
 
     Raises:
-        ValueError: it does not compile.
+        ValueError: no such joint, one that is not a hinge or not in order, or a position out of its limits.
     """
-    try:
-        return spec.compile()
-    except (ValueError, mujoco.FatalError) as error:
-        raise ValueError(f"task.robot does not compile: {' '.join(str(error).split())}") from error
-
-
-def require(key: str, names: Iterable[str], known: Iterable[str], kind: str) -> None:
-    """Raise a ValueError that lists the `kind` of elements that there are if one of `names` is not among them."""
-    there = [name for name in known if name]
-    for name in names:
-        if name not in there:
-            listed = ", ".join(there[:LISTED]) + (", …" if len(there) > LISTED else "")
-            hint = suggestion(name, there) or ":"
-            raise ValueError(f"task.robot.{key} names {name}, which is no {kind}{hint} there are {listed or 'none'}")
+    require("joints", joints, (joint.name for joint in spec.joints), "joint")
+    if len(home) != len(joints):
+        raise ValueError(f"task.robot.home has {len(home)} positions for {len(joints)} joints")
+    model = compiled(spec)
+    carried = set(range(model.nbody))
+    for name, position in zip(joints, home, strict=True):
+        joint = model.joint(name)
+        if int(joint.bodyid[0]) not in carried:
+            raise ValueError(f"task.robot.joints names {name} after a joint that does not carry it: base to tip")
+        carried = descendants(model, int(joint.bodyid[0]))
+        if joint.type[0] != mujoco.mjtJoint.mjJNT_HINGE:
+            raise ValueError(f"task.robot.joints names {name}, which is not a hinge")
+        low, high = joint.range
+        if model.jnt_limited[joint.id] and not low <= position <= high:
+            raise ValueError(f"task.robot.home has {name} at {position}, outside its limits, {low:.3f} to {high:.3f}")
+    return dict(zip(joints, home, strict=True))
 
 
 def attach_hand(spec: mujoco.MjSpec, hand: mujoco.MjSpec, mount: str | None) -> None:
@@ -89,31 +62,52 @@ def attach_hand(spec: mujoco.MjSpec, hand: mujoco.MjSpec, mount: str | None) -> 
 def simplify(spec: mujoco.MjSpec, joints: Collection[str], grips: Collection[str]) -> None:
     """Keep of a model what the tabletop needs: the arm's `joints`, the hand, and the actuators `grips` of the gripper.
 
-    Joints below the hand that are not the arm's are fixed. Lamps, cameras, planes, sensors, key frames, and materials
-    but for their colour are left out.
+    Joints below the hand that are not the arm's are fixed, and what couples them goes with them. Lamps, cameras,
+    planes, pairs of contacts, sensors, key frames, and materials but for their colour are left out.
     """
     model = compiled(spec)
-    last = model.joint(list(joints)[-1]).id
-    hand = descendants(model, int(model.jnt_bodyid[last]))
-    fixed = [j.name for j in map(model.joint, range(model.njnt)) if j.name not in joints and j.bodyid[0] not in hand]
+    hand = descendants(model, int(model.joint(list(joints)[-1]).bodyid[0]))
     for body, masses in zip(spec.bodies, range(model.nbody), strict=True):
         _fix_inertia(body, model, masses)
         body.name = body.name or f"vla_body{masses}"
+    for joint in spec.joints:
+        joint.name = joint.name or f"vla_joint{joint.id}"
+    fixed = {j.name: j for j in spec.joints if j.name not in joints and model.jnt_bodyid[j.id] not in hand}
+    slack = _drop_couplings(spec, model, fixed)
     for element in [*spec.actuators]:
-        if element.name not in grips:
+        if element.name not in grips or element.target in (slack if element.trntype == TENDON else fixed):
             spec.delete(element)
-    for element in [*spec.joints]:
-        if element.name in fixed or (not element.name and model.jnt_bodyid[element.id] not in hand):
-            spec.delete(element)
-        else:
-            element.name = element.name or f"vla_joint{element.id}"
-    for element in (*spec.lights, *spec.cameras, *spec.sensors, *spec.keys, *spec.textures):
+    for element in (*fixed.values(), *spec.lights, *spec.cameras, *spec.sensors, *spec.keys, *spec.pairs, *spec.tuples):
         spec.delete(element)
     _simplify_geoms(spec, model)
-    for element in (*spec.sites, *spec.tendons):
+    for element in (*spec.sites, *spec.tendons, *spec.skins):
         element.material = ""
     for element in [*spec.materials]:
         spec.delete(element)
+
+
+def _drop_couplings(spec: mujoco.MjSpec, model: mujoco.MjModel, fixed: Collection[str]) -> set[str]:
+    """Delete tendons and constraints of `fixed` joints or within what moves as one; return the names of the tendons."""
+    moved = {int(model.jnt_bodyid[joint.id]) for joint in spec.joints if joint.name not in fixed}
+    part = np.arange(model.nbody)  # the first of the bodies that move as one with a body
+    for body in range(1, model.nbody):
+        part[body] = body if body in moved else part[model.body_parentid[body]]
+    slack: set[str] = set()
+    for tendon in [*spec.tendons]:
+        over = [wrap.target for wrap in tendon.path if wrap.target is not None]
+        of_joints = isinstance(over[0], mujoco.MjsJoint)
+        if any(each.name in fixed for each in over) if of_joints else len({part[each.parent.id] for each in over}) < 2:
+            slack.add(tendon.name)
+            spec.delete(tendon)
+    for tie, first, second in zip([*spec.equalities], model.eq_obj1id, model.eq_obj2id, strict=True):
+        ends = [int(first), int(second)]
+        if tie.objtype == mujoco.mjtObj.mjOBJ_SITE:
+            ends = model.site_bodyid[ends].tolist()
+        gone = {mujoco.mjtEq.mjEQ_JOINT: fixed, mujoco.mjtEq.mjEQ_TENDON: slack}.get(tie.type)
+        loose = tie.type in (mujoco.mjtEq.mjEQ_CONNECT, mujoco.mjtEq.mjEQ_WELD) and part[ends[0]] == part[ends[1]]
+        if loose or (gone is not None and (tie.name1 in gone or tie.name2 in gone)):
+            spec.delete(tie)
+    return slack
 
 
 def descendants(model: mujoco.MjModel, body: int) -> set[int]:
@@ -161,23 +155,6 @@ def set_armature(spec: mujoco.MjSpec, joints: Iterable[str], least: float) -> No
         joint.armature = max(joint.armature, least)
 
 
-def make_fingertips(spec: mujoco.MjSpec, names: Sequence[str]) -> list[str]:
-    """Make the geoms, or those of the bodies, `names` fingertips; return the names of those geoms."""
-    geoms, bodies = {geom.name: geom for geom in spec.geoms}, {body.name: body for body in spec.bodies}
-    require("fingertips", names, (*geoms, *bodies), "geom or body")
-    tips = [tip for name in names for tip in ([geoms[name]] if name in geoms else bodies[name].geoms)]
-    tips = [tip for tip in tips if tip.contype or tip.conaffinity]
-    if not tips:
-        raise ValueError(f"task.robot.fingertips names {', '.join(names)}, where nothing collides")
-    for tip in tips:
-        tip.friction, tip.condim, tip.priority = (
-            FINGERTIP_CONTACT[each] for each in ("friction", "condim", "priority")
-        )
-        tip.solref = FINGERTIP_CONTACT["solref"]
-        tip.solimp[:3] = FINGERTIP_CONTACT["solimp"]
-    return [tip.name for tip in tips]
-
-
 def add_servo(spec: mujoco.MjSpec, joint: str, stiffness: float, damping: float, force: float | None) -> str:
     """Add a position servo to a joint; return its name."""
     servo = spec.add_actuator(name=SERVO + joint, target=joint, trntype=mujoco.mjtTrn.mjTRN_JOINT)
@@ -189,6 +166,18 @@ def add_servo(spec: mujoco.MjSpec, joint: str, stiffness: float, damping: float,
     servo.ctrllimited = servo.actlimited = mujoco.mjtLimited.mjLIMITED_FALSE
     servo.forcelimited, servo.forcerange = force is not None, (-(force or 0.0), force or 0.0)
     return SERVO + joint
+
+
+def stiffness(spec: mujoco.MjSpec, home: dict[str, float], frequency: float) -> list[float]:
+    """Return stiffnesses [N m/rad] with which joints, with the arm at `home`, have a natural frequency [rad/s]."""
+    model = compiled(spec)
+    data = mujoco.MjData(model)
+    for name, position in home.items():
+        data.joint(name).qpos[0] = position
+    mujoco.mj_forward(model, data)
+    inertia = np.empty((model.nv, model.nv))
+    mujoco.mj_fullM(model, data, inertia)
+    return [frequency**2 * inertia[dof, dof] for dof in (model.joint(name).dofadr[0] for name in home)]
 
 
 def add_tool(
@@ -243,13 +232,21 @@ def add_camera(body: Any, position: Array, rotation: Array, camera: Array, targe
     body.add_camera(name=WRIST, pos=position + rotation @ camera, quat=quaternion(rotation @ axes), fovy=FOVY)
 
 
+def move_tool(spec: mujoco.MjSpec, shift: Array) -> None:
+    """Move the tool, with its camera, by `shift` (3,) in its own frame [m]."""
+    tool, moved = spec.site(TOOL), np.empty(3)
+    mujoco.mju_rotVecQuat(moved, shift, tool.quat)
+    for each in (tool, spec.camera(WRIST)):
+        each.pos = each.pos + moved
+
+
 def use_convex_hulls(spec: mujoco.MjSpec, model: mujoco.MjModel) -> None:
     """Draw the convex hull of a few vertices in place of every mesh; collisions stay as they are."""
     hulls: dict[str, bool] = {}
     for geom in [geom for geom in spec.geoms if geom.group == VISIBLE and geom.meshname]:
         hull = f"vla_hull_{geom.meshname}"
         if hull not in hulls:
-            hulls[hull] = _add_hull(spec, model, geom.meshname, hull)
+            hulls[hull] = add_hull(spec, hull, _vertices(model, geom.meshname))
         if not hulls[hull]:
             continue
         if geom.contype or geom.conaffinity:
@@ -261,24 +258,21 @@ def use_convex_hulls(spec: mujoco.MjSpec, model: mujoco.MjModel) -> None:
             geom.meshname = hull
 
 
-def _add_hull(spec: mujoco.MjSpec, model: mujoco.MjModel, mesh: str, name: str) -> bool:
-    """Add the convex hull of a mesh as mesh `name`; return False, and add nothing, for a flat mesh."""
-    index = model.mesh(mesh).id
-    points = np.asarray(mesh_triangles(model, index)[0], float)
+def _vertices(model: mujoco.MjModel, mesh: str) -> Array:
+    """Return the vertices (N, 3) of a mesh as in its file [m]; they are stored in the mesh's own frame of inertia."""
+    index, turn = model.mesh(mesh).id, np.empty(9)
+    mujoco.mju_quat2Mat(turn, model.mesh_quat[index])
+    return np.asarray(mesh_triangles(model, index)[0], float) @ turn.reshape(3, 3).T + model.mesh_pos[index]
+
+
+def add_hull(spec: mujoco.MjSpec, name: str, points: Array) -> bool:
+    """Add the convex hull of a few of the (N, 3) points as mesh `name`; return False, and add nothing, if it is
+    flat."""
     if np.linalg.matrix_rank(points - points.mean(0), tol=1e-3) < 3:
         return False
-    turn = np.empty(9)
-    mujoco.mju_quat2Mat(turn, model.mesh_quat[index])  # vertices are stored in the mesh's own frame of inertia
-    corners = spread(points @ turn.reshape(3, 3).T + model.mesh_pos[index], CORNERS)
-    spec.add_mesh(name=name, uservert=corners.ravel())
+    # A scale that the file gives to its own meshes by default must not apply.
+    spec.add_mesh(name=name, uservert=spread(points, CORNERS).ravel(), scale=np.ones(3))
     return True
-
-
-def corners(model: mujoco.MjModel, geom: int) -> Array:
-    """Return points (N, 3) in the frame of a geom whose hull contains it [m]: vertices of a mesh, else of a box."""
-    if model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_MESH:
-        return np.asarray(mesh_triangles(model, int(model.geom_dataid[geom]))[0], float)
-    return model.geom_aabb[geom, :3] + np.array([*product((-1, 1), repeat=3)]) * model.geom_aabb[geom, 3:]
 
 
 def quaternion(rotation: Array) -> Array:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from dm_control import mjcf
 
-from vla.tasks.tabletop.robot import TIMESTEP, VISIBLE, CameraPose, Robot, look_at
+from vla.tasks.tabletop.robot import PHYSICS, VISIBLE, CameraPose, Robot, look_at
 
 COLOURS: dict[str, tuple[float, float, float]] = {
     "red": (0.85, 0.10, 0.10),
@@ -76,9 +76,8 @@ class Scene:
         return self.robot.compile(self._root)
 
     def _set_physics(self) -> None:
-        option = self._root.option
-        option.timestep, option.integrator = TIMESTEP, "implicitfast"
-        option.cone, option.impratio = "elliptic", 10  # prevent slip of held blocks
+        for name, value in PHYSICS.items():
+            setattr(self._root.option, name, value)
 
     def _set_quality(self) -> None:
         visual = self._root.visual

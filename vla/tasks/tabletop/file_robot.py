@@ -1,0 +1,233 @@
+"""An arm with a gripper that was read from files.
+
+Joints, limits, masses, shapes and the kinematic chain are those of the compiled model. What all robots of the tabletop
+share is added to it: position servos with gravity compensation, contacts with the world only, fingertips that do not
+slip, a tool frame and a wrist camera.
+"""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import Literal
+
+import mujoco
+import numpy as np
+from dm_control import mjcf
+from dm_control.mujoco.wrapper import MjModel
+
+from vla.robots.cartesian import LIMIT_MARGIN, Kinematics, rotation_z
+from vla.spec import Array, RobotModel
+from vla.tasks.tabletop import fingertips, robot_spec
+from vla.tasks.tabletop.model_file import compiled, require
+from vla.tasks.tabletop.robot import PHYSICS, Robot
+from vla.tasks.tabletop.robot_file import RobotFile
+
+PREFIX = "robot/"  # of the names of all elements in the scene
+FREQUENCY = 100.0  # natural frequency of a joint of the arm with its servo, at home [rad/s]
+LEAD = 0.05  # damping over stiffness of the servos [s], as of the Panda's, so that joints are overdamped
+ARMATURE = 0.1  # smallest reflected rotor inertia of a joint of the arm [kg m²], as of the Panda's
+SOFTNESS = 0.1  # share of a finger's travel after which its servo gives its whole force
+FASTEST = 0.02  # time in which its whole force moves a finger through its travel, at least [s]
+CLOSING = 0.2  # shortest time in which the gripper closes [s]
+OPENINGS, SETTLING = 17, 250  # commands at which the opening is measured; steps in which the fingers come to rest
+LEAST_TRAVEL = 0.02  # change of the opening of a gripper that can hold a block [m]
+ASIDE = 0.08  # largest distance between the tool point and the middle between the closed fingertips [m]
+AROUND_BLOCK = 0.06  # opening with room for a block, in whose middle the tool point belongs [m]
+BESIDE = 0.005  # how far beside this middle it may be [m]
+BELOW = 0.012  # how far fingertips may reach below the tool point, so that they do not touch the table [m]
+
+
+class FileRobot(Robot):
+    """The arm of a `RobotFile`."""
+
+    prefix, travel, finger_speed, lead = PREFIX, 1.0, 1 / CLOSING, LEAD
+
+    def __init__(self, file: RobotFile, meshes: Literal["light", "full"]) -> None:
+        """Read the files and measure the gripper.
+
+        Args:
+            file: what to read.
+            meshes: drawn as hulls of few vertices ("light"), or as they are ("full").
+
+        Raises:
+            ValueError: a file is missing or does not compile, a name is not in it, or a value does not fit it.
+        """
+        self._file, self._spec = file, file.read()
+        start = robot_spec.checked_home(self._spec, file.joints, file.home)
+        if file.open.keys() != file.closed.keys():
+            raise ValueError(
+                f"task.robot.open names {', '.join(file.open)}, task.robot.closed {', '.join(file.closed)}"
+            )
+        robot_spec.simplify(self._spec, file.joints, file.open)
+        robot_spec.set_armature(self._spec, file.joints, ARMATURE)
+        body, position, rotation = robot_spec.add_tool(
+            self._spec, file.tool, start, rotation_z(file.yaw), np.array(file.offset)
+        )
+        robot_spec.add_camera(body, position, rotation, np.array(file.camera), np.array(file.target))
+        sides = [fingertips.named(self._spec, side) for side in file.fingertips]
+        self._add_servos(start)
+        self._measure_gripper(sides)
+        self.kinematics = self._kinematics()
+        velocities = tuple(f"{joint}_velocity" for joint in file.joints)
+        chain = self._chain()
+        self.arm = RobotModel(tuple(file.joints), "world", velocities, "gripper", chain, tuple(file.home))
+        if meshes == "light":
+            robot_spec.use_convex_hulls(self._spec, compiled(self._spec))
+
+    def _attached(self, scene: mujoco.MjSpec) -> mujoco.MjModel:
+        """Return the compiled model of a scene with the robot in it."""
+        turn = (np.cos(self._file.yaw / 2), 0.0, 0.0, np.sin(self._file.yaw / 2))
+        place = scene.worldbody.add_frame(pos=self._file.place, quat=turn)
+        scene.attach(self._spec.copy(), frame=place, prefix=PREFIX)
+        return compiled(scene)
+
+    def compile(self, scene: mjcf.RootElement) -> mjcf.Physics:
+        """Compile a scene together with the robot."""
+        world = mujoco.MjSpec.from_string(scene.to_xml_string(), assets=scene.get_assets())
+        return mjcf.Physics.from_model(MjModel(self._attached(world)))
+
+    def _add_servos(self, home: dict[str, float]) -> None:
+        """Add servos to the joints of the arm, as stiff as its inertia at home allows, and to those of the gripper."""
+        file, spec = self._file, self._spec
+        strength = zip(home, robot_spec.stiffness(spec, home, FREQUENCY), strict=True)
+        servos = [robot_spec.add_servo(spec, name, k, LEAD * k, None) for name, k in strength]
+        grips = [self._grip(name, max(abs(file.open[name] - file.closed[name]), 1e-3)) for name in file.open]
+        self.joints, self.servos, self.grips = ([PREFIX + each for each in names] for names in (home, servos, grips))
+        self.closed, self.opened = (np.array([each[name] for name in file.open]) for each in (file.closed, file.open))
+
+    def _grip(self, name: str, travel: float) -> str:
+        """Return the name of the gripper's actuator `name`, or of a position servo added to the joint `name`."""
+        spec, force = self._spec, self._file.force
+        if spec.actuator(name) is not None:
+            return name
+        known = [element.name for element in (*spec.actuators, *spec.joints)]
+        require("open", [name], known, "actuator or joint")
+        robot_spec.set_armature(spec, [name], force * FASTEST**2 / (2 * travel))
+        stiffness = force / (SOFTNESS * travel)
+        return robot_spec.add_servo(spec, name, stiffness, LEAD * stiffness, force)
+
+    def _measure_gripper(self, sides: list[list[str]]) -> None:
+        """Tabulate the opening, divide jaws that stay close at a hinge, and move the tool point between the fingertips.
+
+        Raises:
+            ValueError: the opening does not change, or the tool point is far from the fingertips.
+        """
+        middles = self._close(sides)
+        if self.widest - self.narrowest <= LEAST_TRAVEL:
+            sides = fingertips.far_ends(self._spec, self._model, self._data, sides, PREFIX)
+            middles = self._close(sides)
+        self._require_grasp()
+        aside, deeper = float(np.interp(AROUND_BLOCK, self._openings, middles[:, 1])), max(0.0, self.tip[2] - BELOW)
+        if abs(aside) > BESIDE or deeper:
+            robot_spec.move_tool(self._spec, np.array([0.0, aside, deeper]))
+            self.tip = self._extents(float(self._close(sides)[0, 1]))
+        for side in sides:
+            fingertips.soften(self._spec, side)
+
+    def _require_grasp(self) -> None:
+        """Raise a ValueError if the fingertips are far from the tool point or hold no block."""
+        tool, tips = self._data.site(self.tool), [self._data.geom(tip).xpos for side in self.fingertips for tip in side]
+        middle = tool.xmat.reshape(3, 3).T @ (np.mean(tips, axis=0) - tool.xpos)
+        if np.linalg.norm(middle) > ASIDE:
+            raise ValueError(
+                f"task.robot.offset: the middle between the fingertips is at {np.round(middle, 2).tolist()} m from the "
+                "tool point, forward, to the right and down: the tool point belongs there"
+            )
+        if self.widest - self.narrowest <= LEAST_TRAVEL:
+            raise ValueError(
+                f"task.robot.open and task.robot.closed leave the fingertips {1000 * self.widest:.0f} and "
+                f"{1000 * self.narrowest:.0f} mm apart, which holds no block; task.robot.fingertips may name sites at "
+                "the ends of the jaws"
+            )
+
+    def _close(self, sides: list[list[str]]) -> Array:
+        """Tabulate the positions of the finger joints and the opening for commands from open to closed, by simulation.
+
+        Args: sides: geoms of either side.
+
+        Returns:
+            Middle between the fingertips in the frame of the tool, for openings in ascending order, (N, 3) [m].
+        """
+        option = " ".join(f'{name}="{value}"' for name, value in PHYSICS.items())
+        self._model = model = self._attached(mujoco.MjSpec.from_string(f"<mujoco><option {option}/></mujoco>"))
+        self._data = data = mujoco.MjData(model)
+        self.fingertips, self.tool = [[PREFIX + tip for tip in side] for side in sides], PREFIX + robot_spec.TOOL
+        names = [model.joint(index).name for index in range(model.njnt)]
+        self.fingers = [name for name in names if name not in self.joints]
+        for name, servo, position in zip(self.joints, self.servos, self._file.home, strict=True):
+            data.joint(name).qpos[0] = data.actuator(servo).ctrl[0] = position
+        commands, tool, rows = np.linspace(1.0, 0.0, OPENINGS), data.site(self.tool), []
+        for command in commands:
+            for name, value in zip(self.grips, self.closed + command * (self.opened - self.closed), strict=True):
+                data.actuator(name).ctrl[0] = value
+            mujoco.mj_step(model, data, SETTLING)
+            mujoco.mj_kinematics(model, data)
+            opening, middle = fingertips.gap(model, data, self.fingertips)
+            inside = (middle - tool.xpos) @ tool.xmat.reshape(3, 3)
+            rows.append([opening, *inside, *(data.joint(name).qpos[0] for name in self.fingers)])
+        table = np.array(rows)[::-1]
+        self._openings, self._positions = np.maximum.accumulate(table[:, 0]), table[:, 4:]
+        self._commands, self.narrowest, self.widest = commands[::-1], *self._openings[[0, -1]].tolist()
+        self.tip = self._extents()
+        return table[:, 1:4]
+
+    def _extents(self, middle: float = 0.0) -> tuple[float, float, float, float]:
+        """Return the extents of the closed fingertips about `middle` on the tool's y axis, as of `Robot.tip`."""
+        tips = [tip for side in self.fingertips for tip in side]
+        corners = fingertips.points(self._model, self._data, tips, self._data.site(self.tool))
+        forward, aside = np.abs(corners[:, :2] - [0.0, middle]).max(axis=0)
+        return float(forward), float(aside), float(corners[:, 2].max()), middle
+
+    def grip(self, opening: float) -> tuple[Array, float]:
+        """Interpolate in the table of the gripper."""
+        positions = [np.interp(opening, self._openings, column) for column in self._positions.T]
+        return np.array(positions), float(np.interp(opening, self._openings, self._commands))
+
+    def opening(self, model: mujoco.MjModel, data: mujoco.MjData) -> float:
+        """Return the smallest distance between the fingertips of both sides [m]."""
+        return fingertips.gap(model, data, self.fingertips)[0]
+
+    def _kinematics(self) -> Kinematics:
+        model, data, home = self._model, self._data, np.array(self._file.home)
+        joints = [model.joint(name) for name in self.joints]
+        positions, dofs = (
+            [int(at[0]) for at in each] for each in zip(*((j.qposadr, j.dofadr) for j in joints), strict=True)
+        )
+        limits = np.array([j.range if model.jnt_limited[j.id] else (-np.inf, np.inf) for j in joints])
+        site = model.site(self.tool).id
+        jacobian = np.empty((6, model.nv))
+
+        def forward(joints: Array) -> tuple[Array, Array]:
+            data.qpos[positions] = joints
+            mujoco.mj_kinematics(model, data)
+            mujoco.mj_comPos(model, data)
+            mujoco.mj_jacSite(model, data, jacobian[:3], jacobian[3:], site)
+            pose = np.eye(4)
+            pose[:3, :3], pose[:3, 3] = data.site_xmat[site].reshape(3, 3), data.site_xpos[site]
+            return pose, jacobian[:, dofs]
+
+        low, high = np.minimum(limits[:, 0] + LIMIT_MARGIN, home), np.maximum(limits[:, 1] - LIMIT_MARGIN, home)
+        return Kinematics(forward, home, low, high, np.full(len(home), self._file.speed))
+
+    def _chain(self) -> tuple[tuple[float, ...], ...]:
+        """Return the chain of the arm, as in `vla.spec.RobotModel`, with every joint's axis as its z axis."""
+        tool, _ = self.kinematics.forward(np.zeros(len(self.joints)))
+        indices = [self._model.joint(name).id for name in self.joints]
+        frames = [_frame(self._data.xanchor[index], self._data.xaxis[index]) for index in indices]
+        return tuple(_relative(before, frame) for before, frame in pairwise([np.eye(4), *frames, tool]))
+
+
+def _frame(position: Array, axis: Array) -> Array:
+    """Return a pose (4, 4) with the z axis along `axis`."""
+    pose, turn = np.eye(4), np.empty(4)
+    mujoco.mju_quatZ2Vec(turn, axis)
+    rotation = np.empty(9)
+    mujoco.mju_quat2Mat(rotation, turn)
+    pose[:3, :3], pose[:3, 3] = rotation.reshape(3, 3), position
+    return pose
+
+
+def _relative(before: Array, pose: Array) -> tuple[float, ...]:
+    """Return offset [m] and quaternion wxyz of a pose in the one before."""
+    within = np.linalg.inv(before) @ pose
+    return tuple(np.round([*within[:3, 3], *robot_spec.quaternion(within[:3, :3])], 9).tolist())

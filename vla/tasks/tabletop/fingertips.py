@@ -1,0 +1,140 @@
+"""The parts of a gripper that hold a block: named shapes, or the far ends of jaws on a hinge.
+
+A jaw that turns on a hinge stays close to the other jaw there, and its mesh collides as a convex hull, which fills the
+space between the jaws. Such shapes are cut: their last centimetres are the fingertips.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import product
+from typing import Any
+
+import mujoco
+import numpy as np
+from scipy.spatial import ConvexHull
+
+from vla.spec import Array
+from vla.tasks.rendering.shapes import mesh_triangles
+from vla.tasks.tabletop.model_file import require
+from vla.tasks.tabletop.robot import FINGERTIP_CONTACT, HIDDEN, ROBOT_CONTACT
+from vla.tasks.tabletop.robot_spec import TOOL, add_hull
+
+FAR_END = 0.03  # length of a jaw's part that holds a block [m]
+FAR = 1.0  # up to which a gap is measured [m]
+
+
+def named(spec: mujoco.MjSpec, names: Sequence[str]) -> list[str]:
+    """Return the names of the geoms `names` and of those of the bodies `names`; a site becomes a geom of its shape."""
+    geoms, bodies, sites = ({each.name: each for each in kind} for kind in (spec.geoms, spec.bodies, spec.sites))
+    require("fingertips", names, (*geoms, *bodies, *sites), "geom, body or site")
+    tips: list[Any] = []
+    for name in names:
+        if name in geoms or name in bodies:
+            tips += [geoms[name]] if name in geoms else bodies[name].geoms
+        else:
+            site = sites[name]
+            tips += [_add(site.parent, f"vla_tip_{name}", site.type, pos=site.pos, quat=site.quat, size=site.size)]
+    solid = [tip.name for tip in tips if tip.contype or tip.conaffinity]
+    if not solid:
+        raise ValueError(f"task.robot.fingertips names {', '.join(names)}, where nothing collides")
+    return solid
+
+
+def _add(body: Any, name: str, kind: mujoco.mjtGeom, **shape: Any) -> Any:
+    """Add a shape that collides with the world, is not drawn and weighs nothing."""
+    return body.add_geom(name=name, type=kind, mass=0.0, group=HIDDEN, material="", **shape, **ROBOT_CONTACT)
+
+
+def soften(spec: mujoco.MjSpec, tips: Sequence[str]) -> None:
+    """Give shapes the contact of fingertips."""
+    for tip in map(spec.geom, tips):
+        tip.friction, tip.condim, tip.priority, tip.solref = (
+            FINGERTIP_CONTACT[each] for each in ("friction", "condim", "priority", "solref")
+        )
+        tip.solimp[:3] = FINGERTIP_CONTACT["solimp"]
+
+
+def gap(model: mujoco.MjModel, data: mujoco.MjData, sides: Sequence[Sequence[str]]) -> tuple[float, Array]:
+    """Return the smallest distance between the geoms of both sides, at least 0, and the middle (3,) of the gap [m]."""
+    left, right = ([model.geom(name).id for name in side] for side in sides)
+    nearest, ends = FAR, np.zeros(6)
+    for first, second in product(left, right):
+        between = np.zeros(6)
+        distance = mujoco.mj_geomDistance(model, data, first, second, FAR, between)
+        if distance < nearest:
+            nearest, ends = distance, between
+    return max(0.0, nearest), (ends[:3] + ends[3:]) / 2
+
+
+def points(model: mujoco.MjModel, data: mujoco.MjData, tips: Sequence[str], place: Any) -> Array:
+    """Return points (N, 3) whose hull contains the geoms `tips`, in the frame of the site `place` [m]."""
+    return np.concatenate([_triangles(model, data, tip, place).reshape(-1, 3) for tip in tips])
+
+
+def _triangles(model: mujoco.MjModel, data: mujoco.MjData, name: str, place: Any) -> Array:
+    """Return triangles (T, 3 corners, 3) of a mesh, or of the box around another shape, in the frame of `place`."""
+    geom = model.geom(name).id
+    if model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_MESH:
+        vertices, faces = mesh_triangles(model, int(model.geom_dataid[geom]))
+    else:
+        vertices = model.geom_aabb[geom, :3] + np.array([*product((-1, 1), repeat=3)]) * model.geom_aabb[geom, 3:]
+        faces = ConvexHull(vertices).simplices
+    world = data.geom_xpos[geom] + vertices @ data.geom_xmat[geom].reshape(3, 3).T
+    return ((world - place.xpos) @ place.xmat.reshape(3, 3))[faces]
+
+
+def far_ends(
+    spec: mujoco.MjSpec, model: mujoco.MjModel, data: mujoco.MjData, sides: Sequence[Sequence[str]], prefix: str
+) -> list[list[str]]:
+    """Cut the geoms of both sides across the tool's z axis, so that their last centimetres are geoms of their own.
+
+    Args:
+        spec: changed; what remains of a geom still collides.
+        model: this spec, compiled, with `prefix` in front of names.
+        data: the gripper is closed.
+        sides: names of the geoms of either side, in `spec`.
+        prefix: of the names in `model`.
+
+    Returns:
+        Names of the geoms that reach the end of either side, in `spec`.
+    """
+    tool = data.site(prefix + TOOL)
+    shapes = [{tip: _triangles(model, data, prefix + tip, tool) for tip in side} for side in sides]
+    level = min(max(shape[..., 2].max() for shape in side.values()) for side in shapes) - FAR_END
+    ends: list[list[str]] = []
+    for tips in shapes:
+        ends.append([])
+        for tip, shape in tips.items():
+            body = data.body(prefix + spec.geom(tip).parent.name)
+            turn = tool.xmat.reshape(3, 3).T @ body.xmat.reshape(3, 3)
+            start = (tool.xpos - body.xpos) @ body.xmat.reshape(3, 3)
+            end, rest = (_beyond(shape, side * (shape[..., 2] - level)) for side in (1, -1))
+            ends[-1] += _divide(spec, tip, start + end @ turn, start + rest @ turn)
+    return ends
+
+
+def _beyond(triangles: Array, heights: Array) -> Array:
+    """Return points (N, 3) whose hull is that of the part of triangles (T, 3, 3) with heights (T, 3) above 0."""
+    starts, ends = triangles.reshape(-1, 3), np.roll(triangles, -1, axis=1).reshape(-1, 3)
+    here, there = heights.reshape(-1), np.roll(heights, -1, axis=1).reshape(-1)
+    cross = here * there < 0
+    share = (here[cross] / (here[cross] - there[cross]))[:, None]
+    return np.concatenate([starts[here >= 0], starts[cross] + share * (ends[cross] - starts[cross])])
+
+
+def _divide(spec: mujoco.MjSpec, tip: str, end: Array, rest: Array) -> list[str]:
+    """Let the hulls of two parts of a geom, points (N, 3) in the frame of its body, collide in its place.
+
+    Returns:
+        Name of the hull of `end`, or of the geom if it is not divided; nothing if there is no end.
+    """
+    if not len(end):
+        return []
+    if not len(rest) or not add_hull(spec, f"{tip}_end", end):
+        return [tip]
+    whole = spec.geom(tip)
+    whole.contype = whole.conaffinity = 0
+    for name in [f"{tip}_end", *([f"{tip}_rest"] if add_hull(spec, f"{tip}_rest", rest) else [])]:
+        _add(whole.parent, name, mujoco.mjtGeom.mjGEOM_MESH, meshname=name)
+    return [f"{tip}_end"]
