@@ -20,6 +20,7 @@ from arm_models import (
     MESHES,
     arguments_of,
     chosen,
+    fingers,
     hinged,
     make,
     mjcf,
@@ -237,6 +238,7 @@ WRONG: tuple[tuple[dict[str, Any], str], ...] = (
         {"fingertips": [["left_link"], ["thumb"]]},
         r"task\.robot\.fingertips names thumb, which is no geom, body or",
     ),
+    ({"fingertips": [["air"], ["left_link"]]}, r"task\.robot\.fingertips names air, where nothing collides: "),
     ({"home": [4.0, *HOME[1:]]}, r"task\.robot\.home has j0 at 4\.0, outside its limits, -3\.054 to 3\.054"),
     ({"home": HOME[1:]}, r"task\.robot\.home has 5 positions for 6 joints"),
     ({"home": [0.0] * 6}, r"task\.robot\.offset: the middle between the fingertips is at \[0\.0, 0\.0, -0\.16\]"),
@@ -248,7 +250,7 @@ WRONG: tuple[tuple[dict[str, Any], str], ...] = (
 
 @pytest.mark.parametrize(("changes", "message"), WRONG, ids=[message[12:40] for _, message in WRONG])
 def test_what_does_not_fit_the_model_is_named(tmp_path: Path, changes: dict[str, Any], message: str) -> None:
-    (tmp_path / "arm.xml").write_text(mjcf())
+    (tmp_path / "arm.xml").write_text(mjcf(fingers() + '<body name="air"/>'))
     with pytest.raises(ValueError, match=message):
         FileRobot(RobotFile(**arguments_of(tmp_path / "arm.xml", **changes)), "light")
 

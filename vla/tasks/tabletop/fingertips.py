@@ -37,7 +37,10 @@ def named(spec: mujoco.MjSpec, names: Sequence[str]) -> list[str]:
             tips += [_add(site.parent, f"vla_tip_{name}", site.type, pos=site.pos, quat=site.quat, size=site.size)]
     solid = [tip.name for tip in tips if tip.contype or tip.conaffinity]
     if not solid:
-        raise ValueError(f"task.robot.fingertips names {', '.join(names)}, where nothing collides")
+        raise ValueError(
+            f"task.robot.fingertips names {', '.join(names)}, where nothing collides: add shapes that do, such as "
+            "<collision> in a URDF"
+        )
     return solid
 
 
