@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from vla.reports.comparison import compare_runs, read_runs
+from vla.reports.comparison_page import write_comparison
 from vla.reports.evaluation import write_report
-from vla.reports.html import write_comparison
 from vla.rollouts.results import Report, Result, compare_conditions
 from vla.runs.folder import save_config
 from vla.spec import FIRST_SEED
@@ -42,10 +43,11 @@ def a_run(
     curves: str = CURVES,
     light: float | None = None,
     dark: str = "",
+    more: dict[str, Any] | None = None,
 ) -> Path:
     """A folder as an evaluation leaves it, without pictures and recordings.
 
-    s is a success, d a drop, e an error, and in the dark all are drops unless told.
+    s is a success, d a drop, e an error, and in the dark all are drops unless told. The report has `more` entries.
     """
     folder.mkdir(parents=True)
     report, in_the_dark = (
@@ -56,7 +58,7 @@ def a_run(
         report = Report(tuple(replace(result, draws={**result.draws, "light": light}) for result in report.results))
     told = {"evaluate": {"conditions": {"dark": {"light": light}}}}
     config = {**CONFIG, **told, "model": {"_target_": "vla.models.bc.BC", "width": width}}
-    size = {"parameters": 1_500_000, "latency_ms": 2.5}
+    size = {"parameters": 1_500_000, "latency_ms": 2.5, **(more or {})}
     compared = compare_conditions({"seen": report, "dark": in_the_dark}, 0.02)
     used = f"{folder}/checkpoints/last.ckpt"
     write_report(report, folder / "report.json", used, config, size, {"dark": in_the_dark}, compared)

@@ -18,9 +18,9 @@ from vla.deploy.ros import RosNetwork
 from vla.deploy.ros2 import SimulatorDeployment
 from vla.deploy.settings import Timing, Topics
 from vla.reports.evaluation import summary, write_report
-from vla.reports.filmstrips import read_filmstrips
-from vla.reports.html import write_page
+from vla.reports.run_page import write_page
 from vla.rollouts.evaluate import play
+from vla.rollouts.moving_picture import read_moving_pictures
 from vla.rollouts.recorder import RerunRecorder, recording_name
 from vla.rollouts.results import Report, Result
 from vla.rollouts.rollout import replay, rollout
@@ -116,7 +116,7 @@ def test_a_chain_that_cannot_be_is_refused() -> None:
 
 
 def test_the_next_instruction_comes_when_one_is_completed(chain: Tabletop, tmp_path: Path) -> None:
-    recorder = RerunRecorder(tmp_path)
+    recorder = RerunRecorder(tmp_path, pictures=1)
     agent = Tiring(Waypoint(chain.spec), most=3)
     episode = rollout(chain, agent, FIRST, recorder)
     said = [seen.instruction for seen in episode.observations]
@@ -131,7 +131,8 @@ def test_the_next_instruction_comes_when_one_is_completed(chain: Tabletop, tmp_p
     columns = chunk.to_record_batch().to_pydict()
     assert columns["step"] == [said.index(each) for each in wanted]
     assert all(each in text for each, [text] in zip(wanted, columns["TextDocument:text"], strict=True))
-    assert read_filmstrips(file, 0, 1)[0].instruction == "; then ".join(wanted)
+    [caption] = read_moving_pictures(tmp_path)
+    assert caption.instruction == "; then ".join(wanted)
 
 
 def test_a_chain_ends_where_one_instruction_fails_and_its_outcome_is_about_that_one(chain: Tabletop) -> None:

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from conftest import make_tabletop
 
-from vla.reports.filmstrips import read_filmstrips
+from vla.rollouts.moving_picture import read_moving_pictures
 from vla.rollouts.recorder import RerunRecorder
 from vla.rollouts.rollout import replay, rollout
 from vla.tasks.tabletop.compiled_scene import Kind
@@ -177,8 +177,8 @@ def test_impossible_instructions_stay_possible_to_follow() -> None:
     environment.close()
 
 
-def test_recordings_and_filmstrips_tell_when(world: Tabletop, tmp_path: Path) -> None:
+def test_moving_pictures_tell_when(world: Tabletop, tmp_path: Path) -> None:
     only(world, kinds=["move_target"])
-    rollout(world, Waypoint(world.spec), 1, RerunRecorder(tmp_path))
-    [strip] = read_filmstrips(next(tmp_path.iterdir()), failures=1, successes=1)
-    assert strip.events == world.events and len(strip.events) == 1
+    rollout(world, Waypoint(world.spec), 1, RerunRecorder(tmp_path, pictures=1))
+    [caption] = read_moving_pictures(tmp_path)
+    assert [*caption.events] == world.events and len(caption.events) == 1

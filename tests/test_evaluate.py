@@ -17,11 +17,12 @@ from vla.config.experiment import Experiment
 from vla.jobs.evaluate import require_possible
 from vla.parallel.pool import LocalCluster
 from vla.reports.evaluation import summary, write_report
-from vla.rollouts.evaluate import evaluate, keep_recordings
+from vla.rollouts.evaluate import evaluate
+from vla.rollouts.recordings import chosen, keep_recordings
 from vla.rollouts.results import Report, Result
 from vla.rollouts.statistics import wilson_interval
 from vla.runs.folder import read_report
-from vla.spec import FIRST_SEED, Environment, Observation
+from vla.spec import FIRST_SEED, Array, Environment, Observation
 
 SEEDS = range(FIRST_SEED, FIRST_SEED + 10)
 
@@ -218,7 +219,7 @@ def test_libraries_use_one_thread_while_it_lasts(monkeypatch: pytest.MonkeyPatch
 def test_recordings_are_kept_in_one_file_failures_first(tmp_path: Path) -> None:
     folder, target = tmp_path / "recordings", tmp_path / "rollouts.rrd"
     report = evaluate(toy.make_environment, toy.make_agent, toy.make_recorder(folder), SEEDS[:5])
-    assert keep_recordings(report, folder, target, limit=3) == 3
+    assert keep_recordings(report, folder, target, 3) == [SEEDS[3], SEEDS[0], SEEDS[1]]
     kept = [entry.recording_id.rpartition("-")[0] for entry in RrdReader(target).recordings()]
     assert kept == ["failure-01000003-timeout", "success-01000000", "success-01000001"]
     assert list(tmp_path.iterdir()) == [target]
@@ -230,9 +231,42 @@ def test_only_recordings_that_are_kept_are_made(tmp_path: Path) -> None:
     assert len([*tmp_path.iterdir()]) == 5
     for file in tmp_path.iterdir():
         file.unlink()
-    assert evaluate(*makers, SEEDS[:5], recordings=2) == everything
-    names = ["failure-01000003-timeout", "success-01000000"]
-    assert sorted(file.stem for file in tmp_path.iterdir()) == names
+    names = ["failure-01000003-timeout", *(f"success-{seed:08d}" for seed in (*SEEDS[:3], SEEDS[4]))]
+    for wanted, made in ((2, names[:2]), ("failures", names), (0, [])):
+        assert evaluate(*makers, SEEDS[:5], recordings=wanted) == everything
+        assert sorted(file.stem for file in tmp_path.iterdir()) == made
+        for file in tmp_path.iterdir():
+            file.unlink()
+
+
+def test_by_default_the_failures_and_ten_successes_are_kept() -> None:
+    outcomes = ["timeout" if seed % 4 == 0 else "error" if seed % 4 == 1 else "success" for seed in range(40)]
+    report = Report(tuple(Result(FIRST_SEED + n, outcome) for n, outcome in enumerate(outcomes)))
+    failures, successes = ([n for n, each in enumerate(outcomes) if each == which] for which in ("timeout", "success"))
+    for wanted, seeds in (
+        ("failures", failures + successes[:10]),
+        ("all", failures + successes),
+        (12, failures + successes[:2]),
+        (3, failures[:3]),
+        (0, []),
+    ):
+        assert [result.seed - FIRST_SEED for result in chosen(report, wanted)] == seeds
+
+
+def test_an_episode_follows_from_its_seed_alone(tmp_path: Path) -> None:
+    together = evaluate(toy.make_environment, toy.make_agent, None, SEEDS[:5])
+    alone = evaluate(toy.make_environment, toy.make_agent, toy.make_recorder(tmp_path), SEEDS[3:4])
+    assert alone.results == together.results[3:4]
+    assert [file.stem for file in tmp_path.iterdir()] == ["failure-01000003-timeout"]
+
+
+def test_a_recording_that_takes_another_course_is_told(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    class Slower(toy.RecordableEnvironment):
+        def step(self, action: Array) -> Observation:
+            return super().step(action / 2 if self._resets > 1 else action)
+
+    report = evaluate(Slower, toy.make_agent, toy.make_recorder(tmp_path), SEEDS[:1], recordings=1)
+    assert f"where it had taken {report.results[0].steps}" in caplog.text
 
 
 def test_what_ends_differently_when_played_again_has_no_recording(
@@ -247,4 +281,4 @@ def test_what_ends_differently_when_played_again_has_no_recording(
 
     report = evaluate(Fickle, toy.make_agent, toy.make_recorder(tmp_path), SEEDS[:2], recordings=2)
     assert report.successes == 2 and "seed 1000000 has no recording" in caplog.text
-    assert keep_recordings(report, tmp_path, tmp_path / "rollouts.rrd", limit=2) == 0
+    assert keep_recordings(report, tmp_path, tmp_path / "rollouts.rrd", 2) == []

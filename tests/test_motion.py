@@ -12,7 +12,7 @@ import pytest
 import toy
 
 from vla.reports.evaluation import write_report
-from vla.reports.html import write_page
+from vla.reports.run_page import write_page
 from vla.rollouts.evaluate import evaluate
 from vla.rollouts.motion import Motion, log_dimensionless_jerk, path_length
 from vla.rollouts.results import Report, compare_conditions, compare_secondary_metrics

@@ -27,11 +27,12 @@ from vla.data.verification import require_whole, verify_store
 from vla.policy import Policy
 from vla.reports.dataset_card import store_table, write_card
 from vla.reports.evaluation import plot_report, write_report
-from vla.reports.html import write_page
 from vla.reports.resets import contact_sheet
+from vla.reports.run_page import write_page
 from vla.reports.sweep import tabulate
-from vla.rollouts.evaluate import evaluate, keep_recordings
+from vla.rollouts.evaluate import evaluate
 from vla.rollouts.recorder import RerunRecorder
+from vla.rollouts.recordings import keep_recordings
 from vla.runs.folder import save_config
 from vla.spec import FIRST_SEED
 
@@ -90,7 +91,8 @@ def test_a_policy_is_evaluated_recorded_and_reported(folder: Path, tmp_path: Pat
     assert report.episodes == 3 and {*report.tasks} == {
         toy.make_environment().reset(seed).instruction.split()[3] for seed in seeds
     }
-    assert keep_recordings(report, cell / "recordings", cell / "rollouts.rrd", None) == 3
+    recorded = keep_recordings(report, cell / "recordings", cell / "rollouts.rrd", "all")
+    assert sorted(recorded) == [*seeds]
     entities = {chunk.entity_path for chunk in RrdReader(cell / "rollouts.rrd").stream()}
     assert {"/camera/eye/rgb", "/state/m", "/action/1/executed"} <= entities
     assert not any(entity.startswith("/world") or "depth" in entity for entity in entities)

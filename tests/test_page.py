@@ -7,35 +7,39 @@ import io
 import json
 import logging
 import re
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import asdict, replace
 from html import unescape
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from finished_runs import CONFIG, CURVES, SAID, a_report, a_run, compared
+from finished_runs import CONFIG, CURVES, SAID, a_run, compared
 from matplotlib.figure import Figure
 from PIL import Image
 from toy_recordable import ThinkingAgent, make_environment
 
 from vla.config.differences import differences
+from vla.config.origin import Commit, Origin
 from vla.io.files import warn_on_error
 from vla.reports.comparison import compare_runs, read_runs
-from vla.reports.evaluation import plot_report, write_report
-from vla.reports.filmstrips import MOMENTS, read_filmstrips
+from vla.reports.evaluation import write_report
 from vla.reports.first_batch import draw_samples
-from vla.reports.html import write_page
 from vla.reports.posteriors import compact_letters
+from vla.reports.run_page import write_page
 from vla.reports.sweep import tabulate
 from vla.reports.training_curves import draw_run, draw_runs
-from vla.rollouts.evaluate import keep_recordings
+from vla.rollouts.moving_picture import Caption, read_moving_pictures, save_moving_picture
 from vla.rollouts.recorder import RerunRecorder
+from vla.rollouts.recordings import keep_recordings, shown
 from vla.rollouts.results import Report, Result
 from vla.rollouts.rollout import rollout
 from vla.rollouts.statistics import pooled_interval
 from vla.runs.files import Training
 from vla.runs.folder import read_run, save_config, save_training
-from vla.spec import FIRST_SEED
+from vla.spec import FIRST_SEED, Episode
 
 SEEN = [FIRST_SEED, FIRST_SEED + 1, FIRST_SEED + 3]  # the toy world fails at the last
 
@@ -56,11 +60,10 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run that left everything, of the toy world."""
     folder = a_run(tmp_path_factory.mktemp("runs") / "whole", "sssdsd")
     save_training(folder, Training(1_500_000, 40, 400.0, "done"))
-    environment, recorder = make_environment(), RerunRecorder(folder / "recordings")
+    environment, recorder = make_environment(), RerunRecorder(folder / "recordings", pictures=6)
     episodes = [rollout(environment, ThinkingAgent(), seed, recorder) for seed in SEEN]
     report = Report(tuple(Result(each.seed, each.outcome, each.instruction) for each in episodes))
-    keep_recordings(report, folder / "recordings", folder / "rollouts.rrd", None)
-    plot_report(a_report("success", "dropped"), folder / "report.png")
+    keep_recordings(report, folder / "recordings", folder / "rollouts.rrd", "all")
     first = [episode.observations[0] for episode in episodes]
     batch: dict[str, Any] = {
         "rgb": {name: np.stack([seen.rgb[name] for seen in first])[:, None] for name in first[0].rgb},
@@ -90,21 +93,106 @@ def test_the_page_tells_everything_that_lies_in_the_folder(whole: Path) -> None:
     assert not list(whole.glob(".*"))
 
 
-def test_failures_come_first_and_every_camera_is_shown_at_eight_moments(whole: Path) -> None:
-    strips = read_filmstrips(whole / "rollouts.rrd", failures=2, successes=1)
-    assert [(strip.seed, strip.outcome) for strip in strips] == [(SEEN[2], "timeout"), (SEEN[0], "success")]
-    failure = strips[0]
-    assert (failure.length, failure.steps[0], failure.steps[-1], len(failure.steps)) == (40, 0, 39, MOMENTS)
-    assert set(failure.pictures) == {"front", "wrist"}
-    first = make_environment().reset(SEEN[2])
-    assert failure.instruction == first.instruction
-    shown = np.array(Image.open(io.BytesIO(failure.pictures["front"][0])), dtype=int)
-    assert np.abs(shown - first.rgb["front"]).mean() < 20  # a JPEG
-    page = (whole / "report.html").read_text()
-    assert page.index(">timeout<") < page.index(f"seed {SEEN[0]}")
+def test_failures_move_first_and_every_camera_is_shown(whole: Path) -> None:
+    page, shown = (whole / "report.html").read_text(), pictures(whole / "report.html")
+    assert page.index(">timeout<") < page.index(f"seed {SEEN[0]}") < page.index(f"seed {SEEN[1]}")
+    assert [each.format for each in shown] == ["WEBP", "WEBP", "WEBP", "PNG"]  # and the first training batch
+    failure, first = shown[0], make_environment().reset(SEEN[2])
+    assert getattr(failure, "n_frames", 1) > 1 and failure.info["loop"] == 0  # equal frames are one
+    sides = np.concatenate([*first.rgb.values()], axis=1)
+    assert np.abs(np.array(failure.convert("RGB"), dtype=int) - sides).mean() < 20  # lossy
     assert 'href="rollouts.rrd"' in page
-    shown_twice = [len(strip.steps) for strip in read_filmstrips(whole / "rollouts.rrd", 9, 9)]
-    assert len(pictures(whole / "report.html")) == 2 * sum(shown_twice) + 2  # and two plots
+    assert sorted(path.suffix for path in (whole / "recordings").iterdir()) == [".webp"] * 3
+
+
+def test_long_episodes_move_faster_and_their_words_are_kept(tmp_path: Path) -> None:
+    seen = replace(make_environment().reset(0), instruction="leg den roten Würfel 到左边")
+    later = replace(seen, instruction="danach <nichts>", rgb={})  # a step at which no camera was looked at
+    actions = np.zeros((200, 3), np.float32)
+    episode = Episode(
+        7, "a", seen.instruction, "dropped", frozenset(), {}, [seen] * 150 + [later] * 50, actions, actions
+    )
+    save_moving_picture(episode, [(3, "a push")], tmp_path / "one.webp")
+    assert read_moving_pictures(tmp_path) == {
+        Caption(7, "dropped", f"{seen.instruction}; then danach <nichts>", 200, ((3, "a push"),)): tmp_path / "one.webp"
+    }
+    blind = replace(episode, observations=[later])
+    save_moving_picture(blind, [], tmp_path / "none.webp")
+    assert [path.name for path in tmp_path.iterdir()] == ["one.webp"]
+
+
+def test_outcomes_take_turns_in_what_is_shown() -> None:
+    outcomes = ["success", "dropped", "dropped", "dropped", "timeout", "success", "dropped", "success", "success"]
+    results = [Result(seed, outcome) for seed, outcome in enumerate(outcomes)]
+    assert [each.seed for each in shown(results)] == [1, 4, 2, 3, 6, 0, 5, 7]
+    assert [each.seed for each in shown(results, 3, 0)] == [1, 4, 2]
+
+
+def test_the_page_says_what_was_recorded_and_how_to_play_an_episode_again(tmp_path: Path) -> None:
+    folder = a_run(tmp_path / "run", "sssdsde", more={"recorded": [FIRST_SEED + n for n in (3, 5, 0, 1)]})
+    (folder / "rollouts.rrd").touch()
+    told = text(write_page(folder))
+    assert "rollouts.rrd has 2 of 2 failures and 2 of 4 successes" in told and "evaluate.recordings=all" in told
+    again = "checkpoints/last.ckpt evaluate.seed=SEED evaluate.episodes=1 evaluate.recordings=all"
+    assert again in told
+
+
+def test_the_page_tells_the_command_the_commit_and_the_machine(tmp_path: Path) -> None:
+    trained = Origin("python -m vla.run model=bc", {"vla": Commit("0123456789abcdef", False)}, "ada", "EPYC, 2 cores")
+    folder = a_run(tmp_path / "run", more={"origin": asdict(trained)})
+    save_training(folder, Training(1, 1, 1.0, "done", origin=trained))
+    told = text(write_page(folder))
+    where = "git commit 0123456789ab (vla) host ada processor EPYC, 2 cores"
+    assert f"Origin command python -m vla.run model=bc {where}" in told
+    later = replace(trained, command="python -m vla.run", commits={"vla": Commit("0123456789abcdef", True)})
+    save_training(folder, Training(1, 1, 1.0, "done", origin=later))
+    told = text(write_page(folder))
+    assert "Origin of the training command python -m vla.run git commit 0123456789ab with uncommitted changes" in told
+    assert f"Origin of the evaluation command python -m vla.run model=bc {where}" in told
+
+
+def test_a_folder_of_runs_lists_them_newest_first(tmp_path: Path) -> None:
+    runs = tmp_path / "runs"
+    for name, outcomes in (("a first", "ssss"), ("b <b>", "sdss")):
+        write_page(a_run(runs / name, outcomes))
+    (runs / "c").mkdir()
+    save_training(runs / "c", Training(1, 39, 3.0, "interrupted"))
+    page = write_page(runs / "c")
+    for name, content in (("other", "<p>of another program"), ("odd", '<meta name="vla-run" content="{}">')):
+        (runs / name).mkdir()
+        (runs / name / "report.html").write_text(content)
+    write_page(runs / "c")
+    told, markup = text(runs / "index.html"), (runs / "index.html").read_text()
+    assert told.startswith("3 runs in runs")
+    assert re.search(
+        r"c 20[\d-]+ [\d:]+ - - - - interrupted b <b> 20[\d-]+ [\d:]+ BC - 75\.0 \(30\.1-95\.4\) 4 a first .* 100\.0",
+        told,
+    )
+    assert re.findall(r'href="([^"]*)"', markup) == [
+        "c/report.html",
+        "b%20%3Cb%3E/report.html",
+        "a%20first/report.html",
+    ]
+    assert "http" not in page.read_text() and "<b>" not in re.sub(r"<b style.*?</b>", "", markup)
+    write_page(a_run(tmp_path / "elsewhere/run"))
+    assert not (tmp_path / "elsewhere/index.html").exists()
+
+
+def test_of_runs_that_end_at_once_all_are_listed(tmp_path: Path) -> None:
+    folders = [a_run(tmp_path / f"runs/{n}") for n in range(4)]
+    with ProcessPoolExecutor(2, get_context("spawn")) as pool:
+        list(pool.map(write_page, folders))
+    assert text(tmp_path / "runs/index.html").startswith("4 runs in runs")
+    assert not [path for path in (tmp_path / "runs").iterdir() if path.name.startswith(".") and "html" in path.name]
+
+
+def test_every_cell_has_its_head_for_narrow_windows(tmp_path: Path) -> None:
+    markup = write_page(a_run(tmp_path / "run")).read_text()
+    for table in re.findall(r"<table>(.*?)</table>", markup, re.DOTALL):
+        heads, *rows = re.findall(r"<tr.*?</tr>", table, re.DOTALL)
+        names = re.findall(r"<th[^>]*>(.*?)</th>", heads)
+        for row in rows:
+            assert re.findall(r'data-head="(.*?)"', row) == names[1:]
 
 
 def test_a_page_refers_to_nothing_outside_and_runs_nothing(whole: Path, tmp_path: Path) -> None:
@@ -177,7 +265,9 @@ def test_axes_of_success_end_at_one_those_of_errors_begin_at_zero_and_small_numb
 ) -> None:
     head = "step,val/success,val/error_gripper,val/token_accuracy,pace/waiting"
     curves = f"{head}\n9,0.5,0.01001,0.01001,5e-5\n19,1.0,0.01003,0.01003,7e-5\n"
-    panels = draw_run(read_run(a_run(tmp_path / "run", curves=curves)).metrics)
+    sections = draw_run(read_run(a_run(tmp_path / "run", curves=curves)).metrics)
+    assert [*sections["Speed of the training"]] == ["waiting for data, share of the time"]  # not beside the losses
+    panels = sections["Training"] | {"waiting": sections["Speed of the training"].popitem()[1]}
     minus = "\N{MINUS SIGN}"
     tick = rf'text-anchor: end[^>]* x="([\d.-]+)"[^>]*>([\d.e{minus}]+)<'
     labels = {title: re.findall(tick, panel) for title, panel in panels.items()}
@@ -194,12 +284,12 @@ def test_axes_of_success_end_at_one_those_of_errors_begin_at_zero_and_small_numb
 
 def test_every_family_of_metrics_is_one_panel(tmp_path: Path) -> None:
     run = read_run(a_run(tmp_path / "run"))
-    panels = draw_run(run.metrics)
+    [panels] = draw_run(run.metrics).values()
     assert list(panels) == ["loss", "error [mm]", "error gripper", "lr", "truth loss"]
     assert ">dx<" in panels["error [mm]"] and ">dy<" in panels["error [mm]"]
     # from 0.1 to 4.5 the axis is logarithmic
     assert ">0.2<" in panels["loss"] and ">0.5<" in panels["loss"] and ">1<" in panels["loss"]
-    assert list(draw_runs({"a": run.metrics, "b": {}})) == [
+    assert list(draw_runs({"a": run.metrics, "b": {}})["Training"]) == [
         "loss",
         "error dx [mm]",
         "error dy [mm]",
@@ -235,7 +325,9 @@ def test_runs_are_compared_on_the_seeds_they_share(tmp_path: Path) -> None:
     assert page == tmp_path / "new/comparison.html" and told.startswith("3 runs")
     assert "good/run 100.0 (67.6-100.0)" in told
     assert "good/run and bad/run seen 8 7 0 -87.5 (" in told
-    assert ") 0.016 0.078 open dark 8 6 0 -75.0 (" in told  # seven lost, none won: 2 / 2^7; the clearest of five
+    assert (
+        ") 0.016 0.078 open good/run and bad/run dark 8 6 0 -75.0 (" in told
+    )  # seven lost, none won: 2 / 2^7; the clearest of five
     assert "good/run and short/run seen 2 1 0 -50.0 (" in told
     assert "model.width 16 8 16" in told
     assert 'href="../good/run/report.html"' in markup and "bad/run/report.html" not in markup
@@ -330,8 +422,12 @@ def test_runs_with_nothing_to_compare_are_refused(tmp_path: Path) -> None:
     loop.symlink_to(loop)
     with pytest.raises(ValueError, match="loop is no run"):
         compared([loop], tmp_path / "new")
-    (run / "rollouts.rrd").write_text("{")
-    with pytest.raises(ValueError, match=r"rollouts\.rrd cannot be read"):
+    (run / "recordings").mkdir()
+    for content in (b"{", b"RIFF\0\0\0\0WEBP"):
+        (run / "recordings/one.webp").write_bytes(content)
+        with pytest.raises(ValueError, match=r"one\.webp cannot be read"):
+            read_moving_pictures(run / "recordings")
+    with pytest.raises(ValueError, match=r"one\.webp cannot be read"):
         compared([run], tmp_path / "new")
     assert not (tmp_path / "new").exists()
 
@@ -351,7 +447,10 @@ def test_the_page_of_a_sweep_leads_to_every_cell(tmp_path: Path) -> None:
         (cell / ".hydra/overrides.yaml").write_text(f"- model={model}\n- seed={number}\n")
     tabulate(tmp_path)
     markup, told = (tmp_path / "sweep.html").read_text(), text(tmp_path / "sweep.html")
-    assert re.findall(r'href="([^"]*)"', markup.partition("<svg")[0]) == [f"{n}/report.html" for n in range(3)]
+    assert re.findall(r'href="([^"]*)"', markup.partition("<svg")[0]) == [
+        *(f"{n}/report.html" for n in range(3)),
+        "sweep.png",
+    ]
     trainings = [dict(enumerate(won)) for won in ((True, True, True, True), (True, True, True, False))]
     low, high = (100 * bound for bound in pooled_interval(trainings))
     assert f"bc 87.5 ({low:.1f}-{high:.1f})" in told and "0: bc 1: bc 2: rt1" in told

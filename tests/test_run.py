@@ -8,6 +8,7 @@ import os
 import re
 import shutil
 import signal
+import socket
 import time
 from pathlib import Path
 from socket import create_connection, create_server
@@ -29,6 +30,7 @@ from vla import jobs
 from vla.data.episodes import EpisodeStore
 from vla.io.array_messages import pack
 from vla.models.checkpoint import read_checkpoint
+from vla.rollouts.recorder import recording_name
 from vla.tasks.rendering.fast import Fast
 from vla.tasks.rendering.reference import Reference
 
@@ -69,8 +71,14 @@ def test_the_main_job_collects_trains_evaluates_and_records(home: Path) -> None:
     success = header.split(",").index("val/success")
     assert [row.split(",")[success] for row in rows if row.split(",")[success]] == ["0.0", "0.0"]  # hardly trained
     page = (home / "run/report.html").read_text()
-    for words in ("4 steps", "collect.episodes", ">500<", "First training batch", 'href="rollouts.rrd"'):
-        assert words in page, words
+    for words in ("4 steps", "collect.episodes", ">500</code>", "First training batch", 'href="rollouts.rrd"', "${"):
+        assert (words in page) == (words != "${"), words
+    assert training["origin"] == report["origin"] and "python -m vla.run" in report["origin"]["command"] in page
+    assert report["origin"]["host"] == socket.gethostname() in page
+    moving = sorted(path.name for path in (home / "run/recordings").iterdir())
+    named = {each["seed"]: recording_name(each["seed"], each["outcome"]) for each in report["per_episode"]}
+    assert moving == sorted(f"{name}.webp" for name in named.values()) and "data:image/webp" in page
+    assert sorted(report["recorded"]) == sorted(report["seeds"])  # both failures, or successes of at most ten
     assert yaml.safe_load((home / "run/config.yaml").read_text()) == report["config"]
     printed = (home / "printed.txt").read_text()
     assert "\ntraining  " in printed and "Epoch" not in printed

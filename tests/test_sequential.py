@@ -13,7 +13,8 @@ from scipy.special import betaln
 
 from vla.parallel.pool import LocalCluster
 from vla.rollouts.comparison import Pairs, compare_pairs
-from vla.rollouts.evaluate import evaluate, keep_recordings
+from vla.rollouts.evaluate import evaluate
+from vla.rollouts.recordings import keep_recordings
 from vla.rollouts.results import Report, Result
 from vla.rollouts.sequential import (
     anytime_difference,
@@ -137,7 +138,8 @@ def test_recordings_of_episodes_that_do_not_count_are_removed(tmp_path: Path) ->
     report = evaluate(
         toy.make_environment, toy.make_agent, toy.make_recorder(folder), SEEDS, LocalCluster(2), until=until
     )
-    assert keep_recordings(report, folder, tmp_path / "rollouts.rrd", None) == report.episodes
+    recorded = keep_recordings(report, folder, tmp_path / "rollouts.rrd", "all")
+    assert sorted(recorded) == [each.seed for each in report.results]
     assert [path.name for path in tmp_path.iterdir()] == ["rollouts.rrd"]
 
 

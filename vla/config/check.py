@@ -69,7 +69,7 @@ PLAIN: dict[str, Any] = {
         "bar": Annotated[float, Gt(0), Lt(1)] | None,
         "against": Text | None,
         "margin": Annotated[float, Gt(0), Lt(1)],
-        "recordings": Natural | None,
+        "recordings": Literal["all", "failures"] | Natural,
         "conditions": dict[str, dict[str, object]],
         "one_by_one": dict[str, dict[str, dict[str, object]]],
         "without": Annotated[list[Literal["images", "instruction"]], Predicate(unique)],

@@ -17,6 +17,7 @@ from vla.config.annotations import locate
 from vla.config.build import build, require_no_paths
 from vla.config.check import with_changes
 from vla.config.differences import ABSENT, at, differences
+from vla.config.origin import SECRET, Origin, find_origin
 from vla.config.packages import trusted, with_trust
 from vla.parallel.processes import without_triton
 from vla.spec import Spec, SpecOnly
@@ -33,8 +34,6 @@ if TYPE_CHECKING:
     from vla.spec import Agent, Environment, Recorder
 
 Node = dict[str, Any]
-
-SECRET = "api_key"  # key whose values no file is to hold
 
 
 @dataclass(frozen=True)
@@ -55,7 +54,7 @@ class Experiment:
         chosen, standard = (OmegaConf.to_container(each, resolve=False) for each in (cfg, default))
         here, there = plain(cfg), plain(default)
         changes = [
-            {"key": key, "here": value, "default": before}
+            {"key": key, "here": at(here, key, value), "default": at(there, key, before)}
             for key, value, before in differences(chosen, standard)
             if not at(here, key) == at(there, key) != ABSENT  # else one is an interpolation of the same value
             and key.rpartition(".")[2] != SECRET
@@ -67,6 +66,11 @@ class Experiment:
     def config(self) -> Node:
         """The nodes without secrets, for reports, checkpoints and all other files."""
         return _without_secrets(self.nodes)
+
+    @cached_property
+    def origin(self) -> Origin:
+        """Where its results come from, found when it is first asked for."""
+        return find_origin()
 
     def __getitem__(self, key: str) -> Any:
         """Return a top-level node or value."""

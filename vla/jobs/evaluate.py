@@ -22,10 +22,11 @@ from vla.io.versions import installed_versions
 from vla.policy import costs
 from vla.reports.conditions import SecondaryRows, conditions_table, plot_conditions, secondary_table
 from vla.reports.evaluation import plot_report, write_report
-from vla.reports.html import write_page
-from vla.rollouts.evaluate import RecorderFactory, evaluate, keep_recordings
+from vla.reports.run_page import write_page
+from vla.rollouts.evaluate import RecorderFactory, evaluate
 from vla.rollouts.memory import make_nearest, make_without, open_memory
 from vla.rollouts.realtime import Network, make_over_network
+from vla.rollouts.recordings import clear, keep_recordings
 from vla.rollouts.results import Report, compare_conditions, compare_secondary_metrics
 from vla.rollouts.rollout import AgentFactory
 from vla.rollouts.statements import AgainstBar, AgainstRun, Statement, differs_clearly
@@ -35,6 +36,7 @@ from vla.runs.folder import (
     PAGE,
     PLOT,
     RECORDING,
+    RECORDINGS,
     REPORT,
     SUITE,
     require_run,
@@ -150,6 +152,7 @@ def evaluate_trained(experiment: Experiment, checkpoint: Path, rounds: Sequence[
 def _evaluated(experiment: Experiment, checkpoint: Path | None, rounds: Sequence[Round] = ()) -> float:
     """Play the episodes, write the reports, and return the success rate; print it even if writing fails."""
     output, statements, result = experiment.output, _statements(experiment), list[str]()
+    _ = experiment.origin  # of the code that is evaluated, not of later changes
     try:
         with Played(output, _sources(experiment, checkpoint), experiment.config, installed_versions()) as played:
             reports = _play(experiment, checkpoint, statements, played)
@@ -236,11 +239,13 @@ def _play(
     if folder := named and Path(named).resolve():  # workers may be in another folder
         experiment = experiment.with_values({"agent.folder": str(folder)})
     make_agent = experiment.make_agent() or experiment.make_policy(needs[0])
-    recordings = experiment.output.resolve() / "recordings"
+    recordings = experiment.output.resolve() / RECORDINGS
     recorder = experiment.make_recorder(recordings)
     if recorder:
         recordings.mkdir(exist_ok=True)
         needs.append(recordings)
+    if not len(kept):
+        clear(recordings)
     if asked["nearest"]:
         needs.append(Path(asked["nearest"]).resolve())
     if folder:
@@ -254,11 +259,11 @@ def _play(
         agent: AgentFactory = make_agent,
         recorder: RecorderFactory | None = None,
     ) -> Report:
-        environment, limit = experiment.make_environment(changes), asked["recordings"]
+        environment, wanted = experiment.make_environment(changes), asked["recordings"]
         until = until if asked["until"] else None
         known, keep = kept.of(name), partial(kept.add, name)
         report = evaluate(
-            environment, agent, recorder, seeds, cluster, name, needs, until, limit, turns, known=known, keep=keep
+            environment, agent, recorder, seeds, cluster, name, needs, until, wanted, turns, known=known, keep=keep
         )
         return replace(report, tiers=task.get("tiers") or {})  # of worlds that have them
 
@@ -304,7 +309,7 @@ def _write(
         compare_conditions(reports, experiment["evaluate"]["margin"]),
         compare_secondary_metrics(reports),
     )
-    facts = _facts(experiment, checkpoint, rounds, seconds)
+    facts = _facts(experiment, checkpoint, rounds, seconds) | {"origin": asdict(experiment.origin)}
     facts["statements"] = [each.say(report) for each in statements]
     save_config(output, experiment.config, experiment.changes)
     recording = output / RECORDING
@@ -312,7 +317,8 @@ def _write(
     if experiment["recorder"]:
         with warn_on_error(recording):
             again = _errors(reports) > 0  # this evaluation is then continued
-            keep_recordings(report, output / "recordings", recording, experiment["evaluate"]["recordings"], again)
+            wanted = experiment["evaluate"]["recordings"]
+            facts["recorded"] = keep_recordings(report, output / RECORDINGS, recording, wanted, again)
     with warn_on_error(output / PLOT):
         (output / PLOT).unlink(missing_ok=True)  # of an earlier evaluation
         plot_report(report, output / PLOT)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -23,8 +24,8 @@ from vla.io.printable import show
 from vla.jobs.collect import demonstrations
 from vla.models.checkpoint import read_header
 from vla.policy import costs
-from vla.reports.html import write_page
 from vla.reports.open_loop import errors_table, plot_errors, write_errors
+from vla.reports.run_page import write_page
 from vla.rollouts.open_loop import OpenLoop, open_loop
 from vla.rollouts.rollout import close_agent
 from vla.runs.folder import ERRORS, ERRORS_PLOT, PAGE, save_config, wall_time
@@ -41,7 +42,7 @@ def evaluate_open_loop(experiment: Experiment, checkpoint: Path | None) -> float
         ValueError: the checkpoint was trained on other episodes, or on all of them.
     """
     started, output = time.monotonic(), experiment.output
-    facts = dict(experiment["chosen"])
+    facts = {**experiment["chosen"], "origin": asdict(experiment.origin)}
     fraction = experiment["data"]["validation_fraction"]
     if checkpoint is not None:  # before an import
         header = read_header(checkpoint)

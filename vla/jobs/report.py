@@ -10,8 +10,8 @@ from vla.config.experiment import Experiment
 from vla.io.printable import show
 from vla.io.types import Text
 from vla.reports.comparison import CASE, compare_runs, read_runs, remarks, runs_table, secondary_rows
+from vla.reports.comparison_page import write_comparison
 from vla.reports.conditions import secondary_table
-from vla.reports.html import write_comparison
 
 log = logging.getLogger(__name__)
 

@@ -37,8 +37,7 @@ class SweepTable(Callback):
 
     def on_multirun_end(self, config: DictConfig, **kwargs: Any) -> None:
         """Print the table of the sweep, and name its page; end the process with an error if there are no cells."""
-        from vla.reports.html import SWEEP  # imports matplotlib
-        from vla.reports.sweep import console_table
+        from vla.reports.sweep import SWEEP, console_table  # imports matplotlib
 
         folder = Path(config.hydra.sweep.dir)
         if not (folder.is_dir() and cells(folder, OVERRIDES)):

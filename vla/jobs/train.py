@@ -22,7 +22,7 @@ from vla.models.learner import Learner
 from vla.models.model import Model
 from vla.models.tokenizers.tokenization_error import describe_tokenization_error, out_of_bounds
 from vla.reports.first_batch import SHOWN, draw_samples
-from vla.reports.html import write_page
+from vla.reports.run_page import write_page
 from vla.rollouts.collect import collection_time
 from vla.runs.files import Training
 from vla.runs.folder import (
@@ -194,6 +194,7 @@ def _reported(
     output = experiment.output
     parameters = sum(parameter.numel() for parameter in learner.model.parameters())
     start = f", starting from {experiment.pretrained}" if experiment.pretrained else ""
+    _ = experiment.origin  # of the code that is trained with, not of later changes
     log.info("training %s with %.2f M parameters%s", type(learner.model).__name__, parameters / 1e6, start)
     ended = "done"
     try:
@@ -209,7 +210,8 @@ def _reported(
             graceful_stop.started or (saved := read_training(output)) is None or ended == "done" != saved.ended
         ):
             collected = collection_s and round(collection_s, 1)
-            save_training(output, Training(parameters, trainer.global_step, round(seconds, 1), ended, collected))
+            size, origin = (parameters, trainer.global_step, round(seconds, 1)), experiment.origin
+            save_training(output, Training(*size, ended, collected, origin=origin))
             with warn_on_error(output / PAGE):
                 write_page(output)
     log.info("trained %d steps in %.0f s", trainer.global_step, seconds)

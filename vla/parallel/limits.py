@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import platform
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -23,6 +24,18 @@ def cores() -> int:
     from loky import cpu_count  # takes a twentieth of a second
 
     return int(cpu_count())
+
+
+def processor() -> str:
+    """Return the name of the processor."""
+    return processor_facts().get("model name") or platform.processor() or platform.machine()
+
+
+def processor_facts() -> dict[str, str]:
+    """Return what Linux tells about the processor, such as its `flags`; empty elsewhere."""
+    file = Path("/proc/cpuinfo")
+    lines = file.read_text(encoding="utf-8").splitlines() if file.exists() else []
+    return {key.strip(): value.strip() for key, _, value in (line.partition(":") for line in lines)}
 
 
 def free_memory() -> float:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -13,12 +14,13 @@ from matplotlib.figure import Figure
 
 from vla.io.files import write_json
 from vla.reports.factors import association, factors, groups, numeric
-from vla.reports.style import GREEN, GREY, RED, error_bars, rate_limits, save
+from vla.reports.style import GREEN, GREY, RED, as_svg, error_bars, rate_limits, save, svg_style
 from vla.rollouts.comparison import Comparison
 from vla.rollouts.results import ERROR, Report, Result
 from vla.rollouts.statistics import wilson_interval
 
 PANELS = 8  # maximum number of factors on the page
+PANEL = (3.4, 2.5)  # of a factor on the page of a run [inch]
 LENGTH_BINS = 30  # approximate number of bars in the histogram of lengths
 
 
@@ -110,8 +112,7 @@ def _milestone(report: Report, count: int) -> dict[str, Any]:
 
 def plot_report(report: Report, path: Path) -> None:
     """Plot outcomes, episode lengths, and success over the randomised factors with the strongest association."""
-    played = [result for result in report.results if result.outcome != ERROR]
-    shown = sorted(factors(played).items(), key=lambda factor: -association(factor[1], played))[:PANELS]
+    played, shown = _strongest(report)
     rows = 1 + -(-len(shown) // 4)
     figure = Figure(figsize=(13, 3.1 * rows))
     inch = 1 / (3.1 * rows)
@@ -129,15 +130,46 @@ def plot_report(report: Report, path: Path) -> None:
     for index, (name, values) in enumerate(shown):
         axes = figure.add_subplot(grid[1 + index // 4, index % 4])
         axes.set_title(name, fontsize=10)
-        if isinstance(values[0], tuple):
-            _plot_points(axes, values, played)
-        else:
-            _plot_groups(axes, values, played)
+        _plot_factor(axes, values, played)
+        if not isinstance(values[0], tuple):
             scales.append(axes)
     limits = rate_limits(min((axes.dataLim.y0 for axes in scales), default=0.0))  # data are the intervals
     for axes in scales:
         axes.set_ylim(limits)
     save(figure, path)
+
+
+def factor_panels(report: Report) -> dict[str, str]:
+    """Return title → SVG: lengths of the episodes, and success over the factors of `plot_report`."""
+    played, shown = _strongest(report)
+    panels = {"length of episodes": _panel("length of episodes", partial(_plot_lengths, played=played))}
+    for name, values in shown:
+        panels[name] = _panel(name, partial(_plot_factor, values=values, played=played))
+    return panels if played else {}
+
+
+def _panel(title: str, plot: Callable[[Axes], None]) -> str:
+    with svg_style(title):
+        figure = Figure(figsize=PANEL, layout="constrained")
+        axes = figure.add_subplot()
+        plot(axes)
+        axes.set_title("", loc="left")  # the page has it
+        axes.spines[["top", "right"]].set_visible(False)
+        return as_svg(figure)
+
+
+def _strongest(report: Report) -> tuple[list[Result], list[tuple[str, list[Any]]]]:
+    """Return the completed episodes, and title and values of the factors most strongly associated with success."""
+    played = [result for result in report.results if result.outcome != ERROR]
+    return played, sorted(factors(played).items(), key=lambda factor: -association(factor[1], played))[:PANELS]
+
+
+def _plot_factor(axes: Axes, values: Sequence[Any], played: Sequence[Result]) -> None:
+    if isinstance(values[0], tuple):
+        _plot_points(axes, values, played)
+    else:
+        _plot_groups(axes, values, played)
+        axes.set_ylim(0, 1)
 
 
 def _plot_outcomes(axes: Axes, report: Report) -> None:

@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from vla.reports.style import GREEN, GREY, save
+from vla.reports.style import GREEN, GREY, MIDDLE, save
 from vla.spec import Array, Spec, readable
 
 SHOWN = 6  # windows
@@ -19,7 +19,7 @@ LETTER, BAR, VALUE = 0.065, 1.2, 0.7  # widths of a letter, of a bar and of a va
 
 
 def draw_samples(batch: dict[str, Any], spec: Spec, path: Path) -> None:
-    """Draw the newest frame of every window of a batch with its action label, as a PNG written atomically.
+    """Draw the newest frame of every window of a batch with its action label, as a transparent PNG written atomically.
 
     Args:
         batch: `rgb` of each camera (B, T, H, W, 3) uint8, `action` (B, T, k, D) and B `instruction`s.
@@ -33,11 +33,11 @@ def draw_samples(batch: dict[str, Any], spec: Spec, path: Path) -> None:
     width = sum(widths) + names + BAR + VALUE + GAP * (len(images) + 4)
     height = HEIGHT + TITLE + GAP
     total = COLUMNS * width, -(-len(sentences) // COLUMNS) * height
-    figure = Figure(figsize=total, facecolor="white")
+    figure = Figure(figsize=total, facecolor="none")
     axes = figure.add_axes((0, 0, 1, 1))  # a single one, in inches: each takes as long to draw as all that is in it
     for index, sentence in enumerate(sentences):
         left, bottom = index % COLUMNS * width + GAP, total[1] - (index // COLUMNS + 1) * height + GAP
-        axes.text(left, bottom + HEIGHT + GAP, sentence, fontsize=9.5, parse_math=False)
+        axes.text(left, bottom + HEIGHT + GAP, sentence, fontsize=9.5, color=MIDDLE, parse_math=False)
         for image, wide in zip(images, widths, strict=True):
             axes.imshow(image[index], extent=(left, left + wide, bottom, bottom + HEIGHT))
             left += wide + GAP
@@ -59,5 +59,5 @@ def _plot_action(axes: Axes, left: float, bottom: float, action: Array, spec: Sp
         factor, shown = readable(unit)
         number = factor * float(value)
         text = f"{round(number, 1) + 0.0:.1f} {shown}" if shown else f"{round(number, 4) + 0.0:.2g}"  # never "-0.0"
-        axes.text(left - GAP, place, name, ha="right", va="center", fontsize=7.5, parse_math=False)
-        axes.text(left + BAR + GAP, place, text, va="center", fontsize=7.5, parse_math=False)
+        axes.text(left - GAP, place, name, ha="right", va="center", fontsize=7.5, color=MIDDLE, parse_math=False)
+        axes.text(left + BAR + GAP, place, text, va="center", fontsize=7.5, color=MIDDLE, parse_math=False)

@@ -21,6 +21,7 @@ from vla.spec import Array
 Interval = tuple[float, float, float]  # success rate and its 95 % confidence interval
 
 GREEN, RED, BLUE, GREY = "#2e9e5b", "#d2483f", "#3b76c4", "#8a8f98"
+MIDDLE = "#7a7f86"  # text that is readable on white and on black
 INK = "#010203"  # placeholder for the page's text colour
 
 

@@ -10,20 +10,23 @@ from urllib.parse import quote
 from rich.markup import escape
 from rich.table import Table
 
-from vla.config.differences import at
+from vla.config.differences import ABSENT, at
 from vla.io.files import atomic_path, warn_on_error, write_text
-from vla.reports.comparison import RunComparison, compare_all_rows, compare_rows
+from vla.reports.comparison import RunComparison, compare_all_rows, compare_rows, secondary_rows
 from vla.reports.conditions import NARROW, comparison_texts
-from vla.reports.html import ABSENT, SWEEP, TableRow, write_sweep
+from vla.reports.html import DIFFERENCE, PageTable, difference, in_words, links, rate, render, secondary
 from vla.reports.posteriors import FEWEST, MOST, Outcome, draw_posteriors
 from vla.reports.style import markdown_table
 from vla.reports.sweep_plot import plot
+from vla.reports.training_curves import colours, draw_runs
 from vla.rollouts.statistics import effective_episodes
 from vla.runs.cells import failures
 from vla.runs.folder import PAGE
 from vla.runs.sweep import SweepRow, conditions_of, read_rows
 from vla.spec import IN_DISTRIBUTION
 
+SWEEP, OVERVIEW = "sweep.html", "sweep.png"
+COSTS = ("each seed [%]", "parameters [M]", "action [ms]")
 CONDITIONS = 4  # maximum number of conditions on the console
 
 
@@ -36,7 +39,7 @@ def tabulate(folder: Path) -> list[SweepRow]:
             _write_csv(rows, draft)
         failed = failures(folder)
         write_text(folder / "sweep.md", markdown(rows) + markdown_differences(compared) + markdown_failures(failed))
-        plot(rows, folder / "sweep.png")
+        plot(rows, folder / OVERVIEW)
         _write_page(rows, compared, failed, folder)
     return rows
 
@@ -61,7 +64,7 @@ def markdown_failures(failed: Sequence[str]) -> str:
 def markdown(rows: list[SweepRow]) -> str:
     """Format the table in Markdown: success per condition with its interval, then costs."""
     conditions = conditions_of(rows)
-    head = [*rows[0].choices, *(f"{name} [%]" for name in conditions), "each seed [%]", "parameters [M]", "action [ms]"]
+    head = [*rows[0].choices, *(f"{name} [%]" for name in conditions), *COSTS]
     return markdown_table(head, [[*row.choices.values(), *_rates(row, conditions), *_costs(row)] for row in rows])
 
 
@@ -97,18 +100,36 @@ def _costs(row: SweepRow) -> list[str]:
 
 
 def _write_page(rows: list[SweepRow], compared: Sequence[RunComparison], failed: Sequence[str], folder: Path) -> None:
-    lines = [
-        TableRow(
-            list(row.choices.values()),
-            {condition: row.interval(condition) for condition in row.played},
-            _costs(row),
-            {run.folder.name: f"{quote(run.folder.name)}/{PAGE}" for run in row.runs},
-        )
-        for row in rows
+    """Write the page of a sweep with its tables, plots and training curves."""
+    conditions, cells = conditions_of(rows), [run for row in rows for run in row.runs]
+    lines = []
+    for row in rows:
+        rates = [rate(row.interval(each)) if each in row.played else ABSENT for each in conditions]
+        pages = links({run.folder.name: f"{quote(run.folder.name)}/{PAGE}" for run in row.runs})
+        lines.append([*row.choices.values(), *rates, *_costs(row), pages])
+    heads = [*rows[0].choices, *(f"{in_words(name)} [%]" for name in conditions), *COSTS, "cells"]
+    captions = [
+        ": ".join(filter(None, (run.folder.name, " ".join(row.choices.values())))) for row in rows for run in row.runs
     ]
-    cells = [run for row in rows for run in row.runs]
+    pairs = [[each.other, in_words(each.condition), *difference(each.found)] for each in compared]
+    title = f"Differences from {compared[0].one}" if compared else ""
     with warn_on_error(folder / SWEEP):
-        write_sweep(folder, list(rows[0].choices), lines, cells, compared, _draw_posteriors(rows), failed)
+        render(
+            folder / SWEEP,
+            "sweep.html",
+            title=f"Sweep {folder.resolve().name}",
+            results=PageTable(heads, lines, "Success and cost"),
+            posteriors=_draw_posteriors(rows),
+            pairs=PageTable(["row", "condition", *DIFFERENCE], pairs, title),
+            secondary=secondary(
+                secondary_rows(compared), ("row", "minus", "condition"), "Differences in secondary metrics"
+            ),
+            anytime=any(report.anytime for run in cells for report in run.reports.values()),
+            curves=draw_runs({run.folder.name: run.metrics for run in cells}),
+            lines=dict(zip(captions, colours(len(cells)), strict=True)),
+            failed=failed,
+            overview=folder / OVERVIEW,
+        )
 
 
 def _draw_posteriors(rows: list[SweepRow]) -> str | None:

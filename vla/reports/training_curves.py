@@ -18,12 +18,21 @@ SIZE = (3.4, 2.3)  # of a figure [inch]
 RIGHT, BOTTOM, TOP = 0.96, 0.12, 0.96  # ends of the axes in a figure
 DECADE = 10.0  # ratio of maximum to minimum above which a loss has a logarithmic axis
 
+# Metrics of the speed → title.
+PACE = {
+    "pace/samples_per_s": "samples/s",
+    "pace/mfu": "MFU, share of the peak",
+    "pace/waiting": "waiting for data, share of the time",
+    "pace/memory_gb": "memory [GB]",
+}
+
+Sections = dict[str, dict[str, str]]  # section of a page → title of a panel → SVG
 Points = tuple[tuple[float, ...], tuple[float, ...]]  # steps and values
 Line = tuple[str, bool, str, Points]  # label or "", logged in training (not validation), colour, curve
 
 
-def draw_run(metrics: Mapping[str, Curve]) -> dict[str, str]:
-    """Return title → SVG, one per family of metrics: training and validation of one metric, or errors of one unit."""
+def draw_run(metrics: Mapping[str, Curve]) -> Sections:
+    """Return the panels of a run, one per family of metrics: training and validation of one, or errors of one unit."""
     families: dict[str, list[Line]] = {}
     components: dict[str, list[str]] = {}  # of a family
     for name, curve in metrics.items():
@@ -34,17 +43,17 @@ def draw_run(metrics: Mapping[str, Curve]) -> dict[str, str]:
         training = not name.startswith("val/")
         colour = GREY if training and not component else COLOURS[known.index(component) % len(COLOURS)]
         families.setdefault(family, []).append((component, training, colour, _points(curve)))
-    return {title: _draw(title, tuple(lines)) for title, lines in _ordered(families).items()}
+    return _sections(families)
 
 
-def draw_runs(runs: Mapping[str, Mapping[str, Curve]]) -> dict[str, str]:
-    """Return title → SVG, one per metric, with the curves of all runs."""
+def draw_runs(runs: Mapping[str, Mapping[str, Curve]]) -> Sections:
+    """Return the panels of several runs, one per metric, with the curves of all."""
     families: dict[str, list[Line]] = {}
     for colour, metrics in zip(colours(len(runs)), runs.values(), strict=True):
         for name, curve in metrics.items():
             line = "", not name.startswith("val/"), colour, _points(curve)
             families.setdefault(_title(_bare(name)), []).append(line)
-    return {title: _draw(title, tuple(lines)) for title, lines in _ordered(families).items()}
+    return _sections(families)
 
 
 def colours(count: int) -> list[str]:
@@ -58,7 +67,7 @@ def _bare(name: str) -> str:
 
 def _title(name: str) -> str:
     """Format a metric's name as a title, with the unit of an error in brackets."""
-    return re.sub(r"^(error_.+)_(mm|deg)$", r"\1 [\2]", name).removeprefix("pace/").replace("_", " ")
+    return PACE.get(name) or re.sub(r"^(error_.+)_(mm|deg)$", r"\1 [\2]", name).replace("_", " ")
 
 
 def _family(name: str) -> tuple[str, str]:
@@ -67,13 +76,17 @@ def _family(name: str) -> tuple[str, str]:
     return (f"error [{error[2]}]", error[1]) if error else (_title(name), "")
 
 
-def _ordered(families: Mapping[str, list[Line]]) -> dict[str, list[Line]]:
-    """Sort validated metrics first, among them the loss first; otherwise keep the order of logging."""
+def _sections(families: Mapping[str, list[Line]]) -> Sections:
+    """Draw all panels; validated metrics come first, among them the loss; otherwise they keep the order of logging."""
 
     def place(title: str) -> tuple[bool, bool]:
         return all(training for _, training, _, _ in families[title]), title != "loss"
 
-    return {title: families[title] for title in sorted(families, key=place)}
+    sections: Sections = {}
+    for title in sorted(families, key=place):
+        section = "Speed of the training" if title in PACE.values() else "Training"
+        sections.setdefault(section, {})[title] = _draw(title, tuple(families[title]))
+    return {section: sections[section] for section in sorted(sections, key="Training".__ne__)}
 
 
 def _points(curve: Curve) -> Points:
@@ -87,11 +100,10 @@ def _draw(title: str, lines: tuple[Line, ...]) -> str:
         figure = Figure(figsize=SIZE)
         axes = figure.add_axes((0.0, BOTTOM, RIGHT, TOP - BOTTOM))
         for label, training, colour, (steps, values) in lines:
-            few = "o" if len(steps) < 30 and not training else ""
-            look: dict[str, Any] = (
-                {"linewidth": 1.0, "alpha": 0.8} if training else {"linewidth": 1.7, "marker": few, "markersize": 3}
-            )
-            axes.plot(steps, values, color=colour, label=label, clip_on=title != "success", **look)
+            few = "o" if len(steps) < (2 if training else 30) else ""  # a line of one point would not be seen
+            look: dict[str, Any] = {"linewidth": 1.0, "alpha": 0.8} if training else {"linewidth": 1.7}
+            look |= {"marker": few, "markersize": 3, "clip_on": title != "success"}
+            axes.plot(steps, values, color=colour, label=label, **look)
         if title.endswith("loss") and _spans_decades(lines):
             axes.set_yscale("log", subs=[2, 5])
             axes.yaxis.set_minor_formatter("{x:g}")

@@ -9,7 +9,6 @@ import json
 import logging
 import traceback
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
@@ -18,6 +17,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from vla.parallel.pool import THIS_PROCESS, Cluster, Crashed, Pool
 from vla.rollouts.motion import motion_of
+from vla.rollouts.recordings import Recordings, chosen
 from vla.rollouts.results import ERROR, Report, Result
 from vla.rollouts.rollout import AgentFactory, EnvironmentFactory, close_agent, rollout
 from vla.spec import FIRST_SEED, Agent, Environment, Episode, Recorder
@@ -36,15 +36,15 @@ def evaluate(
     name: str = "evaluating",
     needs: Sequence[Path] = (),
     until: Callable[[Report], bool] | None = None,
-    recordings: int | None = None,
+    recordings: Recordings = "all",
     turns: int = 1,
     known: Mapping[int, Result] | None = None,
     keep: Callable[[Result], None] | None = None,
 ) -> Report:
     """Play the episodes of the seeds; `name` is the label of the progress bar.
 
-    `recordings` is the limit of `keep_recordings`. Which episodes it keeps is known at the end only: those are played
-    once more and recorded.
+    `recordings` says which episodes are recorded. Unless that is all, it is known at the end only which they are: these
+    are played once more and recorded.
 
     Every process of the `cluster` calls the factories once and accesses the paths `needs`. Errors of a factory end the
     evaluation; errors of an episode, or a crash of its process, are reported in its result.
@@ -62,7 +62,7 @@ def evaluate(
     if not seeds or min(seeds) < FIRST_SEED:
         raise ValueError(f"evaluation needs seeds from {FIRST_SEED} on, which no policy is trained on; got {seeds}")
     make = partial(_RolloutWorker, make_environment, make_agent, None if recordings == 0 else make_recorder)
-    at_once = recordings is None
+    at_once = recordings == "all"
     columns = (TextColumn(name), BarColumn(), MofNCompleteColumn(), TextColumn("{task.fields[note]}"))
     results = {seed: known[seed] for seed in seeds if seed in known} if known else {}
     counted = 0
@@ -99,48 +99,26 @@ def evaluate(
                     later.cancel()
                 break
         report = reported()
-        if make_recorder is not None and recordings:
-            _record(pool, _kept(report, recordings))
+        if make_recorder is not None and not at_once:
+            _record(pool, chosen(report, recordings))
     return report
 
 
-def _kept(report: Report, limit: int | None) -> list[Result]:
-    """Return the episodes whose recordings are kept: failures first, in the order of their seeds."""
-    completed = [result for result in report.results if result.outcome != ERROR]
-    return sorted(completed, key=lambda result: (result.success, result.seed))[:limit]
-
-
 def _record(pool: Pool, results: Sequence[Result]) -> None:
-    """Play episodes once more and record them; log a warning for those that end differently."""
+    """Play episodes once more and record them; log a warning for those that are played differently."""
     expected = {pool.submit((result.seed, True)): result for result in results}
     for future in pool.as_completed(expected):
         result = expected[future]
         try:
-            again = future.result().outcome
+            again = future.result()
         except Crashed as crash:
-            again = str(crash)
-        if again != result.outcome:
-            log.warning("seed %d has no recording: when played again it ended with %s", result.seed, again)
-
-
-def keep_recordings(report: Report, folder: Path, target: Path, limit: int | None, continues: bool = False) -> int:
-    """Merge the recordings of an evaluation into one file, failures first, at most `limit`; returns their number.
-
-    Unless the evaluation `continues`, the single files are removed, those of episodes that do not count included, and
-    their folder if it is empty.
-    """
-    from vla.rollouts.recorder import merge, recording_name  # imports the viewer's library
-
-    names = [recording_name(result.seed, result.outcome) for result in _kept(report, limit)]
-    files = [file for name in names if (file := folder / f"{name}.rrd").exists()]
-    if files:
-        merge(files, target)
-    if not continues:
-        for file in folder.glob("*.rrd"):
-            file.unlink()
-        with suppress(OSError):
-            folder.rmdir()
-    return len(files)
+            again = Result(result.seed, ERROR, error=str(crash))
+        if again.outcome != result.outcome:
+            ended = again.error or again.outcome
+            log.warning("seed %d has no recording: when played again it ended with %s", result.seed, ended)
+        elif again.steps != result.steps:
+            took = "seed %d is recorded as played again: in %d steps, where it had taken %d"
+            log.warning(took, result.seed, again.steps, result.steps)
 
 
 def play(environment: Environment, agent: Agent, seed: int, recorder: Recorder | None = None) -> Result:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import os
 import subprocess
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -16,7 +17,8 @@ import rerun_cli
 from PIL import Image
 
 from vla.io.files import atomic_path
-from vla.io.types import Point
+from vla.io.types import Natural, Point
+from vla.rollouts.moving_picture import save_moving_picture
 from vla.spec import Array, Drawable, Environment, Episode, Eventful, Observation, Shape, Spec
 
 # N steps, S series of a plot, D action components, K bins, V vertices, F faces
@@ -39,10 +41,16 @@ class RerunRecorder:
     It contains the scene if the environment is `Drawable`, and a log if it is `Eventful`.
     """
 
-    def __init__(self, folder: str | os.PathLike[str]) -> None:
-        """Create the folder of the recordings; files are named by `recording_name`."""
-        self._folder = Path(folder)
+    def __init__(self, folder: str | os.PathLike[str], pictures: Natural = 0) -> None:
+        """Create the folder of the recordings; files are named by `recording_name`.
+
+        Args:
+            folder: of the recordings.
+            pictures: number of episodes of each outcome of which there is also a moving picture, the first ones.
+        """
+        self._folder, self._pictures = Path(folder), pictures
         self._folder.mkdir(parents=True, exist_ok=True)
+        self._pictured = Counter[str]()  # outcome → number of moving pictures
 
     def start(self, environment: Environment) -> None:
         """Begin an episode; an unfinished one is discarded."""
@@ -60,7 +68,7 @@ class RerunRecorder:
         self._pose()
 
     def end(self, episode: Episode) -> None:
-        """Write the file of the episode atomically; an OSError if it cannot be written."""
+        """Write the files of the episode atomically; an OSError if they cannot be written."""
         self._pose()
         name, spec = recording_name(episode.seed, episode.outcome), self._spec
         # Random part: the viewer merges recordings of the same id, and policies share seeds.
@@ -82,6 +90,9 @@ class RerunRecorder:
         with atomic_path(self._folder / f"{name}.rrd") as draft:
             draft.write_bytes(content.read() or b"")
         stream.disconnect()
+        self._pictured[episode.outcome] += 1
+        if self._pictured[episode.outcome] <= self._pictures:
+            save_moving_picture(episode, events, self._folder / f"{name}.webp")
 
     def _pose(self) -> None:
         if self._world is not None:

@@ -13,6 +13,7 @@ from pydantic import AfterValidator, StringConstraints
 from vla.config.annotations import describe, matches
 from vla.config.check import PLAIN
 from vla.config.differences import ABSENT, at
+from vla.config.origin import Origin
 from vla.io.documents import LENIENT, STRICT
 from vla.io.types import Count, Natural, NonNegative, Positive, Share
 from vla.rollouts.comparison import Comparison
@@ -62,6 +63,7 @@ class Training:
     ended: str  # "done", "interrupted", or an error
     collection_s: NonNegative | None = None  # duration of the collection, if known
     checkpoint: CheckpointName | None = None  # selected for evaluation
+    origin: Origin | None = None
 
 
 @dataclass(frozen=True)
@@ -114,6 +116,7 @@ class ErrorsFile:
     relative: NonNegative
     checkpoint: str | None
     config: Node
+    origin: Origin | None = None
     parameters: Count | None = None
     latency_ms: Positive | None = None
     wall_time_s: NonNegative | None = None
@@ -163,6 +166,8 @@ class ReportFile:
     rounds: list[Round] = field(default_factory=list)  # of job=improve
     versions: dict[str, str] = field(default_factory=dict)  # library → version
     statements: list[str] = field(default_factory=list)  # on what the evaluation was to decide
+    origin: Origin | None = None
+    recorded: list[int] = field(default_factory=list)  # seeds of the episodes in the recording
 
     def __post_init__(self) -> None:
         """Require the same episodes in every part."""

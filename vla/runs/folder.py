@@ -6,6 +6,7 @@ import csv
 import io
 import json
 import logging
+import shutil
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, replace
 from functools import partial
@@ -30,6 +31,7 @@ Curve = tuple[Array, Array]  # steps (N,) and values (N,)
 CONFIG, CHANGES, TRAINING = "config.yaml", "changes.yaml", "training.json"
 METRICS, REPORT = "metrics.csv", "report.json"
 PAGE, RECORDING = "report.html", "rollouts.rrd"
+RECORDINGS = "recordings"  # folder of single recordings while an evaluation lasts, and of moving pictures
 SAMPLES, PLOT, SUITE = "samples.png", "report.png", "suite.png"
 ERRORS, ERRORS_PLOT = "errors.json", "errors.png"  # of an open-loop evaluation, in place of a report
 LARGEST_METRIC, MOST_METRICS = 1e100, 300  # that curves are drawn of; a training has about 20
@@ -114,11 +116,13 @@ def archive_evaluation(folder: Path, number: int) -> None:
         folder: of the run.
         number: steps, or rounds, after which the policy was evaluated.
     """
-    names = (REPORT, ERRORS, PLOT, SUITE, ERRORS_PLOT, RECORDING)
+    names = (REPORT, ERRORS, PLOT, SUITE, ERRORS_PLOT, RECORDING, RECORDINGS)
     if files := [file for name in names if (file := folder / name).exists()]:
         target = folder / f"evaluation_{number}"
         target.mkdir(exist_ok=True)
         for file in files:
+            if file.is_dir():
+                shutil.rmtree(target / file.name, ignore_errors=True)  # else it could not be replaced
             file.replace(target / file.name)
         log.info("moved the evaluation so far to %s", target)
 

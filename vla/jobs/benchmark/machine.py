@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import os
-import platform
 import time
 from pathlib import Path
 from typing import Any
 
-from vla.parallel.limits import cores
+from vla.parallel.limits import cores, processor, processor_facts
 
 # Vector instructions that kernels and compilers choose by, from old to new: of x86, then of ARM.
 INSTRUCTIONS = ("sse4_2", "avx", "avx2", "avx512f", "avx512_bf16", "amx_bf16", "asimd", "sve", "bf16")
@@ -18,13 +17,13 @@ TICKS = os.sysconf("SC_CLK_TCK") if hasattr(os, "sysconf") else 100  # of /proc/
 
 def machine() -> dict[str, Any]:
     """Return the processor's name, its vector instructions and the number of cores that this process may use."""
-    told: dict[str, str] = {}
-    if (file := Path("/proc/cpuinfo")).exists():
-        pairs = (line.partition(":") for line in file.read_text(encoding="utf-8").splitlines())
-        told = {key.strip(): value.strip() for key, _, value in pairs}
-    name = told.get("model name") or platform.processor() or platform.machine()
+    told = processor_facts()
     flags = (told.get("flags") or told.get("Features") or "").split()
-    return {"processor": name, "instructions": [each for each in INSTRUCTIONS if each in flags], "cores": cores()}
+    return {
+        "processor": processor(),
+        "instructions": [each for each in INSTRUCTIONS if each in flags],
+        "cores": cores(),
+    }
 
 
 class OtherLoad:

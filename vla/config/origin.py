@@ -1,0 +1,86 @@
+"""Origin of a run's results: the command line, the commits of the code, and the machine."""
+
+from __future__ import annotations
+
+import shlex
+import socket
+import subprocess
+import sys
+from dataclasses import dataclass
+from importlib.util import find_spec
+from pathlib import Path
+
+from hydra.core.hydra_config import HydraConfig
+
+from vla.config.packages import config_folders, option_packages, trusted
+from vla.io.documents import STRICT
+from vla.parallel.limits import cores, processor
+
+SECRET = "api_key"  # key whose values no file is to hold
+SECONDS = 10  # that git may take
+
+
+@dataclass(frozen=True)
+class Commit:
+    """Commit of a git work tree."""
+
+    __pydantic_config__ = STRICT
+
+    hash: str
+    dirty: bool  # the code in the tree has changes that are not committed, or files that git does not know
+
+    def __str__(self) -> str:
+        """Format the hash, and whether it is all."""
+        return self.hash[:12] + (" with uncommitted changes" if self.dirty else "")
+
+
+@dataclass(frozen=True)
+class Origin:
+    """Where results come from."""
+
+    __pydantic_config__ = STRICT
+
+    command: str  # empty if it is unknown; secrets are replaced by asterisks
+    commits: dict[str, Commit]  # name of a git work tree with code → its commit
+    host: str
+    processor: str
+
+
+def find_origin() -> Origin:
+    """Return the origin of what this process computes."""
+    overrides = HydraConfig.get().overrides.task if HydraConfig.initialized() else None
+    command = "" if overrides is None else f"python -m vla.run {shlex.join(map(_without_secret, overrides))}".strip()
+    torch = sys.modules.get("torch")
+    gpu = f", {torch.cuda.get_device_name()}" if torch and torch.cuda.is_available() else ""
+    return Origin(command, _commits(), socket.gethostname(), f"{processor()}, {cores()} cores{gpu}")
+
+
+def _without_secret(override: str) -> str:
+    return f"{override.partition('=')[0]}=***" if SECRET in override else override
+
+
+def _commits() -> dict[str, Commit]:
+    """Return the commits of this package, of its options, and of the packages that add parts."""
+    packages = {"vla", *option_packages(), *(name.partition(".")[0] for name in trusted())}
+    specs = [find_spec(package) for package in sorted(packages)]
+    places = [Path(place) for spec in specs if spec for place in spec.submodule_search_locations or ()]
+    found = dict[str, Commit]()
+    for folder in (*places, *config_folders()):
+        # A package that is installed into an ignored folder of a tree does not belong to it.
+        if not folder.is_dir() or _git(folder, "check-ignore", "-q", ".") is not None:
+            continue
+        if (known := _git(folder, "rev-parse", "--show-toplevel", "HEAD")) is not None:
+            tree, commit = known.splitlines()
+            dirty = bool(_git(folder, "--no-optional-locks", "status", "--porcelain", "--", "."))
+            name = Path(tree).name
+            found[name] = Commit(commit, dirty or (name in found and found[name].dirty))
+    return found
+
+
+def _git(folder: Path, *arguments: str) -> str | None:
+    """Return what a git command prints about a folder, or None where it fails."""
+    try:
+        done = subprocess.run(["git", "-C", folder, *arguments], capture_output=True, text=True, timeout=SECONDS)
+    except (OSError, subprocess.TimeoutExpired):
+        return None
+    return done.stdout if done.returncode == 0 else None
