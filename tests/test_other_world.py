@@ -86,7 +86,7 @@ def test_a_policy_is_evaluated_recorded_and_reported(folder: Path, tmp_path: Pat
     cell = tmp_path / "0"
     (cell / ".hydra").mkdir(parents=True)
     (cell / ".hydra/overrides.yaml").write_text("- model=bc\n")
-    seeds, recorder = range(FIRST_SEED, FIRST_SEED + 3), partial(RerunRecorder, cell / "recordings")
+    seeds, recorder = range(FIRST_SEED, FIRST_SEED + 3), partial(RerunRecorder, cell / "recordings", 1)
     report = evaluate(toy.make_environment, partial(policy_of, "bc", folder), recorder, seeds)
     assert report.episodes == 3 and {*report.tasks} == {
         toy.make_environment().reset(seed).instruction.split()[3] for seed in seeds

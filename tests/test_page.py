@@ -140,15 +140,18 @@ def test_the_page_says_what_was_recorded_and_how_to_play_an_episode_again(tmp_pa
 def test_the_page_tells_the_command_the_commit_and_the_machine(tmp_path: Path) -> None:
     trained = Origin("python -m vla.run model=bc", {"vla": Commit("0123456789abcdef", False)}, "ada", "EPYC, 2 cores")
     folder = a_run(tmp_path / "run", more={"origin": asdict(trained)})
-    save_training(folder, Training(1, 1, 1.0, "done", origin=trained))
+    save_training(folder, Training(1, 1, 1.0, "done", origins=[trained]))
     told = text(write_page(folder))
     where = "git commit 0123456789ab (vla) host ada processor EPYC, 2 cores"
     assert f"Origin command python -m vla.run model=bc {where}" in told
     later = replace(trained, command="python -m vla.run", commits={"vla": Commit("0123456789abcdef", True)})
-    save_training(folder, Training(1, 1, 1.0, "done", origin=later))
+    save_training(folder, Training(1, 1, 1.0, "done", origins=[later]))
     told = text(write_page(folder))
     assert "Origin of the training command python -m vla.run git commit 0123456789ab with uncommitted changes" in told
     assert f"Origin of the evaluation command python -m vla.run model=bc {where}" in told
+    save_training(folder, Training(1, 1, 1.0, "done", origins=[trained, later]))
+    told = text(write_page(folder))
+    assert told.index("Origin of the training") < told.index("Origin of the training, part 2") < told.index("of the e")
 
 
 def test_a_folder_of_runs_lists_them_newest_first(tmp_path: Path) -> None:
@@ -163,7 +166,7 @@ def test_a_folder_of_runs_lists_them_newest_first(tmp_path: Path) -> None:
         (runs / name / "report.html").write_text(content)
     write_page(runs / "c")
     told, markup = text(runs / "index.html"), (runs / "index.html").read_text()
-    assert told.startswith("3 runs in runs")
+    assert told.startswith("3 runs The newest first.")
     assert re.search(
         r"c 20[\d-]+ [\d:]+ - - - - interrupted b <b> 20[\d-]+ [\d:]+ BC - 75\.0 \(30\.1-95\.4\) 4 a first .* 100\.0",
         told,
@@ -182,7 +185,7 @@ def test_of_runs_that_end_at_once_all_are_listed(tmp_path: Path) -> None:
     folders = [a_run(tmp_path / f"runs/{n}") for n in range(4)]
     with ProcessPoolExecutor(2, get_context("spawn")) as pool:
         list(pool.map(write_page, folders))
-    assert text(tmp_path / "runs/index.html").startswith("4 runs in runs")
+    assert text(tmp_path / "runs/index.html").startswith("4 runs ")
     assert not [path for path in (tmp_path / "runs").iterdir() if path.name.startswith(".") and "html" in path.name]
 
 

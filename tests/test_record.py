@@ -24,7 +24,7 @@ SUCCESS, FAILURE = 1_000_000, 1_000_003  # the toy world fails at seeds that are
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[int, Episode]]:
     folder = tmp_path_factory.mktemp("recordings")
-    recorder, environment, agent = RerunRecorder(folder), make_environment(), ThinkingAgent()
+    recorder, environment, agent = RerunRecorder(folder, pictures=0), make_environment(), ThinkingAgent()
     return folder, {seed: rollout(environment, agent, seed, recorder) for seed in (SUCCESS, FAILURE)}
 
 
@@ -122,7 +122,7 @@ def test_merged_episodes_stay_apart_and_failures_come_first(
 def test_the_same_seed_recorded_twice_gives_two_recordings(
     recorded: tuple[Path, dict[int, Episode]], tmp_path: Path
 ) -> None:
-    rollout(make_environment(), ThinkingAgent(), SUCCESS, RerunRecorder(tmp_path))
+    rollout(make_environment(), ThinkingAgent(), SUCCESS, RerunRecorder(tmp_path, pictures=0))
     file = f"{recording_name(SUCCESS, 'success')}.rrd"
     ids = {entry.recording_id for folder in (recorded[0], tmp_path) for entry in RrdReader(folder / file).recordings()}
     assert len(ids) == 2

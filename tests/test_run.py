@@ -73,7 +73,7 @@ def test_the_main_job_collects_trains_evaluates_and_records(home: Path) -> None:
     page = (home / "run/report.html").read_text()
     for words in ("4 steps", "collect.episodes", ">500</code>", "First training batch", 'href="rollouts.rrd"', "${"):
         assert (words in page) == (words != "${"), words
-    assert training["origin"] == report["origin"] and "python -m vla.run" in report["origin"]["command"] in page
+    assert training["origins"] == [report["origin"]] and "python -m vla.run" in report["origin"]["command"] in page
     assert report["origin"]["host"] == socket.gethostname() in page
     moving = sorted(path.name for path in (home / "run/recordings").iterdir())
     named = {each["seed"]: recording_name(each["seed"], each["outcome"]) for each in report["per_episode"]}

@@ -137,7 +137,7 @@ def test_rows_are_compared_with_the_first_on_the_same_scenes(tmp_path: Path) -> 
     assert text.splitlines()[0] == "| minus bc | condition | points (95 % CI) | p | p Holm | verdict |"
     assert re.search(r"\| rt1 \| seen \| -70\.0 \(.*\) \| 0\.016 \| 0\.016 \| worse \|", text)
     page = (tmp_path / "sweep.html").read_text()
-    assert "Differences from bc" in page and page.count("<td>rt1</td>") == 2 and "McNemar" in page
+    assert "Differences from bc" in page and page.count("<td>rt1</td>") == 3 and "McNemar" in page
 
 
 def test_a_condition_that_repeats_the_training_condition_is_no_further_comparison(tmp_path: Path) -> None:

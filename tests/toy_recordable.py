@@ -100,4 +100,4 @@ def make_recorder(folder: Path) -> Callable[[], Recorder]:
     """A factory that a worker process can be given."""
     from vla.rollouts.recorder import RerunRecorder  # the other worlds start faster without it
 
-    return partial(RerunRecorder, folder)
+    return partial(RerunRecorder, folder, pictures=0)

@@ -109,7 +109,7 @@ def replay_episode(output: Path, folder: Path, seed: int, robot: dict[str, Any] 
     environment = make_environment(config["task"])
     store.spec.require(environment.spec, f"the episode store {folder}", "its task as it is built now")
     with environment.blind():
-        step = replay(environment, episode, RerunRecorder(output)).differs
+        step = replay(environment, episode, RerunRecorder(output, pictures=0)).differs
     environment.close()
     recording = output / f"episode-{seed}.rrd"
     os.replace(output / f"{recording_name(seed, episode.outcome)}.rrd", recording)

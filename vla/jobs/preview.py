@@ -30,7 +30,7 @@ def run(experiment: Experiment) -> None:
         TemporaryDirectory(prefix=".recordings-", dir=output) as folder,
         closing(experiment.make_environment()()) as environment,
     ):
-        expert, recorder = experiment.make_expert()(environment), RerunRecorder(folder)
+        expert, recorder = experiment.make_expert()(environment), RerunRecorder(folder, pictures=0)
         first, draws = [], []  # of every episode; all of their images might not fit into memory
         for seed in seeds:
             episode = rollout(environment, expert, seed, recorder)

@@ -14,6 +14,7 @@ from lightning import Callback, LightningModule, Trainer
 
 from vla.config.check import TRAINING, Job
 from vla.config.experiment import Experiment, training_policy
+from vla.config.origin import Origin
 from vla.config.packages import remember_trust
 from vla.data.episodes import EpisodeStore
 from vla.io.files import warn_on_error, writing
@@ -123,7 +124,8 @@ def _fit(experiment: Experiment, state: TrainingProgress, trainer: Trainer, grac
     collection_s = collection_time(store, experiment["collect"]["episodes"])
     if not state.resume_from:
         save_config(output, experiment.config, experiment.changes)  # also of a training that fails at its start
-    with writing(output), _reported(experiment, trainer, graceful_stop, learner, collection_s):
+    origins = _origins(experiment, state)
+    with writing(output), _reported(experiment, trainer, graceful_stop, learner, collection_s, origins):
         try:
             with (
                 explain_memory_errors(experiment.config),
@@ -186,15 +188,26 @@ def _closed_loop(experiment: Experiment, checkpoints: Path) -> ClosedLoop | None
     return ClosedLoop(make_environment, make_policy, seeds, checkpoints) if seeds else None
 
 
+def _origins(experiment: Experiment, state: TrainingProgress) -> list[Origin]:
+    """Return the origins of a training: of its beginning, and of what continued it."""
+    before = read_training(experiment.output) if state.resume_from else None
+    earlier = before.origins if before else []
+    return earlier if experiment.origin in earlier else [*earlier, experiment.origin]
+
+
 @contextmanager
 def _reported(
-    experiment: Experiment, trainer: Trainer, graceful_stop: GracefulStop, learner: Learner, collection_s: float | None
+    experiment: Experiment,
+    trainer: Trainer,
+    graceful_stop: GracefulStop,
+    learner: Learner,
+    collection_s: float | None,
+    origins: list[Origin],
 ) -> Iterator[None]:
     """Write the report page and the log summary however training ends, including the runs it resumed from."""
     output = experiment.output
     parameters = sum(parameter.numel() for parameter in learner.model.parameters())
     start = f", starting from {experiment.pretrained}" if experiment.pretrained else ""
-    _ = experiment.origin  # of the code that is trained with, not of later changes
     log.info("training %s with %.2f M parameters%s", type(learner.model).__name__, parameters / 1e6, start)
     ended = "done"
     try:
@@ -210,8 +223,8 @@ def _reported(
             graceful_stop.started or (saved := read_training(output)) is None or ended == "done" != saved.ended
         ):
             collected = collection_s and round(collection_s, 1)
-            size, origin = (parameters, trainer.global_step, round(seconds, 1)), experiment.origin
-            save_training(output, Training(*size, ended, collected, origin=origin))
+            size = parameters, trainer.global_step, round(seconds, 1)
+            save_training(output, Training(*size, ended, collected, origins=origins))
             with warn_on_error(output / PAGE):
                 write_page(output)
     log.info("trained %d steps in %.0f s", trainer.global_step, seconds)

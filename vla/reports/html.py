@@ -45,7 +45,8 @@ class PageTable:
 
 
 def _is_number(cell: str) -> bool:
-    return not cell or cell == ABSENT or (re.match(r"[+-]?\d", cell) is not None and "<div" not in cell)
+    number = r"[+-]?\d[\d.,/e+ -]*"
+    return not cell or cell == ABSENT or re.fullmatch(rf"({number}|<b>{number}</b>)( <span.*)?", cell) is not None
 
 
 def rate(interval: Interval) -> Markup:

@@ -67,7 +67,7 @@ def write_index(runs: Path) -> Path:
         ]
         heads = ("run", "written", "policy", "task", "success [%]", "episodes", "training")
         count = f"{len(rows)} run{'s' * (len(rows) != 1)}"
-        return render(runs / INDEX, "index.html", title=f"{count} in {runs.name}", table=PageTable(heads, rows))
+        return render(runs / INDEX, "index.html", title=count, table=PageTable(heads, rows))
 
 
 def _entries(runs: Path) -> Iterator[tuple[str, Entry]]:

@@ -132,8 +132,10 @@ def _checkpoint(run: Run, checkpoint: str) -> Path:
 
 def _origins(run: Run) -> dict[str, dict[str, str]]:
     """Return part of the work → name and text of what is known of its origin; a single part if all are alike."""
-    parts = {"training": run.training, "evaluation": run.report or run.errors}
-    known = {name: part.origin for name, part in parts.items() if part and part.origin}
+    begun, evaluated = run.training.origins if run.training else [], run.report or run.errors
+    known = {f"training, part {part}" if part > 1 else "training": each for part, each in enumerate(begun, 1)}
+    if evaluated and evaluated.origin:
+        known["evaluation"] = evaluated.origin
     alike = len({str(origin) for origin in known.values()}) == 1
     return {"": _of(next(iter(known.values())))} if alike else {name: _of(origin) for name, origin in known.items()}
 

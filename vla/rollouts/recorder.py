@@ -41,7 +41,7 @@ class RerunRecorder:
     It contains the scene if the environment is `Drawable`, and a log if it is `Eventful`.
     """
 
-    def __init__(self, folder: str | os.PathLike[str], pictures: Natural = 0) -> None:
+    def __init__(self, folder: str | os.PathLike[str], pictures: Natural) -> None:
         """Create the folder of the recordings; files are named by `recording_name`.
 
         Args:

@@ -63,7 +63,7 @@ class Training:
     ended: str  # "done", "interrupted", or an error
     collection_s: NonNegative | None = None  # duration of the collection, if known
     checkpoint: CheckpointName | None = None  # selected for evaluation
-    origin: Origin | None = None
+    origins: list[Origin] = field(default_factory=list)  # of its beginning, and of what continued it
 
 
 @dataclass(frozen=True)
