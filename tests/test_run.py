@@ -10,6 +10,7 @@ import shutil
 import signal
 import socket
 import time
+from html import unescape
 from pathlib import Path
 from socket import create_connection, create_server
 from typing import Any
@@ -73,7 +74,9 @@ def test_the_main_job_collects_trains_evaluates_and_records(home: Path) -> None:
     page = (home / "run/report.html").read_text()
     for words in ("4 steps", "collect.episodes", ">500</code>", "First training batch", 'href="rollouts.rrd"', "${"):
         assert (words in page) == (words != "${"), words
-    assert training["origins"] == [report["origin"]] and "python -m vla.run" in report["origin"]["command"] in page
+    command = report["origin"]["command"]
+    assert training["origins"] == [report["origin"]] and command.startswith("python -m vla.run ")
+    assert command in unescape(page)
     assert report["origin"]["host"] == socket.gethostname() in page
     moving = sorted(path.name for path in (home / "run/recordings").iterdir())
     named = {each["seed"]: recording_name(each["seed"], each["outcome"]) for each in report["per_episode"]}

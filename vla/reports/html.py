@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import re
 from base64 import b64encode
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from functools import cached_property
@@ -170,8 +170,3 @@ def render(path: Path, template: str, **content: Any) -> Path:
     page = environment.get_template(template).render(written=f"{datetime.now():%Y-%m-%d %H:%M}", **content)
     write_text(path, page)
     return path
-
-
-def filled(tables: Iterable[PageTable]) -> list[PageTable]:
-    """Return the tables that have rows."""
-    return [table for table in tables if table.rows]

@@ -9,24 +9,18 @@ from vla.config.differences import ABSENT, at
 from vla.config.origin import Origin
 from vla.data.index import listed
 from vla.io.files import warn_on_error
-from vla.reports.conditions import SecondaryRows
 from vla.reports.evaluation import factor_panels
 from vla.reports.html import (
-    DIFFERENCE,
     PageTable,
     code,
-    difference,
     duration,
-    filled,
     in_words,
-    rate,
     render,
-    secondary,
     value,
 )
 from vla.reports.index import INDEX, RUNS, Entry, write_index
+from vla.reports.result_tables import condition_tables, error_table, rate_tables, rounds_table
 from vla.reports.training_curves import draw_run
-from vla.rollouts.motion import AMOUNTS
 from vla.rollouts.moving_picture import read_moving_pictures
 from vla.rollouts.recordings import shown
 from vla.rollouts.results import ERROR, Report
@@ -45,6 +39,7 @@ def write_page(folder: Path) -> Path:
         ValueError: a file is damaged.
     """
     run = read_run(folder)
+    report = run.reports.get(IN_DISTRIBUTION, Report(()))
     pictures = read_moving_pictures(folder / RECORDINGS)
     page = render(
         folder / PAGE,
@@ -56,11 +51,11 @@ def write_page(folder: Path) -> Path:
         anytime=any(report.anytime for report in run.reports.values()),
         facts=_facts(run),
         all_steps=at(run.config, "trainer.max_steps", None),
-        tables=filled(_rate_tables(run)),
-        report=run.reports.get(IN_DISTRIBUTION),
-        panels=factor_panels(run.reports[IN_DISTRIBUTION]) if run.report else {},
-        errors=_error_table(run),
-        rounds=_rounds_table(run),
+        tables=[table for table in (*condition_tables(run), *rate_tables(report)) if table.rows],
+        report=report if run.report else None,
+        panels=factor_panels(report),
+        errors=error_table(run),
+        rounds=rounds_table(run),
         curves=draw_run(run.metrics),
         recorded=_recorded(run),
         recording=RECORDING if (folder / RECORDING).is_file() else None,
@@ -160,107 +155,6 @@ def _recorded(run: Run) -> str:
         if found := [each.seed in recorded for each in played if each.success == good and each.outcome != ERROR]:
             parts.append(f"{sum(found)} of {len(found)} {name}")
     return f"{RECORDING} has {' and '.join(parts)}"
-
-
-def _error_table(run: Run) -> PageTable:
-    """Tabulate component, error with its interval, and error of a constant action."""
-    rows = []
-    for each in run.errors.components if run.errors else ():
-        unit, error, interval, constant = each.readable()
-        rows.append([each.name, f"{error} ({interval}) {unit}", f"{constant} {unit}"])
-    note = (
-        "Open loop: the policy saw recorded observations, on which its actions have no effect. The errors tell how "
-        "well it imitates the recordings, not how often it succeeds. Means over episodes with 95 % confidence "
-        "intervals; the constant action is the mean of the training episodes."
-    )
-    heads = ("component", "mean absolute error", "of the constant action")
-    return PageTable(heads, rows, "Errors on held-out recordings", note)
-
-
-def _rate_tables(run: Run) -> list[PageTable]:
-    """Tabulate success by condition, tier and task, milestones and motion."""
-    seen, conditions = run.reports.get(IN_DISTRIBUTION, Report(())), run.report.conditions if run.report else {}
-    mean = seen.mean_over_tiers
-    heads = ("condition", "success [%]", "episodes", *(f"{head} from {IN_DISTRIBUTION}" for head in DIFFERENCE[:1]))
-    found = {name: conditions[name].comparison if name in conditions else None for name in run.reports}
-    rows = [[in_words(name), *_rate(each), *difference(found[name])] for name, each in run.reports.items()]
-    metrics: SecondaryRows = {(name,): part.secondary for name, part in conditions.items()}
-    tiers = [[in_words(name), *_rate(part)] for name, part in seen.by_tier.items()]
-    tiers += [[seen.mean_label, rate(mean), ""]] if mean else []
-    tasks = [[in_words(name), *_rate(part)] for name, part in seen.by_task.items()]
-    completed = [[name, *_rate(seen, count)] for name, count in seen.in_a_row.items()]
-    milestones = [[in_words(name), *_rate(seen, count)] for name, count in seen.milestones.items()]
-    motion = [[AMOUNTS[name], str(median), str(median.episodes)] for name, median in seen.medians.items()]
-    return [
-        PageTable(
-            (*heads, *DIFFERENCE[1:]), rows if conditions else [], "Success under other conditions, on the same seeds"
-        ),
-        secondary(
-            metrics,
-            ["condition"],
-            f"Secondary metrics under other conditions, as the difference from {IN_DISTRIBUTION}",
-        ),
-        PageTable(
-            ("tier", "success [%]", "episodes"), tiers, "Success by tier of difficulty", "" if seen.anytime else TIERS
-        ),
-        PageTable(("task", "success [%]", "episodes"), tasks, "Success by task"),
-        PageTable(
-            ("completed", "episodes [%]", "episodes"), completed, "Instructions completed in a row", _in_a_row(seen)
-        ),
-        PageTable(("milestone", "reached [%]", "episodes"), milestones, "Milestones", MILESTONES),
-        PageTable(("", "median", "episodes"), motion, "Motion", MOTION),
-    ]
-
-
-TIERS = (
-    "The mean over tiers weighs every tier alike, success every episode. The intervals here, and that of success, "
-    "treat the tasks as given: only chance within a task counts."
-)
-MILESTONES = "Share of the episodes in which each milestone was reached, regardless of the outcome."
-MOTION = (
-    "Medians of the successful episodes, and their 95 % confidence intervals. Log jerk is the logarithm of the "
-    "dimensionless jerk of the tool: 5.3 is the smoothest motion from rest to rest, every stop and tremor adds to it."
-)
-
-
-def _rate(report: Report, count: int | None = None) -> list[str]:
-    """Return the cells of the rate of an event that `count` completed episodes had, by default that of success."""
-    interval = report.interval if count is None else report.interval_of(count)
-    count = report.successes if count is None else count
-    return [rate((count / max(report.episodes, 1), *interval)), f"{count}/{report.episodes}"]
-
-
-def _in_a_row(report: Report) -> str:
-    if report.mean_in_a_row is None:
-        return ""
-    mean, low, high = (f"{number:.2f}" for number in report.mean_in_a_row)
-    return (
-        "Share of the episodes in which at least so many instructions, given one after the other, were completed. On "
-        f"average {mean} were ({low}-{high})."
-    )
-
-
-def _rounds_table(run: Run) -> PageTable:
-    rounds = run.report.rounds if run.report else []
-    first = int(bool(rounds) and rounds[0].episodes > 0)  # a round without episodes comes before the first one
-    rows = [
-        [
-            str(number),
-            str(each.episodes),
-            str(each.successes) if each.episodes else "",
-            f"{100 * each.validation:.1f}" if each.validation is not None else "",
-            duration(each.collection_s) if each.episodes else "",
-            duration(each.training_s),
-        ]
-        for number, each in enumerate(rounds, first)
-    ]
-    heads = ("round", "labelled episodes", "of these successes", "success in validation afterwards [%]")
-    note = (
-        "In every round the expert labelled what the policy of the round before saw, which acted alone or, with "
-        "improve.beta, in turns with the expert, and training went on with that; a round without episodes is the "
-        "training on demonstrations alone. Validation has other episodes than the success at the top."
-    )
-    return PageTable((*heads, "episodes took", "training took"), rows, "Rounds", note)
 
 
 def _changes_table(run: Run) -> PageTable | None:
