@@ -205,9 +205,12 @@ def _require_apart(cfg: DictConfig) -> None:
 
 
 def _require_different_stores(cfg: DictConfig) -> None:
-    stores = Counter(Path(folder).resolve() for folder in (cfg.collect.folder, *(cfg.collect.more or ())))
-    if twice := [str(folder) for folder, count in stores.items() if count > 1]:
-        raise ValueError(f"collect.folder and collect.more name {twice[0]} twice: its episodes would count twice")
+    folder = Path(cfg.collect.folder).resolve()
+    if folder in (Path(more).resolve() for more in cfg.collect.more or ()):
+        raise ValueError(
+            f"collect.folder and collect.more name the same store, {folder}: omit it in collect.more, where only further "
+            "stores belong, several times if they are to count for more"
+        )
 
 
 def _require_together(tokenizer: type, model: type) -> None:
