@@ -208,8 +208,8 @@ def _require_different_stores(cfg: DictConfig) -> None:
     folder = Path(cfg.collect.folder).resolve()
     if folder in (Path(more).resolve() for more in cfg.collect.more or ()):
         raise ValueError(
-            f"collect.folder and collect.more name the same store, {folder}: omit it in collect.more, where only further "
-            "stores belong, several times if they are to count for more"
+            f"collect.folder and collect.more name the same store, {folder}: omit it in collect.more, which takes "
+            "further stores only, several times if they are to count for more"
         )
 
 
