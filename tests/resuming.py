@@ -70,7 +70,7 @@ def train(
     if checkpoint:
         restore_metrics(made, checkpoint)
     learner = Learner(model=model, spec=toy.SPEC, config={}, **defaults_of("learner/default", warmup_steps=3, lr=0.001))
-    data = windows(store, history=model.history, chunk=model.chunk)
+    data = windows(store, history=model.history, chunk=model.chunk, tokenize=model.text.tokenize)
     with graceful_stop.explaining_restore(checkpoint):
         made.fit(learner, datamodule=data, ckpt_path=checkpoint, weights_only=True)
     path = output / "checkpoints/last.ckpt"

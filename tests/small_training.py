@@ -6,7 +6,7 @@ from typing import Any
 
 import lightning
 from defaults import defaults_of
-from fake_batch import make_bc
+from fake_batch import make_bc, with_text
 from torch.utils.data import DataLoader
 from toy import SPEC
 
@@ -37,11 +37,12 @@ def make_trainer(steps: int, *callbacks: lightning.Callback, precision: Any = "3
     )
 
 
-def loader(batch: dict[str, Any], steps: int) -> DataLoader[Any]:
-    return DataLoader([batch] * steps, batch_size=None)  # type: ignore[arg-type]
+def loader(learner: Learner, batches: list[dict[str, Any]]) -> DataLoader[Any]:
+    """Loader of batches, with their sentences as tokens."""
+    return DataLoader([with_text(learner.model, batch) for batch in batches], batch_size=None)  # type: ignore[arg-type]
 
 
 def fit(learner: Learner, batch: dict[str, Any], steps: int, **options: Any) -> lightning.Trainer:
     trainer = make_trainer(steps, **options)
-    trainer.fit(learner, loader(batch, steps), loader(batch, 1))
+    trainer.fit(learner, loader(learner, [batch] * steps), loader(learner, [batch]))
     return trainer

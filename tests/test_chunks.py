@@ -152,7 +152,7 @@ def test_looks_again_after_the_actions_that_are_executed(make: Callable[..., One
     policy = as_policy(model)
     looks: list[int] = []
     acted: list[np.ndarray] = []
-    model.shift.register_forward_pre_hook(lambda module, inputs: looks.append(len(acted)))
+    model.images[0].register_forward_pre_hook(lambda module, inputs: looks.append(len(acted)))
     seen = observations(6)
     policy.reset(seen[0].instruction, 0)
     for observation in seen:

@@ -169,7 +169,8 @@ def test_writing_ends_when_all_have_ended() -> None:
 def test_a_trained_decoder_of_fast_tokens_plays_an_episode_from_its_checkpoint(tmp_path: Path) -> None:
     model = make_fast(chunk=4)
     trainer = make_trainer(3)
-    trainer.fit(make_learner(model), loader(make_batch(2, chunk=4), 3))
+    learner = make_learner(model)
+    trainer.fit(learner, loader(learner, [make_batch(2, chunk=4)] * 3))
     trainer.save_checkpoint(tmp_path / "fast.ckpt")
     restored = make_decoder(chunk=4, tokenizer=Fast(bins=256, chunk=4, spec=SPEC, scale=10.0))
     read_checkpoint(tmp_path / "fast.ckpt").restore(restored)

@@ -1,4 +1,4 @@
-"""Device placement of models, tested with torch's fake tensors, which raise on operations across devices."""
+"""What models need of a GPU: device placement, with torch's fake tensors, and compilation as one graph."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from vla.models.diffusion import Diffusion
 from vla.models.flow import Flow
 from vla.models.model import Model
 
-MODELS: dict[str, Callable[[], Model]] = {
+MODELS: dict[str, Callable[..., Model]] = {
     "bc": make_bc,
     "rt1": partial(make_rt1, proprioception=True),
     "decoder": make_decoder,
@@ -39,12 +39,11 @@ class Call(nn.Module):
         return getattr(self.model, self.method)(batch)
 
 
-@pytest.mark.parametrize("method", ["loss", "encode", "predict"])
+@pytest.mark.parametrize("method", ["augment", "loss", "encode", "predict"])
 @pytest.mark.parametrize("name", MODELS)
 def test_nothing_of_a_model_stays_behind_on_the_cpu(name: str, method: str) -> None:
-    model = MODELS[name]()
-    call = Call(model.train(method == "loss"), method)
-    model.shift = nn.Identity()  # which counts on the CPU by how much to shift
+    model = MODELS[name](shift=(64, 64))
+    call = Call(model.train(method in ("augment", "loss")), method)
     batch = with_text(model, make_batch(model.history, model.chunk))
     with FakeTensorMode() as mode:
 
@@ -56,3 +55,12 @@ def test_nothing_of_a_model_stays_behind_on_the_cpu(name: str, method: str) -> N
     results = [value for value in _pytree.tree_leaves(found) if isinstance(value, Tensor)]
     assert all(result.device.type == "cuda" for result in results)
     assert results or method == "encode"  # what keeps nothing of a frame
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_the_compiled_part_of_a_training_step_is_one_graph(name: str) -> None:
+    torch._dynamo.reset()
+    model = MODELS[name](shift=(64, 64)).train()
+    batch = model.augment(with_text(model, make_batch(model.history, model.chunk)))
+    compiled: Any = torch.compile(model, backend="eager", fullgraph=True)  # raises where a graph would break
+    assert compiled(batch).keys() == model(batch).keys()

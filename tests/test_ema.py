@@ -33,7 +33,8 @@ class Watch(Callback):
 def test_it_is_the_exponential_average_of_the_steps_and_what_is_validated_and_saved(tmp_path: Path) -> None:
     batch, watch, steps = make_batch(1), Watch(), 2 * EVERY + 1
     trainer = make_trainer(steps, EMA(DECAY), watch)
-    trainer.fit(make_learner(lr=1e-2, warmup_steps=0), loader(batch, steps), loader(batch, 1))
+    learner = make_learner(lr=1e-2, warmup_steps=0)
+    trainer.fit(learner, loader(learner, [batch] * steps), loader(learner, [batch]))
     trainer.save_checkpoint(tmp_path / "last.ckpt")
     weights = [DECAY ** (steps - step) for step in range(EVERY, steps + 1, EVERY)]
     seen = torch.stack(watch.trained[EVERY - 1 :: EVERY])

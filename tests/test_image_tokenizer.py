@@ -112,8 +112,10 @@ def test_keypoints_of_an_image_of_one_colour_are_its_middle() -> None:
 def test_a_clip_is_shifted_as_one_and_clips_differ() -> None:
     torch.manual_seed(0)
     images = torch.randint(1, 256, (8, 1, 64, 64, 3)).byte().expand(-1, 3, -1, -1, -1)
-    shifted = RandomShift(16, 32)(images)  # up to 4 px up or down, 8 px left or right
+    both = RandomShift(16, 32)({"front": images, "wrist": images})  # up to 4 px up or down, 8 px left or right
+    shifted = both["front"]
     assert shifted.shape == images.shape and shifted.dtype == torch.uint8
+    assert both.keys() == {"front", "wrist"} and not torch.equal(shifted, both["wrist"])
     assert torch.equal(shifted[:, 0], shifted[:, 2])
     assert torch.equal(shifted[:, :, 4:-4, 8:-8].unique(), images.unique())
     offsets = set()
@@ -130,5 +132,16 @@ def test_a_clip_is_shifted_as_one_and_clips_differ() -> None:
 
 
 def test_outside_training_nothing_is_shifted() -> None:
-    images = torch.randint(256, (2, 1, 16, 16, 3)).byte()
-    assert RandomShift(64, 64).eval()(images) is images
+    rgb = {"front": torch.randint(256, (2, 1, 16, 16, 3)).byte()}
+    assert RandomShift(64, 64).eval()(rgb) is rgb
+
+
+def test_what_is_shifted_beyond_the_border_is_black() -> None:
+    torch.manual_seed(0)
+    images = torch.full((16, 2, 32, 48, 3), 255).byte()  # wider than high
+    shifted = RandomShift(256, 256)({"front": images})["front"]  # up to the height of the image
+    white = (shifted == 255).all(-1)
+    rows, columns = white.any(3)[:, 0], white.any(2)[:, 0]
+    assert torch.equal(shifted[white].unique(), torch.tensor([255])) and (shifted[~white] == 0).all()
+    assert torch.equal(white[:, 0], rows[:, :, None] & columns[:, None, :])  # a rectangle
+    assert (rows.sum(1) < 32).sum() > 8 and (columns.sum(1) >= 16).all()

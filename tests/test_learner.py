@@ -10,9 +10,8 @@ from typing import Any
 import lightning
 import pytest
 import torch
-from fake_batch import make_batch, make_bc, make_decoder, make_rt1
+from fake_batch import make_batch, make_bc, make_decoder, make_rt1, with_text
 from small_training import fit, loader, make_learner, make_trainer
-from torch.utils.data import DataLoader
 
 from vla.models.model import Model
 from vla.models.vision.timm_encoders import FilmBackbone
@@ -36,8 +35,8 @@ def test_the_error_of_a_component_is_the_mean_distance_over_what_is_valid() -> N
     learner = make_learner(model).eval()
     batch = make_batch(1)
     batch["valid"][0] = False
-    metrics = make_trainer(1).validate(learner, loader(batch, 1), verbose=False)[0]
-    logits = model(learner.on_after_batch_transfer(batch, 0))["logits"]
+    metrics = make_trainer(1).validate(learner, loader(learner, [batch]), verbose=False)[0]
+    logits = model(with_text(model, batch))["logits"]
     error = (model.tokenizer.decode_logits(logits) - batch["action"]).abs()[1:, ..., 0].mean() * 1000
     assert metrics["val/error_x_mm"] == pytest.approx(error.item(), rel=1e-4)
 
@@ -59,9 +58,10 @@ def test_the_step_is_named_whose_loss_was_the_first_that_was_not_finite(tmp_path
     """Though it is looked for less often than every step, nothing is saved in between."""
     good, bad = make_batch(1), make_batch(1)
     bad["state"][:] = math.nan
-    batches: DataLoader[Any] = DataLoader([good, good, bad, good, good], batch_size=None)  # type: ignore[arg-type]
+    learner = make_learner()
+    batches = loader(learner, [good, good, bad, good, good])
     with pytest.raises(ValueError, match="at step 2: lower"):
-        make_trainer(5).fit(make_learner(), batches)
+        make_trainer(5).fit(learner, batches)
 
     class Save(lightning.Callback):
         def on_train_batch_end(self, trainer: Any, *_: Any) -> None:
@@ -81,7 +81,8 @@ def test_training_leaves_no_setting_behind_that_changes_what_a_policy_computes()
             during.append(flash())
 
     torch.backends.cuda.enable_flash_sdp(True)
-    make_trainer(1, Watch()).fit(make_learner(), loader(make_batch(1), 1))
+    learner = make_learner()
+    make_trainer(1, Watch()).fit(learner, loader(learner, [make_batch(1)]))
     assert during == [False] and flash()
 
 
@@ -94,7 +95,7 @@ def test_schedules() -> None:
                 seen.append(trainer.optimizers[0].param_groups[0]["lr"])
 
         learner = make_learner(lr=1.0, warmup_steps=4, schedule=schedule)
-        make_trainer(12, Watch()).fit(learner, loader(make_batch(1), 12))
+        make_trainer(12, Watch()).fit(learner, loader(learner, [make_batch(1)] * 12))
         return seen
 
     cosine, constant = rates("cosine"), rates("constant")

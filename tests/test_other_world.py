@@ -65,11 +65,12 @@ def policy_of(model: str, store: Path, environment: Any = None) -> Policy:
     """A policy after two steps of training."""
     experiment, opened = Experiment.of(composed(model)), EpisodeStore(store)
     learner = experiment.fitted_learner(opened)
-    data = experiment.data(opened, learner.model.history, learner.model.chunk)
+    network = learner.model
+    data = experiment.data(opened, network.history, network.chunk, network.text.tokenize)
     quiet = {"logger": False, "enable_progress_bar": False, "enable_model_summary": False}
     trainer = Trainer(accelerator="cpu", max_steps=2, enable_checkpointing=False, **quiet)  # type: ignore[arg-type]
     trainer.fit(learner, datamodule=data)
-    return as_policy(learner.model, opened.spec)
+    return as_policy(network, opened.spec)
 
 
 @pytest.mark.parametrize("model", TINY)

@@ -18,8 +18,8 @@ from composing import composed
 from defaults import defaults_of
 from fake_batch import as_policy, make_batch
 from safetensors.torch import save_file
+from small_training import loader
 from tiny_encoder import write_encoder
-from torch.utils.data import DataLoader
 from wheels import contents, digest, write_wheel, zipped_folder
 
 from vla import jobs
@@ -48,8 +48,8 @@ def trained(tmp_path: Path, tabletop: Tabletop, *overrides: str) -> tuple[Policy
         enable_progress_bar=False,
         enable_model_summary=False,
     )
-    batches: Any = [make_batch(learner.model.history, learner.model.chunk, spec=tabletop.spec)] * 2
-    trainer.fit(learner, DataLoader(batches, batch_size=None))
+    batch = make_batch(learner.model.history, learner.model.chunk, spec=tabletop.spec)
+    trainer.fit(learner, loader(learner, [batch] * 2))
     trainer.save_checkpoint(tmp_path / "last.ckpt")
     read_checkpoint(tmp_path / "last.ckpt").restore(learner.model)  # the averages
     return as_policy(learner.model, tabletop.spec, device="cpu"), tmp_path / "last.ckpt"

@@ -57,7 +57,8 @@ def train(store: Path, folder: Path, *overrides: str, checkpoint: Path | None = 
     quiet_lightning()
     learner = untrained(store, *overrides)
     trainer = make_trainer(experiment.config, folder)
-    data = experiment.data(EpisodeStore(store), learner.model.history, learner.model.chunk)
+    model = learner.model
+    data = experiment.data(EpisodeStore(store), model.history, model.chunk, model.text.tokenize)
     trainer.fit(learner, datamodule=data, ckpt_path=checkpoint, weights_only=True)
     trainer.save_checkpoint(folder / LAST)
     return {name: value.item() for name, value in trainer.callback_metrics.items() if name.startswith("val/")}

@@ -193,8 +193,13 @@ class Experiment:
             self.fit_tokenizer(learner.model.tokenizer, store)
         return learner
 
-    def data(self, store: EpisodeStore, history: int, chunk: int) -> WindowDataModule:
-        """Build windows of `history` frames and `chunk` actions from the episodes that `collect` names."""
+    def data(
+        self, store: EpisodeStore, history: int, chunk: int, tokenize: Callable[[list[str]], Any] | None = None
+    ) -> WindowDataModule:
+        """Build windows of `history` frames and `chunk` actions from the episodes that `collect` names.
+
+        `tokenize` is that of a text encoder.
+        """
         return build(
             self["data"],
             "data",
@@ -202,6 +207,7 @@ class Experiment:
             spec=store.spec,
             history=history,
             chunk=chunk,
+            tokenize=tokenize,
             episodes=self["collect"]["episodes"],
             more=self["collect"]["more"] or (),
         )

@@ -20,6 +20,7 @@ from pathlib import Path
 
 import numpy as np
 from lightning import LightningDataModule
+from torch import Tensor
 
 from vla.data.episodes import EpisodeStore
 from vla.data.index import Entry
@@ -110,6 +111,7 @@ class WindowDataModule(LightningDataModule):
         validation_windows: approximate number of held-out windows per validation, over all processes.
         depth: include depth in batches.
         ahead: batches made in advance.
+        tokenize: sentences → tensor, added to batches as `text`; None adds nothing.
         episodes: use only the first so many episodes; all of them when None.
         more: further episode stores, all of whose episodes are used; they may lack the simulator's truth.
     """
@@ -126,6 +128,7 @@ class WindowDataModule(LightningDataModule):
         validation_windows: Count,
         depth: bool,
         ahead: Natural,
+        tokenize: Callable[[list[str]], Tensor] | None = None,
         episodes: Count | None = None,
         more: Sequence[str | Path] = (),
     ) -> None:
@@ -133,7 +136,7 @@ class WindowDataModule(LightningDataModule):
         self.batch_size = batch_size
         self._folder, self._spec, self._episodes, self._more = Path(folder), spec, episodes, more
         self._history, self._chunk, self._depth = history, chunk, depth
-        self._seed, self._ahead = seed, ahead
+        self._seed, self._ahead, self._tokenize = seed, ahead, tokenize
         self._fraction, self._validation_windows = validation_fraction, validation_windows
 
     def setup(self, stage: str | None = None) -> None:
@@ -181,7 +184,7 @@ class WindowDataModule(LightningDataModule):
 
     def train_dataloader(self) -> Prefetcher:
         """Return endless batches, from the trainer's current step on."""
-        return Prefetcher(self.make_batch, self._training_plan, self._ahead)
+        return Prefetcher(self._make_batch, self._training_plan, self._ahead)
 
     def val_dataloader(self) -> SizedPrefetcher | list[Batch]:
         """Return the validation batches, the same every time."""
@@ -193,7 +196,7 @@ class WindowDataModule(LightningDataModule):
         # Whole batches: one shape for a compiled model, and the same number of steps in all processes.
         spread = np.linspace(0, len(self.held_out_windows) - 1, batches * share).round().astype(np.int64)
         windows = self.held_out_windows[spread].reshape(batches, self.batch_size, processes)
-        return SizedPrefetcher(self.make_batch, list(windows[:, :, rank]), self._ahead)
+        return SizedPrefetcher(self._make_batch, list(windows[:, :, rank]), self._ahead)
 
     def order(self, step: int, rank: int = 0, processes: int = 1) -> Array:
         """Return the windows (B,) of training step `step` in process `rank`, as row numbers.
@@ -206,6 +209,14 @@ class WindowDataModule(LightningDataModule):
         numbers = range(shuffle[0], shuffle[-1] + 1)
         chosen = [_shuffled(count, self._seed, number)[place[shuffle == number]] for number in numbers]
         return self.training_windows[np.concatenate(chosen)]
+
+    def _make_batch(self, windows: Array) -> Batch:
+        """Return the batch of windows with its tokenized instructions, in page-locked memory if a GPU is to read it."""
+        batch = self.make_batch(windows)
+        if self._tokenize is not None:
+            text = self._tokenize(batch["instruction"])
+            batch["text"] = text.pin_memory() if self._on_gpu() else text
+        return batch
 
     def _training_plan(self) -> Iterator[Array]:
         rank, processes = self._place()

@@ -100,11 +100,12 @@ def _fit(experiment: Experiment, state: TrainingProgress, trainer: Trainer, grac
     store = demonstrations(experiment)
     if origin is None:
         experiment.fit_tokenizer(learner.model.tokenizer, store)
-    data = experiment.data(store, learner.model.history, learner.model.chunk)
-    _log_tokenization_error(learner.model, store)
+    model = learner.model
+    data = experiment.data(store, model.history, model.chunk, model.text.tokenize)
+    _log_tokenization_error(model, store)
     for further in more:
         if further.episodes:
-            _warn_of_clipped(learner.model, further, further.statistics.chunks(learner.model.chunk))
+            _warn_of_clipped(model, further, further.statistics.chunks(model.chunk))
     data.setup()
     if data.batch_size > len(data.training_windows):
         raise ValueError(

@@ -62,15 +62,18 @@ class FrameModel(Model):
             self.proprioception = RunningNormalizer(self.robot_state_width)
             self.proprioception_token = nn.Linear(self.robot_state_width, width)
 
+    def augment(self, batch: Batch) -> Batch:
+        """Shift the images of every window."""
+        return {**batch, "rgb": self.shift(batch["rgb"])}
+
     def encode(self, batch: Batch) -> Tensor:
         """Return (B, T, N, E) tokens; those of a frame depend only on that frame and the instruction."""
-        text = self.text(batch["text"])  # (B, text_width)
-        frames = batch["present"].shape[1]
-        repeated = text.repeat_interleave(frames, 0)  # (B·T, text_width)
+        cameras, frames = self.spec.cameras, batch["present"].shape[1]
+        text = self.text(batch["text"]).repeat(len(cameras), 1).repeat_interleave(frames, 0)
+        images = torch.cat([batch["rgb"][camera] for camera in cameras])  # one pass of the encoder for all cameras
+        every = self.image(pixels(images, self.image_size), text)  # (cameras·B·T, C, h, w)
         tokens = []
-        for index, camera in enumerate(self.spec.cameras):
-            images = pixels(self.shift(batch["rgb"][camera]), self.image_size)
-            features = self.image(images, repeated)  # (B·T, C, h, w)
+        for index, features in enumerate(every.chunk(len(cameras))):  # (B·T, C, h, w) each
             learned = self.image_tokens(self.token_learners[index](features))
             tokens.append(learned.unflatten(0, (-1, frames)))  # (B, T, learned_tokens, E)
             if self.keypoints is not None:

@@ -14,7 +14,6 @@ from vla.io.types import Natural, NonNegative, Positive, Rate
 from vla.models.compile_cache import set_compile_cache
 from vla.models.fsdp import local_shard, shard, unsharded
 from vla.models.model import Batch, Model
-from vla.models.vision.image_tokenizer import RandomShift
 from vla.spec import Spec, readable
 
 CHECK_FINITE_EVERY = 50  # steps
@@ -61,9 +60,6 @@ class Learner(LightningModule):
         """Compile the model in place, so that names in checkpoints stay; shard it if the strategy has a device mesh."""
         if self._compile:
             set_compile_cache()
-            for part in self.model.modules():
-                if isinstance(part, RandomShift):
-                    part.forward = torch.compiler.disable(part.forward)  # type: ignore[method-assign]
             self.model.compile()
             self._compile = False  # Lightning may call this hook again
         if self.device_mesh is not None:
@@ -135,17 +131,13 @@ class Learner(LightningModule):
         moved: Batch = super().transfer_batch_to_device(tensors, device, dataloader_idx)
         return {**moved, "instruction": batch["instruction"]}
 
-    def on_after_batch_transfer(self, batch: Batch, dataloader_idx: int) -> Batch:
-        """Return the batch with its tokenized instructions as `text`: outside the compiled part."""
-        return {**batch, "text": self.model.text.tokenize(batch["instruction"]).to(batch["state"].device)}
-
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
-        """Return the loss of a batch.
+        """Return the loss of a batch, augmented here, after `StepSeeding` and outside the compiled part.
 
         Raises:
             ValueError: the loss of this step or an earlier one is not finite.
         """
-        losses = self.model.loss(batch)
+        losses = self.model.loss(self.model.augment(batch))
         self._record_finite(losses["loss"].detach())
         every = self.trainer.log_every_n_steps  # type: ignore[attr-defined]
         if every and (self.global_step + 1) % every == 0:  # only when loggers write

@@ -160,6 +160,10 @@ class Model(nn.Module, ABC):
             return pose
         return torch.cat([pose, self.kinematics(batch["state"].index_select(-1, self.joints))], -1)
 
+    def augment(self, batch: Batch) -> Batch:
+        """Return a training batch with random changes to its images; this part is not compiled."""
+        return batch
+
     def encode(self, batch: Batch) -> Tensor | None:
         """Return tokens of each frame, (B, T, N, E), to cache and pass to `forward` as "tokens" instead of images.
 

@@ -42,11 +42,15 @@ class OneFrameModel(Model):
         self.proprioception = RunningNormalizer(self.robot_state_width) if proprioception else None
         self.state_widths = [self.robot_state_width] if proprioception else []
 
+    def augment(self, batch: Batch) -> Batch:
+        """Shift the images of every window."""
+        return {**batch, "rgb": self.shift(batch["rgb"])}
+
     def image_features(self, batch: Batch, text: Tensor) -> list[Tensor]:
         """Return the (B, C) keypoint features of every camera, given the (B, text_width) instruction."""
         features = []
         for camera, encoder, keypoints in zip(self.spec.cameras, self.images, self.keypoints, strict=True):
-            features.append(keypoints(encoder(pixels(self.shift(batch["rgb"][camera][:, -1:])), text)).flatten(1))
+            features.append(keypoints(encoder(pixels(batch["rgb"][camera][:, -1:]), text)).flatten(1))
         return features
 
     def state_features(self, batch: Batch) -> list[Tensor]:

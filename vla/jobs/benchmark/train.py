@@ -166,7 +166,7 @@ class Trial(lightning.Callback):
 
     def _data(self) -> WindowDataModule:
         model = self._learner.model
-        return self._experiment.data(self._store, model.history, model.chunk)
+        return self._experiment.data(self._store, model.history, model.chunk, model.text.tokenize)
 
     def on_train_start(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
         """Verify the demonstrations, which long trainings do once, and reset the peak of the memory."""
@@ -193,7 +193,7 @@ class Trial(lightning.Callback):
                 started = _now(device)
             optimizer.zero_grad()
             with trainer.precision_plugin.train_step_context():
-                loss = model.loss(self._batch)["loss"]
+                loss = model.loss(model.augment(self._batch))["loss"]
             loss.backward()
             optimizer.step()
         self._alone = _now(device) - started

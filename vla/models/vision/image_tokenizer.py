@@ -205,9 +205,9 @@ def grid(features: Tensor) -> Tensor:
 
 
 class RandomShift(nn.Module):
-    """Random shift augmentation: one offset for all images of a clip, padded with black; identity outside training.
+    """Random shift augmentation: one offset for all images of a camera's clip, padded with black.
 
-    Exclude it from compilation: every new offset would trigger a recompilation.
+    It is the identity outside training.
 
     Args:
         vertical, horizontal: largest shift either way [1/256 of the image height].
@@ -217,15 +217,25 @@ class RandomShift(nn.Module):
         super().__init__()
         self.vertical, self.horizontal = vertical, horizontal
 
-    def forward(self, images: Tensor) -> Tensor:
-        """Shift (B, T, H, W, 3) images of B clips; same shape and type."""
-        if not self.training:
-            return images
-        clips, frames, height, width, _ = images.shape
+    def forward(self, rgb: dict[str, Tensor]) -> dict[str, Tensor]:
+        """Shift camera → (B, T, H, W, 3) images of B clips, all cameras in one pass; same shapes and types.
+
+        Offsets are drawn on the device of the images, camera by camera.
+        """
+        if not self.training or not rgb:
+            return rgb
+        images = [*rgb.values()]
+        clips, frames, height, width, _ = images[0].shape
         up, left = round(self.vertical * height / 256), round(self.horizontal * height / 256)
-        padded = images.new_zeros(clips, frames, height + 2 * up, width + 2 * left, 3)
-        padded[:, :, up : up + height, left : left + width] = images
-        rows = torch.randint(2 * up + 1, (clips,)).tolist()
-        columns = torch.randint(2 * left + 1, (clips,)).tolist()
-        crops = zip(padded, rows, columns, strict=True)
-        return torch.stack([clip[:, row : row + height, column : column + width] for clip, row, column in crops])
+        tall, wide = height + 2 * up, width + 2 * left
+        padded = images[0].new_zeros(len(rgb), clips, frames, tall, wide, 3)
+        for target, values in zip(padded, images, strict=True):
+            target[:, :, up : up + height, left : left + width] = values
+        device = padded.device
+        offsets = [torch.randint(2 * most + 1, (clips,), device=device) for _ in rgb for most in (up, left)]
+        row, column = torch.stack(offsets).view(len(rgb), 2, clips, 1, 1).unbind(1)  # (cameras, B, 1, 1) each
+        first = tall * torch.arange(len(rgb) * clips * frames, device=device).view(len(rgb), clips, frames, 1)
+        starts = (first + row + torch.arange(height, device=device)) * wide + column  # of rows [px]
+        runs = padded.flatten().unfold(0, 3 * width, 3)  # from every pixel as many as a row has, without a copy
+        shifted = runs.index_select(0, starts.flatten()).view(len(rgb), *images[0].shape)
+        return dict(zip(rgb, shifted, strict=True))
