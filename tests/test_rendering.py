@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
+import os
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -358,6 +359,64 @@ def test_a_machine_without_gl_is_told_from_others(monkeypatch: pytest.MonkeyPatc
     monkeypatch.delenv(gl.EGL_WORKS, raising=False)
     monkeypatch.setattr(gl, "EGL_PROBE", "raise SystemExit(1)")
     assert not gl.has_egl()
+
+
+@pytest.mark.parametrize(
+    ("set_before", "device"),
+    [({}, "4"), ({gl.WORKER: "3"}, "1"), ({"MUJOCO_EGL_DEVICE_ID": "7"}, "7"), ({gl.EGL_DEVICES: ""}, None)],
+)
+def test_workers_take_turns_on_the_gpus_of_a_machine(
+    set_before: dict[str, str], device: str | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("MUJOCO_EGL_DEVICE_ID", "GLCONTEXT_DEVICE_INDEX"):
+        monkeypatch.setenv(name, "")  # so that what the code sets is undone, too
+        monkeypatch.delenv(name)
+    for name, value in {gl.EGL_DEVICES: "1\n3\n4\n", gl.WORKER: "2", **set_before}.items():
+        monkeypatch.setenv(name, value)
+    gl.choose_device()
+    assert os.environ.get("MUJOCO_EGL_DEVICE_ID") == os.environ.get("GLCONTEXT_DEVICE_INDEX") == device
+
+
+def test_both_renderers_draw_on_the_chosen_device() -> None:
+    """There is none of this number, and both say so."""
+    for probe in (gl.PROBE, gl.EGL_PROBE):
+        chosen = {"MUJOCO_GL": "egl", "MUJOCO_EGL_DEVICE_ID": "99"}
+        code = f"from vla.tasks.gl import choose_device; choose_device()\n{probe}"
+        done = subprocess.run(
+            [sys.executable, "-c", code], env={**os.environ, **chosen}, capture_output=True, text=True
+        )
+        assert done.returncode != 0 and "99" in done.stderr, done.stderr
+
+
+def test_a_software_renderer_is_no_gpu_to_take_turns_on() -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", gl.DEVICES_PROBE],
+        env={**os.environ, "MUJOCO_GL": "egl", "LIBGL_ALWAYS_SOFTWARE": "1"},
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stderr
+    assert all(number.isdecimal() for number in done.stdout.split())
+
+
+def test_triton_is_loaded_before_the_software_renderer_where_a_gpu_needs_it() -> None:
+    """In the other order the process would crash, as soon as Triton compiles."""
+    code = """
+from unittest.mock import patch
+from vla.parallel import processes
+from vla.tasks import gl
+with patch.object(processes, "GPUS", ("null",)):  # as if /dev/null were one
+    gl.choose_backend()
+import moderngl
+context = moderngl.create_standalone_context(backend="egl")
+from triton._C.libtriton import llvm
+llvm.init_targets()
+picture = context.simple_framebuffer((8, 8))
+picture.clear(1.0, 1.0, 1.0)
+assert picture.read()[:3] == b"\\xff\\xff\\xff"
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.returncode == 0, (done.returncode, done.stderr)
 
 
 def test_heavy_meshes_are_decimated_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -9,6 +9,8 @@ import re
 import shutil
 import signal
 import socket
+import subprocess
+import sys
 import time
 from html import unescape
 from pathlib import Path
@@ -294,6 +296,24 @@ def test_preview_shows_resets_and_their_draws(home: Path) -> None:
     recorded = {chunk.entity_path for chunk in RrdReader(home / "look/preview.rrd").stream().to_chunks()}
     assert "/camera/front/rgb" in recorded
     assert "placement" in done.stdout
+
+
+def test_preview_and_replay_need_no_viewer(home: Path) -> None:
+    (store,) = (home / "outputs/episodes").iterdir()
+    (home / "bare").mkdir()
+    for module in ("rerun", "rerun_cli", "av", "rclpy"):
+        (home / f"bare/{module}.py").write_text("raise ImportError('not installed')")
+    paths = os.pathsep.join([str(home / "bare"), *filter(None, [os.environ.get("PYTHONPATH")])])
+    for job, said in (
+        (("job=preview", "preview.episodes=1"), "plain/preview.png"),
+        (("job=inspect", f"inspect.folder={store}", "inspect.episode=2"), "bit for bit"),
+    ):
+        command = [sys.executable, "-m", "vla.run", *job, "recorder=none", "output=plain"]
+        done = subprocess.run(
+            command, cwd=home, env={**os.environ, "PYTHONPATH": paths}, capture_output=True, text=True
+        )
+        assert done.returncode == 0 and said in done.stdout, done.stderr
+    assert sorted(path.name for path in (home / "plain").iterdir() if path.suffix != "") == ["preview.png"]
 
 
 def test_a_success_rate_is_printed_even_where_the_report_cannot_be_written(home: Path) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import signal
 import sys
+import time
 from functools import partial
 from multiprocessing import active_children
 from pathlib import Path
@@ -63,6 +64,19 @@ def test_only_the_item_that_crashes_its_process_twice_is_lost() -> None:
     assert isinstance(lost, Crashed) and str(lost).startswith(
         "a worker process crashed twice: it was ended by signal 11 ("
     )
+
+
+class Numbered(Doubling):
+    """Tells which worker of its pool it is."""
+
+    def attempt(self, number: int) -> int:
+        """Wait until every worker has an item."""
+        time.sleep(0.5)
+        return int(os.environ["VLA_WORKER"])
+
+
+def test_workers_are_numbered() -> None:
+    assert {*results(Numbered, *range(6))} == {0, 1}
 
 
 def test_an_error_that_cannot_be_sent_is_told_in_words() -> None:

@@ -71,7 +71,7 @@ GROUPS = {
         Group(
             "data",
             ("vla.data.datamodule.WindowDataModule",),
-            ("folder", "spec", "history", "chunk", "episodes", "more"),
+            ("folder", "spec", "history", "chunk", "tokenize", "episodes", "more"),
             training="part",
         ),
         Group(

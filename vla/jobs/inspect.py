@@ -19,7 +19,6 @@ from vla.io.files import warn_on_error
 from vla.io.printable import show
 from vla.io.types import Natural, Text
 from vla.reports.dataset_card import store_table, write_card
-from vla.rollouts.recorder import RerunRecorder, recording_name
 from vla.rollouts.rollout import replay
 
 log = logging.getLogger(__name__)
@@ -46,7 +45,8 @@ def run(experiment: Experiment) -> None:
     else:
         if others := [name for name in ("stores", "where", "repair", "into") if asked[name]]:
             raise ValueError(f"inspect.episode replays an episode of inspect.folder: omit inspect.{others[0]}")
-        replay_episode(experiment.output, Path(asked["folder"]), seed, experiment["task"].get("robot"))
+        recorded = experiment["recorder"] is not None
+        replay_episode(experiment.output, Path(asked["folder"]), seed, experiment["task"].get("robot"), recorded)
 
 
 def inspect_store(
@@ -87,8 +87,12 @@ def _chosen(
     return new
 
 
-def replay_episode(output: Path, folder: Path, seed: int, robot: dict[str, Any] | None = None) -> None:
-    """Write `episode-SEED.rrd`: a stored episode in the 3-D scene of a replay of its actions.
+def replay_episode(
+    output: Path, folder: Path, seed: int, robot: dict[str, Any] | None = None, recorded: bool = True
+) -> None:
+    """Replay the actions of a stored episode and compare the states.
+
+    If `recorded`, write `episode-SEED.rrd`: the episode in the 3-D scene of the replay.
 
     Args:
         output: folder of the recording.
@@ -108,13 +112,19 @@ def replay_episode(output: Path, folder: Path, seed: int, robot: dict[str, Any] 
     require_no_paths(config, ("task",), folder, ["task.robot"] if robot else [])
     environment = make_environment(config["task"])
     store.spec.require(environment.spec, f"the episode store {folder}", "its task as it is built now")
+    recorder, written = None, ""
+    if recorded:
+        from vla.rollouts.recorder import RerunRecorder, recording_name  # imports the viewer's library
+
+        recorder, written = RerunRecorder(output, pictures=0), f"{recording_name(seed, episode.outcome)}.rrd"
     with environment.blind():
-        step = replay(environment, episode, RerunRecorder(output, pictures=0)).differs
+        step = replay(environment, episode, recorder).differs
     environment.close()
-    recording = output / f"episode-{seed}.rrd"
-    os.replace(output / f"{recording_name(seed, episode.outcome)}.rrd", recording)
     if step is None:
         log.info("the replay goes through the same states, bit for bit, and ends in %s", episode.outcome)
     else:
         log.warning("the replay differs from step %d on: the scene is the replay's, all else is from the store", step)
-    log.info("wrote %s", recording)
+    if written:
+        recording = output / f"episode-{seed}.rrd"
+        os.replace(output / written, recording)
+        log.info("wrote %s", recording)

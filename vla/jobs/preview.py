@@ -13,32 +13,36 @@ from vla.io.files import atomic_path, writing
 from vla.io.printable import show
 from vla.io.types import Count, Seed
 from vla.reports.resets import contact_sheet, draws_table
-from vla.rollouts.recorder import RerunRecorder, merge
 from vla.rollouts.rollout import close_agent, rollout
 
 log = logging.getLogger(__name__)
 
-JOB = Job(("task", "expert"), {"episodes": Count, "seed": Seed})
+JOB = Job(("task", "expert", "recorder"), {"episodes": Count, "seed": Seed})
 
 
 def run(experiment: Experiment) -> None:
-    """Roll out the expert on a few seeds; write contact sheet and recording, print the draws."""
+    """Roll out the expert on a few seeds; write contact sheet and, with a recorder, recording; print the draws."""
     output, asked = experiment.output, experiment["preview"]
-    seeds = range(asked["seed"], asked["seed"] + asked["episodes"])
+    seeds, written = range(asked["seed"], asked["seed"] + asked["episodes"]), [output / "preview.png"]
     with (
         writing(output / "preview.rrd"),
         TemporaryDirectory(prefix=".recordings-", dir=output) as folder,
         closing(experiment.make_environment()()) as environment,
     ):
-        expert, recorder = experiment.make_expert()(environment), RerunRecorder(folder, pictures=0)
+        make_recorder = experiment.make_recorder(Path(folder))
+        expert, recorder = experiment.make_expert()(environment), make_recorder() if make_recorder else None
         first, draws = [], []  # of every episode; all of their images might not fit into memory
         for seed in seeds:
             episode = rollout(environment, expert, seed, recorder)
             first.append(episode.observations[0])
             draws.append(episode.draws)
         close_agent(expert)
-        merge(sorted(Path(folder).glob("*.rrd")), output / "preview.rrd")
+        if recordings := sorted(Path(folder).glob("*.rrd")):
+            from vla.rollouts.recorder import merge  # imports the viewer's library
+
+            merge(recordings, output / "preview.rrd")
+            written.append(output / "preview.rrd")
     with atomic_path(output / "preview.png") as draft:
         contact_sheet(list(seeds), first).save(draft)
     show(draws_table(list(seeds), draws))
-    log.info("wrote %s and %s", output / "preview.png", output / "preview.rrd")
+    log.info("wrote %s", " and ".join(map(str, written)))

@@ -6,6 +6,7 @@ same on every machine.
 
 from __future__ import annotations
 
+import itertools
 import logging
 import pickle
 import signal
@@ -135,7 +136,7 @@ class ProcessPool:
         self._lock = threading.Lock()
         self._processes: list[WorkerProcess] = []
         self._closed = False
-        self._own = threading.local()
+        self._own, self._numbers = threading.local(), itertools.count()
         self._threads = futures.ThreadPoolExecutor(size, initializer=self._enter_thread)
 
     def submit(self, item: Any) -> futures.Future[Any]:
@@ -171,7 +172,7 @@ class ProcessPool:
         # Processes inherit the signal mask of the thread that starts them; starting the tracker would reset it.
         resource_tracker.ensure_running()
         signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-        self._own.process = None
+        self._own.process, self._own.number = None, next(self._numbers)
 
     def _attempt(self, item: Any) -> Any:
         try:
@@ -192,7 +193,7 @@ class ProcessPool:
             with self._lock:
                 if self._closed:
                     raise WorkersLost("the pool is closed")
-                process = WorkerProcess(self._make)
+                process = WorkerProcess(self._make, self._own.number)
                 self._processes.append(process)
             try:
                 process.answer()

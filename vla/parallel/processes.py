@@ -17,7 +17,9 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any, Protocol
 
+GPUS = "nvidiactl", "dxg", "kfd"  # devices of NVIDIA, the same in WSL, and of AMD
 PATIENCE = 5.0  # [s] for an idle process to free its resources
+WORKER = "VLA_WORKER"  # environment variable: number of a worker process in its pool
 
 # LP_NUM_THREADS is of Mesa's renderer, which counts only threads beside the calling one.
 THREAD_SETTINGS = {"OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "LP_NUM_THREADS": "0"}
@@ -48,10 +50,10 @@ class ProcessEnded(Exception):
 class WorkerProcess:
     """Spawned process that sends one answer when its worker exists, and then one per item."""
 
-    def __init__(self, make: bytes) -> None:
+    def __init__(self, make: bytes, number: int) -> None:
         self._connection, there = get_context("spawn").Pipe()
         # A daemon is ended with this process, even if its pool is never left.
-        self._process = get_context("spawn").Process(target=_serve, args=(there, make), daemon=True)
+        self._process = get_context("spawn").Process(target=_serve, args=(there, make, number), daemon=True)
         self._process.start()
         there.close()  # so that the end of the process ends the connection
 
@@ -111,8 +113,9 @@ class _RemoteTraceback(Exception):
         return f"\n{self._text}"
 
 
-def _serve(connection: Connection, make: bytes) -> None:
+def _serve(connection: Connection, make: bytes, number: int) -> None:
     """Create a worker and process items until the connection is closed."""
+    os.environ[WORKER] = str(number)
     leave_with_parent()
     made: list[Worker] = []
     # Unpickled here, not as an argument of the process, so that import errors reach the parent.
@@ -182,10 +185,10 @@ def require_ranks() -> None:
 def without_triton() -> None:
     """Block the import of Triton where PyTorch cannot use it, on machines without a GPU.
 
-    Triton and Mesa's software renderer each contain an LLVM, and processes that load both crash. Call this before
-    Lightning is imported, which imports Triton.
+    Triton and Mesa's software renderer each contain an LLVM, and processes that load Mesa's first crash. Call this
+    before Lightning is imported, which imports Triton.
     """
-    if not any(Path("/dev", name).exists() for name in ("nvidiactl", "dxg", "kfd")):  # NVIDIA, the same in WSL, AMD
+    if not any(Path("/dev", name).exists() for name in GPUS):
         sys.modules.setdefault("triton", None)  # type: ignore[arg-type]
         for name in ("flop_counter", "cpp_extension"):  # they warn without Triton, and without a GPU
             logging.getLogger(f"torch.utils.{name}").setLevel(logging.ERROR)

@@ -6,8 +6,9 @@ import os
 import subprocess
 import sys
 from contextlib import suppress
+from pathlib import Path
 
-from vla.parallel.processes import without_triton
+from vla.parallel.processes import WORKER, without_triton
 
 WORKING_BACKEND = "VLA_GL_WORKS"  # the backend that worked in a probe, inherited by child processes
 FAILED_BACKENDS = "VLA_GL_FAILS"  # those that did not
@@ -15,14 +16,32 @@ NO_BACKEND = "disabled"
 PROBE = "import mujoco; mujoco.GLContext(8, 8).make_current()"
 EGL_WORKS = "VLA_EGL_WORKS"  # whether the fast renderer can run, found by a probe, inherited by child processes
 EGL_PROBE = "import moderngl; moderngl.create_standalone_context(backend='egl')"
+EGL_DEVICES = "VLA_EGL_DEVICES"  # numbers of the GPUs that EGL can draw on, found by a probe, inherited likewise
+DEVICES_PROBE = """
+from mujoco.egl import egl_ext as egl
+from OpenGL.EGL.EXT.device_query import eglQueryDeviceStringEXT
+
+for number, device in enumerate(egl.eglQueryDevicesEXT()):
+    if b"software" not in eglQueryDeviceStringEXT(device, egl.EGL_EXTENSIONS):
+        display = egl.eglGetPlatformDisplayEXT(egl.EGL_PLATFORM_DEVICE_EXT, device, None)
+        try:
+            egl.eglInitialize(display, None, None)
+        except Exception:  # a GPU that this container may not use
+            continue
+        print(number)
+"""
 
 
 def choose_backend() -> None:
-    """Set MUJOCO_GL on a machine without a display: EGL_WORKS, OSMesa if EGL_WORKS fails, "disabled" if both fail.
+    """Set MUJOCO_GL on a machine without a display: EGL, OSMesa if EGL fails, "disabled" if both fail.
 
-    A backend that the user has set is only probed. Triton, which conflicts with Mesa, is blocked too.
+    A backend that the user has set is only probed. Triton is blocked or loaded now: after Mesa's renderer its LLVM
+    would use parts of Mesa's and crash.
     """
     without_triton()
+    with suppress(ImportError):
+        import triton  # noqa: F401
+    choose_device()
     with suppress(ImportError):  # the system's library: after Mesa it would be Mesa's, and bags would have other bytes
         import backports.zstd  # noqa: F401
     chosen = os.environ.get("MUJOCO_GL")
@@ -36,6 +55,27 @@ def choose_backend() -> None:
     works = next((name for name in candidates if _runs(PROBE, MUJOCO_GL=name)), None)
     os.environ["MUJOCO_GL"] = works or NO_BACKEND
     os.environ[WORKING_BACKEND if works else FAILED_BACKENDS] = works or " or ".join(candidates)
+
+
+def choose_device() -> None:
+    """Let the worker processes of a machine with several GPUs take turns on them, for both renderers.
+
+    A device that the user has set, MUJOCO_EGL_DEVICE_ID, stays.
+    """
+    chosen = os.environ.get("MUJOCO_EGL_DEVICE_ID")
+    if chosen is None and (devices := _egl_devices()):
+        chosen = devices[int(os.environ.get(WORKER, "0")) % len(devices)]
+        os.environ["MUJOCO_EGL_DEVICE_ID"] = chosen
+    if chosen is not None:
+        os.environ.setdefault("GLCONTEXT_DEVICE_INDEX", chosen)  # of moderngl
+
+
+def _egl_devices() -> list[str]:
+    """Return the numbers of the GPUs that EGL can draw on; none of a machine with a single one."""
+    if EGL_DEVICES not in os.environ:
+        several = len([*Path("/dev").glob("nvidia[0-9]*"), *Path("/dev/dri").glob("renderD*")]) > 1
+        os.environ[EGL_DEVICES] = _output(DEVICES_PROBE, MUJOCO_GL="egl") or "" if several else ""
+    return os.environ[EGL_DEVICES].split()
 
 
 def require_backend() -> None:
@@ -59,6 +99,11 @@ def has_egl() -> bool:
 
 
 def _runs(code: str, **settings: str) -> bool:
+    return _output(code, **settings) is not None
+
+
+def _output(code: str, **settings: str) -> str | None:
     # In a process of its own, which a failing GL backend can abort.
     environment = {**os.environ, **settings}
-    return subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True).returncode == 0
+    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True)
+    return done.stdout if done.returncode == 0 else None
