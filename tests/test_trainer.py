@@ -6,6 +6,7 @@ import csv
 import os
 import signal
 from collections.abc import Callable
+from multiprocessing import active_children
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -15,7 +16,7 @@ import pytest
 import torch
 import toy
 from defaults import defaults_of
-from fake_batch import make_act, make_batch, make_bc, make_denoising, make_rt1
+from fake_batch import as_policy, make_act, make_batch, make_bc, make_denoising, make_rt1
 from omegaconf import OmegaConf
 from reading import windows
 from resuming import STEPS, STOP, VALIDATED, config, same, train
@@ -24,7 +25,7 @@ from small_training import fit, make_learner
 from vla.models.diffusion import Diffusion
 from vla.models.learner import Learner
 from vla.models.model import Model
-from vla.spec import Array, Observation
+from vla.spec import FIRST_SEED, Array, Observation
 from vla.training import throughput
 from vla.training.checkpoints import SAVE_EVERY, GracefulStop, PeriodicCheckpoint
 from vla.training.closed_loop import ClosedLoop
@@ -250,6 +251,35 @@ def test_between_validations_no_environment_is_held(folder: Path, tmp_path: Path
     played = ClosedLoop(Counted, lambda model: toy.ToyExpert(), range(2), tmp_path / "run/checkpoints")
     train(make_bc(), folder, tmp_path / "run", killer=played)
     assert len(held) >= 4 and held == [1, -1] * (len(held) // 2)
+
+
+class Ending(toy.ToyEnvironment):
+    """Tells where an episode ended, to the last bit."""
+
+    def step(self, action: Array) -> Observation:
+        """Move the point."""
+        observation = super().step(action)
+        self.draws["end"] = self._point
+        return observation
+
+
+@pytest.mark.parametrize("make", [make_bc, make_rt1], ids=["bc", "rt1"])
+def test_validation_finds_the_same_with_any_number_of_workers(make: Callable[[], Model], tmp_path: Path) -> None:
+    learner, seeds = make_learner(make()), range(FIRST_SEED, FIRST_SEED + 5)
+    learner.on_fit_start()  # what a training sets must not matter
+    try:
+        with ClosedLoop(Ending, as_policy, seeds, tmp_path, workers=2) as closed_loop:
+            alone = closed_loop.play(learner, seeds, 1)
+            shared = closed_loop.play(learner, seeds, 2)
+            for parameter in learner.model.parameters():
+                parameter.data.mul_(-1)
+            again, negated = (closed_loop.play(learner, seeds, workers) for workers in (1, 2))
+    finally:
+        learner.teardown("fit")
+    by_seed = sorted(shared, key=lambda result: result.seed)
+    assert by_seed == alone and all(result.draws["end"] for result in alone)
+    assert sorted(negated, key=lambda result: result.seed) == again != alone
+    assert not active_children()
 
 
 def test_damaged_training_curves_cost_no_training(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from functools import partial
 from pathlib import Path
 
@@ -22,6 +22,7 @@ from vla.jobs.collect import demonstration_spec, demonstrations
 from vla.models.learner import Learner
 from vla.models.model import Model
 from vla.models.tokenizers.tokenization_error import describe_tokenization_error, out_of_bounds
+from vla.parallel.limits import cores
 from vla.reports.first_batch import SHOWN, draw_samples
 from vla.reports.run_page import write_page
 from vla.rollouts.collect import collection_time
@@ -73,7 +74,7 @@ def train(experiment: Experiment) -> Path | None:
         log.info("trainer.max_steps=-1: training runs until interrupted; Ctrl-C saves and stops")
     if experiment["trainer"]["max_steps"] in (None, -1) and experiment["learner"]["schedule"] == "cosine":
         log.warning("without trainer.max_steps learner.schedule=cosine has no end: the learning rate stays at its peak")
-    with training_lock(checkpoints):
+    with closed_loop or nullcontext(), training_lock(checkpoints):
         # Before collection, so that missing devices are reported early.
         callbacks = [_Begun(experiment), *([closed_loop] if closed_loop else []), graceful_stop]
         trainer = make_trainer(experiment.config, checkpoints, *callbacks)
@@ -186,7 +187,8 @@ def _closed_loop(experiment: Experiment, checkpoints: Path) -> ClosedLoop | None
         raise ValueError(f"validate.episodes={len(seeds)}: nothing can be played in a recording: set it to 0")
     make_environment = experiment.make_environment(asked["changes"])
     make_policy = partial(training_policy, experiment["policy"].get("precision", "fp32"))
-    return ClosedLoop(make_environment, make_policy, seeds, checkpoints) if seeds else None
+    workers = experiment["cluster"].get("workers") or cores()
+    return ClosedLoop(make_environment, make_policy, seeds, checkpoints, workers) if seeds else None
 
 
 def _origins(experiment: Experiment, state: TrainingProgress) -> list[Origin]:

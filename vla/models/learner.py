@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any, Literal
 
 import torch
@@ -76,10 +78,20 @@ class Learner(LightningModule):
     def teardown(self, stage: str) -> None:
         """Undo what `on_fit_start` set: an evaluation in this process gives what one in another process gives."""
         if self._before is not None:
-            flash, precision = self._before
-            torch.backends.cuda.enable_flash_sdp(flash)
-            torch.set_float32_matmul_precision(precision)
+            _set_precision(*self._before)
             self._before = None
+
+    @contextmanager
+    def evaluating(self) -> Iterator[None]:
+        """Compute within the context what another process would, which does not train: see `on_fit_start`."""
+        during = torch.backends.cuda.flash_sdp_enabled(), torch.get_float32_matmul_precision()
+        if self._before is not None:
+            _set_precision(*self._before)
+        try:
+            with torch.compiler.set_stance("force_eager"):  # a window's shape is not the compiled one
+                yield
+        finally:
+            _set_precision(*during)
 
     @torch.no_grad()
     def on_train_start(self) -> None:
@@ -205,6 +217,11 @@ class Learner(LightningModule):
         for name in {"state_dict", "current_model_state"} & checkpoint.keys():
             weights = checkpoint[name].items()
             checkpoint[name] = {key: value for key, value in weights if key.startswith("model.")}
+
+
+def _set_precision(flash: bool, precision: str) -> None:
+    torch.backends.cuda.enable_flash_sdp(flash)
+    torch.set_float32_matmul_precision(precision)
 
 
 def _require_counts(value: Any) -> None:

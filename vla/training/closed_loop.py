@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import logging
+import pickle
 from collections.abc import Callable, Sequence
-from contextlib import closing
+from contextlib import ExitStack, closing
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
+from types import TracebackType
 from typing import Annotated, Any
 
 import torch
@@ -16,13 +19,17 @@ from lightning import Callback, LightningModule, Trainer
 from vla.io.documents import STRICT, parse_plain
 from vla.models.learner import Learner
 from vla.models.model import Model
+from vla.parallel.pool import Crashed, Future, ProcessPool
+from vla.parallel.processes import one_thread_each
 from vla.rollouts.evaluate import play
+from vla.rollouts.results import ERROR, Result
 from vla.rollouts.statistics import wilson_interval
 from vla.spec import Agent, Environment
 
 log = logging.getLogger(__name__)
 
 BEST = "best.ckpt"
+PER_WORKER = 5  # episodes; for fewer, a process takes longer to start than they take
 
 Success = Annotated[float, Ge(-1), Le(1)]  # success rate; -1: not measured
 
@@ -38,17 +45,40 @@ class ClosedLoopState:
     seeds: list[int] | None = None
 
 
+class _Player:
+    """Worker that plays episodes with a copy of a model, and holds an environment only meanwhile."""
+
+    def __init__(self, make_environment: Callable[[], Environment], make_policy: Callable[[Model], Agent]) -> None:
+        self._make_environment, self._make_policy = make_environment, make_policy
+
+    def attempt(self, item: tuple[bytes, Sequence[int]]) -> list[Result]:
+        """Play the episodes of seeds with a pickled model."""
+        return self.play(pickle.loads(item[0]), item[1])
+
+    def play(self, model: Model, seeds: Sequence[int]) -> list[Result]:
+        """Play the episodes of seeds with a model."""
+        policy = self._make_policy(model)
+        with closing(self._make_environment()) as environment:
+            return [play(environment, policy, seed) for seed in seeds]
+
+    def close(self) -> None:
+        """Hold nothing."""
+
+
 class ClosedLoop(Callback):
     """Plays episodes with the EMA weights in every validation, and logs `val/success`, 0…1.
 
-    The processes of a training split the episodes. The weights with the highest success rate are saved as `best.ckpt`;
-    ties go to the newest. With sharded weights nothing is played, because all processes would have to act in step.
+    The processes of a training split the episodes, and each has workers that share its part; a result does not depend
+    on their number. The weights with the highest success rate are saved as `best.ckpt`; ties go to the newest. With
+    sharded weights nothing is played, because all processes would have to act in step. It is a context, at whose end
+    the workers end.
 
     Args:
         make_environment: factory of the environment, called for every validation, after which it is closed.
-        make_policy: factory of a policy from the model in training.
+        make_policy: factory of a policy from the model in training, on its device.
         seeds: of the episodes, the same in every validation.
         checkpoints: folder of `best.ckpt`.
+        workers: largest number of worker processes on this machine.
     """
 
     def __init__(
@@ -57,11 +87,26 @@ class ClosedLoop(Callback):
         make_policy: Callable[[Model], Agent],
         seeds: Sequence[int],
         checkpoints: Path,
+        workers: int = 1,
     ) -> None:
-        self._make_environment, self._make_policy, self._seeds = make_environment, make_policy, seeds
+        self._make_environment, self._seeds, self._workers = make_environment, seeds, workers
+        self._make_player = partial(_Player, make_environment, make_policy)
+        self._pool: ProcessPool | None = None
+        self._opened = ExitStack()
         self._path = checkpoints / BEST
         self._plays = self._played = False
         self.success, self.best = 0.0, -1.0
+
+    def __enter__(self) -> ClosedLoop:
+        """Enter the context; workers start in the first validation and wait for the next ones."""
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, where: TracebackType | None
+    ) -> None:
+        """End the workers."""
+        self._pool = None
+        self._opened.__exit__(kind, error, where)
 
     def on_fit_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Build the environment before training, in case this machine cannot."""
@@ -77,10 +122,9 @@ class ClosedLoop(Callback):
         assert isinstance(pl_module, Learner)
         if not self._plays:
             return
-        policy, environment = self._make_policy(pl_module.model), self._make_environment()
         mine = self._seeds[trainer.global_rank :: trainer.world_size]
-        with closing(environment), torch.compiler.set_stance("force_eager"):  # a window's shape is not the compiled one
-            results = [play(environment, policy, seed) for seed in mine]
+        workers = self._workers * trainer.num_nodes // trainer.world_size
+        results = self.play(pl_module, mine, min(workers, len(mine) // PER_WORKER))
         for result in results:
             if result.error:
                 log.warning("validation: seed %d could not be played: %s", result.seed, result.error)
@@ -92,6 +136,22 @@ class ClosedLoop(Callback):
         if self._played:
             self.success = won / completed
             pl_module.log("val/success", self.success, sync_dist=True)
+
+    def play(self, learner: Learner, seeds: Sequence[int], workers: int) -> list[Result]:
+        """Return the results of the episodes of seeds with the weights of now.
+
+        They are played in so many worker processes, or in this one if there would be only one.
+        """
+        with one_thread_each():
+            if workers <= 1:
+                with learner.evaluating():
+                    return self._make_player().play(learner.model, seeds)
+            if self._pool is None:
+                self._pool = self._opened.enter_context(ProcessPool(self._make_player, workers))
+            model = pickle.dumps(learner.model)
+            parts = [seeds[worker::workers] for worker in range(workers)]
+            pending = [self._pool.submit((model, part)) for part in parts]
+            return [result for future, part in zip(pending, parts, strict=True) for result in _results(future, part)]
 
     def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Save `best.ckpt` if episodes were played, and their success rate is at least the best so far."""
@@ -121,3 +181,10 @@ class ClosedLoop(Callback):
         # The best is void in another folder or with other episodes.
         if self._path.exists() and state.seeds == list(self._seeds):
             self.best = state.best
+
+
+def _results(future: Future, seeds: Sequence[int]) -> list[Result]:
+    try:
+        return future.result()
+    except Crashed as crash:
+        return [Result(seed, ERROR, error=str(crash)) for seed in seeds]
