@@ -1,0 +1,43 @@
+"""The files of results: written again after every command, from what the runs of vla wrote."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+from typing import Any
+
+
+def update(file: Path, **values: Any) -> None:
+    """Set top-level keys of a JSON file, atomically: whoever is killed leaves what was measured before."""
+    content = json.loads(file.read_text()) if file.exists() else {}
+    draft = file.with_name(f".{file.name}")
+    draft.write_text(json.dumps(content | values, indent=1))
+    draft.replace(file)
+
+
+def figures_of(output: Path) -> dict[str, Any]:
+    """Return what a run wrote: measures of a benchmark, a training, its curves, and the outcomes of an evaluation."""
+    found: dict[str, Any] = {}
+    for name in ("benchmark", "training"):
+        if (file := output / f"{name}.json").exists():
+            found[name] = json.loads(file.read_text())
+    if (file := output / "metrics.csv").exists():
+        with file.open() as lines:
+            rows = csv.DictReader(lines)
+            found["metrics"] = [{key: float(value) for key, value in row.items() if value} for row in rows]
+    if (file := output / "report.json").exists():
+        report = json.loads(file.read_text())
+        outcomes = [episode["outcome"] for episode in report["per_episode"]]
+        found["outcomes"] = {each: outcomes.count(each) for each in sorted({*outcomes})}
+        found |= {name: report.get(name) for name in ("latency_ms", "wall_time_s")}
+    return found
+
+
+def best_rate(file: Path) -> float | None:
+    """Return the best rate of training in the file of step c [windows/s]."""
+    measures = (
+        json.loads(file.read_text()).get("rates", {}).get("benchmark", {}).get("measures", {}) if file.exists() else {}
+    )
+    rates = [each["value"] for name, each in measures.items() if name.count(":") == 1 and name.startswith("train: ")]
+    return max(rates, default=None)
