@@ -11,7 +11,7 @@ import pytest
 from omegaconf import DictConfig, OmegaConf
 
 from vla.jobs.benchmark.train import _precisions
-from vla.jobs.bfloat16 import has_bfloat16, warn_of_bfloat16
+from vla.jobs.machine import has_bfloat16, warn_of_bfloat16
 
 
 def config(trainer: str = "fp32", policy: str = "fp32") -> DictConfig:
@@ -26,7 +26,7 @@ def config(trainer: str = "fp32", policy: str = "fp32") -> DictConfig:
 @pytest.fixture
 def slow(monkeypatch: pytest.MonkeyPatch) -> None:
     """A processor without the instructions."""
-    monkeypatch.setattr("vla.jobs.bfloat16.has_bfloat16", lambda: False)
+    monkeypatch.setattr("vla.jobs.machine.has_bfloat16", lambda: False)
     monkeypatch.setattr("vla.jobs.benchmark.train.has_bfloat16", lambda: False)
 
 
@@ -57,7 +57,7 @@ def test_what_is_not_slow_is_not_warned_of(caplog: pytest.LogCaptureFixture) -> 
 def test_where_the_processor_is_made_for_it_there_is_no_warning(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr("vla.jobs.bfloat16.has_bfloat16", lambda: True)
+    monkeypatch.setattr("vla.jobs.machine.has_bfloat16", lambda: True)
     warn_of_bfloat16(config("bf16", "bf16"), ("trainer", "policy"))
     assert not caplog.messages
 
@@ -73,7 +73,7 @@ def test_the_benchmark_leaves_slow_bfloat16_out_unless_it_is_asked_for(caplog: p
 
 
 def test_hidden_instructions_are_not_there() -> None:
-    program = "from vla.jobs.bfloat16 import has_bfloat16; print(has_bfloat16())"
+    program = "from vla.jobs.machine import has_bfloat16; print(has_bfloat16())"
     hidden = {**os.environ, "ONEDNN_MAX_CPU_ISA": "AVX2", "ATEN_CPU_CAPABILITY": "avx2"}
     printed = subprocess.run([sys.executable, "-c", program], env=hidden, capture_output=True, text=True, check=True)
     assert printed.stdout.strip() == "False" and isinstance(has_bfloat16(), bool)

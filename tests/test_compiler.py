@@ -11,7 +11,7 @@ from composing import composed
 
 from vla import jobs
 from vla.config.experiment import Experiment, plain
-from vla.jobs.compiler import require_compiler
+from vla.jobs.machine import require_compiler
 
 CHECKPOINT = "checkpoint=nowhere.ckpt"
 

@@ -22,7 +22,7 @@ from omegaconf import OmegaConf
 
 from vla import jobs
 from vla.deploy import ros
-from vla.jobs.bfloat16 import has_bfloat16
+from vla.jobs.machine import has_bfloat16
 from vla.parallel.limits import cores
 
 pytestmark = pytest.mark.usefixtures("recording")

@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from vla.config.annotations import require_trusted
 from vla.config.packages import is_trusted
-from vla.jobs.bfloat16 import warn_of_bfloat16
-from vla.jobs.compiler import require_compiler
+from vla.jobs.machine import require_compiler, warn_of_bfloat16
 
 if TYPE_CHECKING:
     from vla.config.experiment import Experiment

@@ -21,8 +21,8 @@ from vla.data.datamodule import WindowDataModule
 from vla.data.episodes import EpisodeStore
 from vla.jobs.benchmark.measure import Measure, measure
 from vla.jobs.benchmark.memory import peak, reset_peak
-from vla.jobs.bfloat16 import computes_on_cpu, has_bfloat16
 from vla.jobs.collect import demonstrations
+from vla.jobs.machine import computes_on_cpu, has_bfloat16
 from vla.models.flops import matmul_flops, peak_flops, training_flops
 from vla.runs.folder import CHECKPOINTS
 from vla.training.trainer import PRECISIONS, explain_memory_errors, make_trainer, quiet_lightning
