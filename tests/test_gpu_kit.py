@@ -12,6 +12,7 @@ from pathlib import Path
 from zipfile import ZipFile
 
 import minutes
+import notes
 import pack
 import pytest
 
@@ -31,7 +32,8 @@ def test_the_steps_leave_their_figures(tmp_path: Path) -> None:
 
 
 def prepared(tmp_path: Path, total: float) -> minutes.Minutes:
-    return minutes.Minutes(tmp_path / "out", tmp_path / "work", None, minutes.DRY._replace(slower=1), total, 0, [])
+    sizes = minutes.DRY._replace(slower=1)
+    return minutes.Minutes(tmp_path / "out", tmp_path / "work", None, sizes, total, 0, None, [])
 
 
 def test_a_command_past_its_limit_ends_with_all_that_it_started(
@@ -55,6 +57,14 @@ def test_without_time_nothing_is_started_and_what_was_noted_stays(tmp_path: Path
     assert not (tmp_path / "started").exists()
     content = json.loads((tmp_path / "out/x.json").read_text())
     assert content["before"] == {"value": 1} and content["late"]["status"] is None
+
+
+def test_the_rates_of_a_training_leave_out_the_loader(tmp_path: Path) -> None:
+    measures = {"train: bf16": 120, "train: bf16: MFU": 999, "train: loader alone": 9999}
+    eager = {"benchmark": {"measures": {name: {"value": value} for name, value in measures.items()}}}
+    (tmp_path / "c.json").write_text(json.dumps({"eager": eager, "compiled": {"status": "ran past its limit"}}))
+    assert notes.rates_of(tmp_path / "c.json") == {"eager": 120.0}
+    assert notes.rates_of(tmp_path / "none.json") == {}
 
 
 def test_what_vla_depends_on_is_there_or_packed() -> None:

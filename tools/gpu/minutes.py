@@ -18,7 +18,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from notes import best_rate, figures_of, update
+from notes import figures_of, rates_of, update
 
 ROOT, PROBE = Path(__file__).resolve().parents[2], Path(__file__).with_name("probe.py")
 GRACE = 15  # [s] between an interrupt and the end by force
@@ -67,14 +67,23 @@ class Minutes:
         sizes: how much to measure.
         total: time for all steps [s].
         learn: time for training in `d` [s].
+        steps: of the training in `d`; None: as many as there is time for, by the rate of `c`.
         overrides: of the training in `d`.
     """
 
     def __init__(
-        self, out: Path, work: Path, kit: Path | None, sizes: Sizes, total: float, learn: int, overrides: list[str]
+        self,
+        out: Path,
+        work: Path,
+        kit: Path | None,
+        sizes: Sizes,
+        total: float,
+        learn: int,
+        steps: int | None,
+        overrides: list[str],
     ) -> None:
         self.out, self.work, self.kit, self.sizes = out.resolve(), work.resolve(), kit, sizes
-        self.learn, self.overrides = learn, overrides
+        self.learn, self.steps, self.overrides = learn, steps, overrides
         self._end = time.monotonic() + total
         for folder in (self.out, self.work):
             folder.mkdir(parents=True, exist_ok=True)
@@ -139,7 +148,7 @@ class Minutes:
         return self.note(step, name, noted)
 
     def note(self, step: str, name: str, values: dict[str, Any]) -> dict[str, Any]:
-        """Write something into the file of a step, and return it."""
+        """Write values into the file of a step, and return them."""
         update(self.out / f"{step}.json", **{name: values})
         return values
 
@@ -183,37 +192,44 @@ class Minutes:
         }
 
     def c(self) -> None:
-        """Time the training of the large model."""
-        self.rates("c", "rates", 190, self.sizes.batch, self.sizes.precision, self.sizes.compiled)
+        """Time the training of the large model: eager, then compiled, which may take longer than there is time."""
+        self.rate("c", "eager", 70, self.sizes.batch, self.sizes.precision, False)
+        if self.sizes.compiled:
+            self.rate("c", "compiled", 150, self.sizes.batch, self.sizes.precision, True)
 
-    def rates(self, step: str, name: str, limit: float, batch: int, precision: str, compiled: bool) -> None:
-        """Time trainings of the large model: eager, and compiled if asked for."""
+    def rate(self, step: str, name: str, limit: float, batch: int, precision: str, compiled: bool) -> None:
+        """Time a training of the large model."""
         sizes = self.sizes
-        kinds = "[false,true]" if compiled else "[false]"
-        timing = [f"benchmark.steps={sizes.timed}", "benchmark.rounds=1", f"benchmark.compile={kinds}"]
+        timing = [f"benchmark.steps={sizes.timed}", "benchmark.rounds=1", f"benchmark.compile=[{compiled}]"]
         what = [f"model={sizes.model}", f"trainer={sizes.trainer}", f"data.batch_size={batch}"]
         asked = ["job=benchmark", "benchmark.names=[train]", f"benchmark.precisions=[{precision}]"]
         self.vla(step, name, limit, *asked, *timing, *what, *self.data(sizes.used))
 
     def d(self) -> None:
-        """Train the large model for as long as there is time, and evaluate it."""
-        seconds = min(self.learn, self.left - 120)  # 30 s to start, 90 s to evaluate
-        rate = best_rate(self.out / "c.json") or 5.0 * self.sizes.batch
-        steps = self.sizes.trained if self.sizes == DRY else max(20, int(0.93 * rate * seconds / self.sizes.batch))
-        model = [f"model={self.sizes.model}", "learner.lr=5e-4", f"data.batch_size={self.sizes.batch}", *self.overrides]
-        self.train("d", "rt1", seconds + 30, steps, *self.data(self.sizes.demonstrations), *model)
+        """Train the large model for as long as there is time, in the way that c found faster, and evaluate it."""
+        sizes, seconds = self.sizes, min(self.learn, self.left - 120)  # 30 s to start, 90 s to evaluate
+        rates = rates_of(self.out / "c.json") or {"eager": 5.0 * sizes.batch}
+        fastest = max(rates, key=lambda kind: rates[kind])
+        steps = self.steps or max(20, int(0.93 * rates[fastest] * seconds / sizes.batch))
+        model = [f"model={sizes.model}", "learner.lr=5e-4", f"data.batch_size={sizes.batch}", *self.overrides]
+        demonstrations = self.data(sizes.demonstrations)
+        self.train("d", "rt1", seconds + 30, steps, fastest == "compiled", *demonstrations, *model)
 
     def g(self) -> None:
         """Train bc, and evaluate it."""
-        self.train("g", "bc", 90, self.sizes.trained, "model=bc", *self.data(self.sizes.used))
+        what = ["model=bc", *self.data(self.sizes.used)]
+        self.train("g", "bc", 90, self.sizes.trained, self.sizes.compiled, *what)
 
-    def train(self, step: str, name: str, limit: float, steps: int, *overrides: str) -> None:
-        """Train a policy without validations, then evaluate it."""
+    def train(self, step: str, name: str, limit: float, steps: int, compiled: bool, *overrides: str) -> None:
+        """Train a policy without validations, eager if it cannot be compiled, then evaluate it."""
         sizes = self.sizes
         settings = [f"trainer={sizes.trainer}", f"trainer.precision={sizes.precision}", f"trainer.max_steps={steps}"]
-        settings += [f"learner.compile={sizes.compiled}", f"trainer.val_check_interval={NEVER}", "validate.episodes=0"]
-        settings += [f"trainer.log_every_n_steps={min(20, steps)}"]
-        self.vla(step, name, limit, "job=train", *settings, *overrides)
+        settings += [f"trainer.val_check_interval={NEVER}", f"trainer.log_every_n_steps={min(20, steps)}"]
+        settings += ["job=train", "validate.episodes=0", *overrides]
+        ended = self.vla(step, name, limit, f"learner.compile={compiled}", *settings)
+        if compiled and isinstance(ended["status"], int) and ended["status"]:
+            name = f"{name}_eager"
+            self.vla(step, name, limit, "learner.compile=False", *settings)
         checkpoint = f"checkpoint={self.work / 'runs' / name / 'checkpoints/last.ckpt'}"
         self.vla(step, f"{name}_evaluated", 150, checkpoint, f"evaluate.episodes={sizes.evaluated}")
 
@@ -237,9 +253,9 @@ class Minutes:
         """Time rendering, other sizes of a batch, and TensorFloat-32."""
         sizes = self.sizes
         self.vla("h", "rendering", 60, "job=benchmark", "benchmark.names=[collect]", "benchmark.episodes=3")
-        for batch in (sizes.batch // 3, sizes.batch * 4 // 3, sizes.batch * 2):
-            self.rates("h", f"batch_{batch}", 45, max(batch, 2), sizes.precision, False)
-        self.rates("h", "tf32", 150, sizes.batch, "fp32", sizes.compiled)
+        for batch in (max(sizes.batch // 3, 2), sizes.batch * 4 // 3, sizes.batch * 2):
+            self.rate("h", f"batch_{batch}", 45, batch, sizes.precision, False)
+        self.rate("h", "tf32", 60, sizes.batch, "fp32", False)
 
 
 def _ended(process: subprocess.Popen[bytes], limit: float) -> int | str:
@@ -271,13 +287,17 @@ def main() -> None:
     parser.add_argument("--work", type=Path, default=Path("/tmp/gpu_minutes"), help="folder of everything else")
     parser.add_argument("--total", type=float, default=580, help="time for all steps [s]")
     parser.add_argument("--learn", type=int, default=220, help="time for training in step d [s]")
+    parser.add_argument(
+        "--number", type=int, help="of training steps in step d; by default as many as there is time for"
+    )
     parser.add_argument("--rt1", nargs="*", default=["model.auxiliary=1.0"], metavar="KEY=VALUE", help="for step d")
     parser.add_argument("--dry", action="store_true", help="tiny sizes on a CPU")
     asked = parser.parse_args()
     if unknown := [step for step in asked.steps if step not in STEPS]:
         parser.error(f"there is no step {unknown[0]}; there are {' '.join(STEPS)}")
     sizes = DRY if asked.dry else real()
-    minutes = Minutes(asked.out, asked.work, asked.kit, sizes, asked.total, asked.learn, asked.rt1)
+    count = sizes.trained if asked.dry else asked.number
+    minutes = Minutes(asked.out, asked.work, asked.kit, sizes, asked.total, asked.learn, count, asked.rt1)
     for step in asked.steps:
         STEPS[step](minutes)
 

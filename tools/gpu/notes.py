@@ -34,10 +34,11 @@ def figures_of(output: Path) -> dict[str, Any]:
     return found
 
 
-def best_rate(file: Path) -> float | None:
-    """Return the best rate of training in the file of step c [windows/s]."""
-    measures = (
-        json.loads(file.read_text()).get("rates", {}).get("benchmark", {}).get("measures", {}) if file.exists() else {}
-    )
-    rates = [each["value"] for name, each in measures.items() if name.count(":") == 1 and name.startswith("train: ")]
-    return max(rates, default=None)
+def rates_of(file: Path) -> dict[str, float]:
+    """Return kind, "eager" or "compiled" → rate of training in the file of step c [windows/s]."""
+    rates = {}
+    for kind, noted in json.loads(file.read_text()).items() if file.exists() else ():
+        for name, measure in noted.get("benchmark", {}).get("measures", {}).items():
+            if name.startswith("train: ") and name.count(":") == 1 and "loader" not in name:
+                rates[kind] = float(measure["value"])
+    return rates
