@@ -263,7 +263,9 @@ def test_the_whole_loop_reports_and_its_bag_moves_an_agent_again(
     learn_from_the_bag(home)
 
 
-def test_an_episode_that_breaks_off_is_an_error_of_the_loop(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_episode_that_breaks_off_is_an_error_of_the_loop(
+    home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def play() -> Result:
         if results:
             return results.pop()
@@ -272,7 +274,8 @@ def test_an_episode_that_breaks_off_is_an_error_of_the_loop(tmp_path: Path, monk
     results = [Result(5, "success")]
     operator = SimpleNamespace(play=play, stopped=threading.Event(), status={})
     monkeypatch.setattr(Loop, "running", lambda loop: nullcontext(operator))
-    experiment = Experiment.of(composed("job=deploy", "deploy=loop", "checkpoint=last.ckpt", f"output={tmp_path}"))
+    checkpoint = f"checkpoint={home}/run/checkpoints/last.ckpt"
+    experiment = Experiment.of(composed("job=deploy", "deploy=loop", checkpoint, f"output={tmp_path}"))
     with pytest.raises(ValueError, match=r"ended with an error, see .*report.json: timed out after 60 s"):
         job.run(experiment)
     report = json.loads((tmp_path / "report.json").read_text())

@@ -84,14 +84,26 @@ def test_a_file_of_another_kind_is_refused_by_name_with_a_way_out(
     assert "\n" not in told and len(told) < 1000 and not (tmp_path / "new").exists()
 
 
-@pytest.mark.parametrize("config", [{}, {"task": 3, "model": [1], "collect": None, "trainer": "x", "validate": 1}])
-def test_a_configuration_with_other_things_in_it_is_shown_as_it_is(config: dict[str, Any], tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("config", "says"),
+    [
+        ({}, ""),
+        ({"task": 3, "model": [1], "collect": None, "trainer": "x"}, "config.task is not a mapping of names to values"),
+    ],
+)
+def test_a_report_without_a_configuration_is_shown_and_one_with_another_thing_is_refused(
+    config: dict[str, Any], says: str, tmp_path: Path
+) -> None:
     folder, other = a_run(tmp_path / "run"), a_run(tmp_path / "other")
     (folder / "config.yaml").write_text(json.dumps(config))
     report = folder / "report.json"
     report.write_text(json.dumps({**json.loads(report.read_text()), "config": config}))
-    page = compared([folder, other], tmp_path).read_text()
-    assert page.count("100.0") >= 2  # the success of both
+    if says:
+        with pytest.raises(ValueError, match=rf"report\.json .*{says}.*; remove the file, or repeat the run$"):
+            compared([folder, other], tmp_path)
+    else:
+        page = compared([folder, other], tmp_path).read_text()
+        assert page.count("100.0") >= 2  # the success of both
 
 
 def test_a_row_that_a_killed_process_left_half_is_skipped(tmp_path: Path) -> None:

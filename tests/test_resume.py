@@ -29,7 +29,8 @@ def leave(run: Path, config: dict[str, Any], finished: bool, chosen: str = "") -
     (run / "checkpoints").mkdir(parents=True)
     steps = config["trainer"]["max_steps"] if finished else 1
     content = {"config": config, "spec": toy.SPEC.to_dict(), "state_dict": {}, "finished": finished}
-    torch.save({**content, "global_step": steps}, run / "checkpoints/last.ckpt")
+    for name in {"last.ckpt", chosen or "last.ckpt"}:
+        torch.save({**content, "global_step": steps}, run / "checkpoints" / name)
     if chosen:
         save_training(run, Training(1, 1, 1.0, "done"))
         save_choice(run, chosen)

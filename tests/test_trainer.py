@@ -266,6 +266,7 @@ class Ending(toy.ToyEnvironment):
 @pytest.mark.parametrize("make", [make_bc, make_rt1], ids=["bc", "rt1"])
 def test_validation_finds_the_same_with_any_number_of_workers(make: Callable[[], Model], tmp_path: Path) -> None:
     learner, seeds = make_learner(make()), range(FIRST_SEED, FIRST_SEED + 5)
+    torch.backends.cuda.enable_flash_sdp(True)  # as in a new process, whatever an interrupted training before left
     learner.on_fit_start()  # what a training sets must not matter
     try:
         with ClosedLoop(Ending, as_policy, seeds, tmp_path, workers=2) as closed_loop:
