@@ -129,15 +129,9 @@ class Minutes:
         noted: dict[str, Any] = {"command": " ".join(command[-12:]), "limit_s": round(limit), "status": None}
         if limit >= LEAST:
             began, log = time.monotonic(), self.work / f"{name}.log"
+            cwd, env = self.work, {**self.environment, **more}
             with log.open("wb") as file:
-                process = subprocess.Popen(
-                    command,
-                    cwd=self.work,
-                    env={**self.environment, **more},
-                    stdout=file,
-                    stderr=subprocess.STDOUT,
-                    start_new_session=True,
-                )
+                process = subprocess.Popen(command, cwd=cwd, env=env, stdout=file, stderr=file, start_new_session=True)
                 noted["status"] = _ended(process, limit)
             text = log.read_text(errors="replace").replace("\r", "\n")
             noted |= {
