@@ -115,7 +115,7 @@ WRONG = (
 HEADERS: tuple[tuple[str, Any], ...] = (
     *((f"spec.{name}", 5) for name in ("cameras", "action", "state", "state_units", "units", "low", "image_size")),
     *(("spec", 3), ("spec.image_size", [-1, -1]), ("spec.image_size", ["a", "b"]), ("spec.action", [])),
-    *(("spec.control_hz", 0), ("spec.control_hz", "x"), ("packed", None), ("packed", "x"), ("config", None)),
+    *(("spec.control_hz", 0), ("spec.control_hz", "x"), ("codec", None), ("codec", "x"), ("config", None)),
     *(("config", [1]), ("config", {"parts": None}), ("format", 0), ("format", 2), ("format", None)),
     *(("config", {"task": {"_target_": "os.system"}}), ("config", {"task": "${oc.env:PATH}"})),
 )
@@ -207,7 +207,10 @@ def disks(root: Path) -> Trials:
             "job=export export=lerobot export.folder=full",
             "job=export export=program checkpoint=CKPT export.folder=full",
         ),
-        *("job=export export=packed export.folder=full", "job=inspect inspect.into=full inspect.stores=[store]"),
+        *(
+            "job=collect collect.episodes=12 collect.images=jpeg",
+            "job=inspect inspect.into=full inspect.stores=[store]",
+        ),
         *("job=train trainer.max_steps=4", "checkpoint=CKPT evaluate.episodes=1 cluster.workers=1"),
     ):
         arguments = line.replace("CKPT", CHECKPOINT).split(" ")

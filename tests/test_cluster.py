@@ -134,7 +134,7 @@ def test_an_evaluation_reports_and_records_the_same(two: DaskCluster, tmp_path: 
     assert len(here[1]) == len(seeds)
 
 
-@pytest.mark.parametrize("kind", ["files", "lerobot", "packed"])
+@pytest.mark.parametrize("kind", ["files", "lerobot"])
 def test_exported_files_are_the_same(kind: str, two: DaskCluster, folder: Path, tmp_path: Path) -> None:
     store = EpisodeStore(folder, 4)
     here = exporter(kind, tmp_path / "here").export(store)

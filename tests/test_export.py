@@ -72,7 +72,7 @@ def test_what_is_there_is_left_alone(tmp_path: Path) -> None:
     assert (folder / "episode_00000/manifest.json").stat().st_mtime_ns == untouched
 
 
-@pytest.mark.parametrize("kind", ["files", "lerobot", "packed"])
+@pytest.mark.parametrize("kind", ["files", "lerobot"])
 def test_what_a_killed_export_left_beside_the_whole_one_is_removed(kind: str, tmp_path: Path) -> None:
     store, _ = stored(tmp_path / "store")
     folder = exporter(kind, tmp_path / "export").export(store)

@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import toy
-from exporting import exporter
 from toy_recordable import RecordableEnvironment
 
 from vla.data.episodes import EpisodeStore
@@ -73,11 +72,8 @@ def test_the_nearest_demonstration_of_a_known_scene_is_its_own_unless_that_is_sh
     assert np.array_equal(own, any_of_them) and not np.array_equal(own, theirs)
 
 
-def test_the_nearest_demonstration_is_found_in_a_packed_store_and_only_by_the_first_images(
-    folder: Path, tmp_path: Path
-) -> None:
-    packed = exporter("packed", tmp_path / "packed").export(EpisodeStore(folder))
-    environment, agent = toy.make_environment(), NearestDemonstration(packed, 20, spec=toy.SPEC)
+def test_the_nearest_demonstration_is_found_by_the_first_images_only(folder: Path) -> None:
+    environment, agent = toy.make_environment(), NearestDemonstration(folder, 20, spec=toy.SPEC)
     entry = EpisodeStore(folder).episodes[0]
     seen = environment.reset(entry.seed)
     agent.reset(entry.instruction, FIRST_SEED)

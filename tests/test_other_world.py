@@ -106,7 +106,7 @@ def test_a_policy_is_evaluated_recorded_and_reported(folder: Path, tmp_path: Pat
     assert (tmp_path / "sweep.html").is_file()
 
 
-@pytest.mark.parametrize("kind", ["files", "lerobot", "packed"])
+@pytest.mark.parametrize("kind", ["files", "lerobot"])
 def test_episodes_are_exported(folder: Path, tmp_path: Path, kind: str) -> None:
     store = EpisodeStore(folder, episodes=3)
     exporter(kind, tmp_path / "export").export(store)
@@ -114,8 +114,6 @@ def test_episodes_are_exported(folder: Path, tmp_path: Path, kind: str) -> None:
         state = json.loads((tmp_path / "export/episode_00000/step_0000/robot_state.json").read_text())
         assert np.array([state["east"], state["north"]], np.float32).tolist() == store.rows("state")[:1][0].tolist()
         assert not list((tmp_path / "export").rglob("depth*"))
-    elif kind == "packed":
-        assert EpisodeStore(tmp_path / "export").packed == {"rgb_eye": "zlib"}
     else:
         expert = LeRobotDemonstrations(**defaults_of("expert/lerobot", folder=tmp_path / "export"), spec=toy.SPEC)
         episode = expert.episode(0)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,7 @@ import toy
 
 from vla.data import episodes
 from vla.data.episodes import EpisodeStore
-from vla.data.scattered_rows import ScatteredRows
+from vla.data.fields import ScatteredRows
 from vla.data.window_batches import BufferPool, WindowBatcher, perturbed
 
 
@@ -43,13 +44,17 @@ def test_memory_is_used_again_once_nothing_refers_to_it() -> None:
 def test_rows_in_random_order_are_those_of_the_file(tmp_path: Path) -> None:
     values = np.random.default_rng(0).integers(0, 255, (900, 7, 5, 3), np.uint8)
     values.tofile(tmp_path / "rows.bin")
-    rows = ScatteredRows(tmp_path / "rows.bin", (850, 7, 5, 3), values.dtype)  # more are being written
+    damaged = [ValueError(f"row {row}") for row in range(900)].__getitem__
+    rows = ScatteredRows(tmp_path / "rows.bin", (850, 7, 5, 3), values.dtype, damaged)  # more are being written
     index = np.array([[849, 0], [3, 500]])
     np.testing.assert_array_equal(rows.take(index), values[index])
     out = np.empty((2, 2, 7, 5, 3), np.uint8)
     assert rows.take(index, 0, out, "clip") is out and np.array_equal(out, values[index])
     np.testing.assert_array_equal(rows[840:900], values[840:850])
     assert rows[5:5].shape == (0, 7, 5, 3)
+    os.truncate(tmp_path / "rows.bin", 840 * 105)
+    with pytest.raises(ValueError, match="row 840"):
+        rows.take(np.array([3, 840]))
 
 
 @pytest.mark.parametrize("history", [1, 3])

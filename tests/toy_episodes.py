@@ -8,6 +8,7 @@ from pathlib import Path
 from toy import ARM_SPEC, ToyExpert, make_arm
 
 from vla.data.episodes import EpisodeStore
+from vla.data.header import Codec
 from vla.rollouts.rollout import rollout
 from vla.spec import Episode
 
@@ -16,8 +17,11 @@ CONFIG = {"task": {"size": 1.0}, "seed": 0}
 EPISODES = [rollout(make_arm(), ToyExpert(), seed) for seed in range(5)]  # seed 3 fails
 
 
-def add(folder: Path, episodes: list[Episode]) -> EpisodeStore:
-    store = EpisodeStore.create_or_open(folder, ARM_SPEC, CONFIG)
+CODECS = [Codec("raw"), Codec("lossless"), Codec("jpeg", 95)]
+
+
+def add(folder: Path, episodes: list[Episode], codec: Codec | None = None) -> EpisodeStore:
+    store = EpisodeStore.create_or_open(folder, ARM_SPEC, CONFIG, codec)
     with store.writing():
         for episode in episodes:
             if episode.success:

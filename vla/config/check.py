@@ -20,7 +20,7 @@ from vla.config.annotations import MissingLibrary, fits, locate
 from vla.config.build import GROUPS, Group, arguments, check_node, check_value, makes, require_known
 from vla.config.packages import config_folders
 from vla.io.documents import canonical
-from vla.io.types import Count, Natural, Seed, Shift, Text, unique
+from vla.io.types import Count, Images, Natural, Quality, Seed, Shift, Text, unique
 from vla.spec import FIRST_SEED, IN_DISTRIBUTION
 
 UnseenSeed = Annotated[Seed, Ge(FIRST_SEED)]
@@ -60,7 +60,14 @@ PLAIN: dict[str, Any] = {
     "trust": list[str],
     "output": Text,
     "chosen": dict[str, str | None],
-    "collect": {"episodes": Count, "seed": Seed, "folder": Text, "more": list[Text] | None},
+    "collect": {
+        "episodes": Count,
+        "seed": Seed,
+        "folder": Text,
+        "more": list[Text] | None,
+        "images": Images | Literal["auto"],
+        "quality": Quality,
+    },
     "validate": {"episodes": Natural, "seed": UnseenSeed, "changes": dict[str, object]},
     "evaluate": {
         "episodes": Count,

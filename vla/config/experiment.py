@@ -25,6 +25,7 @@ from vla.spec import Spec, SpecOnly
 if TYPE_CHECKING:
     from vla.data.datamodule import WindowDataModule
     from vla.data.episodes import EpisodeStore
+    from vla.data.header import Codec
     from vla.models.checkpoint import Checkpoint
     from vla.models.learner import Learner
     from vla.models.model import Model
@@ -114,6 +115,16 @@ class Experiment:
     def source(self) -> Node:
         """The nodes that determine the demonstrations."""
         return {"task": self["task"], "expert": self["expert"]}
+
+    @property
+    def codec(self) -> Codec | None:
+        """Codec of the images of new stores; None: the one that suits their size."""
+        from vla.data.header import Codec
+
+        asked = self["collect"]
+        if asked["images"] == "auto":
+            return None
+        return Codec(asked["images"], asked["quality"] if asked["images"] == "jpeg" else None)
 
     def make_environment(self, changes: Node | None = None) -> Callable[[], Environment]:
         """Return the factory of the environment, with the `changes` of a condition."""

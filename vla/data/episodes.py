@@ -1,13 +1,14 @@
 """Episode store: one flat file per field and one index line per tried seed.
 
-A folder holds `store.json` (the layout of the rows), `<field>.bin` (the rows of all episodes, in order) and
-`index.jsonl`. An episode exists once its index line does: its rows are written before the line, so a process killed at
-any moment leaves at most rows without a line, which the next writer truncates. The bytes depend on the episodes only,
-never on time or on the number of processes.
+A folder holds `store.json` (the layout of the rows), the files of every field (the rows of all episodes, in order, see
+`vla.data.fields`) and `index.jsonl`. An episode exists once its index line does: its rows are written before the line,
+so a process killed at any moment leaves at most rows without a line, which the next writer truncates. The bytes depend
+on the episodes only, never on time or on the number of processes.
 
 A collected store holds consecutive seeds of one config and can grow. A derived store (`vla.data.verification`) lists
-the configs of its sources as `parts`, holds any seeds, and cannot grow. Nor can a store with packed images
-(`vla.data.formats.packed`), whose `store.json` gives the codec of every packed field.
+the configs of its sources as `parts`, holds any seeds, and cannot grow.
+
+Images are raw or compressed one by one. A codec without loss changes neither config nor checksums of the episodes.
 """
 
 from __future__ import annotations
@@ -18,29 +19,34 @@ import os
 import zlib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
-from math import prod
+from functools import partial
 from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
 from filelock import FileLock, Timeout
 
-from vla.data.header import fields_of, images_of, is_store, read_header, write_header
-from vla.data.image_codec import JPEG, PackedRows, whole_rows
+from vla.data.fields import Rows, ScatteredRows, open_field
+from vla.data.header import Codec, fields_of, images_of, is_store, read_header, write_header
 from vla.data.index import REMEDY, SALVAGE, Entry, dumps, index_line, listed, parse_line, read_index
-from vla.data.scattered_rows import ScatteredRows
 from vla.data.statistics import Statistics
 from vla.io.documents import canonical
 from vla.io.files import require_file
 from vla.parallel.limits import memory
 from vla.spec import FIRST_SEED, Array, Episode, Observation, Spec
 
-Rows = Array | PackedRows
-
 BLOCK = 256  # rows per update of a checksum
 IN_MEMORY = 0.25  # largest share of the memory that a store takes that is expected to stay in it
 
 log = logging.getLogger(__name__)
+
+
+class DamagedRows(ValueError):
+    """Rows differ from their checksums; `what` names the image, if it is known."""
+
+    def __init__(self, message: str, what: str = "rows") -> None:
+        super().__init__(message)
+        self.what = what
 
 
 class EpisodeStore:
@@ -51,7 +57,7 @@ class EpisodeStore:
         spec: layout of a step.
         config: of the task and the expert of the episodes.
         fields: field → shape and dtype of a row, see `fields_of`.
-        packed: packed field → codec.
+        codec: of the images.
         tried: one entry per seed.
         episodes: those of the stored episodes, of seeds that succeeded and of labelled failures; at most `episodes`.
 
@@ -69,29 +75,33 @@ class EpisodeStore:
         self.header, self.spec = read_header(self.folder)
         self.config: dict[str, Any] = self.header.config
         self.fields = fields_of(self.spec)
-        self.packed: Mapping[str, str] = self.header.packed
+        self.codec: Codec = self.header.codec
+        self._columns = {name: open_field(self.folder, name, *row, self.codec) for name, row in self.fields.items()}
         self._limit, self._damaged = episodes, damaged
-        self._files: dict[str, BinaryIO] = {}
+        self._index, self._files = self.folder / "index.jsonl", dict[Path, BinaryIO]()
         self._refresh()
         if episodes is not None and len(self.episodes) < episodes:
             raise ValueError(f"{folder} holds {len(self.episodes)} of {episodes} episodes: collect the rest first")
 
     @classmethod
-    def create_or_open(cls, folder: str | Path, spec: Spec, config: Mapping[str, Any]) -> EpisodeStore:
-        """Open the store in `folder`, or create an empty one.
+    def create_or_open(
+        cls, folder: str | Path, spec: Spec, config: Mapping[str, Any], codec: Codec | None = None
+    ) -> EpisodeStore:
+        """Open the store in `folder`, or create an empty one, whose codec is by default that for its size of images.
 
         Raises:
-            ValueError: the store has another spec or config, or lacks its `store.json`.
+            ValueError: the store has another spec or config, other losses than `codec`, or lacks its `store.json`.
         """
         folder = Path(folder)
         plain = json.loads(dumps(config))
         if not is_store(folder):
             folder.mkdir(parents=True, exist_ok=True)
             with FileLock(folder / "lock"):
-                write_header(folder, spec, plain)
+                write_header(folder, spec, plain, codec or Codec.suited(spec))
         store = cls(folder)
         spec.require(store.spec, "this task", f"the episode store {folder}")
         store.require(plain)
+        store.require_codec(codec)
         return store
 
     def require(self, config: Mapping[str, Any]) -> None:
@@ -105,6 +115,13 @@ class EpisodeStore:
         different = sorted(key for key in {*asked, *there} if asked.get(key) != there.get(key))
         if different:
             raise ValueError(f"{self.folder} was collected with another config for {different}: choose another folder")
+
+    def require_codec(self, codec: Codec | None) -> None:
+        """Raise a ValueError if the images have other losses than those of `codec`; with None they may have any."""
+        if codec is not None and codec.loss != self.codec.loss:
+            raise ValueError(
+                f"{self.folder} holds {self.codec}, not {codec}: choose another folder, or omit collect.images"
+            )
 
     def require_first_seed(self, seed: int) -> None:
         """Raise a ValueError if the first episode has another seed; a derived store may begin anywhere."""
@@ -147,85 +164,79 @@ class EpisodeStore:
     def rows(self, field: str) -> Rows:
         """Return all committed rows of `field`, (N, …), which are read when they are indexed.
 
-        They are a memory-mapped array, or `PackedRows`, which raise a ValueError with the seed of a damaged image.
+        They are a memory-mapped array, or `ScatteredRows`, which raise a DamagedRows error for a damaged image.
         """
         if field not in self.fields:
             raise ValueError(f"{self.folder} has no field {field!r}: it has {sorted(self.fields)}")
         shape, dtype = self.fields[field]
         if self._rows == 0:
             return np.empty((0, *shape), dtype)
-        if field in self.packed:
-            return PackedRows(self.folder, field, self.packed[field], (self._rows, *shape), dtype, self._changed_at)
-        return np.asarray(np.memmap(self._path(field), dtype, mode="r", shape=(self._rows, *shape)))
+        return self._columns[field].rows(self._rows, partial(self._image_changed, field))
 
-    def scattered(self, field: str) -> Rows | ScatteredRows:
+    def scattered(self, field: str) -> Rows:
         """Return the same rows to take in random order; if the store is large, only what is taken is read."""
-        if field in self.packed or not self._large:
+        if not self._large:
             return self.rows(field)
-        shape, dtype = self.fields[field]
-        return ScatteredRows(self._path(field), (self._rows, *shape), dtype)
+        return self._columns[field].scattered(self._rows, partial(self._image_changed, field))
+
+    def packed(self, entry: Entry) -> dict[str, list[bytes]]:
+        """Return the images of an episode as they are compressed, by field; a DamagedRows error if one is damaged."""
+        sources = {field: self.rows(field) for field in images_of(self.spec)}
+        return {field: rows.packed(entry.span) for field, rows in sources.items() if isinstance(rows, ScatteredRows)}
+
+    def size(self, field: str, entry: Entry) -> int:
+        """Return how many bytes of the disk a field of an episode takes."""
+        before, after = (self._columns[field].sizes(rows) for rows in (entry.start, entry.end))
+        return sum(after) - sum(before)
 
     @property
     def _large(self) -> bool:
         """Whether the rows may not stay in memory."""
-        sizes = (prod(shape) * dtype.itemsize for shape, dtype in self.fields.values())
-        return self._rows * sum(sizes) > IN_MEMORY * memory()
+        return self._rows * sum(column.size for column in self._columns.values()) > IN_MEMORY * memory()
 
     def read(self, entry: Entry) -> dict[str, Array]:
-        """Read one episode as field → (steps, …) rows; a ValueError if a checksum differs."""
+        """Read one episode as field → (steps, …) rows; a DamagedRows error if a checksum differs."""
         sources = {field: self.rows(field) for field in self.fields}
         rows = {field: np.array(source[entry.span]) for field, source in sources.items()}
         for field, values in rows.items():
             # JPEG decoders may round differently, so the checksum of a JPEG is that of its file.
-            checked = stored(sources[field], entry.span) if self.lossy(field) else values
-            if len(values) < entry.steps or zlib.crc32(checked.data) != entry.crc.get(field):
+            lossy = self._columns[field].lossy
+            crc = self._checksum(sources[field], entry.span) if lossy else zlib.crc32(values.data)
+            if len(values) < entry.steps or crc != entry.crc.get(field):
                 raise self._changed([entry.seed])
         return rows
 
-    def verify(self, entries: Iterable[Entry], rows: Mapping[str, Rows | ScatteredRows]) -> None:
+    def verify(self, entries: Iterable[Entry], rows: Mapping[str, Rows]) -> None:
         """Compare the `rows` of episodes, by field, with their checksums.
 
         Raises:
-            ValueError: some differ; the message names their seeds.
+            DamagedRows: some differ; the message names their seeds.
         """
-        changed = [
-            entry.seed
-            for entry in entries
-            if not all(self._intact(entry, field, source) for field, source in rows.items())
-        ]
-        if changed:
-            raise self._changed(changed)
+        found = {entry.seed: damage for entry in entries if (damage := self._damage(entry, rows))}
+        if found:
+            raise self._changed([*found]) if len(found) > 1 else found.popitem()[1]
 
-    def _intact(self, entry: Entry, field: str, rows: Rows | ScatteredRows) -> bool:
-        crc = 0
+    def _damage(self, entry: Entry, rows: Mapping[str, Rows]) -> DamagedRows | None:
         try:
-            for first in range(entry.start, entry.end, BLOCK):
-                span = slice(first, min(first + BLOCK, entry.end))
-                crc = zlib.crc32((stored(rows, span) if self.lossy(field) else rows[span]).data, crc)
-        except ValueError:  # an image that cannot be decoded
-            return False
-        return crc == entry.crc.get(field)
+            if all(self._checksum(source, entry.span) == entry.crc.get(field) for field, source in rows.items()):
+                return None
+        except DamagedRows as damage:
+            return damage
+        return self._changed([entry.seed])
 
-    def lossy(self, field: str) -> bool:
-        """Return whether the rows of `field` are compressed with loss."""
-        return self.packed.get(field) == JPEG
-
-    def _changed(self, seeds: Sequence[int]) -> ValueError:
+    def _changed(self, seeds: Sequence[int]) -> DamagedRows:
         which = f"seed {seeds[0]}" if len(seeds) == 1 else f"the seeds {listed(seeds)}"
-        return ValueError(f"the rows of {which} in {self.folder} were changed on disk: {SALVAGE}")
+        return DamagedRows(f"the rows of {which} in {self.folder} were changed on disk: {SALVAGE}")
 
-    def _changed_at(self, row: int) -> ValueError:
-        return self._changed([entry.seed for entry in self.episodes if row < entry.end][:1])
+    def _image_changed(self, field: str, row: int) -> DamagedRows:
+        entry = next(entry for entry in self.tried if entry.start <= row < entry.end)
+        image = f"{field} of step {row - entry.start}"
+        return DamagedRows(f"{image} of seed {entry.seed} in {self.folder} was changed on disk: {SALVAGE}", image)
 
     @contextmanager
     def writing(self) -> Iterator[None]:
         """Lock the store for writing, after any other writer, and truncate what a killed one left incomplete."""
         assert not self._damaged, "a damaged store is left as it is"
-        if self.packed:
-            raise ValueError(
-                f"{self.folder} is packed and does not grow: set collect.episodes={len(self.episodes)}, or collect "
-                "into another folder and pack that"
-            )
         lock = FileLock(self.folder / "lock")
         try:
             lock.acquire(timeout=0)
@@ -235,10 +246,10 @@ class EpisodeStore:
         with ExitStack() as stack:
             stack.callback(lock.release)
             self._refresh()
-            paths = {name: self._path(name) for name in ("index", *self.fields)}
-            _require_own_files(paths.values())
-            for name, path in paths.items():
-                self._files[name] = stack.enter_context(path.open("ab", buffering=0))
+            paths = (self._index, *(path for column in self._columns.values() for path in column.files))
+            _require_own_files(paths)
+            for path in paths:
+                self._files[path] = stack.enter_context(path.open("ab", buffering=0))
             stack.callback(self._files.clear)
             self._cut()
             yield
@@ -247,8 +258,10 @@ class EpisodeStore:
             for file in self._files.values():
                 os.fsync(file.fileno())
 
-    def append(self, episode: Episode) -> None:
+    def append(self, episode: Episode, packed: Mapping[str, Sequence[bytes]] | None = None) -> None:
         """Store an episode atomically: a success, or a failure whose labels are to be kept.
+
+        `packed` are its images as another store with the same codec keeps them: JPEG is not compressed a second time.
 
         Raises:
             ValueError: it does not match the spec, has several instructions or another seed than the next, or cannot be
@@ -263,7 +276,10 @@ class EpisodeStore:
             rows = self._rows_of(episode)
         except KeyError as error:
             raise ValueError(f"seed {episode.seed}: an observation lacks {error}, which the spec names") from error
-        self._commit(self._entry(episode, episode.instruction, len(episode.actions), checksums(rows)), rows)
+        pieces = {name: self._columns[name].pieces(self._rows, rows[name], (packed or {}).get(name)) for name in rows}
+        checked = {name: pieces[name][0] if self._columns[name].lossy else rows[name].data for name in rows}
+        crc = {name: zlib.crc32(content) for name, content in checked.items()}
+        self._commit(self._entry(episode, episode.instruction, len(episode.actions), crc), pieces)
 
     def fail(self, episode: Episode) -> None:
         """Store the outcome of a failed seed, without rows. Raises as `append` does."""
@@ -274,16 +290,17 @@ class EpisodeStore:
         what = (episode.seed, episode.task, episode.outcome, milestones, instruction)
         return Entry(*what, self._rows, steps, dict(episode.draws), crc)
 
-    def _commit(self, entry: Entry, rows: Mapping[str, Array]) -> None:
+    def _commit(self, entry: Entry, pieces: Mapping[str, Sequence[bytes | memoryview]]) -> None:
         assert self._files, "append and fail work inside `with store.writing()`"
         if self.next_seed not in (None, entry.seed):
             raise ValueError(f"{self.folder} expects seed {self.next_seed} next, got seed {entry.seed}")
         line = index_line(entry)
         entry = parse_line(line[:-1], f"{self.folder}: the entry of seed {entry.seed}")  # validated as a reader does
         try:
-            for name, values in rows.items():
-                _write(self._files[name], values.data.cast("B"))
-            _write(self._files["index"], memoryview(line))
+            for name, contents in pieces.items():
+                for path, content in zip(self._columns[name].files, contents, strict=True):
+                    _write(self._files[path], memoryview(content))
+            _write(self._files[self._index], memoryview(line))
             self.tried.append(entry)
             if entry.stored and (self._limit is None or len(self.episodes) < self._limit):
                 self.episodes.append(entry)
@@ -297,29 +314,23 @@ class EpisodeStore:
 
     def _cut(self) -> None:
         # The index first: no line may refer to truncated rows at any moment.
-        self._files["index"].truncate(self._index_size)
-        for field in self.fields:
-            self._files[field].truncate(self._size(field))
+        self._files[self._index].truncate(self._index_size)
+        for column in self._columns.values():
+            for path, size in zip(column.files, column.sizes(self._rows), strict=True):
+                self._files[path].truncate(size)
 
     def _refresh(self) -> None:
-        index = self._path("index")
-        if not index.exists() and (there := [field for field in self.fields if self._path(field).exists()]):
-            raise ValueError(f"{index} is missing, which {self._path(there[0]).name} beside it needs: {REMEDY}")
-        self.tried, self._index_size = read_index(self._path("index"), self.derived, self._damaged)
+        files = [column.files[0] for column in self._columns.values()]
+        if not self._index.exists() and (there := [path for path in files if path.exists()]):
+            raise ValueError(f"{self._index} is missing, which {there[0].name} beside it needs: {REMEDY}")
+        self.tried, self._index_size = read_index(self._index, self.derived, self._damaged)
         self.episodes = [entry for entry in self.tried if entry.stored][: self._limit]
         self._rows = max((entry.end for entry in self.tried), default=0)
-        for field in self.fields if self._rows else ():
-            whole = self._whole(field)
+        for column in self._columns.values():
+            whole = column.whole(self._rows)
             if whole < self._rows and not self._damaged:
-                raise ValueError(f"{self._path(field)} is shorter than its index says: {SALVAGE}")
-            self._rows = min(self._rows, whole)
-
-    def _whole(self, field: str) -> int:
-        if field in self.packed:
-            return whole_rows(self.folder, field, self._rows)
-        path, needed = self._path(field), self._size(field)
-        size = path.stat().st_size if path.exists() else 0
-        return self._rows if size >= needed else self._rows * size // needed
+                raise ValueError(f"{column.files[0]} is shorter than its index says: {SALVAGE}")
+            self._rows = whole
 
     def _rows_of(self, episode: Episode) -> dict[str, Array]:
         observations = episode.observations
@@ -341,14 +352,14 @@ class EpisodeStore:
             raise ValueError(f"{name} must be {(steps, *shape)} {dtype}, got {column.shape} {column.dtype}")
         return np.ascontiguousarray(column, dtype)
 
-    def _size(self, field: str) -> int:
-        shape, dtype = self.fields[field]
-        return self._rows * int(np.prod(shape)) * dtype.itemsize
-
-    def _path(self, name: str) -> Path:
-        if name in self.packed:
-            return self.folder / f"{name}.pack"
-        return self.folder / ("index.jsonl" if name == "index" else f"{name}.bin")
+    def _checksum(self, rows: Rows, span: slice) -> int:
+        """Return the CRC-32 of rows, or of their files if they are JPEG."""
+        if isinstance(rows, ScatteredRows) and rows.lossy:
+            return zlib.crc32(b"".join(rows.packed(span)))
+        crc = 0
+        for first in range(span.start, span.stop, BLOCK):
+            crc = zlib.crc32(rows[first : min(first + BLOCK, span.stop)].data, crc)
+        return crc
 
 
 def observations_of(spec: Spec, rows: Mapping[str, Array], instruction: str) -> list[Observation]:
@@ -364,16 +375,6 @@ def observations_of(spec: Spec, rows: Mapping[str, Array], instruction: str) -> 
         )
         for step in range(len(rows["state"]))
     ]
-
-
-def stored(rows: Rows | ScatteredRows, span: slice) -> Array:
-    """Return consecutive rows as stored on disk: the rows, or compressed bytes (M,)."""
-    return rows.stored(span) if isinstance(rows, PackedRows) else rows[span]
-
-
-def checksums(rows: Mapping[str, Array]) -> dict[str, int]:
-    """Compute field → CRC-32 of rows."""
-    return {field: zlib.crc32(values.data) for field, values in rows.items()}
 
 
 def _require_own_files(paths: Iterable[Path]) -> None:

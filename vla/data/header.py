@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import numpy as np
 from annotated_types import Ge, Le
@@ -12,13 +12,52 @@ from annotated_types import Ge, Le
 from vla.data.index import REMEDY, Plain, dumps
 from vla.io.documents import STRICT, parse_json, parse_plain, read_bounded, resolved
 from vla.io.files import write_text
+from vla.io.types import Images, Quality
 from vla.spec import Spec
 
 FORMAT = 3
 NAME = "store.json"
 LARGEST = 16 << 20  # [bytes]; a derived store of a thousand others has 5 MB
+LARGEST_RAW = 128  # height and width of the images that are stored raw unless asked otherwise [px]
 
-Codec = Literal["jpeg", "zlib"]
+
+@dataclass(frozen=True)
+class Codec:
+    """How a store keeps its images. Depth loses nothing: it is lossless where colour is JPEG."""
+
+    __pydantic_config__ = STRICT
+
+    images: Images = "raw"
+    quality: Quality | None = None  # of JPEG
+
+    @classmethod
+    def suited(cls, spec: Spec) -> Codec:
+        """Return the codec for images of the size in `spec`: raw up to `LARGEST_RAW`, beyond it lossless."""
+        return cls("raw" if max(spec.image_size) <= LARGEST_RAW else "lossless")
+
+    def __str__(self) -> str:
+        """Describe the images."""
+        return f"{self.images} images" + (f" of quality {self.quality}" if self.quality else "")
+
+    @property
+    def valid(self) -> bool:
+        """Whether there is a quality exactly for JPEG."""
+        return (self.images == "jpeg") == (self.quality is not None)
+
+    @property
+    def loss(self) -> Codec:
+        """What two codecs share that give back the same images."""
+        return self if self.images == "jpeg" else RAW
+
+    def of(self, field: str) -> Images:
+        """Return the codec of a field."""
+        kind = field.partition("_")[0]
+        if kind not in ("rgb", "depth"):
+            return "raw"
+        return "lossless" if kind == "depth" and self.images == "jpeg" else self.images
+
+
+RAW = Codec()
 
 
 @dataclass(frozen=True)
@@ -61,14 +100,14 @@ class Header:
     spec: Any
     config: Plain  # of task and expert, or `Derived`
     fields: dict[str, Layout]
-    packed: dict[str, Codec] = field(default_factory=dict)  # field of packed images → codec
-    quality: Annotated[int, Ge(1), Le(95)] | None = None  # of JPEG
+    codec: Codec = RAW  # of the images; not written if they are raw
 
     def text(self) -> str:
         """Return the content of the file."""
-        return dumps(
-            {name: value for name, value in asdict(self).items() if value not in ({}, None) or name == "config"}
-        )
+        content = asdict(self)
+        if self.codec == RAW:
+            del content["codec"]
+        return dumps(content)
 
 
 def fields_of(spec: Spec) -> dict[str, tuple[tuple[int, ...], np.dtype]]:
@@ -118,13 +157,13 @@ def _parsed(content: bytes, path: Path) -> tuple[Header, Spec]:
     if "parts" in header.config:
         parse_plain(header.config, Derived, f"{path}: config")
     resolved(header.config, str(path))
-    if header.fields != _layouts(spec) or (header.packed and set(header.packed) != set(images_of(spec))):
+    if header.fields != _layouts(spec) or not header.codec.valid:
         raise ValueError(f"{path} is damaged or of another kind: its fields are not those of its spec")
     return header, spec
 
 
-def write_header(folder: Path, spec: Spec, config: dict[str, Any]) -> None:
-    """Write the description of an unpacked store unless it exists: another process may have been faster.
+def write_header(folder: Path, spec: Spec, config: dict[str, Any], codec: Codec) -> None:
+    """Write the description of a store unless it exists: another process may have been faster.
 
     Raises:
         ValueError: the folder holds episodes without a description.
@@ -133,10 +172,10 @@ def write_header(folder: Path, spec: Spec, config: dict[str, Any]) -> None:
     path = folder / NAME
     if is_store(folder):
         return
-    orphans = sorted(file.name for file in folder.iterdir() if file.suffix in (".bin", ".jsonl"))
+    orphans = sorted(file.name for file in folder.iterdir() if file.suffix in (".bin", ".pack", ".jsonl"))
     if orphans:
         raise ValueError(f"{folder} holds {orphans[0]} without {NAME}, which says what it means: {REMEDY}")
-    write_text(path, Header(FORMAT, spec.to_dict(), config, _layouts(spec)).text())
+    write_text(path, Header(FORMAT, spec.to_dict(), config, _layouts(spec), codec).text())
 
 
 def _layouts(spec: Spec) -> dict[str, Layout]:

@@ -18,8 +18,9 @@ import numpy as np
 from rich.progress import track
 
 from vla.data.episode_filter import episode_filter
-from vla.data.episodes import EpisodeStore, observations_of, stored
-from vla.data.index import DAMAGED, LOST, NOT_NEEDED, Entry, listed
+from vla.data.episodes import DamagedRows, EpisodeStore, observations_of
+from vla.data.header import Codec
+from vla.data.index import DAMAGED, LISTED, LOST, NOT_NEEDED, Entry, listed
 from vla.spec import Array, Episode
 
 # N steps, D action components
@@ -28,7 +29,7 @@ Copy = tuple[EpisodeStore, Entry]
 
 
 class DamageError(ValueError):
-    """Error: an episode differs from its checksums."""
+    """An episode differs from its checksums."""
 
 
 @dataclass(frozen=True)
@@ -65,8 +66,7 @@ class StoreReport:
     @property
     def sizes(self) -> dict[str, int]:
         """Field → bytes of the undamaged episodes."""
-        fields = {name: self.store.rows(name) for name in self.store.fields}
-        return {name: sum(stored(rows, entry.span).nbytes for entry in self.whole) for name, rows in fields.items()}
+        return {name: sum(self.store.size(name, entry) for entry in self.whole) for name in self.store.fields}
 
 
 def verify_store(store: EpisodeStore) -> StoreReport:
@@ -93,9 +93,11 @@ def require_whole(report: StoreReport) -> None:
     """Raise a ValueError if a store has damaged episodes or none."""
     folder, count = report.store.folder, sum(map(len, report.damaged.values()))
     if report.damaged:
-        problems = "; ".join(f"seeds {listed(seeds)}: {problem}" for problem, seeds in report.damaged.items())
+        problems = [f"seeds {listed(seeds)}: {problem}" for problem, seeds in report.damaged.items()]
+        more = [f"and {len(problems) - LISTED} others"] if len(problems) > LISTED else []
+        named = "; ".join([*problems[:LISTED], *more])
         raise ValueError(
-            f"{folder} has {count} damaged episodes ({problems}): inspect.repair=true leaves them out of a copy"
+            f"{folder} has {count} damaged episodes ({named}): inspect.repair=true leaves them out of a copy"
         )
     report.store.require_episodes()
 
@@ -181,7 +183,8 @@ def derive_store(
     draft = folder.with_name(f".{folder.name}.draft")
     shutil.rmtree(draft, ignore_errors=True)  # left by a process that was killed
     try:
-        store = EpisodeStore.create_or_open(draft, stores[0].spec, _config(chosen, stores, where))
+        config, codec = _config(chosen, stores, where), _codec(stores)
+        store = EpisodeStore.create_or_open(draft, stores[0].spec, config, codec)
         with store.writing():
             seeds = [(seed, found) for part in chosen.values() for seed, found in sorted(part.items())]
             damaged = [seed for seed, found in track(seeds, "writing") if not _write(store, found, repair)]
@@ -215,11 +218,17 @@ def _config(chosen: Chosen, stores: Sequence[EpisodeStore], where: Mapping[str, 
     conditions = [condition for store in stores if store.derived for condition in store.config["where"]]
     conditions += [dict(where)] if where else []
     (config, seeds), *others = chosen.items()
-    exact = not any(store.lossy(field) for store in stores for field in store.fields)
-    if not others and not conditions and exact and max(seeds) - min(seeds) == len(seeds) - 1:
+    alike = len({store.codec.loss for store in stores}) == 1
+    if not others and not conditions and alike and max(seeds) - min(seeds) == len(seeds) - 1:
         return json.loads(config)
     parts = [{"config": json.loads(config), "entries": len(seeds)} for config, seeds in chosen.items()]
     return {"parts": parts, "where": conditions}
+
+
+def _codec(stores: Sequence[EpisodeStore]) -> Codec:
+    """Return the codec that loses nothing more: the common one of the stores, if there is one."""
+    codecs = {store.codec for store in stores}
+    return codecs.pop() if len(codecs) == 1 else Codec("lossless")
 
 
 def _write(store: EpisodeStore, copies: Sequence[Copy], repair: bool) -> bool:
@@ -233,7 +242,7 @@ def _write(store: EpisodeStore, copies: Sequence[Copy], repair: bool) -> bool:
             store.fail(_without_rows(entry))
             return True
         try:
-            store.append(episode_of(source, entry))
+            store.append(episode_of(source, entry), source.packed(entry) if source.codec == store.codec else None)
             return True
         except DamageError:
             if not repair:
@@ -246,8 +255,8 @@ def _rows_of(store: EpisodeStore, entry: Entry) -> tuple[dict[str, Array], str]:
     """Return the rows of an episode and a description of their damage, or an empty text."""
     try:
         rows = store.read(entry)
-    except ValueError:
-        return {}, "rows changed or lost"
+    except DamagedRows as damage:
+        return {}, f"{damage.what} changed or lost"
     if not all(np.isfinite(values).all() for values in rows.values() if values.dtype.kind == "f"):
         return rows, "numbers that are not finite"
     return rows, ""

@@ -14,8 +14,8 @@ import numpy as np
 import torch
 from numpy.typing import DTypeLike
 
-from vla.data.episodes import EpisodeStore, Rows
-from vla.data.scattered_rows import ScatteredRows
+from vla.data.episodes import EpisodeStore
+from vla.data.fields import Rows
 from vla.spec import Array, Spec
 
 Batch = dict[str, Any]
@@ -172,7 +172,7 @@ class WindowBatcher:
         self._store.verify(entries, images)
         self._verified[episodes] = True
 
-    def _take(self, rows: Rows | ScatteredRows, index: Array, absent: Array | None = None) -> torch.Tensor:
+    def _take(self, rows: Rows, index: Array, absent: Array | None = None) -> torch.Tensor:
         values = self._empty((*index.shape, *rows.shape[1:]), TYPES[rows.dtype])
         if values.dtype == rows.dtype:
             rows.take(index, axis=0, out=values, mode="clip")  # "clip" writes into `out` without a buffer

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from annotated_types import Ge, Gt, Le, Lt, MinLen, Predicate
 
@@ -36,6 +36,8 @@ NaturalRange = Annotated[tuple[Natural, Natural], Predicate(ascending)]
 CountRange = Annotated[tuple[Count, Count], Predicate(ascending)]
 Pixels = Annotated[int, Ge(8), Le(1024)]
 ImageSize = tuple[Pixels, Pixels]  # height, width
+Images = Literal["raw", "lossless", "jpeg"]  # codecs of images in a store
+Quality = Annotated[int, Ge(1), Le(95)]  # of JPEG
 Point = tuple[float, float, float]  # [m]
 # Network sizes, bounded by the memory of a machine: model configs are also read from checkpoints.
 Width = Annotated[int, Ge(1), Le(16384)]

@@ -54,13 +54,14 @@ def complete_store(experiment: Experiment) -> EpisodeStore | None:
     """Return the episode store of an experiment if it has enough episodes.
 
     Raises:
-        ValueError: the store was collected with another task, expert or first seed.
+        ValueError: the store was collected with another task, expert or first seed, or its images have other losses.
     """
     folder, asked = Path(experiment["collect"]["folder"]), experiment["collect"]
     if not is_store(folder):
         return None
     store = EpisodeStore(folder)
     store.require(experiment.source)
+    store.require_codec(experiment.codec)
     store.require_first_seed(asked["seed"])
     return store if len(store.episodes) >= asked["episodes"] else None
 
@@ -79,7 +80,7 @@ def _fill(experiment: Experiment) -> EpisodeStore:
     world, spec, recorded = _source(experiment)
     if recorded is not None and asked["seed"]:
         raise ValueError(f"collect.seed={asked['seed']}: recorded episodes are numbered from 0, so omit it")
-    store = EpisodeStore.create_or_open(Path(asked["folder"]), spec, experiment.source)
+    store = EpisodeStore.create_or_open(Path(asked["folder"]), spec, experiment.source, experiment.codec)
     if recorded is not None:
         added = recorded.fill(store, asked["episodes"])
         log.info("%s: %d recorded episodes, %d of them new", store.folder, len(store.episodes), added)

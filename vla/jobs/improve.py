@@ -181,7 +181,7 @@ def _labelled(experiment: Experiment, checkpoint: Path, folder: Path, seed: int)
     }
     world = environment()
     world.close()
-    store = EpisodeStore.create_or_open(folder, world.spec, own)
+    store = EpisodeStore.create_or_open(folder, world.spec, own, experiment.codec)
     policy = experiment.make_policy(checkpoint.resolve())
     agent = partial(make_supervised, policy, experiment.make_expert(), asked["beta"], asked["segment"])
     needs = [checkpoint.resolve()]

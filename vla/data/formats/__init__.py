@@ -1,1 +1,1 @@
-"""Formats of other programs: LeRobot datasets, plain files, video; and packed stores."""
+"""Formats of other programs: LeRobot datasets, plain files, video."""

@@ -1,0 +1,289 @@
+"""Stores of compressed images: without loss they are those of raw ones, and JPEG is compressed once."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from composing import composed
+from exporting import content as exported
+from exporting import exporter
+from PIL import Image
+from toy import ARM_SPEC, make_arm, make_environment, make_expert
+from toy_episodes import CODECS, CONFIG, EPISODES, MORE, add, change, content
+
+from vla.config.check import check
+from vla.config.experiment import Experiment
+from vla.data.datamodule import digest_of
+from vla.data.episodes import EpisodeStore
+from vla.data.fields import END
+from vla.data.formats.imported_demonstrations import ImportedDemonstrations
+from vla.data.header import Codec
+from vla.data.image_codec import decode, encode
+from vla.data.verification import DamageError, derive_store, episode_of, require_whole, verify_store
+from vla.data.window_batches import WindowBatcher
+from vla.jobs.collect import JOB, complete_store
+from vla.parallel.pool import LocalCluster
+from vla.rollouts.collect import collect
+from vla.spec import Episode
+
+RAW, LOSSLESS, JPEG = CODECS
+LATER = 1  # an episode after the first
+
+
+def same(one: Any, other: Any) -> bool:
+    """Whether two batches are equal, bit for bit."""
+    if isinstance(one, dict):
+        return one.keys() == other.keys() and all(same(one[name], other[name]) for name in one)
+    return torch.equal(one, other) if isinstance(one, torch.Tensor) else bool(one == other)
+
+
+def of_all(store: EpisodeStore, field: str) -> list[np.ndarray]:
+    """The rows of every episode."""
+    return [store.read(entry)[field] for entry in store.episodes]
+
+
+def test_without_loss_batches_episodes_and_index_are_those_of_a_raw_store(tmp_path: Path) -> None:
+    raw, small = add(tmp_path / "raw", EPISODES), add(tmp_path / "small", EPISODES, LOSSLESS)
+    assert small.tried == raw.tried and digest_of(small.episodes) == digest_of(raw.episodes)
+    assert content(small.folder)["index.jsonl"] == content(raw.folder)["index.jsonl"]
+    rows = np.random.default_rng(0).permutation(len(raw.rows("action")))
+    for history in (1, 6):
+        made = [WindowBatcher(store, history, 2, depth=True)(rows) for store in (small, raw)]
+        assert same(*made) and made[0]["rgb"]["front"].any()
+    for entry in raw.episodes:
+        expected = raw.read(entry)
+        for field, values in small.read(entry).items():
+            np.testing.assert_array_equal(values, expected[field])
+            assert values.dtype == expected[field].dtype
+
+
+def test_jpeg_is_close_and_smaller_and_depth_exact(tmp_path: Path) -> None:
+    store = add(tmp_path, EPISODES, JPEG)
+    require_whole(verify_store(store))
+    assert digest_of(store.episodes) != digest_of(add(tmp_path / "raw", EPISODES).episodes)
+    for entry in store.episodes:
+        rows, seen = store.read(entry), EPISODES[entry.seed].observations
+        np.testing.assert_array_equal(rows["depth_wrist"], [one.depth["wrist"] for one in seen])
+        assert 0 < np.abs(rows["rgb_front"].astype(float) - [one.rgb["front"] for one in seen]).mean() < 12
+
+
+@pytest.mark.parametrize("codec", CODECS[1:], ids=str)
+def test_images_of_an_even_colour_come_back_small(codec: Codec) -> None:
+    image = np.full((64, 48, 3), 77, np.uint8)
+    packed = encode(image, codec.of("rgb_front"), codec.quality)
+    assert len(packed) < image.nbytes / 5
+    np.testing.assert_array_equal(decode(packed, codec.of("rgb_front"), image.shape, image.dtype), image)
+    for wrong in (packed[:-4], packed[:9], b"", packed + packed):
+        if wrong[: len(packed)] != packed or codec == LOSSLESS:  # what follows a JPEG is not read
+            with pytest.raises(ValueError, match="the image cannot be decoded"):
+                decode(wrong, codec.of("rgb_front"), image.shape, image.dtype)
+    with pytest.raises(ValueError, match="the image"):
+        decode(packed, codec.of("rgb_front"), (64, 47, 3), image.dtype)
+
+
+@pytest.mark.parametrize(("size", "codec"), [((128, 128), RAW), ((128, 129), LOSSLESS), ((224, 224), LOSSLESS)])
+def test_by_default_large_images_are_compressed_without_loss(
+    tmp_path: Path, size: tuple[int, int], codec: Codec
+) -> None:
+    store = EpisodeStore.create_or_open(tmp_path, replace(ARM_SPEC, image_size=size), CONFIG)
+    assert store.codec == codec == EpisodeStore(tmp_path).codec
+    assert ("codec" in (tmp_path / "store.json").read_text()) == (codec != RAW)
+
+
+@pytest.mark.parametrize("codec", CODECS, ids=str)
+def test_a_collection_grows_to_the_same_bytes(tmp_path: Path, codec: Codec) -> None:
+    for folder, steps, workers in (("whole", [6], 2), ("grown", [2, 3, 6], 1)):
+        for episodes in steps:
+            store = EpisodeStore.create_or_open(tmp_path / folder, ARM_SPEC, CONFIG, codec)
+            collect(store, make_arm, make_expert, episodes, LocalCluster(workers), seed=0)
+        (tmp_path / folder / "seconds.txt").unlink()
+    assert content(tmp_path / "grown") == content(tmp_path / "whole")
+    assert len(EpisodeStore(tmp_path / "grown").episodes) == 6
+
+
+def test_a_store_keeps_its_codec_and_other_losses_are_refused(tmp_path: Path) -> None:
+    add(tmp_path / "raw", EPISODES[:1])
+    assert add(tmp_path / "raw", EPISODES[1:2], LOSSLESS).codec == RAW
+    with pytest.raises(ValueError, match=r"raw holds raw images, not jpeg images of quality 95: choose another folder"):
+        add(tmp_path / "raw", [], JPEG)
+    add(tmp_path / "jpeg", EPISODES[:1], JPEG)
+    assert add(tmp_path / "jpeg", EPISODES[1:2]).codec == JPEG
+    for other in (RAW, LOSSLESS, replace(JPEG, quality=90)):
+        with pytest.raises(ValueError, match="holds jpeg images of quality 95, not "):
+            add(tmp_path / "jpeg", [], other)
+
+
+@pytest.mark.parametrize(
+    ("options", "codec"),
+    [
+        ((), None),
+        (("collect.images=lossless",), LOSSLESS),
+        (("collect.images=jpeg",), Codec("jpeg", 90)),
+        (("collect.images=jpeg", "collect.quality=70"), Codec("jpeg", 70)),
+    ],
+)
+def test_the_config_names_the_codec(options: tuple[str, ...], codec: Codec | None) -> None:
+    assert Experiment.of(composed(*options)).codec == codec
+
+
+@pytest.mark.parametrize("option", ["collect.images=png", "collect.images=null", "collect.quality=96"])
+def test_a_config_of_another_codec_is_refused_by_name(option: str) -> None:
+    with pytest.raises(ValueError, match=option.partition("=")[0].replace(".", r"\.")):
+        check(composed("job=collect", option), JOB)
+
+
+def test_demonstrations_with_other_losses_do_not_complete_a_training(tmp_path: Path) -> None:
+    options = (f"collect.folder={tmp_path}", "collect.episodes=2")
+    source = Experiment.of(composed(*options)).source
+    store = EpisodeStore.create_or_open(tmp_path, ARM_SPEC, source, JPEG)
+    with store.writing():
+        for episode in EPISODES[:2]:
+            store.append(episode)
+    assert complete_store(Experiment.of(composed(*options))) is not None
+    with pytest.raises(ValueError, match=r"not lossless images: .* omit collect\.images"):
+        complete_store(Experiment.of(composed(*options, "collect.images=lossless")))
+
+
+@pytest.mark.parametrize("codec", CODECS[1:], ids=str)
+def test_a_damaged_image_is_named_by_episode_and_step(tmp_path: Path, codec: Codec) -> None:
+    store = add(tmp_path / "store", EPISODES, codec)
+    entry, row = store.tried[LATER], store.tried[LATER].start + 3
+    begins = int(np.fromfile(store.folder / "rgb_wrist.ends", END)["end"][row - 1])
+    change(store.folder / "rgb_wrist.pack", lambda data: data[:begins] + b"#" * 8 + data[begins + 8 :])
+    says = r"rgb_wrist of step 3 of seed 1 in .*store was changed on disk: keep what is whole with job=inspect"
+    for read in (lambda: store.read(entry), lambda: WindowBatcher(store, 1, 1)(np.array([0, entry.start]))):
+        with pytest.raises(ValueError, match=says):
+            read()
+    with pytest.raises(DamageError, match=r"seed 1 in .* is damaged \(rgb_wrist of step 3 changed or lost\)"):
+        episode_of(store, entry)
+    assert store.read(store.tried[0]) and verify_store(store).damaged == {"rgb_wrist of step 3 changed or lost": [1]}
+    assert derive_store([store], tmp_path / "repaired", repair=True) == [1]
+    repaired = EpisodeStore(tmp_path / "repaired")
+    assert repaired.codec == codec and [entry.seed for entry in repaired.episodes] == [0, 2, 4]
+    assert repaired.packed(repaired.tried[2]) == store.packed(store.tried[2])
+
+
+def test_damaged_images_of_several_episodes_are_named_by_seed(tmp_path: Path) -> None:
+    store = add(tmp_path, EPISODES, LOSSLESS)
+    change(tmp_path / "rgb_wrist.pack", lambda data: bytes(len(data)))
+    with pytest.raises(ValueError, match=r"the rows of the seeds 0, 1, 2, 4 in .* were changed on disk"):
+        WindowBatcher(store, 1, 1).verify()
+    with pytest.raises(ValueError, match=r"4 damaged .* \(seeds 0, 1, 2, 4: rgb_wrist of step 0 changed or lost\)"):
+        require_whole(verify_store(store))
+
+
+def test_a_message_names_as_many_damaged_images_as_fit_into_a_sentence(tmp_path: Path) -> None:
+    found = verify_store(add(tmp_path, EPISODES))
+    found.damaged.update({f"rgb_front of step {step} changed or lost": [step] for step in range(20)})
+    with pytest.raises(ValueError, match=r"20 damaged .*: rgb_front of step 7 changed or lost; and 12 others\)"):
+        require_whole(found)
+
+
+@pytest.mark.parametrize("end", [0, 2**16, 2**62, 2**63, 2**64 - 1])
+def test_no_memory_is_taken_for_what_a_damaged_file_says(tmp_path: Path, end: int) -> None:
+    store = add(tmp_path, EPISODES, LOSSLESS)
+    ends = np.fromfile(tmp_path / "rgb_front.ends", END)
+    ends["end"][2] = end
+    ends.tofile(tmp_path / "rgb_front.ends")
+    for opened in (store, EpisodeStore(tmp_path)):
+        with pytest.raises(ValueError, match=r"rgb_front of step [23] of seed 0 in .* was changed on disk"):
+            opened.read(store.tried[0])
+
+
+@pytest.mark.parametrize("file", ["rgb_wrist.pack", "rgb_wrist.ends"])
+def test_a_truncated_file_is_named_and_what_is_before_it_is_kept(tmp_path: Path, file: str) -> None:
+    store = add(tmp_path, EPISODES, LOSSLESS)
+    change(tmp_path / file, lambda data: data[:-1])
+    with pytest.raises(ValueError, match=r"rgb_wrist\.pack is shorter than its index says: keep what is whole"):
+        EpisodeStore(store.folder)
+    assert verify_store(EpisodeStore(tmp_path, damaged=True)).damaged == {"rows changed or lost": [4]}
+    (tmp_path / file).unlink()
+    assert len(verify_store(EpisodeStore(tmp_path, damaged=True)).whole) == 0
+
+
+@pytest.mark.parametrize("codec", CODECS, ids=str)
+def test_merged_stores_are_what_one_collection_makes_and_grow(tmp_path: Path, codec: Codec) -> None:
+    early, late = add(tmp_path / "early", MORE[:5], codec), add(tmp_path / "late", MORE[3:], codec)
+    add(tmp_path / "whole", MORE, codec)
+    derive_store([late, early], tmp_path / "merged")
+    assert content(tmp_path / "merged") == content(tmp_path / "whole")
+    assert not EpisodeStore.create_or_open(tmp_path / "merged", ARM_SPEC, CONFIG).derived
+
+
+def test_jpeg_is_not_compressed_a_second_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whatever an encoder would make of the images that a decoder gives."""
+    store = add(tmp_path / "store", EPISODES, JPEG)
+    monkeypatch.setattr("vla.data.fields.encode", lambda *_: pytest.fail("an image is compressed"))
+    derive_store([store], tmp_path / "chosen", {"seed": [1, 2]})
+    chosen = EpisodeStore(tmp_path / "chosen")
+    derive_store([chosen, store], tmp_path / "both")
+    for copied, seeds in ((chosen, [1, 2]), (EpisodeStore(tmp_path / "both"), [0, 1, 2, 4])):
+        require_whole(verify_store(copied))
+        assert copied.codec == JPEG and [entry.seed for entry in copied.episodes] == seeds
+        for entry in copied.episodes:
+            source = store.tried[entry.seed]
+            assert copied.packed(entry) == store.packed(source) and entry.crc == source.crc
+
+
+def test_stores_with_different_codecs_are_merged_without_a_further_loss(tmp_path: Path) -> None:
+    stores = [add(tmp_path / str(codec), MORE[2 * n : 2 * n + 2], codec) for n, codec in enumerate(CODECS)]
+    derive_store(stores, tmp_path / "merged")
+    merged = EpisodeStore(tmp_path / "merged")
+    require_whole(verify_store(merged))
+    assert merged.codec == LOSSLESS and merged.derived  # no collection makes it
+    expected = [images for store in stores for images in of_all(store, "rgb_front")]
+    for images, others in zip(of_all(merged, "rgb_front"), expected, strict=True):
+        np.testing.assert_array_equal(images, others)
+    derive_store(stores[:2], tmp_path / "exact")
+    assert content(tmp_path / "exact") == content(add(tmp_path / "whole", MORE[:4], LOSSLESS).folder)
+
+
+@pytest.mark.parametrize("kind", ["files", "lerobot", "mcap"])
+def test_exports_are_those_of_a_raw_store(tmp_path: Path, kind: str) -> None:
+    made = [
+        exporter(kind, tmp_path / f"{codec}-{kind}").export(add(tmp_path / str(codec), EPISODES[:2], codec))
+        for codec in (RAW, LOSSLESS)
+    ]
+    assert exported(made[0]) == exported(made[1]) != {}
+
+
+def test_images_in_files_are_those_that_a_training_on_jpeg_sees(tmp_path: Path) -> None:
+    store = add(tmp_path / "store", EPISODES[:1], JPEG)
+    folder = exporter("files", tmp_path / "export").export(store)
+    for step, image in enumerate(store.read(store.tried[0])["rgb_front"]):
+        written = Image.open(folder / f"episode_00000/step_{step:04d}/front/rgb_image.png")
+        np.testing.assert_array_equal(np.asarray(written), image)
+
+
+class Recorded(ImportedDemonstrations):
+    """The episodes as recordings."""
+
+    def __len__(self) -> int:
+        return 3
+
+    def episode(self, number: int) -> Episode:
+        return EPISODES[number]
+
+
+@pytest.mark.parametrize("codec", CODECS, ids=str)
+def test_imported_episodes_are_stored_as_collected_ones(tmp_path: Path, codec: Codec) -> None:
+    store = EpisodeStore.create_or_open(tmp_path / "imported", ARM_SPEC, CONFIG, codec)
+    assert [Recorded().fill(store, episodes) for episodes in (2, 3)] == [2, 1]
+    assert content(store.folder) == content(add(tmp_path / "collected", EPISODES[:3], codec).folder)
+
+
+def test_what_another_process_adds_does_not_disturb_a_reader(tmp_path: Path) -> None:
+    add(tmp_path, EPISODES[:2], LOSSLESS)
+    reader = EpisodeStore(tmp_path)
+    rows = reader.rows("rgb_front")
+    before = rows[0 : len(rows)]
+    add(tmp_path, EPISODES[2:], LOSSLESS)
+    np.testing.assert_array_equal(rows[0 : len(rows)], before)
+    assert reader.rows("rgb_front").shape == rows.shape
+    store = EpisodeStore(tmp_path)
+    assert collect(store, make_environment, make_expert, 4, LocalCluster(1), seed=0).added == 0

@@ -1,0 +1,213 @@
+"""Files of an episode store: the rows of one field, raw or as individually compressed images.
+
+Raw rows follow each other in `<field>.bin`. Compressed images follow each other in `<field>.pack`, and `<field>.ends`
+has a record per image: where it ends, and its CRC-32. Files may be longer than the rows that count.
+"""
+
+from __future__ import annotations
+
+import os
+import zlib
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from vla.data.header import Codec
+from vla.data.image_codec import decode, encode, in_threads
+from vla.io.types import Images
+from vla.spec import Array
+
+END = np.dtype([("end", "<u8"), ("crc", "<u4")])
+OVERHEAD = 4096  # largest number of bytes by which compression may enlarge an image
+
+Damaged = Callable[[int], ValueError]  # row → the error to raise
+
+
+class ScatteredRows:
+    """Array-like rows that are read one by one, in random order, and decoded by one thread per core.
+
+    Of a memory-mapped array the kernel reads ahead, on some machines by megabytes; of a file that is larger than the
+    free memory, most of that is evicted before it is used. Here the kernel knows all rows of a batch beforehand, and
+    reads nothing else.
+
+    Args:
+        path: of the file.
+        shape: of all rows, (N, …).
+        dtype: of the rows.
+        damaged: makes the error for a row that cannot be read.
+        codec: of the rows.
+        ends: of compressed rows, (N,) of type `END`.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        shape: tuple[int, ...],
+        dtype: np.dtype,
+        damaged: Damaged,
+        codec: Images = "raw",
+        ends: Array | None = None,
+    ) -> None:
+        self.shape, self.dtype = shape, dtype
+        self._file = path.open("rb", buffering=0)
+        os.posix_fadvise(self._file.fileno(), 0, 0, os.POSIX_FADV_RANDOM)
+        self._damaged, self._codec, self._ends = damaged, codec, ends
+        self.lossy = codec == "jpeg"
+        self._size = int(np.prod(shape[1:])) * dtype.itemsize  # of a decoded row [bytes]
+
+    def __len__(self) -> int:
+        return self.shape[0]
+
+    def __getitem__(self, rows: slice) -> Array:
+        return self.take(np.arange(*rows.indices(len(self))))
+
+    def take(self, index: Array, axis: int = 0, out: Array | None = None, mode: str = "raise") -> Array:
+        """Take rows as `numpy.ndarray.take` does along axis 0; indices must be in bounds and `out` contiguous."""
+        assert axis == 0
+        out = np.empty((*index.shape, *self.shape[1:]), self.dtype) if out is None else out
+        images, rows = out.reshape(-1, *self.shape[1:]), index.ravel()
+        places = self._places(rows)
+
+        def fill(number: int) -> None:
+            row, (start, size) = int(rows[number]), places[number]
+            if self._ends is not None:
+                packed = self._packed(row, start, size)
+                try:
+                    images[number] = decode(packed, self._codec, self.shape[1:], self.dtype)
+                except ValueError as error:
+                    raise self._damaged(row) from error
+            elif os.preadv(self._file.fileno(), [images[number]], start) < size:
+                raise self._damaged(row)
+
+        in_threads(fill, len(rows))
+        return out
+
+    def packed(self, rows: slice) -> list[bytes]:
+        """Return consecutive rows as they are compressed."""
+        index = np.arange(*rows.indices(len(self)))
+        return [self._packed(row, *place) for row, place in zip(index.tolist(), self._places(index), strict=True)]
+
+    def _places(self, rows: Array) -> list[tuple[int, int]]:
+        """Return offset and size [bytes] of rows in the file, which the kernel begins to read."""
+        if self._ends is None:
+            places = [(row * self._size, self._size) for row in rows.tolist()]
+        else:
+            starts = np.where(rows > 0, self._ends["end"][rows - 1], 0)
+            sizes = self._ends["end"][rows] - starts  # unsigned: negative ones are large
+            if len(wrong := np.flatnonzero((sizes > self._size + OVERHEAD) | (starts > np.iinfo(np.int64).max))):
+                raise self._damaged(int(rows[wrong[0]]))
+            places = list(zip(starts.tolist(), sizes.tolist(), strict=True))
+        for place in places:
+            os.posix_fadvise(self._file.fileno(), *place, os.POSIX_FADV_WILLNEED)
+        return places
+
+    def _packed(self, row: int, start: int, size: int) -> bytes:
+        assert self._ends is not None, "raw rows are not compressed"
+        packed = os.pread(self._file.fileno(), size, start)
+        if zlib.crc32(packed) != self._ends["crc"][row]:
+            raise self._damaged(row)
+        return packed
+
+
+Rows = Array | ScatteredRows
+
+
+class RawField:
+    """Files of a field whose rows are not compressed.
+
+    Args:
+        folder: of the store.
+        name: of the field.
+        shape: of a row.
+        dtype: of the rows.
+    """
+
+    lossy = False
+
+    def __init__(self, folder: Path, name: str, shape: tuple[int, ...], dtype: np.dtype) -> None:
+        self.shape, self.dtype = shape, dtype
+        self.size = int(np.prod(shape)) * dtype.itemsize  # of a row [bytes]
+        self.files: tuple[Path, ...] = (folder / f"{name}.bin",)
+
+    def sizes(self, rows: int) -> tuple[int, ...]:
+        """Return the bytes of the first `rows` rows in every file."""
+        return (rows * self.size,)
+
+    def whole(self, rows: int) -> int:
+        """Return how many of the first `rows` rows are complete: fewer if a file was truncated."""
+        return min(rows, _size(self.files[0]) // self.size)
+
+    def rows(self, count: int, damaged: Damaged) -> Rows:
+        """Return the first `count` > 0 rows, which are read when they are indexed."""
+        return np.asarray(np.memmap(self.files[0], self.dtype, mode="r", shape=(count, *self.shape)))
+
+    def scattered(self, count: int, damaged: Damaged) -> ScatteredRows:
+        """Return the same rows to take in random order."""
+        return ScatteredRows(self.files[0], (count, *self.shape), self.dtype, damaged)
+
+    def pieces(self, rows: int, values: Array, packed: Sequence[bytes] | None) -> list[bytes | memoryview]:
+        """Return what every file gets when `values` (N, …) follow `rows` rows; `packed` are the same, compressed."""
+        return [values.data.cast("B")]
+
+
+class PackedField(RawField):
+    """Files of a field of compressed images.
+
+    Args:
+        folder, name, shape, dtype: as of `RawField`.
+        codec: of the store.
+    """
+
+    def __init__(self, folder: Path, name: str, shape: tuple[int, ...], dtype: np.dtype, codec: Codec) -> None:
+        super().__init__(folder, name, shape, dtype)
+        self._codec, self._quality = codec.of(name), codec.quality
+        self.lossy = self._codec == "jpeg"
+        self.files = (folder / f"{name}.pack", folder / f"{name}.ends")
+
+    def sizes(self, rows: int) -> tuple[int, ...]:
+        """See `RawField`."""
+        offset = (rows - 1) * END.itemsize
+        end = int(np.fromfile(self.files[1], END, 1, offset=offset)["end"][0]) if rows else 0
+        return end, rows * END.itemsize
+
+    def whole(self, rows: int) -> int:
+        """See `RawField`."""
+        rows = min(rows, _size(self.files[1]) // END.itemsize)
+        if not rows:
+            return 0
+        within = np.flatnonzero(np.fromfile(self.files[1], END, rows)["end"] <= _size(self.files[0]))
+        return int(within[-1]) + 1 if len(within) else 0  # a changed end is detected when the image is read
+
+    def rows(self, count: int, damaged: Damaged) -> Rows:
+        """See `RawField`."""
+        return self.scattered(count, damaged)
+
+    def scattered(self, count: int, damaged: Damaged) -> ScatteredRows:
+        """See `RawField`."""
+        ends = np.asarray(np.memmap(self.files[1], END, mode="r", shape=(count,)))
+        return ScatteredRows(self.files[0], (count, *self.shape), self.dtype, damaged, self._codec, ends)
+
+    def pieces(self, rows: int, values: Array, packed: Sequence[bytes] | None) -> list[bytes | memoryview]:
+        """See `RawField`."""
+        images = list(packed) if packed is not None else [b""] * len(values)
+
+        def compress(number: int) -> None:
+            images[number] = encode(values[number], self._codec, self._quality)
+
+        if packed is None:
+            in_threads(compress, len(values))
+        ends = np.empty(len(images), END)
+        ends["end"] = self.sizes(rows)[0] + np.cumsum([len(image) for image in images])
+        ends["crc"] = [zlib.crc32(image) for image in images]
+        return [b"".join(images), ends.tobytes()]
+
+
+def open_field(folder: Path, name: str, shape: tuple[int, ...], dtype: np.dtype, codec: Codec) -> RawField:
+    """Return the files of a field in a store with a codec."""
+    packed = codec.of(name) != "raw"
+    return PackedField(folder, name, shape, dtype, codec) if packed else RawField(folder, name, shape, dtype)
+
+
+def _size(path: Path) -> int:
+    return path.stat().st_size if path.exists() else 0
