@@ -38,7 +38,7 @@ def main(folder: Path) -> None:
     store = EpisodeStore(folder)
     fields = [f"rgb_{camera}" for camera in store.spec.cameras]
     for name, read in (("memory-mapped arrays", store.rows), ("as training reads", store.scattered)):
-        forget([folder / f"{field}.bin" for field in fields])
+        forget([path for field in fields for path in folder.glob(f"{field}.*")])
         images, random = [read(field) for field in fields], np.random.default_rng(0)
         started, before, windows = time.perf_counter(), disk_bytes(), 0
         while (seconds := time.perf_counter() - started) < SECONDS:

@@ -12,7 +12,7 @@ import torch
 from composing import composed
 
 from vla.config.experiment import Experiment
-from vla.jobs.benchmark import deploy
+from vla.jobs.benchmark import deploy, loader
 from vla.jobs.benchmark.machine import OtherLoad, is_unreliable, machine
 from vla.jobs.benchmark.measure import measure
 from vla.jobs.benchmark.memory import peak, reset_peak
@@ -57,6 +57,17 @@ def test_a_peak_of_memory_is_remembered_until_it_is_forgotten() -> None:
     assert peak(device) - held > 0.9 * size
     held = reset_peak(device)
     assert peak(device) - held < 0.5 * size
+
+
+def test_large_images_are_loaded_and_their_size_is_extrapolated() -> None:
+    """250 000 steps with three images of 224 by 224 pixels and some numbers take 113 GB raw."""
+    experiment = Experiment.of(composed("job=benchmark", "benchmark.episodes=1", "benchmark.batches=1"))
+    small = experiment.with_values({"task.image_size": [224, 224], "data.batch_size": 4})
+    found = loader._of_large_images(small, chunk=2)
+    for codec in ("lossless", "jpeg"):
+        speed, size = (found[f"loader: 3 x 224 px, {codec}{end}"] for end in ("", ", 2500 x 100 steps"))
+        assert (speed["unit"], speed["n"], size["unit"]) == ("windows/s", 4, "GB") and speed["floor"] > 0
+        assert 0 < size["value"] < 40 and size["floor"] == pytest.approx(112.9, abs=0.1)
 
 
 def test_training_without_a_precision_is_refused_before_any_work() -> None:

@@ -260,6 +260,13 @@ def test_images_in_files_are_those_that_a_training_on_jpeg_sees(tmp_path: Path) 
         np.testing.assert_array_equal(np.asarray(written), image)
 
 
+def test_a_video_of_jpeg_is_a_second_loss_and_that_is_said(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    for codec in CODECS:
+        caplog.clear()
+        exporter("lerobot", tmp_path / f"export-{codec}").export(add(tmp_path / str(codec), EPISODES[:1], codec))
+        assert ("holds JPEG, of which videos lose more" in caplog.text) == (codec == JPEG)
+
+
 class Recorded(ImportedDemonstrations):
     """The episodes as recordings."""
 

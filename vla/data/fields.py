@@ -51,7 +51,8 @@ class ScatteredRows:
     ) -> None:
         self.shape, self.dtype = shape, dtype
         self._file = path.open("rb", buffering=0)
-        os.posix_fadvise(self._file.fileno(), 0, 0, os.POSIX_FADV_RANDOM)
+        self._descriptor = self._file.fileno()
+        os.posix_fadvise(self._descriptor, 0, 0, os.POSIX_FADV_RANDOM)
         self._damaged, self._codec, self._ends = damaged, codec, ends
         self.lossy = codec == "jpeg"
         self._size = int(np.prod(shape[1:])) * dtype.itemsize  # of a decoded row [bytes]
@@ -69,18 +70,20 @@ class ScatteredRows:
         images, rows = out.reshape(-1, *self.shape[1:]), index.ravel()
         places = self._places(rows)
 
-        def fill(number: int) -> None:
-            row, (start, size) = int(rows[number]), places[number]
-            if self._ends is not None:
-                packed = self._packed(row, start, size)
-                try:
-                    images[number] = decode(packed, self._codec, self.shape[1:], self.dtype)
-                except ValueError as error:
-                    raise self._damaged(row) from error
-            elif os.preadv(self._file.fileno(), [images[number]], start) < size:
-                raise self._damaged(row)
+        def unpack(number: int) -> None:
+            row = int(rows[number])
+            packed = self._packed(row, *places[number])
+            try:
+                images[number] = decode(packed, self._codec, self.shape[1:], self.dtype)
+            except ValueError as error:
+                raise self._damaged(row) from error
 
-        in_threads(fill, len(rows))
+        if self._ends is not None:
+            in_threads(unpack, len(rows))
+            return out
+        for row, image, (start, size) in zip(rows, images, places, strict=True):
+            if os.preadv(self._descriptor, [image], start) < size:
+                raise self._damaged(int(row))
         return out
 
     def packed(self, rows: slice) -> list[bytes]:
@@ -99,12 +102,12 @@ class ScatteredRows:
                 raise self._damaged(int(rows[wrong[0]]))
             places = list(zip(starts.tolist(), sizes.tolist(), strict=True))
         for place in places:
-            os.posix_fadvise(self._file.fileno(), *place, os.POSIX_FADV_WILLNEED)
+            os.posix_fadvise(self._descriptor, *place, os.POSIX_FADV_WILLNEED)
         return places
 
     def _packed(self, row: int, start: int, size: int) -> bytes:
         assert self._ends is not None, "raw rows are not compressed"
-        packed = os.pread(self._file.fileno(), size, start)
+        packed = os.pread(self._descriptor, size, start)
         if zlib.crc32(packed) != self._ends["crc"][row]:
             raise self._damaged(row)
         return packed

@@ -5,6 +5,7 @@ Shapes: N steps, D components, H by W pixels.
 
 from __future__ import annotations
 
+import logging
 import os
 import shutil
 from collections import deque
@@ -27,6 +28,8 @@ from vla.io.documents import read_json
 from vla.io.types import Text
 from vla.parallel.pool import THIS_PROCESS, Cluster
 from vla.spec import Array
+
+log = logging.getLogger(__name__)
 
 # Compromise: readers keep every file open, and find frames by 32-bit seconds, which are inexact in long files.
 EPISODES_PER_VIDEO = 50
@@ -64,6 +67,8 @@ class LeRobotExporter:
             if _holds(self._folder, source):
                 return self._folder
             require_empty(self._folder)
+            if store.codec.images == "jpeg":
+                log.warning("%s holds JPEG, of which videos lose more: export=files loses nothing", store.folder)
             draft = place / "dataset"
             if not _holds(draft, source):
                 shutil.rmtree(draft, ignore_errors=True)

@@ -1,8 +1,10 @@
-"""Throughput of the loader, and of LeRobot's loader."""
+"""Throughput of the loader, also of large images, and of LeRobot's loader."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import cycle
+from math import prod
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
@@ -12,22 +14,30 @@ from vla.config.build import build
 from vla.config.compose import compose
 from vla.config.experiment import Experiment, plain
 from vla.data.episodes import EpisodeStore
+from vla.data.header import Codec
 from vla.data.window_batches import aligned_empty
 from vla.jobs.benchmark.baselines.peer import DURATION, peer
 from vla.jobs.benchmark.measure import Measure, measure, timed
 from vla.jobs.collect import demonstrations
+from vla.rollouts.rollout import rollout
+from vla.spec import Episode, Observation
 
 if TYPE_CHECKING:
     from vla.data.datamodule import WindowDataModule
 
 ROUNDS = 5  # of the loader and of its floor, in turns; the fastest counts
+LARGE = 224  # height and width of large images [px]
+QUALITY = 90  # of JPEG
+EPISODES, STEPS = 2500, 100  # of a store whose size is extrapolated
 PEER_EPISODES = 50  # maximum number of episodes for LeRobot's loader
 
 
 def measures(experiment: Experiment) -> dict[str, Measure]:
     """Measure training windows per second, with the history of the model and with other ones.
 
-    The floor is a bare gather of the same images. If `benchmark.lerobot` names a Python interpreter, the floor of two
+    The floor is a bare gather of the same images, decoded. Where the size of images is an option of the task, so is a
+    store of large ones from three cameras, with the codec for their size and as JPEG; the floor of what many of these
+    episodes take on the disk is what they take raw. If `benchmark.lerobot` names a Python interpreter, the floor of two
     further measures is LeRobot's loader on the same episodes.
     """
     asked = experiment["benchmark"]
@@ -39,6 +49,8 @@ def measures(experiment: Experiment) -> dict[str, Measure]:
         name: _loading(alone.data(store, frames, model.chunk), store, frames, asked["batches"])
         for frames, name in [(model.history, "loader"), *names.items()]
     }
+    if "image_size" in experiment["task"]:
+        found |= _of_large_images(alone.with_values({"task.image_size": [LARGE, LARGE]}), model.chunk)
     if asked["lerobot"] is not None:
         some = EpisodeStore(store.folder, min(experiment["collect"]["episodes"], PEER_EPISODES))
         with TemporaryDirectory() as folder:
@@ -51,9 +63,44 @@ def measures(experiment: Experiment) -> dict[str, Measure]:
     return found
 
 
+def _of_large_images(experiment: Experiment, chunk: int) -> dict[str, Measure]:
+    asked, found = experiment["benchmark"], dict[str, Measure]()
+    environment = experiment.make_environment()()
+    expert = experiment.make_expert()(environment)
+    episodes = [_from_three_cameras(rollout(environment, expert, seed)) for seed in range(asked["episodes"])]
+    environment.close()
+    spec = replace(environment.spec, cameras=tuple(episodes[0].observations[0].rgb), depth=(), cut=())
+    every = experiment.with_values({"collect.episodes": None, "data.validation_fraction": 0})
+    for codec in (Codec.suited(spec), Codec("jpeg", QUALITY)):
+        with TemporaryDirectory() as folder:
+            store = EpisodeStore.create_or_open(folder, spec, {}, codec)
+            with store.writing():
+                for episode in episodes:
+                    store.append(episode)
+            name = f"loader: {len(spec.cameras)} x {LARGE} px, {codec.images}"
+            found[name] = _loading(every.data(store, 1, chunk), store, 1, asked["batches"])
+            steps = len(store.rows("action"))
+            stored = sum(store.size(field, entry) for field in store.fields for entry in store.episodes)
+            raw = sum(prod(shape) * dtype.itemsize for shape, dtype in store.fields.values())
+            size, largest = (EPISODES * STEPS * each / 1e9 for each in (stored / steps, raw))
+            found[f"{name}, {EPISODES} x {STEPS} steps"] = measure(size, "GB", steps, largest)
+    return found
+
+
+def _from_three_cameras(episode: Episode) -> Episode:
+    """Return an episode, whatever its outcome, with the images of two cameras and mirrored ones of the first."""
+
+    def seen(one: Observation) -> Observation:
+        first, *others = one.rgb.values()
+        rgb = {"first": first, "second": [first, *others][-1], "mirrored": first[:, ::-1]}
+        return replace(one, rgb=rgb, depth={}, instruction=episode.instruction)
+
+    return replace(episode, outcome="success", observations=[seen(one) for one in episode.observations])
+
+
 def _loading(data: WindowDataModule, store: EpisodeStore, history: int, batches: int) -> Measure:
     data.setup("fit")
-    images = [store.rows(f"rgb_{camera}") for camera in store.spec.cameras]
+    images = [store.rows(f"rgb_{camera}")[:] for camera in store.spec.cameras]
     starts = np.array([entry.start for entry in store.episodes])
     rows = []
     for windows in map(data.order, range(batches)):
