@@ -20,6 +20,7 @@ from composing import check, composed
 from vla.config.adopt import resume
 from vla.config.experiment import Experiment, plain
 from vla.data.episodes import EpisodeStore
+from vla.data.header import Codec
 from vla.data.verification import derive_store, episode_of, verify_store
 from vla.data.window_batches import WindowBatcher
 from vla.jobs import improve
@@ -234,7 +235,7 @@ def result(folder: Path) -> tuple[dict[str, bytes], dict[str, float]]:
 
 
 def test_rounds_that_were_killed_go_on_to_the_same_result(home: Path) -> None:
-    here(home, *ROUNDS, *FEW, "output=rounds", "improve.rounds=1")
+    here(home, *ROUNDS, *FEW, "output=rounds", "improve.rounds=1", "collect.images=lossless")
     changes = (home / "rounds/changes.yaml").read_text()
     assert "key: improve.steps" in changes and "improve.beta" not in changes
     first, second = (home / "rounds" / name for name in ("round_1", "round_2"))
@@ -250,7 +251,9 @@ def test_rounds_that_were_killed_go_on_to_the_same_result(home: Path) -> None:
     index.write_bytes(index.read_bytes().splitlines(keepends=True)[0] + b'{"seed": 500')
     here(home, "resume=rounds", "output=rounds", "job=improve", "improve.rounds=2")
     assert result(first) == whole
-    assert [entry.seed for entry in EpisodeStore(second / "episodes").tried] == [500002, 500003]
+    labelled = EpisodeStore(second / "episodes")
+    assert [entry.seed for entry in labelled.tried] == [500002, 500003]
+    assert labelled.codec == EpisodeStore(home / "few").codec == Codec("lossless")
     assert (home / "rounds/evaluation_1/report.json").exists()  # of the policy after one round
     trained = read_checkpoint(second / "checkpoints/last.ckpt").config
     assert trained["collect"]["more"] == ["rounds/round_1/episodes", "rounds/round_2/episodes"]

@@ -120,6 +120,7 @@ def require_floors(measures: dict[str, dict[str, Any]]) -> None:
         *("collect", *(f"collect: {stage}" for stage in stages), f"collect: {cores()} processes"),
         *(f"collect: rendering, {name}" for name in ("fast", "smooth", "mujoco")),
         *("loader", "loader: 1 frame", "loader: 6 frames"),
+        *(f"loader: 3 x 224 px, {codec}{of}" for codec in ("lossless", "jpeg") for of in ("", ", 2500 x 100 steps")),
         *(f"train: {precision}{what}" for precision in precisions for what in watched),
         *("train: loader alone", "policy", "policy: every frame anew"),
     }
