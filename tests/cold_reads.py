@@ -37,9 +37,9 @@ def disk_bytes() -> int:
 def main(folder: Path) -> None:
     store = EpisodeStore(folder)
     fields = [f"rgb_{camera}" for camera in store.spec.cameras]
-    for name, read in (("memory-mapped arrays", store.rows), ("as training reads", store.scattered)):
+    for name, scattered in (("memory-mapped arrays", False), ("as training reads", True)):
         forget([path for field in fields for path in folder.glob(f"{field}.*")])
-        images, random = [read(field) for field in fields], np.random.default_rng(0)
+        images, random = [store.rows(field, scattered) for field in fields], np.random.default_rng(0)
         started, before, windows = time.perf_counter(), disk_bytes(), 0
         while (seconds := time.perf_counter() - started) < SECONDS:
             rows = random.integers(0, images[0].shape[0], BATCH)

@@ -24,11 +24,13 @@ from vla.data.fields import END
 from vla.data.formats.imported_demonstrations import ImportedDemonstrations
 from vla.data.header import Codec
 from vla.data.image_codec import decode, encode
-from vla.data.verification import DamageError, derive_store, episode_of, require_whole, verify_store
+from vla.data.verification import derive_store, episode_of, require_whole, verify_store
 from vla.data.window_batches import WindowBatcher
+from vla.deploy.view import expected_pictures
 from vla.jobs.collect import JOB, complete_store
 from vla.parallel.pool import LocalCluster
 from vla.rollouts.collect import collect
+from vla.rollouts.memory import NearestDemonstration
 from vla.spec import Episode
 
 RAW, LOSSLESS, JPEG = CODECS
@@ -60,6 +62,14 @@ def test_without_loss_batches_episodes_and_index_are_those_of_a_raw_store(tmp_pa
         for field, values in small.read(entry).items():
             np.testing.assert_array_equal(values, expected[field])
             assert values.dtype == expected[field].dtype
+
+
+def test_who_looks_at_first_images_sees_the_same(tmp_path: Path) -> None:
+    raw, small = (add(tmp_path / str(codec), EPISODES, codec) for codec in (RAW, LOSSLESS))
+    agents = [NearestDemonstration(store.folder, None, spec=ARM_SPEC) for store in (raw, small)]
+    np.testing.assert_array_equal(agents[0]._images, agents[1]._images)
+    pictures = [expected_pictures(store.folder, ["front=/live"])["/live"] for store in (raw, small)]
+    np.testing.assert_array_equal(*pictures)
 
 
 def test_jpeg_is_close_and_smaller_and_depth_exact(tmp_path: Path) -> None:
@@ -131,7 +141,7 @@ def test_the_config_names_the_codec(options: tuple[str, ...], codec: Codec | Non
     assert Experiment.of(composed(*options)).codec == codec
 
 
-@pytest.mark.parametrize("option", ["collect.images=png", "collect.images=null", "collect.quality=96"])
+@pytest.mark.parametrize("option", ["collect.images=png", "collect.images=auto", "collect.quality=96"])
 def test_a_config_of_another_codec_is_refused_by_name(option: str) -> None:
     with pytest.raises(ValueError, match=option.partition("=")[0].replace(".", r"\.")):
         check(composed("job=collect", option), JOB)
@@ -156,11 +166,14 @@ def test_a_damaged_image_is_named_by_episode_and_step(tmp_path: Path, codec: Cod
     begins = int(np.fromfile(store.folder / "rgb_wrist.ends", END)["end"][row - 1])
     change(store.folder / "rgb_wrist.pack", lambda data: data[:begins] + b"#" * 8 + data[begins + 8 :])
     says = r"rgb_wrist of step 3 of seed 1 in .*store was changed on disk: keep what is whole with job=inspect"
-    for read in (lambda: store.read(entry), lambda: WindowBatcher(store, 1, 1)(np.array([0, entry.start]))):
+    for read in (
+        lambda: store.read(entry),
+        lambda: episode_of(store, entry),
+        lambda: derive_store([store], tmp_path / "copy"),
+        lambda: WindowBatcher(store, 1, 1)(np.array([0, entry.start])),
+    ):
         with pytest.raises(ValueError, match=says):
             read()
-    with pytest.raises(DamageError, match=r"seed 1 in .* is damaged \(rgb_wrist of step 3 changed or lost\)"):
-        episode_of(store, entry)
     assert store.read(store.tried[0]) and verify_store(store).damaged == {"rgb_wrist of step 3 changed or lost": [1]}
     assert derive_store([store], tmp_path / "repaired", repair=True) == [1]
     repaired = EpisodeStore(tmp_path / "repaired")

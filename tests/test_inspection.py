@@ -267,7 +267,7 @@ def test_nothing_is_overwritten_or_left_half_written(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"other has control_hz = 20.0, but .*store has 10.0"):
         derive_store([store, other], tmp_path / "new")
     change(store.folder / "action.bin", lambda data: flip(data, len(data) - 1))
-    with pytest.raises(ValueError, match=r"seed 4 in .* is damaged \(rows changed or lost\): inspect\.repair=true"):
+    with pytest.raises(ValueError, match=r"the rows of seed 4 in .* were changed on disk: .* inspect\.repair=true"):
         derive_store([store], tmp_path / "new")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["other", "store"]
     shutil.copytree(store.folder, tmp_path / ".new.draft")  # as if killed there
@@ -285,7 +285,7 @@ def test_a_seed_that_is_not_there_is_named(tmp_path: Path) -> None:
     ):
         find_episode(store, 3)
     change(tmp_path / "action.bin", lambda data: flip(data, 0))
-    with pytest.raises(ValueError, match=r"seed 0 in .* is damaged"):
+    with pytest.raises(ValueError, match=r"the rows of seed 0 in .* were changed on disk"):
         find_episode(EpisodeStore(tmp_path), 0)
 
 

@@ -12,7 +12,8 @@ import toy
 
 from vla.data import episodes
 from vla.data.episodes import EpisodeStore
-from vla.data.fields import ScatteredRows
+from vla.data.fields import Field, ScatteredRows
+from vla.data.header import RAW
 from vla.data.window_batches import BufferPool, WindowBatcher, perturbed
 
 
@@ -45,7 +46,7 @@ def test_rows_in_random_order_are_those_of_the_file(tmp_path: Path) -> None:
     values = np.random.default_rng(0).integers(0, 255, (900, 7, 5, 3), np.uint8)
     values.tofile(tmp_path / "rows.bin")
     damaged = [ValueError(f"row {row}") for row in range(900)].__getitem__
-    rows = ScatteredRows(tmp_path / "rows.bin", (850, 7, 5, 3), values.dtype, damaged)  # more are being written
+    rows = ScatteredRows(Field(tmp_path, "rows", (7, 5, 3), values.dtype, RAW), 850, damaged)  # more are being written
     index = np.array([[849, 0], [3, 500]])
     np.testing.assert_array_equal(rows.take(index), values[index])
     out = np.empty((2, 2, 7, 5, 3), np.uint8)
@@ -64,7 +65,7 @@ def test_batches_of_a_store_that_is_larger_than_the_memory_are_the_same(
     small = WindowBatcher(EpisodeStore(folder), history, 2)
     monkeypatch.setattr(episodes, "memory", lambda: 1)
     store = EpisodeStore(folder)
-    assert all(isinstance(store.scattered(f"rgb_{camera}"), ScatteredRows) for camera in store.spec.cameras)
+    assert all(isinstance(store.rows(f"rgb_{camera}", scattered=True), ScatteredRows) for camera in store.spec.cameras)
     large = WindowBatcher(store, history, 2)
     large.verify()
     windows = np.random.default_rng(0).integers(0, store.episodes[-1].end, 40)

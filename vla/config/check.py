@@ -49,6 +49,8 @@ class Job:
 TRAINING = tuple(group.name for group in GROUPS.values() if group.training)
 NEAREST = "nearest"  # condition of an evaluation in which a demonstration is replayed
 
+CODEC = {"images": Images | None, "quality": Quality}
+
 # Nodes without a class.
 PLAIN: dict[str, Any] = {
     "job": Text,
@@ -60,14 +62,7 @@ PLAIN: dict[str, Any] = {
     "trust": list[str],
     "output": Text,
     "chosen": dict[str, str | None],
-    "collect": {
-        "episodes": Count,
-        "seed": Seed,
-        "folder": Text,
-        "more": list[Text] | None,
-        "images": Images | Literal["auto"],
-        "quality": Quality,
-    },
+    "collect": {"episodes": Count, "seed": Seed, "folder": Text, "more": list[Text] | None, **CODEC},
     "validate": {"episodes": Natural, "seed": UnseenSeed, "changes": dict[str, object]},
     "evaluate": {
         "episodes": Count,

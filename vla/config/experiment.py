@@ -121,10 +121,8 @@ class Experiment:
         """Codec of the images of new stores; None: the one that suits their size."""
         from vla.data.header import Codec
 
-        asked = self["collect"]
-        if asked["images"] == "auto":
-            return None
-        return Codec(asked["images"], asked["quality"] if asked["images"] == "jpeg" else None)
+        images, quality = self["collect"]["images"], self["collect"]["quality"]
+        return images and Codec(images, quality if images == "jpeg" else None)
 
     def make_environment(self, changes: Node | None = None) -> Callable[[], Environment]:
         """Return the factory of the environment, with the `changes` of a condition."""

@@ -26,8 +26,8 @@ from typing import Any, BinaryIO
 import numpy as np
 from filelock import FileLock, Timeout
 
-from vla.data.fields import Rows, ScatteredRows, open_field
-from vla.data.header import Codec, fields_of, images_of, is_store, read_header, write_header
+from vla.data.fields import Field, Rows, ScatteredRows
+from vla.data.header import Codec, fields_of, is_store, read_header, write_header
 from vla.data.index import REMEDY, SALVAGE, Entry, dumps, index_line, listed, parse_line, read_index
 from vla.data.statistics import Statistics
 from vla.io.documents import canonical
@@ -35,17 +35,16 @@ from vla.io.files import require_file
 from vla.parallel.limits import memory
 from vla.spec import FIRST_SEED, Array, Episode, Observation, Spec
 
-BLOCK = 256  # rows per update of a checksum
 IN_MEMORY = 0.25  # largest share of the memory that a store takes that is expected to stay in it
 
 log = logging.getLogger(__name__)
 
 
-class DamagedRows(ValueError):
-    """Rows differ from their checksums; `what` names the image, if it is known."""
+class DamageError(ValueError):
+    """Rows of a store are damaged; `what` is the kind of damage."""
 
-    def __init__(self, message: str, what: str = "rows") -> None:
-        super().__init__(message)
+    def __init__(self, message: str, what: str = "rows changed or lost") -> None:
+        super().__init__(f"{message}: {SALVAGE}")
         self.what = what
 
 
@@ -76,7 +75,7 @@ class EpisodeStore:
         self.config: dict[str, Any] = self.header.config
         self.fields = fields_of(self.spec)
         self.codec: Codec = self.header.codec
-        self._columns = {name: open_field(self.folder, name, *row, self.codec) for name, row in self.fields.items()}
+        self._columns = {name: Field(self.folder, name, *row, self.codec) for name, row in self.fields.items()}
         self._limit, self._damaged = episodes, damaged
         self._index, self._files = self.folder / "index.jsonl", dict[Path, BinaryIO]()
         self._refresh()
@@ -161,27 +160,24 @@ class EpisodeStore:
         ends = np.array([entry.end for entry in self.episodes])
         return Statistics(np.asarray(actions)[: ends[-1]], ends)
 
-    def rows(self, field: str) -> Rows:
+    def rows(self, field: str, scattered: bool = False) -> Rows:
         """Return all committed rows of `field`, (N, …), which are read when they are indexed.
 
-        They are a memory-mapped array, or `ScatteredRows`, which raise a DamagedRows error for a damaged image.
+        Of a large store, `scattered` rows, to be taken in random order, are read one by one.
+
+        They are a memory-mapped array, or `ScatteredRows`, which raise a DamageError error for a damaged image.
         """
         if field not in self.fields:
             raise ValueError(f"{self.folder} has no field {field!r}: it has {sorted(self.fields)}")
         shape, dtype = self.fields[field]
         if self._rows == 0:
             return np.empty((0, *shape), dtype)
-        return self._columns[field].rows(self._rows, partial(self._image_changed, field))
-
-    def scattered(self, field: str) -> Rows:
-        """Return the same rows to take in random order; if the store is large, only what is taken is read."""
-        if not self._large:
-            return self.rows(field)
-        return self._columns[field].scattered(self._rows, partial(self._image_changed, field))
+        large = self._rows * sum(column.size for column in self._columns.values()) > IN_MEMORY * memory()
+        return self._columns[field].rows(self._rows, partial(self._image_changed, field), scattered and large)
 
     def packed(self, entry: Entry) -> dict[str, list[bytes]]:
-        """Return the images of an episode as they are compressed, by field; a DamagedRows error if one is damaged."""
-        sources = {field: self.rows(field) for field in images_of(self.spec)}
+        """Return the images of an episode as they are compressed, by field; a DamageError error if one is damaged."""
+        sources = {field: self.rows(field) for field in self.fields}
         return {field: rows.packed(entry.span) for field, rows in sources.items() if isinstance(rows, ScatteredRows)}
 
     def size(self, field: str, entry: Entry) -> int:
@@ -189,20 +185,12 @@ class EpisodeStore:
         before, after = (self._columns[field].sizes(rows) for rows in (entry.start, entry.end))
         return sum(after) - sum(before)
 
-    @property
-    def _large(self) -> bool:
-        """Whether the rows may not stay in memory."""
-        return self._rows * sum(column.size for column in self._columns.values()) > IN_MEMORY * memory()
-
     def read(self, entry: Entry) -> dict[str, Array]:
-        """Read one episode as field → (steps, …) rows; a DamagedRows error if a checksum differs."""
+        """Read one episode as field → (steps, …) rows; a DamageError error if a checksum differs."""
         sources = {field: self.rows(field) for field in self.fields}
         rows = {field: np.array(source[entry.span]) for field, source in sources.items()}
         for field, values in rows.items():
-            # JPEG decoders may round differently, so the checksum of a JPEG is that of its file.
-            lossy = self._columns[field].lossy
-            crc = self._checksum(sources[field], entry.span) if lossy else zlib.crc32(values.data)
-            if len(values) < entry.steps or crc != entry.crc.get(field):
+            if len(values) < entry.steps or _checksum(sources[field], entry.span, values) != entry.crc.get(field):
                 raise self._changed([entry.seed])
         return rows
 
@@ -210,28 +198,29 @@ class EpisodeStore:
         """Compare the `rows` of episodes, by field, with their checksums.
 
         Raises:
-            DamagedRows: some differ; the message names their seeds.
+            DamageError: some differ; the message names their seeds.
         """
         found = {entry.seed: damage for entry in entries if (damage := self._damage(entry, rows))}
         if found:
             raise self._changed([*found]) if len(found) > 1 else found.popitem()[1]
 
-    def _damage(self, entry: Entry, rows: Mapping[str, Rows]) -> DamagedRows | None:
+    def _damage(self, entry: Entry, rows: Mapping[str, Rows]) -> DamageError | None:
         try:
-            if all(self._checksum(source, entry.span) == entry.crc.get(field) for field, source in rows.items()):
+            if all(_checksum(source, entry.span) == entry.crc.get(field) for field, source in rows.items()):
                 return None
-        except DamagedRows as damage:
+        except DamageError as damage:
             return damage
         return self._changed([entry.seed])
 
-    def _changed(self, seeds: Sequence[int]) -> DamagedRows:
+    def _changed(self, seeds: Sequence[int]) -> DamageError:
         which = f"seed {seeds[0]}" if len(seeds) == 1 else f"the seeds {listed(seeds)}"
-        return DamagedRows(f"the rows of {which} in {self.folder} were changed on disk: {SALVAGE}")
+        return DamageError(f"the rows of {which} in {self.folder} were changed on disk")
 
-    def _image_changed(self, field: str, row: int) -> DamagedRows:
+    def _image_changed(self, field: str, row: int) -> DamageError:
         entry = next(entry for entry in self.tried if entry.start <= row < entry.end)
         image = f"{field} of step {row - entry.start}"
-        return DamagedRows(f"{image} of seed {entry.seed} in {self.folder} was changed on disk: {SALVAGE}", image)
+        message = f"{image} of seed {entry.seed} in {self.folder} was changed on disk"
+        return DamageError(message, f"{image} changed or lost")
 
     @contextmanager
     def writing(self) -> Iterator[None]:
@@ -277,8 +266,8 @@ class EpisodeStore:
         except KeyError as error:
             raise ValueError(f"seed {episode.seed}: an observation lacks {error}, which the spec names") from error
         pieces = {name: self._columns[name].pieces(self._rows, rows[name], (packed or {}).get(name)) for name in rows}
-        checked = {name: pieces[name][0] if self._columns[name].lossy else rows[name].data for name in rows}
-        crc = {name: zlib.crc32(content) for name, content in checked.items()}
+        jpeg = [name for name in rows if self.codec.of(name) == "jpeg"]
+        crc = {name: zlib.crc32(pieces[name][0] if name in jpeg else rows[name].data) for name in rows}
         self._commit(self._entry(episode, episode.instruction, len(episode.actions), crc), pieces)
 
     def fail(self, episode: Episode) -> None:
@@ -336,7 +325,7 @@ class EpisodeStore:
         observations = episode.observations
         columns: dict[str, Any] = {"action": episode.actions, "executed": episode.executed}
         columns["state"] = [observation.state for observation in observations]
-        for name in images_of(self.spec):
+        for name in (name for name in self.fields if "_" in name):
             kind, _, camera = name.partition("_")
             columns[name] = [getattr(observation, kind)[camera] for observation in observations]
         if self.spec.truth:
@@ -351,15 +340,6 @@ class EpisodeStore:
         if column.shape != (steps, *shape) or not np.can_cast(column.dtype, dtype, "same_kind"):
             raise ValueError(f"{name} must be {(steps, *shape)} {dtype}, got {column.shape} {column.dtype}")
         return np.ascontiguousarray(column, dtype)
-
-    def _checksum(self, rows: Rows, span: slice) -> int:
-        """Return the CRC-32 of rows, or of their files if they are JPEG."""
-        if isinstance(rows, ScatteredRows) and rows.lossy:
-            return zlib.crc32(b"".join(rows.packed(span)))
-        crc = 0
-        for first in range(span.start, span.stop, BLOCK):
-            crc = zlib.crc32(rows[first : min(first + BLOCK, span.stop)].data, crc)
-        return crc
 
 
 def observations_of(spec: Spec, rows: Mapping[str, Array], instruction: str) -> list[Observation]:
@@ -383,6 +363,13 @@ def _require_own_files(paths: Iterable[Path]) -> None:
         require_file(path)
         if path.is_symlink():
             raise ValueError(f"{path} is a link, and nothing is added behind a link: copy the file to this place")
+
+
+def _checksum(rows: Rows, span: slice, values: Array | None = None) -> int:
+    """Return the CRC-32 of the rows in `span`, which are `values`; decoders of JPEG round differently: of its bytes."""
+    if isinstance(rows, ScatteredRows) and rows.codec == "jpeg":
+        return zlib.crc32(b"".join(rows.packed(span)))
+    return zlib.crc32((rows[span] if values is None else values).data)
 
 
 def _write(file: BinaryIO, data: memoryview) -> None:

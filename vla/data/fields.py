@@ -15,7 +15,6 @@ import numpy as np
 
 from vla.data.header import Codec
 from vla.data.image_codec import decode, encode, in_threads
-from vla.io.types import Images
 from vla.spec import Array
 
 END = np.dtype([("end", "<u8"), ("crc", "<u4")])
@@ -32,30 +31,19 @@ class ScatteredRows:
     reads nothing else.
 
     Args:
-        path: of the file.
-        shape: of all rows, (N, …).
-        dtype: of the rows.
+        field: whose rows they are.
+        count: number of rows N.
         damaged: makes the error for a row that cannot be read.
-        codec: of the rows.
-        ends: of compressed rows, (N,) of type `END`.
     """
 
-    def __init__(
-        self,
-        path: Path,
-        shape: tuple[int, ...],
-        dtype: np.dtype,
-        damaged: Damaged,
-        codec: Images = "raw",
-        ends: Array | None = None,
-    ) -> None:
-        self.shape, self.dtype = shape, dtype
-        self._file = path.open("rb", buffering=0)
+    def __init__(self, field: Field, count: int, damaged: Damaged) -> None:
+        self.shape, self.dtype, self.codec = (count, *field.shape), field.dtype, field.codec
+        self._size, self._damaged = field.size, damaged
+        self._file = field.files[0].open("rb", buffering=0)
         self._descriptor = self._file.fileno()
         os.posix_fadvise(self._descriptor, 0, 0, os.POSIX_FADV_RANDOM)
-        self._damaged, self._codec, self._ends = damaged, codec, ends
-        self.lossy = codec == "jpeg"
-        self._size = int(np.prod(shape[1:])) * dtype.itemsize  # of a decoded row [bytes]
+        packed = self.codec != "raw"
+        self._ends = np.asarray(np.memmap(field.files[1], END, mode="r", shape=(count,))) if packed else None
 
     def __len__(self) -> int:
         return self.shape[0]
@@ -74,7 +62,7 @@ class ScatteredRows:
             row = int(rows[number])
             packed = self._packed(row, *places[number])
             try:
-                images[number] = decode(packed, self._codec, self.shape[1:], self.dtype)
+                images[number] = decode(packed, self.codec, self.shape[1:], self.dtype)
             except ValueError as error:
                 raise self._damaged(row) from error
 
@@ -116,87 +104,55 @@ class ScatteredRows:
 Rows = Array | ScatteredRows
 
 
-class RawField:
-    """Files of a field whose rows are not compressed.
+class Field:
+    """Files of a field.
 
     Args:
         folder: of the store.
         name: of the field.
         shape: of a row.
         dtype: of the rows.
-    """
-
-    lossy = False
-
-    def __init__(self, folder: Path, name: str, shape: tuple[int, ...], dtype: np.dtype) -> None:
-        self.shape, self.dtype = shape, dtype
-        self.size = int(np.prod(shape)) * dtype.itemsize  # of a row [bytes]
-        self.files: tuple[Path, ...] = (folder / f"{name}.bin",)
-
-    def sizes(self, rows: int) -> tuple[int, ...]:
-        """Return the bytes of the first `rows` rows in every file."""
-        return (rows * self.size,)
-
-    def whole(self, rows: int) -> int:
-        """Return how many of the first `rows` rows are complete: fewer if a file was truncated."""
-        return min(rows, _size(self.files[0]) // self.size)
-
-    def rows(self, count: int, damaged: Damaged) -> Rows:
-        """Return the first `count` > 0 rows, which are read when they are indexed."""
-        return np.asarray(np.memmap(self.files[0], self.dtype, mode="r", shape=(count, *self.shape)))
-
-    def scattered(self, count: int, damaged: Damaged) -> ScatteredRows:
-        """Return the same rows to take in random order."""
-        return ScatteredRows(self.files[0], (count, *self.shape), self.dtype, damaged)
-
-    def pieces(self, rows: int, values: Array, packed: Sequence[bytes] | None) -> list[bytes | memoryview]:
-        """Return what every file gets when `values` (N, …) follow `rows` rows; `packed` are the same, compressed."""
-        return [values.data.cast("B")]
-
-
-class PackedField(RawField):
-    """Files of a field of compressed images.
-
-    Args:
-        folder, name, shape, dtype: as of `RawField`.
         codec: of the store.
     """
 
     def __init__(self, folder: Path, name: str, shape: tuple[int, ...], dtype: np.dtype, codec: Codec) -> None:
-        super().__init__(folder, name, shape, dtype)
-        self._codec, self._quality = codec.of(name), codec.quality
-        self.lossy = self._codec == "jpeg"
-        self.files = (folder / f"{name}.pack", folder / f"{name}.ends")
+        self.shape, self.dtype = shape, dtype
+        self.codec, self._quality = codec.of(name), codec.quality
+        self.size = int(np.prod(shape)) * dtype.itemsize  # of a decoded row [bytes]
+        suffixes = ("bin",) if self.codec == "raw" else ("pack", "ends")
+        self.files = [folder / f"{name}.{suffix}" for suffix in suffixes]
 
-    def sizes(self, rows: int) -> tuple[int, ...]:
-        """See `RawField`."""
+    def sizes(self, rows: int) -> list[int]:
+        """Return the bytes of the first `rows` rows in every file."""
+        if self.codec == "raw":
+            return [rows * self.size]
         offset = (rows - 1) * END.itemsize
         end = int(np.fromfile(self.files[1], END, 1, offset=offset)["end"][0]) if rows else 0
-        return end, rows * END.itemsize
+        return [end, rows * END.itemsize]
 
     def whole(self, rows: int) -> int:
-        """See `RawField`."""
-        rows = min(rows, _size(self.files[1]) // END.itemsize)
-        if not rows:
-            return 0
-        within = np.flatnonzero(np.fromfile(self.files[1], END, rows)["end"] <= _size(self.files[0]))
+        """Return how many of the first `rows` rows are complete: fewer if a file was truncated."""
+        sizes = [path.stat().st_size if path.exists() else 0 for path in self.files]
+        rows = min(rows, sizes[-1] // (self.size if self.codec == "raw" else END.itemsize))
+        if self.codec == "raw" or not rows:
+            return rows
+        within = np.flatnonzero(np.fromfile(self.files[1], END, rows)["end"] <= sizes[0])
         return int(within[-1]) + 1 if len(within) else 0  # a changed end is detected when the image is read
 
-    def rows(self, count: int, damaged: Damaged) -> Rows:
-        """See `RawField`."""
-        return self.scattered(count, damaged)
-
-    def scattered(self, count: int, damaged: Damaged) -> ScatteredRows:
-        """See `RawField`."""
-        ends = np.asarray(np.memmap(self.files[1], END, mode="r", shape=(count,)))
-        return ScatteredRows(self.files[0], (count, *self.shape), self.dtype, damaged, self._codec, ends)
+    def rows(self, count: int, damaged: Damaged, scattered: bool = False) -> Rows:
+        """Return the first `count` > 0 rows, which are read when they are indexed; `scattered`: for random order."""
+        if scattered or self.codec != "raw":
+            return ScatteredRows(self, count, damaged)
+        return np.asarray(np.memmap(self.files[0], self.dtype, mode="r", shape=(count, *self.shape)))
 
     def pieces(self, rows: int, values: Array, packed: Sequence[bytes] | None) -> list[bytes | memoryview]:
-        """See `RawField`."""
+        """Return what every file gets when `values` (N, …) follow `rows` rows; `packed` are the same, compressed."""
+        if self.codec == "raw":
+            return [values.data.cast("B")]
         images = list(packed) if packed is not None else [b""] * len(values)
 
         def compress(number: int) -> None:
-            images[number] = encode(values[number], self._codec, self._quality)
+            images[number] = encode(values[number], self.codec, self._quality)
 
         if packed is None:
             in_threads(compress, len(values))
@@ -204,13 +160,3 @@ class PackedField(RawField):
         ends["end"] = self.sizes(rows)[0] + np.cumsum([len(image) for image in images])
         ends["crc"] = [zlib.crc32(image) for image in images]
         return [b"".join(images), ends.tobytes()]
-
-
-def open_field(folder: Path, name: str, shape: tuple[int, ...], dtype: np.dtype, codec: Codec) -> RawField:
-    """Return the files of a field in a store with a codec."""
-    packed = codec.of(name) != "raw"
-    return PackedField(folder, name, shape, dtype, codec) if packed else RawField(folder, name, shape, dtype)
-
-
-def _size(path: Path) -> int:
-    return path.stat().st_size if path.exists() else 0

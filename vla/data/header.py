@@ -40,11 +40,6 @@ class Codec:
         return f"{self.images} images" + (f" of quality {self.quality}" if self.quality else "")
 
     @property
-    def valid(self) -> bool:
-        """Whether there is a quality exactly for JPEG."""
-        return (self.images == "jpeg") == (self.quality is not None)
-
-    @property
     def loss(self) -> Codec:
         """What two codecs share that give back the same images."""
         return self if self.images == "jpeg" else RAW
@@ -122,11 +117,6 @@ def fields_of(spec: Spec) -> dict[str, tuple[tuple[int, ...], np.dtype]]:
     }
 
 
-def images_of(spec: Spec) -> list[str]:
-    """Return the names of the image fields."""
-    return [*(f"rgb_{camera}" for camera in spec.cameras), *(f"depth_{camera}" for camera in spec.depth)]
-
-
 def is_store(folder: Path) -> bool:
     """Return whether a folder holds an episode store, which may be empty or damaged."""
     return (folder / NAME).exists()
@@ -157,8 +147,9 @@ def _parsed(content: bytes, path: Path) -> tuple[Header, Spec]:
     if "parts" in header.config:
         parse_plain(header.config, Derived, f"{path}: config")
     resolved(header.config, str(path))
-    if header.fields != _layouts(spec) or not header.codec.valid:
-        raise ValueError(f"{path} is damaged or of another kind: its fields are not those of its spec")
+    has_quality = header.codec.quality is not None
+    if header.fields != _layouts(spec) or has_quality != (header.codec.images == "jpeg"):
+        raise ValueError(f"{path} is damaged or of another kind: its fields are not those of its spec and codec")
     return header, spec
 
 

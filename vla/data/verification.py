@@ -18,7 +18,7 @@ import numpy as np
 from rich.progress import track
 
 from vla.data.episode_filter import episode_filter
-from vla.data.episodes import DamagedRows, EpisodeStore, observations_of
+from vla.data.episodes import DamageError, EpisodeStore, observations_of
 from vla.data.header import Codec
 from vla.data.index import DAMAGED, LISTED, LOST, NOT_NEEDED, Entry, listed
 from vla.spec import Array, Episode
@@ -26,10 +26,6 @@ from vla.spec import Array, Episode
 # N steps, D action components
 
 Copy = tuple[EpisodeStore, Entry]
-
-
-class DamageError(ValueError):
-    """An episode differs from its checksums."""
 
 
 @dataclass(frozen=True)
@@ -78,13 +74,14 @@ def verify_store(store: EpisodeStore) -> StoreReport:
     if twice := _repeated_seeds(store):
         damaged["in the index more than once"] = twice
     for entry in track(store.episodes, description="verifying"):
-        rows, problem = _rows_of(store, entry)
-        if problem:
-            damaged.setdefault(problem, []).append(entry.seed)
-        else:
-            whole.append(entry)
-            actions.append(rows["action"])
-            executed.append(rows["executed"])
+        try:
+            rows = _rows_of(store, entry)
+        except DamageError as damage:
+            damaged.setdefault(damage.what, []).append(entry.seed)
+            continue
+        whole.append(entry)
+        actions.append(rows["action"])
+        executed.append(rows["executed"])
     none = np.empty((0, len(store.spec.action)), np.float32)
     return StoreReport(store, whole, damaged, np.concatenate([none, *actions]), np.concatenate([none, *executed]))
 
@@ -128,11 +125,7 @@ def find_episode(store: EpisodeStore, seed: int) -> tuple[dict[str, Any], Episod
 
 def episode_of(store: EpisodeStore, entry: Entry) -> Episode:
     """Read an episode back from a store; a DamageError if it is damaged."""
-    rows, problem = _rows_of(store, entry)
-    if problem:
-        raise DamageError(
-            f"seed {entry.seed} in {store.folder} is damaged ({problem}): inspect.repair=true leaves it out of a copy"
-        )
+    rows = _rows_of(store, entry)
     observations = observations_of(store.spec, rows, entry.instruction)
     return replace(_without_rows(entry), observations=observations, actions=rows["action"], executed=rows["executed"])
 
@@ -183,7 +176,8 @@ def derive_store(
     draft = folder.with_name(f".{folder.name}.draft")
     shutil.rmtree(draft, ignore_errors=True)  # left by a process that was killed
     try:
-        config, codec = _config(chosen, stores, where), _codec(stores)
+        config, codecs = _config(chosen, stores, where), {store.codec for store in stores}
+        codec = Codec("lossless") if len(codecs) > 1 else codecs.pop()  # nothing more is lost
         store = EpisodeStore.create_or_open(draft, stores[0].spec, config, codec)
         with store.writing():
             seeds = [(seed, found) for part in chosen.values() for seed, found in sorted(part.items())]
@@ -225,12 +219,6 @@ def _config(chosen: Chosen, stores: Sequence[EpisodeStore], where: Mapping[str, 
     return {"parts": parts, "where": conditions}
 
 
-def _codec(stores: Sequence[EpisodeStore]) -> Codec:
-    """Return the codec that loses nothing more: the common one of the stores, if there is one."""
-    codecs = {store.codec for store in stores}
-    return codecs.pop() if len(codecs) == 1 else Codec("lossless")
-
-
 def _write(store: EpisodeStore, copies: Sequence[Copy], repair: bool) -> bool:
     """Add a seed to a store from its first undamaged copy; returns whether there was one."""
     known = copies[0][1]
@@ -251,15 +239,13 @@ def _write(store: EpisodeStore, copies: Sequence[Copy], repair: bool) -> bool:
     return False
 
 
-def _rows_of(store: EpisodeStore, entry: Entry) -> tuple[dict[str, Array], str]:
-    """Return the rows of an episode and a description of their damage, or an empty text."""
-    try:
-        rows = store.read(entry)
-    except DamagedRows as damage:
-        return {}, f"{damage.what} changed or lost"
+def _rows_of(store: EpisodeStore, entry: Entry) -> dict[str, Array]:
+    """Read an episode, whose numbers must be finite as well."""
+    rows = store.read(entry)
     if not all(np.isfinite(values).all() for values in rows.values() if values.dtype.kind == "f"):
-        return rows, "numbers that are not finite"
-    return rows, ""
+        what = "numbers that are not finite"
+        raise DamageError(f"seed {entry.seed} in {store.folder} has {what}", what)
+    return rows
 
 
 def _repeated_seeds(store: EpisodeStore) -> list[int]:

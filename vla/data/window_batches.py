@@ -100,7 +100,7 @@ class WindowBatcher:
         self._pin, self._buffers = pin, BufferPool()
         self._ages, self._aheads = np.arange(1 - history, 1), np.arange(chunk)
         cameras = {"rgb": store.spec.cameras, **({"depth": store.spec.depth} if depth else {})}
-        self._images = {kind: {name: store.scattered(f"{kind}_{name}") for name in of} for kind, of in cameras.items()}
+        self._images = {kind: {name: store.rows(f"{kind}_{name}", True) for name in of} for kind, of in cameras.items()}
         # One array: the row look-up costs more than the copy of a few numbers.
         names = ("state", *(("truth",) if store.spec.truth else ()))
         numbers = {name: store.rows(name) for name in (*names, "action", "executed")}

@@ -20,14 +20,13 @@ from vla.jobs.benchmark.baselines.peer import DURATION, peer
 from vla.jobs.benchmark.measure import Measure, measure, timed
 from vla.jobs.collect import demonstrations
 from vla.rollouts.rollout import rollout
-from vla.spec import Episode, Observation
+from vla.spec import Episode
 
 if TYPE_CHECKING:
     from vla.data.datamodule import WindowDataModule
 
 ROUNDS = 5  # of the loader and of its floor, in turns; the fastest counts
 LARGE = 224  # height and width of large images [px]
-QUALITY = 90  # of JPEG
 EPISODES, STEPS = 2500, 100  # of a store whose size is extrapolated
 PEER_EPISODES = 50  # maximum number of episodes for LeRobot's loader
 
@@ -64,38 +63,36 @@ def measures(experiment: Experiment) -> dict[str, Measure]:
 
 
 def _of_large_images(experiment: Experiment, chunk: int) -> dict[str, Measure]:
-    asked, found = experiment["benchmark"], dict[str, Measure]()
-    environment = experiment.make_environment()()
+    environment, found = experiment.make_environment()(), dict[str, Measure]()
     expert = experiment.make_expert()(environment)
-    episodes = [_from_three_cameras(rollout(environment, expert, seed)) for seed in range(asked["episodes"])]
+    seeds = range(experiment["benchmark"]["episodes"])
+    episodes = [_from_three_cameras(rollout(environment, expert, seed)) for seed in seeds]
     environment.close()
     spec = replace(environment.spec, cameras=tuple(episodes[0].observations[0].rgb), depth=(), cut=())
     every = experiment.with_values({"collect.episodes": None, "data.validation_fraction": 0})
-    for codec in (Codec.suited(spec), Codec("jpeg", QUALITY)):
+    for codec in (Codec.suited(spec), Codec("jpeg", experiment["collect"]["quality"])):
         with TemporaryDirectory() as folder:
             store = EpisodeStore.create_or_open(folder, spec, {}, codec)
             with store.writing():
                 for episode in episodes:
                     store.append(episode)
-            name = f"loader: {len(spec.cameras)} x {LARGE} px, {codec.images}"
-            found[name] = _loading(every.data(store, 1, chunk), store, 1, asked["batches"])
-            steps = len(store.rows("action"))
-            stored = sum(store.size(field, entry) for field in store.fields for entry in store.episodes)
+            name, steps = f"loader: 3 x {LARGE} px, {codec.images}", store.episodes[-1].end
+            found[name] = _loading(every.data(store, 1, chunk), store, 1, experiment["benchmark"]["batches"])
+            size = sum(store.size(field, entry) for field in store.fields for entry in store.episodes) / steps
             raw = sum(prod(shape) * dtype.itemsize for shape, dtype in store.fields.values())
-            size, largest = (EPISODES * STEPS * each / 1e9 for each in (stored / steps, raw))
-            found[f"{name}, {EPISODES} x {STEPS} steps"] = measure(size, "GB", steps, largest)
+            of_many = measure(EPISODES * STEPS * size / 1e9, "GB", steps, EPISODES * STEPS * raw / 1e9)
+            found[f"{name}, {EPISODES} x {STEPS} steps"] = of_many
     return found
 
 
 def _from_three_cameras(episode: Episode) -> Episode:
     """Return an episode, whatever its outcome, with the images of two cameras and mirrored ones of the first."""
-
-    def seen(one: Observation) -> Observation:
-        first, *others = one.rgb.values()
-        rgb = {"first": first, "second": [first, *others][-1], "mirrored": first[:, ::-1]}
-        return replace(one, rgb=rgb, depth={}, instruction=episode.instruction)
-
-    return replace(episode, outcome="success", observations=[seen(one) for one in episode.observations])
+    observations = []
+    for seen in episode.observations:
+        images = [*seen.rgb.values()]
+        rgb = {"first": images[0], "last": images[-1], "mirrored": images[0][:, ::-1]}
+        observations.append(replace(seen, rgb=rgb, depth={}, instruction=episode.instruction))
+    return replace(episode, outcome="success", observations=observations)
 
 
 def _loading(data: WindowDataModule, store: EpisodeStore, history: int, batches: int) -> Measure:
