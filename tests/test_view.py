@@ -20,8 +20,10 @@ from rerun.chunk import RrdReader
 from sensor_msgs.msg import Image, JointState
 from std_msgs.msg import String
 
+from vla.data.header import Codec
 from vla.deploy import messages
 from vla.deploy.view import View, expected_pictures
+from vla.io.types import Images
 from vla.robots.panda import CHAIN
 from vla.spec import RobotModel, Shell
 from vla.tasks.tabletop.arm import Arm
@@ -104,8 +106,9 @@ def test_what_is_expected_lies_over_what_a_camera_sees(drawn: Callable[..., dict
     assert "/expected/wrist" not in chunks and "/camera/wrist" in chunks
 
 
-def test_the_expected_picture_is_what_episodes_begin_with(tmp_path: Path) -> None:
-    store, episodes = stored(tmp_path / "store", seeds=range(3))
+@pytest.mark.parametrize("images", ["raw", "lossless"])
+def test_the_expected_picture_is_what_episodes_begin_with(tmp_path: Path, images: Images) -> None:
+    store, episodes = stored(tmp_path / "store", seeds=range(3), codec=Codec(images))
     camera = store.spec.cameras[0]
     first = np.median([episode.observations[0].rgb[camera] for episode in episodes], axis=0)
     pictures = expected_pictures(store.folder, [f"{camera}=/live"])
