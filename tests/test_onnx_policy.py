@@ -57,9 +57,9 @@ def test_it_acts_like_the_model_through_two_instructions(kind: str, request: pyt
     expected = act(exact, seen)
     assert np.abs(np.diff(expected, axis=0)).max() > 1e-3  # they depend on the observations
     assert (np.abs(act(onnx, seen) - expected) / RANGE).max() < 1e-3
-    other = onnx.session()
-    other.reset(seen[0].instruction, 1)
-    assert (np.abs(act(other, seen[:5]) - expected[:5]) / RANGE).max() < 1e-3
+    onnx.reset(seen[0].instruction, 1, 1)
+    other = np.concatenate([onnx.act([each], [1]) for each in seen[:5]])
+    assert (np.abs(other - expected[:5]) / RANGE).max() < 1e-3
 
 
 def test_programs_are_exported_once_for_the_same_weights_and_options(
@@ -97,7 +97,7 @@ def test_a_checkpoint_acts_through_its_programs_quantised_ones_about_like_the_mo
     # On average: where two bins are about as probable, a single component may be decoded to the other one.
     apart = np.mean([np.abs(onnx.plan(each) - model.plan(each)) / span for each in seen])
     assert 1e-7 < apart < 0.02
-    assert onnx.one_at_a_time  # a server plans for one client at a time
+    assert onnx.lanes == 1  # a server plans for one client at a time
 
 
 def test_a_model_that_cannot_be_exported_is_named(tmp_path: Path) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,7 @@ import numpy as np
 import pytest
 import torch
 from defaults import defaults_of
-from fake_batch import TINY_TEXT, as_policy, make_bc, make_decoder, make_rt1
+from fake_batch import TINY_TEXT, as_policy, make_act, make_bc, make_decoder, make_denoising, make_rt1
 from observing import act, observations
 from torch import Tensor, nn
 from torch._inductor.runtime.cache_dir_utils import default_cache_dir
@@ -21,8 +22,10 @@ from toy import SPEC, ToyEnvironment
 from vla.io.types import Inherited
 from vla.models.checkpoint import TensorBudget, read_checkpoint, read_header
 from vla.models.compile_cache import set_compile_cache
+from vla.models.flow import Flow
 from vla.models.model import Batch, Model, TokenModel, pixels
 from vla.models.tokenizers.tokenizer import Uniform
+from vla.policy import Policy
 from vla.rollouts.rollout import rollout
 from vla.spec import Observation
 
@@ -75,6 +78,59 @@ def test_only_the_newest_frame_is_encoded(make: Callable[..., Any]) -> None:
     model.image.register_forward_pre_hook(lambda module, inputs: frames.append(len(inputs[0])))
     act(policy, observations(5))
     assert frames == [1] * (5 * len(SPEC.cameras))
+
+
+STREAMS = [
+    [replace(each, instruction=text) for each in observations(5, seed)]
+    for seed, text in enumerate(("go", "go", "lift it now", "go", "put it down"))
+]
+
+
+def acted(policy: Policy, order: list[int], together: bool) -> dict[int, list[np.ndarray]]:
+    """What the policy does in each of some streams, in lanes in that order, whose seed is the number of the stream."""
+    done: dict[int, list[np.ndarray]] = {stream: [] for stream in order}
+    for lane, stream in enumerate(order):
+        policy.reset(STREAMS[stream][0].instruction, stream, lane)
+    for step in range(len(STREAMS[0])):
+        for lanes in [range(len(order))] if together else [[lane] for lane in range(len(order))]:
+            actions = policy.act([STREAMS[order[lane]][step] for lane in lanes], lanes)
+            for lane, action in zip(lanes, actions, strict=True):
+                done[order[lane]].append(action)
+    return done
+
+
+@pytest.mark.parametrize("make", [make_bc, make_rt1, partial(make_act, execute=2), partial(make_denoising, Flow)])
+@pytest.mark.parametrize("rows", [1, 2, 3, 4])
+def test_a_seed_acts_the_same_alone_and_in_any_company_bit_for_bit(make: Callable[..., Model], rows: int) -> None:
+    policy = as_policy(make(width=33 if make is make_bc else 32), lanes=rows)  # odd products are rounded by their rows
+    alone = acted(policy, [0, 1, 2, 3, 4], together=False)
+    for order in ([0, 1, 2, 3, 4], [4, 2, 0, 3, 1], [2, 0], [1, 3]):
+        for stream, actions in acted(policy, order, together=True).items():
+            np.testing.assert_array_equal(actions, alone[stream])
+    (first,) = acted(as_policy(policy.model, lanes=rows), [3], together=True).values()
+    np.testing.assert_array_equal(first, alone[3])
+
+
+def test_lanes_share_the_passes_of_their_rows() -> None:
+    model = make_bc()
+    policy, passes = as_policy(model, lanes=2), list[int]()
+    model.shift.register_forward_pre_hook(lambda module, inputs: passes.append(len(inputs[0])))
+    for seeds, expected in (([4, 5], [2]), ([4, 6], [2, 2]), ([1], [2])):
+        for lane, seed in enumerate(seeds):
+            policy.reset("go", seed, lane)
+        policy.plan([STREAMS[0][0]] * len(seeds), range(len(seeds)))
+        assert passes == expected
+        passes.clear()
+
+
+def test_what_does_not_fit_in_one_lane_leaves_the_others_as_they_were() -> None:
+    policy = as_policy(make_rt1())
+    policy.reset("go", 0, 1)
+    before = policy.act([STREAMS[0][0]], [1])
+    policy.reset("go", 0, 1)
+    with pytest.raises(ValueError, match="the policy needs cameras"):
+        policy.act([STREAMS[0][0], replace(STREAMS[0][1], rgb={})], [1, 2])
+    np.testing.assert_array_equal(policy.act([STREAMS[0][0]], [1]), before)
 
 
 class Linear(TokenModel):

@@ -103,11 +103,15 @@ def test_chunks_for_the_same_step_are_averaged_with_the_oldest_first() -> None:
 
 def test_an_evaluation_without_latency_is_that_of_the_policy_and_with_latency_repeatable() -> None:
     policy = as_policy(make_act(chunk=4, execute=2))
-    expected = rollout(toy.make_environment(), policy.session(), FIRST_SEED)
-    here = rollout(toy.make_environment(), OverNetwork(policy.session(), network_of(0.0), toy.SPEC), FIRST_SEED)
+    expected = rollout(toy.make_environment(), as_policy(policy.model), FIRST_SEED)
+    here = rollout(toy.make_environment(), OverNetwork(as_policy(policy.model), network_of(0.0), toy.SPEC), FIRST_SEED)
     np.testing.assert_array_equal(here.executed, expected.executed)
     late = [
-        rollout(toy.make_environment(), OverNetwork(policy.session(), network_of(0.2, 0.1, 0.1), toy.SPEC), FIRST_SEED)
+        rollout(
+            toy.make_environment(),
+            OverNetwork(as_policy(policy.model), network_of(0.2, 0.1, 0.1), toy.SPEC),
+            FIRST_SEED,
+        )
         for _ in range(2)
     ]
     np.testing.assert_array_equal(late[0].executed, late[1].executed)

@@ -334,7 +334,9 @@ def test_a_served_policy_is_compared_with_the_episodes_that_a_training_holds_out
         assert errors["checkpoint"] is None and errors["model"] == "remote"
     folder = next(tmp_path.glob("outputs/episodes/*"))
     unseen = [entry.seed for entry in EpisodeStore(folder).episodes if held_out(entry.seed, 0.2)]
-    expected = open_loop(policy.session(), spec, [episode_at(folder, seed) for seed in unseen], np.zeros(3))
+    expected = open_loop(
+        as_policy(policy.model, spec=spec), spec, [episode_at(folder, seed) for seed in unseen], np.zeros(3)
+    )
     assert errors["seeds"] == unseen
     np.testing.assert_allclose([each["error"] for each in errors["components"]], expected.errors.mean(0), rtol=1e-6)
     assert (

@@ -29,7 +29,7 @@ import pytest
 import trustme
 from command_line import SMALL, here
 from composing import composed
-from fake_batch import as_policy, make_bc, make_rt1
+from fake_batch import as_policy, make_act, make_bc, make_denoising, make_rt1
 from toy import SPEC, ToyEnvironment
 from websockets.datastructures import Headers
 from websockets.exceptions import ConnectionClosed, InvalidMessage, InvalidStatus
@@ -43,12 +43,15 @@ from vla.deploy import server
 from vla.deploy.client_observation import Keys
 from vla.deploy.server import PolicyServer, Service
 from vla.io.array_messages import DTYPES, LARGEST_MAP, LONGEST_LIST, pack, unpack
-from vla.policy import Policy, plan_together
+from vla.models.flow import Flow
+from vla.models.model import Model
+from vla.policy import Policy
 from vla.rollouts.evaluate import play
 from vla.rollouts.remote import Component, RemotePolicy
 from vla.rollouts.rollout import rollout
 from vla.spec import FIRST_SEED, LONGEST_INSTRUCTION, Array, Observation
 
+TEXTS = ("go", "lift it now", "go", "put it down")
 KEYS = Keys({"eye": "observation/image"}, ["observation/state"], "prompt")
 
 
@@ -58,7 +61,6 @@ def settings(policy: Policy, **changes: Any) -> PolicyServer:
         "port": 0,
         "keys": KEYS,
         "image_crop": "centre",
-        "batch": 8,
         "connections": 4,
         "largest_message": 1_000_000,
         "api_key": None,
@@ -133,7 +135,7 @@ def remote(url: str, **changes: Any) -> RemotePolicy:
 def test_a_client_gets_the_chunks_of_the_policy_bit_for_bit(make: Callable[[], Any]) -> None:
     policy = as_policy(make())
     seen = observations(4)
-    expected = policy.session()
+    expected = as_policy(policy.model)
     with serving(policy) as url, client(url) as connection:
         described, answers = received(connection), []
         for observation in seen:
@@ -149,7 +151,7 @@ def test_a_client_gets_the_chunks_of_the_policy_bit_for_bit(make: Callable[[], A
 
 def test_an_agent_in_another_process_plays_like_the_policy_here() -> None:
     policy = as_policy(make_bc(chunk=3))
-    expected = rollout(ToyEnvironment(), policy.session(), FIRST_SEED)
+    expected = rollout(ToyEnvironment(), as_policy(policy.model), FIRST_SEED)
     with serving(policy) as url:
         agent = remote(url)
         episodes = [rollout(ToyEnvironment(), agent, FIRST_SEED) for _ in range(2)]
@@ -159,20 +161,21 @@ def test_an_agent_in_another_process_plays_like_the_policy_here() -> None:
 
 
 def test_a_slow_server_is_not_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
-    policy, gate, plan = as_policy(make_bc(chunk=3)), threading.Event(), server._plan
+    policy, gate = as_policy(make_bc(chunk=3)), threading.Event()
+    plan = policy.plan
     asked: list[Observation] = []
 
-    def gated(sessions: Sequence[Any], observations: Sequence[Observation]) -> list[Array]:
+    def gated(observations: Sequence[Observation], lanes: Sequence[int]) -> Array:
         asked.extend(observations)
         assert len(asked) == 1 or gate.wait(30)
-        return plan(sessions, observations)
+        return plan(observations, lanes)
 
-    monkeypatch.setattr(server, "_plan", gated)
     seen = observations(60)
     with serving(policy) as url:
+        monkeypatch.setattr(policy, "plan", gated)
         agent = remote(url, asynchronous=True, execute=1, spec=replace(SPEC, control_hz=200.0))
         agent.reset(seen[0].instruction, 0)
-        first = policy.session().plan(seen[0])
+        first = as_policy(policy.model).plan(seen[0])
         actions = [agent.act(observation) for observation in seen[:5]]
         np.testing.assert_array_equal(actions[:3], first)  # though the server does not answer any more
         held = np.where([True, True, False], 0, first[2])
@@ -182,73 +185,61 @@ def test_a_slow_server_is_not_waited_for(monkeypatch: pytest.MonkeyPatch) -> Non
         more = takewhile(lambda _: time.monotonic() < end, cycle(seen[5:]))
         later = next(action for each in more if not np.array_equal(action := agent.act(each), held))
         # The second observation was sent at step 1; two actions followed, the third of its chunk is due.
-        np.testing.assert_array_equal(later, policy.session().plan(seen[1])[2])
+        np.testing.assert_array_equal(later, as_policy(policy.model).plan(seen[1])[2])
         agent.reset(seen[0].instruction, 0)  # whatever is awaited is dropped
         np.testing.assert_array_equal(agent.act(seen[0]), first[0])
         agent.close()
 
 
 def test_pings_are_answered_while_the_policy_computes(monkeypatch: pytest.MonkeyPatch) -> None:
-    policy, gate, plan = as_policy(make_bc()), threading.Event(), server._plan
+    policy, gate = as_policy(make_bc()), threading.Event()
+    plan = policy.plan
 
-    def gated(sessions: Sequence[Any], observations: Sequence[Observation]) -> list[Array]:
+    def gated(observations: Sequence[Observation], lanes: Sequence[int]) -> Array:
         assert gate.wait(60)
-        return plan(sessions, observations)
+        return plan(observations, lanes)
 
-    monkeypatch.setattr(server, "_plan", gated)
     (seen,) = observations(1)
     with serving(policy) as url, client(url) as connection:
         connection.recv()
+        monkeypatch.setattr(policy, "plan", gated)
         connection.send(pack(message(seen)))
         assert connection.ping().wait(30)
         assert urlopen(f"{url.replace('ws://', 'http://')}/healthz").read() == b"OK\n"
         gate.set()
-        np.testing.assert_array_equal(received(connection)["actions"], policy.session().plan(seen))
+        np.testing.assert_array_equal(received(connection)["actions"], as_policy(policy.model).plan(seen))
 
 
-def test_clients_have_histories_of_their_own_and_share_passes() -> None:
-    policy = as_policy(make_rt1())
-    streams = [observations(5, seed) for seed in range(3)]
-    alone = [[session.plan(each) for each in stream] for stream in streams for session in [policy.session()]]
-    together = [policy.session() for _ in streams]
-    for step, group in enumerate(zip(*streams, strict=True)):
-        planned = plan_together(together, group)
-        for number, actions in enumerate(planned):
-            np.testing.assert_allclose(actions, alone[number][step], atol=1e-5)
+@pytest.mark.parametrize("make", [make_bc, make_rt1, make_act, partial(make_denoising, Flow)])
+@pytest.mark.parametrize("rows", [1, 2, 4])
+def test_clients_act_as_if_they_were_alone_bit_for_bit(make: Callable[[], Model], rows: int) -> None:
+    policy = as_policy(make(), lanes=rows)
+    streams = [[replace(each, instruction=text) for each in observations(3, seed)] for seed, text in enumerate(TEXTS)]
+    results: dict[int, list[Array]] = {}
+
+    def talk(seed: int) -> None:
+        with client(url) as connection:
+            connection.recv()
+            for content in ({"reset": True, "seed": seed, "prompt": TEXTS[seed]}, *map(message, streams[seed])):
+                connection.send(pack(content))
+                results.setdefault(seed, []).append(received(connection).get("actions"))
+
     with serving(policy) as url:
-        results: dict[int, list[Any]] = {}
-
-        def talk(number: int) -> None:
-            with client(url) as connection:
-                connection.recv()
-                results[number] = []
-                for observation in streams[number]:
-                    connection.send(pack(message(observation)))
-                    results[number].append(received(connection)["actions"])
-
-        threads = [threading.Thread(target=talk, args=[number]) for number in range(3)]
+        threads = [threading.Thread(target=talk, args=[seed]) for seed in range(len(TEXTS))]
         for thread in threads:
             thread.start()
         for thread in threads:
             thread.join(20)
-    for number in range(3):
-        np.testing.assert_allclose(results[number], alone[number], atol=1e-5)
-
-
-def test_sentences_of_different_lengths_wait_together() -> None:
-    policy = as_policy(make_bc())
-    seen = [
-        replace(each, instruction=text) for each, text in zip(observations(3), ("go", "lift it now", "go"), strict=True)
-    ]
-    expected = [policy.session().plan(each) for each in seen]
-    planned = plan_together([policy.session() for _ in seen], seen)
-    np.testing.assert_allclose(planned, expected, atol=1e-5)
+    for seed, stream in enumerate(streams):
+        alone = as_policy(policy.model, lanes=rows)
+        alone.reset(TEXTS[seed], seed)
+        np.testing.assert_array_equal(results[seed][1:], [alone.plan(each) for each in stream])
 
 
 def test_a_reset_begins_another_episode() -> None:
     policy = as_policy(make_rt1())
     seen = observations(3)
-    expected = policy.session().plan(seen[2])
+    expected = as_policy(policy.model).plan(seen[2])
     with serving(policy) as url, client(url) as connection:
         connection.recv()
         for observation in seen[:2]:
@@ -355,7 +346,7 @@ WRONG: dict[str, tuple[Any, str]] = {
 
 def test_who_sends_nonsense_is_told_why_and_disturbs_nobody() -> None:
     policy = as_policy(make_bc())
-    expected = policy.session().plan(observations(1)[0])
+    expected = as_policy(policy.model).plan(observations(1)[0])
     with serving(policy) as url, client(url) as good:
         good.recv()
         for data, sentence in WRONG.values():
@@ -385,7 +376,7 @@ OTHER = {
 
 def test_who_speaks_another_protocol_is_told_which_one_is_spoken_here() -> None:
     policy = as_policy(make_bc())
-    expected = policy.session().plan(observations(1)[0])
+    expected = as_policy(policy.model).plan(observations(1)[0])
     with serving(policy) as url, client(url) as good:
         good.recv()
         host, port = url.removeprefix("ws://").split(":")
@@ -440,7 +431,7 @@ def test_web_pages_come_in_only_from_where_they_may() -> None:
 
 def test_with_a_certificate_only_clients_of_tls_are_served(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     policy, observation = as_policy(make_bc()), observations(1)[0]
-    files, expected = certified(tmp_path), policy.session().plan(observation)
+    files, expected = certified(tmp_path), as_policy(policy.model).plan(observation)
     with serving(policy, **files) as url:
         assert url.startswith("wss://")
         with pytest.raises(ssl.SSLCertVerificationError), client(url):
@@ -569,7 +560,7 @@ def test_somebody_elses_actions_become_ours() -> None:
     policy = as_policy(make_bc())
     swapped = {"x": Component(1, 1.0, 0.0), "y": Component(0, -1.0, 0.0), "gripper": Component(2, 1.0, 2.0)}
     observation = observations(1)[0]
-    x, y, _ = policy.session().plan(observation)[0]
+    x, y, _ = as_policy(policy.model).plan(observation)[0]
     with serving(policy) as url:
         agent = remote(url, actions=swapped)
         agent.reset(observation.instruction, 0)
@@ -584,7 +575,7 @@ def test_somebody_elses_actions_become_ours() -> None:
 
 def test_images_are_sent_first_by_channel_and_in_maps_within_maps() -> None:
     policy, observation = as_policy(make_bc()), observations(1)[0]
-    expected = policy.session().plan(observation)
+    expected = as_policy(policy.model).plan(observation)
     with serving(policy) as url:
         agent = remote(url, images={"eye": ["observation", "image"]}, channels_first=True)
         sent = agent.message(observation)
@@ -619,16 +610,17 @@ def test_a_server_with_other_components_units_or_image_sizes_is_noticed(caplog: 
 
 
 def test_a_late_answer_is_not_taken_for_that_of_the_next_observation(monkeypatch: pytest.MonkeyPatch) -> None:
-    policy, gate, plan, asked = as_policy(make_bc()), threading.Event(), server._plan, list[Any]()
+    policy, gate, asked = as_policy(make_bc()), threading.Event(), list[Any]()
+    plan = policy.plan
 
-    def gated(sessions: Sequence[Any], observations: Sequence[Observation]) -> list[Array]:
+    def gated(observations: Sequence[Observation], lanes: Sequence[int]) -> Array:
         asked.extend(observations)
         assert len(asked) != 2 or gate.wait(30)
-        return plan(sessions, observations)
+        return plan(observations, lanes)
 
-    monkeypatch.setattr(server, "_plan", gated)
     seen = observations(4)
     with serving(policy) as url:
+        monkeypatch.setattr(policy, "plan", gated)
         agent = remote(url)
         agent.act(seen[0])
         agent.timeout = 0.5
@@ -639,7 +631,7 @@ def test_a_late_answer_is_not_taken_for_that_of_the_next_observation(monkeypatch
         with pytest.raises(ValueError, match="closed the connection"):
             agent.act(seen[2])  # within the same episode it stays that way
         agent.reset(seen[3].instruction, 1)
-        np.testing.assert_array_equal(agent.act(seen[3]), policy.session().plan(seen[3])[0])
+        np.testing.assert_array_equal(agent.act(seen[3]), as_policy(policy.model).plan(seen[3])[0])
         agent.close()
 
 
@@ -653,22 +645,23 @@ def test_a_message_over_the_limit_is_named_on_both_sides(caplog: pytest.LogCaptu
 
 
 def test_an_error_of_the_server_costs_one_episode(monkeypatch: pytest.MonkeyPatch) -> None:
-    policy, plan, asked = as_policy(make_bc()), server._plan, list[Any]()
+    policy, asked = as_policy(make_bc()), list[Any]()
+    plan = policy.plan
 
-    def failing(sessions: Sequence[Any], observations: Sequence[Observation]) -> list[Array]:
+    def failing(observations: Sequence[Observation], lanes: Sequence[int]) -> Array:
         asked.extend(observations)
         if len(asked) == 1:
             raise RuntimeError("no idea")
-        return plan(sessions, observations)
+        return plan(observations, lanes)
 
-    monkeypatch.setattr(server, "_plan", failing)
     seen = observations(2)
     with serving(policy) as url:
+        monkeypatch.setattr(policy, "plan", failing)
         agent = remote(url)
         with pytest.raises(ValueError, match=r"the policy server at .* failed"):
             agent.act(seen[0])
         agent.reset(seen[1].instruction, 1)
-        np.testing.assert_array_equal(agent.act(seen[1]), policy.session().plan(seen[1])[0])
+        np.testing.assert_array_equal(agent.act(seen[1]), as_policy(policy.model).plan(seen[1])[0])
         agent.close()
 
 
@@ -695,7 +688,7 @@ def test_another_policy_after_a_restart_is_noticed() -> None:
     with serving(history) as agent.url:
         agent.reset(seen.instruction, 1)
         assert (agent.metadata["history"], agent.history) == (history.model.history, history.model.history)
-        np.testing.assert_array_equal(agent.act(seen), history.session().plan(seen)[0])
+        np.testing.assert_array_equal(agent.act(seen), as_policy(history.model).plan(seen)[0])
         agent.close()
 
 
@@ -760,7 +753,7 @@ def test_whoever_acts_is_evaluated_by_the_same_job(tmp_path: Path) -> None:
     common = (*SMALL, "evaluate.episodes=1", "task.time_limit=1", "recorder=none")
     environment = Experiment.of(composed(*common)).make_environment()()
     policy = as_policy(make_bc(spec=environment.spec), spec=environment.spec)
-    expected = play(environment, policy.session(), FIRST_SEED)
+    expected = play(environment, as_policy(policy.model), FIRST_SEED)
     environment.close()
     keys = Keys({"front": "observation/image", "wrist": "observation/wrist_image"}, ["observation/state"], "prompt")
     with serving(policy, keys=keys, api_key="s3cret", connections=1) as url:  # each condition closes its own

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 def load_policy(
-    checkpoint: Path | str, *, device: str = "auto", precision: str = "fp32", trust: Sequence[str] = ()
+    checkpoint: Path | str, *, device: str = "auto", precision: str = "fp32", lanes: int = 1, trust: Sequence[str] = ()
 ) -> Policy:
     """Load the policy in a checkpoint.
 
@@ -29,12 +29,13 @@ def load_policy(
         checkpoint: the file.
         device: such as "cpu" or "cuda"; "auto": a GPU if there is one.
         precision: "fp32" or "bf16".
+        lanes: rows of every pass through the model, for as many worlds side by side: `policy.act(observations, lanes)`.
         trust: names of further packages.
 
     Raises:
         ValueError: there is no such file, it is damaged, or it names a class that is not trusted.
     """
-    options = {"device": device, "precision": precision, "compile": False}
+    options = {"device": device, "precision": precision, "compile": False, "lanes": lanes}
     with trusting(trust, Path(checkpoint)):
         return make_policy({"_target_": "vla.policy.Policy", **options}, Path(checkpoint))
 

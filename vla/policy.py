@@ -6,14 +6,16 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Mapping, Sequence
-from copy import copy
-from typing import Any, Literal
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from itertools import chain
+from typing import Any, Literal, overload
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from vla.io.types import Count
 from vla.models.compile_cache import set_compile_cache
 from vla.models.model import Batch, Model
 from vla.spec import LONGEST_INSTRUCTION, Array, Observation, Spec
@@ -21,14 +23,33 @@ from vla.spec import LONGEST_INSTRUCTION, Array, Observation, Spec
 LONG_SENTENCE = " ".join(["sentence"] * 24)  # shorter instructions are padded to it for a constant shape
 
 
+@dataclass
+class Lane:
+    """The state of a policy in one episode."""
+
+    seed: int  # of the episode
+    instruction: str
+    text: Tensor  # (1, L) its tokens
+    random: torch.Generator  # of the noise of the model
+    frames: deque[dict[str, Tensor]]  # encoded frames of the history, (1, 1, …) each, the newest last
+    chunk: deque[tuple[Array, dict[str, Any]]] = field(default_factory=deque)  # actions to execute, with their `info`
+    info: dict[str, Any] = field(default_factory=dict)  # about the last action
+
+
 class Policy:
-    """An agent around a model: caches encoded frames of the history, and executes the first actions of each chunk.
+    """Agents around a model: each caches encoded frames of its history, and executes the first actions of each chunk.
+
+    Every lane, named by a number, is an agent in an episode of its own. What it does is the same bit for bit whatever
+    the others do, and however many there are: because a sum is rounded by the shape of its product and the place of its
+    row, the model always computes `lanes` rows, of which unused ones are padding, and the seed of an episode is its
+    place, modulo `lanes`. Lanes of one place, or with instructions of different lengths, take several passes.
 
     Args:
         device: "auto" is a GPU if there is one.
         precision: "fp32", or "bf16" for matrix products in bfloat16.
         compile: compile the model, which takes up to a minute at the first action and needs g++ on a CPU. On a GPU
             CUDA graphs are used. Weights stay inputs of the graphs, so that models of one class share them.
+        lanes: rows of every pass through the model.
         model: the network, with its tokenizer.
         spec: observation and action spaces.
 
@@ -41,6 +62,7 @@ class Policy:
         device: Literal["auto", "cpu", "cuda"],
         precision: Literal["fp32", "bf16"],
         compile: bool,
+        lanes: Count,
         *,
         model: Model,
         spec: Spec,
@@ -49,11 +71,9 @@ class Policy:
             raise ValueError("policy.device=cuda, but PyTorch finds no GPU here: policy.device=auto uses the CPU")
         available = "cuda" if torch.cuda.is_available() else "cpu"
         self.device = torch.device(available if device == "auto" else device)
-        self.model, self.spec = model.eval().to(self.device), spec
+        self.model, self.spec, self.lanes = model.eval().to(self.device), spec, lanes
         self.execute = model.execute  # number of actions of a chunk to execute
         self.history = model.history  # number of frames it looks at; with several it wants to see every one
-        self.info: dict[str, Any] = {}
-        self.one_at_a_time = compile  # plans for one observation per pass
         self._bf16 = precision == "bf16"
         self._encode, self._predict_chunk = self.model.encode, self.model.predict
         self._padding_sentences = [LONG_SENTENCE] if compile else []
@@ -63,82 +83,136 @@ class Policy:
             self._encode = torch.compile(self.model.encode, mode=mode)
             self._predict_chunk = torch.compile(self.model.predict, mode=mode)
         self._low, self._high = np.array(spec.low, np.float32), np.array(spec.high, np.float32)
-        self._frames: deque[dict[str, Tensor]] = deque(maxlen=model.history)
-        self._chunk: deque[tuple[Array, dict[str, Any]]] = deque()
+        self._lanes: dict[int, Lane] = {}
         self.reset("", 0)
 
-    def reset(self, instruction: str, seed: int) -> None:
-        """Clear the history, and seed the noise of the model.
+    def reset(self, instruction: str, seed: int, lane: int = 0) -> None:
+        """Start an episode in a lane: clear its history, and seed its noise.
+
+        An episode that begins without is that of the lane's number, with another instruction that of the same seed.
 
         Raises:
             ValueError: the instruction has more than `LONGEST_INSTRUCTION` characters.
         """
         if len(instruction) > LONGEST_INSTRUCTION:
             raise ValueError(f"an instruction has at most {LONGEST_INSTRUCTION} characters, not {len(instruction)}")
-        self._random = torch.Generator().manual_seed(seed)
-        self._frames.clear()
-        self._chunk.clear()
-        self._instruction = instruction
-        self._text = self.model.text.tokenize([instruction, *self._padding_sentences])[:1].to(self.device)
+        text = self.model.text.tokenize([instruction, *self._padding_sentences])[:1].to(self.device)
+        random, frames = torch.Generator().manual_seed(seed), deque[dict[str, Tensor]](maxlen=self.history)
+        self._lanes[lane] = Lane(seed, instruction, text, random, frames)
 
-    def act(self, observation: Observation | Mapping[str, Any]) -> Array:
-        """Return the action to execute, (D,) float32, clipped to the spec; `info` may have token probabilities (D, K).
+    @property
+    def info(self) -> dict[str, Any]:
+        """What is known about the last action of lane 0."""
+        return self.about(0)
 
-        An observation may also be that of `vla.api.load_environment`.
-
-        Raises:
-            ValueError: the observation does not match the spec.
-        """
-        if not isinstance(observation, Observation):
-            observation = Observation.from_mapping(observation, self.spec)
-        self._follow(observation.instruction)
-        if self.looks:
-            self._observe(observation)
-        if not self._chunk:
-            actions, probabilities = self._predict()
-            infos = [{}] * len(actions) if probabilities is None else [{"probabilities": p} for p in probabilities]
-            self._chunk.extend(list(zip(actions, infos, strict=True))[: self.execute])
-        action, self.info = self._chunk.popleft()
-        return action
+    def about(self, lane: int) -> dict[str, Any]:
+        """Return what is known about the last action of a lane: token probabilities (D, K), if the model has them."""
+        return self._lanes[lane].info
 
     @property
     def looks(self) -> bool:
-        """Whether the next action is not chosen yet, or its observation is part of a history."""
-        return not self._chunk or self.model.history > 1
+        """Whether the next action of lane 0 may depend on the images."""
+        return self.looking(0)
 
-    def plan(self, observation: Observation) -> Array:
-        """Return a chunk of actions, (k, D) float32, clipped to the spec; the caller executes the first `execute`.
+    def looking(self, lane: int) -> bool:
+        """Return whether the next action of a lane is not chosen yet, or its observation is part of a history."""
+        return not self._lanes[lane].chunk or self.history > 1
+
+    @overload
+    def act(self, observations: Observation | Mapping[str, Any]) -> Array: ...
+    @overload
+    def act(self, observations: Sequence[Observation], lanes: Sequence[int]) -> Array: ...
+    def act(self, observations: Any, lanes: Sequence[int] | None = None) -> Array:
+        """Return the actions to execute, (n, D) float32, clipped to the spec, of n lanes, given what each of them sees.
+
+        Without `lanes`, return the action (D,) for the one observation of lane 0, which may also be that of
+        `vla.api.load_environment`.
 
         Raises:
-            ValueError: the observation does not match the spec.
+            ValueError: an observation does not match the spec; no lane has acted then.
         """
-        self._observe(observation)
-        return self._predict()[0]
+        if lanes is None:
+            return self.act([_as_observation(observations, self.spec)], [0])[0]
+        seen = self._followed(observations, lanes)
+        self._observe({lane: each for lane, each in seen.items() if self.looking(lane)})
+        for lane, (actions, infos) in self._predict([lane for lane in lanes if not self._lanes[lane].chunk]).items():
+            self._lanes[lane].chunk.extend(list(zip(actions, infos, strict=True))[: self.execute])
+        chosen = []
+        for state in (self._lanes[lane] for lane in lanes):
+            action, state.info = state.chunk.popleft()
+            chosen.append(action)
+        return np.stack(chosen)
 
-    def session(self) -> Policy:
-        """Return another agent with the same model and a history of its own."""
-        other = copy(self)
-        other._frames, other._chunk = deque(maxlen=self.model.history), deque()
-        other.reset("", 0)
-        return other
+    @overload
+    def plan(self, observations: Observation) -> Array: ...
+    @overload
+    def plan(self, observations: Sequence[Observation], lanes: Sequence[int]) -> Array: ...
+    def plan(self, observations: Any, lanes: Sequence[int] | None = None) -> Array:
+        """Return chunks of actions, (n, k, D) float32, clipped to the spec, of n lanes, given what each of them sees.
 
-    def _observe(self, observation: Observation) -> None:
-        self._follow(observation.instruction)
-        self._frames.append(self._encoded(self.frame(observation)))
+        The caller executes the first `execute` actions of each. Without `lanes`, return the chunk (k, D) for the one
+        observation of lane 0.
 
-    def _follow(self, instruction: str) -> None:
-        if instruction != self._instruction:
-            self.reset(instruction, 0)
+        Raises:
+            ValueError: an observation does not match the spec; no lane has seen its own then.
+        """
+        if lanes is None:
+            return self.plan([observations], [0])[0]
+        self._observe(self._followed(observations, lanes))
+        planned = self._predict(lanes)
+        return np.stack([planned[lane][0] for lane in lanes])
 
-    def _predict(self) -> tuple[Array, Array | None]:
-        """Return clipped actions, (k, D), and token probabilities, (k, D, K), if the model has them."""
-        actions, probabilities = self._predicted(self._inputs())
-        return actions[0], None if probabilities is None else probabilities[0]
+    def _followed(self, observations: Sequence[Observation], lanes: Sequence[int]) -> dict[int, Observation]:
+        """Return lane → its observation; a lane with another instruction begins an episode."""
+        seen = dict(zip(lanes, observations, strict=True))
+        for lane, observation in seen.items():
+            state = self._lanes.get(lane)
+            if state is None or observation.instruction != state.instruction:
+                self.reset(observation.instruction, lane if state is None else state.seed, lane)
+        return seen
 
-    def _inputs(self) -> Batch:
+    def _passes(self, lanes: Iterable[int]) -> Iterator[dict[int, int]]:
+        """Divide lanes into passes through the model, row → lane, each with instructions of one length."""
+        passes: dict[int, list[dict[int, int]]] = {}  # length of the instruction → passes
+        for lane in lanes:
+            state = self._lanes[lane]
+            row, alike = state.seed % self.lanes, passes.setdefault(state.text.shape[1], [])
+            free = next((each for each in alike if row not in each), None)
+            if free is None:
+                alike.append(free := {})
+            free[row] = lane
+        yield from chain.from_iterable(passes.values())
+
+    def _observe(self, seen: Mapping[int, Observation]) -> None:
+        """Encode the observations of lanes, and add them to the histories."""
+        frames = {lane: self.frame(observation, lane) for lane, observation in seen.items()}  # all, or none is added
+        for lanes in self._passes(frames):
+            encoded = self._encoded(self._batch({row: frames[lane] for row, lane in lanes.items()}))
+            for row, lane in lanes.items():
+                self._lanes[lane].frames.append({name: values[row : row + 1] for name, values in encoded.items()})
+
+    def _predict(self, lanes: Iterable[int]) -> dict[int, tuple[Array, list[dict[str, Any]]]]:
+        """Return lane → clipped actions, (k, D), and what is known about each."""
+        predicted = {}
+        for together in self._passes(lanes):
+            inputs = {row: self._inputs(lane) for row, lane in together.items()}
+            actions, probabilities = self._predicted(self._batch(inputs))
+            for row, lane in together.items():
+                known = [{}] * len(actions[row])
+                if probabilities is not None:
+                    known = [{"probabilities": each} for each in probabilities[row]]
+                predicted[lane] = actions[row], known
+        return predicted
+
+    def _batch(self, inputs: Mapping[int, Batch]) -> Batch:
+        """Return the batch of all rows, of which some are given as batches of one; the others are any of these."""
+        some = next(iter(inputs.values()))
+        return some if self.lanes == 1 else _joined([inputs.get(row, some) for row in range(self.lanes)])
+
+    def _inputs(self, lane: int) -> Batch:
         """Return the input of one prediction, with the next noise if the model needs any."""
-        noise = self.model.sample_noise(self._random)
-        return self.window() if noise is None else {**self.window(), "noise": noise.to(self.device)}
+        noise = self.model.sample_noise(self._lanes[lane].random)
+        return self.window(lane) if noise is None else {**self.window(lane), "noise": noise.to(self.device)}
 
     @torch.inference_mode()
     def _predicted(self, inputs: Batch) -> tuple[Array, Array | None]:
@@ -151,16 +225,17 @@ class Policy:
     def _autocast(self) -> torch.autocast:
         return torch.autocast(self.device.type, torch.bfloat16, enabled=self._bf16)
 
-    def window(self) -> Batch:
-        """Return the current model input, a batch of one: the frames so far, padded to the history of the model."""
-        padding = {name: torch.zeros_like(values) for name, values in self._frames[0].items()}
-        frames = [*self._frames, *[padding] * (self.model.history - len(self._frames))]
+    def window(self, lane: int = 0) -> Batch:
+        """Return the model input of a lane, a batch of one: the frames so far, padded to the history of the model."""
+        state = self._lanes[lane]
+        padding = {name: torch.zeros_like(values) for name, values in state.frames[0].items()}
+        frames = [*state.frames, *[padding] * (self.history - len(state.frames))]
         joined = {name: torch.cat([frame[name] for frame in frames], 1) for name in padding}
         rgb = {name: joined.pop(name) for name in self.spec.cameras if name in joined}
-        return {**joined, "rgb": rgb, "text": self._text}
+        return {**joined, "rgb": rgb, "text": state.text}
 
-    def frame(self, observation: Observation) -> Batch:
-        """Convert an observation to a batch of one frame.
+    def frame(self, observation: Observation, lane: int = 0) -> Batch:
+        """Convert an observation of a lane to a batch of one frame.
 
         Raises:
             ValueError: the observation does not match the spec.
@@ -177,7 +252,7 @@ class Policy:
             "rgb": {camera: self._tensor(observation.rgb[camera]) for camera in self.spec.cameras},
             "state": self._tensor(np.asarray(observation.state, np.float32)),
             "present": torch.ones(1, 1, dtype=torch.bool, device=self.device),
-            "text": self._text,
+            "text": self._lanes[lane].text,
         }
 
     @torch.inference_mode()
@@ -194,29 +269,8 @@ class Policy:
         return torch.from_numpy(values.copy())[None, None].to(self.device)
 
 
-def plan_together(policies: Sequence[Policy], observations: Sequence[Observation]) -> list[Array]:
-    """Call `plan` of several sessions of one policy, each with its observation, in one pass through the model.
-
-    Actions differ from those of `plan` by rounding, because products of other sizes are summed in another order.
-    Instructions whose tokens have different lengths take one pass per length.
-
-    Raises:
-        ValueError: an observation does not match the spec.
-    """
-    frames = []
-    for policy, observation in zip(policies, observations, strict=True):
-        policy._follow(observation.instruction)
-        frames.append(policy.frame(observation))
-    plans: dict[int, Array] = {}
-    for length in {frame["text"].shape for frame in frames}:
-        group = [index for index, frame in enumerate(frames) if frame["text"].shape == length]
-        first = policies[group[0]]
-        encoded = first._encoded(_joined([frames[index] for index in group]))
-        for row, index in enumerate(group):
-            policies[index]._frames.append({name: values[row : row + 1] for name, values in encoded.items()})
-        actions, _ = first._predicted(_joined([policies[index]._inputs() for index in group]))
-        plans.update(zip(group, actions, strict=True))
-    return [plans[index] for index in range(len(policies))]
+def _as_observation(seen: Observation | Mapping[str, Any], spec: Spec) -> Observation:
+    return seen if isinstance(seen, Observation) else Observation.from_mapping(seen, spec)
 
 
 def _joined(batches: Sequence[Batch]) -> Batch:

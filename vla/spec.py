@@ -406,14 +406,17 @@ class Drivable(Protocol):
 class Agent(Protocol):
     """Source of actions: an expert, a policy, a person."""
 
-    info: dict[str, Any]  # about the last action, for recorders: "clean" (D,), "probabilities" (D, K)
+    @property
+    def info(self) -> dict[str, Any]:
+        """What is known about the last action, for recorders: "clean" (D,), "probabilities" (D, K)."""
+        ...
 
     def reset(self, instruction: str, seed: int) -> None:
         """Start an episode, or a new instruction within it, without history; `seed` initialises the random generator of
         the agent, if it has one."""
         ...
 
-    def act(self, observation: Observation) -> Array:
+    def act(self, observation: Observation, /) -> Array:
         """Return the (D,) float32 action to execute now."""
         ...
 

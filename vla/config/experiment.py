@@ -307,7 +307,7 @@ def make_policy(policy: Node, checkpoint: Path, environment: Environment | None 
 
 def training_policy(precision: str, model: Model) -> Policy:
     """Build the policy of a model in training, on the model's device and without a second compilation or an export."""
-    here = {"device": next(model.parameters()).device.type, "precision": precision, "compile": False}
+    here = {"device": next(model.parameters()).device.type, "precision": precision, "compile": False, "lanes": 1}
     return build({"_target_": "vla.policy.Policy", **here}, "policy", model=model, spec=model.spec)
 
 

@@ -85,7 +85,7 @@ class ProgramExporter:
             raise ValueError(f"{self._folder} exists already: choose another export.folder")
         if self._onnx:
             require_onnx("export.onnx=false")
-        policy = Policy("cpu", "fp32", compile=False, model=policy.model, spec=policy.spec)
+        policy = Policy("cpu", "fp32", compile=False, lanes=1, model=policy.model, spec=policy.spec)
         write_programs(policy, self._folder, {"pt2": write_pt2, **({"onnx": write_onnx} if self._onnx else {})})
         return self._folder
 

@@ -48,7 +48,7 @@ class OnnxPolicy(Policy):
 
     def __init__(self, threads: Count | None, quantize: bool, folder: Text | Path, *, model: Model, spec: Spec) -> None:
         require_onnx("policy=default")
-        super().__init__("cpu", "fp32", compile=False, model=model, spec=spec)
+        super().__init__("cpu", "fp32", compile=False, lanes=1, model=model, spec=spec)
         suffix = "int8.onnx" if quantize else "onnx"
         programs = Path(folder).resolve() / f"{digest(model, spec)}{'_int8' if quantize else ''}"
         programs.parent.mkdir(parents=True, exist_ok=True)
@@ -57,7 +57,6 @@ class OnnxPolicy(Policy):
                 log.info("exporting the model to %s", programs)
                 write = {suffix: write_quantized if quantize else write_onnx}
                 write_programs(self, programs, write, math.inf if quantize else TOLERANCE)
-        self.one_at_a_time = True
         act = open_onnx(programs / f"act.{suffix}", threads)
         self._predict_chunk = lambda batch: Prediction(act(inputs_of(batch)))
         if (encoder := programs / f"encode.{suffix}").exists():  # the model caches tokens of past frames

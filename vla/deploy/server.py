@@ -16,11 +16,12 @@ import logging
 import queue
 import signal
 import time
-from collections.abc import AsyncIterator, Callable, Iterator, Mapping, Sequence
+from collections.abc import AsyncIterator, Callable, Iterator, Mapping
 from concurrent.futures import Executor, ThreadPoolExecutor
 from contextlib import asynccontextmanager, contextmanager, suppress
 from dataclasses import dataclass
 from http import HTTPStatus
+from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -56,7 +57,6 @@ class PolicyServer:
         host, port: address to listen at.
         keys: where an observation has its images, state and instruction.
         image_crop: for images with another aspect ratio than in training: crop the centre, or distort the whole.
-        batch: largest number of clients that one pass through the model serves; a compiled policy serves one.
         connections: largest number of clients at a time.
         largest_message: of a client [bytes].
         api_key: what clients must send; needed to listen beyond this machine.
@@ -73,7 +73,6 @@ class PolicyServer:
     port: Port
     keys: Keys
     image_crop: Crop
-    batch: Count
     connections: Count
     largest_message: Count
     api_key: Text | None
@@ -104,7 +103,7 @@ class PolicyServer:
             ValueError: there is no policy, its cameras have no keys, or the address cannot be used.
         """
         policy = self.policy()
-        if not hasattr(policy, "session"):  # an agent in its place
+        if not hasattr(policy, "lanes"):  # an agent in its place
             raise ValueError(
                 f"deploy=server serves a trained policy, checkpoint=FILE; a {type(policy).__name__} cannot be served"
             )
@@ -125,8 +124,8 @@ class Service:
         self._settings, self._policy = settings, policy
         self._metadata = pack(metadata(policy, settings.keys))
         self._tls = None if settings.certificate is None else tls(settings.certificate, settings.private_key)
-        self._waiting: asyncio.Queue[tuple[Policy, Observation, asyncio.Future[Array]]] = asyncio.Queue()
-        self._connected = 0
+        self._waiting: asyncio.Queue[tuple[int, Observation, asyncio.Future[Array]]] = asyncio.Queue()
+        self._lanes = set[int]()  # of the policy, one for each connection
 
     @asynccontextmanager
     async def listening(self) -> AsyncIterator[str]:
@@ -176,7 +175,7 @@ class Service:
 
     def _warm_up(self) -> None:
         # The first pass through a compiled model takes up to a minute.
-        self._policy.session().plan(self._policy.spec.random_observation(np.random.default_rng(0)))
+        self._policy.plan(self._policy.spec.random_observation(np.random.default_rng(0)))
 
     def _answer_request(self, connection: ServerConnection, request: Request) -> Response | None:
         """Answer health checks; reject web pages, clients without the key, or beyond `connections`."""
@@ -190,19 +189,20 @@ class Service:
             given.encode(errors="surrogateescape"), f"Api-Key {key}".encode()
         ):
             return connection.respond(HTTPStatus.UNAUTHORIZED, "send the API key as Authorization: Api-Key …\n")
-        if self._connected >= self._settings.connections:
-            return connection.respond(HTTPStatus.SERVICE_UNAVAILABLE, f"{self._connected} clients are connected\n")
+        if len(self._lanes) >= self._settings.connections:
+            return connection.respond(HTTPStatus.SERVICE_UNAVAILABLE, f"{len(self._lanes)} clients are connected\n")
         return None
 
     async def _talk(self, connection: ServerConnection) -> None:
         """Serve one client until it leaves or sends something invalid."""
-        session, last = self._policy.session(), 0.0
-        self._connected += 1
+        lane, last = next(lane for lane in count() if lane not in self._lanes), 0.0
+        self._lanes.add(lane)
+        self._policy.reset("", lane, lane)
         try:
             await connection.send(self._metadata)
             async for data in connection:
                 began = time.perf_counter()
-                answer = await self._answer(session, data)
+                answer = await self._answer(lane, data)
                 timing = answer.get("server_timing")
                 if timing and last:
                     timing["prev_total_ms"] = last
@@ -217,7 +217,7 @@ class Service:
             log.exception("a client's observation caused an error")
             await self._refuse(connection, "the server failed, see its log", INTERNAL)
         finally:
-            self._connected -= 1
+            self._lanes.remove(lane)
 
     async def _refuse(self, connection: ServerConnection, sentence: str, code: int) -> None:
         log.warning("refused a client at %s: %s", connection.remote_address[0], " ".join(sentence.split())[:500])
@@ -225,34 +225,33 @@ class Service:
             await connection.send(sentence)
             await connection.close(code, sentence.encode()[:120].decode(errors="ignore"))
 
-    async def _answer(self, session: Policy, data: str | bytes) -> dict[str, Any]:
+    async def _answer(self, lane: int, data: str | bytes) -> dict[str, Any]:
         if isinstance(data, str):
             raise ValueError("an observation is a binary message in msgpack, not text")
         message = unpack(data)
         if isinstance(message, Mapping) and message.get("reset") is True:
-            seed = message.get("seed", 0)
+            seed = message.get("seed", lane)
             if type(seed) is not int or not 0 <= seed < 2**32:
                 raise ValueError(f"seed is {repr(seed)[:50]}, expected an integer from 0 to 2**32 - 1")
-            session.reset(instruction("prompt", message.get("prompt")), seed)
+            self._policy.reset(instruction("prompt", message.get("prompt")), seed, lane)
             return {"reset": True}
-        observation = self._settings.keys.observation(message, session.spec, self._settings.image_crop)
+        observation = self._settings.keys.observation(message, self._policy.spec, self._settings.image_crop)
         began = time.perf_counter()
         result: asyncio.Future[Array] = asyncio.get_running_loop().create_future()
-        self._waiting.put_nowait((session, observation, result))
+        self._waiting.put_nowait((lane, observation, result))
         actions = await result
         return {"actions": actions, "server_timing": {"infer_ms": 1000 * (time.perf_counter() - began)}}
 
     async def _infer(self, thread: Executor) -> None:
-        """Run inference on queued observations until cancelled, in batches of at most `batch` clients."""
+        """Run inference on queued observations until cancelled, for as many clients at once as a pass serves."""
         loop = asyncio.get_running_loop()
-        largest = 1 if self._policy.one_at_a_time else self._settings.batch
         while True:
             group = [await self._waiting.get()]
-            while len(group) < largest and not self._waiting.empty():
+            while len(group) < self._policy.lanes and not self._waiting.empty():
                 group.append(self._waiting.get_nowait())
-            sessions, observations, results = zip(*group, strict=True)
+            lanes, observations, results = zip(*group, strict=True)
             try:
-                plans = await loop.run_in_executor(thread, _plan, sessions, observations)
+                plans = await loop.run_in_executor(thread, self._policy.plan, observations, lanes)
             except Exception as error:
                 for result in results:
                     result.set_exception(error)
@@ -286,11 +285,3 @@ def metadata(policy: Policy, keys: Keys) -> dict[str, Any]:
         "history": policy.history,
         "reset": True,
     }
-
-
-def _plan(sessions: Sequence[Policy], observations: Sequence[Observation]) -> list[Array]:
-    if len(sessions) == 1:
-        return [sessions[0].plan(observations[0])]
-    from vla.policy import plan_together
-
-    return plan_together(sessions, observations)

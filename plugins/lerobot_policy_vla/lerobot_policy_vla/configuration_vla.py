@@ -22,11 +22,13 @@ class VlaConfig(PreTrainedConfig):
         checkpoint: its file; in a folder of `--policy.path`, relative to it.
         precision: "fp32" or "bf16".
         compile: compile the model.
+        lanes: environments that one pass through the model serves; unused ones are padding.
     """
 
     checkpoint: str = ""
     precision: str = "fp32"
     compile: bool = False
+    lanes: int = 1
     push_to_hub: bool = False
 
     def __post_init__(self) -> None:

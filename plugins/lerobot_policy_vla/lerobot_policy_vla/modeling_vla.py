@@ -6,7 +6,6 @@ import shutil
 from pathlib import Path
 from typing import Any, Self
 
-import numpy as np
 import torch
 from lerobot.configs import PreTrainedConfig
 from lerobot.policies.pretrained import PreTrainedPolicy
@@ -36,11 +35,11 @@ class VlaPolicy(PreTrainedPolicy):
         if not config.checkpoint:
             raise ValueError("which checkpoint? --policy.checkpoint=FILE")
         device = "cuda" if str(config.device).startswith("cuda") else "cpu"
-        options = {"device": device, "precision": config.precision, "compile": config.compile}
+        options = {"device": device, "precision": config.precision, "compile": config.compile, "lanes": config.lanes}
         self._policy: Policy = make_policy({"_target_": "vla.policy.Policy", **options}, Path(config.checkpoint))
         self._policy.device = torch.device(str(config.device) if device == "cuda" else "cpu")  # such as cuda:1
         self.model = self._policy.model  # a module, so that it moves with this one
-        self._sessions: list[Policy] = []
+        self._lanes = 0  # environments that have a history
 
     @classmethod
     def from_pretrained(
@@ -67,15 +66,15 @@ class VlaPolicy(PreTrainedPolicy):
 
     def reset(self) -> None:
         """Forget the histories of all environments."""
-        self._sessions = []
+        self._lanes = 0
 
     def select_action(self, batch: dict[str, Any], **_: Any) -> Tensor:
         """Return the action to execute in each environment, (B, D)."""
-        return self._ask(batch, Policy.act)
+        return self._ask(batch, self._policy.act)
 
     def predict_action_chunk(self, batch: dict[str, Any], **_: Any) -> Tensor:
         """Return a chunk of actions for each environment, (B, k, D)."""
-        return self._ask(batch, Policy.plan)
+        return self._ask(batch, self._policy.plan)
 
     def forward(self, batch: dict[str, Tensor]) -> tuple[Tensor, dict[str, Any] | None]:
         """Raise: the policy is not trained here."""
@@ -91,8 +90,10 @@ class VlaPolicy(PreTrainedPolicy):
         }
         said = {TASK: batch[TASK]} if TASK in batch else {}
         seen = observations({**arrays, **said}, self._policy.spec)
-        if len(self._sessions) != len(seen):
-            self._sessions = [self._policy.session() for _ in seen]
-        # One by one, so that every action is exactly the one that the policy gives alone.
-        answers: list[Array] = [question(session, each) for session, each in zip(self._sessions, seen, strict=True)]
-        return torch.from_numpy(np.stack(answers)).to(self._policy.device)
+        lanes = range(len(seen))
+        if self._lanes != len(seen):
+            self._lanes = len(seen)
+            for lane in lanes:
+                self._policy.reset(seen[lane].instruction, lane, lane)
+        answers: Array = question(seen, lanes)
+        return torch.from_numpy(answers).to(self._policy.device)

@@ -29,13 +29,12 @@ def measures(experiment: Experiment) -> dict[str, Measure]:
         ValueError: no checkpoint is given.
     """
     policy, steps = experiment.make_policy()(), experiment["benchmark"]["steps"]
-    here = policy.session()
     random = np.random.default_rng(0)
     observations = [policy.spec.random_observation(random) for _ in range(steps)]
     with _serving(experiment, policy) as agent, _echo() as echo:
         plans, trips, waits, echoes = [], [], [], []
         for observation in observations:
-            plans.append(timed(partial(here.plan, observation))[1])
+            plans.append(timed(partial(policy.plan, [observation], [1]))[1])
             answer, seconds = timed(partial(agent.ask, observation))
             trips.append(seconds)
             waits.append(seconds - answer["server_timing"]["infer_ms"] / 1000)
@@ -60,7 +59,6 @@ def _serving(experiment: Experiment, policy: Policy) -> Iterator[RemotePolicy]:
         port=0,
         keys=keys,
         image_crop="centre",
-        batch=1,
         connections=1,
         largest_message=2**26,
         api_key=None,
