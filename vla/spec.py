@@ -422,6 +422,31 @@ class Agent(Protocol):
 
 
 @runtime_checkable
+class Agents(Protocol):
+    """Agents in several worlds side by side, each in a lane, that share what they compute, as `vla.policy.Policy`."""
+
+    def reset(self, instruction: str, seed: int, lane: int) -> None:
+        """Start an episode, or a new instruction within it, in a lane; as of `Agent`."""
+        ...
+
+    def act(self, observations: Sequence[Observation], lanes: Sequence[int], /) -> Array:
+        """Return the actions (n, D) float32 to execute now in n lanes, given what each of them sees.
+
+        Raises:
+            ValueError: an observation does not fit; no lane has acted then.
+        """
+        ...
+
+    def about(self, lane: int) -> dict[str, Any]:
+        """Return what is known about the last action of a lane, as `Agent.info`."""
+        ...
+
+    def looking(self, lane: int) -> bool:
+        """Return whether the next action of a lane may depend on the images, as `Looking.looks`."""
+        ...
+
+
+@runtime_checkable
 class Looking(Agent, Protocol):
     """Agent that declares at which steps it reads images, so that no other images are rendered."""
 

@@ -235,7 +235,7 @@ def _play(
     asked, task = experiment["evaluate"], experiment["task"]
     seeds: Sequence[int] = range(asked["seed"], asked["seed"] + asked["episodes"])
     cluster, needs = experiment.cluster(), [checkpoint.resolve()] if checkpoint else []
-    named = (experiment["agent"] or {}).get("folder")
+    named, lanes = (experiment["agent"] or {}).get("folder"), (experiment["policy"] or {}).get("lanes", 1)
     if folder := named and Path(named).resolve():  # workers may be in another folder
         experiment = experiment.with_values({"agent.folder": str(folder)})
     make_agent = experiment.make_agent() or experiment.make_policy(needs[0])
@@ -263,7 +263,7 @@ def _play(
         until = until if asked["until"] else None
         known, keep = kept.of(name), partial(kept.add, name)
         report = evaluate(
-            environment, agent, recorder, seeds, cluster, name, needs, until, wanted, turns, known=known, keep=keep
+            environment, agent, recorder, seeds, cluster, name, needs, until, wanted, turns, known, keep, lanes
         )
         return replace(report, tiers=task.get("tiers") or {})  # of worlds that have them
 

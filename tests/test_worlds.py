@@ -1,0 +1,111 @@
+"""Worlds side by side: every episode is what it is alone, bit for bit, and an error costs one."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+import pytest
+from fake_batch import as_policy, make_act, make_bc, make_denoising, make_rt1
+from toy import ToyEnvironment, ToyExpert, ToyInTurn
+
+from vla.models.flow import Flow
+from vla.models.model import Model
+from vla.policy import Policy
+from vla.rollouts.evaluate import evaluate
+from vla.rollouts.rollout import rollout
+from vla.rollouts.worlds import Stage, WorldsHere, in_lanes, play
+from vla.spec import FIRST_SEED, Array, Episode, Observation
+
+MODELS: dict[str, Callable[[], Model]] = {
+    "bc": make_bc,
+    "rt1": make_rt1,
+    "act": partial(make_act, execute=2),
+    "flow": partial(make_denoising, Flow),
+}
+
+
+class Short(ToyEnvironment):
+    """Episodes of twelve steps at most."""
+
+    def step(self, action: Array) -> Observation:
+        seen = super().step(action)
+        self.done = self.done or self._steps == 12
+        return seen
+
+
+def worlds(lanes: int, make: Callable[[], ToyEnvironment] = ToyEnvironment) -> WorldsHere:
+    return WorldsHere([Stage(make()) for _ in range(lanes)])
+
+
+@pytest.mark.parametrize("make", MODELS.values(), ids=MODELS.keys())
+@pytest.mark.parametrize("rows", [1, 2, 4])
+def test_episodes_side_by_side_are_those_that_are_played_alone(make: Callable[[], Model], rows: int) -> None:
+    policy = as_policy(make(), lanes=rows)
+    alone = {seed: rollout(Short(), policy, seed).executed for seed in (2, 3, 4, 5, 9)}
+    for lanes, seeds in ((1, [9, 3]), (2, [2, 3, 4, 5, 9]), (4, [9, 5, 4, 3, 2])):
+        played = dict(play(worlds(lanes, Short), policy, seeds, all_images=False))
+        assert sorted(played) == sorted(seeds)
+        for seed, episode in played.items():
+            np.testing.assert_array_equal(episode.executed, alone[seed])
+
+
+def test_lanes_are_filled_again_as_their_episodes_end() -> None:
+    passes: list[int] = []
+
+    class Counting(Policy):
+        def act(self, observations: object, lanes: object = None) -> Array:
+            passes.append(len(lanes))  # type: ignore[arg-type]
+            return super().act(observations, lanes)  # type: ignore[call-overload,no-any-return]
+
+    policy = as_policy(make_bc(), lanes=2)
+    policy.__class__ = Counting
+    steps = [len(episode.executed) for _, episode in play(worlds(2), policy, range(6))]
+    assert steps == [40] * 6 and passes == [2] * 120
+
+
+def test_an_error_of_a_world_or_of_an_observation_ends_one_episode() -> None:
+    class Breaking(ToyEnvironment):
+        def step(self, action: Array) -> Observation:
+            seen = super().step(action)
+            if self._steps == 5 and self._seed == 1:
+                raise RuntimeError("it fell off")
+            return replace(seen, state=seen.state[:1]) if self._steps == 7 and self._seed == 2 else seen
+
+    policy = as_policy(make_rt1(), lanes=4)
+    alone = {seed: rollout(ToyEnvironment(), policy, seed).executed for seed in (0, 3)}
+    played = dict(play(worlds(4, Breaking), policy, range(4)))
+    assert isinstance(played[1], RuntimeError) and "the policy's state is" in str(played[2])
+    for seed, executed in alone.items():
+        np.testing.assert_array_equal(played[seed].executed, executed)
+
+
+def test_where_a_new_instruction_needs_an_image_only_its_episode_is_run_again() -> None:
+    class Changing(ToyEnvironment):
+        def _look(self) -> Observation:
+            new = self._steps >= 5 and self._seed == 2
+            return replace(super()._look(), instruction="go on" if new else "go")
+
+    policy = as_policy(make_act(execute=4), lanes=2)
+    played: dict[int, Episode] = dict(play(worlds(2, Changing), policy, [1, 2], all_images=False))
+    assert [bool(seen.rgb) for seen in played[1].observations] == [True, False, False, False] * 10
+    assert all(seen.rgb for seen in played[2].observations)
+    np.testing.assert_array_equal(played[2].executed, rollout(Changing(), policy, 2).executed)
+
+
+def test_an_agent_of_one_world_plays_in_one() -> None:
+    expert = ToyExpert()
+    played = dict(play(worlds(1), in_lanes(expert), [4, 1]))
+    for seed, episode in played.items():
+        np.testing.assert_array_equal(episode.executed, rollout(ToyEnvironment(), expert, seed).executed)
+    with pytest.raises(ValueError, match=r"ToyInTurn has no `info`: set self\.info"):
+        in_lanes(ToyInTurn())  # type: ignore[arg-type]
+
+
+def test_an_evaluation_in_lanes_reports_the_same() -> None:
+    policy = as_policy(make_bc(), lanes=2)
+    seeds = range(FIRST_SEED, FIRST_SEED + 7)
+    reports = [evaluate(Short, lambda world: policy, None, seeds, lanes=lanes) for lanes in (1, 2, 3)]
+    assert reports[0] == reports[1] == reports[2] and not reports[0].errors

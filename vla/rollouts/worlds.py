@@ -1,0 +1,259 @@
+"""Worlds side by side, and the loop in which agents act in them: the only one there is.
+
+Every world is a lane, and so is the agent in it. An episode is a function of its seed alone: it depends neither on the
+number of lanes nor on what is played in the others.
+
+Shapes: n lanes, D action components, N steps of an episode.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import nullcontext
+from dataclasses import dataclass, replace
+from typing import Any, Protocol
+
+import numpy as np
+
+from vla.spec import Agent, Agents, Array, Environment, Episode, InARow, Observation, Recorder, Spec, Traceable
+
+
+class Worlds(Protocol):
+    """Environments side by side, each in a lane; what is asked of one lane does not wait for the others."""
+
+    spec: Spec
+    lanes: int
+
+    def reset(self, lane: int, seed: int, recorded: bool) -> None:
+        """Start the episode of a seed in a lane."""
+        ...
+
+    def step(self, lane: int, action: Array, info: Mapping[str, Any], blind: bool) -> None:
+        """Apply an action (D,), about which `info` is known; the next observation has no images if it is `blind`."""
+        ...
+
+    def wait(self) -> Iterable[tuple[int, Any]]:
+        """Wait for at least one of the lanes that were asked.
+
+        Returns lane → its next observation; or, if its episode is over, what is made of it, or the exception that ended
+        it.
+        """
+        ...
+
+
+class Stage:
+    """One world, and what was seen and done so far in the episode that is played in it."""
+
+    def __init__(self, environment: Environment, recorder: Recorder | None = None) -> None:
+        self.environment, self._recorder = environment, recorder
+        self._recording: Recorder | None = None
+
+    def reset(self, seed: int, recorded: bool = False) -> Observation:
+        """Start the episode of a seed.
+
+        Raises:
+            ValueError: it is over at its start.
+        """
+        self._now = self.environment.reset(seed)
+        if self.environment.done:
+            raise ValueError(f"the episode of seed {seed} is over at its start: `reset` must draw another one")
+        self._seed, self._seen, self._clean, self._executed = seed, list[Observation](), list[Array](), list[Array]()
+        # Now, because the tool of a world may exist from its first episode on.
+        world = self.environment
+        self._traced = world if isinstance(world, Traceable) else None
+        self._tool = [self._traced.tool] if self._traced else []
+        self._recording = self._recorder if recorded else None
+        if self._recording is not None:
+            self._recording.start(self.environment)
+        return self._now
+
+    def step(self, action: Array, info: Mapping[str, Any], blind: bool) -> Observation | Episode:
+        """Execute an action (D,); return the next observation, or the episode if it is over.
+
+        The label for imitation is `info["clean"]` if present, else the action. What the agent drew, `info["draws"]`, is
+        added to the draws of the environment.
+        """
+        self._seen.append(copied(self._now))
+        self._clean.append(np.array(info.get("clean", action), dtype=np.float32))
+        self._executed.append(action)
+        if self._recording is not None:
+            self._recording.step(self._now, action, info)
+        with self.environment.blind() if blind else nullcontext():
+            self._now = self.environment.step(action)
+        if self._traced:
+            self._tool.append(self._traced.tool)
+        return self._ended(info) if self.environment.done else self._now
+
+    def _ended(self, info: Mapping[str, Any]) -> Episode:
+        environment = self.environment
+        episode = Episode(
+            seed=self._seed,
+            task=environment.task,
+            instruction=self._seen[0].instruction,
+            outcome=environment.outcome,
+            milestones=environment.milestones,
+            draws={**environment.draws, **info.get("draws", {})},
+            observations=self._seen,
+            actions=np.asarray(self._clean, dtype=np.float32),
+            executed=np.asarray(self._executed, dtype=np.float32),
+            completed=_completed(environment),
+            tool=np.array(self._tool) if self._traced else None,
+        )
+        if self._recording is not None:
+            self._recording.end(episode)
+        return episode
+
+
+class WorldsHere:
+    """Worlds in this process: each does at once what it is asked, and makes an `Episode`."""
+
+    def __init__(self, stages: Sequence[Stage]) -> None:
+        self._stages, self.lanes, self.spec = stages, len(stages), stages[0].environment.spec
+        self._found: list[tuple[int, Any]] = []
+
+    def reset(self, lane: int, seed: int, recorded: bool) -> None:
+        """See `Worlds`."""
+        self._ask(lane, self._stages[lane].reset, seed, recorded)
+
+    def step(self, lane: int, action: Array, info: Mapping[str, Any], blind: bool) -> None:
+        """See `Worlds`."""
+        self._ask(lane, self._stages[lane].step, action, info, blind)
+
+    def _ask(self, lane: int, call: Callable[..., Any], *arguments: Any) -> None:
+        try:
+            self._found.append((lane, call(*arguments)))
+        except Exception as error:  # of any kind: worlds are what people write
+            self._found.append((lane, error))
+
+    def wait(self) -> Iterable[tuple[int, Any]]:
+        """See `Worlds`."""
+        found, self._found = self._found, []
+        return found
+
+
+class Alone:
+    """An agent of one world in a single lane."""
+
+    def __init__(self, agent: Agent) -> None:
+        if not hasattr(agent, "info"):
+            raise ValueError(f"{type(agent).__name__} has no `info`: set self.info = {{}} in its constructor")
+        self.agent = agent
+
+    def reset(self, instruction: str, seed: int, lane: int) -> None:
+        """Start an episode."""
+        self.agent.reset(instruction, seed)
+
+    def act(self, observations: Sequence[Observation], lanes: Sequence[int], /) -> Array:
+        """Return the action to execute, (1, D)."""
+        (observation,) = observations
+        return np.array(self.agent.act(observation), dtype=np.float32)[None]
+
+    def about(self, lane: int) -> dict[str, Any]:
+        """Return what is known about the last action."""
+        return self.agent.info
+
+    def looking(self, lane: int) -> bool:
+        """Return whether the next action may depend on the images."""
+        return getattr(self.agent, "looks", True)
+
+
+def in_lanes(agent: Agent | Agents) -> Agents:
+    """Return agents in lanes; an agent of one world is in a single one."""
+    return agent if isinstance(agent, Agents) else Alone(agent)
+
+
+@dataclass
+class _Episode:
+    """An episode that is played in a lane."""
+
+    seed: int
+    instruction: str | None = None  # None: nothing was seen yet
+    everything: bool = False  # whether all images are rendered
+    blind: bool = False  # whether the newest observation has no images
+
+
+def play(
+    worlds: Worlds, agents: Agents, seeds: Sequence[int], recorded: bool = False, all_images: bool = True
+) -> Iterator[tuple[int, Any]]:
+    """Play the episodes of seeds side by side; yield seed → what the worlds make of it, or its error, as they end.
+
+    Without `all_images`, images are rendered only at steps where the agent reads them. If a new instruction makes the
+    agent read an image that was not rendered, the episode is run again with all images. A new instruction resets the
+    agent. An error of a world or an agent ends the episodes that it concerns: a ValueError of agents those that raise
+    it when they act alone, because no lane has acted then, any other one all that were to act together.
+
+    A lane plays seeds that are its number modulo the number of lanes, as long as there are some: then policies, whose
+    rows are given by seeds, serve all lanes in one pass.
+    """
+    waiting, playing = list(seeds), dict[int, _Episode]()
+    while waiting or playing:
+        for lane in range(worlds.lanes):
+            if waiting and lane not in playing:
+                fitting = next((seed for seed in waiting if seed % worlds.lanes == lane), waiting[0])
+                waiting.remove(fitting)
+                playing[lane] = _Episode(fitting, everything=all_images)
+                worlds.reset(lane, fitting, recorded)
+        seen: dict[int, Observation] = {}
+        ended: dict[int, Any] = {}
+        for lane, found in worlds.wait():
+            try:
+                if not isinstance(found, Observation):
+                    ended[lane] = found
+                elif _follows(agents, lane, playing[lane], found):
+                    seen[lane] = found
+                else:
+                    playing[lane] = _Episode(playing[lane].seed, everything=True)
+                    worlds.reset(lane, playing[lane].seed, recorded)
+            except Exception as error:  # of any kind: agents are what people write
+                ended[lane] = error
+        for lane, action in _acted(agents, seen, len(worlds.spec.action)).items():
+            if isinstance(action, Exception):
+                ended[lane] = action
+                continue
+            playing[lane].blind = not playing[lane].everything and not agents.looking(lane)
+            worlds.step(lane, action, agents.about(lane), playing[lane].blind)
+        for lane, found in ended.items():
+            yield playing.pop(lane).seed, found
+
+
+def _follows(agents: Agents, lane: int, playing: _Episode, seen: Observation) -> bool:
+    """Reset the agent of a lane at a new instruction; return whether the image that it then reads was rendered."""
+    if seen.instruction == playing.instruction:
+        return True
+    agents.reset(seen.instruction, playing.seed, lane)
+    playing.instruction = seen.instruction
+    return not (playing.blind and agents.looking(lane))
+
+
+def _acted(agents: Agents, seen: Mapping[int, Observation], components: int) -> dict[int, Array | Exception]:
+    """Return lane → its action (D,), or what went wrong."""
+    if not seen:
+        return {}
+    lanes = list(seen)
+    try:
+        actions = agents.act([seen[lane] for lane in lanes], lanes)
+    except ValueError as error:
+        if len(lanes) == 1:
+            return {lanes[0]: error}
+        return {lane: found for each in lanes for lane, found in _acted(agents, {each: seen[each]}, components).items()}
+    except Exception as error:  # of any kind: agents are what people write
+        return dict.fromkeys(lanes, error)
+    found: dict[int, Array | Exception] = {}
+    for lane, action in zip(lanes, actions, strict=True):
+        found[lane] = action
+        if action.shape != (components,) or not np.isfinite(action).all():
+            name = type(agents.agent if isinstance(agents, Alone) else agents).__name__
+            found[lane] = ValueError(f"{name} must return {components} finite numbers, got {action}")
+    return found
+
+
+def copied(seen: Observation) -> Observation:
+    """Return a copy with a state of 32 bits: a world may use its arrays again."""
+    rgb, depth = ({name: np.array(image) for name, image in images.items()} for images in (seen.rgb, seen.depth))
+    truth = None if seen.truth is None else {name: np.array(value) for name, value in seen.truth.items()}
+    return replace(seen, rgb=rgb, depth=depth, truth=truth, state=np.array(seen.state, np.float32))
+
+
+def _completed(environment: Environment) -> tuple[int, int] | None:
+    several = isinstance(environment, InARow) and environment.instructions > 1
+    return (environment.completed, environment.instructions) if several else None
