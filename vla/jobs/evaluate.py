@@ -6,8 +6,8 @@ In a world of recordings there is no success to measure, only errors of actions:
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import nullcontext
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, nullcontext
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
@@ -29,6 +29,7 @@ from vla.rollouts.realtime import Network, make_over_network
 from vla.rollouts.recordings import clear, keep_recordings
 from vla.rollouts.results import Report, compare_conditions, compare_secondary_metrics
 from vla.rollouts.rollout import AgentFactory
+from vla.rollouts.shared_policy import shared_policy
 from vla.rollouts.statements import AgainstBar, AgainstRun, Statement, differs_clearly
 from vla.runs.files import Round
 from vla.runs.folder import (
@@ -154,8 +155,12 @@ def _evaluated(experiment: Experiment, checkpoint: Path | None, rounds: Sequence
     output, statements, result = experiment.output, _statements(experiment), list[str]()
     _ = experiment.origin  # of the code that is evaluated, not of later changes
     try:
-        with Played(output, _sources(experiment, checkpoint), experiment.config, installed_versions()) as played:
-            reports = _play(experiment, checkpoint, statements, played)
+        sources = _sources(experiment, checkpoint)
+        with (
+            Played(output, sources, experiment.config, installed_versions()) as played,
+            policy_for_workers(experiment, checkpoint) as make_policy,
+        ):
+            reports = _play(experiment, checkpoint, make_policy, statements, played)
             report = reports[IN_DISTRIBUTION]
             result += [*(each.say(report) for each in statements), str(report)]
             with writing(output / REPORT):
@@ -166,6 +171,20 @@ def _evaluated(experiment: Experiment, checkpoint: Path | None, rounds: Sequence
         for line in result:  # after whatever was logged, because scripts read the last line
             print(printable(line))
     return report.success
+
+
+@contextmanager
+def policy_for_workers(experiment: Experiment, checkpoint: Path | None) -> Iterator[AgentFactory | None]:
+    """Enter with the factory of the policy in a checkpoint, which runs where `cluster.policy` says."""
+    if checkpoint is None:
+        yield None
+        return
+    make_policy = experiment.make_policy(checkpoint.resolve())  # workers may be in another folder
+    if experiment["cluster"].get("policy") != "here":
+        yield make_policy
+        return
+    with shared_policy(make_policy) as make_agent:
+        yield make_agent
 
 
 def _errors(reports: Mapping[str, Report]) -> int:
@@ -224,7 +243,11 @@ def _networks(experiment: Experiment) -> dict[str, Network]:
 
 
 def _play(
-    experiment: Experiment, checkpoint: Path | None, statements: Sequence[Statement], kept: Played
+    experiment: Experiment,
+    checkpoint: Path | None,
+    make_policy: AgentFactory | None,
+    statements: Sequence[Statement],
+    kept: Played,
 ) -> dict[str, Report]:
     """Return condition → report on the same seeds; only the first, the training condition, is recorded.
 
@@ -235,10 +258,13 @@ def _play(
     asked, task = experiment["evaluate"], experiment["task"]
     seeds: Sequence[int] = range(asked["seed"], asked["seed"] + asked["episodes"])
     cluster, needs = experiment.cluster(), [checkpoint.resolve()] if checkpoint else []
-    named, lanes = (experiment["agent"] or {}).get("folder"), (experiment["policy"] or {}).get("lanes", 1)
+    named = (experiment["agent"] or {}).get("folder")
+    here = experiment["cluster"].get("policy") == "here"  # then lanes are workers
+    lanes = 1 if here else (experiment["policy"] or {}).get("lanes", 1)
     if folder := named and Path(named).resolve():  # workers may be in another folder
         experiment = experiment.with_values({"agent.folder": str(folder)})
-    make_agent = experiment.make_agent() or experiment.make_policy(needs[0])
+    make_agent = experiment.make_agent() or make_policy
+    assert make_agent is not None, "there is a checkpoint"
     recordings = experiment.output.resolve() / RECORDINGS
     recorder = experiment.make_recorder(recordings)
     if recorder:

@@ -27,7 +27,7 @@ from vla.data.header import is_store
 from vla.data.index import listed
 from vla.io.types import Count, Seed, Share
 from vla.jobs.collect import complete_store, demonstrations
-from vla.jobs.evaluate import evaluate_trained, require_possible
+from vla.jobs.evaluate import evaluate_trained, policy_for_workers, require_possible
 from vla.jobs.train import train
 from vla.models.checkpoint import read_checkpoint, read_header
 from vla.rollouts.collect import collect, collection_time
@@ -182,10 +182,11 @@ def _labelled(experiment: Experiment, checkpoint: Path, folder: Path, seed: int)
     world = environment()
     world.close()
     store = EpisodeStore.create_or_open(folder, world.spec, own, experiment.codec)
-    policy = experiment.make_policy(checkpoint.resolve())
-    agent = partial(make_supervised, policy, experiment.make_expert(), asked["beta"], asked["segment"])
-    needs = [checkpoint.resolve()]
-    collect(store, environment, agent, asked["episodes"], experiment.cluster(), seed, keep_failures=True, needs=needs)
+    cluster, needs = experiment.cluster(), [checkpoint.resolve()]
+    with policy_for_workers(experiment, checkpoint) as policy:
+        assert policy is not None, "there is a checkpoint"
+        agent = partial(make_supervised, policy, experiment.make_expert(), asked["beta"], asked["segment"])
+        collect(store, environment, agent, asked["episodes"], cluster, seed, keep_failures=True, needs=needs)
     return EpisodeStore(folder)
 
 

@@ -16,7 +16,7 @@ from concurrent import futures
 from contextlib import AbstractContextManager, closing, contextmanager
 from multiprocessing import resource_tracker
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Literal, Protocol
 
 from vla.io.types import Count
 from vla.parallel.limits import cores
@@ -78,9 +78,12 @@ class Cluster(Protocol):
 class LocalCluster:
     """Spawned processes of this machine; a single worker runs in this process."""
 
-    def __init__(self, workers: Count | None) -> None:
-        """Set the number of workers; None: one per core."""
-        self.workers = workers or cores()
+    def __init__(self, workers: Count | None, policy: Literal["beside", "here"] = "beside") -> None:
+        """Args:
+        workers: their number; None: one per core.
+        policy: whether a policy runs beside each worker, or here, in this process, once for all of them.
+        """
+        self.workers, self.policy = workers or cores(), policy
 
     @contextmanager
     def pool(self, make: WorkerFactory, needs: Sequence[Path] = ()) -> Iterator[Pool]:

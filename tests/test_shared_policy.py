@@ -1,0 +1,81 @@
+"""One policy for the worlds of all worker processes: the same episodes as beside each of them, bit for bit."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import closing
+from functools import partial
+from multiprocessing.shared_memory import SharedMemory
+from typing import Any
+
+import numpy as np
+import pytest
+from fake_batch import as_policy, make_act, make_bc, make_denoising, make_rt1
+from toy import SPEC, ToyEnvironment
+from toy_telling import Telling
+
+from vla.models.flow import Flow
+from vla.models.model import Model
+from vla.parallel.pool import LocalCluster
+from vla.rollouts.evaluate import evaluate
+from vla.rollouts.rollout import rollout
+from vla.rollouts.shared_policy import shared_policy
+from vla.spec import FIRST_SEED, Observation
+
+MODELS: dict[str, Callable[[], Model]] = {
+    "rt1": make_rt1,
+    "act": partial(make_act, execute=2),
+    "flow": partial(make_denoising, Flow),
+}
+SEEDS = range(FIRST_SEED, FIRST_SEED + 6)
+
+
+def test_reports_are_the_same_with_any_number_of_workers() -> None:
+    policy = as_policy(make_bc(chunk=2), lanes=2)
+    beside = evaluate(Telling, lambda world: policy, None, SEEDS)
+    with shared_policy(lambda: policy) as agent:
+        reports = [evaluate(Telling, agent, None, SEEDS, LocalCluster(workers)) for workers in (1, 2, 4)]
+    assert not beside.errors and reports == [beside] * 3
+
+
+@pytest.mark.parametrize("make", MODELS.values(), ids=MODELS.keys())
+def test_an_episode_is_that_of_the_policy_alone_and_so_are_chunks_and_probabilities(make: Callable[[], Model]) -> None:
+    policy = as_policy(make(), lanes=4)
+    expected = rollout(Telling(), policy, 3).executed
+    seen, known = Telling().reset(3), policy.info
+    policy.reset(seen.instruction, 3)
+    planned = policy.plan(seen)
+    with shared_policy(lambda: policy) as make_agent, closing(make_agent(Telling())) as agent:
+        np.testing.assert_array_equal(rollout(Telling(), agent, 3).executed, expected)
+        np.testing.assert_equal(agent.info, known)
+        agent.reset(seen.instruction, 3)
+        np.testing.assert_array_equal(agent.plan(seen), planned)
+
+
+def test_what_does_not_fit_is_said_and_no_memory_is_left_behind(monkeypatch: pytest.MonkeyPatch) -> None:
+    used: list[str] = []
+
+    def made(*arguments: Any, **options: Any) -> SharedMemory:
+        memory = SharedMemory(*arguments, **options)
+        used.append(memory.name)
+        return memory
+
+    monkeypatch.setattr("vla.rollouts.shared_policy.SharedMemory", made)
+    with shared_policy(lambda: as_policy(make_bc())) as make_agent:
+        with pytest.raises(ValueError, match=r"the policy has cameras = \('eye',\), but the task has"):
+            make_agent(ToyEnvironment(spec=SPEC.from_dict({**SPEC.to_dict(), "cameras": ["ear"]})))
+        with closing(make_agent(ToyEnvironment())) as agent:
+            (seen,) = (SPEC.random_observation(np.random.default_rng(0)),)
+            with pytest.raises(
+                ValueError, match=r"the policy needs eye of \(16, 16, 3\) uint8, not \(8, 16, 3\) uint8"
+            ):
+                agent.act(Observation({"eye": seen.rgb["eye"][:8]}, seen.state, "go"))
+            with pytest.raises(ValueError, match=r"the policy needs cameras"):
+                agent.act(Observation({}, seen.state, "go"))
+            with pytest.raises(ValueError, match="an instruction has at most 1000 characters"):
+                agent.reset("a" * 1001, 0)
+            assert agent.act(seen).shape == (3,)
+    assert used
+    for name in used:
+        with pytest.raises(FileNotFoundError):
+            SharedMemory(name)

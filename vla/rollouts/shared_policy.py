@@ -1,0 +1,200 @@
+"""One policy in this process for the worlds of all workers: images come through shared memory, the rest by a socket.
+
+Observations that wait at the same time share a pass through the model. What a policy does in a lane depends on nothing
+but its episode, so episodes are the same, bit for bit, as with a policy beside every worker.
+
+Shapes: k action chunk, D action components.
+"""
+
+from __future__ import annotations
+
+import queue
+import secrets
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager, suppress
+from functools import partial
+from itertools import count
+from multiprocessing import AuthenticationError
+from multiprocessing.connection import Client, Connection, Listener
+from multiprocessing.shared_memory import SharedMemory
+from typing import Any, Protocol
+
+import numpy as np
+
+from vla.parallel.processes import one_thread_each
+from vla.spec import Agents, Array, Environment, Observation, Spec
+
+MOST = 1024  # workers
+
+Request = tuple[str, int, Any, Future[Any]]  # "act" or "plan", lane, observation; or "reset", lane, (instruction, seed)
+
+
+class Planner(Agents, Protocol):
+    """Agents that plan chunks, as `vla.policy.Policy`."""
+
+    spec: Spec
+    execute: int
+    history: int
+
+    def plan(self, observations: Sequence[Observation], lanes: Sequence[int], /) -> Array:
+        """Return the chunks (n, k, D) of n lanes."""
+        ...
+
+
+@contextmanager
+def shared_policy(make_policy: Callable[[], Planner]) -> Iterator[Callable[[Environment], DistantPolicy]]:
+    """Run a policy for all workers on this machine within the context, which is entered with the factory of agents."""
+    with one_thread_each(), Listener(family="AF_UNIX", authkey=(key := secrets.token_bytes(32))) as listener:
+        policy, requests = make_policy(), queue.Queue[Request | None]()
+        with ThreadPoolExecutor(MOST) as talks, ThreadPoolExecutor(2) as threads:
+            threads.submit(_accept, listener, partial(talks.submit, _talk, policy, requests))
+            threads.submit(_serve, policy, requests)
+            try:
+                yield partial(_connected, str(listener.address), key)
+            finally:
+                requests.put(None)
+                with suppress(OSError), Client(listener.address, authkey=key) as last:
+                    last.send(False)  # ends `_accept`, which would not notice that its socket is closed
+
+
+def _accept(listener: Listener, begin: Callable[[int, Connection], object]) -> None:
+    """Begin a talk with every worker that connects, each in a lane of its own."""
+    for lane in count():
+        with suppress(AuthenticationError, EOFError, OSError):  # whoever else finds the socket
+            connection = listener.accept()
+            if not connection.recv():
+                return
+            begin(lane, connection)
+
+
+def _serve(policy: Planner, requests: queue.Queue[Request | None]) -> None:
+    """Answer requests, those that wait together in one call of the policy, until there is None."""
+    while (first := requests.get()) is not None:
+        waiting = [first]
+        with suppress(queue.Empty):
+            while (another := requests.get_nowait()) is not None:
+                waiting.append(another)
+            requests.put(None)
+        for kind, call in (("reset", partial(_reset, policy)), ("act", policy.act), ("plan", policy.plan)):
+            if alike := [request for request in waiting if request[0] == kind]:
+                _answer(call, alike)
+
+
+def _reset(policy: Planner, episodes: Sequence[tuple[str, int]], lanes: Sequence[int]) -> Sequence[None]:
+    return [policy.reset(instruction, seed, lane) for (instruction, seed), lane in zip(episodes, lanes, strict=True)]
+
+
+def _answer(call: Callable[..., Iterable[Any]], requests: Sequence[Request]) -> None:
+    """Answer requests together; where an observation is refused, one by one."""
+    try:
+        answers = call([request[2] for request in requests], [request[1] for request in requests])
+    except Exception as error:  # of any kind: the worker raises it
+        for request in requests:
+            if isinstance(error, ValueError) and len(requests) > 1:  # then no lane has acted
+                _answer(call, [request])
+            else:
+                request[3].set_exception(error)
+    else:
+        for request, answer in zip(requests, answers, strict=True):
+            request[3].set_result(answer)
+
+
+def _talk(policy: Planner, requests: queue.Queue[Request | None], lane: int, connection: Connection) -> None:
+    """Ask the policy what a worker asks, until it leaves."""
+    spec, memory = policy.spec, SharedMemory(create=True, size=sum(_sizes(policy.spec)))
+    try:
+        with connection, suppress(EOFError, OSError):  # it has left, or was killed
+            connection.send((memory.name, spec, policy.execute, policy.history))
+            while True:
+                kind, instruction, given = connection.recv()
+                asked = (instruction, given) if kind == "reset" else _observation(memory, spec, instruction, given)
+                requests.put((kind, lane, asked, future := Future()))
+                error = future.exception()
+                connection.send(error or (future.result(), policy.about(lane), policy.looking(lane)))
+    finally:
+        memory.close()
+        memory.unlink()
+
+
+def _observation(memory: SharedMemory, spec: Spec, instruction: str, images: bool) -> Observation:
+    """Return a copy of what a worker sees, without `images` if it gave none."""
+    seen = {name: view.copy() for name, view in _views(memory, spec).items()}
+    state = seen.pop("")
+    return Observation(seen if images else {}, state, instruction)
+
+
+def _sizes(spec: Spec) -> list[int]:
+    """Return the bytes of every image, and of the state."""
+    return [*[3 * int(np.prod(spec.image_size))] * len(spec.cameras), 4 * len(spec.state)]
+
+
+def _views(memory: SharedMemory, spec: Spec) -> dict[str, Array]:
+    """Return camera → its image (H, W, 3) in shared memory, and "" → the state (P,)."""
+    starts = np.cumsum([0, *_sizes(spec)])
+    views: dict[str, Array] = {
+        camera: np.ndarray((*spec.image_size, 3), np.uint8, memory.buf, int(start))
+        for camera, start in zip(spec.cameras, starts, strict=False)
+    }
+    return views | {"": np.ndarray(len(spec.state), np.float32, memory.buf, int(starts[len(spec.cameras)]))}
+
+
+class DistantPolicy:
+    """The agent of one world whose policy is in another process of this machine."""
+
+    def __init__(self, address: str, key: bytes, spec: Spec) -> None:
+        """Args: where the policy is, and the spec of the environment.
+
+        Raises:
+            ValueError: the policy has another spec.
+        """
+        self._connection = Client(address, authkey=key)
+        self._connection.send(True)
+        name, self.spec, self.execute, self.history = self._connection.recv()
+        self.info: dict[str, Any] = {}
+        self.looks = True
+        try:
+            self.spec.without_truth.require(spec.without_truth, "the policy", "the task")
+        except ValueError:
+            self._connection.close()
+            raise
+        self._memory = SharedMemory(name)
+
+    def reset(self, instruction: str, seed: int) -> None:
+        """Start an episode."""
+        self._ask("reset", instruction, seed)
+
+    def act(self, observation: Observation) -> Array:
+        """Return the action to execute, (D,) float32."""
+        return self._asked("act", observation)
+
+    def plan(self, observation: Observation) -> Array:
+        """Return a chunk of actions, (k, D) float32."""
+        return self._asked("plan", observation)
+
+    def _asked(self, kind: str, observation: Observation) -> Array:
+        given: Mapping[str, Array] = {**observation.rgb, "": np.asarray(observation.state, np.float32)}
+        for name, place in _views(self._memory, self.spec).items():
+            array = given.get(name, place)
+            if (array.shape, array.dtype) != (place.shape, place.dtype):
+                wanted, found = (f"{each.shape} {each.dtype}" for each in (place, array))
+                raise ValueError(f"the policy needs {name or 'a state'} of {wanted}, not {found}")
+            place[:] = array
+        return self._ask(kind, observation.instruction, all(camera in given for camera in self.spec.cameras))
+
+    def _ask(self, kind: str, instruction: str, given: object) -> Any:
+        self._connection.send((kind, instruction, given))
+        answer = self._connection.recv()
+        if isinstance(answer, Exception):
+            raise answer
+        result, self.info, self.looks = answer
+        return result
+
+    def close(self) -> None:
+        """Leave the policy."""
+        self._memory.close()
+        self._connection.close()
+
+
+def _connected(address: str, key: bytes, environment: Environment) -> DistantPolicy:
+    return DistantPolicy(address, key, environment.spec)
