@@ -135,7 +135,7 @@ def _times(model: Any, precision: Any, compiled: bool, plans: int) -> dict[str, 
 
     torch._dynamo.reset()
     began, random = time.perf_counter(), np.random.default_rng(0)
-    policy = Policy("auto", precision, compiled, model=model, spec=model.spec)
+    policy = Policy("auto", precision, compiled, 1, model=model, spec=model.spec)
     observations = [policy.spec.random_observation(random) for _ in range(8)]
     for index in range(2 * policy.history + 6):
         policy.plan(observations[index % 8])
