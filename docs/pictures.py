@@ -22,7 +22,7 @@ from rerun.experimental import ViewerClient
 
 from vla.config.compose import compose_task
 from vla.config.experiment import make_environment, make_policy
-from vla.models.checkpoint import read_header
+from vla.models.policy_folder import read_policy
 from vla.rollouts.recorder import VIEWER
 from vla.spec import FIRST_SEED, Array
 
@@ -43,7 +43,7 @@ PARTS = (
     (1, 3, BLUE, "expert", "expert=waypoint: a script\nthat acts and labels"),
     (1, 1, GREEN, "demonstrations", "job=collect: verified,\nshared by all runs"),
     (2, 1, GREEN, "training", "job=train: model, text,\nimage, learner, trainer"),
-    (3, 1, GREEN, "policy", "checkpoint=FILE"),
+    (3, 1, GREEN, "policy", "checkpoint=RUN"),
     (2, 3, ORANGE, "evaluation", "job=evaluate: intervals,\nreport, recording"),
     (3, 3, ORANGE, "robot", "job=deploy: ROS 2 node,\npolicy server"),
 )
@@ -93,8 +93,8 @@ def photograph(page: Path, picture: Path, height: int) -> None:
 
 def film(run: Path, picture: Path) -> None:
     """Save rollouts of a run's policy as an animated WebP: both cameras, rendered larger, above the instruction."""
-    checkpoint = run / "checkpoints/last.ckpt"
-    config = read_header(checkpoint).config
+    checkpoint = run / "policy"
+    config = read_policy(checkpoint).config
     environment = make_environment(config["task"])
     renderer = {**config["task"]["renderer"], "samples": 4, "soft": 2, "faces": None}
     finer = {"image_size": [FILM_SIZE, FILM_SIZE], "meshes": "full", "renderer": renderer}
@@ -241,8 +241,7 @@ def main(run: Path) -> None:
     with tempfile.TemporaryDirectory() as folder:
         vla("job=preview", "task/goal=mixed", "task/randomize=wide", "preview.seed=1000000", f"output={folder}")
         shutil.copy(Path(folder) / "preview.png", DOCS / "wide.png")
-        checkpoint = run / "checkpoints/last.ckpt"
-        vla(f"checkpoint={checkpoint}", "evaluate.episodes=1", "cluster.workers=1", f"output={folder}")
+        vla(f"checkpoint={run}", "evaluate.episodes=1", "cluster.workers=1", f"output={folder}")
         screenshot(Path(folder) / "rollouts.rrd", DOCS / "rollout.png", STEP)
         store = f"collect.folder={folder}/episodes"
         vla("job=collect", "collect.episodes=60", store)

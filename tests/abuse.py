@@ -24,6 +24,7 @@ from abuse_kills import kills
 from abuse_messages import messages
 from crafted import hiding, listener, save
 from hostile import hostile
+from saved_policies import save_run
 from trials import CHECKPOINT, EVALUATE, TRAIN, Trials, last, run
 
 WRONG = (
@@ -169,10 +170,8 @@ def headers(root: Path) -> Trials:
 
 
 def checkpoints(root: Path) -> Trials:
-    """Checkpoints that name or hide something to run or to connect with, through every job that reads one."""
-    mark = root / "mark"
-    evil = root / "evil/checkpoints/last.ckpt"
-    evil.parent.mkdir(parents=True, exist_ok=True)
+    """Policies that name something to run or to connect with, through every job that reads one."""
+    mark, evil = root / "mark", root / "evil"
     named = f"checkpoint={evil}"
     ways: dict[str, tuple[str, ...]] = {
         "evaluate": (named, *EVALUATE, "output=wrong"),
@@ -181,8 +180,7 @@ def checkpoints(root: Path) -> Trials:
         "program": (named, "job=export", "export=program", "export.folder=program", "output=wrong"),
         "deploy": (named, "job=deploy", "deploy=ros2", "output=wrong"),
     }
-    content = torch.load(root / CHECKPOINT, weights_only=True)
-    own = content.pop("config")
+    own = torch.load(root / CHECKPOINT / "checkpoints/last.ckpt", weights_only=True)["config"]
     os.environ["ATTACK_SECRET"] = "hunter2secret"
     with listener() as (port, connected):
         attacks: dict[str, Any] = {}
@@ -190,7 +188,8 @@ def checkpoints(root: Path) -> Trials:
             attacks[attack] = json.loads(json.dumps(own))
             put(attacks[attack], key, value)
         for attack, config in (attacks | hiding(own, mark, port)).items():
-            save(evil, config, **content)
+            save_run(evil, config)
+            save(evil / "policy", config)
             for way, arguments in ways.items():
                 how, printed = run(root, *arguments)
                 shutil.rmtree(root / "wrong", ignore_errors=True)

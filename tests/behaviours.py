@@ -81,7 +81,7 @@ class Bench:
 
     def policy(self) -> str:
         """Return the policy of `trained`, as `checkpoint=` takes it."""
-        return f"checkpoint={self.trained() / 'checkpoints/last.ckpt'}"
+        return f"checkpoint={self.trained()}"
 
 
 def success(folder: Path) -> float:

@@ -1,4 +1,4 @@
-"""Checkpoints and archives that no program of this project writes: what they hide acted when it was read or built."""
+"""Policies and checkpoints that no program of this project writes: what they hold acted when it was read or built."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-import torch
 from composing import composed
 from hostile import node
+from saved_policies import save_policy
 from toy import SPEC
 
 from vla.config.build import build
@@ -40,42 +40,45 @@ def remote(port: int, key: str | None = None) -> dict[str, Any]:
 
 
 def recorded() -> dict[str, Any]:
-    """A world of recordings, as a checkpoint describes it."""
+    """A world of recordings, as a policy describes it."""
     names: dict[str, Any] = {"cameras": ["front"], "state": ["a", "b"], "action": ["a", "b"], "low": [-1.0, -1.0]}
     further = {"image_size": [16, 16], "control_hz": 5.0, "units": "1", "high": [1.0, 1.0], "joints": None}
     return node("vla.tasks.recorded.Recorded", **names, **further)
 
 
 def hiding(config: dict[str, Any], mark: Path, port: int) -> dict[str, Any]:
-    """Attack → the configuration of a checkpoint that ran code, or connected with a port, when it was used."""
+    """Attack → the configuration of a policy that ran code, or connected with a port, when it was used."""
     perturbed = config["expert"] | {"expert": remote(port) | {"_partial_": True}}
+    secret = {**config, "task": recorded(), "expert": remote(port, "${oc.env:ATTACK_SECRET}")}
+    return {
+        "python in a number": {**config, "tokenizer": config["tokenizer"] | {"bins": python(mark)}},
+        "python in a list": {**config, "model": {**config["model"], "image": [python(mark)]}},
+        "python in a key of its own": {**config, "model": {**config["model"], "more": python(mark)}},
+        "a secret for a stranger": secret,
+        "a secret in the report": {**config, "chosen": {"experiment": "${oc.env:ATTACK_SECRET}"}},
+        "a connection of a recording": {**config, "task": recorded(), "expert": remote(port)},
+        "a connection of an expert": {**config, "expert": remote(port)},
+        "a connection within an expert": {**config, "expert": perturbed},
+    }
+
+
+def hidden(config: dict[str, Any], mark: Path) -> dict[str, Any]:
+    """Attack → the configuration of a checkpoint, whose pickle can hide what a mapping holds."""
     methods = ("items", "values", "keys", "get", "__class__", "__iter__", "copy")
     bins = config["tokenizer"] | {"bins": python(mark)}
-    secret = {**config, "task": recorded(), "expert": remote(port, "${oc.env:ATTACK_SECRET}")}
     return {
         "python in a mapping that hides it": {**config, "tokenizer": Hiding(bins, "items", "values")},
         "python in a mapping without methods": {**config, "tokenizer": Hiding(bins, *methods)},
         "python in the mapping of all": Hiding({**config, "tokenizer": Hiding(bins, *methods)}, *methods),
-        "python in a tuple": {**config, "model": {**config["model"], "image": (python(mark),)}},
-        "a secret for a stranger": Hiding(secret, "values"),
-        "a secret in the report": Hiding({**config, "chosen": {"experiment": "${oc.env:ATTACK_SECRET}"}}, "values"),
-        "a connection of a recording": {**config, "task": recorded(), "expert": remote(port)},
-        "a connection of an expert": {**config, "expert": remote(port)},
-        "a connection within an expert": {**config, "expert": perturbed},
         "a key that is no text": {**config, "model": {**config["model"], 5: 1}},
         "keys that are no text": {**config, "model": {True: 1, float("nan"): 2}},
     }
 
 
-def save(path: Path, config: Any, **further: Any) -> Path:
-    """Write a checkpoint, without weights unless given, of the world that its configuration describes."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    content = {"spec": SPEC.to_dict(), "state_dict": {}, **further, "config": config}
-    shown = config._shown if isinstance(config, Hiding) else config
-    if shown["task"] == recorded():
-        content["spec"] = build(shown["task"], "task").spec.to_dict()
-    torch.save(content, path)
-    return path
+def save(folder: Path, config: Any) -> Path:
+    """Write a policy without weights of the world that its configuration describes."""
+    known = config["task"] == recorded()
+    return save_policy(folder, config, build(config["task"], "task").spec if known else SPEC)
 
 
 @contextmanager

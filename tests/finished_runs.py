@@ -60,7 +60,7 @@ def a_run(
     config = {**CONFIG, **told, "model": {"_target_": "vla.models.bc.BC", "width": width}}
     size = {"parameters": 1_500_000, "latency_ms": 2.5, **(more or {})}
     compared = compare_conditions({"seen": report, "dark": in_the_dark}, 0.02)
-    used = f"{folder}/checkpoints/last.ckpt"
+    used = f"{folder}/policy"
     write_report(report, folder / "report.json", used, config, size, {"dark": in_the_dark}, compared)
     (folder / "metrics.csv").write_text(curves)
     save_config(folder, config, [{"key": "model.width", "here": width, "default": 32}])

@@ -11,6 +11,7 @@ import toy
 from defaults import defaults_of
 from lightning import Callback
 from reading import windows
+from small_training import CONFIG
 
 from vla.models.learner import Learner
 from vla.models.model import Model
@@ -69,7 +70,8 @@ def train(
     made = make_trainer(config(**trainer), output / "checkpoints", *watching)
     if checkpoint:
         restore_metrics(made, checkpoint)
-    learner = Learner(model=model, spec=toy.SPEC, config={}, **defaults_of("learner/default", warmup_steps=3, lr=0.001))
+    options = defaults_of("learner/default", warmup_steps=3, lr=0.001)
+    learner = Learner(model=model, spec=toy.SPEC, config=CONFIG, **options)
     data = windows(store, history=model.history, chunk=model.chunk, tokenize=model.text.tokenize)
     with graceful_stop.explaining_restore(checkpoint):
         made.fit(learner, datamodule=data, ckpt_path=checkpoint, weights_only=True)

@@ -13,9 +13,11 @@ import pytest
 import torch
 from defaults import defaults_of
 from fake_batch import Motions
+from saved_policies import save_policy
 from toy import SPEC
 
 from vla.models.model import mean_where
+from vla.models.policy_folder import read_policy
 from vla.models.tokenizers.fast import Fast
 from vla.models.tokenizers.quantile import Quantile
 from vla.models.tokenizers.tokenization_error import describe_tokenization_error, out_of_bounds
@@ -203,12 +205,11 @@ def test_what_the_round_trip_costs_on_small_motions_at_10_hz(name: str) -> None:
 
 
 @every
-def test_a_checkpoint_brings_all_that_was_fitted(name: str, tmp_path: Path) -> None:
+def test_a_policy_brings_all_that_was_fitted(name: str, tmp_path: Path) -> None:
     tokenizer = EVERY[name]
-    file = tmp_path / "state.ckpt"
-    torch.save(tokenizer.state_dict(), file)
     fresh = KINDS[name](spec=SPEC)
-    fresh.load_state_dict(torch.load(file, weights_only=True))
+    save_policy(tmp_path, {"task": {}, "tokenizer": {}, "model": {}}, state=tokenizer.state_dict())
+    read_policy(tmp_path).restore(fresh)
     chunks = torch.from_numpy(CHUNKS[::50].copy())
     tokens = tokenizer.tokenize(chunks)
     assert torch.equal(fresh.tokenize(chunks), tokens)

@@ -19,8 +19,9 @@ BAD_INPUT = {
     "misspelt key": (("colect.episodes=3",), "collect"),
     "misspelt option": (("model=rt2",), "rt1"),
     "wrong type": (("trainer.max_steps=many",), "trainer.max_steps must be "),
-    "missing checkpoint": (("checkpoint=nowhere.ckpt",), "there is no checkpoint"),
-    "a folder as checkpoint": (("checkpoint=.",), ". is a folder, a checkpoint is a file; it has none"),
+    "missing policy": (("checkpoint=nowhere",), "there is no policy"),
+    "a file for a policy": (("checkpoint=nowhere.ckpt",), "only resumes its own training: a policy is a folder"),
+    "a folder without a policy": (("checkpoint=.",), ". is neither a policy nor a run with one"),
     "a deployment without a policy": (("job=deploy", "deploy=loop"), "this deployment needs a trained policy"),
     "a run that is no path": (("resume=true",), "resume=True is not a path"),
     "a checkpoint that is no path": (("checkpoint=3",), "checkpoint=3 is not a path"),
@@ -36,7 +37,7 @@ BAD_INPUT = {
         ("job=deploy", "deploy=server", "deploy.host=0.0.0.0"),
         "set the environment variable",
     ),
-    "another world's key": (("checkpoint=x.ckpt", "task.hand_size=0.3"), "task is set by +task.hand_size=VALUE"),
+    "another world's key": (("checkpoint=x", "task.hand_size=0.3"), "task is set by +task.hand_size=VALUE"),
     "another world's expert": (("job=preview", "expert=metaworld"), "expert=metaworld acts in task=metaworld only"),
     "another world's goal": (("task=metaworld", "task/goal=lift"), "the option chosen for task has no goal"),
     "no environment": (("job=preview", "task=gymnasium"), "task.package is missing: the options chosen need"),
@@ -153,8 +154,8 @@ def test_a_grid_whose_cells_want_several_processes_is_refused(tmp_path: Path) ->
 
 
 def test_a_job_that_takes_no_checkpoint_says_which_word_does(tmp_path: Path) -> None:
-    done = here(tmp_path, "job=train", "checkpoint=x.ckpt", ok=False)
-    assert "job=train takes no checkpoint: resume=RUN continues a run, pretrained=x.ckpt starts" in done.stderr
+    done = here(tmp_path, "job=train", "checkpoint=x", ok=False)
+    assert "job=train takes no checkpoint: resume=RUN continues a run, pretrained=x starts" in done.stderr
 
 
 @pytest.mark.parametrize(
@@ -166,7 +167,7 @@ def test_a_job_that_takes_no_checkpoint_says_which_word_does(tmp_path: Path) -> 
         ("variant=no_transformer model=rt1_small", "variant=no_transformer is model=bc: omit model=rt1_small"),
         ("experiment=standard task=metaworld", "the option chosen for task has no randomize: choose another task"),
         ("task.image_size.height=64", "height"),
-        ("checkpoint=x.ckpt output=2", "output=2 is not a path"),
+        ("checkpoint=x output=2", "output=2 is not a path"),
     ],
 )
 def test_a_line_that_would_not_do_what_it_says_is_refused(tmp_path: Path, line: str, sentence: str) -> None:

@@ -8,12 +8,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import torch
 import toy
 from composing import check, composed
 from defaults import defaults_of
 from hydra.errors import MissingConfigException
 from omegaconf import DictConfig, OmegaConf
+from saved_policies import save_policy
 
 from vla import jobs
 from vla.config.adopt import adopt
@@ -21,7 +21,7 @@ from vla.config.build import build
 from vla.config.check import digest
 from vla.config.experiment import Experiment, plain
 from vla.io.suggestion import suggestion
-from vla.models.checkpoint import require_unseen
+from vla.models.policy_folder import require_unseen
 from vla.run import sentence
 
 GRAMMAR = {
@@ -297,10 +297,7 @@ SAVED = {
 
 @pytest.fixture
 def checkpoint(tmp_path: Path) -> Path:
-    path = tmp_path / "a.ckpt"
-    saved = {**SAVED, "collect": {"episodes": 50}, "learner": {"lr": 1e-4}}
-    torch.save({"config": saved, "spec": toy.SPEC.to_dict(), "state_dict": {}}, path)
-    return path
+    return save_policy(tmp_path / "theirs", {**SAVED, "collect": {"episodes": 50}, "learner": {"lr": 1e-4}})
 
 
 def test_a_checkpoint_brings_its_task_tokenizer_and_model_and_task_overrides_apply_on_top(checkpoint: Path) -> None:
@@ -392,12 +389,12 @@ def test_evaluation_seeds_used_for_training_or_selection_are_refused(override: d
 @pytest.mark.parametrize(
     ("overrides", "key", "shared"),
     [
-        (("checkpoint=FILE", "evaluate.seed=2000010"), "evaluate.seed", "2000010 to 2000019"),
-        (("checkpoint=FILE", "evaluate.seed=1999000", "evaluate.episodes=1001"), "evaluate.seed", "2000000 to 2000000"),
-        (("pretrained=FILE", "evaluate.seed=2000000"), "evaluate.seed", "2000000 to 2000019"),
-        (("job=improve", "pretrained=FILE", "evaluate.seed=2000000"), "evaluate.seed", "2000000 to 2000019"),
+        (("checkpoint=RUN", "evaluate.seed=2000010"), "evaluate.seed", "2000010 to 2000019"),
+        (("checkpoint=RUN", "evaluate.seed=1999000", "evaluate.episodes=1001"), "evaluate.seed", "2000000 to 2000000"),
+        (("pretrained=RUN", "evaluate.seed=2000000"), "evaluate.seed", "2000000 to 2000019"),
+        (("job=improve", "pretrained=RUN", "evaluate.seed=2000000"), "evaluate.seed", "2000000 to 2000019"),
         (
-            ("job=deploy", "deploy=loop", "checkpoint=FILE", "deploy.simulator.seed=2000019"),
+            ("job=deploy", "deploy=loop", "checkpoint=RUN", "deploy.simulator.seed=2000019"),
             "deploy.simulator.seed",
             "2000019 to 2000019",
         ),
@@ -407,21 +404,18 @@ def test_a_checkpoint_is_not_evaluated_on_what_selected_it_whatever_is_validated
     overrides: tuple[str, ...], key: str, shared: str, tmp_path: Path
 ) -> None:
     """The episodes of its own training count, not `validate` of the command."""
-    path = tmp_path / "a.ckpt"
     selected = {"validate": {"episodes": 20, "seed": 2_000_000, "changes": {}}}
-    torch.save({"config": {**SAVED, **selected}, "spec": toy.SPEC.to_dict(), "state_dict": {}}, path)
+    path = save_policy(tmp_path / "theirs", {**SAVED, **selected})
     for validated in ("validate.seed=3000000", "validate.episodes=0"):
-        cfg = composed(*(each.replace("FILE", str(path)) for each in overrides), validated, f"output={tmp_path}/out")
+        cfg = composed(*(each.replace("RUN", str(path)) for each in overrides), validated, f"output={tmp_path}/out")
         check(cfg)
-        with pytest.raises(ValueError, match=rf"^{key}=\d+: episodes {shared} selected the weights in .*a\.ckpt"):
+        with pytest.raises(ValueError, match=rf"^{key}=\d+: episodes {shared} selected the weights in .*theirs"):
             jobs.run(Experiment.of(cfg))
 
 
 def test_a_checkpoint_may_be_evaluated_on_all_that_did_not_select_it(tmp_path: Path) -> None:
-    path = tmp_path / "a.ckpt"
-    for validate in ({"episodes": 20, "seed": 2_000_000}, {"episodes": 0, "seed": 1_000_000}, {"episodes": "x"}, {}):
-        saved = {**SAVED, "validate": validate}
-        torch.save({"config": saved, "spec": toy.SPEC.to_dict(), "state_dict": {}}, path)
+    for validate in ({"episodes": 20, "seed": 2_000_000}, {"episodes": 0, "seed": 1_000_000}, {}):
+        path = save_policy(tmp_path / "theirs", {**SAVED, "validate": validate})
         require_unseen(path, "evaluate.seed", range(1_000_000, 2_000_000))
         require_unseen(path, "evaluate.seed", range(2_000_020, 2_000_040))
     check(config(job="evaluate", checkpoint=str(path), **{"validate.seed": 1_000_000}))  # nothing is validated

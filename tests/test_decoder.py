@@ -14,13 +14,14 @@ from fake_batch import Motions, as_policy, make_batch, make_decoder, make_rt1, o
 from small_training import loader, make_learner, make_trainer
 from toy import SPEC, ToyEnvironment
 
-from vla.models.checkpoint import read_checkpoint
 from vla.models.decoder import Decoder
 from vla.models.model import Model
+from vla.models.policy_folder import read_policy
 from vla.models.tokenizers.fast import Fast
 from vla.models.tokenizers.quantile import Quantile
 from vla.models.tokenizers.tokenizer import RT1Bins
 from vla.rollouts.rollout import rollout
+from vla.training.checkpoints import AtomicCheckpointIO
 
 MOTIONS = Motions()
 
@@ -171,9 +172,10 @@ def test_a_trained_decoder_of_fast_tokens_plays_an_episode_from_its_checkpoint(t
     trainer = make_trainer(3)
     learner = make_learner(model)
     trainer.fit(learner, loader(learner, [make_batch(2, chunk=4)] * 3))
-    trainer.save_checkpoint(tmp_path / "fast.ckpt")
+    trainer.strategy.checkpoint_io = AtomicCheckpointIO()
+    trainer.save_checkpoint(tmp_path / "policy", weights_only=False)
     restored = make_decoder(chunk=4, tokenizer=Fast(bins=256, chunk=4, spec=SPEC, scale=10.0))
-    read_checkpoint(tmp_path / "fast.ckpt").restore(restored)
+    read_policy(tmp_path / "policy").restore(restored)
     episode = rollout(ToyEnvironment(), as_policy(restored), seed=3)
     assert episode.actions.shape == (40, 3)
     expected = rollout(ToyEnvironment(), as_policy(model), seed=3)

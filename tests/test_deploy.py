@@ -45,7 +45,7 @@ from vla.deploy.messages import SimulatedEpisode
 from vla.deploy.ros import NETWORKS, RosNetwork, split_arguments
 from vla.io.images import resize
 from vla.jobs import deploy as job
-from vla.models.checkpoint import read_header
+from vla.models.policy_folder import read_policy
 from vla.robots.panda import forward
 from vla.rollouts.recorder import VIEWER
 from vla.rollouts.results import Result
@@ -53,7 +53,7 @@ from vla.tasks import gl as backend
 
 WORKER = int(os.environ.get("PYTEST_XDIST_WORKER", "gw0").removeprefix("gw"))
 DOMAIN = 33 + 33 * (WORKER % 3)  # after those of test_policy_node
-CHECKPOINT = "checkpoint=run/checkpoints/last.ckpt"
+CHECKPOINT = "checkpoint=run"
 
 
 @pytest.fixture
@@ -263,9 +263,7 @@ def test_the_whole_loop_reports_and_its_bag_moves_an_agent_again(
     learn_from_the_bag(home)
 
 
-def test_an_episode_that_breaks_off_is_an_error_of_the_loop(
-    home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_episode_that_breaks_off_is_an_error_of_the_loop(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def play() -> Result:
         if results:
             return results.pop()
@@ -274,8 +272,8 @@ def test_an_episode_that_breaks_off_is_an_error_of_the_loop(
     results = [Result(5, "success")]
     operator = SimpleNamespace(play=play, stopped=threading.Event(), status={})
     monkeypatch.setattr(Loop, "running", lambda loop: nullcontext(operator))
-    checkpoint = f"checkpoint={home}/run/checkpoints/last.ckpt"
-    experiment = Experiment.of(composed("job=deploy", "deploy=loop", checkpoint, f"output={tmp_path}"))
+    agent = ("agent=remote", "agent.url=ws://127.0.0.1:1")
+    experiment = Experiment.of(composed("job=deploy", "deploy=loop", *agent, f"output={tmp_path}"))
     with pytest.raises(ValueError, match=r"ended with an error, see .*report.json: timed out after 60 s"):
         job.run(experiment)
     report = json.loads((tmp_path / "report.json").read_text())
@@ -289,7 +287,7 @@ def learn_from_the_bag(home: Path) -> None:
     assert "error: loop/bag has no corrections" in nobody.stderr
     here(home, "job=collect", CHECKPOINT, *bag, "expert.steps=all")
     store = EpisodeStore(home / "lessons")
-    policy = read_header(home / "run/checkpoints/last.ckpt")
+    policy = read_policy(home / "run")
     store.spec.require(policy.spec.without_truth, "the bag", "the policy")
     assert len(store.episodes) == 2
     for entry in store.episodes:
@@ -308,11 +306,10 @@ def learn_from_the_bag(home: Path) -> None:
 def test_the_node_acts_like_the_evaluated_policy(home: Path) -> None:
     """On the same observations, through messages and back, bit for bit."""
     from vla.config import experiment as parts
-    from vla.models.checkpoint import read_checkpoint
     from vla.spec import Observation
 
-    checkpoint = home / "run/checkpoints/last.ckpt"
-    environment = parts.make_environment(read_checkpoint(checkpoint).config["task"])
+    checkpoint = home / "run/policy"
+    environment = parts.make_environment(read_policy(checkpoint).config["task"])
     node = {"_target_": "vla.policy.Policy", **defaults_of("policy/default")}
     evaluated, deployed = (parts.make_policy(node, checkpoint, environment) for _ in range(2))
     assert environment.spec.robot is not None

@@ -18,6 +18,7 @@ from together import PAIRS, composed, train, untrained
 
 from vla.config.experiment import make_policy
 from vla.models.learner import Learner
+from vla.models.policy_folder import POLICY
 from vla.runs.folder import LAST
 from vla.training.trainer import make_trainer
 
@@ -56,8 +57,8 @@ def test_two_processes_learn_what_one_learns_from_batches_twice_as_large(
 
 
 @pytest.mark.parametrize("pair", PAIRS)
-def test_what_several_processes_leave_is_a_checkpoint_like_any_other(together: Path, pair: str) -> None:
-    path = together / pair / LAST
+def test_what_several_processes_leave_is_a_policy_like_any_other(together: Path, pair: str) -> None:
+    path = together / pair / POLICY
     policy = make_policy({"_target_": "vla.policy.Policy", **defaults_of("policy/default", device="cpu")}, path)
     action = policy.act(toy.SPEC.random_observation(np.random.default_rng(0)))
     assert action.shape == (3,) and np.isfinite(action).all()

@@ -10,7 +10,8 @@ from fake_batch import make_batch
 from lightning import Callback
 from small_training import loader, make_learner, make_trainer
 
-from vla.models.checkpoint import read_checkpoint
+from vla.models.policy_folder import read_policy
+from vla.training.checkpoints import AtomicCheckpointIO
 from vla.training.ema import EMA, EVERY
 
 DECAY = 0.9
@@ -35,11 +36,13 @@ def test_it_is_the_exponential_average_of_the_steps_and_what_is_validated_and_sa
     trainer = make_trainer(steps, EMA(DECAY), watch)
     learner = make_learner(lr=1e-2, warmup_steps=0)
     trainer.fit(learner, loader(learner, [batch] * steps), loader(learner, [batch]))
-    trainer.save_checkpoint(tmp_path / "last.ckpt")
+    trainer.strategy.checkpoint_io = AtomicCheckpointIO()
+    for name in ("last.ckpt", "policy"):
+        trainer.save_checkpoint(tmp_path / name, weights_only=False)
     weights = [DECAY ** (steps - step) for step in range(EVERY, steps + 1, EVERY)]
     seen = torch.stack(watch.trained[EVERY - 1 :: EVERY])
     average = torch.einsum("n,n...->...", torch.tensor(weights) / sum(weights), seen)  # of the initial weights nothing
     torch.testing.assert_close(watch.validated[-1], average)
-    torch.testing.assert_close(read_checkpoint(tmp_path / "last.ckpt").state["head.weight"], average)
+    torch.testing.assert_close(read_policy(tmp_path).state["head.weight"], average)
     saved = torch.load(tmp_path / "last.ckpt", weights_only=True)
     torch.testing.assert_close(saved["current_model_state"]["model.head.weight"], watch.trained[-1])

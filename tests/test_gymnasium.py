@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-import torch
 import toy
 from composing import composed
+from saved_policies import save_policy
 
 from vla.config import packages
 from vla.config.adopt import adopt
@@ -148,9 +148,8 @@ def test_what_the_command_line_names_is_trusted_and_what_a_file_names_is_not(
         ):
             packages.trust([], [], [name])
     packages.trust([], [])
-    file = tmp_path / "last.ckpt"
-    torch.save({"config": plain(composed(*VALUES)), "spec": toy.SPEC.to_dict(), "state_dict": {}}, file)
-    with pytest.raises(ValueError, match=r"last\.ckpt uses 'toy_gym', which is not trusted: add trust=\[toy_gym\]"):
+    file = save_policy(tmp_path / "policy", plain(composed(*VALUES)))
+    with pytest.raises(ValueError, match=r"policy uses 'toy_gym', which is not trusted: add trust=\[toy_gym\]"):
         adopt(composed(f"checkpoint={file}"), [])
     with pytest.raises(ValueError, match="'toy_gym', which is not trusted"):
         build(node(), "task")

@@ -1,16 +1,16 @@
-"""What a checkpoint hides from a check: no code of it runs, nobody is called, and no secret leaves."""
+"""What a policy hides from a check: no code of it runs, nobody is called, and no secret leaves."""
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
 from composing import check, composed
-from crafted import hiding, listener, save
+from crafted import hidden, hiding, listener, save
 from omegaconf import DictConfig
+from saved_policies import save_run
 
 from vla import jobs
 from vla.config.adopt import adopt, finetune
@@ -35,7 +35,7 @@ def test_nothing_that_is_hidden_acts(attack: str, tmp_path: Path, monkeypatch: p
     mark = tmp_path / "mark"
     with listener() as (port, connected):
         config = hiding(plain(composed("expert=waypoint", "trainer=cpu")), mark, port)[attack]
-        path = save(tmp_path / "theirs/last.ckpt", config)
+        path = save(tmp_path / "theirs", config)
         small = ("output=mine", "cluster.workers=1", "evaluate.episodes=1", "recorder=none")
 
         def adopted(*options: str) -> Callable[[], None]:
@@ -57,22 +57,20 @@ def test_nothing_that_is_hidden_acts(attack: str, tmp_path: Path, monkeypatch: p
     assert not any(SECRET in file.read_bytes().decode("latin-1") for file in written)
 
 
-@pytest.mark.parametrize("attack", [attack for attack in ATTACKS if "secret" in attack])
-def test_no_reference_is_read(attack: str, tmp_path: Path) -> None:
-    path = save(tmp_path / "last.ckpt", hiding(plain(composed("expert=waypoint")), tmp_path / "mark", 0)[attack])
-    with pytest.raises(ValueError, match=r"last\.ckpt cannot be read as a checkpoint"):
-        read_header(path)
+@pytest.mark.parametrize("attack", hidden(plain(composed()), Path()))
+def test_what_a_mapping_of_a_checkpoint_hides_is_not_resumed(attack: str, tmp_path: Path) -> None:
+    run = save_run(
+        tmp_path / "run", hidden(plain(composed(f"output={tmp_path}/run")), tmp_path / "mark")[attack], False
+    )
+    with pytest.raises(ValueError, match=r"last\.ckpt (cannot be read as a checkpoint|holds )"):
+        read_header(run / "checkpoints/last.ckpt")
+    assert not (tmp_path / "mark").exists()
 
 
-def test_the_policy_that_a_run_names_is_the_one_that_is_checked(tmp_path: Path) -> None:
-    mark, config = tmp_path / "mark", plain(composed("expert=waypoint", f"output={tmp_path}"))
-    attack = hiding(config, mark, 0)["python in a mapping that hides it"]
-    plainly = {**config, "tokenizer": attack["tokenizer"]._shown}
-    for theirs, says in ((attack, "cannot be read as a checkpoint"), (plainly, r"differs in tokenizer\.bins")):
-        save(tmp_path / "checkpoints/last.ckpt", config, finished=True)
-        save(tmp_path / "checkpoints/best.ckpt", theirs, finished=True)
-        ended = {"parameters": 1, "steps": 0, "seconds": 1.0, "ended": "done", "checkpoint": "best.ckpt"}
-        (tmp_path / "training.json").write_text(json.dumps(ended))
-        with pytest.raises(ValueError, match=says):
-            training_progress(tmp_path, config)
-        assert not mark.exists()
+def test_the_policy_of_a_run_is_the_one_that_is_checked(tmp_path: Path) -> None:
+    config = plain(composed("expert=waypoint", f"output={tmp_path}"))
+    save_run(tmp_path, config)
+    save(tmp_path / "policy", hiding(config, tmp_path / "mark", 0)["python in a number"])
+    with pytest.raises(ValueError, match=r"differs in tokenizer\.bins"):
+        training_progress(tmp_path, config)
+    assert not (tmp_path / "mark").exists()

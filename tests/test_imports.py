@@ -148,7 +148,7 @@ from vla.config.adopt import adopt
 from vla.config.check import check
 from vla.config.compose import compose
 from vla.jobs import deploy
-robot = ["job=deploy", "deploy=server", "output=served", "checkpoint=without/checkpoints/last.ckpt"]
+robot = ["job=deploy", "deploy=server", "output=served", "checkpoint=without"]
 check(adopt(compose(*robot), robot), deploy.JOB)
 sys.argv[1:] += ["output=further", "collect.episodes=13"]
 main()
@@ -198,8 +198,8 @@ def test_a_policy_acts_without_compiler_and_trainer() -> None:
     """Which take seconds to import: evaluations, nodes and workers start and end without them."""
     code = (
         "import sys, vla.jobs.evaluate, vla.models.rt1; from pathlib import Path\n"
-        "from fake_batch import make_bc; from toy import ARM_SPEC; from vla.models.checkpoint import TensorBudget\n"
-        "with TensorBudget(Path(sys.executable)):\n"
+        "from fake_batch import make_bc; from toy import ARM_SPEC; from vla.models.policy_folder import TensorBudget\n"
+        "with TensorBudget(Path(), 2**30):\n"
         "    assert make_bc(spec=ARM_SPEC).kinematics is not None\n"
         "print(*sys.modules)"
     )

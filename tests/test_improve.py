@@ -6,12 +6,10 @@ import json
 import shutil
 from functools import partial
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
-import torch
 import toy
 from collecting import content
 from command_line import SMALL, here
@@ -24,7 +22,7 @@ from vla.data.header import Codec
 from vla.data.verification import derive_store, episode_of, verify_store
 from vla.data.window_batches import WindowBatcher
 from vla.jobs import improve
-from vla.models.checkpoint import read_checkpoint
+from vla.models.policy_folder import read_policy
 from vla.parallel.pool import LocalCluster
 from vla.rollouts.collect import collect
 from vla.rollouts.rollout import replay, rollout
@@ -35,7 +33,7 @@ from vla.tasks.metaworld.expert import Scripted
 from vla.tasks.perturb import Perturbed
 from vla.tasks.tabletop.expert import Waypoint
 
-ROUNDS = ("job=improve", "pretrained=run/checkpoints/last.ckpt", *SMALL, "task.time_limit=2", "evaluate.episodes=1")
+ROUNDS = ("job=improve", "pretrained=run", *SMALL, "task.time_limit=2", "evaluate.episodes=1")
 FEW = ("improve.episodes=2", "improve.steps=2", "collect.folder=few", "collect.episodes=6")
 
 
@@ -173,17 +171,17 @@ def test_a_task_that_rounds_cannot_play_is_refused_before_any_work(tmp_path: Pat
 
 def test_a_round_validates_once_at_its_end(tmp_path: Path) -> None:
     asked = composed("job=improve", "improve.steps=50", "trainer.accumulate_grad_batches=3")
-    trainer = improve._round(Experiment.of(asked), tmp_path / "last.ckpt", tmp_path, [])["trainer"]
+    trainer = improve._round(Experiment.of(asked), tmp_path / "policy", tmp_path, [])["trainer"]
     assert (trainer["max_steps"], trainer["val_check_interval"]) == (50, 150)  # steps, and batches
 
 
 def test_rounds_resume_with_their_own_config(tmp_path: Path) -> None:
     run = tmp_path / "run"
-    saved = composed("job=improve", f"output={run}", "pretrained=policy.ckpt", "improve.steps=7", "trainer.max_steps=9")
+    saved = composed("job=improve", f"output={run}", "pretrained=policy", "improve.steps=7", "trainer.max_steps=9")
     save_config(run, plain(saved), [])
     more = ["job=improve", "improve.rounds=5"]
     resumed = resume(composed(f"output={tmp_path}/now", *more), run, more)
-    assert (resumed.job, resumed.output, resumed.pretrained) == ("improve", str(run), "policy.ckpt")
+    assert (resumed.job, resumed.output, resumed.pretrained) == ("improve", str(run), "policy")
     assert (resumed.improve.rounds, resumed.improve.steps, resumed.trainer.max_steps) == (5, 7, 9)
 
 
@@ -230,7 +228,7 @@ def test_seeds_of_demonstrations_are_not_played_again(folder: Path) -> None:
 
 def result(folder: Path) -> tuple[dict[str, bytes], dict[str, float]]:
     """What a round leaves that must not depend on interruptions: its episodes and weights."""
-    state = read_checkpoint(folder / "checkpoints/last.ckpt").state
+    state = read_policy(folder).state
     return content(folder / "episodes"), {name: values.double().sum().item() for name, values in state.items()}
 
 
@@ -255,21 +253,12 @@ def test_rounds_that_were_killed_go_on_to_the_same_result(home: Path) -> None:
     assert [entry.seed for entry in labelled.tried] == [500002, 500003]
     assert labelled.codec == EpisodeStore(home / "few").codec == Codec("lossless")
     assert (home / "rounds/evaluation_1/report.json").exists()  # of the policy after one round
-    trained = read_checkpoint(second / "checkpoints/last.ckpt").config
+    trained = read_policy(second).config
     assert trained["collect"]["more"] == ["rounds/round_1/episodes", "rounds/round_2/episodes"]
-    assert trained["pretrained"] == "rounds/round_1/checkpoints/last.ckpt"
+    assert trained["pretrained"] == "rounds/round_1/policy"
     assert len(json.loads(report.read_text())["rounds"]) == 2
-    further = [*ROUNDS, *FEW, "output=further", "pretrained=rounds/round_2/checkpoints/last.ckpt"]
+    further = [*ROUNDS, *FEW, "output=further", "pretrained=rounds/round_2"]
     stores = "rounds/round_1/episodes,rounds/round_2/episodes"
     assert f"collect.more=[{stores}] to train on these episodes again" in here(home, *further, ok=False).stderr
     again = here(home, *further, f"collect.more=[{stores}]", ok=False)
     assert "have 500000, 500001: set improve.seed=500002, or higher" in again.stderr
-
-
-def test_weights_are_told_apart_with_all_that_modules_keep_beside_them(monkeypatch: pytest.MonkeyPatch) -> None:
-    digests = set()
-    for weight, rules in ((1.0, "a"), (2.0, "a"), (1.0, "b")):
-        state = {"tokenizer._extra_state": {"bpe": rules}, "weight": torch.tensor([weight])}
-        monkeypatch.setattr(improve, "read_checkpoint", lambda path, state=state: SimpleNamespace(state=state))
-        digests.add(improve._digest(Path()))
-    assert len(digests) == 3 and all(len(digest) == 12 for digest in digests)

@@ -89,7 +89,7 @@ def test_programs_are_exported_once_for_the_same_weights_and_options(
 
 def test_a_checkpoint_acts_through_its_programs_quantised_ones_about_like_the_model(home: Path, tmp_path: Path) -> None:
     def policy(*overrides: str) -> Any:
-        return Experiment.of(composed(f"checkpoint={home}/run/checkpoints/last.ckpt", *overrides)).make_policy()()
+        return Experiment.of(composed(f"checkpoint={home}/run", *overrides)).make_policy()()
 
     model, onnx = policy(), policy("policy=onnx", "policy.quantize=true", f"policy.folder={tmp_path}")
     span, random = np.subtract(model.spec.high, model.spec.low), np.random.default_rng(0)

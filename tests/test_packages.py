@@ -17,8 +17,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-import torch
-import toy
 from clusters import PLACES, address_in, dask
 from collecting import content
 from command_line import here
@@ -26,6 +24,7 @@ from command_line import vla as vla_process
 from composing import CONF, RT1_VARIANTS, check, composed
 from conftest import made_once
 from hydra.errors import ConfigCompositionException
+from saved_policies import save_run
 
 from vla import jobs
 from vla.api import load_environment, load_policy
@@ -239,7 +238,7 @@ def test_workers_of_a_cluster_give_the_same_results(home: Path, importable: None
 
 def test_a_checkpoint_is_refused_until_the_package_is_trusted(home: Path, importable: None) -> None:
     report = json.loads((home / "run/report.json").read_text())
-    evaluating, deploying = (shlex.split(each.replace("FILE", report["checkpoint"])) for each in COMMANDS[3:])
+    evaluating, deploying = (shlex.split(each.replace("RUN", report["checkpoint"])) for each in COMMANDS[3:])
     *untrusting, trusting = evaluating
     assert trusting == deploying[-1] == "trust=[mypackage]"
     numbers = ("evaluate.episodes=3", "cluster.workers=1", "output=again")
@@ -258,7 +257,7 @@ def test_a_checkpoint_is_refused_until_the_package_is_trusted(home: Path, import
 def test_what_was_trained_here_needs_no_trust_when_it_is_used(home: Path, importable: None) -> None:
     tiny = (*TINY, "cluster.workers=1", "validate.episodes=0", "collect.folder=episodes", "output=regression")
     here(home, "experiment=mine", "model=regression", *tiny)
-    file = home / "regression/checkpoints/last.ckpt"
+    file = home / "regression"
     policy, world = load_policy(file), load_environment(file)
     assert type(policy.model).__name__ == "Regression" and not policy.model.uses_tokens
     observation, _ = world.reset(seed=1_000_000)
@@ -267,27 +266,25 @@ def test_what_was_trained_here_needs_no_trust_when_it_is_used(home: Path, import
     here(home, f"checkpoint={file}", "evaluate.episodes=1", "cluster.workers=1", "output=used")
     shutil.copytree(home / "regression", home / "somebody_elses")
     with pytest.raises(ValueError, match=r"names mypackage\.\w+\.\w+, which is not trusted"):
-        load_environment(home / "somebody_elses/checkpoints/last.ckpt")
+        load_environment(home / "somebody_elses")
 
 
 def test_a_checkpoint_never_trusts_itself(importable: None, tmp_path: Path) -> None:
-    path = tmp_path / "runs/theirs/checkpoints/last.ckpt"
-    path.parent.mkdir(parents=True)
     config = plain(composed()) | {"trust": ["mypackage"]}
     config["task"] = config["data"] = {"_target_": "vla.spec.Environment"}  # which is cheap to import
     config["model"] = {"_target_": MODEL, "width": 8, "text": config["model"]["text"]}
-    torch.save({"config": config, "spec": toy.SPEC.to_dict(), "state_dict": {}}, path)
+    path = save_run(tmp_path / "runs/theirs", config)
     mine = f"output={tmp_path}/runs/mine"  # beside it, as if it were an own run
     evaluating, starting = composed(mine, f"checkpoint={path}"), composed(mine, f"pretrained={path}")
     ways = (
         lambda: adopt(evaluating, []),
         lambda: finetune(starting, []),
-        lambda: resume(composed(mine), path.parents[1], []),
+        lambda: resume(composed(mine), path, []),
     )
     packages.trust([], [])
     for way in ways:
         with pytest.raises(
-            ValueError, match=r"last\.ckpt names mypackage\.models\.Mine, which is not trusted: add trust="
+            ValueError, match=r"(theirs|last\.ckpt) names mypackage\.models\.Mine, which is not trusted: add trust="
         ):
             way()
     packages.trust(["mypackage"], [])

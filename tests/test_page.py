@@ -82,7 +82,7 @@ def test_the_page_tells_everything_that_lies_in_the_folder(whole: Path) -> None:
         "parameters 1.50 M",
         "time per action 2.5 ms",
         "40 steps in 6 min 40 s",
-        "checkpoint checkpoints/last.ckpt",
+        "checkpoint policy",
         "dark 0.0 (0.0-39.0) 0/6 -66.7 (-90.3 to -13.1) 0.12 0.12 open",  # four lost, none won: 2 / 2^4
         "success 4 dropped 2",
         "timeout",

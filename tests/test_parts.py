@@ -25,8 +25,9 @@ from wheels import contents, digest, write_wheel, zipped_folder
 from vla import jobs
 from vla.config.adopt import finetune
 from vla.config.experiment import Experiment, make_policy
-from vla.models.checkpoint import read_checkpoint
+from vla.models.policy_folder import read_policy
 from vla.policy import Policy
+from vla.training.checkpoints import AtomicCheckpointIO
 from vla.training.ema import EMA
 
 if TYPE_CHECKING:
@@ -50,9 +51,11 @@ def trained(tmp_path: Path, tabletop: Tabletop, *overrides: str) -> tuple[Policy
     )
     batch = make_batch(learner.model.history, learner.model.chunk, spec=tabletop.spec)
     trainer.fit(learner, loader(learner, [batch] * 2))
-    trainer.save_checkpoint(tmp_path / "last.ckpt")
-    read_checkpoint(tmp_path / "last.ckpt").restore(learner.model)  # the averages
-    return as_policy(learner.model, tabletop.spec, device="cpu"), tmp_path / "last.ckpt"
+    trainer.strategy.checkpoint_io = AtomicCheckpointIO()
+    for name in ("last.ckpt", "policy"):
+        trainer.save_checkpoint(tmp_path / name, weights_only=False)
+    read_policy(tmp_path / "policy").restore(learner.model)  # the averages
+    return as_policy(learner.model, tabletop.spec, device="cpu"), tmp_path / "policy"
 
 
 def test_a_checkpoint_brings_the_encoder_of_its_instructions(tmp_path: Path, tabletop: Tabletop) -> None:
@@ -63,7 +66,7 @@ def test_a_checkpoint_brings_the_encoder_of_its_instructions(tmp_path: Path, tab
     action = policy.act(observation)
     assert np.array_equal(make_policy(CPU, checkpoint, tabletop).act(observation), action)
     # The averaged weights lie there beside the newest ones; the frozen encoder is the same in both, and written once.
-    saved = torch.load(checkpoint, weights_only=True)
+    saved = torch.load(tmp_path / "last.ckpt", weights_only=True)
     averaged, newest = (saved[name]["model.text._extra_state"] for name in ("state_dict", "current_model_state"))
     for name, weight in averaged["weights"].items():
         assert weight.data_ptr() == newest["weights"][name].data_ptr()
@@ -177,6 +180,6 @@ def test_training_starts_from_a_policy_whose_demonstrations_held_another_truth(
     robot = replace(tabletop.spec.robot, chain=())
     without = replace(tabletop.spec, truth=(), robot=robot)  # as recordings of a real robot are
     model = Experiment.of(composed(*SMALL)).learner(without, checkpoint).model
-    own, saved = model.state_dict(), read_checkpoint(checkpoint).state
+    own, saved = model.state_dict(), read_policy(checkpoint).state
     assert {name for name in saved if name not in own} == {name for name in saved if name.startswith("truth_")} != set()
     assert all(torch.equal(saved[name], value) for name, value in own.items())

@@ -1,4 +1,4 @@
-"""The policy as an agent, and the files it comes from."""
+"""The policy as an agent."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import os
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -20,7 +19,6 @@ from torch._inductor.runtime.cache_dir_utils import default_cache_dir
 from toy import SPEC, ToyEnvironment
 
 from vla.io.types import Inherited
-from vla.models.checkpoint import TensorBudget, read_checkpoint, read_header
 from vla.models.compile_cache import set_compile_cache
 from vla.models.flow import Flow
 from vla.models.model import Batch, Model, TokenModel, pixels
@@ -261,124 +259,3 @@ def test_observations_of_another_kind_are_refused(rgb: dict[str, np.ndarray]) ->
         policy.act(replace(observations(1)[0], rgb=rgb))
     with pytest.raises(ValueError, match="east"):
         policy.act(replace(observations(1)[0], state=np.zeros(3, np.float32)))
-
-
-CONFIG: dict[str, object] = {"task": {}, "tokenizer": {}, "model": {}}  # as much as a checkpoint has at the least
-
-
-def save(path: Path, **changes: object) -> Path:
-    state = {f"model.{name}": value for name, value in make_bc().state_dict().items()}
-    content = {"config": CONFIG, "spec": SPEC.to_dict(), "state_dict": state, **changes}
-    torch.save({name: value for name, value in content.items() if value is not None}, path)
-    return path
-
-
-def test_a_checkpoint_is_read_as_it_was_written(tmp_path: Path) -> None:
-    checkpoint = read_checkpoint(save(tmp_path / "a.ckpt"))
-    assert checkpoint.config == CONFIG and checkpoint.spec == SPEC
-    checkpoint.restore(make_bc())
-    header = read_header(tmp_path / "a.ckpt")
-    assert (header.config, header.spec, header.windows) == (CONFIG, SPEC, "")
-    assert read_header(save(tmp_path / "b.ckpt", OwnDataModule={"windows": "ab"})).windows == "ab"
-
-
-def test_weights_of_another_model_are_refused(tmp_path: Path) -> None:
-    checkpoint = read_checkpoint(save(tmp_path / "a.ckpt"))
-    with pytest.raises(ValueError, match="does not fit the model"):
-        checkpoint.restore(make_rt1())
-
-
-def test_files_that_are_no_checkpoint_are_refused_in_one_sentence(tmp_path: Path) -> None:
-    whole = save(tmp_path / "whole.ckpt").read_bytes()
-    for name, content in {"torn": whole[: len(whole) // 2], "empty": b"", "text": b"hello\n"}.items():
-        path = tmp_path / f"{name}.ckpt"
-        path.write_bytes(content)
-        with pytest.raises(ValueError, match=f"{name}.ckpt cannot be read"):
-            read_checkpoint(path)
-    with pytest.raises(ValueError, match="no checkpoint of this project"):
-        read_checkpoint(save(tmp_path / "foreign.ckpt", spec=None))
-    with pytest.raises(ValueError, match="there is no checkpoint"):
-        read_checkpoint(tmp_path / "missing.ckpt")
-
-
-def test_a_checkpoint_cannot_run_code(tmp_path: Path) -> None:
-    class Attack:
-        def __reduce__(self) -> tuple[Callable[..., None], tuple[str]]:
-            return Path.touch, (tmp_path / "attacked",)  # type: ignore[return-value]
-
-    with pytest.raises(ValueError, match="cannot be read"):
-        read_checkpoint(save(tmp_path / "attack.ckpt", config=Attack()))
-    assert not (tmp_path / "attacked").exists()
-
-
-class Calling:
-    """What calls something as it is read, that PyTorch lets any file call."""
-
-    def __init__(self, called: Callable[..., object], *arguments: object) -> None:
-        self.called, self.arguments = called, arguments
-
-    def __reduce__(self) -> tuple[Callable[..., object], tuple[object, ...]]:
-        return self.called, self.arguments
-
-
-@pytest.mark.parametrize(
-    "value",
-    [
-        Calling(bytearray, 2**33),
-        Calling(torch.FloatTensor, 2**31),
-        Calling(torch.device, "cuda"),
-        torch.zeros(1).expand(10**12),
-        torch.zeros(2, 3)[:1].expand(10**6, 3),
-        torch.empty(10**12, device="meta"),
-        torch.zeros(3).to_sparse(),
-    ],
-    ids=["bytes", "a tensor", "a device", "a stride of 0", "a stride of 0 in one axis", "no storage", "sparse"],
-)
-def test_a_small_file_does_not_fill_the_memory(tmp_path: Path, value: object) -> None:
-    weights = {f"model.{name}": value for name in make_bc().state_dict()}
-    for changes in ({"state_dict": weights}, {"optimizer_states": [{"state": {0: value}}]}):
-        path = save(tmp_path / "a.ckpt", **changes)
-        assert path.stat().st_size < 10**6
-        for read in (read_checkpoint, read_header):
-            with pytest.raises(ValueError, match=r"a\.ckpt cannot be read as a checkpoint"):
-                read(path)
-
-
-def test_a_checkpoint_that_holds_itself_is_read_to_its_end(tmp_path: Path) -> None:
-    endless: list[object] = []
-    endless.append(endless)
-    read_checkpoint(save(tmp_path / "a.ckpt", callbacks=endless))
-
-
-@pytest.mark.parametrize(
-    "make",
-    [
-        lambda: torch.ones(10**12),
-        lambda: torch.arange(10**12),
-        lambda: torch.empty(10**18, 10**18),
-        lambda: torch.eye(10**6),
-        lambda: torch.rand(10**11, generator=torch.Generator()),
-        lambda: torch.nn.Linear(10**6, 10**6),
-        lambda: torch.nn.ModuleList(torch.nn.Linear(1000, 1000) for _ in range(100)),
-    ],
-)
-def test_what_a_checkpoint_cannot_hold_is_not_allocated(tmp_path: Path, make: Callable[[], object]) -> None:
-    (tmp_path / "a.ckpt").write_bytes(b"small")
-    refused = pytest.raises(ValueError, match=r"a\.ckpt describes a model that is larger than the file")
-    with refused, TensorBudget(tmp_path / "a.ckpt"):
-        make()
-
-
-def test_parts_that_come_with_the_weights_are_no_larger_than_their_file(tmp_path: Path) -> None:
-    """As a text encoder is, which is made as its state is loaded."""
-
-    class Late(torch.nn.Module):
-        def set_extra_state(self, state: object) -> None:
-            torch.nn.Linear(10**6, 10**6)
-
-        def get_extra_state(self) -> object:
-            return 1
-
-    checkpoint = replace(read_checkpoint(save(tmp_path / "a.ckpt")), state=Late().state_dict())
-    with pytest.raises(ValueError, match=r"a\.ckpt does not fit .*: .* larger than the file"):
-        checkpoint.restore(Late())

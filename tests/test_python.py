@@ -18,7 +18,7 @@ from vla.policy import Policy
 from vla.spec import Observation
 
 PAGE = (ROOT / "docs/python.md").read_text(encoding="utf-8")
-CHECKPOINT = "run/checkpoints/last.ckpt"
+CHECKPOINT = "run"
 
 
 @pytest.fixture
@@ -79,12 +79,12 @@ def test_trust_is_an_argument_of_packages(home: Path, state: Path) -> None:
 def test_what_was_trusted_in_a_training_is_trusted_for_its_policies_only(state: Path, tmp_path: Path) -> None:
     mine, theirs = tmp_path / "mine", tmp_path / "theirs"
     for folder in (mine, theirs):
-        (folder / "checkpoints").mkdir(parents=True)
+        (folder / "policy").mkdir(parents=True)
     with packages.trusting(["documented"], theirs):
         packages.remember_trust(mine)
-    packages.trust_own(theirs / "checkpoints/last.ckpt")
+    packages.trust_own(theirs / "policy")
     assert packages.trusted() == []
-    with packages.trusting([], mine / "checkpoints/last.ckpt"):
+    with packages.trusting([], mine / "policy"):
         assert packages.trusted() == ["documented"]
     packages.remember_trust(mine)  # a later training there that trusts nothing
     packages.trust_own(mine)

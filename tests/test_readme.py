@@ -7,6 +7,7 @@ import json
 import math
 import re
 import shlex
+import shutil
 import sys
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,7 @@ from command_line import vla as vla_process
 from composing import CONF, check, composed
 from documented import PAGES, ROOT, commands
 from omegaconf import OmegaConf
+from saved_policies import change_json
 
 from vla import jobs
 from vla.deploy import ros
@@ -31,15 +33,14 @@ README = PAGES[0].read_text(encoding="utf-8")
 COMMANDS = [command for command in commands("vla.run") if command != "--help"]  # which is for `test_run`
 TOOLS = [(tool, command) for tool in ("say", "watch", "view", "bag") for command in commands(f"vla.deploy.{tool}")]
 TOOLS.remove(("bag", "play"))  # which a sentence names without its argument
-FILE = "outputs/runs/half/checkpoints/last.ckpt"
-METAWORLD = "metaworld/checkpoints/last.ckpt"
+HALF = "outputs/runs/half"
+METAWORLD = "metaworld"
 STANDS = {
     "ENCODER": "encoder",
-    "FILE": FILE,
     "HOST": "127.0.0.1",
     "plan.runs=[RUN,RUN]": "plan.runs=[run,outputs/runs/half]",
     "RUN,RUN": "run",
-    "resume=RUN": "resume=outputs/runs/half",
+    **{f"{key}=RUN": f"{key}={HALF}" for key in ("resume", "checkpoint", "pretrained")},
 }
 FROM_A_RUN = [command for command in COMMANDS if re.search("checkpoint=|pretrained=|resume=", command)]
 
@@ -50,19 +51,20 @@ def test_all_the_commands_are_found() -> None:
 
 @pytest.fixture(scope="module")
 def folder(home: Path) -> Path:
-    """A folder with a RUN and an interrupted one, with its checkpoint FILE, and with a checkpoint of Meta-World."""
+    """A folder with a RUN, with one that was interrupted as it trained for longer, and with a policy for Meta-World."""
     trained = torch.load(home / "run/checkpoints/last.ckpt", weights_only=True)
-    metaworld = OmegaConf.to_container(composed("experiment=metaworld"), resolve=True)
-    for path, changed in ((FILE, {"finished": False}), (METAWORLD, {"config": metaworld})):
-        (home / path).parent.mkdir(parents=True)
-        torch.save(trained | changed, home / path)
+    shutil.copytree(home / "run", home / HALF)
+    torch.save(trained | {"finished": False}, home / HALF / "checkpoints/last.ckpt")
+    metaworld: Any = OmegaConf.to_container(composed("experiment=metaworld"), resolve=True)
+    shutil.copytree(home / "run/policy", home / METAWORLD)
+    change_json(home / METAWORLD / "config.json", lambda config: {**config, "task": metaworld["task"]})
     return home
 
 
 def arguments_of(command: str) -> list[str]:
     """The arguments, with what stands for the names in capital letters."""
     if "task.drawn=" in command:  # which a task of Meta-World has
-        command = command.replace("FILE", METAWORLD)
+        command = command.replace("checkpoint=RUN", f"checkpoint={METAWORLD}")
     for name, path in STANDS.items():
         command = command.replace(name, path)
     return shlex.split(command)
@@ -173,7 +175,7 @@ def test_the_attacks_in_bulk_are_ready(main_job: Path, tmp_path: Path, capsys: p
 
 def test_the_program_of_the_readme_plays_an_episode(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (code,) = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
-    exec(code.replace('"FILE"', repr(str(folder / FILE))), {})
+    exec(code.replace('"RUN"', repr(str(folder / HALF))), {})
     assert len(capsys.readouterr().out.split()) > 3
 
 

@@ -15,7 +15,6 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-import torch
 from arm import ROBOT, SAFETY
 from command_line import SMALL, here
 from exporting import exporter
@@ -33,6 +32,7 @@ from vla.data.verification import derive_store, find_episode
 from vla.deploy.client_observation import Keys
 from vla.deploy.control_loop import ControlLoop
 from vla.io.images import resize
+from vla.models.policy_folder import read_policy
 from vla.reports.open_loop import components
 from vla.robots.controllers import controller_for
 from vla.rollouts.open_loop import open_loop
@@ -283,7 +283,7 @@ def test_a_policy_is_trained_and_its_errors_measured_without_a_simulator(dataset
     page = (tmp_path / "run/report.html").read_text()
     assert "Errors on held-out recordings" in page and "joint2.pos" in page and "success:" not in page
     assert "${" not in page and str(dataset) in page
-    checkpoint = tmp_path / "run/checkpoints/last.ckpt"
+    checkpoint = tmp_path / "run"
     again = ("job=evaluate", f"checkpoint={checkpoint}", "hydra.run.dir=again", "output=again")
     here(tmp_path, *again, *recording)
     repeated = json.loads((tmp_path / "again/errors.json").read_text())
@@ -299,7 +299,7 @@ def test_a_policy_is_trained_and_its_errors_measured_without_a_simulator(dataset
     fewer = here(tmp_path, *again, *recording, "collect.episodes=6", ok=False)
     assert "was trained on other episodes than the 6" in fewer.stderr
     assert "learner.lr" not in compared([tmp_path / "run", tmp_path / "again"], tmp_path).read_text()
-    assert torch.load(checkpoint, weights_only=True)["spec"]["action"] == list(NAMES)
+    assert list(read_policy(checkpoint).spec.action) == list(NAMES)
 
 
 def test_a_training_on_all_episodes_ends_with_success_and_is_complete(dataset: Path, tmp_path: Path) -> None:
@@ -309,8 +309,8 @@ def test_a_training_on_all_episodes_ends_with_success_and_is_complete(dataset: P
     done = here(tmp_path, *recording, *options, *TINY, *run)
     said = "data.validation_fraction=0 trains on all episodes and leaves none to evaluate the policy on"
     assert 0 <= done.stdout.find(said) < done.stdout.find("importing") < done.stdout.find("trained 4 steps")
-    checkpoint = tmp_path / "outputs/runs/all/checkpoints/last.ckpt"
-    assert checkpoint.is_file() and not (tmp_path / "outputs/runs/all/errors.json").exists()
+    checkpoint = tmp_path / "outputs/runs/all/policy"
+    assert checkpoint.is_dir() and not (tmp_path / "outputs/runs/all/errors.json").exists()
     assert "outputs/runs was interrupted; resume=DIR" in here(tmp_path, "resume=last", ok=False).stderr
     kept = [*tmp_path.glob("outputs/episodes/*")]
     shutil.rmtree(kept[0])

@@ -12,7 +12,7 @@ import pytest
 from finished_runs import CONFIG, a_run, compared
 
 from vla.runs.files import Change, Training
-from vla.runs.folder import chosen_checkpoint, read_run, save_choice, save_training, wall_time
+from vla.runs.folder import read_run, save_training, wall_time
 
 BOMB = "a: &a [x, x]\nb: &b [*a, *a]\nc: [*b, *b]\n"
 
@@ -25,11 +25,10 @@ def changed(**values: Any) -> Callable[[str], str]:
 def test_what_was_written_is_read(tmp_path: Path) -> None:
     folder = a_run(tmp_path / "run", "sd")
     save_training(folder, Training(12, 40, 3.0, "done", 2.0))
-    save_choice(folder, "best.ckpt")
     run = read_run(folder)
-    assert run.training == Training(12, 40, 3.0, "done", 2.0, "best.ckpt")
-    assert (chosen_checkpoint(folder), run.policy, run.tasks) == ("best.ckpt", "BC", [])
-    assert wall_time(folder / "checkpoints/best.ckpt", 1.0) == 6.0
+    assert run.training == Training(12, 40, 3.0, "done", 2.0)
+    assert (run.policy, run.tasks) == ("BC", [])
+    assert wall_time(folder / "policy", 1.0) == 6.0
     assert run.changes == [Change("model.width", 16, 32)] and run.config["task"] == CONFIG["task"]
     assert run.report is not None and run.reports["seen"].successes == 1
     assert [result.outcome for result in run.reports["seen"].results] == ["success", "dropped"]
@@ -57,7 +56,7 @@ def test_what_was_written_is_read(tmp_path: Path) -> None:
         ("changes.yaml", "- {key: 1, here: 2}", r"\[0\]\.key: .*; \[0\]\.default: Field required"),
         ("training.json", "[]", r"training\.json is damaged or of another kind"),
         ("training.json", "{}", r"parameters: Field required"),
-        ("training.json", changed(checkpoint="../../other.ckpt"), r"checkpoint: String should match pattern"),
+        ("training.json", changed(checkpoint="../../other"), r"checkpoint: Unexpected keyword"),
         ("metrics.csv", "epoch,train/loss\n0,1\n", r"metrics\.csv is damaged in line 1: there is no column step"),
         ("metrics.csv", "step,train/loss\n9,1\nten,2\n", r"metrics\.csv is damaged in line 3: .*'ten'"),
         ("metrics.csv", "step,train/loss\n9,low\n", r"line 2: could not convert"),
@@ -130,7 +129,7 @@ def test_a_damaged_description_of_the_training_costs_no_evaluation(
     save_training(folder, Training(12, 40, 3.0, "done", 2.0))
     for name in ("metrics.csv", "report.json", "config.yaml"):
         (folder / name).write_text("[1]")
-    assert wall_time(folder / "checkpoints/last.ckpt", 1.0) == 6.0
+    assert wall_time(folder / "policy", 1.0) == 6.0
     (folder / "training.json").write_text('{"seconds": NaN}')
-    assert wall_time(folder / "checkpoints/last.ckpt", 1.0) is None
+    assert wall_time(folder / "policy", 1.0) is None
     assert f"the wall time is unknown: {folder / 'training.json'} is damaged" in caplog.text

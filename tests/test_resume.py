@@ -10,30 +10,27 @@ from typing import Any
 
 import pytest
 import torch
-import toy
 from composing import composed
+from saved_policies import save_policy
 
 from vla.config.adopt import resume
 from vla.config.experiment import plain
 from vla.reports.evaluation import write_report
 from vla.rollouts.results import Report, Result
-from vla.runs.files import Training
-from vla.runs.folder import save_choice, save_config, save_training
+from vla.runs.folder import save_config
 from vla.runs.resume import FOUND, TrainingProgress, cached_success, interrupted_run, training_progress
 
 OF_TRAINER = ("trainer.max_steps=9", "trainer.precision=bf16")
 
 
-def leave(run: Path, config: dict[str, Any], finished: bool, chosen: str = "") -> None:
-    """What a training of `max_steps` leaves; one that was killed at its end may have chosen nothing."""
+def leave(run: Path, config: dict[str, Any], finished: bool, chosen: bool = False) -> None:
+    """What a training of `max_steps` leaves; one that was killed at its end may have written a policy only."""
     (run / "checkpoints").mkdir(parents=True)
     steps = config["trainer"]["max_steps"] if finished else 1
-    content = {"config": config, "spec": toy.SPEC.to_dict(), "state_dict": {}, "finished": finished}
-    for name in {"last.ckpt", chosen or "last.ckpt"}:
-        torch.save({**content, "global_step": steps}, run / "checkpoints" / name)
+    content = {"config": config, "state_dict": {}, "finished": finished, "global_step": steps}
+    torch.save(content, run / "checkpoints/last.ckpt")
     if chosen:
-        save_training(run, Training(1, 1, 1.0, "done"))
-        save_choice(run, chosen)
+        save_policy(run / "policy", config)
 
 
 @pytest.fixture(autouse=True)
@@ -43,21 +40,19 @@ def nothing_found(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_the_newest_run_that_did_not_end_is_found(tmp_path: Path) -> None:
     evaluated, trained = plain(composed()), plain(composed("job=train"))
-    leave(tmp_path / "whole", trained, finished=True, chosen="last.ckpt")
+    leave(tmp_path / "whole", trained, finished=True, chosen=True)
     with pytest.raises(ValueError, match="no run in"):
         interrupted_run(tmp_path)
-    leave(tmp_path / "unreported", evaluated, finished=True, chosen="last.ckpt")
+    leave(tmp_path / "unreported", evaluated, finished=True, chosen=True)
     assert interrupted_run(tmp_path) == tmp_path / "unreported"
-    leave(tmp_path / "unchosen", trained, finished=True)
-    assert interrupted_run(tmp_path) == tmp_path / "unchosen"
-    leave(tmp_path / "unfinished", trained, finished=False)
+    leave(tmp_path / "unfinished", trained, finished=False, chosen=True)
     assert interrupted_run(tmp_path) == tmp_path / "unfinished"
 
 
 def test_a_run_that_was_extended_after_its_report_is_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     run, rounds = tmp_path / "run", tmp_path / "rounds"
-    leave(run, plain(composed()), finished=True, chosen="last.ckpt")
-    leave(rounds / "round_0", plain(composed("job=train")), finished=True, chosen="last.ckpt")
+    leave(run, plain(composed()), finished=True, chosen=True)
+    leave(rounds / "round_0", plain(composed("job=train")), finished=True, chosen=True)
     save_config(rounds, plain(composed("job=improve")), [])
     for folder, last in ((run, run), (rounds, rounds / "round_0")):
         monkeypatch.setenv(FOUND, "")
@@ -94,20 +89,21 @@ def test_a_run_is_resumed_with_its_config_in_its_folder(tmp_path: Path) -> None:
     assert (resumed.trainer.accelerator, resumed.trainer.gradient_clip_val) == ("cpu", 2)
     assert (resumed.trainer.max_steps, resumed.trainer.precision) == (9, "bf16")  # of the run, not of trainer=cpu
     with pytest.raises(ValueError, match="omit checkpoint="):
-        resume(composed(f"output={tmp_path}/now", "checkpoint=x.ckpt"), tmp_path / "one", [])
+        resume(composed(f"output={tmp_path}/now", "checkpoint=x"), tmp_path / "one", [])
     with pytest.raises(ValueError, match="nothing was trained in that folder"):
         resume(now, tmp_path / "other", [])
     with pytest.raises(ValueError, match="experiment=few cannot be combined"):
         resume(now, tmp_path / "one", ["experiment=few"])
 
 
-@pytest.mark.parametrize(("finished", "chosen"), [(False, ""), (True, ""), (True, "best.ckpt")])
-def test_a_run_continues_in_its_folder(tmp_path: Path, finished: bool, chosen: str) -> None:
+@pytest.mark.parametrize(("finished", "chosen"), [(False, False), (False, True), (True, False), (True, True)])
+def test_a_run_continues_in_its_folder(tmp_path: Path, finished: bool, chosen: bool) -> None:
     config = plain(composed())
     assert training_progress(tmp_path, config) == TrainingProgress()
     leave(tmp_path, config, finished, chosen)
     last = tmp_path / "checkpoints/last.ckpt"
-    expected = TrainingProgress(chosen=last.with_name(chosen)) if chosen else TrainingProgress(resume_from=last)
+    whole = finished and chosen
+    expected = TrainingProgress(chosen=tmp_path / "policy") if whole else TrainingProgress(resume_from=last)
     for name in ("metrics.csv", "report.json", "config.yaml"):
         (tmp_path / name).write_text("[1]")  # damaged, and not needed
     assert training_progress(tmp_path, plain(composed("cluster.workers=1"))) == expected
@@ -121,7 +117,7 @@ def test_a_run_continues_in_its_folder(tmp_path: Path, finished: bool, chosen: s
 
 def test_a_report_of_weights_that_were_trained_for_longer_since_is_not_this_one(tmp_path: Path) -> None:
     asked = plain(composed())
-    checkpoint = tmp_path / "last.ckpt"
+    checkpoint = tmp_path / "policy"
     checkpoint.touch()
     report = Report((Result(1_000_000, "success"), Result(1_000_001, "dropped")))
     write_report(report, tmp_path / "report.json", str(checkpoint), asked)
@@ -132,7 +128,7 @@ def test_a_report_of_weights_that_were_trained_for_longer_since_is_not_this_one(
 
 
 def test_a_report_that_compares_with_a_run_which_was_evaluated_again_is_not_this_one(tmp_path: Path) -> None:
-    checkpoint, other = tmp_path / "last.ckpt", tmp_path / "other/report.json"
+    checkpoint, other = tmp_path / "policy", tmp_path / "other/report.json"
     checkpoint.touch()
     other.parent.mkdir()
     other.touch()

@@ -32,7 +32,7 @@ from websockets.sync.client import connect
 from vla import jobs
 from vla.data.episodes import EpisodeStore
 from vla.io.array_messages import pack
-from vla.models.checkpoint import read_checkpoint
+from vla.models.policy_folder import read_policy
 from vla.rollouts.recorder import recording_name
 from vla.tasks.rendering.fast import Fast
 from vla.tasks.rendering.reference import Reference
@@ -67,7 +67,7 @@ def test_the_main_job_collects_trains_evaluates_and_records(home: Path) -> None:
     assert report["versions"]["mujoco"] == mujoco.__version__
     assert report["config"]["collect"]["episodes"] == 12
     names = ("report.html", "report.png", "rollouts.rrd", "samples.png", "metrics.csv", "checkpoints/last.ckpt")
-    for name in (*names, "checkpoints/best.ckpt"):
+    for name in (*names, *(f"{policy}/model.safetensors" for policy in ("policy", "policy_best"))):
         assert (home / "run" / name).stat().st_size > 0
     assert list((home / "run/tensorboard").glob("events.out.tfevents.*"))
     header, *rows = (home / "run/metrics.csv").read_text().splitlines()
@@ -92,7 +92,7 @@ def test_the_main_job_collects_trains_evaluates_and_records(home: Path) -> None:
 
 
 def test_a_checkpoint_brings_its_task_and_model_and_takes_harder_scenes(home: Path) -> None:
-    arguments = ("checkpoint=run/checkpoints/last.ckpt", "evaluate.episodes=1", "cluster.workers=1", "output=again")
+    arguments = ("checkpoint=run", "evaluate.episodes=1", "cluster.workers=1", "output=again")
     here(home, *arguments, "task/randomize=wide", "task.time_limit=1.0")
     report = json.loads((home / "again/report.json").read_text())
     assert report["config"]["task"]["image_size"] == [32, 32]
@@ -113,7 +113,7 @@ def test_a_policy_sees_the_pictures_of_its_training_and_those_of_the_other_rende
             return really(self, model, view)
 
         monkeypatch.setattr(kind, "open", noted)
-    arguments = ("checkpoint=run/checkpoints/last.ckpt", "evaluate=renderer", "evaluate.episodes=2", "output=renderers")
+    arguments = ("checkpoint=run", "evaluate=renderer", "evaluate.episodes=2", "output=renderers")
     network = "{_target_: vla.rollouts.realtime.Network, latency: 0.3, jitter: 0, loss: 0, ensemble: null}"
     arguments += ("cluster.workers=1", "task.time_limit=1.0")
     clash = here(home, *arguments, f"+evaluate.networks.renderer_fast={network}", ok=False)
@@ -150,7 +150,7 @@ def test_a_folder_that_was_there_before_a_refused_run_stays(tmp_path: Path) -> N
 def test_a_policy_behind_a_server_acts_as_it_does_from_its_checkpoint(home: Path) -> None:
     with create_server(("127.0.0.1", 0)) as free:
         port = free.getsockname()[1]
-    serve = ("job=deploy", "deploy=server", f"deploy.port={port}", "checkpoint=run/checkpoints/last.ckpt")
+    serve = ("job=deploy", "deploy=server", f"deploy.port={port}", "checkpoint=run")
     server = warm.Started(home, "vla.run", *serve, "output=served", environment={})
     try:
         until(lambda: _listens(port))
@@ -184,7 +184,7 @@ def test_the_nearest_demonstration_is_evaluated_like_a_policy_and_beside_one(hom
     report = json.loads((home / "nearest/report.json").read_text())
     assert (report["model"], report["checkpoint"], report["episodes"], report["errors"]) == ("nearest", None, 2, 0)
     assert done.stdout.strip().splitlines()[-1].startswith(f"success {report['successes']}/2 (")
-    policy = ("checkpoint=run/checkpoints/last.ckpt", "evaluate=memory", "evaluate.episodes=2", "cluster.workers=1")
+    policy = ("checkpoint=run", "evaluate=memory", "evaluate.episodes=2", "cluster.workers=1")
     (folder,) = (home / "outputs/episodes").iterdir()
     done = here(home, *policy, f"evaluate.nearest={folder}", "recorder=none", "output=beside_nearest")
     beside = json.loads((home / "beside_nearest/report.json").read_text())["conditions"]
@@ -195,7 +195,7 @@ def test_the_nearest_demonstration_is_evaluated_like_a_policy_and_beside_one(hom
 
 
 def test_a_policy_is_exported_as_programs(home: Path) -> None:
-    policy = ("checkpoint=run/checkpoints/last.ckpt", "export=program", "export.folder=program")
+    policy = ("checkpoint=run", "export=program", "export.folder=program")
     here(home, "job=export", *policy)
     written = json.loads((home / "program/program.json").read_text())
     assert written["act"]["runs"].keys() == {"model", "act.pt2", "act.onnx"}
@@ -203,7 +203,7 @@ def test_a_policy_is_exported_as_programs(home: Path) -> None:
 
 
 def test_an_evaluation_ends_when_what_it_is_asked_is_decided(home: Path) -> None:
-    policy = ("checkpoint=run/checkpoints/last.ckpt", "cluster.workers=1", "task.time_limit=0.2", "recorder=none")
+    policy = ("checkpoint=run", "cluster.workers=1", "task.time_limit=0.2", "recorder=none")
     asked = (*policy, "evaluate.episodes=40", "evaluate.until=decided", "evaluate.margin=0.9")
     done = here(home, *asked, "evaluate.bar=0.5", "evaluate=memory", "output=beside")
     report = json.loads((home / "beside/report.json").read_text())
@@ -222,7 +222,7 @@ def test_an_evaluation_ends_when_what_it_is_asked_is_decided(home: Path) -> None
 
 
 def test_what_an_evaluation_cannot_decide_is_refused_before_any_work(home: Path) -> None:
-    arguments = ("checkpoint=run/checkpoints/last.ckpt", "cluster.workers=1", "output=refused")
+    arguments = ("checkpoint=run", "cluster.workers=1", "output=refused")
     for asked, says in (
         ("evaluate.until=decided", "needs something to decide: evaluate.bar=0.95"),
         ("evaluate.against=nowhere", "nowhere is no run"),
@@ -248,7 +248,7 @@ def test_the_same_command_in_the_same_folder_does_nothing_twice(home: Path) -> N
     done = here(home, *arguments, "output=copy", "evaluate.episodes=1")  # its evaluation is another
     assert "training is already finished" in done.stdout and "training BC" not in done.stdout
     assert json.loads((home / "copy/report.json").read_text())["episodes"] == 1
-    evaluation = ("checkpoint=copy/checkpoints/last.ckpt", "evaluate.episodes=1", "recorder=none", "output=alone")
+    evaluation = ("checkpoint=copy", "evaluate.episodes=1", "recorder=none", "output=alone")
     assert "wrote alone/report.html" in here(home, *evaluation).stdout
     assert "${" not in (home / "alone/changes.yaml").read_text()
     assert "evaluation is already finished" in here(home, *evaluation).stdout
@@ -318,7 +318,7 @@ def test_preview_and_replay_need_no_viewer(home: Path) -> None:
 
 def test_a_success_rate_is_printed_even_where_the_report_cannot_be_written(home: Path) -> None:
     (home / "blocked/report.json").mkdir(parents=True)  # where a file is to go
-    arguments = ("checkpoint=run/checkpoints/last.ckpt", "evaluate.episodes=1", "cluster.workers=1", "recorder=none")
+    arguments = ("checkpoint=run", "evaluate.episodes=1", "cluster.workers=1", "recorder=none")
     done = here(home, *arguments, "output=blocked", ok=False)
     assert done.stdout.strip().splitlines()[-1].startswith("success ")
     errors = [line for line in done.stderr.splitlines() if line.startswith("error: ")]
@@ -329,7 +329,7 @@ def test_a_success_rate_is_printed_even_where_the_report_cannot_be_written(home:
 
 def test_a_picture_that_cannot_be_written_costs_no_report(home: Path) -> None:
     (home / "no_picture/report.png").mkdir(parents=True)  # where a file is to go
-    arguments = ("checkpoint=run/checkpoints/last.ckpt", "evaluate.episodes=1", "cluster.workers=1", "recorder=none")
+    arguments = ("checkpoint=run", "evaluate.episodes=1", "cluster.workers=1", "recorder=none")
     done = here(home, *arguments, "output=no_picture")
     assert "could not write no_picture/report.png" in done.stdout + done.stderr
     assert (home / "no_picture/report.json").is_file()
@@ -400,16 +400,20 @@ def test_further_demonstrations_that_are_not_there_are_missed_before_any_are_col
 
 
 def test_a_damaged_checkpoint_is_named(home: Path) -> None:
-    whole = (home / "run/checkpoints/last.ckpt").read_bytes()
-    (home / "cut.ckpt").write_bytes(whole[: len(whole) // 2])
-    done = here(home, "checkpoint=cut.ckpt", "output=cut", ok=False)
-    assert re.fullmatch(r"error: cut\.ckpt .*damaged.*\n", done.stderr)
-    assert done.stdout == "" and not (home / "cut").exists()
+    weights = Path(shutil.copytree(home / "run/policy", home / "damaged")) / "model.safetensors"
+    whole = weights.read_bytes()
+    weights.write_bytes(whole[: len(whole) // 2])
+    done = here(home, "checkpoint=damaged", "output=cut", ok=False)
+    assert re.fullmatch(r"error: damaged/model\.safetensors is damaged.*\n", done.stderr)
+    assert not (home / "cut").exists()
     flipped = bytearray(whole)
     flipped[len(whole) // 2] ^= 1
-    (home / "flipped.ckpt").write_bytes(flipped)
-    with pytest.raises(ValueError, match="damaged"):
-        read_checkpoint(home / "flipped.ckpt")
+    weights.write_bytes(flipped)
+    with pytest.raises(ValueError, match="is damaged, or not the file"):
+        read_policy(home / "damaged").state  # noqa: B018
+    done = here(home, "checkpoint=run/checkpoints/last.ckpt", "output=cut", ok=False)
+    assert "last.ckpt only resumes its own training: a policy is a folder" in done.stderr
+    assert done.stderr.endswith("the run that has it, run\n")
 
 
 def test_a_bug_gives_a_traceback_and_so_does_a_mistake_where_asked(
@@ -439,18 +443,18 @@ def test_resuming_refuses_a_changed_identity_and_archives_the_evaluation(home: P
 
 
 def test_a_policy_is_trained_further_for_another_goal(home: Path, tmp_path: Path) -> None:
-    shutil.copy(home / "run/checkpoints/last.ckpt", tmp_path / "policy.ckpt")
+    shutil.copytree(home / "run/policy", tmp_path / "theirs")
     arguments = (
         *SMALL,
-        f"pretrained={tmp_path}/policy.ckpt",
+        f"pretrained={tmp_path}/theirs",
         "task/goal=push",
         "job=train",
         "collect.folder=pushed",
         "collect.episodes=5",
     )
     done = here(home, *arguments, "learner.lr=1e-12", "trainer.max_steps=1", "output=tuned")
-    assert f"starting from {tmp_path}/policy.ckpt" in done.stdout
-    before, after = (read_checkpoint(path) for path in (tmp_path / "policy.ckpt", home / "tuned/checkpoints/last.ckpt"))
+    assert f"starting from {tmp_path}/theirs" in done.stdout
+    before, after = map(read_policy, (tmp_path / "theirs", home / "tuned"))
     assert after.config["task"]["goal"] != before.config["task"]["goal"]
     for name, weight in before.state.items():
         gathered = name.startswith(("proprioception.", "truth_scale."))  # statistics, of all that was ever seen
@@ -458,9 +462,9 @@ def test_a_policy_is_trained_further_for_another_goal(home: Path, tmp_path: Path
     for other in ("model=rt1_tiny", "tokenizer.bins=64", "variant=no_shift"):
         refused = here(home, *arguments, other, ok=False)
         assert f"error: {other} cannot be combined with a checkpoint" in refused.stderr
-    refused = here(home, *arguments, "checkpoint=tuned/checkpoints/last.ckpt", ok=False)
+    refused = here(home, *arguments, "checkpoint=tuned", ok=False)
     assert "initialises a new training" in refused.stderr and refused.stderr.count("\n") == 1
-    (tmp_path / "policy.ckpt").unlink()  # which going on does not need
+    shutil.rmtree(tmp_path / "theirs")  # which going on does not need
     done = here(home, "resume=tuned", "output=tuned", "trainer.max_steps=2")
     assert "trained 2 steps" in done.stdout
     done = here(home, *arguments, "learner.lr=1e-12", "trainer.max_steps=1", "output=tuned")
@@ -468,7 +472,7 @@ def test_a_policy_is_trained_further_for_another_goal(home: Path, tmp_path: Path
 
 
 def test_a_checkpoint_of_other_cameras_is_refused(home: Path) -> None:
-    done = here(home, "checkpoint=run/checkpoints/last.ckpt", "task.cameras=[front]", "cluster.workers=1", ok=False)
+    done = here(home, "checkpoint=run", "task.cameras=[front]", "cluster.workers=1", ok=False)
     assert "cameras" in done.stderr and "Traceback" not in done.stderr
 
 

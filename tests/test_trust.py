@@ -9,15 +9,14 @@ from collections.abc import Callable, Iterator
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
-from zipfile import ZIP_DEFLATED, ZipFile
 
 import pytest
 import torch
-import toy
 from command_line import here
 from composing import CONF, check, composed
 from hostile import HANDLER, command, hostile, node
 from omegaconf import DictConfig
+from saved_policies import change_json, save_policy, save_run
 from tiny_encoder import write_encoder
 from toy_episodes import EPISODES, add
 
@@ -25,7 +24,6 @@ from vla import jobs
 from vla.config.adopt import adopt, finetune, resume
 from vla.config.annotations import LIBRARY, OWN, locate
 from vla.config.experiment import Experiment, make_policy, plain
-from vla.models.checkpoint import read_checkpoint
 
 # Everything under these could be named once, and some of it acts when it is built.
 PREFIXES = ("torch", "lightning", "dm_control.composer.variation")
@@ -80,20 +78,18 @@ def toy_store(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return add(tmp_path_factory.mktemp("stores") / "store", EPISODES[:1]).folder
 
 
-def checkpoint(path: Path, key: str, value: Any) -> Path:
-    """A checkpoint whose configuration is the default one but for a key."""
+def run_of(path: Path, key: str, value: Any) -> Path:
+    """A run whose configuration is the default one but for a key."""
     config = plain(composed("expert=clean", "trainer=cpu"))
     put(config, key, value)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    torch.save({"config": config, "spec": toy.SPEC.to_dict(), "state_dict": {}}, path)
-    return path
+    return save_run(path, config)
 
 
 @pytest.mark.parametrize("attack", ATTACKS)
-def test_nothing_that_a_checkpoint_names_is_run(tmp_path: Path, attack: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_nothing_that_a_policy_names_is_run(tmp_path: Path, attack: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     mark = tmp_path / "mark"
-    path = checkpoint(tmp_path / "runs/theirs/checkpoints/last.ckpt", *hostile(mark)[attack])
+    path = run_of(tmp_path / "runs/theirs", *hostile(mark)[attack])
     output = f"output={tmp_path}/runs/mine"  # beside it, as if it were an own run
 
     def adopted(*options: str) -> Callable[[], None]:
@@ -104,7 +100,7 @@ def test_nothing_that_a_checkpoint_names_is_run(tmp_path: Path, attack: str, mon
         "export": adopted("job=export", "export=program", f"export.folder={tmp_path}/new"),
         "deploy": adopted("job=deploy", "deploy=ros2"),
         "benchmark": adopted("job=benchmark"),
-        "resume": lambda: run_job(resume(composed(f"output={path.parent.parent}"), path.parent.parent, [])),
+        "resume": lambda: run_job(resume(composed(f"output={path}"), path, [])),
         "pretrained": lambda: run_job(finetune(composed(output, f"pretrained={path}"), [])),
         "policy": lambda: make_policy(plain(composed().policy), path),  # as evaluate, export and deploy build it
     }
@@ -134,11 +130,11 @@ def test_nothing_that_a_store_names_is_run(tmp_path: Path, attack: str, toy_stor
 
 
 WAYS = {
-    "evaluate": ("checkpoint=runs/theirs/checkpoints/last.ckpt", "evaluate.episodes=1", "recorder=none"),
+    "evaluate": ("checkpoint=runs/theirs", "evaluate.episodes=1", "recorder=none"),
     "resume": ("resume=runs/theirs", "output=runs/mine", "job=train"),
-    "pretrained": ("pretrained=runs/theirs/checkpoints/last.ckpt", "job=train"),
-    "export": ("checkpoint=runs/theirs/checkpoints/last.ckpt", "job=export", "export=program", "export.folder=new"),
-    "deploy": ("checkpoint=runs/theirs/checkpoints/last.ckpt", "job=deploy", "deploy=ros2"),
+    "pretrained": ("pretrained=runs/theirs", "job=train"),
+    "export": ("checkpoint=runs/theirs", "job=export", "export=program", "export.folder=new"),
+    "deploy": ("checkpoint=runs/theirs", "job=deploy", "deploy=ros2"),
     "inspect": ("job=inspect", "inspect.folder=store", "inspect.episode=0"),
 }
 
@@ -146,7 +142,7 @@ WAYS = {
 @pytest.mark.parametrize("way", WAYS)
 def test_a_hostile_file_ends_every_job_in_one_sentence(tmp_path: Path, folder: Path, way: str) -> None:
     mark = tmp_path / "mark"
-    checkpoint(tmp_path / "runs/theirs/checkpoints/last.ckpt", "model.image", command(mark))
+    run_of(tmp_path / "runs/theirs", "model.image", command(mark))
     shutil.copytree(folder, tmp_path / "store")
     header = json.loads((tmp_path / "store/store.json").read_text())
     header["config"] = {"task": plain(composed()).get("task"), "expert": {}}
@@ -159,10 +155,7 @@ def test_a_hostile_file_ends_every_job_in_one_sentence(tmp_path: Path, folder: P
 
 
 def test_only_ones_own_runs_are_resumed(tmp_path: Path) -> None:
-    path = tmp_path / "theirs/checkpoints/last.ckpt"
-    path.parent.mkdir(parents=True)
-    config = plain(composed("collect.folder=/nowhere"))
-    torch.save({"config": config, "spec": toy.SPEC.to_dict(), "state_dict": {}}, path)
+    save_run(tmp_path / "theirs", plain(composed("collect.folder=/nowhere")))
     elsewhere = composed(f"output={tmp_path}/elsewhere/mine")
     with pytest.raises(ValueError, match="is not among your runs"):
         resume(elsewhere, tmp_path / "theirs", [])
@@ -170,15 +163,15 @@ def test_only_ones_own_runs_are_resumed(tmp_path: Path) -> None:
     assert resume(beside, tmp_path / "theirs", []).collect.folder == "/nowhere"
 
 
-def test_a_path_in_somebody_elses_checkpoint_is_refused(tmp_path: Path) -> None:
-    config, path = plain(composed()), tmp_path / "last.ckpt"
+def test_a_path_in_somebody_elses_policy_is_refused(tmp_path: Path) -> None:
+    config = plain(composed())
     config["task"]["goal"] = node("vla.data.formats.lerobot_import.LeRobotDemonstrations", folder="/nowhere")
-    torch.save({"config": config, "spec": toy.SPEC.to_dict(), "state_dict": {}}, path)
-    with pytest.raises(ValueError, match=r"last\.ckpt names a path or an address in task\.goal\.folder"):
+    path = save_policy(tmp_path / "theirs", config)
+    with pytest.raises(ValueError, match=r"theirs names a path or an address in task\.goal\.folder"):
         adopt(composed(f"checkpoint={path}"), [])
 
 
-def test_folders_loggers_and_devices_are_never_those_of_a_checkpoint(tmp_path: Path) -> None:
+def test_folders_loggers_and_devices_are_never_those_of_a_policy(tmp_path: Path) -> None:
     theirs: dict[str, Any] = {
         **plain(composed("expert=lerobot", "expert.folder=/theirs", "collect.episodes=7", "trainer.max_steps=9")),
         **{"output": "/theirs", "pretrained": "/theirs", "resume": "/theirs", "checkpoint": "/theirs"},
@@ -188,8 +181,7 @@ def test_folders_loggers_and_devices_are_never_those_of_a_checkpoint(tmp_path: P
     theirs["inspect"] = {"folder": "/theirs", "into": "/theirs"}
     theirs["export"] |= {"folder": "/theirs"}
     theirs["trainer"] |= {"default_root_dir": "/theirs", "accelerator": "theirs", "devices": 99, "profiler": "theirs"}
-    path = tmp_path / "last.ckpt"
-    torch.save({"config": theirs, "spec": toy.SPEC.to_dict(), "state_dict": {}}, path)
+    path = save_policy(tmp_path / "somebody", theirs)
     own = (f"output={tmp_path}/mine",)
     for adopted in (
         *(adopt(composed(*own, f"checkpoint={path}", f"job={job}"), []) for job in ("evaluate", "export", "benchmark")),
@@ -203,7 +195,7 @@ def test_folders_loggers_and_devices_are_never_those_of_a_checkpoint(tmp_path: P
 
 
 @pytest.mark.parametrize("job", ["evaluate", "benchmark"])
-def test_no_checkpoint_asks_for_a_download(job: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_policy_asks_for_a_download(job: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def fetch(*_: str) -> Path:
         raise AssertionError("a download")
 
@@ -211,10 +203,8 @@ def test_no_checkpoint_asks_for_a_download(job: str, tmp_path: Path, monkeypatch
     own = (f"output={tmp_path}/mine", "model/text=huggingface")
     encoder = write_encoder(tmp_path / "encoder")
     trained = Experiment.of(composed(*own, f"model.text.name={encoder}")).fitted_learner(store)
-    state = {f"model.{name}": value for name, value in trained.model.state_dict().items()}
     config = plain(composed(*own, "model.text.name=somebody/encoder", "expert=clean"))
-    path = tmp_path / "last.ckpt"
-    torch.save({"config": config, "spec": store.spec.to_dict(), "state_dict": state}, path)
+    path = save_policy(tmp_path / "theirs", config, store.spec, trained.model.state_dict())
     monkeypatch.setattr("vla.models.text.huggingface.fetch", fetch)
     asked = Experiment.of(adopt(composed(f"output={tmp_path}/mine", f"checkpoint={path}", f"job={job}"), []))
     model = asked.make_policy()().model if job == "evaluate" else asked.fitted_learner(store).model
@@ -222,28 +212,9 @@ def test_no_checkpoint_asks_for_a_download(job: str, tmp_path: Path, monkeypatch
     assert torch.equal(model.text.tokenize(sentence), trained.model.text.tokenize(sentence))
 
 
-def test_a_model_that_its_checkpoint_cannot_hold_is_refused_before_it_is_made(tmp_path: Path) -> None:
-    path = checkpoint(tmp_path / "last.ckpt", "model.width", 16384)
-    config = torch.load(path, weights_only=True)["config"]
-    config["model"]["text_width"] = 16384
-    torch.save({"config": config, "spec": toy.SPEC.to_dict(), "state_dict": {}}, path)
-    with pytest.raises(ValueError, match="describes a model that is larger than the file"):
+def test_a_model_that_its_weights_do_not_fill_is_refused_before_it_is_made(tmp_path: Path) -> None:
+    path = run_of(tmp_path / "theirs", "model.width", 16384)
+    config = path / "policy/config.json"
+    change_json(config, lambda nodes: {**nodes, "model": nodes["model"] | {"text_width": 16384}})
+    with pytest.raises(ValueError, match="describes a model that is larger than its weights"):
         make_policy(plain(composed().policy), path)
-
-
-def test_compressed_checkpoints_are_refused_before_they_are_unpacked(tmp_path: Path) -> None:
-    with ZipFile(tmp_path / "bomb.ckpt", "w", ZIP_DEFLATED) as archive, archive.open("archive/data.pkl", "w") as file:
-        for _ in range(256):
-            file.write(bytes(2**20))
-    with pytest.raises(ValueError, match=r"bomb\.ckpt cannot be read as a checkpoint"):
-        read_checkpoint(tmp_path / "bomb.ckpt")
-
-
-def test_a_checkpoint_behind_another_file_is_not_read(tmp_path: Path) -> None:
-    """PyTorch would read the other one, in its old format, which is not verified."""
-    path = checkpoint(tmp_path / "last.ckpt", "model.width", 64)
-    content = path.read_bytes()
-    torch.save(torch.load(path, weights_only=True), path, _use_new_zipfile_serialization=False)
-    path.write_bytes(path.read_bytes() + content)
-    with pytest.raises(ValueError, match=r"last\.ckpt cannot be read as a checkpoint"):
-        read_checkpoint(path)

@@ -19,6 +19,7 @@ from fake_batch import make_rt1
 from vla.config.experiment import Experiment
 from vla.data.episodes import EpisodeStore
 from vla.models.learner import Learner
+from vla.models.policy_folder import POLICY
 from vla.runs.folder import LAST
 from vla.training.trainer import make_trainer, quiet_lightning
 
@@ -60,7 +61,8 @@ def train(store: Path, folder: Path, *overrides: str, checkpoint: Path | None = 
     model = learner.model
     data = experiment.data(EpisodeStore(store), model.history, model.chunk, model.text.tokenize)
     trainer.fit(learner, datamodule=data, ckpt_path=checkpoint, weights_only=True)
-    trainer.save_checkpoint(folder / LAST)
+    for name in (LAST, POLICY):
+        trainer.save_checkpoint(folder / name, weights_only=False)
     return {name: value.item() for name, value in trainer.callback_metrics.items() if name.startswith("val/")}
 
 

@@ -19,7 +19,7 @@ import warm
 SMALL = ("task.image_size=[32,32]", "task.shadows=false", "collect.episodes=12", "cluster.workers=2")
 TRAIN = (*SMALL, "job=train", "validate.episodes=0", "data.batch_size=4", "trainer.max_steps=4", "trainer=cpu")
 EVALUATE = ("evaluate.episodes=1", "cluster.workers=1", "recorder=none")
-CHECKPOINT = "run/checkpoints/last.ckpt"
+CHECKPOINT = "run"
 LIMIT = 100.0  # [s] that a command may take
 
 Trials = Iterator[tuple[str, bool, str]]  # what was tried, whether it held, and how it ended

@@ -11,7 +11,7 @@ from vla.config.check import with_changes
 from vla.config.experiment import make_environment, make_policy
 from vla.config.packages import trusting
 from vla.envs.gym import GymEnvironment
-from vla.models.checkpoint import read_header
+from vla.models.policy_folder import policy_folder, read_policy
 
 if TYPE_CHECKING:
     from vla.policy import Policy
@@ -20,24 +20,25 @@ if TYPE_CHECKING:
 def load_policy(
     checkpoint: Path | str, *, device: str = "auto", precision: str = "fp32", lanes: int = 1, trust: Sequence[str] = ()
 ) -> Policy:
-    """Load the policy in a checkpoint.
+    """Load a trained policy.
 
-    A checkpoint contains no code, but names classes: of other packages only those are built that are trusted, here or
-    by `VLA_TRUST`. What was trusted in a training of this user is trusted for its checkpoints.
+    Its folder contains no code, but names classes: of other packages only those are built that are trusted, here or
+    by `VLA_TRUST`. What was trusted in a training of this user is trusted for its policies.
 
     Args:
-        checkpoint: the file.
+        checkpoint: the folder of a policy, or of a run that has one, or hub:owner/name@revision.
         device: such as "cpu" or "cuda"; "auto": a GPU if there is one.
         precision: "fp32" or "bf16".
         lanes: rows of every pass through the model, for as many worlds side by side: `policy.act(observations, lanes)`.
         trust: names of further packages.
 
     Raises:
-        ValueError: there is no such file, it is damaged, or it names a class that is not trusted.
+        ValueError: there is no such policy, it is damaged, or it names a class that is not trusted.
     """
     options = {"device": device, "precision": precision, "compile": False, "lanes": lanes}
-    with trusting(trust, Path(checkpoint)):
-        return make_policy({"_target_": "vla.policy.Policy", **options}, Path(checkpoint))
+    folder = policy_folder(checkpoint)
+    with trusting(trust, folder):
+        return make_policy({"_target_": "vla.policy.Policy", **options}, folder)
 
 
 def load_environment(
@@ -47,18 +48,19 @@ def load_environment(
     trust: Sequence[str] = (),
     render_mode: str | None = None,
 ) -> GymEnvironment:
-    """Make the world in which the policy of a checkpoint was trained, as an environment of gymnasium.
+    """Make the world in which a policy was trained, as an environment of gymnasium.
 
     Args:
-        checkpoint: the file.
+        checkpoint: as of `load_policy`.
         changes: to the task, as in the conditions of an evaluation, such as {"time_limit": 20.0}.
         trust: as of `load_policy`.
         render_mode: "rgb_array", or None.
 
     Raises:
-        ValueError: as `load_policy`, the file names a path, or there are recordings only, in which nothing can act.
+        ValueError: as `load_policy`, the policy names a path, or there are recordings only, in which nothing can act.
     """
-    task = {"task": read_header(checkpoint).config["task"]}
-    with trusting(trust, Path(checkpoint)):
+    saved = read_policy(checkpoint)
+    task = {"task": saved.config["task"]}
+    with trusting(trust, saved.folder):
         require_no_paths(task, ["task"], checkpoint)
         return GymEnvironment(make_environment(with_changes(task["task"], changes or {})), render_mode)

@@ -207,7 +207,7 @@ def _do(cfg: DictConfig) -> float | None:
 
 
 def _adopted(cfg: DictConfig, overrides: list[str]) -> DictConfig:
-    """Return `cfg` merged with the run, checkpoint or pretrained weights that it names.
+    """Return `cfg` merged with the run, policy or pretrained weights that it names.
 
     Raises:
         ValueError: a value is no path, or the named file cannot be used.

@@ -1,6 +1,6 @@
-"""Merge of a composed config with the checkpoint or run that it names.
+"""Merge of a composed config with the policy or run that it names.
 
-`checkpoint=FILE` takes task, tokenizer and model from a policy, `pretrained=FILE` tokenizer, model and data for a new
+`checkpoint=RUN` takes task, tokenizer and model from a policy, `pretrained=RUN` tokenizer, model and data for a new
 training (with job=improve also task, expert and learner), `resume=RUN` the whole config of a run. Overrides of these
 nodes on the command line apply on top.
 """
@@ -19,10 +19,11 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 from vla.config.build import GROUPS, require_no_paths, require_trust, without_paths
 from vla.config.differences import at, differences
 from vla.io.documents import read_yaml, resolved
-from vla.models.checkpoint import REQUIRED_NODES, read_header
+from vla.models.checkpoint import read_header
+from vla.models.policy_folder import POLICY, REQUIRED_NODES, is_gone, read_policy
 
 OF_MODEL = ("tokenizer", "model", "data")  # the batch size depends on the model
-OF_TRAINING = (*OF_MODEL, "task", "expert", "learner", "validate")  # of job=improve pretrained=FILE
+OF_TRAINING = (*OF_MODEL, "task", "expert", "learner", "validate")  # of job=improve pretrained=RUN
 # Parts of a training that a report on its policy shows: whole nodes, which only an open-loop evaluation builds, and
 # single values of other nodes.
 REPORTED = ("expert", "data", "learner", "validate", "seed")
@@ -49,11 +50,11 @@ def adopt(cfg: DictConfig, overrides: Sequence[str]) -> DictConfig:
     A path or address in these nodes is an error; in the training settings it becomes null. Devices are not taken over.
 
     Raises:
-        ValueError: the file does not exist, or an override contradicts its weights.
+        ValueError: there is no such policy, or an override contradicts its weights.
     """
     parsed = _parsed(overrides)
     _require_own_parts(parsed, ("tokenizer", "model", *PRESETS))
-    saved = read_header(cfg.checkpoint).config
+    saved = read_policy(cfg.checkpoint).config
     given = [_path(override) for override in parsed if not override.is_delete()]
     require_no_paths(saved, REQUIRED_NODES, cfg.checkpoint, given)
     chosen = {group: saved.get("chosen", {}).get(group) for group in CHOSEN}
@@ -68,7 +69,7 @@ def finetune(cfg: DictConfig, overrides: Sequence[str]) -> DictConfig:
     and number and seed of the demonstrations are that policy's.
 
     Raises:
-        ValueError: the file does not exist, the job does not train, or an override contradicts the weights.
+        ValueError: there is no such policy, the job does not train, or an override contradicts the weights.
     """
     if cfg.checkpoint is not None or cfg.job not in ("train", "evaluate", "improve"):
         raise ValueError(
@@ -78,7 +79,8 @@ def finetune(cfg: DictConfig, overrides: Sequence[str]) -> DictConfig:
     parsed = _parsed(overrides)
     _require_own_parts(parsed, ("tokenizer", "model", *PRESETS))
     own = Path(cfg.output) / LAST  # of this training; `pretrained` may have been deleted since
-    saved = read_header(own if own.exists() and not Path(cfg.pretrained).exists() else cfg.pretrained).config
+    gone = own.exists() and is_gone(cfg.pretrained)
+    saved = read_header(own).config if gone else read_policy(cfg.pretrained).config
     improved = cfg.job == "improve"
     parts = OF_TRAINING if improved else OF_MODEL
     given = [_path(override) for override in parsed if not override.is_delete()] if improved else None
@@ -109,10 +111,10 @@ def resume(cfg: DictConfig, run: Path, overrides: Sequence[str]) -> DictConfig:
         raise ValueError(
             f"resume={run} is not among your runs in {output.parent}: a run's config names files and folders, so only "
             f"your own are resumed. If it is yours, add output={run}; to use somebody else's weights: "
-            f"pretrained={run / LAST}"
+            f"pretrained={run}"
         )
     if cfg.job == "improve" != saved.get("job"):
-        raise ValueError(f"resume={run} is a training without rounds: job=improve pretrained={run / LAST} improves it")
+        raise ValueError(f"resume={run} is a training without rounds: job=improve pretrained={run} improves it")
     own = str(saved.get("job")).rpartition(".")[2]  # a job has a node of its own
     parsed, known = _parsed(overrides), {*map(str, cfg), own}
     _require_own_parts(parsed, PRESETS)
@@ -172,7 +174,7 @@ def require_identity(saved: Mapping[str, Any], config: Mapping[str, Any], folder
     before, now = ({key: at(each, key, None) for key in IDENTITY} for each in (saved, config))
     changed = [key for key, _, _ in differences(before, now)]
     if changed:
-        weights = f"; pretrained={folder / LAST} starts another from its weights" if (folder / LAST).exists() else ""
+        weights = f"; pretrained={folder} starts another from its weights" if (folder / POLICY).exists() else ""
         way_out = f"choose another output=DIR (hydra.sweep.dir=DIR of a sweep), or continue it with resume={folder}"
         raise ValueError(
             f"{folder} holds a training that differs in {', '.join(changed[:3])}{', …' if changed[3:] else ''}: "

@@ -32,9 +32,9 @@ class Job:
 
     groups: tuple[str | Group, ...]  # that it builds from; only these are checked and imported; names in `GROUPS`
     options: Mapping[str, Any] = field(default_factory=dict)  # name → type, in the config node of the job's name
-    adopts: bool = False  # takes checkpoint=FILE
+    adopts: bool = False  # takes checkpoint=RUN
     without_agent: tuple[str, ...] = ()  # groups also needed without agent=OPTION
-    without_checkpoint: tuple[str, ...] = ()  # groups also needed without agent=OPTION and checkpoint=FILE
+    without_checkpoint: tuple[str, ...] = ()  # groups also needed without agent=OPTION and checkpoint=RUN
     stored: tuple[str, ...] = ()  # groups whose libraries may be missing: a complete episode store takes their place
 
     def needs(self, config: Any) -> dict[str, Group]:
@@ -105,7 +105,7 @@ def check(cfg: DictConfig, job: Job) -> None:
     if cfg.agent is not None and "agent" not in groups:
         raise ValueError(f"job={cfg.job} takes no agent: agent=OPTION goes with job=evaluate and deploy")
     if cfg.agent is not None and cfg.checkpoint is not None:
-        raise ValueError("agent=OPTION and checkpoint=FILE are two policies: omit one of them")
+        raise ValueError("agent=OPTION and checkpoint=RUN are two policies: omit one of them")
     for name, group in groups.items():
         if cfg.get(name) is not None:
             node = OmegaConf.to_container(cfg[name], resolve=True, throw_on_missing=True)

@@ -26,9 +26,9 @@ if TYPE_CHECKING:
     from vla.data.datamodule import WindowDataModule
     from vla.data.episodes import EpisodeStore
     from vla.data.header import Codec
-    from vla.models.checkpoint import Checkpoint
     from vla.models.learner import Learner
     from vla.models.model import Model
+    from vla.models.policy_folder import SavedPolicy
     from vla.models.tokenizers.tokenizer import ActionTokenizer
     from vla.parallel.pool import Cluster
     from vla.policy import Policy
@@ -108,8 +108,8 @@ class Experiment:
 
     @property
     def checkpoint(self) -> Path | None:
-        """Checkpoint of the policy that the job uses, if given."""
-        return Path(self["checkpoint"]) if self["checkpoint"] else None
+        """Folder of the policy that the job uses, if given; a ValueError if there is none."""
+        return _policy_folder(self["checkpoint"])
 
     @property
     def source(self) -> Node:
@@ -133,14 +133,14 @@ class Experiment:
         return partial(with_trust, trusted(), make_expert, self["expert"])
 
     def make_policy(self, checkpoint: Path | None = None) -> Callable[..., Policy]:
-        """Return the factory of the policy in a checkpoint, by default `checkpoint` of the config.
+        """Return the factory of the policy in a folder, by default `checkpoint` of the config.
 
         Raises:
-            ValueError: no checkpoint is given.
+            ValueError: no policy is given.
         """
         checkpoint = checkpoint or self.checkpoint
         if checkpoint is None:
-            raise ValueError("this needs a trained policy: checkpoint=FILE")
+            raise ValueError("this needs a trained policy: checkpoint=RUN")
         return partial(with_trust, trusted(), make_policy, self["policy"], checkpoint, own=True)
 
     def make_agent(self) -> Callable[[Environment], Agent] | None:
@@ -164,21 +164,33 @@ class Experiment:
 
         Args:
             spec: of the demonstrations.
-            origin: checkpoint with the initial weights.
+            origin: folder of the policy with the initial weights.
 
         Raises:
-            ValueError: `origin` is no checkpoint, or its policy has another spec.
+            ValueError: `origin` is no policy, or has another spec.
         """
-        from vla.models.checkpoint import read_checkpoint
+        from vla.models.policy_folder import read_policy
 
         node = self["model"]
-        saved = read_checkpoint(origin) if origin else None
+        saved = read_policy(origin) if origin else None
         if saved:
-            saved.spec.without_truth.require(spec.without_truth, f"the checkpoint {origin}", "the demonstrations")
+            saved.spec.without_truth.require(spec.without_truth, f"the policy {origin}", "the demonstrations")
             spec, node = replace(spec, robot=saved.spec.robot), _without_pretraining(node)
         model = _model(node, spec, build(self["tokenizer"], "tokenizer", spec=spec), saved)
         if saved:
             saved.initialize(model)
+        return build(self["learner"], "learner", model=model, spec=spec, config=self.config)
+
+    def resumed_learner(self, spec: Spec, checkpoint: Path) -> Learner:
+        """Build the learner that Lightning's checkpoint of this training continues; a ValueError if it is damaged."""
+        from vla.models.checkpoint import read_content, weights_of
+
+        content = read_content(checkpoint)
+        spec = replace(spec, robot=Spec.from_dict(content["spec"], str(checkpoint)).robot)
+        tokenizer = build(self["tokenizer"], "tokenizer", spec=spec)
+        model = _model(_without_pretraining(self["model"]), spec, tokenizer, None)
+        # Before Lightning does, because a sharded model cannot load what modules keep besides their weights.
+        model.load_state_dict(weights_of(content))
         return build(self["learner"], "learner", model=model, spec=spec, config=self.config)
 
     def fit_tokenizer(self, tokenizer: ActionTokenizer, store: EpisodeStore) -> None:
@@ -188,8 +200,8 @@ class Experiment:
 
     @property
     def pretrained(self) -> Path | None:
-        """Checkpoint with the initial weights of a training, if given."""
-        return Path(self["pretrained"]) if self["pretrained"] else None
+        """Folder of the policy with the initial weights of a training, if given; a ValueError if there is none."""
+        return _policy_folder(self["pretrained"])
 
     def fitted_learner(self, store: EpisodeStore) -> Learner:
         """Build the learner of a new training, of the weights of `pretrained` or `checkpoint` if one is given.
@@ -272,22 +284,22 @@ def make_agent(agent: Node, environment: Environment) -> Agent:
 
 
 def make_policy(policy: Node, checkpoint: Path, environment: Environment | None = None, *, own: bool = False) -> Policy:
-    """Build the policy in a checkpoint with the options of a policy node.
+    """Build the policy in a folder with the options of a policy node.
 
     Args:
         policy: the node.
-        checkpoint: the file.
+        checkpoint: the folder.
         environment: that the policy is to act in.
-        own: the checkpoint may name paths and addresses, because it is of this run, or was looked through before.
+        own: the policy may name paths and addresses, because it is of this run, or was looked through before.
 
     Raises:
-        ValueError: there is no checkpoint, its spec differs from the environment's, or it names what it may not.
+        ValueError: there is no policy, its spec differs from the environment's, or it names what it may not.
     """
-    from vla.models.checkpoint import read_checkpoint
+    from vla.models.policy_folder import read_policy
 
-    saved = read_checkpoint(checkpoint)
+    saved = read_policy(checkpoint)
     if environment is not None:
-        saved.spec.without_truth.require(environment.spec.without_truth, f"the checkpoint {checkpoint}", "the task")
+        saved.spec.without_truth.require(environment.spec.without_truth, f"the policy {checkpoint}", "the task")
     nodes = {"tokenizer": saved.config["tokenizer"], "model": _without_pretraining(saved.config["model"])}
     if not own:
         require_no_paths(nodes, nodes, checkpoint)
@@ -311,17 +323,21 @@ def training_policy(precision: str, model: Model) -> Policy:
     return build({"_target_": "vla.policy.Policy", **here}, "policy", model=model, spec=model.spec)
 
 
-def _model(node: Node, spec: Spec, tokenizer: ActionTokenizer, saved: Checkpoint | None) -> Model:
-    """Build the model of a node; with a checkpoint, refuse a model larger than its file."""
-    from vla.models.checkpoint import TensorBudget
+def _policy_folder(name: str | None) -> Path | None:
+    from vla.models.policy_folder import policy_folder  # imports PyTorch
 
-    with TensorBudget(saved.path) if saved else nullcontext():
+    return policy_folder(name) if name else None
+
+
+def _model(node: Node, spec: Spec, tokenizer: ActionTokenizer, saved: SavedPolicy | None) -> Model:
+    """Build the model of a node; of a saved policy, refuse a model larger than its weights."""
+    with saved.budget() if saved else nullcontext():
         model: Model = build(node, "model", spec=spec, tokenizer=tokenizer)
     return model
 
 
 def _without_pretraining(model: Node) -> Node:
-    """Remove pretrained weights from a model node whose weights all come from a checkpoint."""
+    """Remove pretrained weights from a model node whose weights all come from a policy."""
     nowhere = {"image": "pretrained", "text": "name"}
     parts = {part: _emptied(model[part], key) for part, key in nowhere.items() if isinstance(model.get(part), dict)}
     return {**model, **parts}

@@ -105,7 +105,7 @@ class PolicyServer:
         policy = self.policy()
         if not hasattr(policy, "lanes"):  # an agent in its place
             raise ValueError(
-                f"deploy=server serves a trained policy, checkpoint=FILE; a {type(policy).__name__} cannot be served"
+                f"deploy=server serves a trained policy, checkpoint=RUN; a {type(policy).__name__} cannot be served"
             )
         if keyless := [camera for camera in policy.spec.cameras if camera not in self.keys.images]:
             raise ValueError(f"the policy sees {', '.join(keyless)}: add +deploy.keys.images.{keyless[0]}=KEY")

@@ -114,6 +114,21 @@ def resolved(value: Any, name: str) -> Any:
     return copied(value, 0)
 
 
+def read_resolved(path: Path) -> Any:
+    """Read the JSON file at `path` as a configuration, see `resolved`; a ValueError also if a key stands twice."""
+
+    def unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+        if len(found := dict(pairs)) < len(pairs):
+            raise ValueError("a key stands twice")
+        return found
+
+    try:
+        value = json.loads(read_bounded(path), object_pairs_hook=unique, parse_constant=int)  # which NaN is not
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f"{path} is damaged or of another kind: {str(error)[:200]}") from error
+    return resolved(value, str(path))
+
+
 def mappings(value: Any) -> Iterator[dict[Any, Any]]:
     """Yield all mappings in a plain value, every one before those within it."""
     if isinstance(value, dict):

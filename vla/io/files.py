@@ -20,22 +20,28 @@ UNWRITABLE = (EACCES, EDQUOT, EFBIG, EISDIR, ENOSPC, ENOTDIR, EPERM, EROFS)
 def atomic_path(target: Path) -> Iterator[Path]:
     """Yield a draft path beside `target`, for a file or a folder; the draft replaces `target` at the end.
 
+    A folder is replaced in two steps: a process that is killed between them leaves none under that name.
+
     Several processes may write to one target at once. On failure the draft is removed and `target` stays as it was.
 
     Raises:
         OSError: the draft cannot be written; the message names `target`.
     """
     draft = target.with_name(f".{os.getpid()}.{target.name}")  # libraries choose the format by the suffix
+    before = draft.with_name(f"{draft.name}.before")
     try:
         with writing(target):
             yield draft
+            if draft.is_dir() and target.is_dir():
+                os.replace(target, before)
             os.replace(draft, target)
     finally:
-        if draft.is_dir():
-            shutil.rmtree(draft, ignore_errors=True)
-        else:
-            with suppress(OSError):  # where nothing can be written, nothing can be removed either
-                draft.unlink()
+        if before.is_dir() and not target.exists():
+            os.replace(before, target)
+        for folder in (draft, before):
+            shutil.rmtree(folder, ignore_errors=True)
+        with suppress(OSError):  # where nothing can be written, nothing can be removed either
+            draft.unlink()
 
 
 def write_text(target: Path, text: str) -> None:

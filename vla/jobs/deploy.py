@@ -10,7 +10,7 @@ from vla.config.check import Job
 from vla.config.differences import at
 from vla.config.experiment import Experiment
 from vla.io.printable import printable
-from vla.models.checkpoint import require_unseen
+from vla.models.policy_folder import require_unseen
 from vla.reports.evaluation import plot_report, write_report
 from vla.runs.folder import PLOT, REPORT
 
@@ -51,7 +51,7 @@ def deployment(experiment: Experiment) -> Any:
         output=experiment.output,
     )
     if getattr(built, "needs_policy", True) and experiment.checkpoint is None and not experiment["agent"]:
-        raise ValueError("this deployment needs a trained policy: checkpoint=FILE")
+        raise ValueError("this deployment needs a trained policy: checkpoint=RUN")
     return built
 
 

@@ -80,7 +80,7 @@ def run(experiment: Experiment) -> float | None:
             return None
         if (checkpoint := train(experiment)) is None:
             return None
-    trained_here = checkpoint is not None and checkpoint.resolve().parent == (output / CHECKPOINTS).resolve()
+    trained_here = checkpoint is not None and checkpoint.resolve().parent == output.resolve()
     if not experiment.playable:
         from vla.jobs.open_loop import evaluate_open_loop
 
@@ -119,14 +119,14 @@ def require_possible(experiment: Experiment) -> None:
 
 def _require_unseen(experiment: Experiment) -> None:
     """Raise a ValueError if an episode of the evaluation selected given weights, whatever `validate` is now."""
-    asked, files = experiment["evaluate"], [experiment.checkpoint, experiment.pretrained]
-    if not any(files):
+    asked, named = experiment["evaluate"], [experiment["checkpoint"], experiment["pretrained"]]
+    if not any(named):
         return
-    from vla.models.checkpoint import require_unseen  # imports PyTorch
+    from vla.models.policy_folder import is_gone, require_unseen  # imports PyTorch
 
-    for file in files:
-        if file is not None and file.exists():  # initial weights may have been deleted since
-            require_unseen(file, "evaluate.seed", range(asked["seed"], asked["seed"] + asked["episodes"]))
+    for name in named:
+        if name and not is_gone(name):  # initial weights may have been deleted since
+            require_unseen(name, "evaluate.seed", range(asked["seed"], asked["seed"] + asked["episodes"]))
 
 
 def _require_world(experiment: Experiment, name: str, changes: dict[str, Any]) -> None:
@@ -146,7 +146,7 @@ def evaluate_trained(experiment: Experiment, checkpoint: Path, rounds: Sequence[
     """Return the success rate of a policy that this run trained, in `rounds` if given; a report of it is kept."""
     if (success := cached_success(experiment.output, experiment.config, checkpoint)) is not None:
         return success
-    with training_lock(checkpoint.parent):  # else resume=last would find it interrupted
+    with training_lock(checkpoint.parent / CHECKPOINTS):  # else resume=last would find it interrupted
         return _evaluated(experiment, checkpoint, rounds)
 
 

@@ -8,15 +8,12 @@ acts; in the others the policy does, or both in turns (`improve.beta`). Every ro
 
 from __future__ import annotations
 
-import hashlib
 import logging
 from collections.abc import Mapping, Sequence
 from contextlib import closing
 from functools import partial
 from pathlib import Path
 from typing import Any
-
-import torch
 
 from vla.config.adopt import require_identity
 from vla.config.check import TRAINING, Job, devices, with_changes
@@ -29,7 +26,7 @@ from vla.io.types import Count, Seed, Share
 from vla.jobs.collect import complete_store, demonstrations
 from vla.jobs.evaluate import evaluate_trained, policy_for_workers, require_possible
 from vla.jobs.train import train
-from vla.models.checkpoint import read_checkpoint, read_header
+from vla.models.policy_folder import read_policy
 from vla.rollouts.collect import collect, collection_time
 from vla.rollouts.rollout import close_agent
 from vla.rollouts.supervised import make_supervised, require_memoryless
@@ -138,7 +135,7 @@ def _require_possible(experiment: Experiment) -> range:
         close_agent(expert)
         require_memoryless(expert)
         if (policy := experiment.pretrained) is not None:
-            known = read_header(policy).spec.without_truth
+            known = read_policy(policy).spec.without_truth
             known.require(environment.spec.without_truth, f"the checkpoint {policy}", "the task")
         with closing(experiment.make_environment(asked["changes"])()) as changed:
             environment.spec.require(changed.spec, "the task", "the task with improve.changes")
@@ -149,7 +146,7 @@ def _require_possible(experiment: Experiment) -> range:
 
 def _require_further_episodes(experiment: Experiment, policy: Path) -> None:
     """Raise a ValueError if the policy was trained on further stores, such as rounds, that nothing is said about."""
-    further = at(read_header(policy).config, "collect.more", None)
+    further = at(read_policy(policy).config, "collect.more", None)
     if isinstance(further, list) and further and experiment["collect"]["more"] is None:
         names = ",".join(map(str, further))
         raise ValueError(
@@ -176,7 +173,7 @@ def _labelled(experiment: Experiment, checkpoint: Path, folder: Path, seed: int)
     own = {
         "task": task,
         "expert": experiment["expert"],
-        "policy": {**experiment["policy"], "weights": _digest(checkpoint)},
+        "policy": {**experiment["policy"], "weights": read_policy(checkpoint).training.weights[:12]},
         "improve": {**{name: asked[name] for name in ("episodes", "beta", "segment")}, "seed": seed},
     }
     world = environment()
@@ -223,13 +220,3 @@ def _described(folder: Path, store: EpisodeStore | None) -> Round:
         training_s=found.training.seconds if found.training else 0.0,
         validation=round(float(curve[1][-1]), 6) if curve else None,
     )
-
-
-def _digest(checkpoint: Path) -> str:
-    """Return a digest of the weights in a checkpoint, twelve hexadecimal digits."""
-    digest = hashlib.sha256()
-    for name, value in sorted(read_checkpoint(checkpoint).state.items()):
-        tensor = isinstance(value, torch.Tensor)  # or what a module keeps besides, such as the rules of a tokenizer
-        digest.update(name.encode())
-        digest.update(value.flatten().view(torch.uint8).numpy().tobytes() if tensor else repr(value).encode())
-    return digest.hexdigest()[:12]

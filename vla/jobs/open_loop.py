@@ -22,7 +22,7 @@ from vla.data.verification import episode_of
 from vla.io.files import warn_on_error, writing
 from vla.io.printable import show
 from vla.jobs.collect import demonstrations
-from vla.models.checkpoint import read_header
+from vla.models.policy_folder import read_policy
 from vla.policy import costs
 from vla.reports.open_loop import errors_table, plot_errors, write_errors
 from vla.reports.run_page import write_page
@@ -45,10 +45,10 @@ def evaluate_open_loop(experiment: Experiment, checkpoint: Path | None) -> float
     facts = {**experiment["chosen"], "origin": asdict(experiment.origin)}
     fraction = experiment["data"]["validation_fraction"]
     if checkpoint is not None:  # before an import
-        header = read_header(checkpoint)
-        trained, world = header.spec.without_truth, experiment.world().spec.without_truth
+        saved = read_policy(checkpoint)
+        trained, world = saved.spec.without_truth, experiment.world().spec.without_truth
         trained.require(world, f"the checkpoint {checkpoint}", "the task, with the options given here,")
-        fraction = header.config["data"]["validation_fraction"]
+        fraction = saved.config["data"]["validation_fraction"]
     if not fraction:
         whose = f"{checkpoint} was trained" if checkpoint else "a training would be"
         raise ValueError(
@@ -99,18 +99,20 @@ def _store(experiment: Experiment) -> EpisodeStore:
 
 def _unseen(store: EpisodeStore, more: Sequence[Path], checkpoint: Path) -> list[Entry]:
     """Return the episodes of the store that the training of a checkpoint on it, and on `more` stores, held out."""
-    header, entries = read_header(checkpoint), store.episodes
-    if header.windows != digest_of([*entries, *(entry for folder in more for entry in EpisodeStore(folder).episodes)]):
+    saved, entries = read_policy(checkpoint), store.episodes
+    if saved.training.windows != digest_of(
+        [*entries, *(entry for folder in more for entry in EpisodeStore(folder).episodes)]
+    ):
         folders = " and those in ".join(map(str, [store.folder, *more]))
         raise ValueError(
             f"{checkpoint} was trained on other episodes than the {len(entries)} in {folders}, so which of them were "
             "held out is unknown: name the recording, its options, collect.episodes and collect.more as in training"
         )
-    if origin := header.config.get("pretrained"):
+    if origin := saved.config.get("pretrained"):
         log.warning(
             "%s began with the weights of %s: whether these were trained on its episodes is unknown", checkpoint, origin
         )
-    fraction = at(header.config, "data.validation_fraction", None)
+    fraction = at(saved.config, "data.validation_fraction", None)
     if not isinstance(fraction, float | int):
         raise ValueError(f"{checkpoint} does not say which share of the episodes its training held out")
     return _held_out(store, fraction)

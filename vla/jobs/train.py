@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
 from functools import partial
@@ -17,10 +18,11 @@ from vla.config.experiment import Experiment, training_policy
 from vla.config.origin import Origin
 from vla.config.packages import remember_trust
 from vla.data.episodes import EpisodeStore
-from vla.io.files import warn_on_error, writing
+from vla.io.files import atomic_path, warn_on_error, writing
 from vla.jobs.collect import demonstration_spec, demonstrations
 from vla.models.learner import Learner
 from vla.models.model import Model
+from vla.models.policy_folder import POLICY
 from vla.models.tokenizers.tokenization_error import describe_tokenization_error, out_of_bounds
 from vla.parallel.limits import cores
 from vla.reports.first_batch import SHOWN, draw_samples
@@ -34,7 +36,6 @@ from vla.runs.folder import (
     SAMPLES,
     archive_evaluation,
     read_training,
-    save_choice,
     save_config,
     save_training,
 )
@@ -55,7 +56,7 @@ def run(experiment: Experiment) -> None:
 
 
 def train(experiment: Experiment) -> Path | None:
-    """Train, and return the checkpoint that validation selects; None in all but the first process.
+    """Train, and return the folder of the policy that validation selects; None in all but the first process.
 
     An unfinished training in the output folder is resumed; a finished one is kept.
 
@@ -69,7 +70,7 @@ def train(experiment: Experiment) -> Path | None:
     output = experiment.output
     checkpoints = output / CHECKPOINTS
     graceful_stop = GracefulStop(checkpoints)
-    closed_loop = _closed_loop(experiment, checkpoints)
+    closed_loop = _closed_loop(experiment)
     if _endless(experiment):
         log.info("trainer.max_steps=-1: training runs until interrupted; Ctrl-C saves and stops")
     if experiment["trainer"]["max_steps"] in (None, -1) and experiment["learner"]["schedule"] == "cosine":
@@ -85,21 +86,20 @@ def train(experiment: Experiment) -> Path | None:
             torch.distributed.destroy_process_group()  # together: at their exit the others would wait for the first one
         if not trainer.is_global_zero:
             return None
-        chosen = closed_loop.selected_checkpoint(checkpoints / LAST) if closed_loop else checkpoints / LAST
-        save_choice(output, chosen.name)
-    log.info("the policy is %s", chosen)
-    return chosen
+    log.info("the policy is %s", output / POLICY)
+    return output / POLICY
 
 
 def _fit(experiment: Experiment, state: TrainingProgress, trainer: Trainer, graceful_stop: GracefulStop) -> None:
-    """Collect missing demonstrations and train on them."""
+    """Collect missing demonstrations, train on them, and write the policy."""
     more = [EpisodeStore(folder) for folder in experiment["collect"]["more"] or ()]
-    output, origin = experiment.output, state.resume_from or experiment.pretrained
+    output, origin = experiment.output, None if state.resume_from else experiment.pretrained
     lightning.seed_everything(experiment["seed"], verbose=False)
-    with explain_memory_errors(experiment.config):
-        learner = experiment.learner(demonstration_spec(experiment), origin)
+    with explain_memory_errors(experiment.config), graceful_stop.explaining_restore(state.resume_from):
+        spec, last = demonstration_spec(experiment), state.resume_from
+        learner = experiment.resumed_learner(spec, last) if last else experiment.learner(spec, origin)
     store = demonstrations(experiment)
-    if origin is None:
+    if origin is last is None:
         experiment.fit_tokenizer(learner.model.tokenizer, store)
     model = learner.model
     data = experiment.data(store, model.history, model.chunk, model.text.tokenize)
@@ -117,7 +117,7 @@ def _fit(experiment: Experiment, state: TrainingProgress, trainer: Trainer, grac
         trainer.limit_val_batches = 0  # else callbacks wait for a validation that never runs
         if experiment["validate"]["episodes"]:
             log.warning(
-                "data.validation_fraction=0: no validation, so no episodes are played in it and last.ckpt is used"
+                "data.validation_fraction=0: no validation, so no episodes are played, and the last weights are used"
             )
     with warn_on_error(output / SAMPLES):
         draw_samples(data.make_batch(data.order(0)[:SHOWN]), store.spec, output / SAMPLES)
@@ -139,9 +139,21 @@ def _fit(experiment: Experiment, state: TrainingProgress, trainer: Trainer, grac
             if not graceful_stop.requested:
                 raise
         if not graceful_stop.stopped:
-            trainer.save_checkpoint(output / CHECKPOINTS / LAST, weights_only=False)
+            _save(trainer, output)
         if graceful_stop.requested and trainer.is_global_zero:
             raise KeyboardInterrupt
+
+
+def _save(trainer: Trainer, output: Path) -> None:
+    """Save the policy in training, or a better one, and then the checkpoint, whose `finished` says that it is there."""
+    callbacks: list[Callback] = trainer.callbacks  # type: ignore[attr-defined]
+    (better,) = [each.clearly_better() for each in callbacks if isinstance(each, ClosedLoop)] or [None]
+    if better is None:
+        trainer.save_checkpoint(output / POLICY, weights_only=False)
+    elif trainer.is_global_zero:
+        with atomic_path(output / POLICY) as draft:
+            shutil.copytree(better, draft)
+    trainer.save_checkpoint(output / CHECKPOINTS / LAST, weights_only=False)
 
 
 class _Begun(Callback):
@@ -179,7 +191,7 @@ def _warn_of_clipped(model: Model, store: EpisodeStore, chunks: Array) -> None:
         log.warning("%s exceed the bounds of the tokenizer, to which they are clipped", where)
 
 
-def _closed_loop(experiment: Experiment, checkpoints: Path) -> ClosedLoop | None:
+def _closed_loop(experiment: Experiment) -> ClosedLoop | None:
     """Return the callback that plays episodes in every validation, or None without episodes."""
     asked = experiment["validate"]
     seeds = range(asked["seed"], asked["seed"] + asked["episodes"])
@@ -188,7 +200,7 @@ def _closed_loop(experiment: Experiment, checkpoints: Path) -> ClosedLoop | None
     make_environment = experiment.make_environment(asked["changes"])
     make_policy = partial(training_policy, experiment["policy"].get("precision", "fp32"))
     workers = experiment["cluster"].get("workers") or cores()
-    return ClosedLoop(make_environment, make_policy, seeds, checkpoints, workers) if seeds else None
+    return ClosedLoop(make_environment, make_policy, seeds, experiment.output, workers) if seeds else None
 
 
 def _origins(experiment: Experiment, state: TrainingProgress) -> list[Origin]:
@@ -210,7 +222,7 @@ def _reported(
     """Write the report page and the log summary however training ends, including the runs it resumed from."""
     output = experiment.output
     parameters = sum(parameter.numel() for parameter in learner.model.parameters())
-    start = f", starting from {experiment.pretrained}" if experiment.pretrained else ""
+    start = f", starting from {experiment['pretrained']}" if experiment["pretrained"] else ""
     log.info("training %s with %.2f M parameters%s", type(learner.model).__name__, parameters / 1e6, start)
     ended = "done"
     try:

@@ -10,8 +10,13 @@ from urllib.request import urlopen
 TIMEOUT = 10  # until the hub counts as unreachable [s]
 
 
-def fetch(repository: str, *patterns: str) -> Path:
+def fetch(repository: str, *patterns: str, revision: str | None = None) -> Path:
     """Return a folder with the files of a model that match the patterns, downloading those that are not cached.
+
+    Args:
+        repository: OWNER/NAME.
+        patterns: of the names of the files.
+        revision: a branch, a tag or a commit; None: the newest.
 
     Raises:
         OSError: there is no such model, or the hub is unreachable and the model is not cached; the text is one line.
@@ -19,11 +24,12 @@ def fetch(repository: str, *patterns: str) -> Path:
     from huggingface_hub import snapshot_download
     from huggingface_hub.errors import HfHubHTTPError, HFValidationError
 
-    reason = _unreachable()
+    reason, name = _unreachable(), f"{repository} at {revision}" if revision else repository
     try:
-        return Path(snapshot_download(repository, allow_patterns=list(patterns), local_files_only=reason is not None))
+        cached = {"local_files_only": reason is not None}
+        return Path(snapshot_download(repository, revision=revision, allow_patterns=list(patterns), **cached))
     except (HfHubHTTPError, HFValidationError) as error:
-        raise OSError(f"it has no public model {repository}") from error
+        raise OSError(f"it has no public model {name}") from error
     except OSError as error:
         raise OSError(reason or str(error).partition("\n")[0]) from error
 

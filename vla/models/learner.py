@@ -197,37 +197,17 @@ class Learner(LightningModule):
             self.log(f"val/error_{name}{f'_{unit_name}' if unit_name else ''}", metric)
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Add config and spec as plain dicts, which load without running code.
+        """Add config, spec and the figures of the last validation as plain dicts, which load without running code.
 
         Raises:
             ValueError: a loss was not finite.
         """
         self._require_finite()
         checkpoint["config"], checkpoint["spec"] = self._config, self._spec.to_dict()
-
-    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Keep only the weights of the model: metrics would take over whatever stands under their names.
-
-        Raises:
-            ValueError: the progress of the training holds other things than counts, or its optimiser has no state.
-        """
-        _require_counts(checkpoint["loops"])
-        if not checkpoint["optimizer_states"] or not checkpoint["lr_schedulers"]:
-            raise ValueError("it holds no state of the optimiser")
-        for name in {"state_dict", "current_model_state"} & checkpoint.keys():
-            weights = checkpoint[name].items()
-            checkpoint[name] = {key: value for key, value in weights if key.startswith("model.")}
+        measured = self.trainer.callback_metrics.items()
+        checkpoint["figures"] = {name: float(value) for name, value in measured if name.startswith("val/")}
 
 
 def _set_precision(flash: bool, precision: str) -> None:
     torch.backends.cuda.enable_flash_sdp(flash)
     torch.set_float32_matmul_precision(precision)
-
-
-def _require_counts(value: Any) -> None:
-    """Raise a ValueError if a nested mapping holds other values than counts and flags."""
-    if isinstance(value, dict):
-        for part in value.values():
-            _require_counts(part)
-    elif not isinstance(value, int) or not 0 <= value < 2**63:
-        raise ValueError(f"its progress holds {str(value)[:100]}, which is no count")

@@ -8,7 +8,7 @@ from functools import cached_property
 from itertools import repeat
 from typing import Annotated, Any
 
-from pydantic import AfterValidator, StringConstraints
+from pydantic import AfterValidator
 
 from vla.config.annotations import describe, matches
 from vla.config.check import PLAIN
@@ -37,7 +37,6 @@ def readable_config(config: Node) -> Node:
 
 
 Config = Annotated[Node, AfterValidator(readable_config)]
-CheckpointName = Annotated[str, StringConstraints(pattern=r"^\w[\w.-]*\.ckpt$")]  # in the run's own folder
 
 
 @dataclass(frozen=True)
@@ -62,7 +61,6 @@ class Training:
     seconds: NonNegative
     ended: str  # "done", "interrupted", or an error
     collection_s: NonNegative | None = None  # duration of the collection, if known
-    checkpoint: CheckpointName | None = None  # selected for evaluation
     origins: list[Origin] = field(default_factory=list)  # of its beginning, and of what continued it
 
 

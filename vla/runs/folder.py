@@ -8,7 +8,7 @@ import json
 import logging
 import shutil
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
@@ -36,7 +36,7 @@ SAMPLES, PLOT, SUITE = "samples.png", "report.png", "suite.png"
 ERRORS, ERRORS_PLOT = "errors.json", "errors.png"  # of an open-loop evaluation, in place of a report
 LARGEST_METRIC, MOST_METRICS = 1e100, 300  # that curves are drawn of; a training has about 20
 LARGEST_REPORT = 4 << 30  # [bytes], a million episodes
-CHECKPOINTS, LAST = "checkpoints", "last.ckpt"  # the folder of weights, and those of the newest save
+CHECKPOINTS, LAST = "checkpoints", "last.ckpt"  # what resumes a training: its folder, and the newest save
 
 
 @dataclass(frozen=True)
@@ -99,16 +99,6 @@ def read_training(folder: Path) -> Training | None:
     return _read(folder / TRAINING, partial(read_json, kind=Training), None)
 
 
-def chosen_checkpoint(folder: Path) -> str | None:
-    """Return the file name of the checkpoint selected for evaluation in a run's folder, or None if there is none yet.
-
-    Raises:
-        ValueError: the file that says so is damaged.
-    """
-    training = read_training(folder)
-    return training.checkpoint if training else None
-
-
 def archive_evaluation(folder: Path, number: int) -> None:
     """Archive the evaluation in a run's folder as `evaluation_NUMBER`, because further training changes the policy.
 
@@ -127,15 +117,15 @@ def archive_evaluation(folder: Path, number: int) -> None:
         log.info("moved the evaluation so far to %s", target)
 
 
-def wall_time(checkpoint: Path, evaluation: float) -> float | None:
-    """Return the wall time of collection, training and evaluation of a checkpoint [s], or None if unknown.
+def wall_time(policy: Path, evaluation: float) -> float | None:
+    """Return the wall time of collection, training and evaluation of a policy [s], or None if unknown.
 
     Args:
-        checkpoint: in the folder of the run that trained it.
+        policy: its folder, in that of the run that trained it.
         evaluation: duration of the evaluation [s].
     """
     try:
-        training = read_training(checkpoint.resolve().parent.parent)
+        training = read_training(policy.resolve().parent)
     except (OSError, ValueError) as error:  # it only informs
         log.warning("the wall time is unknown: %s", error)
         return None
@@ -164,11 +154,6 @@ def save_config(folder: Path, config: Mapping[str, Any], changes: list[Node]) ->
 def save_training(folder: Path, training: Training) -> None:
     """Save the result of a training."""
     write_text(folder / TRAINING, json.dumps(asdict(training), ensure_ascii=False) + "\n")
-
-
-def save_choice(folder: Path, checkpoint: str) -> None:
-    """Add the checkpoint selected for evaluation to what `save_training` wrote."""
-    save_training(folder, replace(read_json(folder / TRAINING, Training), checkpoint=checkpoint))
 
 
 def _read(path: Path, read: Callable[[Path], T], otherwise: T) -> T:

@@ -17,7 +17,8 @@ from filelock import FileLock, Timeout
 from vla.config.adopt import require_identity
 from vla.config.differences import differences
 from vla.models.checkpoint import read_header
-from vla.runs.folder import CHECKPOINTS, CONFIG, ERRORS, LAST, REPORT, chosen_checkpoint, read_report
+from vla.models.policy_folder import POLICY, read_policy
+from vla.runs.folder import CHECKPOINTS, CONFIG, ERRORS, LAST, REPORT, read_report
 from vla.spec import IN_DISTRIBUTION
 
 log = logging.getLogger(__name__)
@@ -33,7 +34,7 @@ class TrainingProgress:
     """Progress of a run's training; both fields are None before its first save."""
 
     resume_from: Path | None = None  # checkpoint of an unfinished training
-    chosen: Path | None = None  # checkpoint selected by a finished training
+    chosen: Path | None = None  # folder of the policy that a finished training selected
 
 
 def training_progress(folder: Path, config: Mapping[str, Any]) -> TrainingProgress:
@@ -51,13 +52,11 @@ def training_progress(folder: Path, config: Mapping[str, Any]) -> TrainingProgre
     longer = (
         any(trainer.get(name) != before.get(name) for name in LENGTHS) and not 0 <= trainer["max_steps"] <= saved.steps
     )
-    chosen = (
-        chosen_checkpoint(folder) if saved.finished else None
-    )  # None if the process was killed before the selection
-    if chosen is not None and not longer:
-        require_identity(read_header(last.with_name(chosen)).config, config, folder)  # which is the one that is built
-        log.info("training is already finished: %s", last.with_name(chosen))
-        return TrainingProgress(chosen=last.with_name(chosen))
+    chosen = folder / POLICY
+    if saved.finished and chosen.is_dir() and not longer:
+        require_identity(read_policy(chosen).config, config, folder)  # which is the one that is built
+        log.info("training is already finished: %s", chosen)
+        return TrainingProgress(chosen=chosen)
     if isinstance(trainer.get("strategy"), dict) and not isinstance(before.get("strategy"), dict):
         # A sharded optimiser orders its parameters differently.
         raise ValueError(f"trainer=fsdp cannot continue {last}, which was trained without it: use trainer=ddp")
@@ -66,7 +65,7 @@ def training_progress(folder: Path, config: Mapping[str, Any]) -> TrainingProgre
 
 
 def cached_success(folder: Path, config: Mapping[str, Any], checkpoint: Path) -> float | None:
-    """Return the success rate of a run's report if it is of the same checkpoint and the same evaluation."""
+    """Return the success rate of a run's report if it is of the same policy and the same evaluation."""
     report = read_report(folder)
     if report is None or report.checkpoint != str(checkpoint):
         return None
@@ -119,9 +118,8 @@ def _evaluated(run: Path, *since: Path) -> bool:
 def _unfinished(run: Path) -> bool:
     """Return whether a training was interrupted, or the evaluation that was to follow."""
     saved = read_header(run / CHECKPOINTS / LAST)
-    unchosen = chosen_checkpoint(run) is None  # killed between the last save and the selection
     last = run / CHECKPOINTS / LAST
-    return not saved.finished or unchosen or (saved.config.get("job") == "evaluate" and not _evaluated(run, last))
+    return not saved.finished or (saved.config.get("job") == "evaluate" and not _evaluated(run, last))
 
 
 @contextmanager

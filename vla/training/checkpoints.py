@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
-from typing import Any, cast
+from typing import Any
 
 import torch
 from lightning import LightningModule, Trainer
@@ -19,10 +19,9 @@ from lightning.pytorch.callbacks import Checkpoint
 from lightning.pytorch.plugins import TorchCheckpointIO
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 
-from vla.io.documents import parse_plain
 from vla.io.files import atomic_path
-from vla.io.types import NonNegative
 from vla.models.checkpoint import read_content
+from vla.models.policy_writing import write_policy
 from vla.runs.folder import LAST
 
 log = logging.getLogger(__name__)
@@ -103,10 +102,8 @@ class GracefulStop(Checkpoint):
         checkpoint["finished"], checkpoint["seconds"] = trainer.state.finished, self.seconds
 
     def on_load_checkpoint(self, trainer: Trainer, pl_module: LightningModule, checkpoint: dict[str, Any]) -> None:
-        """Restore the training time; a ValueError if it is no duration."""
-        self._previous_seconds = parse_plain(
-            checkpoint.get("seconds", 0.0), cast(type[float], NonNegative), "the training time"
-        )
+        """Restore the training time."""
+        self._previous_seconds = checkpoint["seconds"]
 
     @contextmanager
     def explaining_restore(self, checkpoint: Path | None) -> Iterator[None]:
@@ -162,19 +159,22 @@ def _validates(trainer: Trainer) -> bool:
 
 
 class AtomicCheckpointIO(TorchCheckpointIO):
-    """Writes checkpoints atomically: a complete file replaces the previous one. Reads them as data."""
+    """Writes checkpoints atomically, as a policy where the path is not that of a `.ckpt`. Reads them as data."""
 
     def load_checkpoint(self, path: Any, map_location: Any = None, weights_only: bool | None = None) -> dict[str, Any]:
         """Return plain values and tensors, on the CPU. Raises as `read_content` does."""
         return read_content(Path(path))
 
     def save_checkpoint(self, checkpoint: dict[str, Any], path: Any, storage_options: Any = None) -> None:
-        """Write a temporary file, then rename it to `path`.
+        """Write a temporary file or folder, then rename it to `path`.
 
         Raises:
-            OSError: it cannot be written; an existing file is unchanged.
+            OSError: it cannot be written; what is there is unchanged.
         """
         target = Path(path)
+        if target.suffix != Path(LAST).suffix:
+            write_policy(target, checkpoint)
+            return
         target.parent.mkdir(parents=True, exist_ok=True)
         with atomic_path(target) as draft, draft.open("wb") as file:
             try:

@@ -6,19 +6,17 @@ import logging
 import pickle
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack, closing
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from types import TracebackType
-from typing import Annotated, Any
+from typing import Any
 
 import torch
-from annotated_types import Ge, Le
 from lightning import Callback, LightningModule, Trainer
 
-from vla.io.documents import STRICT, parse_plain
 from vla.models.learner import Learner
 from vla.models.model import Model
+from vla.models.policy_folder import BEST
 from vla.parallel.pool import Crashed, Future, ProcessPool
 from vla.parallel.processes import one_thread_each
 from vla.rollouts.evaluate import play
@@ -28,21 +26,7 @@ from vla.spec import Agent, Environment
 
 log = logging.getLogger(__name__)
 
-BEST = "best.ckpt"
 PER_WORKER = 5  # episodes; for fewer, a process takes longer to start than they take
-
-Success = Annotated[float, Ge(-1), Le(1)]  # success rate; -1: not measured
-
-
-@dataclass(frozen=True)
-class ClosedLoopState:
-    """State of `ClosedLoop` in a checkpoint."""
-
-    __pydantic_config__ = STRICT
-
-    success: Success
-    best: Success
-    seeds: list[int] | None = None
 
 
 class _Player:
@@ -69,7 +53,7 @@ class ClosedLoop(Callback):
     """Plays episodes with the EMA weights in every validation, and logs `val/success`, 0…1.
 
     The processes of a training split the episodes, and each has workers that share its part; a result does not depend
-    on their number. The weights with the highest success rate are saved as `best.ckpt`; ties go to the newest. With
+    on their number. The policy with the highest success rate is saved as `policy_best`; ties go to the newest. With
     sharded weights nothing is played, because all processes would have to act in step. It is a context, at whose end
     the workers end.
 
@@ -77,7 +61,7 @@ class ClosedLoop(Callback):
         make_environment: factory of the environment, called for every validation, after which it is closed.
         make_policy: factory of a policy from the model in training, on its device.
         seeds: of the episodes, the same in every validation.
-        checkpoints: folder of `best.ckpt`.
+        run: folder of `policy_best`.
         workers: largest number of worker processes on this machine.
     """
 
@@ -86,14 +70,14 @@ class ClosedLoop(Callback):
         make_environment: Callable[[], Environment],
         make_policy: Callable[[Model], Agent],
         seeds: Sequence[int],
-        checkpoints: Path,
+        run: Path,
         workers: int = 1,
     ) -> None:
         self._make_environment, self._seeds, self._workers = make_environment, seeds, workers
         self._make_player = partial(_Player, make_environment, make_policy)
         self._pool: ProcessPool | None = None
         self._opened = ExitStack()
-        self._path = checkpoints / BEST
+        self._path = run / BEST
         self._plays = self._played = False
         self.success, self.best = 0.0, -1.0
 
@@ -154,19 +138,19 @@ class ClosedLoop(Callback):
             return [result for future, part in zip(pending, parts, strict=True) for result in _results(future, part)]
 
     def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Save `best.ckpt` if episodes were played, and their success rate is at least the best so far."""
+        """Save `policy_best` if episodes were played, and their success rate is at least the best so far."""
         if self._played and self.success >= self.best:
             self.best = self.success
             trainer.save_checkpoint(self._path, weights_only=False)
 
-    def selected_checkpoint(self, last: Path) -> Path:
-        """Return `best.ckpt` if the last success rate is below the 95 % confidence interval of the best, else `last`.
+    def clearly_better(self) -> Path | None:
+        """Return `policy_best` if the last success rate is below the 95 % confidence interval of its own, else None.
 
         Smaller differences between a few episodes are chance, and longer training is better.
         """
         low, _ = wilson_interval(round(max(self.best, 0.0) * len(self._seeds)), len(self._seeds))
         if self.success >= low or not self._path.exists():
-            return last
+            return None
         log.info("success in validation fell from %.0f to %.0f %%: %s", 100 * self.best, 100 * self.success, self._path)
         return self._path
 
@@ -175,12 +159,10 @@ class ClosedLoop(Callback):
         return {"success": self.success, "best": self.best, "seeds": list(self._seeds)}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Restore the state; a ValueError if it is of another kind."""
-        state = parse_plain(state_dict, ClosedLoopState, "the state of the validation")
-        self.success = state.success
-        # The best is void in another folder or with other episodes.
-        if self._path.exists() and state.seeds == list(self._seeds):
-            self.best = state.best
+        """Restore the state; the best is void in another folder or with other episodes."""
+        self.success = state_dict["success"]
+        if self._path.exists() and state_dict["seeds"] == list(self._seeds):
+            self.best = state_dict["best"]
 
 
 def _results(future: Future, seeds: Sequence[int]) -> list[Result]:

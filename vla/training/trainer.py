@@ -21,7 +21,7 @@ from lightning.pytorch.strategies import ParallelStrategy
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 
 from vla.config.build import build
-from vla.models.checkpoint import read_content
+from vla.models.checkpoint import read_header
 from vla.parallel.limits import cores
 from vla.runs.folder import METRICS, metric_rows
 from vla.training.checkpoints import AtomicCheckpointIO, PeriodicCheckpoint
@@ -147,7 +147,7 @@ def restore_metrics(trainer: Trainer, checkpoint: Path) -> None:
     writers = [logger for logger in trainer.loggers if isinstance(logger, CSVLogger)]
     if not writers or not source.exists() or not trainer.is_global_zero:
         return
-    steps = read_content(checkpoint, weights=False)["global_step"]
+    steps = read_header(checkpoint).steps
     try:
         rows = metric_rows(source)
     except (OSError, ValueError) as error:  # they only inform

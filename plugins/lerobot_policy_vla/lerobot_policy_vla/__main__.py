@@ -1,4 +1,4 @@
-"""Write a checkpoint as a folder for `--policy.path`: python -m lerobot_policy_vla CHECKPOINT FOLDER."""
+"""Write a policy as a folder for `--policy.path`: python -m lerobot_policy_vla RUN FOLDER."""
 
 import sys
 from pathlib import Path

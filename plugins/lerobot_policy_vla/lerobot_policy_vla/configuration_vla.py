@@ -1,4 +1,4 @@
-"""Configuration of the policy: its checkpoint, and the features that it reads."""
+"""Configuration of the policy: its folder, and the features that it reads."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ from lerobot.configs import FeatureType, PolicyFeature, PreTrainedConfig
 from lerobot.utils.constants import ACTION
 
 from vla.envs.lerobot import IMAGES, RATES, STATE
-from vla.models.checkpoint import read_header
+from vla.models.policy_folder import read_policy
 
 
 @PreTrainedConfig.register_subclass("vla")
 @dataclass
 class VlaConfig(PreTrainedConfig):
-    """A checkpoint of vla.
+    """A policy of vla.
 
     Attributes:
-        checkpoint: its file; in a folder of `--policy.path`, relative to it.
+        checkpoint: its folder, or that of its run; in a folder of `--policy.path`, relative to it.
         precision: "fp32" or "bf16".
         compile: compile the model.
         lanes: environments that one pass through the model serves; unused ones are padding.
@@ -33,16 +33,16 @@ class VlaConfig(PreTrainedConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.checkpoint and Path(self.checkpoint).is_file():
+        if self.checkpoint and Path(self.checkpoint).is_dir():
             self.describe(Path(self.checkpoint))
 
     def describe(self, checkpoint: Path) -> None:
         """Describe what the policy sees, under the names of LeRobot.
 
         Raises:
-            ValueError: there is no checkpoint, or it is damaged.
+            ValueError: there is no policy, or it is damaged.
         """
-        spec = read_header(checkpoint).spec
+        spec = read_policy(checkpoint).spec
         vectors = {STATE: len(spec.pose), **({RATES: len(spec.rates)} if spec.rates else {})}
         self.input_features = {
             **{f"{IMAGES}{name}": PolicyFeature(FeatureType.VISUAL, (3, *spec.image_size)) for name in spec.cameras},

@@ -1,4 +1,4 @@
-"""A checkpoint of vla as a policy of LeRobot."""
+"""A policy of vla as one of LeRobot."""
 
 from __future__ import annotations
 
@@ -14,17 +14,16 @@ from torch import Tensor
 from lerobot_policy_vla.configuration_vla import VlaConfig
 from vla.config.experiment import make_policy
 from vla.envs.lerobot import TASK, observations
+from vla.models.policy_folder import POLICY, policy_folder
 from vla.policy import Policy
 from vla.spec import Array
 
-FILE = "policy.ckpt"  # of the checkpoint in a folder
-
 
 class VlaPolicy(PreTrainedPolicy):
-    """A checkpoint of vla as a policy of LeRobot, with one history per environment.
+    """A policy of vla as one of LeRobot, with one history per environment.
 
     Raises:
-        ValueError: there is no checkpoint, or it is damaged.
+        ValueError: there is no policy, or it is damaged.
     """
 
     config_class = VlaConfig
@@ -33,10 +32,12 @@ class VlaPolicy(PreTrainedPolicy):
     def __init__(self, config: VlaConfig, **_: Any) -> None:
         super().__init__(config)
         if not config.checkpoint:
-            raise ValueError("which checkpoint? --policy.checkpoint=FILE")
+            raise ValueError("which policy? --policy.checkpoint=RUN")
         device = "cuda" if str(config.device).startswith("cuda") else "cpu"
         options = {"device": device, "precision": config.precision, "compile": config.compile, "lanes": config.lanes}
-        self._policy: Policy = make_policy({"_target_": "vla.policy.Policy", **options}, Path(config.checkpoint))
+        self._policy: Policy = make_policy(
+            {"_target_": "vla.policy.Policy", **options}, policy_folder(config.checkpoint)
+        )
         self._policy.device = torch.device(str(config.device) if device == "cuda" else "cpu")  # such as cuda:1
         self.model = self._policy.model  # a module, so that it moves with this one
         self._lanes = 0  # environments that have a history
@@ -48,21 +49,21 @@ class VlaPolicy(PreTrainedPolicy):
         """Load a folder that `save_pretrained` wrote.
 
         Raises:
-            ValueError: it holds no checkpoint, or a damaged one.
+            ValueError: it holds no policy, or a damaged one.
         """
         folder = Path(pretrained_name_or_path)
         config = config or PreTrainedConfig.from_pretrained(folder)
         assert isinstance(config, VlaConfig)
-        config.checkpoint = str(folder / FILE)
-        config.describe(folder / FILE)
+        config.checkpoint = str(folder / POLICY)
+        config.describe(folder / POLICY)
         return cls(config)
 
     def _save_pretrained(self, save_directory: Path, state_dict: dict[str, Tensor] | None = None) -> None:
-        """Write the checkpoint, which holds its whole configuration, beside the configuration of LeRobot."""
-        shutil.copyfile(self.config.checkpoint, save_directory / FILE)
-        self.config.checkpoint = FILE
+        """Write the policy, which holds its whole configuration, beside the configuration of LeRobot."""
+        shutil.copytree(policy_folder(self.config.checkpoint), save_directory / POLICY, dirs_exist_ok=True)
+        self.config.checkpoint = POLICY
         self.config._save_pretrained(save_directory)
-        self.config.checkpoint = str(save_directory / FILE)
+        self.config.checkpoint = str(save_directory / POLICY)
 
     def reset(self) -> None:
         """Forget the histories of all environments."""

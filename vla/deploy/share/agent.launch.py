@@ -1,4 +1,4 @@
-"""ros2 launch vla agent.launch.py checkpoint:=FILE network:=site"""
+"""ros2 launch vla agent.launch.py checkpoint:=RUN network:=site"""
 
 from launch import LaunchDescription
 from launch.actions import DeclareLaunchArgument

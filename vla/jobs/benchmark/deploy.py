@@ -21,7 +21,7 @@ def measures(experiment: Experiment) -> dict[str, Measure]:
         ValueError: no loop or no checkpoint is chosen.
     """
     if not experiment["deploy"] or experiment["deploy"]["_target_"] != "vla.deploy.loop.Loop":
-        raise ValueError("benchmark.names=[deploy] needs deploy=loop checkpoint=FILE")
+        raise ValueError("benchmark.names=[deploy] needs deploy=loop checkpoint=RUN")
     loop = deployment(experiment)
     with loop.running() as operator:
         for _ in range(loop.episodes):

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import logging
 from difflib import get_close_matches
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,6 @@ from torch import Tensor, nn
 from vla.io.types import Pixels, Width
 from vla.models.hub import fetch
 from vla.models.packaged import PackagedFile
-from vla.models.pickles import load_tensors
 from vla.models.vision.image_tokenizer import FiLM, ImageEncoder
 
 log = logging.getLogger(__name__)
@@ -223,17 +223,14 @@ def _read(source: Path | PackagedFile) -> dict[str, Tensor]:
     """Read weights; of a pickle only tensors are read."""
     from safetensors.torch import load_file
 
-    packaged = isinstance(source, PackagedFile)
-    content = source.read() if packaged else b""
+    path = source.source if isinstance(source, PackagedFile) else source
+    content = BytesIO(source.read()) if isinstance(source, PackagedFile) else source
     try:
-        if packaged:
-            found = load_tensors(content)
-        else:
-            found = load_file(source) if source.suffix == ".safetensors" else load_tensors(source.read_bytes())
+        if isinstance(content, Path) and content.suffix == ".safetensors":
+            return load_file(content)
+        return dict(torch.load(content, map_location="cpu", weights_only=True))
     except Exception as error:  # a pickle can raise nearly anything
-        path = source.source if packaged else source
         raise ValueError(f"{path} cannot be read as weights, it is damaged or something else") from error
-    return dict(found)
 
 
 def _renamed(weights: dict[str, Tensor], name: str) -> dict[str, Tensor]:

@@ -1,0 +1,245 @@
+"""A trained policy as a folder of plain data: JSON, safetensors, and a card that a person reads.
+
+config.json has the resolved nodes of the training, spec.json its spaces, model.safetensors what was trained (the EMA
+weights, under the names of the modules), and training.json how that was done. Nothing in the folder is code.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import cache, cached_property
+from pathlib import Path
+from typing import Annotated, Any
+
+import torch
+from pydantic import StringConstraints
+from torch import Tensor
+from torch.overrides import TorchFunctionMode
+
+from vla.io.documents import STRICT, lines_of, parse_json, parse_plain, read_resolved
+from vla.io.types import Natural
+from vla.models.hub import fetch
+from vla.models.model import Model
+from vla.spec import Spec
+
+POLICY, BEST = "policy", "policy_best"  # in the folder of a run: its policy, and the best one in validation
+CONFIG, SPEC, WEIGHTS, TRAINING, CARD = "config.json", "spec.json", "model.safetensors", "training.json", "README.md"
+REQUIRED_NODES = ("task", "tokenizer", "model")  # of the config
+OPTIONAL_NODES = ("policy", "chosen", "expert", "collect", "data", "learner", "trainer", "validate")
+TRUTH_MODULES = ("truth_head", "truth_scale")  # modules of a model used in training only
+HUB = "hub:"
+REPOSITORY = re.compile(r"hub:([\w.-]+/[\w.-]+)@([\w./-]+)")
+FACTORIES: tuple[Any, ...] = (
+    *(torch.empty, torch.zeros, torch.ones, torch.full, torch.rand, torch.randn, torch.randint, torch.randperm),
+    *(torch.arange, torch.linspace, torch.eye),
+)
+
+
+@dataclass(frozen=True)
+class Training:
+    """training.json: how the weights were made."""
+
+    __pydantic_config__ = STRICT
+
+    steps: Natural  # of the optimiser
+    windows: str  # digest of the demonstrations, empty if unknown
+    seed: int | None
+    validation: tuple[Natural, Natural] | None  # first seed and number of the episodes that select among weights
+    weights: Annotated[str, StringConstraints(pattern=r"^[0-9a-f]{64}$")]  # SHA-256 of their file
+    versions: dict[str, str]  # library → version
+    figures: dict[str, float]  # of the last validation
+
+
+@dataclass(frozen=True)
+class SavedPolicy:
+    """A policy in a folder; its weights are read when they are asked for."""
+
+    folder: Path
+    config: dict[str, Any]  # of the training
+    spec: Spec
+    training: Training
+
+    @cached_property
+    def state(self) -> dict[str, Any]:
+        """Name → weights of the model, on the CPU, and the further state of its modules.
+
+        Raises:
+            ValueError: the file is damaged, or another than that of this training.
+        """
+        path = _file(self.folder, WEIGHTS)
+        with path.open("rb") as file:
+            if hashlib.file_digest(file, "sha256").hexdigest() != self.training.weights:
+                raise ValueError(f"{path} is damaged, or not the file that {TRAINING} describes: copy the folder again")
+        with _opened(path) as weights:
+            names: list[str] = weights.keys()  # it is no mapping
+            return _joined(weights.metadata() or {}, {name: weights.get_tensor(name) for name in names})
+
+    def initialize(self, model: Model) -> None:
+        """Load the weights for fine-tuning, as `restore`; the truth head keeps its own if the truth differs."""
+        state = self.state
+        if self.spec.truth != model.spec.truth:
+            state = {name: value for name, value in state.items() if name.partition(".")[0] not in TRUTH_MODULES}
+            for part, module in model.named_children():
+                if part in TRUTH_MODULES:
+                    state |= {f"{part}.{name}": value for name, value in module.state_dict().items()}
+        self.restore(model, state)
+
+    def restore(self, model: torch.nn.Module, state: dict[str, Any] | None = None) -> None:
+        """Load the weights, or another `state`, into `model`, and nothing larger, such as a text encoder.
+
+        Raises:
+            ValueError: they belong to another model.
+        """
+        state = self.state if state is None else state
+        try:
+            with self.budget():
+                model.load_state_dict(state)
+            for name, value in (*model.named_parameters(), *model.named_buffers()):
+                if name in state and state[name].dtype != value.dtype:
+                    raise ValueError(f"{name} has numbers of {state[name].dtype}, not {value.dtype}")
+        except Exception as error:  # whatever modules raise for a state that is not theirs
+            first = lines_of(error)[-1].strip()[:200]
+            raise ValueError(f"{self.folder} does not fit the model of its own configuration: {first}") from error
+
+    def budget(self) -> TensorBudget:
+        """Return the context in which a model is built that its file can fill."""
+        return TensorBudget(self.folder, _file(self.folder, WEIGHTS).stat().st_size)
+
+
+def policy_folder(name: str | Path) -> Path:
+    """Return the folder of a policy.
+
+    Args:
+        name: the folder, or that of a run, whose policy is meant, or hub:owner/name@revision.
+
+    Raises:
+        ValueError: there is none.
+    """
+    if str(name).startswith(HUB):
+        return _fetched(str(name))
+    path = Path(name)
+    for folder in (path, path / POLICY):
+        if (folder / SPEC).is_file():
+            return folder
+    if path.suffix == ".ckpt":
+        run = path.parent.parent
+        raise ValueError(f"{path} only resumes its own training: a policy is a folder, or the run that has it, {run}")
+    if path.is_dir():
+        best = f"; the best so far is {path / BEST}" if (path / BEST).exists() else ""
+        raise ValueError(f"{path} is neither a policy nor a run with one, there is no {path / POLICY / SPEC}{best}")
+    raise ValueError(f"there is no policy {path}: name a run, as in outputs/runs/…, its folder {POLICY}, or {HUB}…")
+
+
+def is_gone(name: str) -> bool:
+    """Return whether a policy that was here when a training began has been deleted since."""
+    return not name.startswith(HUB) and not Path(name).exists()
+
+
+@cache
+def _fetched(name: str) -> Path:
+    """Return the folder of a policy on the hub, downloading what is not cached: a revision is looked up once."""
+    if (found := REPOSITORY.fullmatch(name)) is None:
+        raise ValueError(f"{name} is no policy on the hub: write {HUB}OWNER/NAME@REVISION, a tag, a branch or a commit")
+    try:
+        return fetch(found[1], CONFIG, SPEC, WEIGHTS, TRAINING, CARD, revision=found[2])
+    except OSError as error:
+        raise ValueError(f"{name} cannot be fetched from the Hugging Face hub: {error}") from error
+
+
+def read_policy(name: str | Path) -> SavedPolicy:
+    """Read a policy but for its weights, as data: no code in it runs, and it holds resolved plain values.
+
+    Args:
+        name: as of `policy_folder`.
+
+    Raises:
+        ValueError: there is none, or a file is missing, damaged, or none of this project.
+        OSError: a file cannot be read.
+    """
+    folder = policy_folder(name)
+    config, spec, training = (read_resolved(_file(folder, each)) for each in (CONFIG, SPEC, TRAINING))
+    nodes = config if isinstance(config, dict) else {}
+    present = [nodes[name] for name in (*REQUIRED_NODES, *OPTIONAL_NODES) if name in nodes]
+    if not nodes.keys() >= {*REQUIRED_NODES} or not all(isinstance(node, dict) for node in present):
+        raise ValueError(f"{folder / CONFIG} is of no policy of this project: it lacks {', '.join(REQUIRED_NODES)}")
+    with _opened(_file(folder, WEIGHTS)):
+        pass  # its header has the sizes of all weights, which are those of the file
+    made = parse_plain(training, Training, str(folder / TRAINING))
+    return SavedPolicy(folder, nodes, Spec.from_dict(spec, str(folder / SPEC)), made)
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[Any]:
+    """Open a file of weights, whose header is checked; a ValueError if it is damaged."""
+    from safetensors import safe_open
+
+    try:
+        with safe_open(path, "pt") as file:
+            yield file
+    except Exception as error:  # safetensors has errors of its own
+        raise ValueError(f"{path} is damaged: {lines_of(error)[0][:200]}") from error
+
+
+def _file(folder: Path, name: str) -> Path:
+    """Return a file of a folder.
+
+    Raises:
+        ValueError: there is none, or it is a link out of the folder; those of the hub's cache lead to its blobs.
+    """
+    path, root = folder / name, folder.resolve()
+    if not path.resolve().is_relative_to(root.parents[1] if root.parent.name == "snapshots" else root):
+        raise ValueError(f"{path} is a link that leaves the folder: copy the policy from where it is whole")
+    if not path.is_file():
+        raise ValueError(f"{folder} has no {name}: copy the policy from where it is whole")
+    return path
+
+
+def require_unseen(name: str | Path, key: str, seeds: range) -> None:
+    """Raise a ValueError if a policy is to be evaluated on `seeds`, set by the dotted `key`, that selected it."""
+    first, count = read_policy(name).training.validation or (0, 0)
+    if shared := range(max(first, seeds.start), min(first + count, seeds.stop)):
+        raise ValueError(
+            f"{key}={seeds.start}: episodes {shared.start} to {shared.stop - 1} selected the weights in {name} when it "
+            f"was trained, and cannot evaluate them: set {key}={first + count} or another"
+        )
+
+
+def _joined(plain: Mapping[str, str], tensors: Mapping[str, Tensor]) -> dict[str, Any]:
+    """Return the state that `_split` took apart."""
+    state: dict[str, Any] = {name: parse_json(text, Any, name) for name, text in plain.items()}  # type: ignore[arg-type]
+    for name, tensor in tensors.items():
+        if "/" in name:
+            module, part, key = name.split("/", 2)
+            state[module].setdefault(part, {})[key] = tensor
+        else:
+            state[name] = tensor
+    return state
+
+
+class TensorBudget(TorchFunctionMode):
+    """Context that limits the total size of created tensors to what weights of `size` [bytes] in a `folder` could fill.
+
+    A config that requires more is refused at the first tensor above the limit, before it is allocated. A model built on
+    the device "meta" would tell the same, but its initialisation there imports PyTorch's compiler, which takes seconds.
+    """
+
+    def __init__(self, folder: Path, size: int) -> None:
+        super().__init__()
+        self._folder, self._remaining = folder, 2 * size + 2**26
+
+    def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        """Call `func` after subtracting the size of its result from the budget; a ValueError if it is exceeded."""
+        kwargs = kwargs or {}
+        if func in FACTORIES:
+            described = {name: value for name, value in kwargs.items() if name not in ("generator", "out")}
+            try:
+                self._remaining -= func(*args, **(described | {"device": "meta", "pin_memory": False})).nbytes
+            except RuntimeError:  # a size beyond any address
+                self._remaining = -1
+            if self._remaining < 0:
+                raise ValueError(f"{self._folder} describes a model that is larger than its weights")
+        return func(*args, **kwargs)

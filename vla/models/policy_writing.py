@@ -1,0 +1,106 @@
+"""Writing of a trained policy as a folder, see `vla.models.policy_folder`."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import os
+from collections.abc import Mapping
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from vla.io.files import atomic_path, write_json
+from vla.io.versions import installed_versions
+from vla.models import policy_folder as files
+from vla.models.checkpoint import weights_of
+
+TEXT = """---
+library_name: vla
+pipeline_tag: robotics
+tags:
+- robotics
+- imitation-learning
+---
+
+# {model} for {task}
+
+A policy of `vla`: configuration, spaces and weights, as plain data.
+
+| | |
+|-|-|
+{table}
+
+`python -m vla.run checkpoint=FOLDER` measures its success rate, `job=deploy deploy=server checkpoint=FOLDER` serves it,
+and in a program it is `vla.api.load_policy(FOLDER)`.
+"""  # of the card
+
+
+def write_policy(folder: Path, content: Mapping[str, Any]) -> None:
+    """Write a policy, which replaces the one in `folder`, of what Lightning saves of a training.
+
+    What is no tensor in the state of the model must be plain, or a mapping of plain values and of name → tensor.
+
+    Raises:
+        OSError: it cannot be written; an existing one is unchanged.
+    """
+    from safetensors.torch import save
+
+    config, spec = content["config"], content["spec"]
+    names = (*files.REQUIRED_NODES, *files.OPTIONAL_NODES, "seed", "pretrained")
+    nodes = {name: config[name] for name in names if name in config}
+    asked, seed = config.get("validate") or {}, config.get("seed")
+    validation = (asked["seed"], asked["episodes"]) if {"seed", "episodes"} <= asked.keys() else None
+    states = [part for part in content.values() if isinstance(part, dict)]  # that of the data module among them
+    windows = next((part["windows"] for part in states if isinstance(part.get("windows"), str)), "")
+    figures = {name: value for name, value in content["figures"].items() if math.isfinite(value)}
+    plain, tensors = _split(weights_of(content))
+    weights = save(tensors, plain)
+    digest, steps, versions = hashlib.sha256(weights).hexdigest(), content["global_step"], installed_versions()
+    training = files.Training(steps, windows, seed, validation, digest, versions, figures)
+    count = sum(tensor.numel() for tensor in tensors.values())
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    with atomic_path(folder) as draft:
+        draft.mkdir()
+        (draft / files.WEIGHTS).write_bytes(weights)
+        for name, part in ((files.CONFIG, nodes), (files.SPEC, spec), (files.TRAINING, asdict(training))):
+            write_json(draft / name, part)
+        (draft / files.CARD).write_text(_card(nodes, spec, training, count), encoding="utf-8")
+        for file in draft.iterdir():
+            with file.open("rb") as written:
+                os.fsync(written.fileno())
+
+
+def _split(state: Mapping[str, Any]) -> tuple[dict[str, str], dict[str, Tensor]]:
+    """Return what is plain in a state, as name → JSON, and the tensors; those within other parts have their path."""
+    plain, tensors = dict[str, str](), dict[str, Tensor]()
+    for name, value in state.items():
+        if isinstance(value, Tensor):
+            tensors[name] = value
+            continue
+        inner = {key: part for key, part in value.items() if isinstance(part, dict)} if isinstance(value, dict) else {}
+        parts = {key: part for key, part in inner.items() if all(isinstance(each, Tensor) for each in part.values())}
+        plain[name] = json.dumps({key: each for key, each in value.items() if key not in parts} if parts else value)
+        tensors |= {f"{name}/{key}/{each}": tensor for key, part in parts.items() for each, tensor in part.items()}
+    # Contiguous, and without shared memory, as the format demands.
+    whole = torch.contiguous_format
+    return plain, {name: each.detach().cpu().clone(memory_format=whole) for name, each in tensors.items()}
+
+
+def _card(config: Mapping[str, Any], spec: Mapping[str, Any], training: files.Training, count: int) -> str:
+    """Return what a person reads of a policy, with the header that the hub reads."""
+    model, task = (str(config[name].get("_target_", name)).rpartition(".")[2] for name in ("model", "task"))
+    rows = {
+        "weights": f"{count / 1e6:.2f} million numbers",
+        "cameras": f"{', '.join(spec['cameras'])} of {' by '.join(map(str, spec['image_size']))} px",
+        "state": ", ".join(spec["state"]),
+        "actions": f"{', '.join(spec['action'])} at {spec['control_hz']:g} Hz",
+        "training": f"{training.steps} steps, seed {training.seed}, demonstrations {training.windows or 'unknown'}",
+        **{name: f"{value:.4g}" for name, value in training.figures.items()},
+    }
+    table = "\n".join(f"| {name} | {text} |" for name, text in rows.items())
+    return TEXT.format(model=model, task=task, table=table)
