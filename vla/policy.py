@@ -109,11 +109,6 @@ class Policy:
         """Return what is known about the last action of a lane: token probabilities (D, K), if the model has them."""
         return self._lanes[lane].info
 
-    @property
-    def looks(self) -> bool:
-        """Whether the next action of lane 0 may depend on the images."""
-        return self.looking(0)
-
     def looking(self, lane: int) -> bool:
         """Return whether the next action of a lane is not chosen yet, or its observation is part of a history."""
         return not self._lanes[lane].chunk or self.history > 1

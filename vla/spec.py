@@ -404,7 +404,11 @@ class Drivable(Protocol):
 
 
 class Agent(Protocol):
-    """Source of actions: an expert, a policy, a person."""
+    """Source of actions: an expert, a policy, a person.
+
+    One that also has `looks`, whether its next action may depend on the images, gets no others rendered: false while a
+    planned chunk is executed and no new instruction discards it; always for experts on the truth.
+    """
 
     @property
     def info(self) -> dict[str, Any]:
@@ -442,20 +446,7 @@ class Agents(Protocol):
         ...
 
     def looking(self, lane: int) -> bool:
-        """Return whether the next action of a lane may depend on the images, as `Looking.looks`."""
-        ...
-
-
-@runtime_checkable
-class Looking(Agent, Protocol):
-    """Agent that declares at which steps it reads images, so that no other images are rendered."""
-
-    @property
-    def looks(self) -> bool:
-        """Whether the next action may depend on the images.
-
-        False while a planned chunk is executed and no new instruction discards it; always for experts on the truth.
-        """
+        """Return whether the next action of a lane may depend on the images, as `looks` of an `Agent`."""
         ...
 
 
