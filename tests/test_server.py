@@ -753,7 +753,7 @@ def test_whoever_acts_is_evaluated_by_the_same_job(tmp_path: Path) -> None:
     common = (*SMALL, "evaluate.episodes=1", "task.time_limit=1", "recorder=none")
     environment = Experiment.of(composed(*common)).make_environment()()
     policy = as_policy(make_bc(spec=environment.spec), spec=environment.spec)
-    expected = play(environment, as_policy(policy.model), FIRST_SEED)
+    expected = play(environment, as_policy(policy.model, spec=environment.spec), FIRST_SEED)
     environment.close()
     keys = Keys({"front": "observation/image", "wrist": "observation/wrist_image"}, ["observation/state"], "prompt")
     with serving(policy, keys=keys, api_key="s3cret", connections=1) as url:  # each condition closes its own
