@@ -85,7 +85,7 @@ NONSENSE = {
         *("model.chunk=-1", "model.width=-1", "model.width=0", "model.width=10000000", "model.keypoints=0"),
         *("model.text_width=0", "model.shift=[-1,-1]", "model.auxiliary=nan", "model.auxiliary=-1"),
         *("model.image.strides=[0,1,1]", "model.image.kernels=[0,0,0]", "model.image.kernels=[99,99,99]"),
-        *("model.text.vocabulary=1", "model.text.words=0", "model.text.characters=0", "model.text.dropout=1"),
+        *("model.text.vocabulary=1", "model.text.words=0", "model.text.word_dropout=1", "model.text.dropout=1"),
         *(
             "model.image.channels=[]",
             "tokenizer.bins=1",

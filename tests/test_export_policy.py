@@ -23,7 +23,7 @@ from vla.models.decoder import Decoder
 from vla.models.diffusion import Diffusion
 from vla.models.model import Model
 from vla.models.rt1 import RT1
-from vla.models.text.known_words import KnownWords
+from vla.models.text.ngrams import NGrams
 
 pytestmark = pytest.mark.usefixtures("faster_exports")
 
@@ -32,7 +32,7 @@ pytestmark = pytest.mark.usefixtures("faster_exports")
     "make",
     [
         lambda: make_bc(chunk=2),
-        lambda: make_bc(text=partial(KnownWords, **defaults_of("model/text/known_words"))),
+        lambda: make_bc(text=partial(NGrams, **defaults_of("model/text/known_words"))),
         lambda: make_rt1(proprioception=True, layers=1),
         lambda: make_decoder(layers=1),
         lambda: make_denoising(Diffusion, layers=1, steps=2),

@@ -19,9 +19,8 @@ from tiny_encoder import write_encoder
 
 from vla.config.build import check_node
 from vla.models.text.both import Both
-from vla.models.text.colours import NamedColours, simplified
+from vla.models.text.colours import in_basic_terms
 from vla.models.text.huggingface import HuggingFace
-from vla.models.text.known_words import KnownWords
 from vla.models.text.ngrams import NGrams
 from vla.models.text.tensor_cache import TensorCache
 from vla.tasks.tabletop.scene import COLOURS
@@ -39,7 +38,7 @@ def test_tokens_are_filled_up_and_the_filling_changes_nothing() -> None:
 
 
 def test_tokens_are_the_same_in_every_process() -> None:
-    program = "from vla.models.text.ngrams import NGrams; encoder = NGrams(4096, 3, 3, 0.0, width=4)"
+    program = "from vla.models.text.ngrams import NGrams; encoder = NGrams(4096, 3, 0.0, None, False, width=4)"
     program += "; print(encoder.tokenize(['lift the red block']).tolist())"
     elsewhere = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout
     assert elsewhere.strip() == str(
@@ -66,7 +65,7 @@ def test_case_and_punctuation_do_not_matter_but_order_does() -> None:
     ],
 )
 def test_names_of_colours_mean_basic_terms(said: str, meant: str) -> None:
-    knowing, plain = (kind(width=8, **defaults_of("model/text/ngrams")) for kind in (NamedColours, NGrams))
+    knowing, plain = (NGrams(width=8, **defaults_of(f"model/text/{option}")) for option in ("colours", "ngrams"))
     assert torch.equal(knowing.tokenize([said]), plain.tokenize([meant]))
     assert (said == meant) == torch.equal(plain.tokenize([said]), plain.tokenize([meant]))
 
@@ -75,7 +74,7 @@ def test_every_name_of_a_block_that_training_never_has_means_its_colour() -> Non
     names = OmegaConf.load(CONF / "task/randomize/phrasing/unseen_names.yaml").words
     for colour in COLOURS:
         for name in names[f"the {colour} block"]:
-            assert colour in simplified(name).split(), name
+            assert colour in in_basic_terms(name.split()), name
 
 
 SAID = {"block": "red", "other": "blue", "pad": "black", "rest": "white"}
@@ -135,10 +134,10 @@ def test_unknown_words_hardly_change_what_training_made_of_the_known_ones() -> N
     assert torch.cosine_similarity(one, other).item() > 0.8
 
 
-def make_known_words(sentences: list[str], **changes: Any) -> KnownWords:
+def make_known_words(sentences: list[str], **changes: Any) -> NGrams:
     """An encoder that has heard some sentences in training."""
     options = {"dropout": 0.0, "word_dropout": 0.0, **changes}
-    encoder = KnownWords(width=8, **defaults_of("model/text/known_words", **options))
+    encoder = NGrams(width=8, **defaults_of("model/text/known_words", **options))
     encoder(encoder.tokenize(sentences))
     return encoder.eval()
 
@@ -178,12 +177,11 @@ def test_sentences_go_without_a_share_of_their_words_in_training_only(kind: str)
     assert torch.equal(encoder(tokens), encoder(tokens))
 
 
-@pytest.mark.parametrize("name", ["words", "characters"])
-def test_n_grams_are_short(name: str) -> None:
+def test_n_grams_are_short() -> None:
     """Over the lengths up to 2^31, which a checkpoint could ask for, a single sentence took minutes."""
     node: Any = OmegaConf.to_container(OmegaConf.load(CONF / "model/text/ngrams.yaml"))
-    with pytest.raises(ValueError, match=rf"text\.{name} must be a whole number, at least 1, at most \d\d, got"):
-        check_node("text", {**node, name: 2**31 - 1}, object)
+    with pytest.raises(ValueError, match=r"text\.words must be a whole number, at least 1, at most 16, got"):
+        check_node("text", {**node, "words": 2**31 - 1}, object)
 
 
 def test_a_cache_holds_what_was_used_last_within_its_bytes() -> None:
@@ -208,14 +206,17 @@ def test_a_cache_holds_what_was_used_last_within_its_bytes() -> None:
 
 def test_both_are_n_grams_beside_a_sentence_encoder(tmp_path: Path) -> None:
     folder = str(write_encoder(tmp_path))
-    options = defaults_of("model/text/ngrams", vocabulary=2**24, dropout=0.0)
+    options: dict[str, Any] = defaults_of("model/text/ngrams", vocabulary=2**24, dropout=0.0)
     torch.manual_seed(0)
-    ngrams, sentence = NGrams(width=3, **{**options, "vocabulary": 64}), HuggingFace(folder, width=4)
+    small: dict[str, Any] = {**options, "vocabulary": 64}
+    ngrams, sentence = NGrams(width=3, **small), HuggingFace(folder, width=4)
     large = Both(partial(NGrams, **options), partial(HuggingFace, folder), width=2)
     exact = large.ngrams.tokenize(SENTENCES)
     assert exact.max() > 2**23 and torch.equal(large.tokenize(SENTENCES)[:, 16:].long(), exact)
     both = Both(lambda width: ngrams, lambda width: sentence, width=7)
     expected = torch.cat([part(part.tokenize(SENTENCES)) for part in (ngrams, sentence)], 1)
     torch.testing.assert_close(both(both.tokenize(SENTENCES)), expected)
-    both = Both(partial(NGrams, **{**options, "vocabulary": 64}), partial(HuggingFace, folder), width=7)
+    both = Both(partial(NGrams, **small), partial(HuggingFace, folder), width=7)
     assert both(both.tokenize(SENTENCES)).shape == (3, 7)
+    with pytest.raises(ValueError, match=r"ngrams\.word_dropout must be null beside a sentence encoder"):
+        Both(partial(NGrams, **{**options, "word_dropout": 0.1}), partial(HuggingFace, folder), width=2)

@@ -21,11 +21,16 @@ class Both(TextEncoder):
         ngrams: factory of the n-grams, called with `width`.
         sentence: factory of the sentence encoder, called with `width`.
         width: length of the vector.
+
+    Raises:
+        ValueError: the n-grams have word dropout, whose tokens are too large for a tensor of floats.
     """
 
     def __init__(self, ngrams: Callable[..., NGrams], sentence: Callable[..., HuggingFace], *, width: int) -> None:
         super().__init__(width)
         self.ngrams, self.sentence = ngrams(width=width // 2), sentence(width=width - width // 2)
+        if self.ngrams.word_dropout is not None:
+            raise ValueError("model.text.ngrams.word_dropout must be null beside a sentence encoder")
 
     def tokenize(self, sentences: list[str]) -> Tensor:
         """Return (B, E + L) float32: frozen vectors, and hashes of n-grams, below 2^24 and therefore exact."""

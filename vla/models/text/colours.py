@@ -1,39 +1,20 @@
-"""N-grams of sentences in which names of colours are replaced by basic terms."""
+"""Names of colours in basic terms: crimson is red, though training never says so."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import cache, lru_cache
+from functools import cache
 
 import numpy as np
-from torch import Tensor
-
-from vla.models.text.ngrams import NGrams, words_of
 
 # The basic colour terms of English (Berlin and Kay, Basic Color Terms, 1969).
 TERMS = ("black", "white", "grey", "red", "green", "yellow", "blue", "brown", "orange", "pink", "purple")
 
 
-class NamedColours(NGrams):
-    """N-grams of sentences whose colour names are replaced by basic colour terms: crimson by red.
-
-    The mapping is not learned but comes from a survey, see `terms`; it covers names that training does not contain.
-    """
-
-    def tokenize(self, sentences: list[str]) -> Tensor:
-        """Return (B, L) int64 hashes of the n-grams of B sentences in basic terms, padded with 0."""
-        return super().tokenize([simplified(sentence) for sentence in sentences])
-
-
-@lru_cache(4096)
-def simplified(sentence: str) -> str:
-    """Return the words of a sentence in lower case, with names of colours in basic terms."""
-    return " ".join(in_basic_terms(words_of(sentence)))
-
-
 def in_basic_terms(words: Sequence[str]) -> list[str]:
     """Replace each name of a colour, of one or several words, by a basic term: navy blue by blue, crimson by red.
 
+    The mapping is not learned but comes from a survey, see `terms`; it covers names that training does not contain.
     A name directly after another one is the thing that has the colour, and stays: "jade brick" becomes "green brick".
 
     Args:

@@ -1,6 +1,6 @@
 """Text encoders: the base class, and learned embeddings of n-grams.
 
-Shapes: B sentences, L tokens of the longest, such as its n-grams.
+Shapes: B sentences, L tokens of the longest, such as its n-grams or its W words.
 """
 
 from __future__ import annotations
@@ -8,7 +8,6 @@ from __future__ import annotations
 import re
 import zlib
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Hashable
 from typing import Annotated
 
 import torch
@@ -16,11 +15,14 @@ from annotated_types import Ge, Le
 from torch import Tensor, nn
 
 from vla.io.types import Rate
+from vla.models.text.colours import in_basic_terms
 from vla.models.text.tensor_cache import TensorCache
 
 PADDING = 0
+CHARACTERS = 3  # length of character n-grams
 CACHE = TensorCache(64 << 20)  # of the hashes of sentences, about 1.5 kB each
 INITIAL_STD = 0.1  # of embeddings; small, so that untrained n-grams have little effect
+PRIME, FACTOR = 2**31 - 1, 1_000_003  # of the polynomial hash of n-grams; its products fit into 64 bits
 
 
 class TextEncoder(nn.Module, ABC):
@@ -43,71 +45,86 @@ class TextEncoder(nn.Module, ABC):
         """Return (B, width) vectors for the (B, L) output of `tokenize`."""
 
 
-class HashEmbedding(TextEncoder):
-    """Base class of encoders with learned embeddings of hashed n-grams.
-
-    Args:
-        vocabulary: number of embeddings.
-        dropout: rate at which n-grams are dropped in training.
-        width: length of the sentence vector.
-    """
-
-    def __init__(self, vocabulary: int, dropout: float, width: int) -> None:
-        super().__init__(width)
-        self.vocabulary, self.dropout = vocabulary, dropout
-        self.embedding = nn.Embedding(vocabulary, width, padding_idx=PADDING)
-        with torch.no_grad():
-            self.embedding.weight.mul_(INITIAL_STD)
-        self.norm = nn.LayerNorm(width)
-
-    def average(self, rows: Tensor) -> Tensor:
-        """Return the normalised means, (B, width), of the embeddings of (B, L) rows; 0 is ignored at any position."""
-        if self.training and self.dropout:
-            rows = rows * (torch.rand(rows.shape, device=rows.device) >= self.dropout)
-        count = (rows != PADDING).sum(1, keepdim=True).clamp(min=1)
-        return self.norm(self.embedding(rows).sum(1) / count)
-
-
-class NGrams(HashEmbedding):
+class NGrams(TextEncoder):
     """Mean of learned embeddings of the hashed words and n-grams of a sentence; needs no download.
 
-    Unseen words share character n-grams with known ones. Trigrams of words distinguish "put the red block on the blue
-    block" from "put the blue block on the red block", which have the same bigrams.
+    Trigrams of words distinguish "put the red block on the blue block" from "put the blue block on the red block",
+    which have the same bigrams. Words that training does not have are treated in one of two ways:
+
+    - They share n-grams of characters with known ones.
+    - With `word_dropout` there are no n-grams of characters, and unknown words are left out before n-grams are taken:
+      "put the red brick on the pad" becomes "put the red on the pad". Word dropout (Iyyer et al., Deep Unordered
+      Composition, ACL 2015) produces such sentences in training.
 
     Args:
         vocabulary: number of embeddings; n-grams with the same hash share one.
         words: longest n-gram of words.
-        characters: length of character n-grams, taken from every word with boundary marks.
         dropout: rate at which n-grams are dropped in training, which imitates unknown words.
+        word_dropout: rate at which words are left out in training; None: unknown words are not left out.
+        basic_colours: whether names of colours are replaced by basic terms, see `vla.models.text.colours`.
         width: length of the sentence vector.
     """
+
+    heard: Tensor  # (vocabulary,) bool: rows of the words seen in training; None without word dropout
 
     def __init__(
         self,
         vocabulary: Annotated[int, Ge(2), Le(2**24)],
         words: Annotated[int, Ge(1), Le(16)],
-        characters: Annotated[int, Ge(1), Le(32)],
         dropout: Rate,
+        word_dropout: Rate | None,
+        basic_colours: bool,
         *,
         width: int,
     ) -> None:
-        super().__init__(vocabulary, dropout, width)
-        self.words, self.characters = words, characters
+        super().__init__(width)
+        self.vocabulary, self.words, self.basic_colours = vocabulary, words, basic_colours
+        self.dropout, self.word_dropout = dropout, word_dropout
+        self.embedding = nn.Embedding(vocabulary, width, padding_idx=PADDING)
+        with torch.no_grad():
+            self.embedding.weight.mul_(INITIAL_STD)
+        self.norm = nn.LayerNorm(width)
+        self.register_buffer("heard", None if word_dropout is None else torch.zeros(vocabulary, dtype=torch.bool))
 
     def tokenize(self, sentences: list[str]) -> Tensor:
-        """Return (B, L) int64 hashes of the n-grams of B lower-cased sentences, padded with 0."""
-        sizes = self.vocabulary, self.words, self.characters
-        return padded(sentences, lambda sentence: _hashes(sentence, *sizes), *sizes)
+        """Return (B, L) int64 hashes, padded with 0: of n-grams, or with word dropout of words, case ignored."""
+        options = self.vocabulary, self.words, self.word_dropout is None, self.basic_colours
+        rows = [CACHE.get(each, lambda each=each: torch.tensor(self._hashes(each)), *options) for each in sentences]
+        return nn.utils.rnn.pad_sequence(rows, batch_first=True, padding_value=PADDING)
+
+    def _hashes(self, sentence: str) -> list[int]:
+        found = words_of(sentence)
+        if self.basic_colours:
+            found = in_basic_terms(found)
+        # crc32, because hash() differs between processes.
+        if self.word_dropout is not None:
+            return [1 + zlib.crc32(word.encode()) % (PRIME - 1) for word in found] or [PADDING]
+        grams = [*_word_ngrams(found, self.words), *_character_ngrams(found)]
+        return [1 + zlib.crc32(gram.encode()) % (self.vocabulary - 1) for gram in grams] or [PADDING]
 
     def forward(self, tokens: Tensor) -> Tensor:
         """Return (B, width) vectors for (B, L) tokens; 0 is ignored at any position."""
-        return self.average(tokens)
+        rows = tokens
+        if self.word_dropout is not None:
+            rows = self._rows(_hashed_ngrams(self._known(tokens, self.word_dropout), self.words))
+        if self.training and self.dropout:
+            rows = rows * (torch.rand(rows.shape, device=rows.device) >= self.dropout)
+        count = (rows != PADDING).sum(1, keepdim=True).clamp(min=1)
+        return self.norm(self.embedding(rows).sum(1) / count)
 
+    def _known(self, tokens: Tensor, rate: float) -> Tensor:
+        """Leave words out of (B, W) tokens: in training at a rate, otherwise those that training did not have."""
+        rows = self._rows(tokens)
+        if self.training:
+            self.heard.index_fill_(0, rows.flatten(), True)  # each process its own; those of the first are saved
+            left_out = torch.rand(tokens.shape, device=tokens.device) < rate
+        else:
+            left_out = ~self.heard[rows]
+        return _shifted_left(tokens.masked_fill(left_out, PADDING))
 
-def padded(sentences: list[str], hashes: Callable[[str], list[int]], *options: Hashable) -> Tensor:
-    """Return (B, L) int64 hashes of B sentences, padded with 0; they are cached by sentence and options."""
-    rows = [CACHE.get(each, lambda each=each: torch.tensor(hashes(each) or [PADDING]), *options) for each in sentences]
-    return nn.utils.rnn.pad_sequence(rows, batch_first=True, padding_value=PADDING)
+    def _rows(self, hashes: Tensor) -> Tensor:
+        """Return the rows of the embedding for hashes below 2^31."""
+        return torch.where(hashes == PADDING, PADDING, 1 + hashes % (self.vocabulary - 1))
 
 
 def words_of(sentence: str) -> list[str]:
@@ -115,12 +132,29 @@ def words_of(sentence: str) -> list[str]:
     return re.findall(r"\w+", sentence.lower())
 
 
-def _hashes(sentence: str, vocabulary: int, words: int, characters: int) -> list[int]:
-    """Return the L hashes of the n-grams of a sentence."""
-    found = words_of(sentence)
-    grams = [" ".join(found[i : i + n]) for n in range(1, words + 1) for i in range(len(found) - n + 1)]
-    for word in found:
-        marked = f"<{word}>"
-        grams += [f"#{marked[i : i + characters]}" for i in range(len(marked) - characters + 1)]
-    # crc32, because hash() differs between processes.
-    return [1 + zlib.crc32(gram.encode()) % (vocabulary - 1) for gram in grams]
+def _word_ngrams(words: list[str], longest: int) -> list[str]:
+    return [" ".join(words[i : i + n]) for n in range(1, longest + 1) for i in range(len(words) - n + 1)]
+
+
+def _character_ngrams(words: list[str]) -> list[str]:
+    """Return the n-grams of characters of every word with marks of its ends; # tells them from words."""
+    marked = [f"<{word}>" for word in words]
+    return [f"#{word[i : i + CHARACTERS]}" for word in marked for i in range(len(word) - CHARACTERS + 1)]
+
+
+def _shifted_left(tokens: Tensor) -> Tensor:
+    """Move the padding of (B, W) tokens to the end of each row."""
+    length = tokens.shape[1]
+    places = torch.arange(length, device=tokens.device)
+    return tokens.gather(1, torch.where(tokens == PADDING, places + length, places).argsort(1))
+
+
+def _hashed_ngrams(tokens: Tensor, longest: int) -> Tensor:
+    """Return hashes of the n-grams of up to `longest` of (B, W) tokens, (B, L); `PADDING` where a row is too short."""
+    length = tokens.shape[1]
+    padded = nn.functional.pad(tokens, (0, longest - 1), value=PADDING)
+    grams = [tokens]
+    for further in range(1, longest):
+        following = padded[:, further : further + length]
+        grams.append(torch.where(following == PADDING, PADDING, (grams[-1] * FACTOR + following) % PRIME))
+    return torch.cat(grams, 1)
