@@ -17,9 +17,6 @@ from vla.config.compose import CONF as CONF
 from vla.config.compose import compose
 from vla.config.packages import TRUSTED, trusted
 
-# Variants that change an option of RT-1.
-RT1_VARIANTS = {"images_and_text", "dropout", "smaller", "no_history", "small_embeddings", "two_tokens"}
-
 
 def composed(*overrides: str) -> DictConfig:
     """What the command line composes.
@@ -42,7 +39,8 @@ def check(config: DictConfig) -> None:
 
 def _is_value(override: str) -> bool:
     key = override.partition("=")[0]
-    return key[0] not in "+~" and not key.startswith("hydra") and "/" not in key and not (CONF / key).is_dir()
+    composing = key == "variant" or key.startswith("hydra") or "/" in key or (CONF / key).is_dir()
+    return key[0] not in "+~" and not composing
 
 
 @cache

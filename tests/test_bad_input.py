@@ -164,7 +164,10 @@ def test_a_job_that_takes_no_checkpoint_says_which_word_does(tmp_path: Path) -> 
         ("experiment=recipe", "experiment=recipe is a grid of runs: add -m"),
         ("-m experiment=ablation,recipe", "experiment=ablation is a grid of its own: name no other one beside it"),
         ("-m seed=0,1 output=there", "every cell has a folder of its own: name that of the sweep, hydra.sweep.dir=DIR"),
-        ("variant=no_transformer model=rt1_small", "variant=no_transformer is model=bc: omit model=rt1_small"),
+        (
+            "-m experiment=ablation variant=no_transformer model=rt1_small seed=0",
+            "variant=no_transformer is model=bc: omit model=rt1_small",
+        ),
         ("experiment=standard task=metaworld", "the option chosen for task has no randomize: choose another task"),
         ("task.image_size.height=64", "height"),
         ("checkpoint=x output=2", "output=2 is not a path"),

@@ -335,7 +335,7 @@ KEPT = [
     "model/image=efficientnet",
     "+model.x=1",
     "experiment=few",
-    "variant=smaller",
+    "model.shift=[0,0]",
 ]
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from functools import cache
 from inspect import Parameter, signature
@@ -12,13 +13,15 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
-from composing import CONF, RT1_VARIANTS, check, composed
+from composing import CONF, check, composed
 from defaults import defaults_of
 from hydra import compose, initialize_config_dir
 from hydra.utils import get_class
 from omegaconf import OmegaConf
 
+from vla.config.axes import axes
 from vla.config.check import conditions
+from vla.config.compose import compose as compose_whole
 from vla.config.differences import differences
 from vla.config.experiment import Experiment, plain
 from vla.deploy.bag import POLICY_INPUTS
@@ -30,20 +33,19 @@ from vla.tasks.tabletop.environment import Tabletop
 from vla.tasks.tabletop.goals.stay import REST_STEPS
 from vla.tasks.tabletop.simulation import WORKSPACE
 
-AXES = CONF / "task/randomize"  # a group for each, with levels of the same names
-LEVELS = sorted({path.stem for path in AXES.glob("*/*.yaml")} - {"swapped"})
+LEVELS = sorted({level for levels in axes().values() for level in levels} - {"swapped"})
 OPTIONS = [
     (path.parent.relative_to(CONF).as_posix(), path.stem)
     for path in sorted(CONF.rglob("*.yaml"))
-    if path.parent != CONF and path.parent.name != "hydra" and path.parents[1] != AXES
+    if path.parent != CONF and path.parent.name != "hydra" and not path.stem.startswith("_")
 ]
+MODELS = sorted(path.stem for path in (CONF / "model").glob("[!_]*.yaml"))
 
 
 pytestmark = pytest.mark.usefixtures("recording")
 
 # Options that are only for some options of another group.
 TOGETHER = {
-    **{("variant", option): ["model=rt1_tiny"] for option in RT1_VARIANTS},
     ("evaluate", "lerobot"): ["task=metaworld"],
     ("tokenizer", "fast"): ["model=decoder"],
     ("job", "deploy"): ["deploy=ros2"],
@@ -91,10 +93,12 @@ def test_every_encoder_can_be_chosen_with_every_model() -> None:
         assert not {"image", "text"} & set(yaml.safe_load(path.read_text())), path.name
 
 
-def variants(experiment: str) -> list[str]:
-    """What a grid compares."""
+def variants(experiment: str) -> dict[str, list[str]]:
+    """What a grid compares: name → what the command line would say."""
     file = yaml.safe_load((CONF / f"experiment/{experiment}.yaml").read_text())
-    return [name.strip() for name in file["hydra"]["sweeper"]["params"]["variant"].split(",")]
+    named = [name.strip() for name in file["hydra"]["sweeper"]["params"]["variant"].split(",")]
+    assert named == [*file["variants"]] and named[0] == "none"
+    return file["variants"]
 
 
 GRIDS = [(name, variant) for name in ("ablation", "images_alone", "recipe") for variant in variants(name)]
@@ -102,12 +106,31 @@ GRIDS = [(name, variant) for name in ("ablation", "images_alone", "recipe") for 
 
 @pytest.mark.parametrize(("experiment", "variant"), GRIDS, ids="-".join)
 def test_every_variant_of_a_grid_is_a_model(experiment: str, variant: str, tabletop: Tabletop) -> None:
-    chosen = (f"experiment={experiment}", f"variant={variant}")
-    learner = Experiment.of(composed(*chosen)).learner(tabletop.spec)
+    config = composed(f"experiment={experiment}", f"variant={variant}")
+    learner = Experiment.of(config).learner(tabletop.spec)
     assert sum(weight.numel() for weight in learner.model.parameters()) > 10_000
-    first = plain(composed(f"experiment={experiment}", "variant=none"))
-    changed = [key for key, *_ in differences(first, plain(composed(*chosen))) if not key.startswith("chosen")]
+    typed = variants(experiment)[variant]
+    assert plain(config) == plain(composed(f"experiment={experiment}", *typed))
+    first = plain(composed(f"experiment={experiment}"))
+    changed = [key for key, *_ in differences(first, plain(config)) if not key.startswith("chosen")]
     assert (variant == "none") == (not changed)
+
+
+@pytest.mark.parametrize(
+    ("overrides", "sentence"),
+    [
+        (
+            ("experiment=recipe", "variant=no_shft"),
+            "there is no variant=no_shft, did you mean no_shift? there are none",
+        ),
+        (("variant=no_shift",), "there is no variant=no_shift; an experiment that is a grid has variants"),
+        (("experiment=recipe", "variant=chunked", "model.chunk=2"), "is model.chunk=4: omit model.chunk=2"),
+        (("+variants.mine=3", "variant=mine"), "variants.mine must be a list"),
+    ],
+)
+def test_a_variant_that_cannot_be_is_refused(overrides: tuple[str, ...], sentence: str) -> None:
+    with pytest.raises(ValueError, match=re.escape(sentence)):
+        compose_whole("output=there", *overrides)
 
 
 @pytest.mark.parametrize(
@@ -127,8 +150,7 @@ def test_success_is_what_the_documentation_says(goal: str, values: dict[str, flo
 
 @pytest.mark.parametrize("level", LEVELS)
 def test_every_axis_of_randomisation_at_a_level(level: str) -> None:
-    axes = [path.parent.name for path in sorted(AXES.glob(f"*/{level}.yaml")) if path.parent.name != "naming"]
-    check(composed(*(f"task/randomize/{axis}={level}" for axis in axes)))
+    check(composed(*(f"{axis}={level}" for axis, levels in axes().items() if level in levels)))
 
 
 def test_an_axis_is_applied_at_its_place_however_it_was_switched_on() -> None:
@@ -178,17 +200,27 @@ def test_a_misspelt_word_in_a_condition_is_found_before_anything_is_done() -> No
         check(wrong)
 
 
-@pytest.mark.parametrize("experiment", ["standard", "few", "multitask"])
-def test_no_experiment_changes_how_rt1_is_augmented(experiment: str) -> None:
-    assert composed(f"experiment={experiment}", "model=rt1").model.shift == [20, 50]
-    assert composed(f"experiment={experiment}").model.shift == [4, 4]
+@pytest.mark.parametrize("model", MODELS)
+def test_every_model_says_by_how_much_it_shifts_images(model: str) -> None:
+    assert composed(f"model={model}").model.shift == ([20, 50] if model == "rt1" else [12, 12])
+    assert composed("experiment=rt1").model.shift == [20, 50]
+    for experiment in ("standard", "few", "multitask"):  # of any model
+        assert composed(f"experiment={experiment}", f"model={model}").model.shift == [4, 4]
+
+
+def test_no_model_extends_another_one() -> None:
+    for path in (CONF / "model").glob("*.yaml"):
+        file = yaml.safe_load(path.read_text())
+        extended = [each for each in file["defaults"] if isinstance(each, str) and each != "_self_"]
+        assert all(name.startswith("_") for name in extended), path.name
+        assert ("_target_" in file) == (path.stem in MODELS), path.name
 
 
 def test_a_model_changes_nothing_but_itself() -> None:
     default = plain(composed())
-    for path in sorted((CONF / "model").glob("*.yaml")):
-        other = plain(composed(f"model={path.stem}"))
-        assert {name for name in default if other[name] != default[name]} <= {"model", "chosen"}, path.stem
+    for model in MODELS:
+        other = plain(composed(f"model={model}"))
+        assert {name for name in default if other[name] != default[name]} <= {"model", "chosen"}, model
 
 
 def test_options_are_named_as_the_command_line_names_them() -> None:
@@ -246,7 +278,7 @@ def test_numbers_that_the_simulator_and_a_file_need_are_equal() -> None:
 
 @pytest.mark.parametrize("path", sorted(CONF.rglob("*.yaml")), ids=lambda path: path.relative_to(CONF).as_posix())
 def test_what_stands_in_a_file_has_no_default_in_the_code(path: Path) -> None:
-    for node in nodes(OmegaConf.to_container(OmegaConf.load(path))):
+    for node in nodes(axes() if path.name == "axes.yaml" else OmegaConf.to_container(OmegaConf.load(path))):
         if node["_target_"].startswith("vla."):
             parameters = signature(get_class(node["_target_"])).parameters.values()
             defaults = {each.name for each in parameters if each.default is not Parameter.empty}

@@ -14,6 +14,7 @@ from hydra.errors import InstantiationException
 from hydra.utils import instantiate
 from matplotlib.colors import XKCD_COLORS, rgb_to_hsv, to_rgb
 
+from vla.config.axes import axes
 from vla.config.check import conditions
 from vla.config.experiment import plain
 from vla.io.documents import read_yaml
@@ -73,7 +74,7 @@ def heard() -> set[str]:
     return {word for each in said for word in re.findall(r"\w+", re.sub(r"{\w+}", "", each))}
 
 
-UNSEEN = read_yaml(CONF / "task/randomize/phrasing/unseen_names.yaml", dict[str, Any])["words"]
+UNSEEN = axes()["task/randomize/phrasing"]["unseen_names"]["words"]
 GRAMMATICAL = {"the", "one", "that", "looks", "like", "a", "an"}
 
 

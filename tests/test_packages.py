@@ -21,7 +21,7 @@ from clusters import PLACES, address_in, dask
 from collecting import content
 from command_line import here
 from command_line import vla as vla_process
-from composing import CONF, RT1_VARIANTS, check, composed
+from composing import CONF, check, composed
 from conftest import made_once
 from hydra.errors import ConfigCompositionException
 from saved_policies import save_run
@@ -139,21 +139,19 @@ def test_a_job_with_a_group_of_its_own_is_two_options_and_a_module(home: Path, i
 OF_ONE_WORLD = {
     *("ablation", "few", "images_alone", "learning_curve", "multitask", "recipe", "standard"),
     *("generalisation", "language", "levels", "paper", "suite", "tabletop"),
-    *("no_excursions", "no_noise", "coarse_images"),
     *("unseen_names", "renderer", "lerobot", "metaworld", "metaworld_perturbed", "metaworld_improved", "few_improved"),
     *("multitask_improved", "standard_improved"),
 }
 
 
-@pytest.mark.parametrize("group", ["experiment", "evaluate", "validate", "variant"])
+@pytest.mark.parametrize("group", ["experiment", "evaluate", "validate"])
 def test_options_go_with_any_world_or_are_refused_for_it(
     group: str, importable: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv(packages.TRUSTED, "mypackage")
     options = {path.stem for path in (CONF / group).glob("*.yaml")}
     for option in sorted(options - OF_ONE_WORLD):
-        model = ["model=rt1_tiny"] if option in RT1_VARIANTS else []
-        check(composed("task=mine", "expert=mine", f"{group}={option}", *model))
+        check(composed("task=mine", "expert=mine", f"{group}={option}"))
     for option in sorted(options & OF_ONE_WORLD):
         with pytest.raises(
             (ValueError, ConfigCompositionException), match=r"randomize|perturb|task/goal|renderer|window|image_size"

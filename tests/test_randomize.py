@@ -8,8 +8,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from conftest import CONF, make_tabletop
+from conftest import make_tabletop
 
+from vla.config.axes import axes
 from vla.spec import Array
 from vla.tasks.streams import Streams
 from vla.tasks.tabletop.environment import Tabletop
@@ -17,7 +18,7 @@ from vla.tasks.tabletop.randomize.blocks import Colours, Distractors, Masses, Pl
 
 DEFAULT = {"distractors", "colour", "size", "mass", "friction", "placement", "arm", "light", "camera", "table"}
 # What is asked for, which "naming" changes, is no draw, and a disturbance is no property of the scene.
-AXES = sorted({path.name for path in (CONF / "task/randomize").iterdir() if path.is_dir()} - {"naming", "disturbance"})
+AXES = sorted({group.rpartition("/")[2] for group in axes()} - {"naming", "disturbance"})
 INVISIBLE = {"mass", "friction", "gain", "latency", "phrasing"}  # until something moves, or speaks
 
 

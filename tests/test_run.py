@@ -459,7 +459,7 @@ def test_a_policy_is_trained_further_for_another_goal(home: Path, tmp_path: Path
     for name, weight in before.state.items():
         gathered = name.startswith(("proprioception.", "truth_scale."))  # statistics, of all that was ever seen
         assert gathered or torch.allclose(after.state[name], weight, atol=1e-9), name
-    for other in ("model=rt1_tiny", "tokenizer.bins=64", "variant=no_shift"):
+    for other in ("model=rt1_tiny", "tokenizer.bins=64", "model.shift=[0,0]"):
         refused = here(home, *arguments, other, ok=False)
         assert f"error: {other} cannot be combined with a checkpoint" in refused.stderr
     refused = here(home, *arguments, "checkpoint=tuned", ok=False)

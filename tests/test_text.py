@@ -17,6 +17,7 @@ from hydra.utils import instantiate
 from omegaconf import OmegaConf
 from tiny_encoder import write_encoder
 
+from vla.config.axes import axes
 from vla.config.build import check_node
 from vla.models.text.both import Both
 from vla.models.text.colours import in_basic_terms
@@ -71,7 +72,7 @@ def test_names_of_colours_mean_basic_terms(said: str, meant: str) -> None:
 
 
 def test_every_name_of_a_block_that_training_never_has_means_its_colour() -> None:
-    names = OmegaConf.load(CONF / "task/randomize/phrasing/unseen_names.yaml").words
+    names = axes()["task/randomize/phrasing"]["unseen_names"]["words"]
     for colour in COLOURS:
         for name in names[f"the {colour} block"]:
             assert colour in in_basic_terms(name.split()), name

@@ -25,8 +25,9 @@ from yaml import YAMLError
 
 from vla import jobs
 from vla.config.annotations import packages, targets
+from vla.config.axes import axes, offer_axes
 from vla.config.check import Job, check, devices
-from vla.config.compose import CONF  # registers the resolver `jobs` of --help
+from vla.config.compose import CONF, with_variant  # registers the resolver `jobs` of --help
 from vla.config.experiment import Experiment, plain
 from vla.config.packages import config_folders, offer_options, option_packages, trust, trust_own
 from vla.config.substitutes import builds_world, with_substitutes
@@ -54,8 +55,9 @@ def _described(error: Exception) -> str:
         return "a value or a folder is nested too deep: HYDRA_FULL_ERROR=1 shows where"
     if isinstance(error, MissingConfigException) and error.missing_cfg_file and error.options is not None:
         group, _, option = error.missing_cfg_file.rpartition("/")
-        hint = suggestion(option, error.options) or ":"
-        return f"{group} has no option {option}{hint} there are {', '.join(error.options)}"
+        options = [name for name in error.options if not name.startswith("_")]  # others only extend these
+        hint = suggestion(option, options) or ":"
+        return f"{group} has no option {option}{hint} there are {', '.join(options)}"
     if isinstance(error, OverrideParseException):
         reason = error.message.splitlines()[0]
         return f"cannot read {error.override}: {reason}; quote special characters, as in 'key=\"value\"'"
@@ -156,19 +158,6 @@ def _require_swept() -> None:
         raise ValueError("with -m every cell has a folder of its own: name that of the sweep, hydra.sweep.dir=DIR")
 
 
-def _require_variant() -> None:
-    """Refuse an option of the command line that replaces the one which makes the variant."""
-    choices = HydraConfig.get().runtime.choices
-    variant = choices.get("variant")
-    paths = (folder / f"variant/{variant}.yaml" for folder in config_folders())
-    file = next((path for path in paths if path.is_file()), None)
-    for entry in OmegaConf.select(OmegaConf.load(file), "defaults", default=[]) if file else []:
-        for key, option in entry.items() if isinstance(entry, DictConfig) else ():
-            group = str(key).removeprefix("override /")
-            if choices.get(group) != option:
-                raise ValueError(f"variant={variant} is {group}={option}: omit {group}={choices.get(group)}")
-
-
 @contextmanager
 def _without_empty_folders(cfg: DictConfig) -> Iterator[None]:
     """Remove the folder that Hydra created for this run, and `output` if it is new, if nothing is in them at the end.
@@ -190,10 +179,10 @@ def _without_empty_folders(cfg: DictConfig) -> Iterator[None]:
 
 def _do(cfg: DictConfig) -> float | None:
     _require_swept()
-    _require_variant()
     without_triton()
-    composed: Any = OmegaConf.to_container(cfg, resolve=False)
     overrides = HydraConfig.get().overrides.task
+    cfg = with_variant(cfg, overrides)
+    composed: Any = OmegaConf.to_container(cfg, resolve=False)
     # Before anything is read from a file.
     trust(composed.get("trust"), [composed["job"], *targets(composed)], packages(composed))
     cfg = _adopted(cfg, overrides)
@@ -277,8 +266,10 @@ def _menu() -> str:
     for folder in config_folders():
         for file in folder.rglob("*.yaml"):
             group = file.parent.relative_to(folder)
-            if group.parts[:1] not in ((), ("hydra",)):
+            if group.parts[:1] not in ((), ("hydra",)) and not file.name.startswith("_"):
                 groups.setdefault(group.as_posix(), []).append(file.stem)
+    for group, options in axes().items():
+        groups.setdefault(group, []).extend(options)
     lines = [f"{group}: {', '.join(sorted({*options}))}\n" for group, options in sorted(groups.items())]
     template = OmegaConf.select(OmegaConf.load(CONF / "config.yaml"), "hydra.help.template")
     return Template(template).substitute(APP_CONFIG_GROUPS="".join(lines))
@@ -304,6 +295,7 @@ def main() -> None:
             print(_menu())
             return
         offer_options()
+        offer_axes()
         _compose()
     except KeyboardInterrupt:
         sys.exit(130)

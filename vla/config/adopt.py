@@ -28,7 +28,6 @@ OF_TRAINING = (*OF_MODEL, "task", "expert", "learner", "validate")  # of job=imp
 # single values of other nodes.
 REPORTED = ("expert", "data", "learner", "validate", "seed")
 CHOSEN = ("experiment", "model")  # groups in `chosen`
-PRESETS = ("experiment", "variant", "shift")  # groups and keys that change other groups
 SCHEDULE = ("max_steps", "val_check_interval", "accumulate_grad_batches", "gradient_clip_val")
 REPORTED_VALUES = {"collect": ("episodes", "seed"), "trainer": (*SCHEDULE, "precision")}
 LAST = Path("checkpoints/last.ckpt")  # in the folder of a training
@@ -53,7 +52,7 @@ def adopt(cfg: DictConfig, overrides: Sequence[str]) -> DictConfig:
         ValueError: there is no such policy, or an override contradicts its weights.
     """
     parsed = _parsed(overrides)
-    _require_own_parts(parsed, ("tokenizer", "model", *PRESETS))
+    _require_own_parts(parsed, ("tokenizer", "model", "experiment"))
     saved = read_policy(cfg.checkpoint).config
     given = [_path(override) for override in parsed if not override.is_delete()]
     require_no_paths(saved, REQUIRED_NODES, cfg.checkpoint, given)
@@ -77,7 +76,7 @@ def finetune(cfg: DictConfig, overrides: Sequence[str]) -> DictConfig:
             "without checkpoint=, which evaluates a policy"
         )
     parsed = _parsed(overrides)
-    _require_own_parts(parsed, ("tokenizer", "model", *PRESETS))
+    _require_own_parts(parsed, ("tokenizer", "model", "experiment"))
     own = Path(cfg.output) / LAST  # of this training; `pretrained` may have been deleted since
     gone = own.exists() and is_gone(cfg.pretrained)
     saved = read_header(own).config if gone else read_policy(cfg.pretrained).config
@@ -117,7 +116,7 @@ def resume(cfg: DictConfig, run: Path, overrides: Sequence[str]) -> DictConfig:
         raise ValueError(f"resume={run} is a training without rounds: job=improve pretrained={run} improves it")
     own = str(saved.get("job")).rpartition(".")[2]  # a job has a node of its own
     parsed, known = _parsed(overrides), {*map(str, cfg), own}
-    _require_own_parts(parsed, PRESETS)
+    _require_own_parts(parsed, ("experiment",))
     taken = {name: node for name, node in saved.items() if name in known and name not in OF_THIS_COMMAND}
     require_trust(taken, taken, file)
     if any(_path(override) == "trainer" for override in parsed):

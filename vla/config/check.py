@@ -20,7 +20,7 @@ from vla.config.annotations import MissingLibrary, fits, locate
 from vla.config.build import GROUPS, Group, arguments, check_node, check_value, makes, require_known
 from vla.config.packages import config_folders
 from vla.io.documents import canonical
-from vla.io.types import Count, Images, Natural, Quality, Seed, Shift, Text, unique
+from vla.io.types import Count, Images, Natural, Quality, Seed, Text, unique
 from vla.spec import FIRST_SEED, IN_DISTRIBUTION
 
 UnseenSeed = Annotated[Seed, Ge(FIRST_SEED)]
@@ -55,7 +55,6 @@ CODEC = {"images": Images | None, "quality": Quality}
 PLAIN: dict[str, Any] = {
     "job": Text,
     "seed": Seed,
-    "shift": Shift,
     "checkpoint": Text | None,
     "pretrained": Text | None,
     "resume": Text | None,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -16,21 +16,53 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 
 import vla.config.check
 import vla.config.recorded  # noqa: F401  these two register the resolvers
+from vla.config.axes import offer_axes
+from vla.config.build import check_value
 from vla.config.experiment import Node, plain
 from vla.config.packages import CONF, config_folders, offer_options
+from vla.io.suggestion import suggestion
 
 
 def compose(*overrides: str) -> DictConfig:
     """Compose the config that `python -m vla.run` composes from the same overrides.
 
     Add `output=DIR`: only the command line creates a folder per run.
+
+    Raises:
+        ValueError: see `with_variant`.
     """
     with _hydra():
         config = hydra.compose("config", list(overrides), return_hydra_config=True)
     OmegaConf.resolve(config.chosen)  # needs Hydra's node
     with open_dict(config):
         del config["hydra"]
-    return config
+    return with_variant(config, overrides)
+
+
+def with_variant(config: DictConfig, overrides: Sequence[str]) -> DictConfig:
+    """Return a config without its `variants`, composed again with the overrides of the one that `variant` names.
+
+    Args:
+        config: as composed from the overrides.
+        overrides: of the command line.
+
+    Raises:
+        ValueError: the config has no such variant, or an override contradicts it.
+    """
+    with open_dict(config):
+        name, variants = config.pop("variant"), config.pop("variants")
+    if name is None:
+        return config
+    if name not in variants:
+        there = f"{suggestion(str(name), variants) or ':'} there are {', '.join(variants)}" if variants else ""
+        raise ValueError(f"there is no variant={name}{there or '; an experiment that is a grid has variants'}")
+    changes = plain(variants)[name]
+    check_value(f"variants.{name}", changes, list[str])
+    given = {override.partition("=")[0]: override for override in overrides}
+    for change in changes:
+        if contrary := given.get(change.partition("=")[0]):
+            raise ValueError(f"variant={name} is {change}: omit {contrary}")
+    return compose(*(override for key, override in given.items() if key != "variant"), *changes)
 
 
 def compose_task(task: str, **overrides: Any) -> Node:
@@ -64,6 +96,7 @@ def _hydra() -> Iterator[ConfigLoader]:
     before = GlobalHydra.instance().hydra, VersionBase.instance().version_base
     GlobalHydra.instance().clear()
     offer_options()
+    offer_axes()
     try:
         with hydra.initialize_config_dir(str(CONF), version_base="1.3"):
             yield GlobalHydra.instance().config_loader()
