@@ -37,9 +37,9 @@ LEVELS = sorted({level for levels in axes().values() for level in levels} - {"sw
 OPTIONS = [
     (path.parent.relative_to(CONF).as_posix(), path.stem)
     for path in sorted(CONF.rglob("*.yaml"))
-    if path.parent != CONF and path.parent.name != "hydra" and not path.stem.startswith("_")
+    if path.parent != CONF and path.parent.name != "hydra"
 ]
-MODELS = sorted(path.stem for path in (CONF / "model").glob("[!_]*.yaml"))
+MODELS = sorted(path.stem for path in (CONF / "model").glob("*.yaml"))
 
 
 pytestmark = pytest.mark.usefixtures("recording")
@@ -208,12 +208,10 @@ def test_every_model_says_by_how_much_it_shifts_images(model: str) -> None:
         assert composed(f"experiment={experiment}", f"model={model}").model.shift == [4, 4]
 
 
-def test_no_model_extends_another_one() -> None:
-    for path in (CONF / "model").glob("*.yaml"):
-        file = yaml.safe_load(path.read_text())
-        extended = [each for each in file["defaults"] if isinstance(each, str) and each != "_self_"]
-        assert all(name.startswith("_") for name in extended), path.name
-        assert ("_target_" in file) == (path.stem in MODELS), path.name
+def test_a_model_stands_in_one_file() -> None:
+    for model in MODELS:
+        file = yaml.safe_load((CONF / f"model/{model}.yaml").read_text())
+        assert [each for each in file["defaults"] if isinstance(each, str)] == ["_self_"], model
 
 
 def test_a_model_changes_nothing_but_itself() -> None:

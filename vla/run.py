@@ -55,9 +55,8 @@ def _described(error: Exception) -> str:
         return "a value or a folder is nested too deep: HYDRA_FULL_ERROR=1 shows where"
     if isinstance(error, MissingConfigException) and error.missing_cfg_file and error.options is not None:
         group, _, option = error.missing_cfg_file.rpartition("/")
-        options = [name for name in error.options if not name.startswith("_")]  # others only extend these
-        hint = suggestion(option, options) or ":"
-        return f"{group} has no option {option}{hint} there are {', '.join(options)}"
+        hint = suggestion(option, error.options) or ":"
+        return f"{group} has no option {option}{hint} there are {', '.join(error.options)}"
     if isinstance(error, OverrideParseException):
         reason = error.message.splitlines()[0]
         return f"cannot read {error.override}: {reason}; quote special characters, as in 'key=\"value\"'"
@@ -266,7 +265,7 @@ def _menu() -> str:
     for folder in config_folders():
         for file in folder.rglob("*.yaml"):
             group = file.parent.relative_to(folder)
-            if group.parts[:1] not in ((), ("hydra",)) and not file.name.startswith("_"):
+            if group.parts[:1] not in ((), ("hydra",)):
                 groups.setdefault(group.as_posix(), []).append(file.stem)
     for group, options in axes().items():
         groups.setdefault(group, []).extend(options)
