@@ -224,7 +224,7 @@ class Minutes:
         if compiled and isinstance(ended["status"], int) and ended["status"]:
             name = f"{name}_eager"
             self.vla(step, name, limit, "learner.compile=False", *settings)
-        checkpoint = f"checkpoint={self.work / 'runs' / name / 'checkpoints/last.ckpt'}"
+        checkpoint = f"checkpoint={self.work / 'runs' / name}"
         self.vla(step, f"{name}_evaluated", 150, checkpoint, f"evaluate.episodes={sizes.evaluated}")
 
     def e(self) -> None:
