@@ -108,7 +108,7 @@ def test_the_documented_commands_make_a_cluster(tmp_path: Path) -> None:
         joined = [address if argument.startswith("tcp:") else argument for argument in on_worker]
         with dask(*(argument.replace("=-1", "=1") for argument in joined)):
             gather(tmp_path / "episodes", cluster(address))
-    gather(whole, LocalCluster(1))
+    gather(whole, LocalCluster(1, "beside"))
     assert content(tmp_path / "episodes") == content(whole)
 
 
@@ -129,7 +129,7 @@ def test_an_evaluation_reports_and_records_the_same(two: DaskCluster, tmp_path: 
         report = evaluate(*makers, seeds, cluster, needs=[folder])
         return report, sorted(path.name for path in folder.iterdir())
 
-    here = played(tmp_path / "here", LocalCluster(1))
+    here = played(tmp_path / "here", LocalCluster(1, "beside"))
     assert played(tmp_path / "there", two) == here
     assert len(here[1]) == len(seeds)
 
@@ -155,8 +155,8 @@ def test_without_workers_it_gives_up_and_goes_on_elsewhere(address: str, tmp_pat
     with worker(address, "--no-nanny") as only, killed(only, folder), without:
         gather(folder, cluster(address, patience=0.5), toy.make_slow_environment)
     assert 3 <= len(EpisodeStore(folder).tried) < TRIED
-    gather(folder, LocalCluster(1))
-    gather(whole, LocalCluster(1))
+    gather(folder, LocalCluster(1, "beside"))
+    gather(whole, LocalCluster(1, "beside"))
     assert content(folder) == content(whole)
 
 

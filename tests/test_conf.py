@@ -19,8 +19,8 @@ from hydra import compose, initialize_config_dir
 from hydra.utils import get_class
 from omegaconf import OmegaConf
 
-from vla.config.axes import axes
 from vla.config.check import conditions
+from vla.config.compose import axes
 from vla.config.compose import compose as compose_whole
 from vla.config.differences import differences
 from vla.config.experiment import Experiment, plain

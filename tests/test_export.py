@@ -126,7 +126,8 @@ if __name__ == "__main__":  # worker processes import this file
     from vla.config.build import build
     from vla.data.episodes import EpisodeStore
     from vla.parallel.pool import LocalCluster
-    build({config}, "export").export(EpisodeStore(Path({store!r}), {episodes}), LocalCluster(int(sys.argv[1])))
+    cluster = LocalCluster(int(sys.argv[1]), "beside")
+    build({config}, "export").export(EpisodeStore(Path({store!r}), {episodes}), cluster)
 """
 
 

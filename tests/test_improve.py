@@ -44,7 +44,7 @@ def supervised(beta: float) -> Supervised:
 def label(folder: Path, workers: int, episodes: int = 12) -> EpisodeStore:
     store = EpisodeStore.create_or_open(folder, toy.SPEC, {})
     agent = partial(make_supervised, toy.make_wanderer, toy.make_expert, 0.4, 5)
-    collect(store, toy.make_environment, agent, episodes, LocalCluster(workers), 100, keep_failures=True)
+    collect(store, toy.make_environment, agent, episodes, LocalCluster(workers, "beside"), 100, keep_failures=True)
     return EpisodeStore(folder)
 
 

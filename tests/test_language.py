@@ -14,8 +14,8 @@ from hydra.errors import InstantiationException
 from hydra.utils import instantiate
 from matplotlib.colors import XKCD_COLORS, rgb_to_hsv, to_rgb
 
-from vla.config.axes import axes
 from vla.config.check import conditions
+from vla.config.compose import axes
 from vla.config.experiment import plain
 from vla.io.documents import read_yaml
 from vla.spec import FIRST_SEED

@@ -68,9 +68,11 @@ def test_the_command_line_can_be_copied_and_has_no_secret(monkeypatch: pytest.Mo
 
 
 def test_differences_from_the_default_show_resolved_values() -> None:
-    cfg = composed("shift=[3,4]", "collect.episodes=7", "task.image_size=[64,64]", "output=there", "evaluate=suite")
+    cfg = composed(
+        "model.shift=[3,4]", "collect.episodes=7", "task.image_size=[64,64]", "output=there", "evaluate=suite"
+    )
     changes = {each["key"]: each for each in Experiment.of(cfg, composed()).changes}
-    assert changes["shift"] == {"key": "shift", "here": [3, 4], "default": [12, 12]}
+    assert changes["model.shift"] == {"key": "model.shift", "here": [3, 4], "default": [12, 12]}
     assert changes["collect.episodes"]["here"] == 7
     tint = changes["evaluate.conditions.light_intensity_wide"]["here"]["randomize"]["light"]["tint"]
     assert tint == cfg.task.randomize.light.tint and "${" not in str(changes)  # an interpolation

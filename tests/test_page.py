@@ -133,7 +133,7 @@ def test_the_page_says_what_was_recorded_and_how_to_play_an_episode_again(tmp_pa
     (folder / "rollouts.rrd").touch()
     told = text(write_page(folder))
     assert "rollouts.rrd has 2 of 2 failures and 2 of 4 successes" in told and "evaluate.recordings=all" in told
-    again = "checkpoints/last.ckpt evaluate.seed=SEED evaluate.episodes=1 evaluate.recordings=all"
+    again = f"checkpoint={folder}/policy evaluate.seed=SEED evaluate.episodes=1 evaluate.recordings=all"
     assert again in told
 
 

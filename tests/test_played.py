@@ -190,7 +190,9 @@ def test_known_episodes_are_not_played_again(workers: int) -> None:
     known = {result.seed: result for result in expected.results[::2]}
     kept = list[Result]()
     report = evaluate(
-        *(toy.make_environment, toy.make_agent, None, SEEDS, LocalCluster(workers)), known=known, keep=kept.append
+        *(toy.make_environment, toy.make_agent, None, SEEDS, LocalCluster(workers, "beside")),
+        known=known,
+        keep=kept.append,
     )
     assert report == expected and {result.seed for result in kept} == {*SEEDS} - {*known}
 

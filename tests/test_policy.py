@@ -112,7 +112,7 @@ def test_a_seed_acts_the_same_alone_and_in_any_company_bit_for_bit(make: Callabl
 def test_lanes_share_the_passes_of_their_rows() -> None:
     model = make_bc()
     policy, passes = as_policy(model, lanes=2), list[int]()
-    model.shift.register_forward_pre_hook(lambda module, inputs: passes.append(len(inputs[0])))
+    model.mlp.register_forward_pre_hook(lambda module, inputs: passes.append(len(inputs[0])))
     for seeds, expected in (([4, 5], [2]), ([4, 6], [2, 2]), ([1], [2])):
         for lane, seed in enumerate(seeds):
             policy.reset("go", seed, lane)

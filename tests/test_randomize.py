@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from conftest import make_tabletop
 
-from vla.config.axes import axes
+from vla.config.compose import axes
 from vla.spec import Array
 from vla.tasks.streams import Streams
 from vla.tasks.tabletop.environment import Tabletop

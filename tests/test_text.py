@@ -17,8 +17,8 @@ from hydra.utils import instantiate
 from omegaconf import OmegaConf
 from tiny_encoder import write_encoder
 
-from vla.config.axes import axes
 from vla.config.build import check_node
+from vla.config.compose import axes
 from vla.models.text.both import Both
 from vla.models.text.colours import in_basic_terms
 from vla.models.text.huggingface import HuggingFace

@@ -215,7 +215,7 @@ def make_lost_expert(environment: Environment) -> ToyExpert:
 def make_store(folder: Path, make: Callable[[], ToyEnvironment] = make_environment) -> EpisodeStore:
     """A store of the expert's first episodes."""
     store = EpisodeStore.create_or_open(folder, make().spec, {})
-    collect(store, make, make_expert, EPISODES, LocalCluster(1), seed=0)
+    collect(store, make, make_expert, EPISODES, LocalCluster(1, "beside"), seed=0)
     return store
 
 

@@ -25,9 +25,8 @@ from yaml import YAMLError
 
 from vla import jobs
 from vla.config.annotations import packages, targets
-from vla.config.axes import axes, offer_axes
 from vla.config.check import Job, check, devices
-from vla.config.compose import CONF, with_variant  # registers the resolver `jobs` of --help
+from vla.config.compose import CONF, axes, offer_axes, with_variant  # registers the resolver `jobs` of --help
 from vla.config.experiment import Experiment, plain
 from vla.config.packages import config_folders, offer_options, option_packages, trust, trust_own
 from vla.config.substitutes import builds_world, with_substitutes

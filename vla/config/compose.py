@@ -5,21 +5,23 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 import hydra
 from hydra.core.config_loader import ConfigLoader
+from hydra.core.config_store import ConfigStore
 from hydra.core.global_hydra import GlobalHydra
 from hydra.version import VersionBase
 from omegaconf import DictConfig, OmegaConf, open_dict
 
 import vla.config.check
 import vla.config.recorded  # noqa: F401  these two register the resolvers
-from vla.config.axes import offer_axes
 from vla.config.build import check_value
 from vla.config.experiment import Node, plain
 from vla.config.packages import CONF, config_folders, offer_options
+from vla.io.documents import read_yaml
 from vla.io.suggestion import suggestion
 
 
@@ -88,6 +90,26 @@ def compose_task(task: str, **overrides: Any) -> Node:
                 key, new = name.removeprefix("+"), name.startswith("+")
                 OmegaConf.update(config.task, key, listed, merge=True, force_add=new)
         return plain(config.task)
+
+
+@cache
+def axes() -> dict[str, dict[str, dict[str, Any]]]:
+    """Return group → option → node out of `conf/axes.yaml`, such as task/randomize/light → hard → node of a lamp."""
+    table = read_yaml(CONF / "axes.yaml", dict[str, dict[str, Any]])
+    return {
+        f"task/randomize/{axis}": {
+            level: {"_target_": levels["_target_"], **values} for level, values in levels.items() if level != "_target_"
+        }
+        for axis, levels in table.items()
+    }
+
+
+@cache
+def offer_axes() -> None:
+    """Register these options with Hydra, beside those that are files."""
+    for group, options in axes().items():
+        for name, node in options.items():
+            ConfigStore.instance().store(name=name, node=node, group=group, provider="vla")
 
 
 @contextmanager

@@ -78,7 +78,7 @@ class Cluster(Protocol):
 class LocalCluster:
     """Spawned processes of this machine; a single worker runs in this process."""
 
-    def __init__(self, workers: Count | None, policy: Literal["beside", "here"] = "beside") -> None:
+    def __init__(self, workers: Count | None, policy: Literal["beside", "here"]) -> None:
         """Args:
         workers: their number; None: one per core.
         policy: whether a policy runs beside each worker, or here, in this process, once for all of them.
@@ -97,7 +97,7 @@ class LocalCluster:
                     yield pool
 
 
-THIS_PROCESS = LocalCluster(1)
+THIS_PROCESS = LocalCluster(1, "beside")
 
 
 class _SerialPool:

@@ -103,7 +103,7 @@ def _keep(store: EpisodeStore, episodes: list[Episode]) -> None:
 
 def _attempts(make: WorkerFactory, processes: int, episodes_each: int) -> tuple[float, str, int]:
     """Return the rate of verified control steps of concurrent processes after a warm-up, its unit, and their number."""
-    with LocalCluster(processes).pool(make) as pool:
+    with LocalCluster(processes, "beside").pool(make) as pool:
         for attempt in [pool.submit(seed) for seed in range(2 * processes)]:
             attempt.result()
         seeds = range(processes * episodes_each)

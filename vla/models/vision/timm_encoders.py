@@ -228,7 +228,10 @@ def _read(source: Path | PackagedFile) -> dict[str, Tensor]:
     try:
         if isinstance(content, Path) and content.suffix == ".safetensors":
             return load_file(content)
-        return dict(torch.load(content, map_location="cpu", weights_only=True))
+        weights = dict(torch.load(content, map_location="cpu", weights_only=True))
+        if not all(isinstance(each, Tensor) for each in weights.values()):
+            raise ValueError("it holds something else than tensors")
+        return weights
     except Exception as error:  # a pickle can raise nearly anything
         raise ValueError(f"{path} cannot be read as weights, it is damaged or something else") from error
 
