@@ -14,8 +14,10 @@ from vla import jobs
 from vla.config import check as checking
 from vla.config.annotations import packages as packages_in
 from vla.config.compose import CONF as CONF
-from vla.config.compose import compose
+from vla.config.compose import compose, offer_axes
 from vla.config.packages import TRUSTED, trusted
+
+offer_axes()
 
 
 def composed(*overrides: str) -> DictConfig:

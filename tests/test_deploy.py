@@ -43,6 +43,7 @@ from vla.deploy.demo_operator import DemoOperator
 from vla.deploy.loop import Loop
 from vla.deploy.messages import SimulatedEpisode
 from vla.deploy.ros import NETWORKS, RosNetwork, split_arguments
+from vla.io.errors import UserError
 from vla.io.images import resize
 from vla.jobs import deploy as job
 from vla.models.policy_folder import read_policy
@@ -396,7 +397,7 @@ def test_a_policy_is_deployed_where_nothing_renders(monkeypatch: pytest.MonkeyPa
         monkeypatch.delenv(name)
     backend.choose_backend()
     assert os.environ["MUJOCO_GL"] == "disabled"
-    with pytest.raises(RuntimeError, match="this machine cannot render with MUJOCO_GL=egl or osmesa"):
+    with pytest.raises(UserError, match="this machine cannot render with MUJOCO_GL=egl or osmesa"):
         backend.require_backend()
 
 

@@ -25,6 +25,7 @@ from vla import jobs
 from vla.config.compose import compose as compose_config
 from vla.config.experiment import plain
 from vla.config.substitutes import builds_world, options, with_substitutes
+from vla.io.errors import UserError
 from vla.spec import Array
 from vla.tasks import gl
 from vla.tasks.rendering import shapes
@@ -331,7 +332,7 @@ def test_without_egl_the_error_names_the_other_renderer(monkeypatch: pytest.Monk
     monkeypatch.setattr(moderngl, "create_standalone_context", refuse)
     monkeypatch.setattr("vla.tasks.rendering.fast.shared_context", Context)  # that of this process exists already
     model, _ = gallery("spot")
-    with pytest.raises(RuntimeError, match=r"lacks \(libEGL.so not found\): .*, or choose task/renderer=mujoco"):
+    with pytest.raises(UserError, match=r"lacks \(libEGL.so not found\): .*, or choose task/renderer=mujoco"):
         fast().open(model, View((0,), 8, 8))
 
 

@@ -33,7 +33,7 @@ def load_policy(
         trust: names of further packages.
 
     Raises:
-        ValueError: there is no such policy, it is damaged, or it names a class that is not trusted.
+        UserError: there is no such policy, it is damaged, or it names a class that is not trusted.
     """
     options = {"device": device, "precision": precision, "compile": False, "lanes": lanes}
     folder = policy_folder(checkpoint)
@@ -57,7 +57,7 @@ def load_environment(
         render_mode: "rgb_array", or None.
 
     Raises:
-        ValueError: as `load_policy`, the policy names a path, or there are recordings only, in which nothing can act.
+        UserError: as `load_policy`, the policy names a path, or there are recordings only, in which nothing can act.
     """
     saved = read_policy(checkpoint)
     task = {"task": saved.config["task"]}

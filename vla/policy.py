@@ -15,6 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from vla.io.errors import UserError
 from vla.io.types import Count
 from vla.models.compile_cache import set_compile_cache
 from vla.models.model import Batch, Model
@@ -54,7 +55,7 @@ class Policy:
         spec: observation and action spaces.
 
     Raises:
-        ValueError: device="cuda" without a GPU.
+        UserError: device="cuda" without a GPU.
     """
 
     def __init__(
@@ -68,7 +69,7 @@ class Policy:
         spec: Spec,
     ) -> None:
         if device == "cuda" and not torch.cuda.is_available():
-            raise ValueError("policy.device=cuda, but PyTorch finds no GPU here: policy.device=auto uses the CPU")
+            raise UserError("policy.device=cuda, but PyTorch finds no GPU here: policy.device=auto uses the CPU")
         available = "cuda" if torch.cuda.is_available() else "cpu"
         self.device = torch.device(available if device == "auto" else device)
         self.model, self.spec, self.lanes = model.eval().to(self.device), spec, lanes
@@ -92,10 +93,10 @@ class Policy:
         An episode that begins without is that of the lane's number, with another instruction that of the same seed.
 
         Raises:
-            ValueError: the instruction has more than `LONGEST_INSTRUCTION` characters.
+            UserError: the instruction has more than `LONGEST_INSTRUCTION` characters.
         """
         if len(instruction) > LONGEST_INSTRUCTION:
-            raise ValueError(f"an instruction has at most {LONGEST_INSTRUCTION} characters, not {len(instruction)}")
+            raise UserError(f"an instruction has at most {LONGEST_INSTRUCTION} characters, not {len(instruction)}")
         text = self.model.text.tokenize([instruction, *self._padding_sentences])[:1].to(self.device)
         random, frames = torch.Generator().manual_seed(seed), deque[dict[str, Tensor]](maxlen=self.history)
         self._lanes[lane] = Lane(seed, instruction, text, random, frames)
@@ -124,7 +125,7 @@ class Policy:
         `vla.api.load_environment`.
 
         Raises:
-            ValueError: an observation does not match the spec; no lane has acted then.
+            UserError: an observation does not match the spec; no lane has acted then.
         """
         if lanes is None:
             return self.act([_as_observation(observations, self.spec)], [0])[0]
@@ -149,7 +150,7 @@ class Policy:
         observation of lane 0.
 
         Raises:
-            ValueError: an observation does not match the spec; no lane has seen its own then.
+            UserError: an observation does not match the spec; no lane has seen its own then.
         """
         if lanes is None:
             return self.plan([observations], [0])[0]
@@ -233,16 +234,16 @@ class Policy:
         """Convert an observation of a lane to a batch of one frame.
 
         Raises:
-            ValueError: the observation does not match the spec.
+            UserError: the observation does not match the spec.
         """
         shape = (*self.spec.image_size, 3)
         shapes = {camera: image.shape for camera, image in observation.rgb.items()}
         if any(shapes.get(camera) != shape for camera in self.spec.cameras):
-            raise ValueError(f"the policy needs cameras {self.spec.cameras} of {shape}, the observation has {shapes}")
+            raise UserError(f"the policy needs cameras {self.spec.cameras} of {shape}, the observation has {shapes}")
         if other := [camera for camera in self.spec.cameras if observation.rgb[camera].dtype != np.uint8]:
-            raise ValueError(f"images must be uint8, 0 to 255, that of {other[0]} is {observation.rgb[other[0]].dtype}")
+            raise UserError(f"images must be uint8, 0 to 255, that of {other[0]} is {observation.rgb[other[0]].dtype}")
         if observation.state.shape != (len(self.spec.state),):
-            raise ValueError(f"the policy's state is {self.spec.state}, the observation's {observation.state.shape}")
+            raise UserError(f"the policy's state is {self.spec.state}, the observation's {observation.state.shape}")
         return {
             "rgb": {camera: self._tensor(observation.rgb[camera]) for camera in self.spec.cameras},
             "state": self._tensor(np.asarray(observation.state, np.float32)),

@@ -9,7 +9,6 @@ import sys
 import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager
-from importlib.util import find_spec
 from pathlib import Path
 from string import Template
 from typing import Any, NoReturn
@@ -28,9 +27,10 @@ from vla.config.annotations import packages, targets
 from vla.config.check import Job, check, devices
 from vla.config.compose import CONF, axes, offer_axes, with_variant  # registers the resolver `jobs` of --help
 from vla.config.experiment import Experiment, plain
-from vla.config.packages import config_folders, offer_options, option_packages, trust, trust_own
+from vla.config.packages import config_folders, offer_options, trust, trust_own
 from vla.config.substitutes import builds_world, with_substitutes
 from vla.deploy import ros
+from vla.io.errors import UserError
 from vla.io.printable import printable
 from vla.io.suggestion import suggestion
 from vla.parallel.fast_exit import fast_exit
@@ -40,6 +40,7 @@ from vla.runs.cells import describe_failures, save_failure
 PACKAGE = Path(__file__).resolve().parent
 SWEEP = "in the sweep "  # prefix of a note on a cell's error
 PICKLE = "--experimental-rerun"  # option of Hydra
+MENDABLE = (UserError, OSError, HydraException, OmegaConfBaseException, YAMLError, RecursionError)
 TRACEBACKS = "VLA_TRACEBACKS"  # environment variable that passes the user's HYDRA_FULL_ERROR to child processes
 
 
@@ -67,7 +68,7 @@ def _described(error: Exception) -> str:
         return f"{error.full_key} is missing: the options chosen need {error.full_key}=VALUE"
     if isinstance(error, OmegaConfBaseException) and error.full_key:
         line = str(error).splitlines()[0]
-        _, resolver, reason = line.partition("ValueError raised while resolving interpolation: ")
+        _, resolver, reason = line.partition("UserError raised while resolving interpolation: ")
         return reason if resolver else f"{error.full_key}: {line}"
     if isinstance(error, OSError) and error.filename:
         return f"{error.filename}: {error.strerror}"
@@ -105,29 +106,12 @@ def _unknown_key(error: OmegaConfBaseException) -> str:
 
 
 def _meant_for_user(error: Exception) -> bool:
-    """Return whether `error` is about the command line, a file or the machine rather than a bug.
-
-    Libraries also raise ValueError and RuntimeError for bugs. The traceback of a deliberate error, here or in a worker
-    process, ends with a `raise` in this package or one that adds options, or in Hydra for the command line.
-    """
-    if isinstance(error, (OSError, HydraException, OmegaConfBaseException, RecursionError)):
-        return True
+    """Return whether `error` is about the command line, a file or the machine rather than a bug."""
     # By name, because importing Lightning takes seconds; MuJoCo raises FatalError without a display.
-    if type(error).__name__ in ("MisconfigurationException", "FatalError") or isinstance(error, YAMLError):
-        return True
-    remote = type(error.__cause__).__name__ == "_RemoteTraceback"
-    text = str(error.__cause__) if remote else "".join(traceback.format_tb(error.__traceback__))
-    # Generated constructors have no source; that of other frames is indented by four spaces.
-    lines = re.findall(r'File "([^"]+)", line \d+, in .*\n {4}(.*)', text)
-    if not isinstance(error, (ValueError, RuntimeError, ImportError)) or not lines:
-        return False
-    file, statement = lines[-1]
-    if Path(file).name == "omegaconf.py":  # a key of a list that is no number
-        return True
-    added = [find_spec(package) for package in option_packages()]
-    places = [Path(place) for spec in added if spec for place in spec.submodule_search_locations or ()]
-    ours = any(Path(file).is_relative_to(folder) for folder in (PACKAGE, Path(hydra.__file__).parent, *places))
-    return ours and statement.startswith("raise")
+    by_name = type(error).__name__ in ("MisconfigurationException", "FatalError")
+    # OmegaConf lets the ValueError of a list's key that is no number through.
+    list_key = Path(traceback.extract_tb(error.__traceback__)[-1].filename).name == "omegaconf.py"
+    return by_name or list_key or isinstance(error, MENDABLE)
 
 
 def _require_sweepable(cfg: DictConfig, job: Job) -> None:
@@ -136,7 +120,7 @@ def _require_sweepable(cfg: DictConfig, job: Job) -> None:
     if HydraConfig.get().mode != RunMode.MULTIRUN or choices["hydra/launcher"] == "submitit_slurm":
         return
     if "trainer" in job.needs(cfg) and cfg.trainer is not None and devices(plain(cfg.trainer)) > 1:
-        raise ValueError(
+        raise UserError(
             "-m cannot train on several devices in this launcher: add trainer.devices=1, "
             "or hydra/launcher=submitit_slurm, which starts every process of a cell itself"
         )
@@ -149,11 +133,11 @@ def _require_swept() -> None:
     given = {key: value for key, _, value in parts}
     choices, swept = hydra_config.runtime.choices, hydra_config.mode == RunMode.MULTIRUN
     if not swept and hydra_config.sweeper.params:
-        raise ValueError(f"experiment={choices['experiment']} is a grid of runs: add -m")
+        raise UserError(f"experiment={choices['experiment']} is a grid of runs: add -m")
     if not given.keys() >= (hydra_config.sweeper.params or {}).keys():
-        raise ValueError(f"experiment={choices['experiment']} is a grid of its own: name no other one beside it")
+        raise UserError(f"experiment={choices['experiment']} is a grid of its own: name no other one beside it")
     if swept and "${" not in given.get("output", "${"):
-        raise ValueError("with -m every cell has a folder of its own: name that of the sweep, hydra.sweep.dir=DIR")
+        raise UserError("with -m every cell has a folder of its own: name that of the sweep, hydra.sweep.dir=DIR")
 
 
 @contextmanager
@@ -197,13 +181,11 @@ def _adopted(cfg: DictConfig, overrides: list[str]) -> DictConfig:
     """Return `cfg` merged with the run, policy or pretrained weights that it names.
 
     Raises:
-        ValueError: a value is no path, or the named file cannot be used.
+        UserError: a value is no path, or the named file cannot be used.
     """
     for key in ("resume", "checkpoint", "pretrained", "output"):
         if not isinstance(cfg[key], str | None) or (key == "output" and not cfg[key]):
-            raise ValueError(
-                f"{key}={cfg[key]} is not a path: give a folder or file; a number is quoted, {key}=\\'3\\'"
-            )
+            raise UserError(f"{key}={cfg[key]} is not a path: give a folder or file; a number is quoted, {key}=\\'3\\'")
     if cfg.resume is cfg.pretrained is cfg.checkpoint is None:
         return cfg
     for file in (cfg.resume, cfg.pretrained, cfg.checkpoint):
@@ -218,7 +200,7 @@ def _adopted(cfg: DictConfig, overrides: list[str]) -> DictConfig:
     if cfg.pretrained is not None:
         return finetune(cfg, overrides)
     if not jobs.find(cfg.job).JOB.adopts:
-        raise ValueError(
+        raise UserError(
             f"job={cfg.job} takes no checkpoint: resume=RUN continues a run, pretrained={cfg.checkpoint} starts a new "
             "training from its weights"
         )
@@ -276,7 +258,7 @@ def _menu() -> str:
 def _require_no_pickle(arguments: list[str]) -> None:
     """Refuse Hydra's option that takes a config from a pickle, which may run anything; it can be abbreviated."""
     if any(len(name := each.partition("=")[0]) > 2 and PICKLE.startswith(name) for each in arguments):
-        raise ValueError(f"{PICKLE} runs whatever a file says: compose the run again from its command line")
+        raise UserError(f"{PICKLE} runs whatever a file says: compose the run again from its command line")
 
 
 def main() -> None:

@@ -16,6 +16,7 @@ import numpy as np
 from annotated_types import Ge, Le, MaxLen, MinLen, Predicate
 
 from vla.io.documents import STRICT, parse_plain
+from vla.io.errors import UserError
 from vla.io.types import Count, Point, Positive, unique
 
 Array = np.ndarray
@@ -111,20 +112,20 @@ class Spec:
         """Return the robot.
 
         Raises:
-            ValueError: there is none; the message says that `what` needs it.
+            UserError: there is none; the message says that `what` needs it.
         """
         if self.robot is None:
-            raise ValueError(
+            raise UserError(
                 f"{what} needs a robot, and the spec has none (robot=None): its state is {', '.join(self.state)}; a "
                 "world gives one in its spec, a recording by task.joints"
             )
         return self.robot
 
     def require_cut(self, camera: str, shape: Sequence[int], what: str) -> None:
-        """Raise a ValueError if the image `what` (H, W, …) may be a whole picture of which `camera` shows a part."""
+        """Raise a UserError if the image `what` (H, W, …) may be a whole picture of which `camera` shows a part."""
         if camera in self.cut and (shape[0], shape[1]) != tuple(self.image_size):
             height, width = self.image_size
-            raise ValueError(
+            raise UserError(
                 f"{what} has {shape[1]} by {shape[0]} pixels, but {camera} shows a part of a larger picture: cut that "
                 f"out as the world of the policy does, {width} by {height} pixels"
             )
@@ -145,15 +146,15 @@ class Spec:
         """Invert `to_dict` on untrusted values; fields with a default may be missing.
 
         Raises:
-            ValueError: `values` are no spec; the message calls them `name`.
+            UserError: `values` are no spec; the message calls them `name`.
         """
         spec = parse_plain(values, cls, name)
         if problem := next(_contradictions(spec), None):
-            raise ValueError(f"{name} is damaged or of another kind: {problem}")
+            raise UserError(f"{name} is damaged or of another kind: {problem}")
         return spec
 
     def require(self, other: Spec, what: str, against: str) -> None:
-        """Raise a ValueError naming the first field in which the spec of `what` (self) differs from `against`.
+        """Raise a UserError naming the first field in which the spec of `what` (self) differs from `against`.
 
         What is unknown to one of them, chain, home or cut cameras, is no difference.
         """
@@ -161,7 +162,7 @@ class Spec:
         for name, value in mine.items():
             unknown = name in ("robot.chain", "robot.home", "cut") and () in (value, theirs.get(name))
             if value != theirs.get(name) and not unknown:
-                raise ValueError(
+                raise UserError(
                     f"{what} has {name} = {str(value)[:200]}, but {against} has {str(theirs.get(name))[:200]}"
                 )
 
@@ -225,10 +226,10 @@ class Observation:
         """Take an observation of an environment of gymnasium: an image per camera, "state" and "instruction".
 
         Raises:
-            ValueError: one of them is missing.
+            UserError: one of them is missing.
         """
         if missing := [name for name in (*spec.cameras, "state", "instruction") if name not in values]:
-            raise ValueError(f"the observation has {', '.join(map(str, values))}, but lacks {', '.join(missing)}")
+            raise UserError(f"the observation has {', '.join(map(str, values))}, but lacks {', '.join(missing)}")
         rgb = {camera: values[camera] for camera in spec.cameras}
         return cls(rgb, values["state"], values["instruction"])
 
@@ -390,7 +391,7 @@ class Drivable(Protocol):
         """Move towards joint targets (J,) [rad] and a gripper opening 0…1 for `seconds` [s].
 
         Raises:
-            ValueError: physics cannot step for so long.
+            UserError: physics cannot step for so long.
         """
         ...
 
@@ -437,7 +438,7 @@ class Agents(Protocol):
         """Return the actions (n, D) float32 to execute now in n lanes, given what each of them sees.
 
         Raises:
-            ValueError: an observation does not fit; no lane has acted then.
+            UserError: an observation does not fit; no lane has acted then.
         """
         ...
 

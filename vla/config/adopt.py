@@ -19,6 +19,7 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 from vla.config.build import GROUPS, require_no_paths, require_trust, without_paths
 from vla.config.differences import at, differences
 from vla.io.documents import read_yaml, resolved
+from vla.io.errors import UserError
 from vla.models.checkpoint import read_header
 from vla.models.policy_folder import POLICY, REQUIRED_NODES, is_gone, read_policy
 
@@ -49,7 +50,7 @@ def adopt(cfg: DictConfig, overrides: Sequence[str]) -> DictConfig:
     A path or address in these nodes is an error; in the training settings it becomes null. Devices are not taken over.
 
     Raises:
-        ValueError: there is no such policy, or an override contradicts its weights.
+        UserError: there is no such policy, or an override contradicts its weights.
     """
     parsed = _parsed(overrides)
     _require_own_parts(parsed, ("tokenizer", "model", "experiment"))
@@ -68,10 +69,10 @@ def finetune(cfg: DictConfig, overrides: Sequence[str]) -> DictConfig:
     and number and seed of the demonstrations are that policy's.
 
     Raises:
-        ValueError: there is no such policy, the job does not train, or an override contradicts the weights.
+        UserError: there is no such policy, the job does not train, or an override contradicts the weights.
     """
     if cfg.checkpoint is not None or cfg.job not in ("train", "evaluate", "improve"):
-        raise ValueError(
+        raise UserError(
             f"pretrained={cfg.pretrained} initialises a new training: use it with job=train, evaluate or improve, and "
             "without checkpoint=, which evaluates a policy"
         )
@@ -100,20 +101,20 @@ def resume(cfg: DictConfig, run: Path, overrides: Sequence[str]) -> DictConfig:
     change of a key in `IDENTITY` is refused by `require_identity` when training starts.
 
     Raises:
-        ValueError: the folder has no training, is not one of the user's own runs, or `cfg` names another policy.
+        UserError: the folder has no training, is not one of the user's own runs, or `cfg` names another policy.
     """
     if cfg.checkpoint is not None or cfg.pretrained is not None:
-        raise ValueError(f"resume={cfg.resume} continues a run unchanged: omit checkpoint= and pretrained=")
+        raise UserError(f"resume={cfg.resume} continues a run unchanged: omit checkpoint= and pretrained=")
     file, saved = _saved(run)
     output = Path(cfg.output).resolve()
     if run.resolve().parent != output.parent and run.resolve() != output:
-        raise ValueError(
+        raise UserError(
             f"resume={run} is not among your runs in {output.parent}: a run's config names files and folders, so only "
             f"your own are resumed. If it is yours, add output={run}; to use somebody else's weights: "
             f"pretrained={run}"
         )
     if cfg.job == "improve" != saved.get("job"):
-        raise ValueError(f"resume={run} is a training without rounds: job=improve pretrained={run} improves it")
+        raise UserError(f"resume={run} is a training without rounds: job=improve pretrained={run} improves it")
     own = str(saved.get("job")).rpartition(".")[2]  # a job has a node of its own
     parsed, known = _parsed(overrides), {*map(str, cfg), own}
     _require_own_parts(parsed, ("experiment",))
@@ -134,14 +135,14 @@ def _saved(run: Path) -> tuple[Path, Mapping[str, Any]]:
     """Return the config of a run and the file that has it: its last checkpoint, or config.yaml of one in rounds.
 
     Raises:
-        ValueError: there is neither.
+        UserError: there is neither.
     """
     if (run / LAST).is_file():
         return run / LAST, read_header(run / LAST).config
     file = run / "config.yaml"
     if file.is_file() and (config := read_yaml(file, dict[str, Any])).get("job") == "improve":
         return file, resolved(config, str(file))
-    raise ValueError(f"resume={run}: nothing was trained in that folder, there is no {run / LAST}")
+    raise UserError(f"resume={run}: nothing was trained in that folder, there is no {run / LAST}")
 
 
 def _reported(cfg: DictConfig, saved: Mapping[str, Any]) -> dict[str, Any]:
@@ -169,13 +170,13 @@ def _texts(node: Any) -> set[str]:
 
 
 def require_identity(saved: Mapping[str, Any], config: Mapping[str, Any], folder: Path) -> None:
-    """Raise a ValueError unless `config` describes the training in a run's `folder`, which has the config `saved`."""
+    """Raise a UserError unless `config` describes the training in a run's `folder`, which has the config `saved`."""
     before, now = ({key: at(each, key, None) for key in IDENTITY} for each in (saved, config))
     changed = [key for key, _, _ in differences(before, now)]
     if changed:
         weights = f"; pretrained={folder} starts another from its weights" if (folder / POLICY).exists() else ""
         way_out = f"choose another output=DIR (hydra.sweep.dir=DIR of a sweep), or continue it with resume={folder}"
-        raise ValueError(
+        raise UserError(
             f"{folder} holds a training that differs in {', '.join(changed[:3])}{', …' if changed[3:] else ''}: "
             f"{'omit that to continue it' if config.get('resume') else way_out}{weights}"
         )
@@ -185,7 +186,7 @@ def _require_own_parts(parsed: Sequence[Override], groups: Sequence[str]) -> Non
     for override in parsed:
         group = _path(override).partition(".")[0]
         if group in groups:
-            raise ValueError(
+            raise UserError(
                 f"{override.input_line} cannot be combined with a checkpoint, whose weights belong to the {group} "
                 "they were trained with: omit one of the two; options of task and evaluate can be combined"
             )
@@ -215,7 +216,7 @@ def _on_top(cfg: DictConfig, saved: Mapping[str, Any], parsed: Sequence[Override
                 parent, _, name = path.rpartition(".")
                 node = OmegaConf.select(adopted, parent)
                 if not isinstance(node, DictConfig):
-                    raise ValueError(f"{override.input_line} removes a key of {parent}, which the checkpoint lacks")
+                    raise UserError(f"{override.input_line} removes a key of {parent}, which the checkpoint lacks")
                 node.pop(name, None)
             elif isinstance(value := override.value(), dict):  # which Hydra merges with what is there
                 OmegaConf.update(adopted, path, value, merge=True, force_add=True)

@@ -22,6 +22,7 @@ from pydantic import BeforeValidator, ConfigDict, TypeAdapter, ValidationError
 
 from vla.config.packages import can_be_trusted, is_trusted
 from vla.io.documents import mappings
+from vla.io.errors import UserError
 
 # Configs also come from checkpoints and stores of other people. A `_target_` may name a class of this package, one of
 # those that `conf/` uses, or one that the user trusts.
@@ -52,7 +53,7 @@ WORDS: dict[Any, tuple[str, str]] = {  # type → one, several
 ENDLESS = 2**31 - 1  # an upper bound that descriptions omit
 
 
-class MissingLibrary(ValueError):
+class MissingLibrary(UserError):
     """A class that this machine cannot import, because a library is not installed."""
 
 
@@ -61,11 +62,11 @@ def locate(key: str, target: Any) -> type:
 
     Raises:
         MissingLibrary: a library is not installed.
-        ValueError: the class is not allowed or does not exist.
+        UserError: the class is not allowed or does not exist.
     """
     require_trusted(key, target)
     if not isinstance(target, str) or not (target.startswith(OWN) or target in LIBRARY or is_trusted(target)):
-        raise ValueError(
+        raise UserError(
             f"{key} must name a class of {OWN.rstrip('.')}, of a package that trust=[…] names, or one of "
             f"{', '.join(LIBRARY)}, got {target!r}"
         )
@@ -76,24 +77,22 @@ def locate(key: str, target: Any) -> type:
     except (ImportError, AttributeError) as error:
         where = "" if target.startswith(OWN) else f" on {gethostname()}, where {package} must be installed"
         library = isinstance(error, ModuleNotFoundError) and not f"{error.name}.".startswith(f"{package}.")
-        kind = MissingLibrary if library else ValueError
+        kind = MissingLibrary if library else UserError
         raise kind(f"{key} is {target}, which cannot be imported{where}: {error}") from error
     # A module's attributes include its imports, such as `os`.
     defined = isinstance(found, type) and found.__module__.partition(".")[0] in (OWN.rstrip("."), package)
     if not isinstance(found, type) or not (target in LIBRARY or defined):
-        raise ValueError(f"{key} must name a class that is defined in {package}, got {target!r}")
+        raise UserError(f"{key} must name a class that is defined in {package}, got {target!r}")
     return found
 
 
 def require_trusted(source: object, target: Any) -> None:
-    """Raise a ValueError if `target`, named by `source`, belongs to a package that can be trusted but is not."""
+    """Raise a UserError if `target`, named by `source`, belongs to a package that can be trusted but is not."""
     if not isinstance(target, str) or target.startswith(OWN) or target in LIBRARY or is_trusted(target):
         return
     package, dot, _ = target.partition(".")
     if dot and can_be_trusted(package):
-        raise ValueError(
-            f"{source} names {target}, which is not trusted: add trust=[{package}] if you trust its source"
-        )
+        raise UserError(f"{source} names {target}, which is not trusted: add trust=[{package}] if you trust its source")
 
 
 def is_node(value: Any) -> bool:
@@ -112,9 +111,9 @@ def packages(value: Any) -> list[Any]:
 
 
 def require_trusted_package(source: object, package: Any) -> None:
-    """Raise a ValueError if `package`, which `source` has imported, is not trusted."""
+    """Raise a UserError if `package`, which `source` has imported, is not trusted."""
     if not isinstance(package, str) or not is_trusted(package):
-        raise ValueError(
+        raise UserError(
             f"{source} uses {package!r}, which is not trusted: add trust=[{package}] if you trust its source"
         )
 
@@ -229,9 +228,9 @@ def _of_json(annotation: Any) -> Any:
 
 def _plain(value: Any) -> Any:
     if is_node(value):
-        raise ValueError("no object belongs here")
+        raise UserError("no object belongs here")
     if isinstance(value, float) and not isfinite(value):
-        raise ValueError("numbers are finite")
+        raise UserError("numbers are finite")
     for part in value.values() if isinstance(value, dict) else value if isinstance(value, list) else ():
         _plain(part)
     return value
@@ -239,7 +238,7 @@ def _plain(value: Any) -> Any:
 
 def _node(value: Any, expected: Any, partial: bool) -> Any:
     if not is_node(value) or bool(value.get("_partial_")) is not partial:
-        raise ValueError("not a node")
+        raise UserError("not a node")
     if not fits(locate("_target_", value["_target_"]), expected):
-        raise ValueError("a node of another class")
+        raise UserError("a node of another class")
     return value

@@ -37,6 +37,7 @@ from vla.config.annotations import (
     targets,
 )
 from vla.io.documents import resolved
+from vla.io.errors import UserError
 from vla.io.suggestion import suggestion
 from vla.io.types import Count, Inherited, Natural, NonNegative, Share
 
@@ -137,7 +138,7 @@ def build(node: Mapping[str, Any], group: str | Group, **runtime: Any) -> Any:
         runtime: arguments from the program.
 
     Raises:
-        ValueError: a class that is not allowed or of another kind, wrong arguments, or an error of the constructor.
+        UserError: a class that is not allowed or of another kind, wrong arguments, or an error of the constructor.
     """
     group = GROUPS[group] if isinstance(group, str) else group
     node = resolved(node, group.name)
@@ -146,7 +147,7 @@ def build(node: Mapping[str, Any], group: str | Group, **runtime: Any) -> Any:
         factory = instantiate(node, _convert_="all", _partial_=True)
     except InstantiationException as error:
         if isinstance(error.__cause__, ValueError):
-            raise ValueError(str(error.__cause__)) from error
+            raise UserError(str(error.__cause__)) from error
         raise
     return factory(**runtime)
 
@@ -165,22 +166,22 @@ def check_node(key: str, node: Any, expected: Any, runtime: Sequence[str] = ()) 
     that programs give to a group. It belongs within another node only.
 
     Raises:
-        ValueError: the class is no `expected`, or a key is unknown, missing or ill-typed; with its dotted name and the
+        UserError: the class is no `expected`, or a key is unknown, missing or ill-typed; with its dotted name and the
             allowed values.
     """
     if not is_node(node):
-        raise ValueError(f"{key} must be a node with a _target_, got {_short(node)}")
+        raise UserError(f"{key} must be a node with a _target_, got {_short(node)}")
     partial = node.get("_partial_", False)
     if not isinstance(partial, bool) or (partial and expected is not object):
-        raise ValueError(f"{key}._partial_ must be {'true or false' if expected is object else 'omitted here'}")
+        raise UserError(f"{key}._partial_ must be {'true or false' if expected is object else 'omitted here'}")
     target = locate(f"{key}._target_", node["_target_"])
     if not fits(target, expected):
-        raise ValueError(f"{key}._target_ must name a class of kind {describe(expected)}, got {node['_target_']}")
+        raise UserError(f"{key}._target_ must name a class of kind {describe(expected)}, got {node['_target_']}")
     parameters = arguments(target)
     several = [name for name, each in parameters.items() if each.kind is inspect.Parameter.VAR_KEYWORD]
     known = [name for name in parameters if name not in (*runtime, *several)]
     if lacking := [name for name in runtime if not several and name not in parameters]:
-        raise ValueError(f"{key}: {target.__name__} must take the arguments {', '.join(lacking)}, which the job gives")
+        raise UserError(f"{key}: {target.__name__} must take the arguments {', '.join(lacking)}, which the job gives")
     hints = {name: each.annotation for name, each in parameters.items()} | NARROWER.get(node["_target_"], {})
     for name, value in node.items():
         if name in HYDRA_KEYS:
@@ -193,11 +194,11 @@ def check_node(key: str, node: Any, expected: Any, runtime: Sequence[str] = ()) 
     for name in known:
         by_caller = partial and (name in RUNTIME or parameters[name].kind is inspect.Parameter.KEYWORD_ONLY)
         if name not in node and not by_caller and parameters[name].default is inspect.Parameter.empty:
-            raise ValueError(f"{key}.{name} is missing: {target.__name__} needs it")
+            raise UserError(f"{key}.{name} is missing: {target.__name__} needs it")
 
 
 def require_trust(config: Mapping[str, Any], names: Iterable[Any], source: object) -> None:
-    """Raise a ValueError if a node among `names` of the file `source` names a class or package that is not trusted."""
+    """Raise a UserError if a node among `names` of the file `source` names a class or package that is not trusted."""
     nodes = [config.get(name) for name in names]
     for target in targets(nodes):
         require_trusted(source, target)
@@ -216,13 +217,13 @@ def require_no_paths(
         given: dotted names of nodes that the command line gives in place of the file's; None: it cannot.
 
     Raises:
-        ValueError: with the dotted name of the first such argument, or a class that may not be built.
+        UserError: with the dotted name of the first such argument, or a class that may not be built.
     """
     require_trust(config, names, source)
     for key in (key for name in names for key in _paths_in(config.get(name), name)):
         if not any(f"{key}.".startswith(f"{name}.") for name in given or ()):
             hint = "" if given is None else f"; {key.rpartition('.')[0].replace('.', '/')}=OPTION gives yours"
-            raise ValueError(
+            raise UserError(
                 f"{source} names a path or an address in {key}: these are taken from your own runs and commands only"
                 f"{hint}"
             )
@@ -268,12 +269,12 @@ def _paths_in(node: Any, key: str) -> Iterator[str]:
 
 
 def check_value(key: str, value: Any, annotation: Any) -> None:
-    """Raise a ValueError with the dotted name `key` if a value does not match an annotation."""
+    """Raise a UserError with the dotted name `key` if a value does not match an annotation."""
     _check_nodes(key, value)  # first, because an error within a node is more specific
     if not matches(value, annotation):
         choices = [str(choice) for choice in get_args(annotation)] if get_origin(annotation) is Literal else []
         hint = suggestion(str(value), choices)
-        raise ValueError(f"{key} must be {describe(annotation)}, got {_short(value)}{hint}")
+        raise UserError(f"{key} must be {describe(annotation)}, got {_short(value)}{hint}")
 
 
 def _check_nodes(key: str, value: Any) -> None:
@@ -292,11 +293,11 @@ def _short(value: Any) -> str:
 
 
 def require_known(key: str, name: str, known: Collection[str], owner: str) -> None:
-    """Raise a ValueError with a suggestion for a name that `owner` does not take."""
+    """Raise a UserError with a suggestion for a name that `owner` does not take."""
     if name not in known:
         prefix = f"{key}." if key else ""
         hint = suggestion(name, known) or ":"
-        raise ValueError(f"{prefix}{name} is unknown{hint} {owner} takes {', '.join(known)}")
+        raise UserError(f"{prefix}{name} is unknown{hint} {owner} takes {', '.join(known)}")
 
 
 def arguments(target: type) -> dict[str, inspect.Parameter]:

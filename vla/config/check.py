@@ -20,6 +20,7 @@ from vla.config.annotations import MissingLibrary, fits, locate
 from vla.config.build import GROUPS, Group, arguments, check_node, check_value, makes, require_known
 from vla.config.packages import config_folders
 from vla.io.documents import canonical
+from vla.io.errors import UserError
 from vla.io.types import Count, Images, Natural, Quality, Seed, Text, unique
 from vla.spec import FIRST_SEED, IN_DISTRIBUTION
 
@@ -85,7 +86,7 @@ def check(cfg: DictConfig, job: Job) -> None:
     """Check every node that the `job` of `cfg` will build against the signature of its class.
 
     Raises:
-        ValueError: an unknown, missing or ill-typed key, with its dotted name and the allowed values.
+        UserError: an unknown, missing or ill-typed key, with its dotted name and the allowed values.
     """
     groups, plain = job.needs(cfg), dict(PLAIN)
     if job.options:
@@ -102,9 +103,9 @@ def check(cfg: DictConfig, job: Job) -> None:
         _require_apart(cfg)
     _require_different_stores(cfg)
     if cfg.agent is not None and "agent" not in groups:
-        raise ValueError(f"job={cfg.job} takes no agent: agent=OPTION goes with job=evaluate and deploy")
+        raise UserError(f"job={cfg.job} takes no agent: agent=OPTION goes with job=evaluate and deploy")
     if cfg.agent is not None and cfg.checkpoint is not None:
-        raise ValueError("agent=OPTION and checkpoint=RUN are two policies: omit one of them")
+        raise UserError("agent=OPTION and checkpoint=RUN are two policies: omit one of them")
     for name, group in groups.items():
         if cfg.get(name) is not None:
             node = OmegaConf.to_container(cfg[name], resolve=True, throw_on_missing=True)
@@ -114,7 +115,7 @@ def check(cfg: DictConfig, job: Job) -> None:
                 with suppress(MissingLibrary) if name in job.stored else nullcontext():
                     check_node(key, each, makes(group), group.runtime)
         elif not group.optional:
-            raise ValueError(f"job={cfg.job} needs {name}=OPTION; --help lists the options")
+            raise UserError(f"job={cfg.job} needs {name}=OPTION; --help lists the options")
     if "model" in groups:
         _require_together(*(locate(f"{group}._target_", cfg[group]._target_) for group in ("tokenizer", "model")))
     _check_changes(cfg, training="learner" in groups)
@@ -147,7 +148,7 @@ def conditions(evaluate: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
         evaluate: the plain node, whose `one_by_one` is level → argument of the task → part → value.
 
     Raises:
-        ValueError: two conditions have one name, those of `without` and `networks` and the training condition included.
+        UserError: two conditions have one name, those of `without` and `networks` and the training condition included.
     """
     named: list[tuple[str, dict[str, Any]]] = [*evaluate["conditions"].items()]
     levels: dict[tuple[str, str], dict[str, Any]] = {}
@@ -166,7 +167,7 @@ def conditions(evaluate: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
     others += [NEAREST] if evaluate["nearest"] else []
     for name, count in Counter([*others, *(name for name, _ in named)]).items():
         if count > 1:
-            raise ValueError(f"evaluate has {count} conditions with the name {name}: rename one")
+            raise UserError(f"evaluate has {count} conditions with the name {name}: rename one")
     return dict(named)
 
 
@@ -199,7 +200,7 @@ def _require_apart(cfg: DictConfig) -> None:
     names = ("validate", "evaluate")
     one, other = (range(cfg[name].seed, cfg[name].seed + cfg[name].episodes) for name in names)
     if range(max(one.start, other.start), min(one.stop, other.stop)):
-        raise ValueError(
+        raise UserError(
             f"validate.seed={one.start} and evaluate.seed={other.start} share episodes, but episodes that select the "
             "weights must not evaluate them: change one of the two"
         )
@@ -208,7 +209,7 @@ def _require_apart(cfg: DictConfig) -> None:
 def _require_different_stores(cfg: DictConfig) -> None:
     folder = Path(cfg.collect.folder).resolve()
     if folder in (Path(more).resolve() for more in cfg.collect.more or ()):
-        raise ValueError(
+        raise UserError(
             f"collect.folder and collect.more name the same store, {folder}: omit it in collect.more, which takes "
             "further stores only, several times if they are to count for more"
         )
@@ -217,9 +218,9 @@ def _require_different_stores(cfg: DictConfig) -> None:
 def _require_together(tokenizer: type, model: type) -> None:
     taken = arguments(model).get("tokenizer")
     if taken is None:
-        raise ValueError(f"{model.__name__} does not name its arguments: end them with **inherited: Inherited")
+        raise UserError(f"{model.__name__} does not name its arguments: end them with **inherited: Inherited")
     if taken.annotation not in (Any, Parameter.empty) and not fits(tokenizer, taken.annotation):
-        raise ValueError(
+        raise UserError(
             f"{model.__name__} predicts one token per component, which {tokenizer.__name__} does not have: choose "
             "another tokenizer, such as uniform, or model=decoder, which goes with all"
         )
@@ -247,12 +248,12 @@ def _check_plain(key: str, value: Any, annotation: Any) -> None:
     if not isinstance(annotation, Mapping):
         return check_value(key, value, annotation)
     if not isinstance(value, dict):
-        raise ValueError(f"{key} must hold {', '.join(annotation)}, got {value!r}")
+        raise UserError(f"{key} must hold {', '.join(annotation)}, got {value!r}")
     for name in value:
         require_known(key, name, annotation, key)
     for name in annotation:
         if name not in value:
-            raise ValueError(f"{key}.{name} is missing")
+            raise UserError(f"{key}.{name} is missing")
         check_value(f"{key}.{name}", value[name], annotation[name])
     return None
 

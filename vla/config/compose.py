@@ -22,6 +22,7 @@ from vla.config.build import check_value
 from vla.config.experiment import Node, plain
 from vla.config.packages import CONF, config_folders, offer_options
 from vla.io.documents import read_yaml
+from vla.io.errors import UserError
 from vla.io.suggestion import suggestion
 
 
@@ -31,7 +32,7 @@ def compose(*overrides: str) -> DictConfig:
     Add `output=DIR`: only the command line creates a folder per run.
 
     Raises:
-        ValueError: see `with_variant`.
+        UserError: see `with_variant`.
     """
     with _hydra():
         config = hydra.compose("config", list(overrides), return_hydra_config=True)
@@ -49,7 +50,7 @@ def with_variant(config: DictConfig, overrides: Sequence[str]) -> DictConfig:
         overrides: of the command line.
 
     Raises:
-        ValueError: the config has no such variant, or an override contradicts it.
+        UserError: the config has no such variant, or an override contradicts it.
     """
     with open_dict(config):
         name, variants = config.pop("variant"), config.pop("variants")
@@ -57,13 +58,13 @@ def with_variant(config: DictConfig, overrides: Sequence[str]) -> DictConfig:
         return config
     if name not in variants:
         there = f"{suggestion(str(name), variants) or ':'} there are {', '.join(variants)}" if variants else ""
-        raise ValueError(f"there is no variant={name}{there or '; an experiment that is a grid has variants'}")
+        raise UserError(f"there is no variant={name}{there or '; an experiment that is a grid has variants'}")
     changes = plain(variants)[name]
     check_value(f"variants.{name}", changes, list[str])
     given = {override.partition("=")[0]: override for override in overrides}
     for change in changes:
         if contrary := given.get(change.partition("=")[0]):
-            raise ValueError(f"variant={name} is {change}: omit {contrary}")
+            raise UserError(f"variant={name} is {change}: omit {contrary}")
     return compose(*(override for key, override in given.items() if key != "variant"), *changes)
 
 

@@ -19,6 +19,7 @@ from vla.config.check import with_changes
 from vla.config.differences import ABSENT, at, differences
 from vla.config.origin import SECRET, Origin, find_origin
 from vla.config.packages import trusted, with_trust
+from vla.io.errors import UserError
 from vla.parallel.processes import without_triton
 from vla.spec import Spec, SpecOnly
 
@@ -108,7 +109,7 @@ class Experiment:
 
     @property
     def checkpoint(self) -> Path | None:
-        """Folder of the policy that the job uses, if given; a ValueError if there is none."""
+        """Folder of the policy that the job uses, if given; a UserError if there is none."""
         return _policy_folder(self["checkpoint"])
 
     @property
@@ -136,11 +137,11 @@ class Experiment:
         """Return the factory of the policy in a folder, by default `checkpoint` of the config.
 
         Raises:
-            ValueError: no policy is given.
+            UserError: no policy is given.
         """
         checkpoint = checkpoint or self.checkpoint
         if checkpoint is None:
-            raise ValueError("this needs a trained policy: checkpoint=RUN")
+            raise UserError("this needs a trained policy: checkpoint=RUN")
         return partial(with_trust, trusted(), make_policy, self["policy"], checkpoint, own=True)
 
     def make_agent(self) -> Callable[[Environment], Agent] | None:
@@ -167,7 +168,7 @@ class Experiment:
             origin: folder of the policy with the initial weights.
 
         Raises:
-            ValueError: `origin` is no policy, or has another spec.
+            UserError: `origin` is no policy, or has another spec.
         """
         from vla.models.policy_folder import read_policy
 
@@ -182,7 +183,7 @@ class Experiment:
         return build(self["learner"], "learner", model=model, spec=spec, config=self.config)
 
     def resumed_learner(self, spec: Spec, checkpoint: Path) -> Learner:
-        """Build the learner that Lightning's checkpoint of this training continues; a ValueError if it is damaged."""
+        """Build the learner that Lightning's checkpoint of this training continues; a UserError if it is damaged."""
         from vla.models.checkpoint import read_content, weights_of
 
         content = read_content(checkpoint)
@@ -200,7 +201,7 @@ class Experiment:
 
     @property
     def pretrained(self) -> Path | None:
-        """Folder of the policy with the initial weights of a training, if given; a ValueError if there is none."""
+        """Folder of the policy with the initial weights of a training, if given; a UserError if there is none."""
         return _policy_folder(self["pretrained"])
 
     def fitted_learner(self, store: EpisodeStore) -> Learner:
@@ -251,12 +252,12 @@ def make_environment(task: Node) -> Environment:
     """Build the environment of a task node.
 
     Raises:
-        ValueError: nothing can act in the world.
+        UserError: nothing can act in the world.
     """
     without_triton()
     environment = build(task, "task")
     if isinstance(environment, SpecOnly):
-        raise ValueError(
+        raise UserError(
             "the task has no simulator, only recordings, so nothing can be played in it: job=collect, train, evaluate, "
             "export and inspect work with recordings, and so do deploy=server and deploy=ros2"
         )
@@ -268,13 +269,13 @@ def make_expert(expert: Node, environment: Environment) -> Agent:
     """Build the expert for an environment.
 
     Raises:
-        ValueError: the expert is a recording, which cannot act.
+        UserError: the expert is a recording, which cannot act.
     """
     from vla.data.formats.imported_demonstrations import ImportedDemonstrations
 
     agent: Agent = build(expert, "expert", spec=environment.spec)
     if isinstance(agent, ImportedDemonstrations):
-        raise ValueError("recorded demonstrations cannot act: this job needs the expert of a world that can be played")
+        raise UserError("recorded demonstrations cannot act: this job needs the expert of a world that can be played")
     return agent
 
 
@@ -293,7 +294,7 @@ def make_policy(policy: Node, checkpoint: Path, environment: Environment | None 
         own: the policy may name paths and addresses, because it is of this run, or was looked through before.
 
     Raises:
-        ValueError: there is no policy, its spec differs from the environment's, or it names what it may not.
+        UserError: there is no policy, its spec differs from the environment's, or it names what it may not.
     """
     from vla.models.policy_folder import read_policy
 
@@ -311,7 +312,7 @@ def make_policy(policy: Node, checkpoint: Path, environment: Environment | None 
     except RuntimeError as error:  # torch.OutOfMemoryError, or one of CUDA itself
         if "out of memory" not in str(error):
             raise
-        raise ValueError(
+        raise UserError(
             "the GPU has too little memory for a policy in every process: lower cluster.workers, as in "
             "cluster.workers=8, or set policy.device=cpu"
         ) from error

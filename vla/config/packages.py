@@ -24,6 +24,7 @@ from hydra.core.plugins import Plugins
 from hydra.plugins.search_path_plugin import SearchPathPlugin
 
 from vla.io.documents import read_json
+from vla.io.errors import UserError
 from vla.io.files import write_json
 
 log = logging.getLogger(__name__)
@@ -67,7 +68,7 @@ def option_folders() -> tuple[tuple[str, Path], ...]:
     """Return (package, folder of options) of installed packages, without importing them.
 
     Raises:
-        ValueError: an installed package names a folder that does not exist.
+        UserError: an installed package names a folder that does not exist.
     """
     found = []
     for entry in sorted(entry_points(group=ENTRY_POINTS), key=lambda entry: entry.value):
@@ -76,7 +77,7 @@ def option_folders() -> tuple[tuple[str, Path], ...]:
         places = spec.submodule_search_locations or () if spec else ()
         folder = next((path for place in places if (path := Path(place, *parts)).is_dir()), None)
         if folder is None:
-            raise ValueError(
+            raise UserError(
                 f"the installed package {package} names {entry.value} as its options, which is not a folder: its wheel "
                 "must include the YAML files"
             )
@@ -94,10 +95,10 @@ def trust(packages: Any, chosen: Iterable[Any], used: Iterable[Any] = ()) -> Non
         used: every `package` in it, which is trusted.
 
     Raises:
-        ValueError: `packages` is not a list, or a package cannot be trusted.
+        UserError: `packages` is not a list, or a package cannot be trusted.
     """
     if not isinstance(packages, list):
-        raise ValueError(f"trust must be a list of packages, as in trust=[mypackage], got {packages!r}")
+        raise UserError(f"trust must be a list of packages, as in trust=[mypackage], got {packages!r}")
     used = [name for name in used if name != MISSING]
     named = [*packages, *_names(TRUST), *used]
     for name in named:
@@ -112,10 +113,10 @@ def trusting(packages: Sequence[str], checkpoint: Path) -> Iterator[None]:
     """Trust further packages within the context, and what this user trusted in the training of a checkpoint.
 
     Raises:
-        ValueError: a package cannot be trusted.
+        UserError: a package cannot be trusted.
     """
     if isinstance(packages, str):
-        raise ValueError(f"trust must be a list of packages, as in trust=[{packages!r}], got {packages!r}")
+        raise UserError(f"trust must be a list of packages, as in trust=[{packages!r}], got {packages!r}")
     for name in packages:
         _require_trustworthy("trust", name)
     before = os.environ.get(TRUSTED)
@@ -175,7 +176,7 @@ def is_trusted(target: str) -> bool:
 
 def _require_trustworthy(key: str, name: Any) -> None:
     if not isinstance(name, str) or not can_be_trusted(name):
-        raise ValueError(
+        raise UserError(
             f"{key} cannot name {name!r}: it takes packages made for vla or gymnasium, by the name that "
             "is imported, without a module: their distribution depends on one of these"
         )

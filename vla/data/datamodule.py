@@ -25,6 +25,7 @@ from torch import Tensor
 from vla.data.episodes import EpisodeStore
 from vla.data.index import Entry
 from vla.data.window_batches import Batch, JoinedBatcher, WindowBatcher
+from vla.io.errors import UserError
 from vla.io.types import Count, Natural, Rate, Seed
 from vla.spec import Array, Spec
 
@@ -143,7 +144,7 @@ class WindowDataModule(LightningDataModule):
         """Open the stores and split their episodes.
 
         Raises:
-            ValueError: a store cannot be read or has another spec, or there are too few episodes to split.
+            UserError: a store cannot be read or has another spec, or there are too few episodes to split.
         """
         stores = [EpisodeStore(self._folder, self._episodes), *map(EpisodeStore, self._more)]
         rows = [max((entry.end for entry in store.episodes), default=0) for store in stores]
@@ -156,7 +157,7 @@ class WindowDataModule(LightningDataModule):
                 side.append(first + np.arange(entry.start, entry.end))
         episodes = [entry for store in stores for entry in store.episodes]
         if not trained or (self._fraction > 0 and not unseen):
-            raise ValueError(
+            raise UserError(
                 f"{len(episodes)} episodes leave {len(trained)} for training and {len(unseen)} for validation: raise "
                 f"collect.episodes, or set data.validation_fraction (now {self._fraction})"
             )
@@ -174,10 +175,10 @@ class WindowDataModule(LightningDataModule):
         """Compare the demonstrations with those of the resumed training.
 
         Raises:
-            ValueError: they differ.
+            UserError: they differ.
         """
         if state["windows"] != self._digest:
-            raise ValueError(
+            raise UserError(
                 f"the resumed training was started with other demonstrations than those in {self._folder}: "
                 "set collect.folder=DIR to their folder, or start a new training without resume="
             )

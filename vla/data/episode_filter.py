@@ -13,6 +13,7 @@ from typing import Any
 
 from vla.data.draws import flat, leaves
 from vla.data.index import Entry
+from vla.io.errors import UserError
 from vla.io.suggestion import suggestion
 
 FACTS = ("seed", "task", "instruction", "outcome", "steps")
@@ -33,15 +34,15 @@ def episode_filter(where: Mapping[str, Any], entries: Iterable[Entry]) -> Callab
         entries: the entries to filter; each name must occur in one of them.
 
     Raises:
-        ValueError: a name occurs in no entry, or a condition is of another kind.
+        UserError: a name occurs in no entry, or a condition is of another kind.
     """
     known = dict.fromkeys(name for entry in entries for name in facts(entry))
     for name, condition in where.items():
         if name not in known:
             hint = suggestion(name, known) or f": there are {', '.join(known)}"
-            raise ValueError(f"inspect.where: no episode has {name}{hint}")
+            raise UserError(f"inspect.where: no episode has {name}{hint}")
         if not (isinstance(condition, (str, bool, int, float)) or _is_range(condition) or _is_texts(condition)):
-            raise ValueError(
+            raise UserError(
                 f"inspect.where: {name} must be a text, in which * stands for anything, a number, a range "
                 f"[low, high] or a list of texts, not {condition!r}"
             )

@@ -31,6 +31,7 @@ from vla.data.header import Codec, fields_of, is_store, read_header, write_heade
 from vla.data.index import REMEDY, SALVAGE, Entry, dumps, index_line, listed, parse_line, read_index
 from vla.data.statistics import Statistics
 from vla.io.documents import canonical
+from vla.io.errors import UserError
 from vla.io.files import require_file
 from vla.parallel.limits import memory
 from vla.spec import FIRST_SEED, Array, Episode, Observation, Spec
@@ -40,7 +41,7 @@ IN_MEMORY = 0.25  # largest share of the memory that a store takes that is expec
 log = logging.getLogger(__name__)
 
 
-class DamageError(ValueError):
+class DamageError(UserError):
     """Rows of a store are damaged; `what` is the kind of damage."""
 
     def __init__(self, message: str, what: str = "rows changed or lost") -> None:
@@ -66,7 +67,7 @@ class EpisodeStore:
         damaged: also open a store with truncated files or unreadable index lines; the seeds of the latter are `LOST`.
 
     Raises:
-        ValueError: the folder holds no store, or one that has another format, is damaged, or is too short.
+        UserError: the folder holds no store, or one that has another format, is damaged, or is too short.
     """
 
     def __init__(self, folder: str | Path, episodes: int | None = None, damaged: bool = False) -> None:
@@ -80,7 +81,7 @@ class EpisodeStore:
         self._index, self._files = self.folder / "index.jsonl", dict[Path, BinaryIO]()
         self._refresh()
         if episodes is not None and len(self.episodes) < episodes:
-            raise ValueError(f"{folder} holds {len(self.episodes)} of {episodes} episodes: collect the rest first")
+            raise UserError(f"{folder} holds {len(self.episodes)} of {episodes} episodes: collect the rest first")
 
     @classmethod
     def create_or_open(
@@ -89,7 +90,7 @@ class EpisodeStore:
         """Open the store in `folder`, or create an empty one, whose codec is by default that for its size of images.
 
         Raises:
-            ValueError: the store has another spec or config, other losses than `codec`, or lacks its `store.json`.
+            UserError: the store has another spec or config, other losses than `codec`, or lacks its `store.json`.
         """
         folder = Path(folder)
         plain = json.loads(dumps(config))
@@ -104,7 +105,7 @@ class EpisodeStore:
         return store
 
     def require(self, config: Mapping[str, Any]) -> None:
-        """Raise a ValueError if the episodes have another config.
+        """Raise a UserError if the episodes have another config.
 
         A derived store may differ: its episodes were chosen explicitly.
         """
@@ -113,33 +114,31 @@ class EpisodeStore:
         asked, there = canonical(json.loads(dumps(config))), canonical(self.config)
         different = sorted(key for key in {*asked, *there} if asked.get(key) != there.get(key))
         if different:
-            raise ValueError(f"{self.folder} was collected with another config for {different}: choose another folder")
+            raise UserError(f"{self.folder} was collected with another config for {different}: choose another folder")
 
     def require_codec(self, codec: Codec | None) -> None:
-        """Raise a ValueError if the images have other losses than those of `codec`; with None they may have any."""
+        """Raise a UserError if the images have other losses than those of `codec`; with None they may have any."""
         if codec is not None and codec.loss != self.codec.loss:
-            raise ValueError(
+            raise UserError(
                 f"{self.folder} holds {self.codec}, not {codec}: choose another folder, or omit collect.images"
             )
 
     def require_first_seed(self, seed: int) -> None:
-        """Raise a ValueError if the first episode has another seed; a derived store may begin anywhere."""
+        """Raise a UserError if the first episode has another seed; a derived store may begin anywhere."""
         if self.tried and not self.derived and self.tried[0].seed != seed:
             first = self.tried[0].seed
-            raise ValueError(f"{self.folder} starts at seed {first}, not {seed}: set collect.seed={first}")
+            raise UserError(f"{self.folder} starts at seed {first}, not {seed}: set collect.seed={first}")
 
     def require_growable(self) -> None:
-        """Raise a ValueError if no episodes may be added, because the present ones were copied from other stores."""
+        """Raise a UserError if no episodes may be added, because the present ones were copied from other stores."""
         if self.derived:
             most = len(self.episodes)
-            raise ValueError(
-                f"{self.folder} was derived from other stores and cannot grow: set collect.episodes={most}"
-            )
+            raise UserError(f"{self.folder} was derived from other stores and cannot grow: set collect.episodes={most}")
 
     def require_episodes(self) -> None:
-        """Raise a ValueError if there are no episodes."""
+        """Raise a UserError if there are no episodes."""
         if not self.episodes:
-            raise ValueError(f"{self.folder} holds no episodes yet: collect some first")
+            raise UserError(f"{self.folder} holds no episodes yet: collect some first")
 
     @property
     def derived(self) -> bool:
@@ -153,7 +152,7 @@ class EpisodeStore:
 
     @property
     def statistics(self) -> Statistics:
-        """Bounds and a sample of the actions in `episodes`; a ValueError if there are none, or if they are damaged."""
+        """Bounds and a sample of the actions in `episodes`; a UserError if there are none, or if they are damaged."""
         self.require_episodes()
         actions = self.rows("action")
         self.verify(self.episodes, {"action": actions})
@@ -168,7 +167,7 @@ class EpisodeStore:
         They are a memory-mapped array, or `ScatteredRows`, which raise a DamageError error for a damaged image.
         """
         if field not in self.fields:
-            raise ValueError(f"{self.folder} has no field {field!r}: it has {sorted(self.fields)}")
+            raise UserError(f"{self.folder} has no field {field!r}: it has {sorted(self.fields)}")
         shape, dtype = self.fields[field]
         if self._rows == 0:
             return np.empty((0, *shape), dtype)
@@ -253,18 +252,18 @@ class EpisodeStore:
         `packed` are its images as another store with the same codec keeps them: JPEG is not compressed a second time.
 
         Raises:
-            ValueError: it does not match the spec, has several instructions or another seed than the next, or cannot be
+            UserError: it does not match the spec, has several instructions or another seed than the next, or cannot be
                 written.
         """
         if len({seen.instruction for seen in episode.observations}) > 1:
-            raise ValueError(
+            raise UserError(
                 f"seed {episode.seed} has several instructions, and a store keeps one per episode: give episodes below "
                 f"seed {FIRST_SEED} one each"
             )
         try:
             rows = self._rows_of(episode)
         except KeyError as error:
-            raise ValueError(f"seed {episode.seed}: an observation lacks {error}, which the spec names") from error
+            raise UserError(f"seed {episode.seed}: an observation lacks {error}, which the spec names") from error
         pieces = {name: self._columns[name].pieces(self._rows, rows[name], (packed or {}).get(name)) for name in rows}
         jpeg = [name for name in rows if self.codec.of(name) == "jpeg"]
         crc = {name: zlib.crc32(pieces[name][0] if name in jpeg else rows[name].data) for name in rows}
@@ -282,7 +281,7 @@ class EpisodeStore:
     def _commit(self, entry: Entry, pieces: Mapping[str, Sequence[bytes | memoryview]]) -> None:
         assert self._files, "append and fail work inside `with store.writing()`"
         if self.next_seed not in (None, entry.seed):
-            raise ValueError(f"{self.folder} expects seed {self.next_seed} next, got seed {entry.seed}")
+            raise UserError(f"{self.folder} expects seed {self.next_seed} next, got seed {entry.seed}")
         line = index_line(entry)
         entry = parse_line(line[:-1], f"{self.folder}: the entry of seed {entry.seed}")  # validated as a reader does
         try:
@@ -297,7 +296,7 @@ class EpisodeStore:
             self._index_size += len(line)
         except OSError as error:
             safe = f"the {len(self.episodes)} episodes before it are safe, make room and run again to continue"
-            raise ValueError(f"{self.folder} cannot take seed {entry.seed} ({error.strerror}): {safe}") from error
+            raise UserError(f"{self.folder} cannot take seed {entry.seed} ({error.strerror}): {safe}") from error
         finally:
             self._cut()
 
@@ -311,14 +310,14 @@ class EpisodeStore:
     def _refresh(self) -> None:
         files = [column.files[0] for column in self._columns.values()]
         if not self._index.exists() and (there := [path for path in files if path.exists()]):
-            raise ValueError(f"{self._index} is missing, which {there[0].name} beside it needs: {REMEDY}")
+            raise UserError(f"{self._index} is missing, which {there[0].name} beside it needs: {REMEDY}")
         self.tried, self._index_size = read_index(self._index, self.derived, self._damaged)
         self.episodes = [entry for entry in self.tried if entry.stored][: self._limit]
         self._rows = max((entry.end for entry in self.tried), default=0)
         for column in self._columns.values():
             whole = column.whole(self._rows)
             if whole < self._rows and not self._damaged:
-                raise ValueError(f"{column.files[0]} is shorter than its index says: {SALVAGE}")
+                raise UserError(f"{column.files[0]} is shorter than its index says: {SALVAGE}")
             self._rows = whole
 
     def _rows_of(self, episode: Episode) -> dict[str, Array]:
@@ -338,7 +337,7 @@ class EpisodeStore:
         shape, dtype = self.fields[name]
         column = np.asarray(values)
         if column.shape != (steps, *shape) or not np.can_cast(column.dtype, dtype, "same_kind"):
-            raise ValueError(f"{name} must be {(steps, *shape)} {dtype}, got {column.shape} {column.dtype}")
+            raise UserError(f"{name} must be {(steps, *shape)} {dtype}, got {column.shape} {column.dtype}")
         return np.ascontiguousarray(column, dtype)
 
 
@@ -358,11 +357,11 @@ def observations_of(spec: Spec, rows: Mapping[str, Array], instruction: str) -> 
 
 
 def _require_own_files(paths: Iterable[Path]) -> None:
-    """Refuse links, which an archive keeps: what is behind them would be overwritten. Raises a ValueError."""
+    """Refuse links, which an archive keeps: what is behind them would be overwritten. Raises a UserError."""
     for path in paths:
         require_file(path)
         if path.is_symlink():
-            raise ValueError(f"{path} is a link, and nothing is added behind a link: copy the file to this place")
+            raise UserError(f"{path} is a link, and nothing is added behind a link: copy the file to this place")
 
 
 def _checksum(rows: Rows, span: slice, values: Array | None = None) -> int:

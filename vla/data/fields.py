@@ -15,12 +15,13 @@ import numpy as np
 
 from vla.data.header import Codec
 from vla.data.image_codec import decode, encode, in_threads
+from vla.io.errors import UserError
 from vla.spec import Array
 
 END = np.dtype([("end", "<u8"), ("crc", "<u4")])
 OVERHEAD = 4096  # largest number of bytes by which compression may enlarge an image
 
-Damaged = Callable[[int], ValueError]  # row → the error to raise
+Damaged = Callable[[int], UserError]  # row → the error to raise
 
 
 class ScatteredRows:

@@ -11,6 +11,7 @@ from annotated_types import Ge, Le
 
 from vla.data.index import REMEDY, Plain, dumps
 from vla.io.documents import STRICT, parse_json, parse_plain, read_bounded, resolved
+from vla.io.errors import UserError
 from vla.io.files import write_text
 from vla.io.types import Images, Quality
 from vla.spec import Spec
@@ -126,19 +127,19 @@ def read_header(folder: Path) -> tuple[Header, Spec]:
     """Read the description of the store in a folder.
 
     Raises:
-        ValueError: it is missing, damaged or of another kind.
+        UserError: it is missing, damaged or of another kind.
     """
     path = folder / NAME
     if not is_store(folder):
-        raise ValueError(f"there is no episode store in {folder} (no {NAME}): collect one first, with job=collect")
+        raise UserError(f"there is no episode store in {folder} (no {NAME}): collect one first, with job=collect")
     try:
         content = read_bounded(path, LARGEST)
         found = parse_json(content, dict[str, Any], str(path)).get("format")
         if found == FORMAT:
             return _parsed(content, path)
     except ValueError as error:
-        raise ValueError(f"{error}: {REMEDY}") from error
-    raise ValueError(f"{path} has format {str(found)[:20]}, this version reads {FORMAT}: collect again")
+        raise UserError(f"{error}: {REMEDY}") from error
+    raise UserError(f"{path} has format {str(found)[:20]}, this version reads {FORMAT}: collect again")
 
 
 def _parsed(content: bytes, path: Path) -> tuple[Header, Spec]:
@@ -149,7 +150,7 @@ def _parsed(content: bytes, path: Path) -> tuple[Header, Spec]:
     resolved(header.config, str(path))
     has_quality = header.codec.quality is not None
     if header.fields != _layouts(spec) or has_quality != (header.codec.images == "jpeg"):
-        raise ValueError(f"{path} is damaged or of another kind: its fields are not those of its spec and codec")
+        raise UserError(f"{path} is damaged or of another kind: its fields are not those of its spec and codec")
     return header, spec
 
 
@@ -157,7 +158,7 @@ def write_header(folder: Path, spec: Spec, config: dict[str, Any], codec: Codec)
     """Write the description of a store unless it exists: another process may have been faster.
 
     Raises:
-        ValueError: the folder holds episodes without a description.
+        UserError: the folder holds episodes without a description.
         OSError: it cannot be written.
     """
     path = folder / NAME
@@ -165,7 +166,7 @@ def write_header(folder: Path, spec: Spec, config: dict[str, Any], codec: Codec)
         return
     orphans = sorted(file.name for file in folder.iterdir() if file.suffix in (".bin", ".pack", ".jsonl"))
     if orphans:
-        raise ValueError(f"{folder} holds {orphans[0]} without {NAME}, which says what it means: {REMEDY}")
+        raise UserError(f"{folder} holds {orphans[0]} without {NAME}, which says what it means: {REMEDY}")
     write_text(path, Header(FORMAT, spec.to_dict(), config, _layouts(spec), codec).text())
 
 

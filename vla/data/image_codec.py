@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 from PIL import Image, UnidentifiedImageError
 
+from vla.io.errors import UserError
 from vla.io.types import Images
 from vla.parallel.limits import cores
 from vla.spec import Array
@@ -35,13 +36,13 @@ def encode(image: Array, codec: Images, quality: int | None) -> bytes:
 
 
 def decode(packed: bytes, codec: Images, shape: tuple[int, ...], dtype: np.dtype) -> Array:
-    """Invert `encode`; a ValueError for damaged images and those of another shape, before memory is taken for them."""
+    """Invert `encode`; a UserError for damaged images and those of another shape, before memory is taken for them."""
     if codec == "jpeg":
         return decode_image(packed, ("JPEG",), shape)
     try:
         rows = _zstandard().decompress(packed, int(np.prod(shape)) * dtype.itemsize)
     except OSError as error:
-        raise ValueError(f"the image cannot be decoded ({error})") from error
+        raise UserError(f"the image cannot be decoded ({error})") from error
     return np.frombuffer(rows, dtype).reshape(shape)
 
 
@@ -51,18 +52,18 @@ def decode_image(packed: bytes | memoryview, formats: tuple[str, ...], shape: tu
     Grey becomes equal colours; transparency is dropped.
 
     Raises:
-        ValueError: the shape differs, the image is of another kind, or it is damaged.
+        UserError: the shape differs, the image is of another kind, or it is damaged.
     """
     try:
         with Image.open(io.BytesIO(packed), formats=formats) as image:
             if image.mode not in MODES or (image.height, image.width, 3) != shape:
                 size = f"{shape[0]} x {shape[1]} of {', '.join(MODES)}"
-                raise ValueError(f"the image is {image.height} x {image.width} pixels of {image.mode}, not {size}")
+                raise UserError(f"the image is {image.height} x {image.width} pixels of {image.mode}, not {size}")
             return np.asarray(image if image.mode == "RGB" else image.convert("RGB"))
     except UnidentifiedImageError as error:  # whose text has an address in memory
-        raise ValueError(f"the image cannot be decoded: it is not {' or '.join(formats)}") from error
+        raise UserError(f"the image cannot be decoded: it is not {' or '.join(formats)}") from error
     except (OSError, SyntaxError, EOFError, struct.error, zlib.error, Image.DecompressionBombError) as error:
-        raise ValueError(f"the image cannot be decoded ({str(error)[:200]})") from error
+        raise UserError(f"the image cannot be decoded ({str(error)[:200]})") from error
 
 
 def in_threads(work: Callable[[int], None], count: int) -> None:

@@ -13,6 +13,7 @@ import numpy as np
 from annotated_types import Ge, Le, MaxLen, Predicate
 
 from vla.io.documents import STRICT, parse_json, read_bounded
+from vla.io.errors import UserError
 from vla.io.types import Seed
 from vla.spec import LONGEST_INSTRUCTION, Name
 
@@ -91,14 +92,14 @@ def parse_line(line: bytes, name: str) -> Entry:
     """Decode a line without its line end.
 
     Raises:
-        ValueError: the line is damaged; the message begins with `name`.
+        UserError: the line is damaged; the message begins with `name`.
     """
     body = line.rpartition(CHECK)[0] + b"}"
     if _sealed(body) != line:
-        raise ValueError(f"{name} is damaged: it does not fit its checksum")
+        raise UserError(f"{name} is damaged: it does not fit its checksum")
     entry = parse_json(body, Entry, name)
     if entry.success and not entry.stored:
-        raise ValueError(f"{name} is damaged: a success has steps")
+        raise UserError(f"{name} is damaged: a success has steps")
     return entry
 
 
@@ -107,14 +108,14 @@ def _sealed(body: bytes) -> bytes:
 
 
 def dumps(value: Any) -> str:
-    """Encode as JSON on one line, with arrays as lists; a ValueError for other types than JSON has."""
+    """Encode as JSON on one line, with arrays as lists; a UserError for other types than JSON has."""
     return json.dumps(value, default=_plain, allow_nan=False, ensure_ascii=False)
 
 
 def _plain(value: Any) -> Any:
     if isinstance(value, (np.ndarray, np.generic)):
         return value.tolist()
-    raise ValueError(f"an episode store keeps numbers, strings, lists and dicts, not {value!r}")
+    raise UserError(f"an episode store keeps numbers, strings, lists and dicts, not {value!r}")
 
 
 def listed(numbers: Sequence[int]) -> str:
@@ -132,7 +133,7 @@ def read_index(path: Path, any_seed: bool, damaged: bool) -> tuple[list[Entry], 
     Unless `any_seed`, seeds are consecutive, which identifies the `LOST` ones in a `damaged` index.
 
     Raises:
-        ValueError: lines are damaged, and named in the message, or do not follow each other.
+        UserError: lines are damaged, and named in the message, or do not follow each other.
     """
     lines = _lines(path)
     entries: dict[int, Entry] = {}  # line number → entry
@@ -147,13 +148,13 @@ def read_index(path: Path, any_seed: bool, damaged: bool) -> tuple[list[Entry], 
     if problems and not salvaged:
         first, *others = problems
         more = f"; so are the lines {listed(others)}" if others else ""
-        raise ValueError(f"{problems[first]}{more}: {remedy}")
+        raise UserError(f"{problems[first]}{more}: {remedy}")
     if salvaged:
         return _with_lost(entries, len(lines)), 0
     rows, seed = 0, None
     for number, entry in entries.items():
         if entry.start != rows or (entry.seed != seed and seed is not None and not any_seed):
-            raise ValueError(f"line {number} of {path} does not follow the line before it: {remedy}")
+            raise UserError(f"line {number} of {path} does not follow the line before it: {remedy}")
         rows, seed = entry.end, entry.seed + 1
     return [*entries.values()], sum(len(line) + 1 for line in lines)
 

@@ -21,6 +21,7 @@ from vla.data.episode_filter import episode_filter
 from vla.data.episodes import DamageError, EpisodeStore, observations_of
 from vla.data.header import Codec
 from vla.data.index import DAMAGED, LISTED, LOST, NOT_NEEDED, Entry, listed
+from vla.io.errors import UserError
 from vla.spec import Array, Episode
 
 # N steps, D action components
@@ -87,13 +88,13 @@ def verify_store(store: EpisodeStore) -> StoreReport:
 
 
 def require_whole(report: StoreReport) -> None:
-    """Raise a ValueError if a store has damaged episodes or none."""
+    """Raise a UserError if a store has damaged episodes or none."""
     folder, count = report.store.folder, sum(map(len, report.damaged.values()))
     if report.damaged:
         problems = [f"seeds {listed(seeds)}: {problem}" for problem, seeds in report.damaged.items()]
         more = [f"and {len(problems) - LISTED} others"] if len(problems) > LISTED else []
         named = "; ".join([*problems[:LISTED], *more])
-        raise ValueError(
+        raise UserError(
             f"{folder} has {count} damaged episodes ({named}): inspect.repair=true leaves them out of a copy"
         )
     report.store.require_episodes()
@@ -103,21 +104,21 @@ def find_episode(store: EpisodeStore, seed: int) -> tuple[dict[str, Any], Episod
     """Return the config and the episode of a seed.
 
     Raises:
-        ValueError: the seed was not tried, failed or occurs twice, or its episode is damaged.
+        UserError: the seed was not tried, failed or occurs twice, or its episode is damaged.
     """
     found = [(config, entry) for config, entries in entries_by_config(store) for entry in entries if entry.seed == seed]
     if not found:
         seeds = [entry.seed for entry in store.tried]
-        raise ValueError(f"{store.folder} has no seed {seed}: it holds {listed(seeds) or 'none yet'}")
+        raise UserError(f"{store.folder} has no seed {seed}: it holds {listed(seeds) or 'none yet'}")
     kept = [(config, entry) for config, entry in found if entry.stored]
     if not kept:
         seeds = sorted({entry.seed for entry in store.episodes}, key=lambda other: abs(other - seed))[:2]
-        raise ValueError(
+        raise UserError(
             f"seed {seed} in {store.folder} ended as {found[0][1].outcome}, and its steps were not kept: there is "
             f"{' or '.join(map(str, seeds)) or 'none'}"
         )
     if len(kept) > 1:
-        raise ValueError(
+        raise UserError(
             f"{store.folder} has {len(kept)} episodes of seed {seed}: inspect one of the stores that it was merged from"
         )
     return kept[0][0], episode_of(store, kept[0][1])
@@ -137,12 +138,12 @@ def _without_rows(entry: Entry) -> Episode:
 
 
 def entries_by_config(store: EpisodeStore) -> list[tuple[dict[str, Any], list[Entry]]]:
-    """Return the entries of a store by their config; a ValueError if the index of a derived store lost lines."""
+    """Return the entries of a store by their config; a UserError if the index of a derived store lost lines."""
     if not store.derived:
         return [(store.config, store.tried)]
     ends = np.cumsum([0, *(part["entries"] for part in store.config["parts"])])
     if ends[-1] != len(store.tried):
-        raise ValueError(f"the index of {store.folder} has lost lines: derive it again from its sources")
+        raise UserError(f"the index of {store.folder} has lost lines: derive it again from its sources")
     return [(part["config"], store.tried[ends[at] : ends[at + 1]]) for at, part in enumerate(store.config["parts"])]
 
 
@@ -162,17 +163,17 @@ def derive_store(
         repair: turn a damaged episode into a failed seed instead of raising.
 
     Raises:
-        ValueError: the folder exists, specs differ, nothing matches, or an episode is damaged.
+        UserError: the folder exists, specs differ, nothing matches, or an episode is damaged.
     """
     if folder.exists():
-        raise ValueError(f"{folder} exists already and is left alone: choose another inspect.into")
+        raise UserError(f"{folder} exists already and is left alone: choose another inspect.into")
     for store in stores[1:]:
         store.spec.require(stores[0].spec, f"the episode store {store.folder}", f"{stores[0].folder}")
     chosen = _choose(stores, where or {})
     episodes = sum(any(entry.stored for _, entry in found) for seeds in chosen.values() for found in seeds.values())
     if not episodes:
         fitting = f" that fit inspect.where={dict(where)}" if where else ""
-        raise ValueError(f"{', '.join(str(store.folder) for store in stores)}: there are no episodes{fitting}")
+        raise UserError(f"{', '.join(str(store.folder) for store in stores)}: there are no episodes{fitting}")
     draft = folder.with_name(f".{folder.name}.draft")
     shutil.rmtree(draft, ignore_errors=True)  # left by a process that was killed
     try:
@@ -186,7 +187,7 @@ def derive_store(
     except BaseException as error:
         shutil.rmtree(draft, ignore_errors=True)
         if isinstance(error.__cause__, OSError):  # of a growing store, whose message does not apply here
-            raise ValueError(
+            raise UserError(
                 f"{folder} cannot be written ({error.__cause__.strerror}), nothing of it is kept: make room there, or "
                 "choose another inspect.into"
             ) from error

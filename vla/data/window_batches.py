@@ -85,7 +85,7 @@ class WindowBatcher:
         truth_size: number S of truth scalars, NaN if the store has no truth; None: that of the store.
 
     Raises:
-        ValueError: numeric rows of the store differ from their checksums.
+        UserError: numeric rows of the store differ from their checksums.
     """
 
     def __init__(
@@ -127,7 +127,7 @@ class WindowBatcher:
         within a chunk was perturbed.
 
         Raises:
-            ValueError: images of these episodes differ from their checksums, which are compared once per episode.
+            UserError: images of these episodes differ from their checksums, which are compared once per episode.
         """
         episode = self._first.searchsorted(windows, side="right") - 1  # (B,)
         if not self._verified[episode].all():
@@ -164,7 +164,7 @@ class WindowBatcher:
         Otherwise an episode is verified when its first window is read.
 
         Raises:
-            ValueError: they differ.
+            UserError: they differ.
         """
         episodes = np.arange(len(self._entries)) if episodes is None else episodes
         entries = [self._entries[number] for number in episodes.tolist()]
@@ -214,7 +214,7 @@ class JoinedBatcher:
         """Compare the images of all episodes with their checksums.
 
         Raises:
-            ValueError: they differ.
+            UserError: they differ.
         """
         for batcher in self._batchers:
             batcher.verify()

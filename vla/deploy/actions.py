@@ -12,6 +12,7 @@ from rclpy.action import ActionClient
 
 from vla.deploy.ros import action_class
 from vla.deploy.settings import FrankaGripper, GripperCommand
+from vla.io.errors import UserError
 
 PATIENCE = 5.0  # longest wait for a server at the start [s]
 ANSWER = 1.0  # longest time until a server accepts or rejects a goal [s]
@@ -62,10 +63,10 @@ class GoalSender:
         self._cancelled = self._rejected = self._given_up = False
 
     def require_server(self) -> None:
-        """Raise a ValueError if the server does not show up."""
+        """Raise a UserError if the server does not show up."""
         if not self._client.wait_for_server(PATIENCE):
             kind = f"{self.kind.__module__.partition('.')[0]}/action/{self.kind.__name__}"
-            raise ValueError(
+            raise UserError(
                 f"there is no action server {self.name} of {kind}: is its controller active, and on the same network "
                 "and domain?"
             )
@@ -168,7 +169,7 @@ class GripperGoals:
         """Args: the node; settings of the gripper; name of its action server; `fail` as in `GoalSender`.
 
         Raises:
-            ValueError: a package of messages is not installed.
+            UserError: a package of messages is not installed.
         """
 
         def sender(kind: Any, name: str, complaint: Callable[[Any, bool], str]) -> GoalSender:

@@ -24,6 +24,7 @@ from vla.deploy.messages import shorten
 from vla.deploy.ros import NETWORKS, command_node, spin
 from vla.deploy.topic_listener import TopicListener, message_class
 from vla.io.documents import read_yaml
+from vla.io.errors import UserError
 from vla.io.files import require_file
 
 # The inputs of a policy in conf/deploy/topics/isaac.yaml.
@@ -47,12 +48,12 @@ class BagRecorder(TopicListener):
         """Args: the node that subscribes, which the caller spins; the folder of the bag, which must not exist.
 
         Raises:
-            ValueError: the folder exists.
+            UserError: the folder exists.
         """
         from rosbags.rosbag2 import StoragePlugin, Writer
 
         if folder.exists():
-            raise ValueError(f"{folder} exists already: choose another folder")
+            raise UserError(f"{folder} exists already: choose another folder")
         folder.parent.mkdir(parents=True, exist_ok=True)
         self._folder = folder
         self._writer = Writer(folder, version=9, storage_plugin=StoragePlugin.MCAP)
@@ -66,7 +67,7 @@ class BagRecorder(TopicListener):
 
         def write(message: bytes) -> None:
             if shutil.disk_usage(self._folder).free < RESERVE:
-                raise ValueError(f"{self._folder} ends here: the disk has less than {RESERVE >> 20} MiB left")
+                raise UserError(f"{self._folder} ends here: the disk has less than {RESERVE >> 20} MiB left")
             self._writer.write(connection, time.time_ns(), message)
             self.messages += 1
 
@@ -82,7 +83,7 @@ def play(node: Any, folder: Path, topics: Collection[str], stopped: Event, speed
     """Publish the messages of some topics of a bag at their original times; returns the number of messages.
 
     Raises:
-        ValueError: the folder is not a bag, it is damaged, or it lacks a topic.
+        UserError: the folder is not a bag, it is damaged, or it lacks a topic.
     """
     published = 0
     with opened(folder) as reader:
@@ -90,11 +91,11 @@ def play(node: Any, folder: Path, topics: Collection[str], stopped: Event, speed
         classes = {connection.topic: message_class(connection.msgtype) for connection in connections}
         if missing := ", ".join(topic for topic in topics if topic not in classes):
             there = ", ".join(sorted({connection.topic for connection in reader.connections})) or "nothing"
-            raise ValueError(
+            raise UserError(
                 f"{folder} has no topic {missing}, it has {shorten(there, 500)}: choose topics with --topics"
             )
         if unknown := ", ".join(each.topic for each in connections if classes[each.topic] is None):
-            raise ValueError(f"{folder}: the messages of {unknown} are of a type that this machine does not have")
+            raise UserError(f"{folder}: the messages of {unknown} are of a type that this machine does not have")
         publishers = {topic: node.create_publisher(kind, topic, 10) for topic, kind in classes.items()}
         deadline = time.monotonic() + 2.0  # for the discovery of these publishers
         while time.monotonic() < deadline and not all(p.get_subscription_count() for p in publishers.values()):
@@ -102,7 +103,7 @@ def play(node: Any, folder: Path, topics: Collection[str], stopped: Event, speed
         begin, start, end = time.monotonic(), reader.start_time, reader.end_time
         for topic, stamp, raw in messages_of(reader, connections, folder):
             if not start <= stamp <= end:
-                raise ValueError(f"{folder} is damaged: a message lies outside its time range")
+                raise UserError(f"{folder} is damaged: a message lies outside its time range")
             stopped.wait(max(0.0, begin + (stamp - start) * 1e-9 / speed - time.monotonic()))
             if stopped.is_set():
                 break
@@ -126,13 +127,13 @@ def opened(folder: Path) -> Iterator[Any]:
     """Open a reader of the bag in a folder; within the context, memory and the size of files are limited.
 
     Raises:
-        ValueError: the folder is not a bag, or it is damaged.
+        UserError: the folder is not a bag, or it is damaged.
     """
     from rosbags.rosbag2 import Reader
 
     description = folder / "metadata.yaml"
     if not description.is_file():
-        raise ValueError(f"{folder} is not a bag: it has no {description.name}")
+        raise UserError(f"{folder} is not a bag: it has no {description.name}")
     read_yaml(description, dict[str, Any])  # rosbags limits neither its size nor its depth
     for path in folder.iterdir():
         require_file(path)
@@ -162,14 +163,14 @@ def messages_of(
 
 @contextmanager
 def bag_errors(folder: Path) -> Iterator[None]:
-    """Convert exceptions of rosbags and ROS, which can be of any type, into a ValueError that names the bag."""
+    """Convert exceptions of rosbags and ROS, which can be of any type, into a UserError that names the bag."""
     try:
         yield
     except MemoryError as error:
-        raise ValueError(f"{folder} needs more than {MAX_MEMORY >> 30} GiB of memory once it is unpacked") from error
+        raise UserError(f"{folder} needs more than {MAX_MEMORY >> 30} GiB of memory once it is unpacked") from error
     except Exception as error:
         why = shorten(" ".join(str(error).split()), 200) or type(error).__name__
-        raise ValueError(f"{folder} is damaged or not a bag: {why}") from error
+        raise UserError(f"{folder} is damaged or not a bag: {why}") from error
 
 
 def _stamped_now(node: Any, message: bytes, kind: Any) -> Any:

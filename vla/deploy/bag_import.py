@@ -24,6 +24,7 @@ from vla.deploy.bag_index import BagIndex, Picture, Stretch, read_index
 from vla.deploy.joint_limiter import Robot
 from vla.deploy.observer import HISTORY, Observer
 from vla.deploy.settings import Topics
+from vla.io.errors import UserError
 from vla.io.images import Crop, resize
 from vla.io.types import Text
 from vla.robots.controllers import gripper_index, recorded_controller
@@ -64,7 +65,7 @@ class BagDemonstrations(ImportedDemonstrations):
         spec: of the task.
 
     Raises:
-        ValueError: the bag is missing, damaged or incomplete, lacks topics, or is of another robot.
+        UserError: the bag is missing, damaged or incomplete, lacks topics, or is of another robot.
     """
 
     def __init__(
@@ -81,9 +82,9 @@ class BagDemonstrations(ImportedDemonstrations):
         self.spec, self._robot, self._crop = spec.without_truth, robot, image_crop
         model = spec.require_robot("expert=bag")
         if len(robot.joints) != len(model.joints):
-            raise ValueError(f"the task's robot has {len(model.joints)} joints, expert.robot has {len(robot.joints)}")
+            raise UserError(f"the task's robot has {len(model.joints)} joints, expert.robot has {len(robot.joints)}")
         if missing := [camera for camera in spec.cameras if camera not in topics.images]:
-            raise ValueError(f"no topic for the cameras {', '.join(missing)}: add +expert.topics.images.{missing[0]}")
+            raise UserError(f"no topic for the cameras {', '.join(missing)}: add +expert.topics.images.{missing[0]}")
         self._controller = recorded_controller(spec)
         self._gripper_index = gripper_index(spec)
         self._topics = {camera: topics.images[camera] for camera in spec.cameras}
@@ -94,7 +95,7 @@ class BagDemonstrations(ImportedDemonstrations):
         actions = np.concatenate(self._actions)
         beyond = (actions < np.array(spec.low) - ROUNDING) | (actions > np.array(spec.high) + ROUNDING)
         if far := [name for name, share in zip(spec.action, beyond.mean(0), strict=True) if share > MOSTLY]:
-            raise ValueError(
+            raise UserError(
                 f"{self._index.folder}: most actions exceed the bounds of {', '.join(far)}: set task.low and task.high "
                 "in the units of task.units"
             )
@@ -135,7 +136,7 @@ class BagDemonstrations(ImportedDemonstrations):
         """Return one episode, with its images.
 
         Raises:
-            ValueError: images are damaged.
+            UserError: images are damaged.
         """
         spec, stretch, steps = self.spec, self._stretches[number], self._steps[number]
         images = self._images(steps)
@@ -163,7 +164,7 @@ class BagDemonstrations(ImportedDemonstrations):
         return super().fill(store, episodes)
 
     def _steps_in(self, stretch: Stretch) -> list[Step]:
-        """Return the steps of a stretch, made as the policy node makes its observations; a ValueError without any."""
+        """Return the steps of a stretch, made as the policy node makes its observations; a UserError without any."""
         observer, steps, period = Observer(self.spec), list[Step](), 1 / self.spec.control_hz
         last = earliest = -np.inf
         first = bisect_left(self._index.inputs, stretch.start - HISTORY, key=itemgetter(0))
@@ -185,7 +186,7 @@ class BagDemonstrations(ImportedDemonstrations):
                 steps.append(Step(taken, pictures, observer.state(measured)))
                 last, earliest = taken, taken + period
         if not steps:
-            raise ValueError(
+            raise UserError(
                 f"{self._index.folder} has no matching images of {', '.join(self._topics)} from {stretch.start:.1f} to "
                 f"{stretch.end:.1f} s, in '{messages.shorten(stretch.instruction)}'"
             )
@@ -224,20 +225,20 @@ class BagDemonstrations(ImportedDemonstrations):
 
 def _folder_of(folder: Path | str | None) -> Path:
     if folder is None:
-        raise ValueError("expert=bag needs a bag: name its folder with expert=bag expert.folder=DIR")
+        raise UserError("expert=bag needs a bag: name its folder with expert=bag expert.folder=DIR")
     return Path(folder)
 
 
 def _chosen(index: BagIndex, steps: str) -> list[Stretch]:
-    """Return the stretches that are episodes; a ValueError if there are none."""
+    """Return the stretches that are episodes; a UserError if there are none."""
     found = index.corrections() if steps == "corrected" else index.stretches
     if not found and index.stretches:
-        raise ValueError(
+        raise UserError(
             f"{index.folder} has no corrections: nobody moved the arm after ~/hand_over. expert.steps=all also takes "
             "what the policy did"
         )
     if not found:
-        raise ValueError(f"{index.folder} has no instruction that an arm followed")
+        raise UserError(f"{index.folder} has no instruction that an arm followed")
     return found
 
 

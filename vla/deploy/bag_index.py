@@ -24,6 +24,7 @@ from vla.deploy.control_loop import REPEATED, State
 from vla.deploy.joint_limiter import Robot
 from vla.deploy.observer import Measured, age_of
 from vla.deploy.settings import Topics
+from vla.io.errors import UserError
 from vla.spec import LONGEST_INSTRUCTION, Array
 
 log = logging.getLogger(__name__)
@@ -136,7 +137,7 @@ def read_index(folder: Path, topics: Topics, robot: Robot, status: str) -> BagIn
     Messages that the policy node would drop are left out.
 
     Raises:
-        ValueError: it is no bag, damaged or incomplete, or lacks a topic, or all messages on one are unusable.
+        UserError: it is no bag, damaged or incomplete, or lacks a topic, or all messages on one are unusable.
     """
     files = sorted(folder.iterdir()) if folder.is_dir() else []
     state = tuple((file.name, file.stat().st_size, file.stat().st_mtime_ns) for file in files)
@@ -172,7 +173,7 @@ class _Reading:
         self.index.stretches = [*self._stretches()]
 
     def _handle(self, topics: Topics, status: str, reader: Any) -> dict[str, Callable[[int, float, Any], None]]:
-        """Return topic → message handler; a ValueError if a topic is missing or of another type."""
+        """Return topic → message handler; a UserError if a topic is missing or of another type."""
         commands = {JOINTS: self._command, TRAJECTORY: self._trajectory, NUMBERS: self._numbers, TWIST: self._nothing}
         wanted: dict[str, dict[str, Any]] = {}  # topic → type → handler
         for camera, topic in topics.images.items():
@@ -185,14 +186,14 @@ class _Reading:
         there = {connection.topic: connection.msgtype for connection in reader.connections}
         if missing := ", ".join(topic for topic in wanted if topic not in there):
             known = messages.shorten(", ".join(sorted(there)) or "nothing", 500)
-            raise ValueError(
+            raise UserError(
                 f"{self.index.folder} has no topic {missing}, it has {known}: choose others with expert.topics"
             )
         self._tell_missing(topics, status, there)
         wanted |= optional
         for topic, kinds in wanted.items():
             if topic in there and there[topic] not in kinds:
-                raise ValueError(
+                raise UserError(
                     f"{self.index.folder}: {topic} is of type {messages.shorten(there[topic])}, expected "
                     f"{' or '.join(kinds)}"
                 )
@@ -204,7 +205,7 @@ class _Reading:
         """Log what replaces optional topics that are missing.
 
         Raises:
-            ValueError: the topic `status` is missing, but the bag has one of an agent in a namespace.
+            UserError: the topic `status` is missing, but the bag has one of an agent in a namespace.
         """
         missing = {
             topics.commands: "actions follow the measured motion",
@@ -213,7 +214,7 @@ class _Reading:
             status: "all motion counts as a person's",
         }
         if others := [topic for topic in there if topic.endswith(status) and status not in there]:
-            raise ValueError(
+            raise UserError(
                 f"{self.index.folder} has no topic {status}, which tells who moves the arm, but {others[0]}: choose it "
                 f"with expert.status={others[0]}"
             )
@@ -237,20 +238,20 @@ class _Reading:
                 self._dropped.setdefault(topic, str(error))
         expected = sum(connection.msgcount for connection in connections)
         if read < expected:
-            raise ValueError(f"{folder} is incomplete: {read} of {expected} messages are there, was its end cut off?")
+            raise UserError(f"{folder} is incomplete: {read} of {expected} messages are there, was its end cut off?")
 
     def _require_usable(self, topics: Topics) -> None:
         for topic in (*topics.images.values(), topics.joint_states, topics.instruction):
             if not self._usable[topic]:
                 why = self._dropped.get(topic, "there are no messages")
-                raise ValueError(f"{self.index.folder}: no message on {topic} can be used: {why}")
+                raise UserError(f"{self.index.folder}: no message on {topic} can be used: {why}")
 
     # Messages.
 
     def _image(self, camera: str, stamp: int, at: float, message: Any) -> None:
         taken = message.header.stamp.sec, message.header.stamp.nanosec
         if taken != (0, 0) and taken == self._taken.get(camera):
-            raise ValueError(f"two images of the camera {camera} have the same time stamp")
+            raise UserError(f"two images of the camera {camera} have the same time stamp")
         self._taken[camera] = taken
         if camera not in self._seen or not hasattr(message, "format"):
             messages.image_from(message)  # other compressed ones are decoded when they are needed
@@ -271,7 +272,7 @@ class _Reading:
     def _words(self, stamp: int, at: float, message: Any) -> None:
         said = message.data.strip()
         if len(said) > LONGEST_INSTRUCTION:
-            raise ValueError(f"an instruction of {len(said)} characters")
+            raise UserError(f"an instruction of {len(said)} characters")
         if not said and self._has_status:
             return  # the agent says that it stops
         if said != self._instruction or at - self._said_at > REPEATED:
@@ -308,7 +309,7 @@ class _Reading:
     def _fingers(self, stamp: int, at: float, message: Any) -> None:
         opening = float(np.mean(message.data)) / self._robot.finger_travel if len(message.data) else np.nan
         if not np.isfinite(opening):
-            raise ValueError("finger positions that are not finite")
+            raise UserError("finger positions that are not finite")
         self.index.gripper_commands.add(at, opening)
 
     def _stretches(self) -> Iterator[Stretch]:

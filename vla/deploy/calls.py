@@ -12,6 +12,8 @@ from rclpy.duration import Duration
 from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
 
+from vla.io.errors import UserError
+
 TIMEOUT = 10.0  # of the discovery of a subscriber or service, and of a service call [s]
 SETTLED = 0.7  # discovery is complete after so long without a new subscriber [s]
 HAND_OVER = "/vla_agent/hand_over"
@@ -22,7 +24,7 @@ def say(node: Any, topic: str, instruction: str) -> None:
     """Publish an instruction once all subscribers are discovered.
 
     Raises:
-        ValueError: there is no subscriber, or one does not confirm the message.
+        UserError: there is no subscriber, or one does not confirm the message.
     """
     publisher = node.create_publisher(String, topic, 1)
     subscribers, since = 0, time.monotonic()
@@ -32,17 +34,17 @@ def say(node: Any, topic: str, instruction: str) -> None:
             subscribers, since = publisher.get_subscription_count(), time.monotonic()
         time.sleep(0.02)
     if publisher.get_subscription_count() == 0:
-        raise ValueError(f"no subscriber on {topic}: is the agent running, and on the same network and domain?")
+        raise UserError(f"no subscriber on {topic}: is the agent running, and on the same network and domain?")
     publisher.publish(String(data=instruction))
     if not publisher.wait_for_all_acked(Duration(seconds=TIMEOUT)):
-        raise ValueError(f"a subscriber on {topic} does not confirm the instruction: does one of the nodes hang?")
+        raise UserError(f"a subscriber on {topic} does not confirm the instruction: does one of the nodes hang?")
 
 
 def resume(node: Any) -> None:
     """Resume a stopped agent.
 
     Raises:
-        ValueError: there is no agent, or it is not stopped.
+        UserError: there is no agent, or it is not stopped.
     """
     _require(_call(node, Trigger, RESUME, Trigger.Request()))
 
@@ -51,7 +53,7 @@ def hand_over(node: Any, to_person: bool) -> None:
     """Make the agent leave the arm to a person, or take it back.
 
     Raises:
-        ValueError: there is no agent, or it refuses, as while the arm moves.
+        UserError: there is no agent, or it refuses, as while the arm moves.
     """
     _require(_call(node, SetBool, HAND_OVER, SetBool.Request(data=to_person)))
 
@@ -62,7 +64,7 @@ def next_episode(node: Any) -> str:
     Returns the simulator's description of the episode.
 
     Raises:
-        ValueError: there is no simulator, or a node does not respond.
+        UserError: there is no simulator, or a node does not respond.
     """
 
     def change(transition: int) -> bool:
@@ -71,27 +73,27 @@ def next_episode(node: Any) -> str:
 
     reset = node.create_client(Trigger, RESET)
     if not reset.wait_for_service(TIMEOUT):
-        raise ValueError(f"no service {RESET}: is the simulator running, and on the same network and domain?")
+        raise UserError(f"no service {RESET}: is the simulator running, and on the same network and domain?")
     agent = node.create_client(ChangeState, CHANGE).wait_for_service(SETTLED)
     # The reset moves the arm: an active agent would pull it back.
     active = agent and change(Transition.TRANSITION_DEACTIVATE)
     description = str(_call(node, Trigger, RESET, Trigger.Request()).message)
     if active and not change(Transition.TRANSITION_ACTIVATE):
-        raise ValueError("the agent cannot be activated again, see its log")
+        raise UserError("the agent cannot be activated again, see its log")
     return description
 
 
 def _require(answer: Any) -> None:
     if not answer.success:
-        raise ValueError(answer.message)
+        raise UserError(answer.message)
 
 
 def _call(node: Any, kind: Any, service: str, request: Any) -> Any:
     client = node.create_client(kind, service)
     if not client.wait_for_service(TIMEOUT):
-        raise ValueError(f"no service {service}: is its node running, and on the same network and domain?")
+        raise UserError(f"no service {service}: is its node running, and on the same network and domain?")
     answer = client.call_async(request)
     rclpy.spin_until_future_complete(node, answer, timeout_sec=TIMEOUT)
     if not answer.done():
-        raise ValueError(f"{service} does not respond")
+        raise UserError(f"{service} does not respond")
     return answer.result()

@@ -9,6 +9,7 @@ from typing import Annotated, Any
 import numpy as np
 from annotated_types import MinLen
 
+from vla.io.errors import UserError
 from vla.io.images import Crop, resize
 from vla.io.types import Text
 from vla.spec import LONGEST_INSTRUCTION, Array, Observation, Spec
@@ -28,22 +29,22 @@ class Keys:
         """Convert a client's observation; images are resized, and all components are checked.
 
         Raises:
-            ValueError: it does not match the spec; all missing keys are named at once.
+            UserError: it does not match the spec; all missing keys are named at once.
         """
         if not isinstance(message, Mapping):
-            raise ValueError(f"an observation is a map, not {type(message).__name__}")
+            raise UserError(f"an observation is a map, not {type(message).__name__}")
         wanted = [*(self.images[camera] for camera in spec.cameras), *self.state, self.prompt]
         found = {key: _find(message, key) for key in wanted}
         if missing := [key for key, value in found.items() if value is None]:
             present = ", ".join(str(key)[:50] for key in list(message)[:20])
-            raise ValueError(f"the observation lacks {', '.join(missing)}: it has {present or 'nothing'}")
+            raise UserError(f"the observation lacks {', '.join(missing)}: it has {present or 'nothing'}")
         images = {camera: _image(self.images[camera], found[self.images[camera]]) for camera in spec.cameras}
         for camera, image in images.items():
             spec.require_cut(camera, image.shape, self.images[camera])
         rgb = {camera: resize(image, spec.image_size, crop) for camera, image in images.items()}
         state = np.concatenate([_vector(key, found[key]) for key in self.state])
         if len(state) != len(spec.state):
-            raise ValueError(
+            raise UserError(
                 f"the state in {' and '.join(self.state)} has {len(state)} numbers, "
                 f"the policy needs {len(spec.state)}: {', '.join(spec.state)}"
             )
@@ -64,14 +65,14 @@ def _image(key: str, value: Any) -> Array:
     """Return an image as (H, W, 3) uint8."""
     if not isinstance(value, np.ndarray) or value.ndim != 3 or 3 not in (value.shape[0], value.shape[2]):
         shape = getattr(value, "shape", type(value).__name__)
-        raise ValueError(f"{key} is an image (H, W, 3) or (3, H, W), not {shape}")
+        raise UserError(f"{key} is an image (H, W, 3) or (3, H, W), not {shape}")
     image = value if value.shape[2] == 3 else value.transpose(1, 2, 0)
     if not 1 <= min(image.shape[:2]) <= max(image.shape[:2]) <= LARGEST_IMAGE:
-        raise ValueError(f"{key} has {image.shape[1]} by {image.shape[0]} pixels, at most {LARGEST_IMAGE} each")
+        raise UserError(f"{key} has {image.shape[1]} by {image.shape[0]} pixels, at most {LARGEST_IMAGE} each")
     if image.dtype == np.uint8:
         return np.ascontiguousarray(image)
     if image.dtype.kind != "f" or not (np.min(image) >= 0 and np.max(image) <= 1):  # NaN fails both
-        raise ValueError(f"{key} is {image.dtype}: send uint8, or floats from 0 to 1")
+        raise UserError(f"{key} is {image.dtype}: send uint8, or floats from 0 to 1")
     return np.ascontiguousarray(np.round(255 * image).astype(np.uint8))
 
 
@@ -80,20 +81,20 @@ def _vector(key: str, value: Any) -> Array:
     try:
         given = np.asarray(value).reshape(-1)
     except ValueError as error:  # rows of different lengths
-        raise ValueError(f"{key} is not a vector of numbers") from error
+        raise UserError(f"{key} is not a vector of numbers") from error
     if given.dtype.kind not in "biuf":
-        raise ValueError(f"{key} is not a vector of numbers")
+        raise UserError(f"{key} is not a vector of numbers")
     with np.errstate(over="ignore"):
         vector = given.astype(np.float32)
     if not np.isfinite(vector).all():
-        raise ValueError(f"{key} holds a number that is not finite")
+        raise UserError(f"{key} holds a number that is not finite")
     return vector
 
 
 def instruction(key: str, value: Any) -> str:
-    """Return an instruction; raises a ValueError if it is none."""
+    """Return an instruction; raises a UserError if it is none."""
     if not isinstance(value, str):
-        raise ValueError(f"{key} is an instruction, a text, not {type(value).__name__}")
+        raise UserError(f"{key} is an instruction, a text, not {type(value).__name__}")
     if len(value) > LONGEST_INSTRUCTION:
-        raise ValueError(f"{key} has {len(value)} characters, an instruction at most {LONGEST_INSTRUCTION}")
+        raise UserError(f"{key} has {len(value)} characters, an instruction at most {LONGEST_INSTRUCTION}")
     return value

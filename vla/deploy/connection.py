@@ -11,6 +11,8 @@ from weakref import WeakSet
 
 from websockets.asyncio.server import Server, ServerConnection
 
+from vla.io.errors import UserError
+
 WEBSOCKET = b"GET "  # how every WebSocket connection begins (RFC 6455, section 4.1)
 SENTENCE = b"this is a policy server: connect to it by WebSocket with openpi's protocol\n"
 NO_WEBSOCKET = b"HTTP/1.1 405 Method Not Allowed\r\nAllow: GET\r\nConnection: close\r\n" + (
@@ -53,13 +55,13 @@ def tls(certificate: str, private_key: str | None) -> ssl.SSLContext:
     """Return the TLS context of two PEM files.
 
     Raises:
-        ValueError: one is damaged, or they do not belong together.
+        UserError: one is damaged, or they do not belong together.
     """
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     try:
         context.load_cert_chain(certificate, private_key)
     except ssl.SSLError as error:
-        raise ValueError(
+        raise UserError(
             f"deploy.certificate={certificate} and deploy.private_key={private_key} are not a certificate and its key "
             f"in PEM format ({error.reason})"
         ) from error

@@ -16,6 +16,7 @@ import numpy as np
 from vla.deploy.joint_limiter import JointLimiter, Robot
 from vla.deploy.observer import HISTORY, Measured, Observer
 from vla.deploy.workspace import Workspace
+from vla.io.errors import UserError
 from vla.io.types import Count, Point, Positive
 from vla.robots.cartesian import CartesianController
 from vla.robots.controllers import controller_for, gripper_index
@@ -82,11 +83,11 @@ class ControlLoop:
             and the commands of every plan start at the measured pose.
 
         Raises:
-            ValueError: the policy does not fit the arm or the command rate.
+            UserError: the policy does not fit the arm or the command rate.
         """
         model = spec.require_robot("deployment")
         if len(robot.joints) != len(model.joints):
-            raise ValueError(
+            raise UserError(
                 f"the policy was trained with {len(model.joints)} joints, the robot has {len(robot.joints)}"
             )
         limits = robot.min_position, robot.max_position, np.array(robot.speed)
@@ -98,9 +99,9 @@ class ControlLoop:
         self.has_gripper = self._gripper_index is not None
         self._motion = [index for index in range(len(spec.action)) if index != self._gripper_index]
         if model.gripper in spec.state and not robot.fingers:
-            raise ValueError("the policy sees how far its gripper is open: name the joints in deploy.robot.fingers")
+            raise UserError("the policy sees how far its gripper is open: name the joints in deploy.robot.fingers")
         if command_hz < spec.control_hz:
-            raise ValueError(f"command_hz is {command_hz}, below the {spec.control_hz} actions/s of the policy")
+            raise UserError(f"command_hz is {command_hz}, below the {spec.control_hz} actions/s of the policy")
         self.spec, self.safety, self.tick = spec, safety, 1 / command_hz
         self._follows_positions = follows_positions
         self.limiter = JointLimiter(robot, self.tick)
@@ -190,13 +191,13 @@ class ControlLoop:
         """Command the arm again, from its measured pose; the gripper is left as it is until the policy moves it.
 
         Raises:
-            ValueError: the arm moves, is outside its limits, or has no recent joint state; the person keeps it.
+            UserError: the arm moves, is outside its limits, or has no recent joint state; the person keeps it.
         """
         measured = self._observer.newest
         if measured is None or now - measured.at > self.safety.joints_age:
-            raise ValueError(f"the newest joint state is older than {self.safety.joints_age} s")
+            raise UserError(f"the newest joint state is older than {self.safety.joints_age} s")
         if self._observer.moved(STILL_FOR) > STILL:
-            raise ValueError("the arm still moves: let it rest first")
+            raise UserError("the arm still moves: let it rest first")
         self.limiter.start(measured.joints)
         self._sent, self._sent_valid = None, False
         self._commanded.clear()

@@ -22,6 +22,7 @@ from std_srvs.srv import Trigger
 from vla.deploy import messages
 from vla.deploy.calls import CHANGE, RESET
 from vla.deploy.messages import SimulatedEpisode
+from vla.io.errors import UserError
 from vla.rollouts.motion import Motion
 from vla.rollouts.results import Result
 
@@ -43,7 +44,7 @@ class DemoOperator:
         processes of the nodes.
 
         Raises:
-            ValueError: a node exited or does not respond, here and in all methods.
+            UserError: a node exited or does not respond, here and in all methods.
         """
         self.stopped, self.agent, self.simulator, self._patience = stopped, agent, simulator, EPISODE / speed
         self.node = rclpy.create_node("vla_operator")
@@ -113,14 +114,14 @@ class DemoOperator:
         answer = client.call_async(request)
         self.wait(answer.done, ANSWER, f"a node to {what}")
         if not answer.result().success:
-            raise ValueError(f"a node refused to {what}, see its log above")
+            raise UserError(f"a node refused to {what}, see its log above")
 
     def wait(self, condition: Callable[[], bool], seconds: float, what: str) -> None:
         """Spin until the condition `what` holds, for at most some seconds."""
         deadline = time.monotonic() + seconds
         while not condition():
             if not (self.agent.is_alive() and self.simulator.is_alive()):
-                raise ValueError("a node has exited, see its log above")
+                raise UserError("a node has exited, see its log above")
             if time.monotonic() > deadline:
-                raise ValueError(f"timed out after {seconds:g} s: waiting for {what}")
+                raise UserError(f"timed out after {seconds:g} s: waiting for {what}")
             rclpy.spin_once(self.node, timeout_sec=0.02)

@@ -19,6 +19,7 @@ from torch.export import Dim, ExportedProgram
 from torch.onnx import ONNXProgram
 
 from vla.io.documents import lines_of
+from vla.io.errors import UserError
 from vla.io.files import atomic_path
 from vla.io.types import Text
 from vla.models.model import Batch, Model
@@ -79,10 +80,10 @@ class ProgramExporter:
         """Write the programs of a policy, in float32 for the CPU whatever its device is; returns the folder.
 
         Raises:
-            ValueError: the folder exists, ONNX is not installed, or the output of a program differs from the model's.
+            UserError: the folder exists, ONNX is not installed, or the output of a program differs from the model's.
         """
         if self._folder.exists():
-            raise ValueError(f"{self._folder} exists already: choose another export.folder")
+            raise UserError(f"{self._folder} exists already: choose another export.folder")
         if self._onnx:
             require_onnx("export.onnx=false")
         policy = Policy("cpu", "fp32", compile=False, lanes=1, model=policy.model, spec=policy.spec)
@@ -100,7 +101,7 @@ def write_programs(policy: Policy, folder: Path, formats: Mapping[str, Write], t
         tolerance: largest difference between the outputs of a program and of the model, relative to their range.
 
     Raises:
-        ValueError: the output of a program differs from the model's.
+        UserError: the output of a program differs from the model's.
     """
     model, span = policy.model, torch.tensor(np.subtract(policy.spec.high, policy.spec.low), dtype=torch.float32)
     report: dict[str, Any] = {"model": type(model).__name__, "spec": policy.spec.to_dict()}
@@ -117,7 +118,7 @@ def write_programs(policy: Policy, folder: Path, formats: Mapping[str, Write], t
             for run, measure in measures.items():
                 log.info("%s: %.1f ms per step, largest difference %.1e", run, measure["ms"], measure["difference"])
                 if not measure["difference"] <= tolerance:  # also true for NaN
-                    raise ValueError(
+                    raise UserError(
                         f"{run} differs from the model by {measure['difference']:.1e} of the output range: "
                         f"this model cannot be exported{', try export.onnx=false' if 'onnx' in run else ''}"
                     )
@@ -143,7 +144,7 @@ def capture(program: Encode | Act, inputs: Inputs) -> ExportedProgram:
     """Trace the program as one graph for instructions of any length.
 
     Raises:
-        ValueError: it computes outside PyTorch, as `tokenizer=fast` does.
+        UserError: it computes outside PyTorch, as `tokenizer=fast` does.
     """
     model = program.model
     lengths = {model.text.tokenize([instruction]).shape[1] for instruction in INSTRUCTIONS}
@@ -153,7 +154,7 @@ def capture(program: Encode | Act, inputs: Inputs) -> ExportedProgram:
         return torch.export.export(program.eval(), (inputs,), dynamic_shapes=(shapes,))
     except Exception as error:  # of many kinds
         names = f"{type(model).__name__} with {type(model.tokenizer).__name__}"
-        raise ValueError(f"{names} cannot be exported: {lines_of(error)[0]}") from error
+        raise UserError(f"{names} cannot be exported: {lines_of(error)[0]}") from error
 
 
 def write_pt2(captured: ExportedProgram, inputs: Inputs, path: Path) -> Run:
@@ -190,7 +191,7 @@ def open_onnx(path: Path, threads: int | None = None) -> Run:
     """Return a function that runs an ONNX program on the CPU, by default with as many threads as PyTorch.
 
     Raises:
-        ValueError: the file is damaged.
+        UserError: the file is damaged.
     """
     from onnxruntime import InferenceSession, SessionOptions
 
@@ -201,7 +202,7 @@ def open_onnx(path: Path, threads: int | None = None) -> Run:
     try:
         session = InferenceSession(path, options, providers=["CPUExecutionProvider"])
     except Exception as error:  # of its own kinds
-        raise ValueError(f"{path} is damaged: delete its folder, and export the policy again") from error
+        raise UserError(f"{path} is damaged: delete its folder, and export the policy again") from error
     used = {node.name for node in session.get_inputs()}  # without inputs that the program ignores
 
     def run(inputs: Inputs) -> Tensor:
@@ -234,12 +235,12 @@ def compare(runs: dict[str, Run], steps: list[Inputs], span: Tensor | None) -> d
 
 
 def require_onnx(otherwise: str) -> None:
-    """Raise a ValueError that names what to do `otherwise`, unless ONNX is installed."""
+    """Raise a UserError that names what to do `otherwise`, unless ONNX is installed."""
     try:
         import onnxruntime  # noqa: F401
         import onnxscript  # noqa: F401
     except ImportError as error:
-        raise ValueError(f"ONNX is not installed: pip install 'vla[onnx]', or {otherwise}") from error
+        raise UserError(f"ONNX is not installed: pip install 'vla[onnx]', or {otherwise}") from error
 
 
 def inputs_of(batch: Batch) -> Inputs:

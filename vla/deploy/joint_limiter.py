@@ -12,6 +12,7 @@ from typing import Annotated
 import numpy as np
 from annotated_types import Gt, Le, MinLen
 
+from vla.io.errors import UserError
 from vla.io.types import NonNegative, Positive, Text
 from vla.spec import Array
 
@@ -35,7 +36,7 @@ class Robot:
         speed_share, acceleration_share: usable share of those limits, above 0 and at most 1.
 
     Raises:
-        ValueError: lists of different lengths, or a share out of range.
+        UserError: lists of different lengths, or a share out of range.
     """
 
     joints: Annotated[list[Text], MinLen(1)]
@@ -53,18 +54,18 @@ class Robot:
     def __post_init__(self) -> None:
         lengths = {len(values) for values in (self.joints, self.low, self.high, self.speed, self.acceleration)}
         if len(lengths) != 1:
-            raise ValueError(
+            raise UserError(
                 "deploy.robot needs one entry per joint in each of joints, low, high, speed and acceleration"
             )
         if not (0 < self.speed_share <= 1 and 0 < self.acceleration_share <= 1):
-            raise ValueError("deploy.robot.speed_share and acceleration_share must be above 0 and at most 1")
+            raise UserError("deploy.robot.speed_share and acceleration_share must be above 0 and at most 1")
         # Parameters of ROS come here without the checks of a config.
         if not all(0 < value < math.inf for value in (*self.speed, *self.acceleration, self.finger_travel)):
-            raise ValueError("deploy.robot.speed, acceleration and finger_travel must be above 0 and finite")
+            raise UserError("deploy.robot.speed, acceleration and finger_travel must be above 0 and finite")
         if not all(0 <= value < math.inf for value in (self.margin, self.overshoot)):
-            raise ValueError("deploy.robot.margin and overshoot must be at least 0 and finite")
+            raise UserError("deploy.robot.margin and overshoot must be at least 0 and finite")
         if not (np.isfinite([*self.low, *self.high]).all() and (self.min_position < self.max_position).all()):
-            raise ValueError("deploy.robot.low must be below high by more than twice the margin, for every joint")
+            raise UserError("deploy.robot.low must be below high by more than twice the margin, for every joint")
 
     @property
     def min_position(self) -> Array:
@@ -109,12 +110,12 @@ class JointLimiter:
         """Start from the measured position (J,), at rest.
 
         Raises:
-            ValueError: the arm is outside its position limits.
+            UserError: the arm is outside its position limits.
         """
         out = (measured < self.robot.min_position) | (measured > self.robot.max_position)
         if out.any():
             joint = int(np.argmax(out))
-            raise ValueError(
+            raise UserError(
                 f"{self.robot.joints[joint]} is at {measured[joint]:.3f} rad, outside "
                 f"{self.robot.min_position[joint]:.3f} to {self.robot.max_position[joint]:.3f}: move it inside first"
             )

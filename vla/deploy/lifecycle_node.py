@@ -25,11 +25,11 @@ class GuardedLifecycleNode(LifecycleNode):
 
     @abstractmethod
     def configure(self) -> None:
-        """Prepare; a ValueError refuses the transition."""
+        """Prepare; a UserError refuses the transition."""
 
     @abstractmethod
     def activate(self) -> None:
-        """Start; a ValueError refuses the transition."""
+        """Start; a UserError refuses the transition."""
 
     @abstractmethod
     def brake(self) -> None:

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 from vla.deploy.bag import BagRecorder
 from vla.deploy.ros import plain_errors, ros
 from vla.deploy.ros2 import PolicyDeployment, SimulatorDeployment
+from vla.io.errors import UserError
 from vla.io.types import Count
 from vla.parallel.processes import leave_with_parent, without_triton
 from vla.rollouts.results import ERROR, Report, Result
@@ -54,7 +55,7 @@ class Loop:
         """Play all episodes, up to the first one that ends in an error.
 
         Raises:
-            ValueError: a node exited or does not respond in the first episode, or is not to move the arm.
+            UserError: a node exited or does not respond in the first episode, or is not to move the arm.
         """
         with self.running() as operator:
             results: list[Result] = []
@@ -79,7 +80,7 @@ class Loop:
         arguments = {"policy": self.policy, "environment": self.environment, "output": self.output}
         agent, simulator = self.agent(**arguments), self.simulator(**arguments)
         if agent.command != "joint_state" or agent.dry_run:
-            raise ValueError(
+            raise UserError(
                 "deploy=loop: the simulator obeys deploy.agent.command=joint_state only, without deploy.agent.dry_run"
             )
         processes = get_context("spawn")

@@ -18,6 +18,7 @@ from vla.data.index import Entry
 from vla.deploy.bag import message_types
 from vla.deploy.joint_limiter import Robot
 from vla.deploy.settings import Topics
+from vla.io.errors import UserError
 from vla.io.types import Text
 from vla.parallel.pool import THIS_PROCESS, Cluster
 from vla.robots.controllers import joint_factors
@@ -45,7 +46,7 @@ class Mcap(FolderExporter):
         executed: topic of the actions that were executed.
 
     Raises:
-        ValueError: `rosbags` is not installed.
+        UserError: `rosbags` is not installed.
     """
 
     def __init__(
@@ -63,13 +64,13 @@ class Mcap(FolderExporter):
         try:
             message_types()
         except ImportError as error:
-            raise ValueError("export=mcap needs the package rosbags: pip install 'vla[ros]' or rosbags") from error
+            raise UserError("export=mcap needs the package rosbags: pip install 'vla[ros]' or rosbags") from error
 
     def export(self, store: EpisodeStore, cluster: Cluster = THIS_PROCESS) -> Path:
         """Write the missing bags, each one atomically; returns the folder.
 
         Raises:
-            ValueError: the episodes have no robot or one with another number of joints, a camera has no topic, or the
+            UserError: the episodes have no robot or one with another number of joints, a camera has no topic, or the
                 base class refuses the folder.
         """
         self._require_fit(store.spec)
@@ -104,9 +105,9 @@ class Mcap(FolderExporter):
         images, depths = (spec.cameras, self._topics.images), (spec.depth, self._depths)
         for key, (cameras, topics) in {"topics.images": images, "depths": depths}.items():
             if missing := [camera for camera in cameras if camera not in topics]:
-                raise ValueError(f"export.{key} has no topic for {', '.join(missing)}: it has {', '.join(topics)}")
+                raise UserError(f"export.{key} has no topic for {', '.join(missing)}: it has {', '.join(topics)}")
         if len(self._robot.joints) != len(robot.joints):
-            raise ValueError(
+            raise UserError(
                 f"export.robot has {len(self._robot.joints)} joints, the episodes {len(robot.joints)}: "
                 "choose another export.robot"
             )

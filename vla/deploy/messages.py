@@ -22,6 +22,7 @@ from PIL import Image
 from vla.deploy.control_loop import Command
 from vla.deploy.joint_limiter import Robot
 from vla.io.documents import STRICT, parse_json
+from vla.io.errors import UserError
 from vla.io.printable import printable
 from vla.io.types import Natural, NonNegative, Seed
 from vla.spec import LONGEST_INSTRUCTION, Array, Name, Names, Numbers, RobotModel
@@ -77,20 +78,20 @@ def image_from(message: Any) -> Array:
     """Read the (H, W, 3) uint8 RGB image of a sensor_msgs/Image or CompressedImage.
 
     Raises:
-        ValueError: the encoding is not supported, or the size is zero or does not match the data.
+        UserError: the encoding is not supported, or the size is zero or does not match the data.
     """
     if hasattr(message, "format"):
         return _decompressed(message)
     if message.encoding not in ENCODINGS:
-        raise ValueError(f"image encoding is {shorten(message.encoding)!r}, expected one of {', '.join(ENCODINGS)}")
+        raise UserError(f"image encoding is {shorten(message.encoding)!r}, expected one of {', '.join(ENCODINGS)}")
     depth, order = ENCODINGS[message.encoding]
     height, width, step = message.height, message.width, message.step
     if not height or not width:
-        raise ValueError(f"image is {width} by {height} pixels")
+        raise UserError(f"image is {width} by {height} pixels")
     if step < width * depth:
-        raise ValueError(f"image step is {step} bytes, {width} pixels of {message.encoding} need {width * depth}")
+        raise UserError(f"image step is {step} bytes, {width} pixels of {message.encoding} need {width * depth}")
     if len(message.data) != step * height:
-        raise ValueError(f"image has {len(message.data)} bytes, {height} rows of {step} are {step * height}")
+        raise UserError(f"image has {len(message.data)} bytes, {height} rows of {step} are {step * height}")
     rows = np.frombuffer(message.data, np.uint8).reshape(height, step)[:, : width * depth]
     return np.ascontiguousarray(rows.reshape(height, width, depth)[..., order])
 
@@ -101,10 +102,10 @@ def _decompressed(message: Any) -> Array:
     try:
         with Image.open(io.BytesIO(message.data), formats=["JPEG", "PNG"]) as image:
             if image.mode not in ("RGB", "RGBA") or image.width * image.height > MOST_PIXELS:
-                raise ValueError(f"image of format {quoted} has {image.width} by {image.height} pixels of {image.mode}")
+                raise UserError(f"image of format {quoted} has {image.width} by {image.height} pixels of {image.mode}")
             return np.array(image.convert("RGB"))
     except (OSError, SyntaxError, EOFError, struct.error, zlib.error, Image.DecompressionBombError) as error:
-        raise ValueError(f"image of format {quoted} is not a JPEG or PNG, or is damaged") from error
+        raise UserError(f"image of format {quoted} is not a JPEG or PNG, or is damaged") from error
 
 
 def fill_image(message: Any, image: Array, frame: str) -> Any:
@@ -127,17 +128,17 @@ def arm_from(message: Any) -> ArmDescription:
     """Read the description of an arm from a std_msgs/String.
 
     Raises:
-        ValueError: it is no such description, or its chain does not fit its joints.
+        UserError: it is no such description, or its chain does not fit its joints.
     """
     arm = parse_json(message.data, ArmDescription, "the description of the arm")
     fits = [len(frame) for frame in arm.chain] == [7] * (len(arm.joints) + 1) and all(any(f[3:]) for f in arm.chain)
     if arm.chain and not fits:
-        raise ValueError(f"the arm's chain is not 7 numbers for each of {len(arm.joints)} joints and the tool")
+        raise UserError(f"the arm's chain is not 7 numbers for each of {len(arm.joints)} joints and the tool")
     return arm
 
 
 def episode_from(message: Any) -> SimulatedEpisode:
-    """Read a simulator's episode from a std_msgs/String; raise a ValueError if it is none."""
+    """Read a simulator's episode from a std_msgs/String; raise a UserError if it is none."""
     return parse_json(message.data[:LONGEST], SimulatedEpisode, "/vla_simulator/episode")
 
 
@@ -152,7 +153,7 @@ class JointStates:
         """Read a sensor_msgs/JointState that came at `at` [s], as `joints_from` does; None if it has the fingers only.
 
         Raises:
-            ValueError: as `joints_from`; fingers are missing if none came within the last `FINGERS_AGE`.
+            UserError: as `joints_from`; fingers are missing if none came within the last `FINGERS_AGE`.
         """
         fingers, names = self._robot.fingers, {*message.name}
         of_gripper = names >= {*fingers} and names.isdisjoint(self._robot.joints)  # which may have further joints
@@ -169,7 +170,7 @@ def joints_from(message: Any, robot: Robot, opening: float | None = None) -> tup
     Missing velocities, also NaN, become zero. With an `opening` from elsewhere the fingers need not be there.
 
     Raises:
-        ValueError: a joint is missing or named twice, the lengths differ, or a number is not finite.
+        UserError: a joint is missing or named twice, the lengths differ, or a number is not finite.
     """
     fingers = robot.fingers if opening is None else []
     position, velocity = _positions(message, [*robot.joints, *fingers])
@@ -181,12 +182,12 @@ def _positions(message: Any, joints: Sequence[str]) -> tuple[Array, Array]:
     """Read positions and velocities of some joints, by name."""
     names = list(message.name)
     if len(set(names)) != len(names):
-        raise ValueError("joint state names a joint twice")
+        raise UserError("joint state names a joint twice")
     missing = [name for name in joints if name not in names]
     if missing:
-        raise ValueError(f"joint state lacks {', '.join(missing)}; it has {', '.join(names) or 'no names'}")
+        raise UserError(f"joint state lacks {', '.join(missing)}; it has {', '.join(names) or 'no names'}")
     if len(message.position) != len(names) or len(message.velocity) not in (0, len(names)):
-        raise ValueError(
+        raise UserError(
             f"joint state has {len(names)} names, {len(message.position)} positions, {len(message.velocity)} velocities"
         )
     position = np.array(message.position, dtype=float)
@@ -195,7 +196,7 @@ def _positions(message: Any, joints: Sequence[str]) -> tuple[Array, Array]:
     position, velocity = position[places], velocity[places]
     velocity = np.where(np.isnan(velocity), 0.0, velocity)  # ros2_control's mark of a joint without one
     if not (np.isfinite(position).all() and np.isfinite(velocity).all()):
-        raise ValueError("joint state has a number that is not finite")
+        raise UserError("joint state has a number that is not finite")
     return position, velocity
 
 
@@ -246,13 +247,13 @@ def command_from(names: Sequence[str], positions: Any, robot: Robot) -> tuple[Ar
     """Read target positions (J,) [rad] and opening 0 … 1, or None without fingers, of a command, by name.
 
     Raises:
-        ValueError: a joint is missing, the lengths differ, or a number is not finite.
+        UserError: a joint is missing, the lengths differ, or a number is not finite.
     """
     names, positions = list(names), np.array(positions, dtype=float)
     missing = [name for name in robot.joints if name not in names]
     if missing or len(names) != len(positions) or not np.isfinite(positions).all():
         problem = f"lacks {', '.join(missing)}" if missing else "needs one finite position per name"
-        raise ValueError(f"joint command {problem}")
+        raise UserError(f"joint command {problem}")
     fingers = [positions[names.index(name)] for name in robot.fingers if name in names]
     opening = float(np.mean(fingers)) / robot.finger_travel if fingers else None
     return positions[[names.index(name) for name in robot.joints]], opening

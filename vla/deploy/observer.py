@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from vla.deploy.camera_sync import CameraSync
+from vla.io.errors import UserError
 from vla.robots.controllers import UNITS
 from vla.spec import Array, Observation, Spec
 
@@ -35,11 +36,11 @@ class Observer:
         """Args: the spec of the policy.
 
         Raises:
-            ValueError: the spec has no robot, or its state has more than joint states contain.
+            UserError: the spec has no robot, or its state has more than joint states contain.
         """
         self._spec, self._model = spec, spec.require_robot("deployment")
         if others := [name for name in spec.state if name not in self._model.components]:
-            raise ValueError(f"the policy's state has {', '.join(others)}, which joint states do not contain")
+            raise UserError(f"the policy's state has {', '.join(others)}, which joint states do not contain")
         self._factors = np.array([UNITS.get(unit.removesuffix("/s"), 1.0) for unit in spec.state_units])
         self.cameras = CameraSync(spec.cameras)
         self._measured: deque[Measured] = deque()

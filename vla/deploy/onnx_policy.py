@@ -43,7 +43,7 @@ class OnnxPolicy(Policy):
         folder: of all exported programs.
 
     Raises:
-        ValueError: ONNX is not installed, or the model cannot be exported.
+        UserError: ONNX is not installed, or the model cannot be exported.
     """
 
     def __init__(self, threads: Count | None, quantize: bool, folder: Text | Path, *, model: Model, spec: Spec) -> None:

@@ -36,6 +36,7 @@ from vla.deploy.observer import age_of
 from vla.deploy.ros import action_class
 from vla.deploy.settings import COMPRESSED, FOLLOW, TRAJECTORY_ACTION, PolicySettings
 from vla.io import images
+from vla.io.errors import UserError
 from vla.policy import Policy
 from vla.robots.controllers import acts_on_joints
 from vla.spec import LONGEST_INSTRUCTION, Array, Observation
@@ -84,7 +85,7 @@ class PolicyNode(GuardedLifecycleNode):
         try:
             self._declare()
         except ParameterException as error:  # in the arguments after --ros-args
-            raise ValueError(str(error)) from error
+            raise UserError(str(error)) from error
 
     # Parameters.
 
@@ -133,7 +134,7 @@ class PolicyNode(GuardedLifecycleNode):
         unnamed = sorted(set(spec.cameras) - set(topics.images))
         if unnamed:
             missing = ", ".join(unnamed)
-            raise ValueError(f"no topic for the policy's cameras {missing}: add +deploy.topics.images.{unnamed[0]}")
+            raise UserError(f"no topic for the policy's cameras {missing}: add +deploy.topics.images.{unnamed[0]}")
         robot = Robot(**{name: self.get_parameter(name).value for name in asdict(self.settings.robot)})
         self._command_type = self._choice("command", COMMANDS)
         self.settings.require_messages(self._command_type)
@@ -142,14 +143,14 @@ class PolicyNode(GuardedLifecycleNode):
         self._dry_run = dry_run = self.get_parameter("dry_run").value
         twist = self._command_type == "twist"
         if twist and acts_on_joints(spec):
-            raise ValueError("command=twist needs a policy of Cartesian actions, this one's are joint positions")
+            raise UserError("command=twist needs a policy of Cartesian actions, this one's are joint positions")
         rate, follows = self.get_parameter("command_hz").value, not (dry_run or twist)
         loop = ControlLoop(spec, robot, self.settings.safety, rate, follows)
         if self.settings.gripper is not None and (topics.gripper is None or not loop.has_gripper):
             missing = (
                 "its action server in deploy.topics.gripper" if loop.has_gripper else "a policy that moves a gripper"
             )
-            raise ValueError(f"deploy/gripper needs {missing}")
+            raise UserError(f"deploy/gripper needs {missing}")
         self._pool.submit(self._warm_up).result()  # in the thread of inference: compiled programs are kept per thread
         best_effort = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
         image_qos = QoSProfile(depth=1, reliability=ReliabilityPolicy[reliability.upper()])
@@ -186,7 +187,7 @@ class PolicyNode(GuardedLifecycleNode):
         """Return a parameter that must be one of `choices`."""
         value = str(self.get_parameter(name).value)
         if value not in choices:
-            raise ValueError(f"{name} is '{value}', expected one of {', '.join(choices)}")
+            raise UserError(f"{name} is '{value}', expected one of {', '.join(choices)}")
         return value
 
     def _connect_actions(self) -> None:
@@ -231,7 +232,7 @@ class PolicyNode(GuardedLifecycleNode):
     def _require_only_commander(self) -> None:
         others = self.count_publishers(self._commands.topic_name) - 1
         if others > 0:
-            raise ValueError(f"{others} other publisher(s) on {self._commands.topic_name}: stop them first")
+            raise UserError(f"{others} other publisher(s) on {self._commands.topic_name}: stop them first")
 
     def _require_servers(self) -> None:
         for sender in self._senders:

@@ -18,6 +18,7 @@ from typing import Annotated, Any, Literal
 
 from annotated_types import Ge, Le
 
+from vla.io.errors import UserError
 from vla.io.printable import printable
 
 MAX_DOMAIN = 232  # larger domains have no UDP ports
@@ -68,15 +69,15 @@ class RosNetwork:
         """Set the environment variables that ROS reads at start.
 
         Raises:
-            ValueError: the profile or the domain does not exist, or the middleware ignores the profile.
+            UserError: the profile or the domain does not exist, or the middleware ignores the profile.
         """
         os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = self.discovery
         if self.profile is not None:
             if not Path(self.profile).is_file():
-                raise ValueError(f"deploy.network.profile: there is no file {self.profile}")
+                raise UserError(f"deploy.network.profile: there is no file {self.profile}")
             middleware = os.environ.get("RMW_IMPLEMENTATION") or FAST_DDS
             if not middleware.startswith(FAST_DDS):
-                raise ValueError(
+                raise UserError(
                     f"RMW_IMPLEMENTATION is {middleware}, which ignores the profile of Fast DDS that keeps others out: "
                     "unset it, or choose deploy/network=localhost or site"
                 )
@@ -85,7 +86,7 @@ class RosNetwork:
             os.environ["ROS_DOMAIN_ID"] = str(self.domain)
         domain = os.environ.get("ROS_DOMAIN_ID") or "0"
         if not (domain.isdecimal() and int(domain) <= MAX_DOMAIN):
-            raise ValueError(f"deploy.network.domain, or ROS_DOMAIN_ID, is {domain!r}, expected 0 to {MAX_DOMAIN}")
+            raise UserError(f"deploy.network.domain, or ROS_DOMAIN_ID, is {domain!r}, expected 0 to {MAX_DOMAIN}")
 
 
 @contextmanager
@@ -95,8 +96,8 @@ def ros(network: RosNetwork, log_folder: Path | None = None) -> Iterator[Event]:
     The handlers of ROS would shut it down before a node can publish its last command.
 
     Raises:
-        ImportError: rclpy cannot be imported.
-        ValueError: ROS does not accept this network or these arguments.
+        UserError: rclpy cannot be imported.
+        UserError: ROS does not accept this network or these arguments.
     """
     network.apply()
     # dm_control enables DeprecationWarnings; users cannot fix those of other packages.
@@ -107,7 +108,7 @@ def ros(network: RosNetwork, log_folder: Path | None = None) -> Iterator[Event]:
         import rclpy
         from rclpy.signals import SignalHandlerOptions
     except ImportError as error:
-        raise ImportError(
+        raise UserError(
             "ROS 2 is not installed: install vla[ros] (Linux, x86-64), or source the setup.bash of a ROS 2 Jazzy for "
             f"this version of Python ({error})"
         ) from error
@@ -123,7 +124,7 @@ def ros(network: RosNetwork, log_folder: Path | None = None) -> Iterator[Event]:
             rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
         except RuntimeError as error:
             given = shlex.join(arguments) or "its environment"
-            raise ValueError(f"ROS does not accept {given}: {str(error).splitlines()[0]}") from error
+            raise UserError(f"ROS does not accept {given}: {str(error).splitlines()[0]}") from error
         yield stopped
     finally:
         rclpy.try_shutdown()
@@ -135,14 +136,14 @@ def action_class(package: str, name: str) -> Any:
     """Return the class of an action.
 
     Raises:
-        ValueError: its package is not installed.
+        UserError: its package is not installed.
     """
     try:
         return getattr(import_module(f"{package}.action"), name)
     except (ImportError, AttributeError) as error:
         apt = f"apt install ros-jazzy-{package.replace('_', '-')}"
         source = "build franka_ros2" if package == "franka_msgs" else apt
-        raise ValueError(
+        raise UserError(
             f"{package}/action/{name} is not installed: {source}, and source its setup.bash before the start ({error})"
         ) from error
 
@@ -152,7 +153,7 @@ def plain_errors() -> Iterator[None]:
     """Exit with one sentence on user errors."""
     try:
         yield
-    except (ValueError, ImportError) as error:
+    except UserError as error:
         sys.exit(printable(f"error: {error}"))
     except OSError as error:
         sys.exit(f"error: {error.filename}: {error.strerror}" if error.filename else f"error: {error}")

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, ClassVar
 from vla.deploy.joint_limiter import Robot
 from vla.deploy.ros import RosNetwork, ros, spin
 from vla.deploy.settings import PolicySettings, Timing, Topics
+from vla.io.errors import UserError
 from vla.io.types import Seed
 
 if TYPE_CHECKING:
@@ -42,7 +43,7 @@ class PolicyDeployment(PolicySettings):
         """Run until interrupted, then brake and hold.
 
         Raises:
-            ValueError: there is no policy, or it does not fit the robot, or messages are not installed.
+            UserError: there is no policy, or it does not fit the robot, or messages are not installed.
         """
         self.require_messages(self.command)
         policy = self.policy()
@@ -54,7 +55,7 @@ class PolicyDeployment(PolicySettings):
             try:
                 for step in (agent.trigger_configure, agent.trigger_activate) if self.autostart else ():
                     if step() != SUCCESS:
-                        raise ValueError("the agent cannot start, see its log above")
+                        raise UserError("the agent cannot start, see its log above")
                 spin(agent, stopped)
             finally:
                 agent.brake()

@@ -34,6 +34,7 @@ from websockets.http11 import Request, Response
 from vla.deploy.client_observation import Keys, instruction
 from vla.deploy.connection import Connection, is_loopback, tls
 from vla.io.array_messages import pack, unpack
+from vla.io.errors import UserError
 from vla.io.images import Crop
 from vla.io.types import Count, Text
 from vla.spec import Array, Environment, Observation
@@ -66,7 +67,7 @@ class PolicyServer:
         output: folder of results, unused.
 
     Raises:
-        ValueError: other machines could connect without a key, or one of the two files for TLS is missing.
+        UserError: other machines could connect without a key, or one of the two files for TLS is missing.
     """
 
     host: Text
@@ -85,36 +86,36 @@ class PolicyServer:
 
     def __post_init__(self) -> None:
         if self.api_key is None and not is_loopback(self.host):
-            raise ValueError(
+            raise UserError(
                 f"deploy.host={self.host} lets other machines use the policy: set the environment variable "
                 "VLA_API_KEY, which clients must then know, or deploy.host=127.0.0.1"
             )
         if (self.certificate is None) != (self.private_key is None):
-            raise ValueError("TLS needs both deploy.certificate and deploy.private_key")
+            raise UserError("TLS needs both deploy.certificate and deploy.private_key")
         for name in ("certificate", "private_key"):
             file = getattr(self, name)
             if file is not None and not Path(file).is_file():
-                raise ValueError(f"deploy.{name}={file}: there is no such file")
+                raise UserError(f"deploy.{name}={file}: there is no such file")
 
     def run(self) -> None:
         """Serve until interrupted.
 
         Raises:
-            ValueError: there is no policy, its cameras have no keys, or the address cannot be used.
+            UserError: there is no policy, its cameras have no keys, or the address cannot be used.
         """
         policy = self.policy()
         if not hasattr(policy, "lanes"):  # an agent in its place
-            raise ValueError(
+            raise UserError(
                 f"deploy=server serves a trained policy, checkpoint=RUN; a {type(policy).__name__} cannot be served"
             )
         if keyless := [camera for camera in policy.spec.cameras if camera not in self.keys.images]:
-            raise ValueError(f"the policy sees {', '.join(keyless)}: add +deploy.keys.images.{keyless[0]}=KEY")
+            raise UserError(f"the policy sees {', '.join(keyless)}: add +deploy.keys.images.{keyless[0]}=KEY")
         service = Service(self, policy)
         try:
             asyncio.run(service.serve())
         except OSError as error:
             where = f"deploy.host={self.host} deploy.port={self.port}"
-            raise ValueError(f"cannot listen at {where}: {error.strerror}; deploy.port=0 is any free one") from error
+            raise UserError(f"cannot listen at {where}: {error.strerror}; deploy.port=0 is any free one") from error
 
 
 class Service:
@@ -227,12 +228,12 @@ class Service:
 
     async def _answer(self, lane: int, data: str | bytes) -> dict[str, Any]:
         if isinstance(data, str):
-            raise ValueError("an observation is a binary message in msgpack, not text")
+            raise UserError("an observation is a binary message in msgpack, not text")
         message = unpack(data)
         if isinstance(message, Mapping) and message.get("reset") is True:
             seed = message.get("seed", lane)
             if type(seed) is not int or not 0 <= seed < 2**32:
-                raise ValueError(f"seed is {repr(seed)[:50]}, expected an integer from 0 to 2**32 - 1")
+                raise UserError(f"seed is {repr(seed)[:50]}, expected an integer from 0 to 2**32 - 1")
             self._policy.reset(instruction("prompt", message.get("prompt")), seed, lane)
             return {"reset": True}
         observation = self._settings.keys.observation(message, self._policy.spec, self._settings.image_crop)

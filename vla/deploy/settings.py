@@ -9,6 +9,7 @@ from typing import ClassVar, Literal
 from vla.deploy.control_loop import Safety
 from vla.deploy.joint_limiter import Robot
 from vla.deploy.ros import action_class
+from vla.io.errors import UserError
 from vla.io.images import Crop
 from vla.io.types import NonNegative, Positive, Text
 
@@ -23,7 +24,7 @@ class Topics:
     """Names of the topics, before remapping.
 
     Raises:
-        ValueError: a name is not valid in ROS.
+        UserError: a name is not valid in ROS.
     """
 
     images: dict[str, str]  # camera → topic of sensor_msgs/Image, or of CompressedImage if it ends with /compressed
@@ -37,7 +38,7 @@ class Topics:
         named = {**asdict(self), **{f"images.{camera}": topic for camera, topic in self.images.items()}}
         for key, topic in named.items():
             if isinstance(topic, str) and not NAME.fullmatch(topic):
-                raise ValueError(f"topics.{key} is {topic!r}, expected letters, digits and _ between slashes")
+                raise UserError(f"topics.{key} is {topic!r}, expected letters, digits and _ between slashes")
 
 
 @dataclass(frozen=True)
@@ -106,7 +107,7 @@ class PolicySettings:
     dry_run: bool
 
     def require_messages(self, command: str) -> None:
-        """Raise a ValueError if messages that `command` or the gripper needs are not installed."""
+        """Raise a UserError if messages that `command` or the gripper needs are not installed."""
         arm = [TRAJECTORY_ACTION] if command == FOLLOW else []
         for package, name in [*arm, *(self.gripper.actions if self.gripper is not None else [])]:
             action_class(package, name)

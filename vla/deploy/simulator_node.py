@@ -23,6 +23,7 @@ from vla.deploy import messages
 from vla.deploy.joint_limiter import Robot
 from vla.deploy.messages import SimulatedEpisode
 from vla.deploy.settings import Timing, Topics
+from vla.io.errors import UserError
 from vla.spec import LONGEST_INSTRUCTION, Array, Drivable, Environment, InARow
 
 
@@ -36,18 +37,18 @@ class SimulatorNode(Node):
         """Args: a `Drivable` environment; its arm; topics; rates; seed of the first episode.
 
         Raises:
-            ValueError: the environment has no robot, is not `Drivable`, or gives several instructions in a row, or a
+            UserError: the environment has no robot, is not `Drivable`, or gives several instructions in a row, or a
                 control step is not a whole number of ticks.
         """
         model = environment.spec.require_robot("deploy=simulator")
         if not isinstance(environment, Drivable):
-            raise ValueError(
+            raise UserError(
                 f"deploy=simulator needs an environment that is Drivable, {type(environment).__name__} is not"
             )
         control_hz = environment.spec.control_hz
         self._ticks_per_step = round(timing.joints_hz / control_hz)
         if not math.isclose(self._ticks_per_step * control_hz, timing.joints_hz):
-            raise ValueError(
+            raise UserError(
                 f"the simulator's joints_hz={timing.joints_hz:g} must be a multiple of the task's {control_hz:g} Hz"
             )
         super().__init__("vla_simulator")
@@ -76,7 +77,7 @@ class SimulatorNode(Node):
         self.seed += 1
         self.instruction = self.environment.reset(self.seed).instruction
         if isinstance(self.environment, InARow) and self.environment.instructions > 1:
-            raise ValueError("deploy=simulator waits for one instruction per episode: set task.goal.length=1")
+            raise UserError("deploy=simulator waits for one instruction per episode: set task.goal.length=1")
         self._target = self._hold_command()
         self._commanded_at: float | None = None
         self._running, self._ticks = False, 0

@@ -28,6 +28,7 @@ from vla.deploy import messages
 from vla.deploy.control_loop import REPEATED
 from vla.deploy.ros import NETWORKS, command_node, spin
 from vla.deploy.topic_listener import TopicListener
+from vla.io.errors import UserError
 from vla.io.files import atomic_path
 from vla.io.images import resize
 from vla.robots.chain import frame_positions
@@ -230,11 +231,11 @@ class View(TopicListener):
 
 
 def _shell(name: str) -> Shell:
-    """Build the shell of a dotted name; a ValueError if there is none."""
+    """Build the shell of a dotted name; a UserError if there is none."""
     try:
         shell: Shell = pkgutil.resolve_name(name)()
     except (ImportError, AttributeError, ValueError, TypeError) as error:
-        raise ValueError(f"--shell {name} cannot be built: {error}") from error
+        raise UserError(f"--shell {name} cannot be built: {error}") from error
     return shell
 
 
@@ -248,7 +249,7 @@ def expected_pictures(folder: Path, cameras: Iterable[str]) -> dict[str, Array]:
         cameras: as in "front=/front/image_raw".
 
     Raises:
-        ValueError: there is no such store, or no such camera in it.
+        UserError: there is no such store, or no such camera in it.
     """
     store = EpisodeStore(folder)
     store.require_episodes()
@@ -256,7 +257,7 @@ def expected_pictures(folder: Path, cameras: Iterable[str]) -> dict[str, Array]:
     for camera, _, topic in (each.partition("=") for each in cameras):
         if camera not in store.spec.cameras or not topic:
             known = ", ".join(store.spec.cameras)
-            raise ValueError(f"--cameras {camera}={topic}: name a topic for cameras of {folder}, which has {known}")
+            raise UserError(f"--cameras {camera}={topic}: name a topic for cameras of {folder}, which has {known}")
         rows = store.rows(f"rgb_{camera}")
         first = [rows[entry.start : entry.start + 1][0] for entry in store.episodes[:LOOKS]]
         pictures[topic] = np.median(first, axis=0).astype(np.uint8)

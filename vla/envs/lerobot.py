@@ -16,6 +16,7 @@ import numpy as np
 from gymnasium.spaces import Box, Dict
 
 from vla.envs.gym import Task
+from vla.io.errors import UserError
 from vla.spec import FIRST_SEED, Array, Observation, Spec
 
 IMAGES, STATE, RATES = "observation.images.", "observation.state", "observation.velocities"
@@ -87,18 +88,18 @@ def observations(batch: Mapping[str, Any], spec: Spec) -> list[Observation]:
         spec: of the policy.
 
     Raises:
-        ValueError: an entry is missing or has another shape.
+        UserError: an entry is missing or has another shape.
     """
     parts = _parts(spec)
     needed = [*(f"{IMAGES}{camera}" for camera in spec.cameras), *parts, TASK]
     if missing := [key for key in needed if key not in batch]:
-        raise ValueError(f"the policy needs {', '.join(missing)}; there are {', '.join(map(str, batch))}")
+        raise UserError(f"the policy needs {', '.join(missing)}; there are {', '.join(map(str, batch))}")
     count = len(batch[STATE])
     state = np.zeros((count, len(spec.state)), np.float32)
     for key, indices in parts.items():
         if batch[key].shape != (count, len(indices)):
             names = ", ".join(spec.state[index] for index in indices)
-            raise ValueError(f"{key} must be ({count}, {len(indices)}): {names}; it is {batch[key].shape}")
+            raise UserError(f"{key} must be ({count}, {len(indices)}): {names}; it is {batch[key].shape}")
         state[:, indices] = batch[key]
     images = {camera: _pixels(batch[f"{IMAGES}{camera}"]) for camera in spec.cameras}
     instructions: Sequence[str] = batch[TASK]

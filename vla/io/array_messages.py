@@ -12,6 +12,8 @@ from typing import Any
 
 import numpy as np
 
+from vla.io.errors import UserError
+
 try:
     import msgpack
     import websockets  # noqa: F401 who encodes messages sends them
@@ -40,7 +42,7 @@ def unpack(data: bytes) -> Any:
     """Decode a message; arrays are read-only views of `data`, and those without a dimension are Python's numbers.
 
     Raises:
-        ValueError: it is damaged, too large, or holds something else than plain values and arrays of numbers.
+        UserError: it is damaged, too large, or holds something else than plain values and arrays of numbers.
     """
     budget = _Budget()
     bounds = {"max_array_len": LONGEST_LIST, "max_map_len": LARGEST_MAP, "max_str_len": LONGEST_TEXT, "max_ext_len": 0}
@@ -48,7 +50,7 @@ def unpack(data: bytes) -> Any:
         return msgpack.unpackb(data, object_hook=budget.take_map, list_hook=budget.take_list, **bounds)
     except (ValueError, TypeError, OverflowError, msgpack.UnpackException) as error:
         what = str(error)[:200] or type(error).__name__
-        raise ValueError(f"this is no message in msgpack with arrays of numbers: {what}") from error
+        raise UserError(f"this is no message in msgpack with arrays of numbers: {what}") from error
 
 
 class _Budget:
@@ -60,13 +62,13 @@ class _Budget:
     def take_list(self, values: list[Any]) -> list[Any]:
         self._items -= 1 + len(values)
         if self._items < 0:
-            raise ValueError(f"its lists hold more than {LONGEST_LIST} items: send arrays")
+            raise UserError(f"its lists hold more than {LONGEST_LIST} items: send arrays")
         return values
 
     def take_map(self, values: dict[Any, Any]) -> Any:
         self._maps -= 1
         if self._maps < 0:
-            raise ValueError(f"it holds more than {LARGEST_MAP} maps")
+            raise UserError(f"it holds more than {LARGEST_MAP} maps")
         if b"__ndarray__" in values:
             return _array(values)
         return _scalar(values) if b"__npgeneric__" in values else values
@@ -84,9 +86,9 @@ def _encode(value: Any) -> Any:
 def _array(values: dict[Any, Any]) -> np.ndarray:
     dtype, data, shape = _dtype(values), values.get(b"data"), values.get(b"shape")
     if not isinstance(shape, list) or len(shape) > 8 or not all(type(n) is int and n >= 0 for n in shape):
-        raise ValueError("an array has no valid shape")
+        raise UserError("an array has no valid shape")
     if not isinstance(data, bytes) or len(data) != math.prod(shape) * dtype.itemsize:
-        raise ValueError(f"an array of shape {shape} has too many or too few bytes")
+        raise UserError(f"an array of shape {shape} has too many or too few bytes")
     array = np.frombuffer(data, dtype).reshape(shape)
     return array if shape else array.item()
 
@@ -94,12 +96,12 @@ def _array(values: dict[Any, Any]) -> np.ndarray:
 def _scalar(values: dict[Any, Any]) -> Any:
     dtype, data = _dtype(values), values.get(b"data")
     if not isinstance(data, (bool, int, float)):
-        raise ValueError("a NumPy scalar is no number")
+        raise UserError("a NumPy scalar is no number")
     return np.array(data, dtype).item()
 
 
 def _dtype(values: dict[Any, Any]) -> np.dtype[Any]:
     name = values.get(b"dtype")
     if not isinstance(name, str) or name not in DTYPES:
-        raise ValueError(f"an array has the type {str(name)[:50]}, expected one of {', '.join(DTYPES)}")
+        raise UserError(f"an array has the type {str(name)[:50]}, expected one of {', '.join(DTYPES)}")
     return DTYPES[name]

@@ -12,6 +12,7 @@ from typing import Any, TypeVar, cast
 import yaml
 from pydantic import ConfigDict, PydanticUserError, TypeAdapter, ValidationError
 
+from vla.io.errors import UserError
 from vla.io.files import require_file
 
 T = TypeVar("T")
@@ -31,7 +32,7 @@ def read_json(path: Path, kind: type[T], largest: int = MAX_BYTES) -> T:
     """Read the JSON file at `path` as a `kind`: a dataclass, a typed dictionary or any annotation.
 
     Raises:
-        ValueError: the file is larger than `largest` [bytes], nested too deep, not JSON, or not of that kind.
+        UserError: the file is larger than `largest` [bytes], nested too deep, not JSON, or not of that kind.
         OSError: it cannot be read.
     """
     return parse_json(read_bounded(path, largest), kind, str(path))
@@ -47,7 +48,7 @@ def parse_json(text: str | bytes, kind: type[T], name: str) -> T:
     try:
         validated: T = _adapter(cast(Any, kind)).validate_json(text, strict=True)
     except ValidationError as error:
-        raise ValueError(f"{name} is damaged or of another kind: {problems(error)}") from error
+        raise UserError(f"{name} is damaged or of another kind: {problems(error)}") from error
     return validated
 
 
@@ -56,7 +57,7 @@ def parse_plain(value: Any, kind: type[T], name: str) -> T:
     try:
         text = json.dumps(value)
     except (TypeError, ValueError, RecursionError) as error:
-        raise ValueError(f"{name} is damaged or of another kind: {str(error)[:200]}") from error
+        raise UserError(f"{name} is damaged or of another kind: {str(error)[:200]}") from error
     return parse_json(text, kind, name)
 
 
@@ -70,10 +71,10 @@ def parse_yaml(text: str | bytes, kind: type[T], name: str) -> T:
     try:
         shallow = _is_shallow(text)
         plain = json.dumps(yaml.load(text, Loader=yaml.CSafeLoader) if shallow else None)
-    except (yaml.YAMLError, ValueError, TypeError, RecursionError) as error:  # a ValueError also for impossible dates
-        raise ValueError(f"{name} is no plain YAML: {' '.join(str(error).split())[:200]}") from error
+    except (yaml.YAMLError, ValueError, TypeError, RecursionError) as error:  # a UserError also for impossible dates
+        raise UserError(f"{name} is no plain YAML: {' '.join(str(error).split())[:200]}") from error
     if not shallow:
-        raise ValueError(f"{name} is nested deeper than {MAX_DEPTH} levels, or has aliases")
+        raise UserError(f"{name} is nested deeper than {MAX_DEPTH} levels, or has aliases")
     return parse_json(plain, kind, name)
 
 
@@ -91,41 +92,41 @@ def resolved(value: Any, name: str) -> Any:
     """Return a copy of a configuration from a file, called `name`: dicts with texts as keys, lists, and plain values.
 
     Raises:
-        ValueError: a value is no mapping, list, text, number or null; a key is no text; a text contains `${`, which
+        UserError: a value is no mapping, list, text, number or null; a key is no text; a text contains `${`, which
             would be resolved later; or there are more than `MAX_VALUES` values or `MAX_DEPTH` levels.
     """
     count = itertools.count(1)
 
     def copied(item: Any, depth: int) -> Any:
         if next(count) > MAX_VALUES or depth > MAX_DEPTH:  # a file can refer to a list many times, or to itself
-            raise ValueError(f"{name} holds more than {MAX_VALUES} values, or more than {MAX_DEPTH} levels of them")
+            raise UserError(f"{name} holds more than {MAX_VALUES} values, or more than {MAX_DEPTH} levels of them")
         if type(item) in (list, tuple):
             return [copied(part, depth + 1) for part in item]
         if type(item) is dict:
             if other := [key for key in item if type(key) is not str]:
-                raise ValueError(f"{name} holds the key {str(other[0])[:200]}, which is no text")
+                raise UserError(f"{name} holds the key {str(other[0])[:200]}, which is no text")
             return {copied(key, depth + 1): copied(part, depth + 1) for key, part in item.items()}
         if type(item) is str and "${" in item:
-            raise ValueError(f"{name} holds the reference {item[:200]!r}: only resolved values are read from files")
+            raise UserError(f"{name} holds the reference {item[:200]!r}: only resolved values are read from files")
         if item is not None and type(item) not in (bool, int, float, str):
-            raise ValueError(f"{name} holds a {type(item).__name__}, which is no plain data")
+            raise UserError(f"{name} holds a {type(item).__name__}, which is no plain data")
         return item
 
     return copied(value, 0)
 
 
 def read_resolved(path: Path) -> Any:
-    """Read the JSON file at `path` as a configuration, see `resolved`; a ValueError also if a key stands twice."""
+    """Read the JSON file at `path` as a configuration, see `resolved`; a UserError also if a key stands twice."""
 
     def unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
         if len(found := dict(pairs)) < len(pairs):
-            raise ValueError("a key stands twice")
+            raise UserError("a key stands twice")
         return found
 
     try:
         value = json.loads(read_bounded(path), object_pairs_hook=unique, parse_constant=int)  # which NaN is not
     except (ValueError, RecursionError) as error:
-        raise ValueError(f"{path} is damaged or of another kind: {str(error)[:200]}") from error
+        raise UserError(f"{path} is damaged or of another kind: {str(error)[:200]}") from error
     return resolved(value, str(path))
 
 
@@ -163,7 +164,7 @@ def read_bounded(path: Path, largest: int = MAX_BYTES) -> bytes:
     require_file(path)
     size = path.stat().st_size
     if size > largest:
-        raise ValueError(f"{path} has {size} bytes, more than the {largest} that such a file can have")
+        raise UserError(f"{path} has {size} bytes, more than the {largest} that such a file can have")
     return path.read_bytes()
 
 

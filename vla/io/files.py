@@ -11,6 +11,8 @@ from contextlib import contextmanager, suppress
 from errno import EACCES, EDQUOT, EFBIG, EISDIR, ENOSPC, ENOTDIR, EPERM, EROFS
 from pathlib import Path
 
+from vla.io.errors import UserError
+
 log = logging.getLogger(__name__)
 
 UNWRITABLE = (EACCES, EDQUOT, EFBIG, EISDIR, ENOSPC, ENOTDIR, EPERM, EROFS)
@@ -60,10 +62,10 @@ def require_file(path: Path) -> None:
     """Require that `path` is missing or a regular file, because reading from a pipe or a device may never end.
 
     Raises:
-        ValueError: it is a folder, a pipe or a device.
+        UserError: it is a folder, a pipe or a device.
     """
     if path.exists() and not path.is_file():
-        raise ValueError(f"{path} is a folder, a pipe or a device, not a file")
+        raise UserError(f"{path} is a folder, a pipe or a device, not a file")
 
 
 @contextmanager

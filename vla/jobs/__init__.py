@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from vla.config.annotations import require_trusted
 from vla.config.packages import is_trusted
+from vla.io.errors import UserError
 from vla.jobs.machine import require_compiler, warn_of_bfloat16
 
 if TYPE_CHECKING:
@@ -20,7 +21,7 @@ def find(name: str) -> Any:
     """Import the module of a job: `vla.jobs.NAME`, or of a trusted package if `name` has dots.
 
     Raises:
-        ValueError: there is no such job, or its package is not trusted.
+        UserError: there is no such job, or its package is not trusted.
     """
     module = name if "." in name else f"vla.jobs.{name}"
     require_trusted("job", module)
@@ -31,7 +32,7 @@ def find(name: str) -> Any:
             raise
         found = None
     if not hasattr(found, "JOB"):
-        raise ValueError(f"there is no job={name}; --help lists the jobs")
+        raise UserError(f"there is no job={name}; --help lists the jobs")
     return found
 
 
@@ -39,7 +40,7 @@ def run(experiment: Experiment) -> float | None:
     """Run the job of an experiment; evaluation returns the success rate, which sweeps maximise.
 
     Raises:
-        ValueError: the config compiles a model, and this machine cannot; or an error of the job.
+        UserError: the config compiles a model, and this machine cannot; or an error of the job.
     """
     job = find(experiment["job"])
     groups = job.JOB.needs(experiment.config)

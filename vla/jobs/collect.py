@@ -11,6 +11,7 @@ from vla.config.experiment import Experiment
 from vla.data.episodes import EpisodeStore
 from vla.data.formats.imported_demonstrations import ImportedDemonstrations
 from vla.data.header import is_store
+from vla.io.errors import UserError
 from vla.rollouts.collect import collect
 from vla.spec import FIRST_SEED, Environment, Multitask, Spec, SpecOnly
 
@@ -28,11 +29,11 @@ def demonstrations(experiment: Experiment) -> EpisodeStore:
     """Return the episode store of an experiment, limited to `collect.episodes`; collect missing episodes.
 
     Raises:
-        ValueError: the store has episodes of another experiment, or collection fails.
+        UserError: the store has episodes of another experiment, or collection fails.
     """
     asked = experiment["collect"]
     if asked["seed"] + asked["episodes"] > FIRST_SEED:
-        raise ValueError(f"collect.seed={asked['seed']}: seeds from {FIRST_SEED} on are reserved for evaluation")
+        raise UserError(f"collect.seed={asked['seed']}: seeds from {FIRST_SEED} on are reserved for evaluation")
     store = complete_store(experiment)
     if store is None:
         store = _fill(experiment)
@@ -54,7 +55,7 @@ def complete_store(experiment: Experiment) -> EpisodeStore | None:
     """Return the episode store of an experiment if it has enough episodes.
 
     Raises:
-        ValueError: the store was collected with another task, expert or first seed, or its images have other losses.
+        UserError: the store was collected with another task, expert or first seed, or its images have other losses.
     """
     folder, asked = Path(experiment["collect"]["folder"]), experiment["collect"]
     if not is_store(folder):
@@ -79,7 +80,7 @@ def _fill(experiment: Experiment) -> EpisodeStore:
     asked, cluster = experiment["collect"], experiment.cluster()
     world, spec, recorded = _source(experiment)
     if recorded is not None and asked["seed"]:
-        raise ValueError(f"collect.seed={asked['seed']}: recorded episodes are numbered from 0, so omit it")
+        raise UserError(f"collect.seed={asked['seed']}: recorded episodes are numbered from 0, so omit it")
     store = EpisodeStore.create_or_open(Path(asked["folder"]), spec, experiment.source, experiment.codec)
     if recorded is not None:
         added = recorded.fill(store, asked["episodes"])

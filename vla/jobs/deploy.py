@@ -9,6 +9,7 @@ from vla.config.build import build
 from vla.config.check import Job
 from vla.config.differences import at
 from vla.config.experiment import Experiment
+from vla.io.errors import UserError
 from vla.io.printable import printable
 from vla.models.policy_folder import require_unseen
 from vla.reports.evaluation import plot_report, write_report
@@ -21,7 +22,7 @@ def run(experiment: Experiment) -> None:
     """Run the deployment until done or interrupted; report a measured success rate like an evaluation.
 
     Raises:
-        ValueError: an episode ended in an error; the report is written and contains it. Or, before anything is started,
+        UserError: an episode ended in an error; the report is written and contains it. Or, before anything is started,
             an episode that is to be played selected the weights.
     """
     seed, episodes = (at(experiment["deploy"], key, None) for key in ("simulator.seed", "episodes"))
@@ -34,14 +35,14 @@ def run(experiment: Experiment) -> None:
         plot_report(report, output / PLOT)
         print(printable(str(report)))
         if report.errors:
-            raise ValueError(f"the episodes ended with an error, see {output / REPORT}: {report.errors[0].error}")
+            raise UserError(f"the episodes ended with an error, see {output / REPORT}: {report.errors[0].error}")
 
 
 def deployment(experiment: Experiment) -> Any:
     """Build the deployment of an experiment.
 
     Raises:
-        ValueError: it needs a policy, and there is none.
+        UserError: it needs a policy, and there is none.
     """
     built = build(
         experiment["deploy"],
@@ -51,17 +52,17 @@ def deployment(experiment: Experiment) -> Any:
         output=experiment.output,
     )
     if getattr(built, "needs_policy", True) and experiment.checkpoint is None and not experiment["agent"]:
-        raise ValueError("this deployment needs a trained policy: checkpoint=RUN")
+        raise UserError("this deployment needs a trained policy: checkpoint=RUN")
     return built
 
 
 def _policy(experiment: Experiment) -> Any:
-    """Build the trained policy, or the agent in its place; raise a ValueError if there is neither."""
+    """Build the trained policy, or the agent in its place; raise a UserError if there is neither."""
     make_agent = experiment.make_agent()
     if make_agent is None:
         return experiment.make_policy()()
     world: Any = experiment.world()
     agent: Any = make_agent(world)
     if not hasattr(agent, "plan"):
-        raise ValueError(f"{type(agent).__name__} plans no chunks of actions, so it cannot be deployed")
+        raise UserError(f"{type(agent).__name__} plans no chunks of actions, so it cannot be deployed")
     return agent

@@ -16,6 +16,7 @@ from typing import Any
 from vla.config.build import Group, build
 from vla.config.check import NEAREST, Job, conditions, with_changes
 from vla.config.experiment import Experiment
+from vla.io.errors import UserError
 from vla.io.files import warn_on_error, writing
 from vla.io.printable import printable, show
 from vla.io.versions import installed_versions
@@ -64,7 +65,7 @@ def run(experiment: Experiment) -> float | None:
     A policy that is trained on all episodes of a recording is not evaluated, as none is left: the result is None, too.
 
     Raises:
-        ValueError: an episode ended in an error; the report is written and contains it.
+        UserError: an episode ended in an error; the report is written and contains it.
     """
     output = experiment.output
     require_possible(experiment)
@@ -97,28 +98,28 @@ def require_possible(experiment: Experiment) -> None:
     """Check, before any work, that the evaluation can be completed.
 
     Raises:
-        ValueError: there is no such run to compare with, nothing to decide, no such network or store, or no world to
+        UserError: there is no such run to compare with, nothing to decide, no such network or store, or no world to
             change; or its episodes selected the weights.
     """
     _require_unseen(experiment)
     _statements(experiment)
     _networks(experiment)
     if experiment["evaluate"]["by_clock"] and not experiment["evaluate"]["networks"]:
-        raise ValueError("evaluate.by_clock is about evaluate.networks, and there are none: add evaluate=latency")
+        raise UserError("evaluate.by_clock is about evaluate.networks, and there are none: add evaluate=latency")
     if not experiment.playable and experiment["evaluate"]["conditions"]:
-        raise ValueError("evaluate.conditions change a world, and a recording has none: omit them")
+        raise UserError("evaluate.conditions change a world, and a recording has none: omit them")
     if (folder := experiment["evaluate"]["nearest"]) is not None:
         open_memory(Path(folder), None, experiment.world().spec)
     output = Path(experiment["output"])  # not created yet
     if experiment["job"] != "improve" and any(output.glob(f"round_*/{CHECKPOINTS}")):
-        raise ValueError(f"{output} has the rounds of a job=improve, whose report this would replace: add output=DIR")
+        raise UserError(f"{output} has the rounds of a job=improve, whose report this would replace: add output=DIR")
     if experiment.playable:
         for name, changes in conditions(experiment["evaluate"]).items():
             _require_world(experiment, name, changes)
 
 
 def _require_unseen(experiment: Experiment) -> None:
-    """Raise a ValueError if an episode of the evaluation selected given weights, whatever `validate` is now."""
+    """Raise a UserError if an episode of the evaluation selected given weights, whatever `validate` is now."""
     asked, named = experiment["evaluate"], [experiment["checkpoint"], experiment["pretrained"]]
     if not any(named):
         return
@@ -130,7 +131,7 @@ def _require_unseen(experiment: Experiment) -> None:
 
 
 def _require_world(experiment: Experiment, name: str, changes: dict[str, Any]) -> None:
-    """Raise a ValueError if there is no episode under a condition, such as with more blocks than colours."""
+    """Raise a UserError if there is no episode under a condition, such as with more blocks than colours."""
     try:
         world = experiment.make_environment(changes)()
         try:
@@ -139,7 +140,7 @@ def _require_world(experiment: Experiment, name: str, changes: dict[str, Any]) -
         finally:
             world.close()
     except ValueError as error:
-        raise ValueError(f"condition {name} of the evaluation: {error}") from error
+        raise UserError(f"condition {name} of the evaluation: {error}") from error
 
 
 def evaluate_trained(experiment: Experiment, checkpoint: Path, rounds: Sequence[Round] = ()) -> float:
@@ -166,7 +167,7 @@ def _evaluated(experiment: Experiment, checkpoint: Path | None, rounds: Sequence
             with writing(output / REPORT):
                 _write(experiment, checkpoint, reports, statements, rounds, played.seconds)
             if errors := _errors(reports):  # what was played is kept, so that the same command plays only these again
-                raise ValueError(f"{errors} episodes ended in an error, see {output / REPORT}")
+                raise UserError(f"{errors} episodes ended in an error, see {output / REPORT}")
     finally:
         for line in result:  # after whatever was logged, because scripts read the last line
             print(printable(line))
@@ -202,7 +203,7 @@ def _statements(experiment: Experiment) -> list[Statement]:
     """Build the statements on the training condition that the evaluation must decide.
 
     Raises:
-        ValueError: there is no such run to compare with, or nothing to decide.
+        UserError: there is no such run to compare with, or nothing to decide.
     """
     asked = experiment["evaluate"]
     bar, against, found = asked["bar"], asked["against"], list[Statement]()
@@ -211,7 +212,7 @@ def _statements(experiment: Experiment) -> list[Statement]:
     if against is not None:
         report = require_run(Path(against)).report
         if report is None:
-            raise ValueError(f"evaluate.against={against} has no report.json to compare with: evaluate that run first")
+            raise UserError(f"evaluate.against={against} has no report.json to compare with: evaluate that run first")
         theirs = {result.seed: result for result in report.per_episode}
         if not any(result.draws for result in report.per_episode) and report.config.get("task") != experiment["task"]:
             theirs = {}  # without draws to compare, equal seeds are the same episodes in the same task only
@@ -220,12 +221,12 @@ def _statements(experiment: Experiment) -> list[Statement]:
         found.append(statement)
     others = asked["without"] or asked["nearest"] or asked["networks"]
     if asked["until"] and not found and not (conditions(asked) or others):
-        raise ValueError(
+        raise UserError(
             "evaluate.until=decided needs something to decide: evaluate.bar=0.95, evaluate.against=RUN, or conditions, "
             "as in evaluate=suite"
         )
     if not experiment.playable and (found or asked["until"] or others):
-        raise ValueError(
+        raise UserError(
             "evaluate.bar, against, until, without, nearest and networks need success, which recordings do not have: "
             "omit them"
         )
@@ -236,7 +237,7 @@ def _networks(experiment: Experiment) -> dict[str, Network]:
     """Return condition → network of `evaluate.networks`.
 
     Raises:
-        ValueError: one is invalid.
+        UserError: one is invalid.
     """
     kind = Group("evaluate.networks", ("vla.rollouts.realtime.Network",))
     return {name: build(node, kind) for name, node in experiment["evaluate"]["networks"].items()}

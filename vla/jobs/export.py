@@ -18,7 +18,7 @@ def run(experiment: Experiment) -> None:
     """Export demonstrations or a policy, depending on the exporter.
 
     Raises:
-        ValueError: the exporter needs a policy, and no checkpoint is given.
+        UserError: the exporter needs a policy, and no checkpoint is given.
     """
     exporter = build(experiment["export"], "export")
     if hasattr(exporter, "export_policy"):

@@ -22,6 +22,7 @@ from vla.config.experiment import Experiment
 from vla.data.episodes import EpisodeStore
 from vla.data.header import is_store
 from vla.data.index import listed
+from vla.io.errors import UserError
 from vla.io.types import Count, Seed, Share
 from vla.jobs.collect import complete_store, demonstrations
 from vla.jobs.evaluate import evaluate_trained, policy_for_workers, require_possible
@@ -56,7 +57,7 @@ def run(experiment: Experiment) -> float:
     """Improve a policy in rounds and return its success rate; finished rounds, and parts of one, are kept.
 
     Raises:
-        ValueError: the expert cannot label, seeds are not fresh, or a round of another policy lies in the folder.
+        UserError: the expert cannot label, seeds are not fresh, or a round of another policy lies in the folder.
     """
     seeds = _require_possible(experiment)
     known = complete_store(experiment)
@@ -92,7 +93,7 @@ def _save_config(experiment: Experiment) -> None:
     """Save the config for `resume=`.
 
     Raises:
-        ValueError: the folder has rounds of another training, or they begin where this one would not end.
+        UserError: the folder has rounds of another training, or they begin where this one would not end.
     """
     saved = read_run(experiment.output).config
     if saved.get("job") == "improve":
@@ -104,12 +105,12 @@ def _save_config(experiment: Experiment) -> None:
 
 
 def _require_same_length(saved: Mapping[str, Any], experiment: Experiment) -> None:
-    """Raise a ValueError if a training that later ones continue would get another length."""
+    """Raise a UserError if a training that later ones continue would get another length."""
     lengths = [f"trainer.{name}" for name in LENGTHS] if experiment.pretrained is None else []
     for key in (*lengths, "improve.steps"):
         before, now = at(saved, key, None), at(experiment.config, key, None)
         if before != now:
-            raise ValueError(
+            raise UserError(
                 f"{key}={now}: the rounds in {experiment.output} were trained with {before}: leave it at that, or "
                 "choose another output=DIR"
             )
@@ -119,15 +120,15 @@ def _require_possible(experiment: Experiment) -> range:
     """Check the config, and return the seeds of all rounds.
 
     Raises:
-        ValueError: seeds are of evaluation, training is to use several devices, or the expert cannot label.
+        UserError: seeds are of evaluation, training is to use several devices, or the expert cannot label.
     """
     require_possible(experiment)
     asked = experiment["improve"]
     seeds = range(asked["seed"], asked["seed"] + asked["rounds"] * asked["episodes"])
     if seeds.stop > FIRST_SEED:
-        raise ValueError(f"improve.seed={seeds.start}: seeds from {FIRST_SEED} on are reserved for evaluation")
+        raise UserError(f"improve.seed={seeds.start}: seeds from {FIRST_SEED} on are reserved for evaluation")
     if devices(experiment["trainer"]) > 1:
-        raise ValueError("job=improve trains on one device, because its trainings follow each other: trainer.devices=1")
+        raise UserError("job=improve trains on one device, because its trainings follow each other: trainer.devices=1")
     if experiment.pretrained is not None:
         _require_further_episodes(experiment, experiment.pretrained)
     with closing(experiment.make_environment()()) as environment:
@@ -145,21 +146,21 @@ def _require_possible(experiment: Experiment) -> range:
 
 
 def _require_further_episodes(experiment: Experiment, policy: Path) -> None:
-    """Raise a ValueError if the policy was trained on further stores, such as rounds, that nothing is said about."""
+    """Raise a UserError if the policy was trained on further stores, such as rounds, that nothing is said about."""
     further = at(read_policy(policy).config, "collect.more", None)
     if isinstance(further, list) and further and experiment["collect"]["more"] is None:
         names = ",".join(map(str, further))
-        raise ValueError(
+        raise UserError(
             f"{policy} was also trained on {names}: add collect.more=[{names}] to train on "
             "these episodes again, or collect.more=[] to leave them out"
         )
 
 
 def require_new(seeds: range, store: EpisodeStore) -> None:
-    """Raise a ValueError if a demonstration has one of the seeds."""
+    """Raise a UserError if a demonstration has one of the seeds."""
     seen = [entry.seed for entry in store.tried if entry.seed in seeds]
     if seen:
-        raise ValueError(
+        raise UserError(
             f"improve.seed={seeds.start}: the {len(seeds)} seeds of the rounds must be new, and the demonstrations in "
             f"{store.folder} have {listed(seen)}: set improve.seed={max(seen) + 1}, or higher"
         )

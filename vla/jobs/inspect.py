@@ -15,6 +15,7 @@ from vla.config.experiment import Experiment, make_environment
 from vla.data.episodes import EpisodeStore
 from vla.data.index import listed
 from vla.data.verification import derive_store, find_episode, require_whole, verify_store
+from vla.io.errors import UserError
 from vla.io.files import warn_on_error
 from vla.io.printable import show
 from vla.io.types import Natural, Text
@@ -44,7 +45,7 @@ def run(experiment: Experiment) -> None:
         inspect_store(**asked)
     else:
         if others := [name for name in ("stores", "where", "repair", "into") if asked[name]]:
-            raise ValueError(f"inspect.episode replays an episode of inspect.folder: omit inspect.{others[0]}")
+            raise UserError(f"inspect.episode replays an episode of inspect.folder: omit inspect.{others[0]}")
         recorded = experiment["recorder"] is not None
         replay_episode(experiment.output, Path(asked["folder"]), seed, experiment["task"].get("robot"), recorded)
 
@@ -57,7 +58,7 @@ def inspect_store(
     Args: see the node `inspect` of the config.
 
     Raises:
-        ValueError: the store does not exist, cannot be made, or is damaged; its intact episodes are described first.
+        UserError: the store does not exist, cannot be made, or is damaged; its intact episodes are described first.
     """
     findings = verify_store(EpisodeStore(_chosen(folder, stores, where, repair, into), damaged=True))
     show(store_table(findings))
@@ -72,7 +73,7 @@ def _chosen(
 ) -> Path:
     """Return the path of the store to inspect; make it if needed."""
     if into is None and (stores or where):
-        raise ValueError("inspect.stores and inspect.where make a new store: give its folder, inspect.into=DIR")
+        raise UserError("inspect.stores and inspect.where make a new store: give its folder, inspect.into=DIR")
     if into is None and not repair:
         return Path(folder)
     sources = [EpisodeStore(source, damaged=repair) for source in stores or [folder]]
@@ -101,12 +102,12 @@ def replay_episode(
         robot: node that replaces the one of the store's task, which may not name files.
 
     Raises:
-        ValueError: there is no such episode, or its store does not contain its task, or another robot's.
+        UserError: there is no such episode, or its store does not contain its task, or another robot's.
     """
     store = EpisodeStore(folder, damaged=True)
     config, episode = find_episode(store, seed)
     if not isinstance(config.get("task"), dict):
-        raise ValueError(f"{folder} does not contain the task of seed {seed}, so there is no scene to replay it in")
+        raise UserError(f"{folder} does not contain the task of seed {seed}, so there is no scene to replay it in")
     if robot:
         config["task"]["robot"] = robot
     require_no_paths(config, ("task",), folder, ["task.robot"] if robot else [])

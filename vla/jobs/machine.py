@@ -12,6 +12,8 @@ from collections.abc import Container, Mapping
 from pathlib import Path
 from typing import Any
 
+from vla.io.errors import UserError
+
 log = logging.getLogger(__name__)
 
 # Node with a key `compile` → key of the device for which it compiles.
@@ -57,14 +59,14 @@ def require_compiler(config: Mapping[str, Any], groups: Container[str]) -> None:
     On a CPU PyTorch calls a C++ compiler, on a GPU Triton calls one of C, and both include the headers of Python.
 
     Raises:
-        ValueError: the compiler or the headers are missing.
+        UserError: the compiler or the headers are missing.
     """
     for name, device in COMPILING.items():
         if _compiles(config, name, groups):
             group, _, key = device.partition(".")
             if missing := _missing(computes_on_cpu(config[group].get(key))):
                 off = "[false]" if name == "benchmark" else "false"
-                raise ValueError(f"{name}.compile needs {missing}, or set {name}.compile={off}")
+                raise UserError(f"{name}.compile needs {missing}, or set {name}.compile={off}")
 
 
 def _compiles(config: Mapping[str, Any], name: str, groups: Container[str]) -> bool:

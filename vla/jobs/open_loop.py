@@ -19,6 +19,7 @@ from vla.data.episodes import EpisodeStore
 from vla.data.header import is_store
 from vla.data.index import Entry
 from vla.data.verification import episode_of
+from vla.io.errors import UserError
 from vla.io.files import warn_on_error, writing
 from vla.io.printable import show
 from vla.jobs.collect import demonstrations
@@ -39,7 +40,7 @@ def evaluate_open_loop(experiment: Experiment, checkpoint: Path | None) -> float
     Without a checkpoint the agent of the config is shown the episodes that a training would hold out.
 
     Raises:
-        ValueError: the checkpoint was trained on other episodes, or on all of them.
+        UserError: the checkpoint was trained on other episodes, or on all of them.
     """
     started, output = time.monotonic(), experiment.output
     facts = {**experiment["chosen"], "origin": asdict(experiment.origin)}
@@ -51,7 +52,7 @@ def evaluate_open_loop(experiment: Experiment, checkpoint: Path | None) -> float
         fraction = saved.config["data"]["validation_fraction"]
     if not fraction:
         whose = f"{checkpoint} was trained" if checkpoint else "a training would be"
-        raise ValueError(
+        raise UserError(
             f"data.validation_fraction=0: {whose} on all episodes, and errors on these say nothing about others: train "
             "with a larger fraction"
         )
@@ -104,7 +105,7 @@ def _unseen(store: EpisodeStore, more: Sequence[Path], checkpoint: Path) -> list
         [*entries, *(entry for folder in more for entry in EpisodeStore(folder).episodes)]
     ):
         folders = " and those in ".join(map(str, [store.folder, *more]))
-        raise ValueError(
+        raise UserError(
             f"{checkpoint} was trained on other episodes than the {len(entries)} in {folders}, so which of them were "
             "held out is unknown: name the recording, its options, collect.episodes and collect.more as in training"
         )
@@ -114,14 +115,14 @@ def _unseen(store: EpisodeStore, more: Sequence[Path], checkpoint: Path) -> list
         )
     fraction = at(saved.config, "data.validation_fraction", None)
     if not isinstance(fraction, float | int):
-        raise ValueError(f"{checkpoint} does not say which share of the episodes its training held out")
+        raise UserError(f"{checkpoint} does not say which share of the episodes its training held out")
     return _held_out(store, fraction)
 
 
 def _held_out(store: EpisodeStore, fraction: float) -> list[Entry]:
     unseen = [entry for entry in store.episodes if held_out(entry.recording, fraction)]
     if not unseen:
-        raise ValueError(
+        raise UserError(
             f"data.validation_fraction={fraction} holds none of the {len(store.episodes)} episodes in {store.folder} "
             "out of training: train with a larger fraction, or with more episodes"
         )
@@ -132,7 +133,7 @@ def _measure(experiment: Experiment, store: EpisodeStore, unseen: list[Entry], p
     actions, known = store.rows("action"), {entry.seed for entry in unseen}
     seen = [actions[entry.span] for entry in store.episodes if entry.seed not in known]
     if not seen:
-        raise ValueError(
+        raise UserError(
             f"all {len(unseen)} episodes in {store.folder} are held out, so there is no constant action to compare "
             "with: record more, or raise collect.episodes"
         )

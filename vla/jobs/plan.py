@@ -12,6 +12,7 @@ from rich.table import Table
 
 from vla.config.check import Job
 from vla.config.experiment import Experiment
+from vla.io.errors import UserError
 from vla.io.printable import show
 from vla.io.types import Share, Text
 from vla.reports.comparison import common_episodes, read_runs
@@ -48,9 +49,9 @@ def run(experiment: Experiment) -> None:
     asked = experiment["plan"]
     one, other = asked["rates"]
     if one == other:
-        raise ValueError(f"plan.rates={asked['rates']} are equal: no number of episodes tells them apart")
+        raise UserError(f"plan.rates={asked['rates']} are equal: no number of episodes tells them apart")
     if asked["runs"] and asked["discordant"] is not None:
-        raise ValueError("plan.discordant is measured on plan.runs: omit one of the two")
+        raise UserError("plan.discordant is measured on plan.runs: omit one of the two")
     common = _common(asked["runs"]) if asked["runs"] else []
     share = sum(one.success != two.success for one, two in common) / len(common) if common else asked["discordant"]
     show(plan_table(one, other, asked["power"], share))
@@ -73,7 +74,7 @@ def plan_table(one: float, other: float, power: float, discordant: float | None)
         discordant: share of the episodes in which only one of them succeeds; None: the limits of what it can be.
 
     Raises:
-        ValueError: the rates cannot differ in such a share.
+        UserError: the rates cannot differ in such a share.
     """
     difference, apart = abs(other - one), one * (1 - other) + other * (1 - one)
     largest = min(one + other, 2 - one - other)
@@ -82,7 +83,7 @@ def plan_table(one: float, other: float, power: float, discordant: float | None)
     elif difference - 1e-9 <= discordant <= largest + 1e-9:
         shares = {"": max(discordant, difference)}
     else:
-        raise ValueError(
+        raise UserError(
             f"policies of {_percent(one)} and {_percent(other)} differ in {_percent(difference)} to "
             f"{_percent(largest)} of the same episodes, not in {_percent(discordant)}: change plan.rates"
         )
@@ -110,7 +111,7 @@ def _common(runs: Sequence[str]) -> list[tuple[Result, Result]]:
     one, other = read_runs([Path(folder) for folder in runs]).values()
     if common := common_episodes(one, other, IN_DISTRIBUTION):
         return common
-    raise ValueError(
+    raise UserError(
         f"plan.runs={runs} have no episode in common: give the share of differing ones, plan.discordant=0.05"
     )
 

@@ -18,6 +18,7 @@ from vla.config.experiment import Experiment, training_policy
 from vla.config.origin import Origin
 from vla.config.packages import remember_trust
 from vla.data.episodes import EpisodeStore
+from vla.io.errors import UserError
 from vla.io.files import atomic_path, warn_on_error, writing
 from vla.jobs.collect import demonstration_spec, demonstrations
 from vla.models.learner import Learner
@@ -61,7 +62,7 @@ def train(experiment: Experiment) -> Path | None:
     An unfinished training in the output folder is resumed; a finished one is kept.
 
     Raises:
-        ValueError: the output folder has another training, or this one cannot start.
+        UserError: the output folder has another training, or this one cannot start.
     """
     state = training_progress(experiment.output, experiment.config)
     if state.chosen is not None:
@@ -109,7 +110,7 @@ def _fit(experiment: Experiment, state: TrainingProgress, trainer: Trainer, grac
             _warn_of_clipped(model, further, further.statistics.chunks(model.chunk))
     data.setup()
     if data.batch_size > len(data.training_windows):
-        raise ValueError(
+        raise UserError(
             f"data.batch_size={data.batch_size} is more than the {len(data.training_windows)} windows of "
             f"the episodes in {store.folder}: lower it, or collect more"
         )
@@ -196,7 +197,7 @@ def _closed_loop(experiment: Experiment) -> ClosedLoop | None:
     asked = experiment["validate"]
     seeds = range(asked["seed"], asked["seed"] + asked["episodes"])
     if seeds and not experiment.playable:
-        raise ValueError(f"validate.episodes={len(seeds)}: nothing can be played in a recording: set it to 0")
+        raise UserError(f"validate.episodes={len(seeds)}: nothing can be played in a recording: set it to 0")
     make_environment = experiment.make_environment(asked["changes"])
     make_policy = partial(training_policy, experiment["policy"].get("precision", "fp32"))
     workers = experiment["cluster"].get("workers") or cores()

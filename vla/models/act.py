@@ -68,7 +68,7 @@ class ACT(ChunkModel):
         kl_weight: weight of the KL divergence of the latent from its prior; 0 omits latent and CVAE encoder.
 
     Raises:
-        ValueError: `width` is not a multiple of `heads`.
+        UserError: `width` is not a multiple of `heads`.
     """
 
     def __init__(

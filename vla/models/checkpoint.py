@@ -10,6 +10,7 @@ from zipfile import BadZipFile, ZipFile
 import torch
 
 from vla.io.documents import resolved
+from vla.io.errors import UserError
 
 
 class Header(NamedTuple):
@@ -25,7 +26,7 @@ def read_header(path: Path) -> Header:
     content = read_content(path, weights=False)
     config, steps = resolved(content.get("config"), f"the configuration in {path}"), content.get("global_step")
     if not isinstance(config, dict) or not isinstance(steps, int):
-        raise ValueError(f"{path} is no checkpoint of this project: it carries no configuration, or no steps")
+        raise UserError(f"{path} is no checkpoint of this project: it carries no configuration, or no steps")
     return Header(config, content.get("finished") is True, steps)
 
 
@@ -33,11 +34,11 @@ def read_content(path: Path, weights: bool = True) -> dict[str, Any]:
     """Read a checkpoint as plain values and tensors, on the CPU; without `weights` no numbers of tensors.
 
     Raises:
-        ValueError: there is no file, or it is damaged or something else.
+        UserError: there is no file, or it is damaged or something else.
         OSError: the file cannot be read.
     """
     if not path.is_file():
-        raise ValueError(f"there is no checkpoint {path}")
+        raise UserError(f"there is no checkpoint {path}")
     try:
         with ZipFile(path) as archive:
             if weights and (part := archive.testzip()):  # PyTorch ignores the checksums that it writes
@@ -46,7 +47,7 @@ def read_content(path: Path, weights: bool = True) -> dict[str, Any]:
     except OSError:
         raise
     except Exception as error:  # a damaged pickle can raise nearly anything
-        raise ValueError(f"{path} cannot be read as a checkpoint, it is damaged or something else") from error
+        raise UserError(f"{path} cannot be read as a checkpoint, it is damaged or something else") from error
     return content if isinstance(content, dict) else {}
 
 

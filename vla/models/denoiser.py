@@ -12,6 +12,7 @@ from abc import abstractmethod
 import torch
 from torch import Tensor, nn
 
+from vla.io.errors import UserError
 from vla.io.types import Inherited, Layers, NonNegative, Steps
 from vla.models.chunk_policy import ChunkModel, transformer_decoder
 from vla.models.model import Batch, Prediction, mean_where, require_heads
@@ -70,7 +71,7 @@ class DenoisingModel(ChunkModel):
         temperature: factor of the initial noise: 1 samples the learned distribution, 0 is deterministic.
 
     Raises:
-        ValueError: `width` is odd or not a multiple of `heads`.
+        UserError: `width` is odd or not a multiple of `heads`.
     """
 
     noise: Tensor
@@ -87,7 +88,7 @@ class DenoisingModel(ChunkModel):
         super().__init__(**inherited)
         require_heads(self.width, heads)
         if self.width % 2:
-            raise ValueError(f"model.width={self.width} must be even, for pairs of a sine and a cosine")
+            raise UserError(f"model.width={self.width} must be even, for pairs of a sine and a cosine")
         self.copies, self.steps, self.temperature = copies, steps, temperature
         components = len(self.spec.action)
         self.denoiser = Denoiser(components, self.chunk, self.width, layers, heads)

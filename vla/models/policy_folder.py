@@ -21,6 +21,7 @@ from torch import Tensor
 from torch.overrides import TorchFunctionMode
 
 from vla.io.documents import STRICT, lines_of, parse_json, parse_plain, read_resolved
+from vla.io.errors import UserError
 from vla.io.types import Natural
 from vla.models.hub import fetch
 from vla.models.model import Model
@@ -68,12 +69,12 @@ class SavedPolicy:
         """Name → weights of the model, on the CPU, and the further state of its modules.
 
         Raises:
-            ValueError: the file is damaged, or another than that of this training.
+            UserError: the file is damaged, or another than that of this training.
         """
         path = _file(self.folder, WEIGHTS)
         with path.open("rb") as file:
             if hashlib.file_digest(file, "sha256").hexdigest() != self.training.weights:
-                raise ValueError(f"{path} is damaged, or not the file that {TRAINING} describes: copy the folder again")
+                raise UserError(f"{path} is damaged, or not the file that {TRAINING} describes: copy the folder again")
         with _opened(path) as weights:
             names: list[str] = weights.keys()  # it is no mapping
             return _joined(weights.metadata() or {}, {name: weights.get_tensor(name) for name in names})
@@ -92,7 +93,7 @@ class SavedPolicy:
         """Load the weights, or another `state`, into `model`, and nothing larger, such as a text encoder.
 
         Raises:
-            ValueError: they belong to another model.
+            UserError: they belong to another model.
         """
         state = self.state if state is None else state
         try:
@@ -100,10 +101,10 @@ class SavedPolicy:
                 model.load_state_dict(state)
             for name, value in (*model.named_parameters(), *model.named_buffers()):
                 if name in state and state[name].dtype != value.dtype:
-                    raise ValueError(f"{name} has numbers of {state[name].dtype}, not {value.dtype}")
+                    raise UserError(f"{name} has numbers of {state[name].dtype}, not {value.dtype}")
         except Exception as error:  # whatever modules raise for a state that is not theirs
             first = lines_of(error)[-1].strip()[:200]
-            raise ValueError(f"{self.folder} does not fit the model of its own configuration: {first}") from error
+            raise UserError(f"{self.folder} does not fit the model of its own configuration: {first}") from error
 
     def budget(self) -> TensorBudget:
         """Return the context in which a model is built that its file can fill."""
@@ -117,7 +118,7 @@ def policy_folder(name: str | Path) -> Path:
         name: the folder, or that of a run, whose policy is meant, or hub:owner/name@revision.
 
     Raises:
-        ValueError: there is none.
+        UserError: there is none.
     """
     if str(name).startswith(HUB):
         return _fetched(str(name))
@@ -127,11 +128,11 @@ def policy_folder(name: str | Path) -> Path:
             return folder
     if path.suffix == ".ckpt":
         run = path.parent.parent
-        raise ValueError(f"{path} only resumes its own training: a policy is a folder, or the run that has it, {run}")
+        raise UserError(f"{path} only resumes its own training: a policy is a folder, or the run that has it, {run}")
     if path.is_dir():
         best = f"; the best so far is {path / BEST}" if (path / BEST).exists() else ""
-        raise ValueError(f"{path} is neither a policy nor a run with one, there is no {path / POLICY / SPEC}{best}")
-    raise ValueError(f"there is no policy {path}: name a run, as in outputs/runs/…, its folder {POLICY}, or {HUB}…")
+        raise UserError(f"{path} is neither a policy nor a run with one, there is no {path / POLICY / SPEC}{best}")
+    raise UserError(f"there is no policy {path}: name a run, as in outputs/runs/…, its folder {POLICY}, or {HUB}…")
 
 
 def is_gone(name: str) -> bool:
@@ -143,11 +144,11 @@ def is_gone(name: str) -> bool:
 def _fetched(name: str) -> Path:
     """Return the folder of a policy on the hub, downloading what is not cached: a revision is looked up once."""
     if (found := REPOSITORY.fullmatch(name)) is None:
-        raise ValueError(f"{name} is no policy on the hub: write {HUB}OWNER/NAME@REVISION, a tag, a branch or a commit")
+        raise UserError(f"{name} is no policy on the hub: write {HUB}OWNER/NAME@REVISION, a tag, a branch or a commit")
     try:
         return fetch(found[1], CONFIG, SPEC, WEIGHTS, TRAINING, CARD, revision=found[2])
     except OSError as error:
-        raise ValueError(f"{name} cannot be fetched from the Hugging Face hub: {error}") from error
+        raise UserError(f"{name} cannot be fetched from the Hugging Face hub: {error}") from error
 
 
 def read_policy(name: str | Path) -> SavedPolicy:
@@ -157,7 +158,7 @@ def read_policy(name: str | Path) -> SavedPolicy:
         name: as of `policy_folder`.
 
     Raises:
-        ValueError: there is none, or a file is missing, damaged, or none of this project.
+        UserError: there is none, or a file is missing, damaged, or none of this project.
         OSError: a file cannot be read.
     """
     folder = policy_folder(name)
@@ -165,7 +166,7 @@ def read_policy(name: str | Path) -> SavedPolicy:
     nodes = config if isinstance(config, dict) else {}
     present = [nodes[name] for name in (*REQUIRED_NODES, *OPTIONAL_NODES) if name in nodes]
     if not nodes.keys() >= {*REQUIRED_NODES} or not all(isinstance(node, dict) for node in present):
-        raise ValueError(f"{folder / CONFIG} is of no policy of this project: it lacks {', '.join(REQUIRED_NODES)}")
+        raise UserError(f"{folder / CONFIG} is of no policy of this project: it lacks {', '.join(REQUIRED_NODES)}")
     with _opened(_file(folder, WEIGHTS)):
         pass  # its header has the sizes of all weights, which are those of the file
     made = parse_plain(training, Training, str(folder / TRAINING))
@@ -174,35 +175,35 @@ def read_policy(name: str | Path) -> SavedPolicy:
 
 @contextmanager
 def _opened(path: Path) -> Iterator[Any]:
-    """Open a file of weights, whose header is checked; a ValueError if it is damaged."""
+    """Open a file of weights, whose header is checked; a UserError if it is damaged."""
     from safetensors import safe_open
 
     try:
         with safe_open(path, "pt") as file:
             yield file
     except Exception as error:  # safetensors has errors of its own
-        raise ValueError(f"{path} is damaged: {lines_of(error)[0][:200]}") from error
+        raise UserError(f"{path} is damaged: {lines_of(error)[0][:200]}") from error
 
 
 def _file(folder: Path, name: str) -> Path:
     """Return a file of a folder.
 
     Raises:
-        ValueError: there is none, or it is a link out of the folder; those of the hub's cache lead to its blobs.
+        UserError: there is none, or it is a link out of the folder; those of the hub's cache lead to its blobs.
     """
     path, root = folder / name, folder.resolve()
     if not path.resolve().is_relative_to(root.parents[1] if root.parent.name == "snapshots" else root):
-        raise ValueError(f"{path} is a link that leaves the folder: copy the policy from where it is whole")
+        raise UserError(f"{path} is a link that leaves the folder: copy the policy from where it is whole")
     if not path.is_file():
-        raise ValueError(f"{folder} has no {name}: copy the policy from where it is whole")
+        raise UserError(f"{folder} has no {name}: copy the policy from where it is whole")
     return path
 
 
 def require_unseen(name: str | Path, key: str, seeds: range) -> None:
-    """Raise a ValueError if a policy is to be evaluated on `seeds`, set by the dotted `key`, that selected it."""
+    """Raise a UserError if a policy is to be evaluated on `seeds`, set by the dotted `key`, that selected it."""
     first, count = read_policy(name).training.validation or (0, 0)
     if shared := range(max(first, seeds.start), min(first + count, seeds.stop)):
-        raise ValueError(
+        raise UserError(
             f"{key}={seeds.start}: episodes {shared.start} to {shared.stop - 1} selected the weights in {name} when it "
             f"was trained, and cannot evaluate them: set {key}={first + count} or another"
         )
@@ -232,7 +233,7 @@ class TensorBudget(TorchFunctionMode):
         self._folder, self._remaining = folder, 2 * size + 2**26
 
     def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
-        """Call `func` after subtracting the size of its result from the budget; a ValueError if it is exceeded."""
+        """Call `func` after subtracting the size of its result from the budget; a UserError if it is exceeded."""
         kwargs = kwargs or {}
         if func in FACTORIES:
             described = {name: value for name, value in kwargs.items() if name not in ("generator", "out")}
@@ -241,5 +242,5 @@ class TensorBudget(TorchFunctionMode):
             except RuntimeError:  # a size beyond any address
                 self._remaining = -1
             if self._remaining < 0:
-                raise ValueError(f"{self._folder} describes a model that is larger than its weights")
+                raise UserError(f"{self._folder} describes a model that is larger than its weights")
         return func(*args, **kwargs)

@@ -20,6 +20,7 @@ from socket import gethostname
 from typing import TYPE_CHECKING, Any
 from uuid import uuid4
 
+from vla.io.errors import UserError
 from vla.io.types import Positive
 from vla.io.versions import installed_versions, normal_name
 from vla.parallel.pool import Crashed, Pool, WorkersLost
@@ -45,12 +46,12 @@ class DaskCluster:
         patience: timeout for a result while there are no workers [s].
 
         Raises:
-            ValueError: Dask is not installed, or the address has another form.
+            UserError: Dask is not installed, or the address has another form.
         """
         if find_spec("distributed") is None:
-            raise ValueError("cluster=dask needs Dask, which is not installed: install vla[cluster]")
+            raise UserError("cluster=dask needs Dask, which is not installed: install vla[cluster]")
         if not re.fullmatch(r"tcp://.+:\d+", address):
-            raise ValueError(f"cluster.address must read tcp://HOST:PORT, got {address!r}")
+            raise UserError(f"cluster.address must read tcp://HOST:PORT, got {address!r}")
         self.address, self.patience = address, patience
 
     @contextmanager
@@ -58,7 +59,7 @@ class DaskCluster:
         """See `Cluster`.
 
         Raises:
-            ValueError: no scheduler answers, it lacks a package, or it had no workers for `patience`.
+            UserError: no scheduler answers, it lacks a package, or it had no workers for `patience`.
         """
         from distributed import Client
 
@@ -67,7 +68,7 @@ class DaskCluster:
             asyncio.run(_ping(self.address))
             client = Client(self.address, timeout=CONNECT)
         except (OSError, MemoryError, struct.error) as error:  # the latter two if another program answers
-            raise ValueError(
+            raise UserError(
                 f"no Dask scheduler answers at cluster.address={self.address}: start one with `dask scheduler`, "
                 "or use this machine alone with cluster=local"
             ) from error
@@ -75,7 +76,7 @@ class DaskCluster:
             try:
                 client.run_on_scheduler(callable, make)  # unpickling imports all modules that it names
             except ImportError as error:
-                raise ValueError(
+                raise UserError(
                     f"the scheduler at {self.address} lacks a package ({error}): install vla[cluster] there and on the "
                     "machines of its workers"
                 ) from error
@@ -119,9 +120,9 @@ class _DaskPool:
                 self.require_workers()
 
     def require_workers(self) -> None:
-        """Raise a ValueError if there are none, `WorkersLost` if there is no scheduler."""
+        """Raise a UserError if there are none, `WorkersLost` if there is no scheduler."""
         if not self._workers():
-            raise ValueError(
+            raise UserError(
                 f"{self.cluster.address} has had no worker for {self.cluster.patience:g} s: start workers and run again"
             )
 
@@ -180,11 +181,11 @@ def _make_checked(make: WorkerFactory, versions: dict[str, str], needs: Sequence
     """Create a worker on another machine, which loads libraries of the same `versions`: bit-exact results need them.
 
     Raises:
-        ValueError: that machine loads another version, or lacks a path in `needs`.
+        UserError: that machine loads another version, or lacks a path in `needs`.
     """
     for path in needs:
         if not path.exists():
-            raise ValueError(f"{gethostname()} has no {path}: workers need it on a file system that all machines share")
+            raise UserError(f"{gethostname()} has no {path}: workers need it on a file system that all machines share")
     one_thread()
     try:
         return make()
@@ -197,7 +198,7 @@ def _make_checked(make: WorkerFactory, versions: dict[str, str], needs: Sequence
         }
         for name in sorted(loaded & {*versions}):
             if version(name) != versions[name]:
-                raise ValueError(
+                raise UserError(
                     f"{gethostname()} has {name} {version(name)}, not {versions[name]}: install the same versions "
                     "everywhere"
                 )

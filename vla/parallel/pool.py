@@ -18,6 +18,7 @@ from multiprocessing import resource_tracker
 from pathlib import Path
 from typing import Any, Literal, Protocol
 
+from vla.io.errors import UserError
 from vla.io.types import Count
 from vla.parallel.limits import cores
 from vla.parallel.processes import ProcessEnded, Worker, WorkerFactory, WorkerProcess, one_thread_each
@@ -25,7 +26,7 @@ from vla.parallel.processes import ProcessEnded, Worker, WorkerFactory, WorkerPr
 log = logging.getLogger(__name__)
 
 
-class WorkersLost(ValueError):
+class WorkersLost(UserError):
     """Loss of workers that crashed, were killed or became unreachable; a retry with new ones may succeed."""
 
 
@@ -146,7 +147,7 @@ class ProcessPool:
         """Process an item as soon as a process is idle.
 
         The future raises the error of the worker factory or of the attempt, `Crashed` if two processes ended in
-        succession, or a ValueError if one ended before its worker existed.
+        succession, or a UserError if one ended before its worker existed.
         """
         return self._threads.submit(self._attempt, item)
 
@@ -203,7 +204,7 @@ class ProcessPool:
             except ProcessEnded as end:
                 if process.killed:
                     raise
-                raise ValueError(
+                raise UserError(
                     f"a worker process could not start: {end}, see its output, or run with cluster.workers=1"
                 ) from end
             self._own.process = process

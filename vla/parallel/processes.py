@@ -17,6 +17,8 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any, Protocol
 
+from vla.io.errors import UserError
+
 GPUS = "nvidiactl", "dxg", "kfd"  # devices of NVIDIA, the same in WSL, and of AMD
 PATIENCE = 5.0  # [s] for an idle process to free its resources
 WORKER = "VLA_WORKER"  # environment variable: number of a worker process in its pool
@@ -175,11 +177,11 @@ def require_ranks() -> None:
     """Require numbers in the variables by which launchers number processes; libraries read them as they are imported.
 
     Raises:
-        ValueError: one is no number.
+        UserError: one is no number.
     """
     for name in RANKS:
         if not (value := os.environ.get(name, "0")).isdecimal():
-            raise ValueError(f"the environment variable {name} must be a number of a launcher, got {value!r}: unset it")
+            raise UserError(f"the environment variable {name} must be a number of a launcher, got {value!r}: unset it")
 
 
 def without_triton() -> None:

@@ -12,6 +12,7 @@ from rich.table import Table
 
 from vla.config.check import conditions, with_changes
 from vla.config.differences import at
+from vla.io.errors import UserError
 from vla.reports.conditions import COMPARED, NARROW, SecondaryRows, short_texts
 from vla.rollouts.comparison import Comparison, compare_pairs, compare_samples, concluded
 from vla.rollouts.results import ERROR, Report, Result, concluded_secondary, pairs_of, secondary_of
@@ -38,10 +39,10 @@ def read_runs(folders: Sequence[Path]) -> dict[str, Run]:
     """Return name → run.
 
     Raises:
-        ValueError: no folder is given, a folder is no run or given twice, or a file in it is damaged.
+        UserError: no folder is given, a folder is no run or given twice, or a file in it is damaged.
     """
     if not folders:
-        raise ValueError("name the runs to compare, as in report.runs=[RUN,RUN]")
+        raise UserError("name the runs to compare, as in report.runs=[RUN,RUN]")
     read = [require_run(folder) for folder in folders]
     return dict(zip(_names(folders), read, strict=True))
 
@@ -53,7 +54,7 @@ def _names(folders: Sequence[Path]) -> list[str]:
         names = ["/".join(path[-length:]) for path in paths]
         if len(set(names)) == len(names):
             return names
-    raise ValueError(f"a run is named twice: {', '.join(map(str, folders))}")
+    raise UserError(f"a run is named twice: {', '.join(map(str, folders))}")
 
 
 def compare_runs(runs: Mapping[str, Run], margin: float) -> list[RunComparison]:

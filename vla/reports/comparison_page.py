@@ -37,7 +37,7 @@ def write_comparison(runs: Mapping[str, Run], compared: Sequence[RunComparison],
     """Write a page on several runs, by name, and their comparisons into the folder `target`, and return its path.
 
     Raises:
-        ValueError: a moving picture is damaged.
+        UserError: a moving picture is damaged.
     """
     lines = dict(zip(runs, colours(len(runs)), strict=True))
     reports = {name: run.reports[IN_DISTRIBUTION] for name, run in runs.items() if run.report}

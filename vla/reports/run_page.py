@@ -36,7 +36,7 @@ def write_page(folder: Path) -> Path:
     In a folder named `runs` that lists them, the list is written again.
 
     Raises:
-        ValueError: a file is damaged.
+        UserError: a file is damaged.
     """
     run = read_run(folder)
     report = run.reports.get(IN_DISTRIBUTION, Report(()))

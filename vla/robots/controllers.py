@@ -10,6 +10,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from vla.io.errors import UserError
 from vla.io.types import Point
 from vla.robots import panda
 from vla.robots.cartesian import CartesianController, Kinematics
@@ -59,7 +60,7 @@ def controller_for(
         limits: (J,) smallest and largest positions [rad] and speeds [rad/s] of the arm; None: the Panda's own, or none.
 
     Raises:
-        ValueError: the kinematics are not known, the actions are of another kind, or the box cannot be kept.
+        UserError: the kinematics are not known, the actions are of another kind, or the box cannot be kept.
     """
     model = spec.require_robot("deployment")
     if acts_on_joints(spec):
@@ -68,11 +69,11 @@ def controller_for(
     found = list(zip(spec.action, spec.units, strict=True))
     expected = [*CartesianController.motion, (GRIPPER, "1")]
     if found != expected:
-        raise ValueError(f"the policy's action is {_listed(found)}, expected {_listed(expected)}")
+        raise UserError(f"the policy's action is {_listed(found)}, expected {_listed(expected)}")
     if workspace is None:
-        raise ValueError("deploy.safety.workspace=null: Cartesian motion needs a box for the tool point")
+        raise UserError("deploy.safety.workspace=null: Cartesian motion needs a box for the tool point")
     if ((arm.home < arm.lowest) | (arm.home > arm.highest)).any():
-        raise ValueError(
+        raise UserError(
             "the home posture of the policy's arm is outside the limits of deploy.robot: is it another arm?"
         )
     return CartesianController(arm, 1 / spec.control_hz, *np.sort(workspace, axis=0))
@@ -84,7 +85,7 @@ def _kinematics(model: RobotModel, limits: tuple[Array, Array, Array] | None) ->
     if np.shape(model.chain) == np.shape(panda.CHAIN) and np.allclose(model.chain, panda.CHAIN):
         return panda.PANDA if limits is None else Kinematics(panda.forward, panda.HOME, *limits)
     if not model.chain or not model.home:
-        raise ValueError(
+        raise UserError(
             f"Cartesian actions need the kinematics of the arm of {count} joints, and the checkpoint lacks its "
             f"{'home posture' if model.chain else 'kinematic chain'}: train with task/robot=file, or with actions that "
             "are joint positions"
@@ -94,7 +95,7 @@ def _kinematics(model: RobotModel, limits: tuple[Array, Array, Array] | None) ->
 
 
 def acts_on_joints(spec: Spec) -> bool:
-    """Return whether the actions in `spec` are joint positions; a ValueError if it has no robot."""
+    """Return whether the actions in `spec` are joint positions; a UserError if it has no robot."""
     return {*spec.require_robot("deployment").joints} <= {*spec.action}
 
 
@@ -102,7 +103,7 @@ def recorded_controller(spec: Spec) -> CartesianController | JointController:
     """Build the controller for recorded actions, without a limit of the workspace.
 
     Raises:
-        ValueError: the arm or the actions are of another kind.
+        UserError: the arm or the actions are of another kind.
     """
     return controller_for(spec, None if acts_on_joints(spec) else ((-math.inf,) * 3, (math.inf,) * 3))
 
@@ -111,7 +112,7 @@ def gripper_index(spec: Spec) -> int | None:
     """Return the index of the gripper's opening in an action; None if there is none or it is a joint of the arm.
 
     Raises:
-        ValueError: the spec has no robot.
+        UserError: the spec has no robot.
     """
     joints = spec.require_robot("deployment").joints
     return spec.action.index(GRIPPER) if GRIPPER in spec.action and GRIPPER not in joints else None
@@ -121,7 +122,7 @@ def joint_factors(spec: Spec, velocities: bool = False) -> Array:
     """Return the (J,) factors from the units of the joints in the state to [rad], or of their velocities to [rad/s].
 
     Raises:
-        ValueError: there is no robot, or a joint has another unit.
+        UserError: there is no robot, or a joint has another unit.
     """
     robot = spec.require_robot("a position in rad")
     units = dict(zip(spec.state, spec.state_units, strict=True))
@@ -131,16 +132,16 @@ def joint_factors(spec: Spec, velocities: bool = False) -> Array:
 
 def _joint_controller(spec: Spec, model: RobotModel, workspace: tuple[Point, Point] | None) -> JointController:
     if others := [name for name in spec.action if name not in (*model.joints, GRIPPER)]:
-        raise ValueError(f"the policy's action has {', '.join(others)}, which are no joints of its robot")
+        raise UserError(f"the policy's action has {', '.join(others)}, which are no joints of its robot")
     joint_factors(spec)  # those of the state must be known too
     if workspace is not None:
-        raise ValueError(
+        raise UserError(
             "deploy.safety.workspace cannot be kept by a policy that acts with joint positions: set it to null, and "
             "narrow deploy.robot.low and high where the arm must not go"
         )
     gripper = gripper_index(spec)
     if gripper is not None and (spec.low[gripper] < -SLACK or spec.high[gripper] > 1 + SLACK):
-        raise ValueError(
+        raise UserError(
             f"the action {GRIPPER} must be an opening, 0 closed to 1 open, and is from {spec.low[gripper]:g} to "
             f"{spec.high[gripper]:g}: scale it before training"
         )
@@ -152,7 +153,7 @@ def _joint_controller(spec: Spec, model: RobotModel, workspace: tuple[Point, Poi
 
 def _factors(joints: list[tuple[str, str]]) -> Array:
     if unknown := [joint for joint in joints if joint[1] not in UNITS]:
-        raise ValueError(
+        raise UserError(
             f"the joints {_listed(unknown)} have no unit of a position, {', '.join(UNITS)}: name it with task.units "
             "before training"
         )

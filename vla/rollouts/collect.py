@@ -24,6 +24,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from vla.data.episodes import EpisodeStore
 from vla.data.index import DAMAGED, NOT_NEEDED
 from vla.io.documents import read_json
+from vla.io.errors import UserError
 from vla.io.files import write_text
 from vla.parallel.pool import Cluster, Future, Pool, WorkersLost
 from vla.parallel.processes import WorkerFactory
@@ -75,7 +76,7 @@ def collect(
     tasks get equal shares. With `keep_failures` every seed gives an episode: failures are stored and count too.
 
     Raises:
-        ValueError: the store starts at another seed or is derived, the expert fails persistently, workers died, or the
+        UserError: the store starts at another seed or is derived, the expert fails persistently, workers died, or the
             disk is full.
     """
     started = time.monotonic()
@@ -189,7 +190,7 @@ class Attempts:
         missing = most - len(going)
         while missing > 0:
             if self._next >= FIRST_SEED:
-                raise ValueError(f"seeds from {FIRST_SEED} on are reserved for evaluation: lower collect.seed")
+                raise UserError(f"seeds from {FIRST_SEED} on are reserved for evaluation: lower collect.seed")
             needed = self._needed(self._next, expected)
             self._pending.append((self._next, self._pool.submit(self._next) if needed else None))
             expected[self._task_of(self._next)] += needed
@@ -232,7 +233,7 @@ def _fill(store: EpisodeStore, pool: Pool, episodes: int, seed: int, multitask: 
 
 def _give_up_after(task: str, failures: Sequence[str]) -> None:
     if len(failures) >= PATIENCE:
-        raise ValueError(
+        raise UserError(
             f"the expert failed on {len(failures)} seeds of {task} in a row ({dict(Counter(failures))}): watch it with "
             "job=preview, or simplify the task"
         )

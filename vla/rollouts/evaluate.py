@@ -15,6 +15,7 @@ from pathlib import Path
 
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+from vla.io.errors import UserError
 from vla.parallel.pool import THIS_PROCESS, Cluster, Crashed, Future, Pool
 from vla.rollouts.motion import motion_of
 from vla.rollouts.recordings import Recordings, chosen
@@ -64,10 +65,10 @@ def evaluate(
     Agents that are `vla.spec.Agents` act in so many `lanes` side by side in every process.
 
     Raises:
-        ValueError: there are no seeds, seeds are in the range of collection, or the cluster raises one.
+        UserError: there are no seeds, seeds are in the range of collection, or the cluster raises one.
     """
     if not seeds or min(seeds) < FIRST_SEED:
-        raise ValueError(f"evaluation needs seeds from {FIRST_SEED} on, which no policy is trained on; got {seeds}")
+        raise UserError(f"evaluation needs seeds from {FIRST_SEED} on, which no policy is trained on; got {seeds}")
     make = partial(_RolloutWorker, make_environment, make_agent, None if recordings == 0 else make_recorder, lanes)
     at_once = recordings == "all"
     columns = (TextColumn(name), BarColumn(), MofNCompleteColumn(), TextColumn("{task.fields[note]}"))

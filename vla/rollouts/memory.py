@@ -68,7 +68,7 @@ class NearestDemonstration:
         spec: of the environment.
 
         Raises:
-            ValueError: as of `open_memory`.
+            UserError: as of `open_memory`.
         """
         store = open_memory(folder, episodes, spec)
         self._entries, self._executed = store.episodes, store.rows("executed")
@@ -112,7 +112,7 @@ def open_memory(folder: Path, episodes: int | None, spec: Spec) -> EpisodeStore:
     """Open the store of the demonstrations to replay in a world with a spec.
 
     Raises:
-        ValueError: there is no such store, it has no or fewer episodes, or another spec.
+        UserError: there is no such store, it has no or fewer episodes, or another spec.
     """
     store = EpisodeStore(folder, episodes)
     store.require_episodes()

@@ -11,6 +11,7 @@ import numpy as np
 from PIL import Image
 
 from vla.io.documents import STRICT, parse_json
+from vla.io.errors import UserError
 from vla.io.files import atomic_path, require_file
 from vla.spec import Episode, Observation
 
@@ -67,7 +68,7 @@ def read_moving_pictures(folder: Path) -> dict[Caption, Path]:
     """Return caption → file of the moving pictures in a folder.
 
     Raises:
-        ValueError: one is damaged, or of another program.
+        UserError: one is damaged, or of another program.
     """
     return {_caption(path): path for path in sorted(folder.glob("*.webp"))}
 
@@ -76,11 +77,11 @@ def _caption(path: Path) -> Caption:
     require_file(path)
     try:
         if path.stat().st_size > LARGEST:
-            raise ValueError(f"it is larger than {LARGEST} bytes")
+            raise UserError(f"it is larger than {LARGEST} bytes")
         with Image.open(path, formats=["WEBP"]) as picture:
             return parse_json(str(picture.getexif()[DESCRIPTION]), Caption, "its caption")
     except (OSError, KeyError, ValueError) as error:
-        raise ValueError(f"{path} cannot be read: remove it to write the page without it: {error}") from error
+        raise UserError(f"{path} cannot be read: remove it to write the page without it: {error}") from error
 
 
 def _frame(seen: Observation) -> Image.Image:

@@ -16,6 +16,7 @@ import rerun.blueprint as rrb
 import rerun_cli
 from PIL import Image
 
+from vla.io.errors import UserError
 from vla.io.files import atomic_path
 from vla.io.types import Natural, Point
 from vla.rollouts.moving_picture import save_moving_picture
@@ -298,13 +299,13 @@ def merge(files: Sequence[Path], target: Path) -> None:
     """Merge recordings into one file, in which the viewer lists them by name.
 
     Raises:
-        ValueError: there are no files, or one of them is no recording.
+        UserError: there are no files, or one of them is no recording.
     """
     if not files:
-        raise ValueError(f"no recordings to merge into {target}")
+        raise UserError(f"no recordings to merge into {target}")
     with atomic_path(target) as draft:
         command = [VIEWER, "rrd", "merge", *map(str, files), "-o", str(draft)]
         done = subprocess.run(command, capture_output=True, text=True, check=False)
         if done.returncode:
             reason = done.stderr[-500:].strip()
-            raise ValueError(f"rerun could not merge {len(files)} recordings into {target}: {reason}")
+            raise UserError(f"rerun could not merge {len(files)} recordings into {target}: {reason}")

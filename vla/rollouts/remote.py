@@ -21,6 +21,7 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus, InvalidURI, W
 from websockets.uri import parse_uri
 
 from vla.io.array_messages import pack, unpack
+from vla.io.errors import UserError
 from vla.io.types import Count, ImageSize, Natural, NonNegative, Positive, Text
 from vla.rollouts.realtime import IDEAL, BackgroundLink, RealTime, SimulatedLink
 from vla.spec import Array, Observation, Spec
@@ -81,7 +82,7 @@ class RemotePolicy:
         spec: of the environment.
 
     Raises:
-        ValueError: the mapping does not fit the spec, or the server does not respond.
+        UserError: the mapping does not fit the spec, or the server does not respond.
     """
 
     url: Text
@@ -102,14 +103,14 @@ class RemotePolicy:
         self._images = {camera: key for camera, key in self.images.items() if key and camera in self.spec.cameras}
         if not self._images:
             cameras = self.spec.cameras
-            raise ValueError(
+            raise UserError(
                 f"agent.images has no key for the world's cameras, {', '.join(cameras)}: add "
                 f"+agent.images.{cameras[0]}=KEY"
             )
         names = [name for names in self.state.values() for name in names or ()]
         _require_known("agent.state", names, self.spec.state, "state components")
         if self.actions is not None and sorted(self.actions) != sorted(self.spec.action):
-            raise ValueError(f"agent.actions must map {', '.join(self.spec.action)}, got {', '.join(self.actions)}")
+            raise UserError(f"agent.actions must map {', '.join(self.spec.action)}, got {', '.join(self.actions)}")
         if self.image_size is not None and max(np.divide(self.image_size, self.spec.image_size)) > 1:
             size = f"[{self.image_size[0]},{self.image_size[1]}]"
             log.warning("agent.image_size=%s enlarges the images of the world: set task.image_size=%s", size, size)
@@ -143,7 +144,7 @@ class RemotePolicy:
         """Compare the server's metadata of its actions, as `vla.deploy.server` sends it, with the spec.
 
         Raises:
-            ValueError: its actions have other names, and no mapping is given.
+            UserError: its actions have other names, and no mapping is given.
         """
         action, rate = self.metadata.get("action"), self.metadata.get("control_hz")
         names = action.get("names") if isinstance(action, dict) else None
@@ -166,7 +167,7 @@ class RemotePolicy:
         """Return the next action, (D,) float32, clipped to the spec; `info` has the time of the last answer.
 
         Raises:
-            ValueError: the server refuses the observation, fails, is too slow, or answers with something else.
+            UserError: the server refuses the observation, fails, is too slow, or answers with something else.
         """
         return self._real_time.act(observation)
 
@@ -236,7 +237,7 @@ class RemotePolicy:
                 options = {"compression": None, "max_size": 2**26, "additional_headers": headers}
                 return await connect(self.url, **place, **options, **times)
             except (ValueError, InvalidURI) as error:
-                raise ValueError(
+                raise UserError(
                     f"agent.url={self.url[:200]} leads to no policy server ({error}): it looks like ws://127.0.0.1:8000"
                 ) from error
 
@@ -251,7 +252,7 @@ class RemotePolicy:
             ) from error
         except (OSError, WebSocketException) as error:  # a time-out is an OSError without a text
             reason = error if str(error) else f"no answer within {self.timeout:g} s"
-            raise ValueError(f"no policy server at {self.url} ({reason}): start it, or set agent.url") from error
+            raise UserError(f"no policy server at {self.url} ({reason}): start it, or set agent.url") from error
         return connection, metadata
 
     def _ask(self, message: Mapping[str, Any]) -> dict[str, Any]:
@@ -283,8 +284,8 @@ class RemotePolicy:
             raise self._error(f"an answer is a map, not {type(answer).__name__}")
         return answer
 
-    def _error(self, what: str) -> ValueError:
-        return ValueError(f"the policy server at {self.url} failed: {what}")
+    def _error(self, what: str) -> UserError:
+        return UserError(f"the policy server at {self.url} failed: {what}")
 
 
 def _resized(image: Array, size: Sequence[int] | None) -> Array:
@@ -296,4 +297,4 @@ def _resized(image: Array, size: Sequence[int] | None) -> Array:
 
 def _require_known(key: str, names: Any, known: Sequence[str], what: str) -> None:
     if unknown := [str(name) for name in names if name not in known]:
-        raise ValueError(f"{key} names {', '.join(unknown)}, the {what} are {', '.join(known)}")
+        raise UserError(f"{key} names {', '.join(unknown)}, the {what} are {', '.join(known)}")

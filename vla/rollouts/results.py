@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from vla.io.errors import UserError
 from vla.rollouts.comparison import Comparison, Key, Pairs, compare_amounts, compare_pairs, concluded, median_interval
 from vla.rollouts.motion import AMOUNTS, Motion
 from vla.rollouts.sequential import anytime_interval
@@ -209,7 +210,7 @@ class Report:
         Pairs with an error do not count. Where episodes were played until it was clear, one report may be longer.
 
         Raises:
-            ValueError: the reports have different seeds.
+            UserError: the reports have different seeds.
         """
         return compare_pairs(pairs_of(self._together(other)), self.anytime or other.anytime)
 
@@ -222,7 +223,7 @@ class Report:
         if any(one.seed != two.seed for one, two in together) or (
             len(self.results) != len(other.results) and not (self.anytime or other.anytime)
         ):
-            raise ValueError("only reports on the same seeds can be compared")
+            raise UserError("only reports on the same seeds can be compared")
         return together
 
     def __str__(self) -> str:

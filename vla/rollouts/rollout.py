@@ -20,7 +20,7 @@ def rollout(
     """Run the episode of `seed` to its end: `vla.rollouts.worlds.play` in one world.
 
     Raises:
-        ValueError: the agent returned an action of the wrong shape, or one that is not finite, or the episode is over
+        UserError: the agent returned an action of the wrong shape, or one that is not finite, or the episode is over
             at its start.
     """
     worlds = WorldsHere([Stage(environment, recorder)])

@@ -22,6 +22,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from vla.io.errors import UserError
 from vla.parallel.processes import one_thread_each
 from vla.spec import Agents, Array, Environment, Observation, Spec
 
@@ -146,7 +147,7 @@ class DistantPolicy:
         """Args: where the policy is, and the spec of the environment.
 
         Raises:
-            ValueError: the policy has another spec.
+            UserError: the policy has another spec.
         """
         self._connection = Client(address, authkey=key)
         self._connection.send(True)
@@ -178,7 +179,7 @@ class DistantPolicy:
             array = given.get(name, place)
             if (array.shape, array.dtype) != (place.shape, place.dtype):
                 wanted, found = (f"{each.shape} {each.dtype}" for each in (place, array))
-                raise ValueError(f"the policy needs {name or 'a state'} of {wanted}, not {found}")
+                raise UserError(f"the policy needs {name or 'a state'} of {wanted}, not {found}")
             place[:] = array
         return self._ask(kind, observation.instruction, all(camera in given for camera in self.spec.cameras))
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
+from vla.io.errors import UserError
 from vla.rollouts.comparison import Comparison, compare_pairs
 from vla.rollouts.results import ERROR, Report, Result, pairs_of
 from vla.rollouts.sequential import excludes, is_decided
@@ -44,7 +45,7 @@ class AgainstRun:
         It is valid after any number of episodes.
 
         Raises:
-            ValueError: the other run has other episodes with the same seeds.
+            UserError: the other run has other episodes with the same seeds.
         """
         found = self._compared(report)
         if not found.episodes and self._completed(report):
@@ -55,7 +56,7 @@ class AgainstRun:
         return is_decided(found.only_first, found.only_second, found.episodes, self.margin)
 
     def require_common(self, seeds: Iterable[int]) -> None:
-        """Raise a ValueError if the other run completed no episode with one of these seeds."""
+        """Raise a UserError if the other run completed no episode with one of these seeds."""
         if not any(seed in self.results and self.results[seed].outcome != ERROR for seed in seeds):
             raise self._apart()
 
@@ -85,8 +86,8 @@ class AgainstRun:
         ]
         return compare_pairs(pairs_of(same), self.anytime or report.anytime)
 
-    def _apart(self) -> ValueError:
-        return ValueError(
+    def _apart(self) -> UserError:
+        return UserError(
             f"evaluate.against={self.run} has no episode in common with this evaluation: it needs a run with the same "
             "task, randomisation and evaluate.seed"
         )

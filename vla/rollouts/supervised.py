@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from vla.io.errors import UserError
 from vla.rollouts.rollout import AgentFactory, close_agent
 from vla.spec import Agent, Array, Environment, Expert, Observation
 
@@ -25,7 +26,7 @@ class Supervised:
         segment: length [steps].
 
         Raises:
-            ValueError: the expert is not memoryless, so that it cannot label states of another agent.
+            UserError: the expert is not memoryless, so that it cannot label states of another agent.
         """
         require_memoryless(expert)
         self._policy, self._expert, self._beta, self._segment = policy, expert, beta, segment
@@ -58,9 +59,9 @@ class Supervised:
 
 
 def require_memoryless(expert: Agent) -> None:
-    """Raise a ValueError unless the expert's labels depend on the observation alone, as its `memoryless` says."""
+    """Raise a UserError unless the expert's labels depend on the observation alone, as its `memoryless` says."""
     if not (isinstance(expert, Expert) and expert.memoryless):
-        raise ValueError(
+        raise UserError(
             f"{type(expert).__name__} cannot label the states of another agent: without memoryless = True its actions "
             "may depend on its earlier actions; choose another expert"
         )

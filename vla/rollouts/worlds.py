@@ -15,6 +15,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from vla.io.errors import UserError
 from vla.spec import Agent, Agents, Array, Environment, Episode, InARow, Observation, Recorder, Spec, Traceable
 
 
@@ -52,11 +53,11 @@ class Stage:
         """Start the episode of a seed.
 
         Raises:
-            ValueError: it is over at its start.
+            UserError: it is over at its start.
         """
         self._now = self.environment.reset(seed)
         if self.environment.done:
-            raise ValueError(f"the episode of seed {seed} is over at its start: `reset` must draw another one")
+            raise UserError(f"the episode of seed {seed} is over at its start: `reset` must draw another one")
         self._seed, self._seen, self._clean, self._executed = seed, list[Observation](), list[Array](), list[Array]()
         # Now, because the tool of a world may exist from its first episode on.
         world = self.environment
@@ -136,7 +137,7 @@ class Alone:
 
     def __init__(self, agent: Agent) -> None:
         if not hasattr(agent, "info"):
-            raise ValueError(f"{type(agent).__name__} has no `info`: set self.info = {{}} in its constructor")
+            raise UserError(f"{type(agent).__name__} has no `info`: set self.info = {{}} in its constructor")
         self.agent = agent
 
     def reset(self, instruction: str, seed: int, lane: int) -> None:
@@ -243,7 +244,7 @@ def _acted(agents: Agents, seen: Mapping[int, Observation], components: int) -> 
         found[lane] = action
         if action.shape != (components,) or not np.isfinite(action).all():
             name = type(agents.agent if isinstance(agents, Alone) else agents).__name__
-            found[lane] = ValueError(f"{name} must return {components} finite numbers, got {action}")
+            found[lane] = UserError(f"{name} must return {components} finite numbers, got {action}")
     return found
 
 

@@ -15,6 +15,7 @@ from vla.config.check import PLAIN
 from vla.config.differences import ABSENT, at
 from vla.config.origin import Origin
 from vla.io.documents import LENIENT, STRICT
+from vla.io.errors import UserError
 from vla.io.types import Count, Natural, NonNegative, Positive, Share
 from vla.rollouts.comparison import Comparison
 from vla.rollouts.motion import Motion
@@ -29,10 +30,10 @@ READ |= {f"evaluate.{name}": kind for name, kind in PLAIN["evaluate"].items()}
 
 
 def readable_config(config: Node) -> Node:
-    """Return a config that reports can read; a ValueError if one of its values is none of this project."""
+    """Return a config that reports can read; a UserError if one of its values is none of this project."""
     for key, kind in READ.items():
         if (value := at(config, key)) != ABSENT and not matches(value, kind):
-            raise ValueError(f"config.{key} is not {describe(kind)}")
+            raise UserError(f"config.{key} is not {describe(kind)}")
     return config
 
 
@@ -170,15 +171,15 @@ class ReportFile:
     def __post_init__(self) -> None:
         """Require the same episodes in every part."""
         if [result.seed for result in self.per_episode] != self.seeds:
-            raise ValueError("per_episode has other episodes than seeds")
+            raise UserError("per_episode has other episodes than seeds")
         if not self.seeds or len(set(self.seeds)) < len(self.seeds):
-            raise ValueError("seeds has none, or one of them twice")
+            raise UserError("seeds has none, or one of them twice")
         for name, condition in self.conditions.items():
             played = len(condition.outcomes)
             if played > len(self.seeds) or (played < len(self.seeds) and not condition.anytime):
-                raise ValueError(f"conditions.{name} has {played} outcomes of {len(self.seeds)} seeds")
+                raise UserError(f"conditions.{name} has {played} outcomes of {len(self.seeds)} seeds")
             if any(len(each) not in (0, played) for each in (condition.reached, condition.motions)):
-                raise ValueError(f"conditions.{name} has other episodes in reached or motions than in outcomes")
+                raise UserError(f"conditions.{name} has other episodes in reached or motions than in outcomes")
 
     @cached_property
     def reports(self) -> dict[str, Report]:

@@ -18,6 +18,7 @@ import yaml
 
 from vla.config.differences import at
 from vla.io.documents import read_bounded, read_json, read_yaml
+from vla.io.errors import UserError
 from vla.io.files import write_text
 from vla.rollouts.results import Report
 from vla.runs.files import Change, ErrorsFile, Node, ReportFile, Training
@@ -79,7 +80,7 @@ def read_run(folder: Path) -> Run:
     """Read a run's folder; every file is optional.
 
     Raises:
-        ValueError: a file is damaged.
+        UserError: a file is damaged.
     """
     report, errors = read_report(folder), _read(folder / ERRORS, partial(read_json, kind=ErrorsFile), None)
     evaluated = report or errors
@@ -90,12 +91,12 @@ def read_run(folder: Path) -> Run:
 
 
 def read_report(folder: Path) -> ReportFile | None:
-    """Read the report of a run's folder, or return None; a ValueError if the file is damaged."""
+    """Read the report of a run's folder, or return None; a UserError if the file is damaged."""
     return _read(folder / REPORT, partial(read_json, kind=ReportFile, largest=LARGEST_REPORT), None)
 
 
 def read_training(folder: Path) -> Training | None:
-    """Read the result of a run's training, or return None; a ValueError if the file is damaged."""
+    """Read the result of a run's training, or return None; a UserError if the file is damaged."""
     return _read(folder / TRAINING, partial(read_json, kind=Training), None)
 
 
@@ -138,10 +139,10 @@ def require_run(folder: Path) -> Run:
     """Read a run's folder that has a report, errors of an open-loop evaluation, or metrics.
 
     Raises:
-        ValueError: the folder has none of them, or a file is damaged.
+        UserError: the folder has none of them, or a file is damaged.
     """
     if not any((folder / name).is_file() for name in (REPORT, ERRORS, METRICS)):
-        raise ValueError(f"{folder} is no run: it has none of {REPORT}, {ERRORS} and {METRICS}")
+        raise UserError(f"{folder} is no run: it has none of {REPORT}, {ERRORS} and {METRICS}")
     return read_run(folder)
 
 
@@ -162,7 +163,7 @@ def _read(path: Path, read: Callable[[Path], T], otherwise: T) -> T:
     try:
         return read(path)
     except ValueError as error:
-        raise ValueError(f"{error}; remove the file, or repeat the run") from error
+        raise UserError(f"{error}; remove the file, or repeat the run") from error
 
 
 def _curves(path: Path) -> dict[str, Curve]:
@@ -179,16 +180,16 @@ def metric_rows(path: Path) -> list[dict[str, str]]:
     """Read metrics.csv as rows of column → number, as text, without empty cells; each has a `step`.
 
     Raises:
-        ValueError: the file is too large, has no steps or holds something else than numbers.
+        UserError: the file is too large, has no steps or holds something else than numbers.
     """
     rows = csv.reader(io.StringIO(read_bounded(path).decode("utf-8", "replace"), newline=""))
     found = []
     try:
         names = next(rows, ["step"])
         if "step" not in names or len(set(names)) < len(names):
-            raise ValueError("there is no column step, or a column twice")
+            raise UserError("there is no column step, or a column twice")
         if len(names) > MOST_METRICS:
-            raise ValueError(f"there are more than {MOST_METRICS} columns")
+            raise UserError(f"there are more than {MOST_METRICS} columns")
         for row in rows:
             if len(row) < len(names):  # truncated by a killed process
                 continue
@@ -196,8 +197,8 @@ def metric_rows(path: Path) -> list[dict[str, str]]:
             for value in numbers.values():
                 float(value)
             if not 0 <= int(numbers.get("step", -1)) < 2**31:
-                raise ValueError(f"step is no count, but {numbers.get('step')}")
+                raise UserError(f"step is no count, but {numbers.get('step')}")
             found.append(numbers)
     except (ValueError, csv.Error) as error:
-        raise ValueError(f"{path} is damaged in line {rows.line_num}: {str(error)[:200]}") from error
+        raise UserError(f"{path} is damaged in line {rows.line_num}: {str(error)[:200]}") from error
     return found

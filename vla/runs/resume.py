@@ -16,6 +16,7 @@ from filelock import FileLock, Timeout
 
 from vla.config.adopt import require_identity
 from vla.config.differences import differences
+from vla.io.errors import UserError
 from vla.models.checkpoint import read_header
 from vla.models.policy_folder import POLICY, read_policy
 from vla.runs.folder import CHECKPOINTS, CONFIG, ERRORS, LAST, REPORT, read_report
@@ -41,7 +42,7 @@ def training_progress(folder: Path, config: Mapping[str, Any]) -> TrainingProgre
     """Return the progress of the training that `config` describes in a run's folder.
 
     Raises:
-        ValueError: the folder holds another training, or one that `config` cannot continue.
+        UserError: the folder holds another training, or one that `config` cannot continue.
     """
     last = folder / CHECKPOINTS / LAST
     if not last.exists():
@@ -59,7 +60,7 @@ def training_progress(folder: Path, config: Mapping[str, Any]) -> TrainingProgre
         return TrainingProgress(chosen=chosen)
     if isinstance(trainer.get("strategy"), dict) and not isinstance(before.get("strategy"), dict):
         # A sharded optimiser orders its parameters differently.
-        raise ValueError(f"trainer=fsdp cannot continue {last}, which was trained without it: use trainer=ddp")
+        raise UserError(f"trainer=fsdp cannot continue {last}, which was trained without it: use trainer=ddp")
     log.info("resuming from %s", last)
     return TrainingProgress(resume_from=last)
 
@@ -86,11 +87,11 @@ def interrupted_run(runs: Path) -> Path:
     The first process passes the result to the processes that a trainer starts, because it locks that run.
 
     Raises:
-        ValueError: there is no unfinished run.
+        UserError: there is no unfinished run.
     """
     started = os.environ.get("SLURM_STEP_NUM_TASKS", os.environ.get("TORCHELASTIC_RUN_ID") and os.environ["WORLD_SIZE"])
     if int(started or 1) > 1:
-        raise ValueError("resume=last: each of several processes would search for itself: name the run, resume=RUN")
+        raise UserError("resume=last: each of several processes would search for itself: name the run, resume=RUN")
     if os.environ.get("LOCAL_RANK", "0") == "0" or FOUND not in os.environ:
         os.environ[FOUND] = str(_newest_interrupted(runs))
     return Path(os.environ[FOUND])
@@ -106,7 +107,7 @@ def _newest_interrupted(runs: Path) -> Path:
         run, lock = (training.parent, training.parent) if in_rounds else (training, last.parent)
         if not _locked(lock) and (not _evaluated(run, last, run / CONFIG) if in_rounds else _unfinished(run)):
             return run
-    raise ValueError(f"resume=last: no run in {runs} was interrupted; resume=DIR names one")
+    raise UserError(f"resume=last: no run in {runs} was interrupted; resume=DIR names one")
 
 
 def _evaluated(run: Path, *since: Path) -> bool:
@@ -127,7 +128,7 @@ def training_lock(folder: Path) -> Iterator[None]:
     """Lock a folder of checkpoints, or of rounds, against other processes; only the first of a training takes the lock.
 
     Raises:
-        ValueError: another process holds the lock.
+        UserError: another process holds the lock.
     """
     if not first_process():
         yield
@@ -137,7 +138,7 @@ def training_lock(folder: Path) -> Iterator[None]:
     try:
         lock.acquire()
     except Timeout as error:
-        raise ValueError(
+        raise UserError(
             f"another process is training or evaluating in {folder}: wait for it, or choose another output=DIR"
         ) from error
     try:

@@ -8,6 +8,7 @@ import sys
 from contextlib import suppress
 from pathlib import Path
 
+from vla.io.errors import UserError
 from vla.parallel.processes import WORKER, without_triton
 
 WORKING_BACKEND = "VLA_GL_WORKS"  # the backend that worked in a probe, inherited by child processes
@@ -82,10 +83,10 @@ def require_backend() -> None:
     """Require that MuJoCo can render.
 
     Raises:
-        RuntimeError: no GL backend works on this machine.
+        UserError: no GL backend works on this machine.
     """
     if os.environ.get("MUJOCO_GL") == NO_BACKEND:
-        raise RuntimeError(
+        raise UserError(
             f"this machine cannot render with MUJOCO_GL={os.environ.get(FAILED_BACKENDS, NO_BACKEND)}: install the "
             "packages libegl1 and libgl1-mesa-dri, or libosmesa6, or set MUJOCO_GL to egl, osmesa or glfw"
         )

@@ -14,6 +14,7 @@ from gymnasium.envs.registration import EnvSpec
 from gymnasium.error import Error
 from gymnasium.spaces import Box
 
+from vla.io.errors import UserError
 from vla.io.images import resize
 from vla.io.types import Count, ImageSize, Names, Positive, Text
 from vla.spec import Array, Numbers, Observation, Spec
@@ -76,7 +77,7 @@ class Gymnasium(Blindable):
             truth: name → path of an array, for training and experts only.
 
         Raises:
-            ValueError: the package is not installed or does not contain the environment, an action has no bounds, an
+            UserError: the package is not installed or does not contain the environment, an action has no bounds, an
                 observation lacks a path, or arguments do not fit each other.
         """
         truth = truth or {}
@@ -88,7 +89,7 @@ class Gymnasium(Blindable):
         self.draws: dict[str, Any] = {}
         space = self._environment.action_space
         if not isinstance(space, Box) or len(space.shape) != 1:
-            raise ValueError(f"{id} has the actions {space}: task=gymnasium takes a Box with one axis")
+            raise UserError(f"{id} has the actions {space}: task=gymnasium takes a Box with one axis")
         bounds = _bounds(space, low, high)
         values = self._values(*self._environment.reset(seed=0))
         alike = len({path.rpartition(".")[2] for path in state}) < len(state)  # then whole paths tell components apart
@@ -97,7 +98,7 @@ class Gymnasium(Blindable):
         state_units, action_units = units_of(units, names, actions)
         rate = control_hz or self._environment.metadata.get("render_fps")
         if rate is None:
-            raise ValueError(f"{id} does not tell its rate: set task.control_hz")
+            raise UserError(f"{id} does not tell its rate: set task.control_hz")
         spec = Spec(
             cameras=tuple(images),
             image_size=self._size,
@@ -113,7 +114,7 @@ class Gymnasium(Blindable):
         self.spec = Spec.from_dict(spec.to_dict(), f"task.id={id}")
         self._observe(values)  # refuses images that are none
         if not success.startswith(PATHS):
-            raise ValueError(f"task.success={success} must be a path that begins with {' or '.join(PATHS)}")
+            raise UserError(f"task.success={success} must be a path that begins with {' or '.join(PATHS)}")
         self._success_reported = False  # in a step, or its absence in the log
 
     def reset(self, seed: int) -> Observation:
@@ -124,7 +125,7 @@ class Gymnasium(Blindable):
     def step(self, action: Array) -> Observation:
         """Apply one (D,) action, clipped to the bounds."""
         if self.done:
-            raise ValueError("the episode is over; call reset(seed) before step(action)")
+            raise UserError("the episode is over; call reset(seed) before step(action)")
         clipped = np.clip(action, self.spec.low, self.spec.high).astype(self._environment.action_space.dtype)
         observation, _, terminated, truncated, info = self._environment.step(clipped)
         values = self._values(observation, info)
@@ -161,31 +162,31 @@ def _make(package: str, id: str, options: Mapping[str, object], steps: int | Non
     try:
         import_module(package)
     except ImportError as error:
-        raise ValueError(f"task.package={package} cannot be imported: {error}") from error
+        raise UserError(f"task.package={package} cannot be imported: {error}") from error
     try:
         spec = gymnasium.spec(id) if ":" not in id else None
     except Error as error:
-        raise ValueError(f"task.id={id} is not registered by {package}: {error}") from error
+        raise UserError(f"task.id={id} is not registered by {package}: {error}") from error
     if spec is None or _home(spec) != package:
-        raise ValueError(
+        raise UserError(
             f"task.id={id} is no environment of task.package={package}: name the package that contains its class, and "
             "the id without a module"
         )
     if steps is None and spec.max_episode_steps is None:
-        raise ValueError(f"{id} does not tell how long an episode lasts: set task.steps")
+        raise UserError(f"{id} does not tell how long an episode lasts: set task.steps")
     if render:
         options = {**options, "render_mode": "rgb_array"}
     try:
         return gymnasium.make(spec, max_episode_steps=steps, disable_env_checker=True, **options)
     except TypeError as error:
-        raise ValueError(f"task.options={dict(options)} does not fit {id}: {error}") from error
+        raise UserError(f"task.options={dict(options)} does not fit {id}: {error}") from error
 
 
 def _bounds(space: Box, low: Numbers | float | None, high: Numbers | float | None) -> list[tuple[float, ...]]:
     """Return the low and high bounds of an action, as given or else of its space.
 
     Raises:
-        ValueError: there is no bound, or more or fewer than components.
+        UserError: there is no bound, or more or fewer than components.
     """
     found = []
     for name, given, own in (("low", low, space.low), ("high", high, space.high)):
@@ -194,9 +195,9 @@ def _bounds(space: Box, low: Numbers | float | None, high: Numbers | float | Non
         else:
             bound = (float(given),) * len(own) if isinstance(given, int | float) else tuple(given)
         if len(bound) != len(own):
-            raise ValueError(f"task.{name} has {len(bound)} numbers, an action has {len(own)} components")
+            raise UserError(f"task.{name} has {len(bound)} numbers, an action has {len(own)} components")
         if not np.isfinite(bound).all():
-            raise ValueError(f"the actions {space} have no bounds: set task.{name}, a number, or one per component")
+            raise UserError(f"the actions {space} have no bounds: set task.{name}, a number, or one per component")
         found.append(bound)
     return found
 
@@ -212,7 +213,7 @@ def _get(values: Any, path: str, default: Any = None) -> Any:
     """Return the value at a dotted path.
 
     Raises:
-        ValueError: there is none, and no default.
+        UserError: there is none, and no default.
     """
     found = values
     for name in path.split("."):
@@ -220,7 +221,7 @@ def _get(values: Any, path: str, default: Any = None) -> Any:
             if default is not None:
                 return default
             there = ", ".join(map(str, found)) if isinstance(found, Mapping) else "no further names"
-            raise ValueError(f"there is no {path} in what the environment returns: instead of {name} there is {there}")
+            raise UserError(f"there is no {path} in what the environment returns: instead of {name} there is {there}")
         found = found[name]
     return found
 
@@ -229,21 +230,21 @@ def _named(path: str, values: Any, names: Names | None, whole: bool = False) -> 
     """Return the names of the components of an array, by default the last part of its path, or all, and numbers.
 
     Raises:
-        ValueError: there are more or fewer components than names.
+        UserError: there are more or fewer components than names.
     """
     size = np.size(values)
     if names is None:
         name = path.partition(".")[2] if whole else path.rpartition(".")[2]
         return tuple(f"{name}_{index}" for index in range(size))
     if len(names) != size:
-        raise ValueError(f"{path} has {size} components, and {len(names)} names: {', '.join(names)}")
+        raise UserError(f"{path} has {size} components, and {len(names)} names: {', '.join(names)}")
     return tuple(names)
 
 
 def _resized(camera: str, picture: Any, size: tuple[int, int]) -> Array:
     picture = np.asarray(picture)
     if picture.dtype != np.uint8 or picture.ndim != 3 or picture.shape[2] != 3:
-        raise ValueError(
+        raise UserError(
             f"task.images.{camera} names no (H, W, 3) image of uint8, but {picture.dtype} of {picture.shape}"
         )
     return resize(np.ascontiguousarray(picture), size, "centre")

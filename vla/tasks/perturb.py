@@ -9,6 +9,7 @@ from typing import Annotated, Any
 import numpy as np
 from annotated_types import Ge, Le, MinLen
 
+from vla.io.errors import UserError
 from vla.io.types import CountRange, Names, PositiveRange, Share, Text
 from vla.spec import Agent, Array, Observation, Spec
 
@@ -26,7 +27,7 @@ class Perturbation:
     open or closed at random. Only a gripper misses grasps.
 
     Raises:
-        ValueError: `low`, `high` and `move` differ in length.
+        UserError: `low`, `high` and `move` differ in length.
     """
 
     low: Corner  # lower corner of the box of excursion targets, in the frame of the actions [m]
@@ -51,17 +52,17 @@ class Perturbation:
         """Require corners with a coordinate per component of `move`."""
         low, high, move = len(self.low), len(self.high), len(self.move)
         if not low == high == move:
-            raise ValueError(f"expert.perturb has {low} numbers in low, {high} in high, {move} in move")
+            raise UserError(f"expert.perturb has {low} numbers in low, {high} in high, {move} in move")
 
     def reset(self, spec: Spec, seed: int) -> None:
         """Draw the pace of an episode and its first excursion.
 
         Raises:
-            ValueError: the actions lack a named component.
+            UserError: the actions lack a named component.
         """
         groups = self.move, (self.turn,) if self.turn else (), (self.gripper,) if self.gripper else ()
         if unknown := [name for group in groups for name in group if name not in spec.action]:
-            raise ValueError(f"expert.perturb names {', '.join(unknown)}; actions have {', '.join(spec.action)}")
+            raise UserError(f"expert.perturb names {', '.join(unknown)}; actions have {', '.join(spec.action)}")
         self._move, self._turn, self._grip = ([spec.action.index(name) for name in group] for group in groups)
         self._motions = [index for index in range(len(spec.action)) if index not in self._grip]
         self._shut, self._wide = (np.array(bounds)[self._grip] for bounds in (spec.low, spec.high))
@@ -84,11 +85,11 @@ class Perturbation:
         With `must_turn` the gripper also turns in episodes without turns; with `steady` no excursion begins.
 
         Raises:
-            ValueError: the truth has no such tool.
+            UserError: the truth has no such tool.
         """
         tool, coordinates = truth.get(self.tool), len(self.low)
         if tool is None or tool.shape != (coordinates,):
-            raise ValueError(
+            raise UserError(
                 f"expert.perturb.tool={self.tool} is no point of {coordinates} coordinates in the truth, which has "
                 f"{', '.join(truth) or 'nothing'}"
             )
@@ -135,12 +136,12 @@ class Perturbed:
         """Return the (D,) float32 action to execute.
 
         Raises:
-            ValueError: the observation lacks the simulator's truth.
+            UserError: the observation lacks the simulator's truth.
         """
         clean = self._expert.act(observation)
         self.info = {**self._expert.info, "clean": clean}
         if observation.truth is None:
-            raise ValueError("expert.perturb needs the simulator's truth, which this observation lacks")
+            raise UserError("expert.perturb needs the simulator's truth, which this observation lacks")
         needs = {name: self._expert.info[name] for name in ("must_turn", "steady") if name in self._expert.info}
         executed = self._perturb(clean, observation.truth, **needs)
         return np.clip(executed, self._spec.low, self._spec.high).astype(np.float32)

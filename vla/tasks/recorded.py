@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
+from vla.io.errors import UserError
 from vla.io.types import ImageSize, Positive, Text
 from vla.robots.controllers import UNITS
 from vla.spec import Cameras, Names, Numbers, RobotModel, Spec, SpecOnly
@@ -20,13 +21,13 @@ def units_of(
         action: names of its components.
 
     Raises:
-        ValueError: a name is of no component.
+        UserError: a name is of no component.
     """
     if isinstance(units, str):
         return (units,) * len(state), (units,) * len(action)
     if unknown := [name for name in units if name not in (*state, *action)]:
         known = ", ".join(dict.fromkeys((*state, *action)))
-        raise ValueError(f"task.units names {', '.join(unknown)}, the components are {known}")
+        raise UserError(f"task.units names {', '.join(unknown)}, the components are {known}")
     return tuple(units.get(name, "1") for name in state), tuple(units.get(name, "1") for name in action)
 
 
@@ -45,7 +46,7 @@ class Recorded(SpecOnly):
             deployment as a ROS 2 node.
 
     Raises:
-        ValueError: arguments contradict each other, or a joint has no unit of a position.
+        UserError: arguments contradict each other, or a joint has no unit of a position.
     """
 
     def __init__(
@@ -63,11 +64,11 @@ class Recorded(SpecOnly):
         state_units, action_units = units_of(units, state, action)
         if isinstance(joints, str):
             if joints != "all":
-                raise ValueError(f"task.joints must be a list of names, all or null, got {joints}")
+                raise UserError(f"task.joints must be a list of names, all or null, got {joints}")
             joints = tuple(action)
         known = {**dict(zip(state, state_units, strict=True)), **dict(zip(action, action_units, strict=True))}
         if lacking := [name for name in joints or () if known.get(name, "rad") not in UNITS]:
-            raise ValueError(
+            raise UserError(
                 f"task.joints names {', '.join(lacking)} without a unit of a position, {', '.join(UNITS)}: name "
                 "it with task.units, or leave the joint out"
             )

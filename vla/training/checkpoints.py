@@ -19,6 +19,7 @@ from lightning.pytorch.callbacks import Checkpoint
 from lightning.pytorch.plugins import TorchCheckpointIO
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 
+from vla.io.errors import UserError
 from vla.io.files import atomic_path
 from vla.models.checkpoint import read_content
 from vla.models.policy_writing import write_policy
@@ -110,7 +111,7 @@ class GracefulStop(Checkpoint):
         """Convert errors before the training starts from `checkpoint` into a sentence that names the file.
 
         Raises:
-            ValueError: the state of the training in the file is damaged.
+            UserError: the state of the training in the file is damaged.
         """
         try:
             yield
@@ -120,7 +121,7 @@ class GracefulStop(Checkpoint):
             if self.started or checkpoint is None:
                 raise
             what = str(error) if isinstance(error, ValueError) else f"{type(error).__name__}: {error}"
-            raise ValueError(f"{checkpoint} cannot be resumed: {what[:1000]}") from error
+            raise UserError(f"{checkpoint} cannot be resumed: {what[:1000]}") from error
 
 
 class PeriodicCheckpoint(Checkpoint):

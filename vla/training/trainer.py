@@ -21,6 +21,7 @@ from lightning.pytorch.strategies import ParallelStrategy
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 
 from vla.config.build import build
+from vla.io.errors import UserError
 from vla.models.checkpoint import read_header
 from vla.parallel.limits import cores
 from vla.runs.folder import METRICS, metric_rows
@@ -73,7 +74,7 @@ def make_trainer(config: Mapping[str, Any], checkpoints: Path | None, *callbacks
     The given callbacks run before EMA at the end of a validation, so that they use the EMA weights.
 
     Raises:
-        ValueError: the machine lacks what the config requires, or a logger's package is missing.
+        UserError: the machine lacks what the config requires, or a logger's package is missing.
     """
     _keep_freed_memory()
     all_callbacks: list[Callback] = [TrainingProgressBar(), *callbacks]
@@ -94,12 +95,12 @@ def make_trainer(config: Mapping[str, Any], checkpoints: Path | None, *callbacks
             # Compare the number of processes with the cluster now; Lightning would only at the start of training.
             trainer.strategy.cluster_environment.validate_settings(trainer.num_devices, trainer.num_nodes)
     except RuntimeError as error:  # a cluster started another number of processes
-        raise ValueError(f"training cannot start in this environment: {error}") from error
+        raise UserError(f"training cannot start in this environment: {error}") from error
     except (MisconfigurationException, ValueError) as error:
         names = ("accelerator", "devices", "num_nodes", "strategy", "precision")
         values = {name: config["trainer"][name] for name in names if name in config["trainer"]}
         options_text = [f"trainer.{name}={value}" for name, value in values.items() if not isinstance(value, dict)]
-        raise ValueError(
+        raise UserError(
             f"{' '.join(options_text)} is not available here ({error}): try trainer=cpu or trainer=auto"
         ) from error
     _require_cores(trainer)
@@ -108,14 +109,14 @@ def make_trainer(config: Mapping[str, Any], checkpoints: Path | None, *callbacks
 
 
 def _require_cores(trainer: Trainer) -> None:
-    """Raise a ValueError for more processes on this CPU than it has cores, unless a cluster started them.
+    """Raise a UserError for more processes on this CPU than it has cores, unless a cluster started them.
 
     Two are always allowed, as the smallest training of several processes to try.
     """
     environment = getattr(trainer.strategy, "cluster_environment", None)
     external = environment is not None and environment.creates_processes_externally
     if isinstance(trainer.accelerator, CPUAccelerator) and not external and trainer.num_devices > max(cores(), 2):
-        raise ValueError(
+        raise UserError(
             f"trainer.devices={trainer.num_devices} asks for more processes than this machine has cores: set "
             f"trainer.devices={cores()} or fewer"
         )
@@ -126,7 +127,7 @@ def explain_memory_errors(config: Mapping[str, Any]) -> Iterator[None]:
     """Convert out-of-memory errors into an explanation that names the options to lower.
 
     Raises:
-        ValueError: the memory of the GPU or of the machine is not enough.
+        UserError: the memory of the GPU or of the machine is not enough.
     """
     try:
         yield
@@ -135,7 +136,7 @@ def explain_memory_errors(config: Mapping[str, Any]) -> Iterator[None]:
             raise
         keys = [f"data.batch_size (now {config['data']['batch_size']})"]
         keys += [f"model.{name} (now {config['model'][name]})" for name in SIZE_KEYS if config["model"].get(name)]
-        raise ValueError(
+        raise UserError(
             f"training needs more memory than available: lower {', '.join(keys)}; trainer.precision=bf16 needs less, "
             "and trainer.accumulate_grad_batches=2 makes one step of two batches of half the size"
         ) from error
@@ -175,7 +176,7 @@ def _loggers(config: Mapping[str, Any], folder: Path) -> list[Logger]:
         try:
             loggers.append(build(node, "logger", save_dir=str(folder)))
         except ModuleNotFoundError as error:
-            raise ValueError(
+            raise UserError(
                 f"logger.{name} needs a package that is not installed: pip install 'vla[{name}]'"
             ) from error
     return loggers

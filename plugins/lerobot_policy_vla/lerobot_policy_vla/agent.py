@@ -12,6 +12,7 @@ from lerobot.utils.constants import ACTION
 from lerobot.utils.import_utils import register_third_party_plugins
 
 from vla.envs.lerobot import TASK, arrays
+from vla.io.errors import UserError
 from vla.io.types import Text
 from vla.spec import Array, Observation, Spec
 
@@ -33,7 +34,7 @@ class LeRobotPolicy:
         try:
             config = PreTrainedConfig.from_pretrained(folder, local_files_only=True)
         except Exception as error:  # of the hub, of draccus, of the file system
-            raise ValueError(f"agent.folder={folder} holds no policy of LeRobot: {str(error)[:200]}") from error
+            raise UserError(f"agent.folder={folder} holds no policy of LeRobot: {str(error)[:200]}") from error
         config.device, config.pretrained_path = device, folder  # type: ignore[assignment]
         _require(config, spec, folder)
         self._policy = get_policy_class(config.type).from_pretrained(folder, config=config).eval()
@@ -62,4 +63,4 @@ def _require(config: PreTrainedConfig, spec: Spec, folder: str) -> None:
     there = {key: (*value.shape,) for key, value in given.items()} | {ACTION: (len(spec.action),)}
     wanted = {key: (*part.shape,) for key, part in {**config.input_features, **config.output_features}.items()}
     if other := [f"{key} {shape}, not {there.get(key)}" for key, shape in wanted.items() if shape != there.get(key)]:
-        raise ValueError(f"the policy in {folder} does not fit the task: it has {'; '.join(other)}")
+        raise UserError(f"the policy in {folder} does not fit the task: it has {'; '.join(other)}")

@@ -22,6 +22,7 @@ from rich.progress import track
 from vla.data.episodes import EpisodeStore
 from vla.data.index import Entry
 from vla.io.documents import read_json
+from vla.io.errors import UserError
 from vla.io.files import writing
 from vla.io.types import Text
 from vla.parallel.pool import THIS_PROCESS, Cluster, WorkersLost
@@ -47,7 +48,7 @@ class FolderExporter(ABC):
         """Write the missing episodes, each atomically; returns the folder.
 
         Raises:
-            ValueError: the folder holds an episode of another store, or the store is damaged.
+            UserError: the folder holds an episode of another store, or the store is damaged.
         """
         self._folder.mkdir(parents=True, exist_ok=True)
         with staging_folder(self._folder) as place:
@@ -62,7 +63,7 @@ class FolderExporter(ABC):
             return False
         manifest = self._manifest(store, number)
         if read_json(folder / "manifest.json", dict[str, Any]) != manifest:
-            raise ValueError(
+            raise UserError(
                 f"{folder} was exported from other episodes, or as other files: choose another export.folder"
             )
         return True
@@ -131,10 +132,10 @@ def require_empty(folder: Path) -> None:
     """Require a folder to be missing or empty.
 
     Raises:
-        ValueError: the folder has content, or is a file.
+        UserError: the folder has content, or is a file.
     """
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise ValueError(f"{folder} has content other than these episodes: choose another export.folder")
+        raise UserError(f"{folder} has content other than these episodes: choose another export.folder")
 
 
 @contextmanager
@@ -142,7 +143,7 @@ def staging_folder(folder: Path) -> Iterator[Path]:
     """Yield a hidden folder beside `folder` for incomplete files; it is removed on success and kept on failure.
 
     Raises:
-        ValueError: another process is exporting to `folder`.
+        UserError: another process is exporting to `folder`.
         OSError: the export cannot be written; the message names `folder`.
     """
     place = folder.with_name(f".{folder.name}.unfinished")
@@ -151,7 +152,7 @@ def staging_folder(folder: Path) -> Iterator[Path]:
     try:
         lock.acquire(timeout=0)
     except Timeout as error:
-        raise ValueError(f"another export to {folder} is under way: wait, or choose another export.folder") from error
+        raise UserError(f"another export to {folder} is under way: wait, or choose another export.folder") from error
     try:
         with writing(folder):
             yield place
@@ -175,7 +176,7 @@ def map_episodes(
     Workers also access the paths `needs`.
 
     Raises:
-        ValueError: raised by `work` or by the cluster.
+        UserError: raised by `work` or by the cluster.
     """
     folder = store.folder.resolve()
     make = partial(_ExportWorker, work, folder, len(store.episodes))

@@ -15,6 +15,7 @@ import numpy as np
 from rich.progress import track
 
 from vla.data.episodes import EpisodeStore
+from vla.io.errors import UserError
 from vla.spec import Array, Episode, Spec
 
 log = logging.getLogger(__name__)
@@ -46,9 +47,9 @@ class ImportedDemonstrations(ABC):
         """Describe the recording that `options`, the arguments of the constructor but the spec, name.
 
         Raises:
-            ValueError: it is missing or damaged, or this format is for given tasks only.
+            UserError: it is missing or damaged, or this format is for given tasks only.
         """
-        raise ValueError(f"{cls.__name__} does not describe its recordings: choose the task that they are of")
+        raise UserError(f"{cls.__name__} does not describe its recordings: choose the task that they are of")
 
     @abstractmethod
     def __len__(self) -> int:
@@ -62,12 +63,10 @@ class ImportedDemonstrations(ABC):
         """Append episodes until the store holds `episodes`; returns the number appended.
 
         Raises:
-            ValueError: there are too few, the store holds other ones, one is damaged, or the disk is full.
+            UserError: there are too few, the store holds other ones, one is damaged, or the disk is full.
         """
         if episodes > len(self):
-            raise ValueError(
-                f"there are only {len(self)} recorded episodes: set collect.episodes={len(self)}, or fewer"
-            )
+            raise UserError(f"there are only {len(self)} recorded episodes: set collect.episodes={len(self)}, or fewer")
         if episodes < len(self):
             log.info("collect.episodes=%d of the %d recorded episodes are used", episodes, len(self))
         self.require_held(store)
@@ -77,17 +76,17 @@ class ImportedDemonstrations(ABC):
         with store.writing():  # another process may have added some meanwhile
             first = store.next_seed or 0
             if (possible := len(store.episodes) + len(self) - first) < episodes:  # damaged ones do not come back
-                raise ValueError(f"only {possible} episodes are whole: set collect.episodes={possible}, or fewer")
+                raise UserError(f"only {possible} episodes are whole: set collect.episodes={possible}, or fewer")
             missing = range(first, first + episodes - len(store.episodes))
             for number in track(missing, "importing"):
                 store.append(self.episode(number))
         return len(missing)
 
     def require_held(self, store: EpisodeStore) -> None:
-        """Raise a ValueError unless the last episode that a store and this recording share is the same in both."""
+        """Raise a UserError unless the last episode that a store and this recording share is the same in both."""
         held = [entry for entry in store.episodes if entry.seed < len(self)][-1:]
         if any(not np.array_equal(store.read(entry)["action"], self.episode(entry.seed).actions) for entry in held):
-            raise ValueError(f"{store.folder} holds other episodes than these: choose another collect.folder")
+            raise UserError(f"{store.folder} holds other episodes than these: choose another collect.folder")
 
 
 def action_bounds(values: Array) -> tuple[float, float]:

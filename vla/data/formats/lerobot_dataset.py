@@ -21,6 +21,7 @@ from vla.data.formats.lerobot_tables import MEND, REMEDY, counts, numbers
 from vla.data.formats.video import decode, require_video
 from vla.data.image_codec import decode_image
 from vla.io.documents import read_bounded, read_json
+from vla.io.errors import UserError
 from vla.io.images import resize
 from vla.spec import Array
 
@@ -43,7 +44,7 @@ class LeRobotDataset:
         images: camera → key; None: every feature of images, named without `observation.images.`.
 
     Raises:
-        ValueError: the dataset is missing, incomplete, damaged, of another version, contradicts itself, names images
+        UserError: the dataset is missing, incomplete, damaged, of another version, contradicts itself, names images
             that it does not have, or has several rates.
     """
 
@@ -54,7 +55,7 @@ class LeRobotDataset:
         there = [key for key, feature in self.info.features.items() if feature.dtype in IMAGES and not feature.is_depth]
         self.images = {camera_of(key): key for key in there} if images is None else dict(images)
         if unknown := [key for key in self.images.values() if key not in there]:
-            raise ValueError(f"expert.images: {folder} has no images {', '.join(unknown)}, it has {', '.join(there)}")
+            raise UserError(f"expert.images: {folder} has no images {', '.join(unknown)}, it has {', '.join(there)}")
         self.parts = read_parts(folder, self.info, [key for key in self.images.values() if self._is_video(key)])
 
     def components(self, keys: Sequence[str], anonymous: Sequence[str] = ()) -> dict[str, tuple[str, int]]:
@@ -63,14 +64,14 @@ class LeRobotDataset:
         Unnamed components are called by `anonymous` if there are as many, else by their feature and index.
 
         Raises:
-            ValueError: there is no such feature, or it is no vector of a reasonable size.
+            UserError: there is no such feature, or it is no vector of a reasonable size.
         """
         for key in keys:
             if key not in self.info.features or len(self.info.features[key].shape) != 1:
                 vectors = [name for name, feature in self.info.features.items() if len(feature.shape) == 1]
-                raise ValueError(f"{self.folder} has no vector {key}, it has {', '.join(vectors)[:500]}")
+                raise UserError(f"{self.folder} has no vector {key}, it has {', '.join(vectors)[:500]}")
             if (size := self.info.features[key].shape[0]) > MOST_COMPONENTS:
-                raise ValueError(f"{self.folder} has {size} components in {key}, the limit is {MOST_COMPONENTS}")
+                raise UserError(f"{self.folder} has {size} components in {key}, the limit is {MOST_COMPONENTS}")
         named = {key: dict(enumerate(self.info.features[key].components or ())) for key in keys}
         places = [(key, index) for key in keys for index in range(self.info.features[key].shape[0])]
         numbered = {f"{key.rpartition('.')[2]}_{index}" for key, index in places}
@@ -87,7 +88,7 @@ class LeRobotDataset:
         """Read the numbers of features, each (N, D) float32, in the order of the tables.
 
         Raises:
-            ValueError: rows are no vectors of finite numbers.
+            UserError: rows are no vectors of finite numbers.
         """
         rows = tables.read(tables.files(self.folder / "data"), dict.fromkeys(keys, numbers) | {OWNER: counts})
         return {key: self._matrix(rows, key) for key in keys}
@@ -98,7 +99,7 @@ class LeRobotDataset:
         Of images in tables and of frames of videos, this decodes the first one of each camera.
 
         Raises:
-            ValueError: a file is missing or damaged, or contradicts others.
+            UserError: a file is missing or damaged, or contradicts others.
         """
         self._matrices = self.read(keys)
         images = [self.images[camera] for camera in cameras]
@@ -117,7 +118,7 @@ class LeRobotDataset:
         """Return every `every`-th image of a part, (N, H, W, 3) uint8, cropped at the centre and resized to `size`.
 
         Raises:
-            ValueError: images are missing or damaged.
+            UserError: images are missing or damaged.
         """
         images = self._decoded(part, self.images[camera], every)
         return np.stack([resize(image, size, "centre") for image in images])
@@ -132,7 +133,7 @@ class LeRobotDataset:
         size = self.info.features[name].shape[0]
         values = tables.matrix(rows[name], size)
         if values is None or not len(values):
-            raise ValueError(
+            raise UserError(
                 f"{self.folder}/data has rows of {name} without the {size} numbers that meta/info.json states: {MEND}"
             )
         require_finite(self.folder, name, values, rows[OWNER].to_numpy())
@@ -153,7 +154,7 @@ class LeRobotDataset:
                 yield decode_image(self._content(column[step].as_py() or {}), PICTURES, (*size, 3))
             except ValueError as error:
                 step += part.steps.start
-                raise ValueError(f"{self.folder}: {key} of episode {part.episode}, step {step}: {error}") from error
+                raise UserError(f"{self.folder}: {key} of episode {part.episode}, step {step}: {error}") from error
 
     def _begin(self, part: Part, key: str) -> float:
         """Return the time of the first step of an episode in a video [s].
@@ -170,11 +171,11 @@ class LeRobotDataset:
         if picture.get("bytes"):
             return picture["bytes"]
         if not (path := picture.get("path")):
-            raise ValueError(f"there is no image: {MEND}")
+            raise UserError(f"there is no image: {MEND}")
         folder = os.path.realpath(self.folder)
         file = Path(os.path.realpath(os.path.join(folder, str(path))))  # untrusted, it could lead anywhere
         if not file.is_relative_to(folder) or not os.path.isfile(file):
-            raise ValueError(
+            raise UserError(
                 f"the table has no image but the path {str(path)[:200]!r}, which is no file in the folder of the "
                 "dataset: copy the images there, or embed them in the tables"
             )
@@ -188,20 +189,20 @@ class LeRobotDataset:
     def _read_info(self) -> layout.Info:
         path = self.folder / "meta/info.json"
         if not path.exists():
-            raise ValueError(f"there is no LeRobot dataset in {self.folder} (no meta/info.json)")
+            raise UserError(f"there is no LeRobot dataset in {self.folder} (no meta/info.json)")
         try:
             version = str(read_json(path, dict[str, Any]).get("codebase_version"))
         except ValueError as error:
-            raise ValueError(f"{error}: {REMEDY}") from error
+            raise UserError(f"{error}: {REMEDY}") from error
         if version == layout.VERSION:
             return read_json(path, layout.Info)
         known, found = (re.fullmatch(r"v(\d{1,4})\.(\d{1,4})", text) for text in (layout.VERSION, version))
         if found and known and [*map(int, found.groups())] > [*map(int, known.groups())]:
-            raise ValueError(
+            raise UserError(
                 f"{path} has version {version}, newer than {layout.VERSION}, which is read here: look for a newer vla"
             )
         what = f"has version {version}: convert" if found else f"has no version, but {version[:20]}: write or convert"
-        raise ValueError(f"{path} {what} the dataset to {layout.VERSION} with lerobot")
+        raise UserError(f"{path} {what} the dataset to {layout.VERSION} with lerobot")
 
     def _require_unchanged(self) -> None:
         """Compare the files with their checksums, if the dataset has any."""
@@ -211,9 +212,9 @@ class LeRobotDataset:
         try:
             expected, found = read_json(path, layout.Checksums), layout.checksums(self.folder)
         except ValueError as error:
-            raise ValueError(f"{error}: {REMEDY}") from error
+            raise UserError(f"{error}: {REMEDY}") from error
         if changed := [name for name in expected if expected[name] != found.get(name)]:
-            raise ValueError(
+            raise UserError(
                 f"{self.folder} has changed since it was exported, in {', '.join(changed)[:200]}: {REMEDY}, or delete "
                 f"{layout.CHECKSUMS} if this was intended"
             )
@@ -228,7 +229,7 @@ class LeRobotDataset:
                 frames[place] = max(frames.get(place, 0), end)
         if missing := [str(path.relative_to(self.folder)) for path, _ in frames if not path.exists()]:
             more = f" and {len(missing) - 3} more" if len(missing) > 3 else ""
-            raise ValueError(f"{self.folder} lacks {', '.join(missing[:3])}{more}: {REMEDY}")
+            raise UserError(f"{self.folder} lacks {', '.join(missing[:3])}{more}: {REMEDY}")
         for (path, key), count in frames.items():
             require_video(path, self.info.features[key].image_size, layout.fraction(self.info.fps), count)
 

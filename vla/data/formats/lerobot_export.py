@@ -59,7 +59,7 @@ class LeRobotExporter:
         """Write the dataset, or resume an interrupted export; returns the folder.
 
         Raises:
-            ValueError: the folder has other content, or the store is damaged or empty.
+            UserError: the folder has other content, or the store is damaged or empty.
         """
         store.require_episodes()
         source = self._source(store)

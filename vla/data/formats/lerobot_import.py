@@ -22,6 +22,7 @@ from vla.data.formats.lerobot_compatibility import mismatches, out_of_bounds
 from vla.data.formats.lerobot_dataset import LeRobotDataset
 from vla.data.formats.lerobot_episodes import Part
 from vla.data.formats.lerobot_tables import MEND
+from vla.io.errors import UserError
 from vla.io.images import describe_resize
 from vla.io.types import Count, Text, unique
 from vla.spec import Array, Episode, Spec
@@ -50,7 +51,7 @@ class LeRobotDemonstrations(ImportedDemonstrations):
         spec: of the task.
 
     Raises:
-        ValueError: the dataset is missing or damaged, or differs from the task; the message lists all differences.
+        UserError: the dataset is missing or damaged, or differs from the task; the message lists all differences.
     """
 
     def __init__(
@@ -111,7 +112,7 @@ class LeRobotDemonstrations(ImportedDemonstrations):
         """Return one episode, with its images.
 
         Raises:
-            ValueError: images are damaged.
+            UserError: images are damaged.
         """
         spec, dataset, part = self.spec, self._dataset, self._dataset.parts[number]
         first = np.arange(part.steps.start, part.steps.stop, self._every)
@@ -128,7 +129,7 @@ class LeRobotDemonstrations(ImportedDemonstrations):
         return Episode(*what, observations, actions, executed)
 
     def _require_fit(self, keys: Keys) -> None:
-        """Raise a ValueError unless metadata and action range, from the features `keys`, match the task."""
+        """Raise a UserError unless metadata and action range, from the features `keys`, match the task."""
         dataset, spec = self._dataset, self.spec
         found = [*mismatches(dataset, self._state, self._action, spec, self._every)]
         if all(name in self._action for name in spec.action):
@@ -138,7 +139,7 @@ class LeRobotDemonstrations(ImportedDemonstrations):
             found += out_of_bounds(actions, spec)
             self._beyond = float(((actions < self._low) | (actions > self._high)).mean())
         if found:
-            raise ValueError(f"{dataset.folder} does not match the task: {'; '.join(found)}")
+            raise UserError(f"{dataset.folder} does not match the task: {'; '.join(found)}")
 
     def _states(self, part: Part) -> Array:
         """Return (N, P) float32; joint velocities are differences of positions if the dataset has none."""
@@ -166,7 +167,7 @@ class LeRobotDemonstrations(ImportedDemonstrations):
         values = np.asarray(pc.list_flatten(pc.list_flatten(column)).combine_chunks())
         regular = tables.lists_have(column, *self.spec.image_size) and len(values) == np.prod(shape)
         if values.dtype != np.uint16 or not regular:
-            raise ValueError(
+            raise UserError(
                 f"{self._dataset.folder} has {layout.depth_key(camera)} of another size in episode {part.episode}: "
                 f"{MEND}"
             )
@@ -192,7 +193,7 @@ class LeRobotDemonstrations(ImportedDemonstrations):
 
 def _opened(folder: Path | str | None, images: dict[str, Text] | None) -> LeRobotDataset:
     if folder is None:
-        raise ValueError("expert=lerobot needs a dataset: name its folder with expert=lerobot expert.folder=DIR")
+        raise UserError("expert=lerobot needs a dataset: name its folder with expert=lerobot expert.folder=DIR")
     return LeRobotDataset(Path(folder), images)
 
 

@@ -11,6 +11,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
+from vla.io.errors import UserError
 from vla.io.files import require_file
 from vla.spec import Array
 
@@ -62,40 +63,40 @@ def files(folder: Path) -> list[Path]:
     """Return the files of a table, in their order.
 
     Raises:
-        ValueError: there are none.
+        UserError: there are none.
     """
     if found := sorted(folder.glob("chunk-*/file-*.parquet")):
         return found
-    raise ValueError(f"{folder} holds no tables: {REMEDY}")
+    raise UserError(f"{folder} holds no tables: {REMEDY}")
 
 
 def read(paths: Sequence[Path], columns: Mapping[str, Kind], only: Any = None) -> pa.Table:
     """Read the named columns of Parquet files, concatenated; `only` filters rows.
 
     Raises:
-        ValueError: a file is damaged, too large, or lacks a column of the expected type.
+        UserError: a file is damaged, too large, or lacks a column of the expected type.
     """
     found = [_read(path, columns, only) for path in paths]
     try:
         return pa.concat_tables(found, promote_options="permissive")
     except pa.ArrowException as error:
-        raise ValueError(f"{paths[0]} and others beside it differ ({str(error)[:200]}): {MEND}") from error
+        raise UserError(f"{paths[0]} and others beside it differ ({str(error)[:200]}): {MEND}") from error
 
 
 def schema_of(path: Path) -> pa.Schema:
     """Return the columns of a Parquet file.
 
     Raises:
-        ValueError: it is damaged, no ordinary file, or has too many rows.
+        UserError: it is damaged, no ordinary file, or has too many rows.
     """
     require_file(path)
     try:
         with pq.ParquetFile(path) as file:
             rows, schema = file.metadata.num_rows, file.schema_arrow
     except (pa.ArrowException, OSError, UnicodeDecodeError) as error:
-        raise ValueError(f"{path} cannot be read ({str(error)[:200]}): {REMEDY}") from error
+        raise UserError(f"{path} cannot be read ({str(error)[:200]}): {REMEDY}") from error
     if rows > MOST_ROWS:
-        raise ValueError(f"{path} has {rows} rows, more than the {MOST_ROWS} that such a file can have")
+        raise UserError(f"{path} has {rows} rows, more than the {MOST_ROWS} that such a file can have")
     return schema
 
 
@@ -103,29 +104,29 @@ def require(path: Path, columns: Mapping[str, Kind]) -> None:
     """Require a Parquet file to have columns of the expected types; their values are not read.
 
     Raises:
-        ValueError: it has not, or cannot be read.
+        UserError: it has not, or cannot be read.
     """
     empty = schema_of(path).empty_table()
     if missing := [name for name in columns if name not in empty.column_names]:
-        raise ValueError(f"{path} lacks the columns {', '.join(missing)}: {MEND}")
+        raise UserError(f"{path} lacks the columns {', '.join(missing)}: {MEND}")
     _require_kinds(path, empty, columns)
 
 
 def _require_kinds(path: Path, table: pa.Table, columns: Mapping[str, Kind]) -> None:
     for name, is_kind in columns.items():
         if not is_kind(table[name]):
-            raise ValueError(f"{path}: {name} does not hold {is_kind.__doc__}: {MEND}")
+            raise UserError(f"{path}: {name} does not hold {is_kind.__doc__}: {MEND}")
 
 
 def _read(path: Path, columns: Mapping[str, Kind], only: Any) -> pa.Table:
     require(path, columns)
     if (unpacked := _unpacked_size(path, columns, only is not None)) > MOST_BYTES:
-        raise ValueError(f"{path} unpacks to {unpacked / 1e9:.0f} GB, more than the {MOST_BYTES / 1e9:.0f} GB it may")
+        raise UserError(f"{path} unpacks to {unpacked / 1e9:.0f} GB, more than the {MOST_BYTES / 1e9:.0f} GB it may")
     try:
         table = pq.read_table(path, columns=[*columns], filters=only, page_checksum_verification=True)
         table.validate(full=True)
     except (pa.ArrowException, OSError) as error:
-        raise ValueError(f"{path} cannot be read ({str(error)[:200]}): {REMEDY}") from error
+        raise UserError(f"{path} cannot be read ({str(error)[:200]}): {REMEDY}") from error
     _require_kinds(path, table, columns)
     return table
 

@@ -12,6 +12,7 @@ from pathlib import Path
 import av
 from av.video.frame import PictureType
 
+from vla.io.errors import UserError
 from vla.io.files import require_file
 from vla.spec import Array
 
@@ -67,7 +68,7 @@ def decode(
     """Yield every `every`-th of `count` frames of a video from `start` [s] on, (H, W, 3) uint8 of `size` (H, W).
 
     Raises:
-        ValueError: the video cannot be read, has images of another size, or lacks a frame.
+        UserError: the video cannot be read, has images of another size, or lacks a frame.
     """
     wanted = 0
     with _opened(path) as (file, stream):
@@ -82,7 +83,7 @@ def decode(
             if wanted >= count or number > wanted:
                 break
     if wanted < count:
-        raise ValueError(f"{path} lacks the frame at {start + wanted / float(fps):.3f} s")
+        raise UserError(f"{path} lacks the frame at {start + wanted / float(fps):.3f} s")
 
 
 def require_video(path: Path, size: tuple[int, int], fps: Fraction, count: int) -> None:
@@ -91,32 +92,32 @@ def require_video(path: Path, size: tuple[int, int], fps: Fraction, count: int) 
     The rate may differ as long as the first `count` images are the right ones.
 
     Raises:
-        ValueError: it does not, or cannot be read.
+        UserError: it does not, or cannot be read.
     """
     with _opened(path) as (_, stream):
         _require_size(path, stream, size)
         rates, frames = [rate for rate in (stream.average_rate, stream.base_rate) if rate], stream.frames
     rate = min(rates, key=lambda each: abs(each - fps), default=fps)  # the average may count the last image less
     if abs(rate - fps) * count > 0.5 * fps:
-        raise ValueError(
+        raise UserError(
             f"{path} has {float(rate):.5g} images per second, the dataset {float(fps):.5g}: encode the video again at "
             "that rate, or write its own as fps into meta/info.json"
         )
     if 0 < frames < count:  # 0: unknown
-        raise ValueError(f"{path} has {frames} images of the {count} that the dataset needs")
+        raise UserError(f"{path} has {frames} images of the {count} that the dataset needs")
 
 
 @contextmanager
 def _opened(path: Path) -> Iterator[tuple[av.container.InputContainer, av.VideoStream]]:
-    """Open a video and its first stream; errors within, of reading it, become a ValueError."""
+    """Open a video and its first stream; errors within, of reading it, become a UserError."""
     require_file(path)
     try:
         with av.open(path) as file:
             yield file, file.streams.video[0]
     except (av.error.FFmpegError, OSError, IndexError) as error:
-        raise ValueError(f"{path} cannot be read as a video: {error}") from error
+        raise UserError(f"{path} cannot be read as a video: {error}") from error
 
 
 def _require_size(path: Path, images: av.VideoStream | av.VideoFrame, size: tuple[int, int]) -> None:
     if (images.height, images.width) != size:
-        raise ValueError(f"{path} has images of {images.height} x {images.width} pixels, not {size[0]} x {size[1]}")
+        raise UserError(f"{path} has images of {images.height} x {images.width} pixels, not {size[0]} x {size[1]}")

@@ -6,6 +6,7 @@ import numpy as np
 
 from vla.config.experiment import Experiment
 from vla.io.documents import parse_json
+from vla.io.errors import UserError
 from vla.jobs.benchmark.measure import Measure, measure
 from vla.jobs.deploy import deployment
 
@@ -18,10 +19,10 @@ def measures(experiment: Experiment) -> dict[str, Measure]:
     - watchdog: median delay from a frozen simulator to a held arm; the floor is the maximum age of a joint state.
 
     Raises:
-        ValueError: no loop or no checkpoint is chosen.
+        UserError: no loop or no checkpoint is chosen.
     """
     if not experiment["deploy"] or experiment["deploy"]["_target_"] != "vla.deploy.loop.Loop":
-        raise ValueError("benchmark.names=[deploy] needs deploy=loop checkpoint=RUN")
+        raise UserError("benchmark.names=[deploy] needs deploy=loop checkpoint=RUN")
     loop = deployment(experiment)
     with loop.running() as operator:
         for _ in range(loop.episodes):

@@ -26,7 +26,7 @@ def measures(experiment: Experiment) -> dict[str, Measure]:
       echoes them.
 
     Raises:
-        ValueError: no checkpoint is given.
+        UserError: no checkpoint is given.
     """
     policy, steps = experiment.make_policy()(), experiment["benchmark"]["steps"]
     random = np.random.default_rng(0)

@@ -19,6 +19,7 @@ from torch import Tensor
 from vla.config.experiment import Experiment
 from vla.data.datamodule import WindowDataModule
 from vla.data.episodes import EpisodeStore
+from vla.io.errors import UserError
 from vla.jobs.benchmark.measure import Measure, measure
 from vla.jobs.benchmark.memory import peak, reset_peak
 from vla.jobs.collect import demonstrations
@@ -49,13 +50,13 @@ def measures(experiment: Experiment) -> dict[str, Measure]:
     Rounds of the combinations alternate and the fastest counts, so that other load on the machine affects all alike.
 
     Raises:
-        ValueError: there is nothing to measure, or not enough memory.
+        UserError: there is nothing to measure, or not enough memory.
     """
     asked = experiment["benchmark"]
     on_processor = computes_on_cpu(experiment["trainer"]["accelerator"])
     precisions = _precisions(asked["precisions"], on_processor)
     if not precisions or not asked["compile"]:
-        raise ValueError("training is timed in each of benchmark.precisions and benchmark.compile: both need an entry")
+        raise UserError("training is timed in each of benchmark.precisions and benchmark.compile: both need an entry")
     quiet_lightning()
     logging.getLogger("lightning.pytorch.profilers").setLevel(logging.WARNING)
     store = demonstrations(experiment)

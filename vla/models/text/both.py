@@ -10,6 +10,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
+from vla.io.errors import UserError
 from vla.models.text.huggingface import HuggingFace
 from vla.models.text.ngrams import NGrams, TextEncoder
 
@@ -23,14 +24,14 @@ class Both(TextEncoder):
         width: length of the vector.
 
     Raises:
-        ValueError: the n-grams have word dropout, whose tokens are too large for a tensor of floats.
+        UserError: the n-grams have word dropout, whose tokens are too large for a tensor of floats.
     """
 
     def __init__(self, ngrams: Callable[..., NGrams], sentence: Callable[..., HuggingFace], *, width: int) -> None:
         super().__init__(width)
         self.ngrams, self.sentence = ngrams(width=width // 2), sentence(width=width - width // 2)
         if self.ngrams.word_dropout is not None:
-            raise ValueError("model.text.ngrams.word_dropout must be null beside a sentence encoder")
+            raise UserError("model.text.ngrams.word_dropout must be null beside a sentence encoder")
 
     def tokenize(self, sentences: list[str]) -> Tensor:
         """Return (B, E + L) float32: frozen vectors, and hashes of n-grams, below 2^24 and therefore exact."""

@@ -16,6 +16,7 @@ import torch
 from torch import Tensor, nn
 
 from vla.io.documents import lines_of, mappings, parse_json, read_bounded
+from vla.io.errors import UserError
 from vla.models.hub import fetch
 from vla.models.packaged import PackagedFile
 from vla.models.text.ngrams import TextEncoder
@@ -86,14 +87,14 @@ class SentenceEncoder:
         """Load an encoder from a folder.
 
         Raises:
-            ValueError: a file is missing or damaged, or the weights are not safetensors.
+            UserError: a file is missing or damaged, or the weights are not safetensors.
         """
         from safetensors import SafetensorError
         from transformers import PreTrainedTokenizerFast
 
         for needed in ("config.json", "tokenizer.json", "model*.safetensors"):
             if not any(folder.glob(needed)):
-                raise ValueError(
+                raise UserError(
                     f"{folder} has no {needed.replace('*', '')}, which an encoder needs (weights in other formats may "
                     "run code, and are not read): write it there with save_pretrained of transformers"
                 )
@@ -108,10 +109,10 @@ class SentenceEncoder:
             )
             tokenizer = PreTrainedTokenizerFast.from_pretrained(folder)
         except (OSError, RuntimeError, ValueError, SafetensorError) as error:
-            raise ValueError(f"{folder} cannot be read as an encoder: {lines_of(error)[0]}") from error
+            raise UserError(f"{folder} cannot be read as an encoder: {lines_of(error)[0]}") from error
         missing = sorted(name for name in report["missing_keys"] if not name.startswith("pooler."))  # not used
         if missing:
-            raise ValueError(f"the weights in {folder} are those of another network: {missing[0]} is missing")
+            raise UserError(f"the weights in {folder} are those of another network: {missing[0]} is missing")
         return cls(network, _standalone_tokenizer(tokenizer, network.config))
 
     @classmethod
@@ -119,18 +120,18 @@ class SentenceEncoder:
         """Restore an encoder from the result of `state`.
 
         Raises:
-            ValueError: it is invalid.
+            UserError: it is invalid.
         """
         try:
             weights, config = state["weights"], _configuration(state["config"])
             layers = [name for name, value in vars(config).items() if _exceeds(name, value, len(weights))]
             if layers:
-                raise ValueError(f"{layers[0]} is {getattr(config, layers[0])}, with {len(weights)} weights")
+                raise UserError(f"{layers[0]} is {getattr(config, layers[0])}, with {len(weights)} weights")
             network = _network_class(config)(config)
             network.load_state_dict(weights)
             return cls(network, _saved_tokenizer(state["tokenizer"]))
         except Exception as error:  # tokenizers raises a plain Exception for invalid text
-            raise ValueError(f"the encoder in the checkpoint cannot be read: {str(error)[:200]}") from error
+            raise UserError(f"the encoder in the checkpoint cannot be read: {str(error)[:200]}") from error
 
     def state(self) -> dict[str, Any]:
         """Return all that `from_state` needs: config and tokenizer as JSON, and the weights."""
@@ -164,7 +165,7 @@ class HuggingFace(TextEncoder):
         width: length of the sentence vector.
 
     Raises:
-        ValueError: transformers is not installed, the folder, model or package does not exist, or it is not an encoder.
+        UserError: transformers is not installed, the folder, model or package does not exist, or it is not an encoder.
     """
 
     def __init__(self, name: str | PackagedFile, *, width: int) -> None:
@@ -181,10 +182,10 @@ class HuggingFace(TextEncoder):
         """Return the frozen encoder.
 
         Raises:
-            ValueError: there was no name, and no checkpoint has been loaded.
+            UserError: there was no name, and no checkpoint has been loaded.
         """
         if self._encoder is None:
-            raise ValueError("model.text.name is empty, and no checkpoint with an encoder has been loaded")
+            raise UserError("model.text.name is empty, and no checkpoint with an encoder has been loaded")
         return self._encoder
 
     @property
@@ -220,7 +221,7 @@ def _require_transformers() -> None:
     try:
         from transformers.utils import logging as transformers_logging
     except ImportError as error:
-        raise ValueError(
+        raise UserError(
             "a text encoder of Hugging Face needs transformers: install this package with its extra hf, as in "
             "pip install -e '.[hf]'"
         ) from error
@@ -243,7 +244,7 @@ def _folder(name: str | PackagedFile) -> Iterator[tuple[Path, str | Path]]:
         try:
             fetched = fetch(name, *FILES)
         except OSError as error:
-            raise ValueError(
+            raise UserError(
                 f"model.text.name={name} is no folder here, and cannot be fetched from the Hugging Face hub ({error}): "
                 "give the folder of a downloaded encoder, or use the one in a Python package, model/text=minilm"
             ) from error
@@ -261,14 +262,14 @@ def _configuration(text: str | bytes) -> Any:
     the code that `attn_implementation` names.
 
     Raises:
-        ValueError: it is no configuration of one of `ENCODERS` or `TOWERS`.
+        UserError: it is no configuration of one of `ENCODERS` or `TOWERS`.
     """
     from transformers import AutoConfig
 
     values = parse_json(text, dict[str, Any], "its configuration")
     kind = values.pop("model_type", None)
     if not isinstance(kind, str) or kind.removesuffix("_text_model") not in (*ENCODERS, *TOWERS):
-        raise ValueError(f"{str(kind)[:100]} is none of the text encoders {', '.join((*ENCODERS, *TOWERS))}")
+        raise UserError(f"{str(kind)[:100]} is none of the text encoders {', '.join((*ENCODERS, *TOWERS))}")
     known = {*AutoConfig.for_model(kind).to_dict(), *FURTHER.get(kind, ())}
     config = AutoConfig.for_model(kind, **{name: value for name, value in values.items() if name in known})
     tower = getattr(config, "text_config", None)
@@ -292,7 +293,7 @@ def _saved_tokenizer(text: str) -> Any:
     """Restore a tokenizer from its JSON.
 
     Raises:
-        ValueError: it pads or grows a text without bound.
+        UserError: it pads or grows a text without bound.
         Exception: it is invalid.
     """
     from tokenizers import Tokenizer
@@ -301,13 +302,11 @@ def _saved_tokenizer(text: str) -> Any:
     insertions = [each for each in mappings(normalizer) if each.get("type") in ("Replace", "Prepend")]
     inserted = [str(each.get("content") or each.get("prepend") or "") for each in insertions]
     if len(inserted) > INSERTIONS or any(len(each) > INSERTED for each in inserted):
-        raise ValueError(
-            f"its tokenizer has more than {INSERTIONS} replacements, or ones of over {INSERTED} characters"
-        )
+        raise UserError(f"its tokenizer has more than {INSERTIONS} replacements, or ones of over {INSERTED} characters")
     tokenizer = Tokenizer.from_str(text)
     padding = tokenizer.padding or {}
     if max(padding.get("length") or 0, padding.get("pad_to_multiple_of") or 0) > LONGEST:
-        raise ValueError(f"its tokenizer pads texts to more than {LONGEST} tokens")
+        raise UserError(f"its tokenizer pads texts to more than {LONGEST} tokens")
     return tokenizer
 
 

@@ -17,6 +17,7 @@ from tokenizers.trainers import BpeTrainer
 from torch import Tensor
 
 from vla.io.documents import parse_plain
+from vla.io.errors import UserError
 from vla.io.types import Bins, Positive, Steps, ascending
 from vla.models.tokenizers.tokenizer import MIN_SPAN, ActionStatistics, ActionTokenizer, data_bounds
 from vla.spec import Spec
@@ -80,10 +81,10 @@ class Fast(ActionTokenizer):
         """Return k·D + 1: one token per coefficient and the end token.
 
         Raises:
-            ValueError: the tokenizer was fitted on chunks of another length.
+            UserError: the tokenizer was fitted on chunks of another length.
         """
         if chunk != self.chunk:
-            raise ValueError(
+            raise UserError(
                 f"the model predicts {chunk} actions, its tokenizer {self.chunk}: set tokenizer.chunk={chunk}"
             )
         return chunk * self.components + 1
@@ -132,7 +133,7 @@ class Fast(ActionTokenizer):
         """Restore the fitted values.
 
         Raises:
-            ValueError: they are not those of a fitted tokenizer of this configuration.
+            UserError: they are not those of a fitted tokenizer of this configuration.
         """
         if type(state).__name__ == "_EXTRA_STATE":  # PyTorch's mark of what a sharded model is not to load
             return
@@ -142,12 +143,12 @@ class Fast(ActionTokenizer):
             bpe = Tokenizer.from_str(state["bpe"])
             words = bpe.get_vocab()
         except Exception as error:  # tokenizers raises a plain Exception for invalid text
-            raise ValueError(f"the tokenizer in the checkpoint cannot be read: {str(error)[:200]}") from error
+            raise UserError(f"the tokenizer in the checkpoint cannot be read: {str(error)[:200]}") from error
         plain = (bpe.normalizer, bpe.pre_tokenizer, bpe.post_processor, bpe.padding, bpe.truncation)
         longest = max(self.chunk * self.components, len(END))
         numbered = sorted(words.values()) == list(range(len(words)))
         if any(plain) or not numbered or len(words) > self.bins or max(map(len, words), default=0) > longest:
-            raise ValueError(
+            raise UserError(
                 f"the tokenizer in the checkpoint has more than {self.bins} words of up to {longest} characters, or "
                 "more parts than byte pairs"
             )
@@ -158,7 +159,7 @@ class Fast(ActionTokenizer):
         self._least, self._most = int(coefficients.min()), int(coefficients.max())
         alphabet = [chr(FIRST_CODE_POINT + number) for number in range(self._most - self._least + 1)]
         if len(alphabet) >= self.bins:
-            raise ValueError(
+            raise UserError(
                 f"the coefficients take {len(alphabet)} values, more than tokenizer.bins={self.bins} can tell apart: "
                 f"raise it, or lower tokenizer.scale={self.scale}"
             )

@@ -16,6 +16,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from vla.io.errors import UserError
 from vla.io.types import Bins, Natural, NonNegative
 from vla.spec import Spec
 
@@ -64,7 +65,7 @@ class ActionTokenizer(nn.Module, ABC):
         ranges = zip(spec.action, spec.low, spec.high, strict=True)
         empty = [name for name, least, largest in ranges if not (least < largest and math.isfinite(largest - least))]
         if empty:
-            raise ValueError(f"the spec must give {', '.join(empty)} a range: a low and a higher high, both finite")
+            raise UserError(f"the spec must give {', '.join(empty)} a range: a low and a higher high, both finite")
         self.bins, self.components = bins, len(spec.action)
         self.register_buffer("low", torch.as_tensor(low, dtype=torch.float32))
         self.register_buffer("high", torch.as_tensor(high, dtype=torch.float32))
@@ -243,7 +244,7 @@ class RT1Bins(EvenBins):
     def __init__(self, bins: Bins, *, spec: Spec, statistics: ActionStatistics | None = None) -> None:
         unknown = sorted(set(spec.units) - set(RT1_BOUNDS))
         if unknown:
-            raise ValueError(f"tokenizer=rt1 supports the units {sorted(RT1_BOUNDS)}, the spec has {unknown}")
+            raise UserError(f"tokenizer=rt1 supports the units {sorted(RT1_BOUNDS)}, the spec has {unknown}")
         bound = np.array([RT1_BOUNDS[unit] for unit in spec.units])
         super().__init__(spec, -bound, bound, bins)
 
@@ -257,13 +258,13 @@ def data_bounds(spec: Spec, statistics: ActionStatistics | None, margin: float =
     """Return (D,) bounds: the data extended by `margin` times its range, or without data the allowed range.
 
     Raises:
-        ValueError: the statistics have another number of components.
+        UserError: the statistics have another number of components.
     """
     allowed_low, allowed_high = np.array(spec.low), np.array(spec.high)
     low = allowed_low if statistics is None else np.asarray(statistics.low, dtype=np.float64)
     high = allowed_high if statistics is None else np.asarray(statistics.high, dtype=np.float64)
     if low.shape != allowed_low.shape:
-        raise ValueError(
+        raise UserError(
             f"the statistics describe actions of {low.size} components, the spec has {len(spec.action)}: "
             f"{', '.join(spec.action)}"
         )

@@ -12,6 +12,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from vla.io.errors import UserError
 from vla.io.types import Kernels, Widths
 
 POSITION_SCALE = 4.0  # of keypoint positions; large, because a hundredth of the image matters
@@ -90,7 +91,7 @@ class FilmConv(ImageEncoder):
         text_width: int,
     ) -> None:
         if not len(channels) == len(kernels) == len(strides):
-            raise ValueError(
+            raise UserError(
                 f"channels, kernels and strides need one entry per convolution, got {channels}, {kernels}, {strides}"
             )
         super().__init__(channels[-1] + 2 * positions)

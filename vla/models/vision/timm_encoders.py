@@ -15,6 +15,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from vla.io.errors import UserError
 from vla.io.types import Pixels, Width
 from vla.models.hub import fetch
 from vla.models.packaged import PackagedFile
@@ -107,7 +108,7 @@ class FilmBackbone(ImageEncoder):
         text_width: length of the text vector.
 
     Raises:
-        ValueError: timm has no such network, the size is unsupported, or the weights are not available.
+        UserError: timm has no such network, the size is unsupported, or the weights are not available.
     """
 
     def __init__(
@@ -125,7 +126,7 @@ class FilmBackbone(ImageEncoder):
         self.backbone.prune_intermediate_layers(1, prune_norm=False, prune_head=True)
         last = self.backbone.feature_info[-1]
         if size is not None and size % last["reduction"]:
-            raise ValueError(f"model.image.size={size} must be a multiple of {last['reduction']} px for {name}")
+            raise UserError(f"model.image.size={size} must be a multiple of {last['reduction']} px for {name}")
         self.size = size or self.backbone.pretrained_cfg["input_size"][-1]
         self.frozen = frozen
         self.normalized = "hiera" not in name  # the only family without a normalisation of feature maps
@@ -158,7 +159,7 @@ def load_backbone(name: str, pretrained: bool | str | PackagedFile, kind: str = 
         size: height and width of the images [px], for networks with a fixed input size.
 
     Raises:
-        ValueError: timm has no such network, or the weights are not available.
+        UserError: timm has no such network, or the weights are not available.
     """
     import timm  # slow to import, not needed by every policy
 
@@ -166,7 +167,7 @@ def load_backbone(name: str, pretrained: bool | str | PackagedFile, kind: str = 
     known = {*timm.list_models(pattern), *timm.list_pretrained(pattern)}
     if name not in known:
         close = ", ".join(get_close_matches(name, known, 5, 0))
-        raise ValueError(f"timm has no {kind or 'network'} called '{name}', it has {close} and others")
+        raise UserError(f"timm has no {kind or 'network'} called '{name}', it has {close} and others")
     config: Any = timm.get_pretrained_cfg(name)
     options: dict[str, Any] = {"num_classes": 0, "img_size": size if config.fixed_input_size else None}
     if isinstance(pretrained, PackagedFile):
@@ -180,12 +181,12 @@ def load_backbone(name: str, pretrained: bool | str | PackagedFile, kind: str = 
     # Without a classifier in network and file, timm loads the weights strictly.
     weights = _without_classifier(_renamed(_read(source), name), config.classifier)
     if not weights:
-        raise ValueError(f"{path} holds no weights")
+        raise UserError(f"{path} holds no weights")
     overlay = {"state_dict": weights, "classifier": None, "num_classes": 0}
     try:
         net: Any = timm.create_model(name, pretrained=True, pretrained_cfg_overlay=overlay, **options)
     except RuntimeError as error:
-        raise ValueError(f"{path} does not hold the weights of timm's {name}: {str(error).splitlines()[-1]}") from error
+        raise UserError(f"{path} does not hold the weights of timm's {name}: {str(error).splitlines()[-1]}") from error
     del net.pretrained_cfg["state_dict"]
     log.info("%s: weights loaded from %s", name, path)
     return net
@@ -201,7 +202,7 @@ def _weights_file(name: str, repository: str | None, pretrained: bool | str) -> 
     if isinstance(pretrained, str) and pretrained != "auto":
         path = Path(pretrained)
         if not path.is_file():
-            raise ValueError(
+            raise UserError(
                 f"model.image.pretrained is true, false, auto or a weights file, and there is no file {path}"
             )
         return path
@@ -211,7 +212,7 @@ def _weights_file(name: str, repository: str | None, pretrained: bool | str) -> 
         return fetch(repository, WEIGHTS) / WEIGHTS
     except OSError as error:
         if pretrained is True:
-            raise ValueError(
+            raise UserError(
                 f"the weights of {name} cannot be fetched ({error}): give model.image.pretrained the path of a weights "
                 "file, or false to start at random"
             ) from error
@@ -230,10 +231,10 @@ def _read(source: Path | PackagedFile) -> dict[str, Tensor]:
             return load_file(content)
         weights = dict(torch.load(content, map_location="cpu", weights_only=True))
         if not all(isinstance(each, Tensor) for each in weights.values()):
-            raise ValueError("it holds something else than tensors")
+            raise UserError("it holds something else than tensors")
         return weights
     except Exception as error:  # a pickle can raise nearly anything
-        raise ValueError(f"{path} cannot be read as weights, it is damaged or something else") from error
+        raise UserError(f"{path} cannot be read as weights, it is damaged or something else") from error
 
 
 def _renamed(weights: dict[str, Tensor], name: str) -> dict[str, Tensor]:

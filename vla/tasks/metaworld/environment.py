@@ -9,6 +9,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from annotated_types import Ge, Gt, Le, Predicate
 
+from vla.io.errors import UserError
 from vla.io.types import ImageSize, Names, Natural, Share, Text
 from vla.parallel.limits import free_memory
 from vla.spec import Array, Observation, Spec
@@ -76,15 +77,15 @@ class MetaWorld(Blindable):
             steps: largest number of steps of an episode.
 
         Raises:
-            ValueError: `metaworld` is not installed, or a task is unknown or has no sentence.
+            UserError: `metaworld` is not installed, or a task is unknown or has no sentence.
         """
         known = self._known = tasks_of("mt50")  # the truth names a task by its place here
         self.tasks = tuple(tasks_of(tasks) if isinstance(tasks, str) else tasks)
         listed = {*self.tasks, *sentences, *(name for names in tiers.values() for name in names)}
         if unknown := sorted(listed - {*known}):
-            raise ValueError(f"Meta-World has no task {', '.join(unknown)}: it has {', '.join(sorted(known))}")
+            raise UserError(f"Meta-World has no task {', '.join(unknown)}: it has {', '.join(sorted(known))}")
         if silent := [name for name in self.tasks if name not in sentences]:
-            raise ValueError(f"task.sentences has none for {', '.join(silent)}")
+            raise UserError(f"task.sentences has none for {', '.join(silent)}")
         self.spec = Spec(
             cameras=tuple(cameras),
             image_size=(image_size[0], image_size[1]),
@@ -131,7 +132,7 @@ class MetaWorld(Blindable):
     def step(self, action: Array) -> Observation:
         """Apply one (4,) action, clipped to the spec's bounds, for one control period."""
         if self.done:
-            raise ValueError("the episode is over; call reset(seed) before step(action)")
+            raise UserError("the episode is over; call reset(seed) before step(action)")
         observation, solved = self._scene.step(_command(np.clip(action, self.spec.low, self.spec.high)))
         self.outcome = "success" if solved else "timeout"
         self._taken += 1

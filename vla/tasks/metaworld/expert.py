@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from vla.io.errors import UserError
 from vla.spec import Array, Observation, Spec
 from vla.tasks.metaworld.environment import STATE, action_of
 from vla.tasks.metaworld.package import expert, tasks_of
@@ -21,10 +22,10 @@ class Scripted:
         """Args: the environment's spec.
 
         Raises:
-            ValueError: it is not that of Meta-World.
+            UserError: it is not that of Meta-World.
         """
         if spec.state != STATE:
-            raise ValueError("expert=metaworld acts in task=metaworld only: choose the expert of this task")
+            raise UserError("expert=metaworld acts in task=metaworld only: choose the expert of this task")
         self.info: dict[str, Any] = {}
         self._names = tasks_of("mt50")
         self._expert: Any = None
@@ -37,10 +38,10 @@ class Scripted:
         """Return the (4,) float32 action of the expert.
 
         Raises:
-            ValueError: the observation lacks the simulator's truth.
+            UserError: the observation lacks the simulator's truth.
         """
         if observation.truth is None:
-            raise ValueError("expert=metaworld needs the simulator's truth, which this observation lacks")
+            raise UserError("expert=metaworld needs the simulator's truth, which this observation lacks")
         if self._expert is None:
             self._expert = expert(self._names[int(observation.truth["task"][0])])
         return action_of(np.asarray(self._expert.get_action(observation.truth["observation"])))

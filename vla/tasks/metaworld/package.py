@@ -12,6 +12,8 @@ from typing import Any
 
 import mujoco
 
+from vla.io.errors import UserError
+
 VERSION = "-v3"
 # Where a weld holds a body: anchor (3), relative position (3) and quaternion (4), torque scale. A current MuJoCo has a
 # twelfth number, which upstream's row of eleven does not fit.
@@ -23,12 +25,12 @@ def metaworld() -> ModuleType:
     """Import the package and make its simulator construct models with this MuJoCo.
 
     Raises:
-        ValueError: it is not installed.
+        UserError: it is not installed.
     """
     try:
         from metaworld import env_dict, sawyer_xyz_env
     except ImportError as error:
-        raise ValueError(
+        raise UserError(
             f"task=metaworld needs the package metaworld, which is not installed ({error}): "
             "pip install 'vla[metaworld]'"
         ) from error

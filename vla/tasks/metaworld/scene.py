@@ -8,6 +8,7 @@ import mujoco
 import numpy as np
 from PIL import Image
 
+from vla.io.errors import UserError
 from vla.spec import Array
 from vla.tasks.metaworld.package import simulator
 from vla.tasks.rendering.renderer import WHOLE, Renderer, RendererFactory, View
@@ -47,13 +48,13 @@ class Scene:
         shadows: edge of the shadow map [texels]; 0: no shadows.
 
         Raises:
-            ValueError: there is no such camera.
+            UserError: there is no such camera.
         """
         self.simulator = simulator(task)
         model = self.model = self.simulator.model
         known = [model.camera(number).name for number in range(model.ncam)]
         if unknown := [name for name in cameras if name not in (*known, HAND)]:
-            raise ValueError(
+            raise UserError(
                 f"task.cameras names {', '.join(unknown)}; Meta-World has {', '.join(known)}, and {HAND}, which is "
                 f"the part of {CAMERA} around the hand"
             )

@@ -17,6 +17,7 @@ import mujoco
 import numpy as np
 from annotated_types import Ge, Le
 
+from vla.io.errors import UserError
 from vla.spec import Array
 from vla.tasks.gl import has_egl
 from vla.tasks.rendering import lights, shaders, shapes
@@ -67,12 +68,12 @@ class Fast:
         """Make a renderer of `model`.
 
         Raises:
-            RuntimeError: this machine has no EGL. Nothing else draws in its place, because a store names its renderer.
+            UserError: this machine has no EGL. Nothing else draws in its place, because a store names its renderer.
         """
         try:
             context = shared_context()
         except Exception as error:  # moderngl raises plain exceptions
-            raise RuntimeError(
+            raise UserError(
                 f"the fast renderer needs EGL, which this machine lacks ({error}): install the packages "
                 f"{PACKAGES}, or choose task/renderer=mujoco"
             ) from error

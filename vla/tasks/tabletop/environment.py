@@ -11,6 +11,7 @@ import mujoco
 import numpy as np
 from annotated_types import Le
 
+from vla.io.errors import UserError
 from vla.io.types import Count, ImageSize, Names, Point, Positive
 from vla.spec import FIRST_SEED, Array, Observation, Shape, Spec
 from vla.tasks.blind import Blindable
@@ -73,13 +74,13 @@ class Tabletop(Blindable):
             robot: an arm from a file; None: the Panda.
 
         Raises:
-            ValueError: an unknown camera, more blocks than colours, or a robot that does not work.
-            RuntimeError: this machine cannot render.
+            UserError: an unknown camera, more blocks than colours, or a robot that does not work.
+            UserError: this machine cannot render.
         """
         require_backend()
         most = len(COLOURS) - goal.absent
         if not goal.blocks <= blocks <= most:
-            raise ValueError(f"task.blocks must be from {goal.blocks} to {most}, one colour each, got {blocks}")
+            raise UserError(f"task.blocks must be from {goal.blocks} to {most}, one colour each, got {blocks}")
         chosen = FileRobot(robot, meshes) if robot else Panda(meshes=meshes)
         arm, joints = chosen.arm, len(chosen.joints)
         low = np.array([-TRANSLATION] * 3 + [-ROTATION] * 3 + [0.0])
@@ -102,7 +103,7 @@ class Tabletop(Blindable):
         self.simulation = Simulation(goal, randomize, scene, low, high, time_limit)
         known = self.simulation.compiled.cameras
         if unknown := sorted(set(cameras) - set(known)):
-            raise ValueError(f"unknown cameras {unknown}; task.cameras may list {sorted(known)}")
+            raise UserError(f"unknown cameras {unknown}; task.cameras may list {sorted(known)}")
         self.done, self.outcome, self.task = True, "timeout", ""
         self.milestones: frozenset[str] = frozenset()
         self.draws: dict[str, Any] = {}
@@ -141,7 +142,7 @@ class Tabletop(Blindable):
     def step(self, action: Array) -> Observation:
         """Apply one (7,) action, clipped to the spec's bounds, for one control period."""
         if self.done:
-            raise ValueError("the episode is over; call reset(seed) before step(action)")
+            raise UserError("the episode is over; call reset(seed) before step(action)")
         self.simulation.step(action)
         self._update_outcome(self.simulation.over)
         return self.look()
@@ -151,7 +152,7 @@ class Tabletop(Blindable):
         period.
 
         Raises:
-            ValueError: `seconds` is no whole number of physics steps.
+            UserError: `seconds` is no whole number of physics steps.
         """
         self.simulation.follow(joints, opening, seconds)
 

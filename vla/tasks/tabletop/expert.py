@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from vla.io.errors import UserError
 from vla.robots.cartesian import DOWN, rotation_z, vector_from_rotation
 from vla.spec import Array, Observation, Spec
 from vla.tasks.tabletop.goals.goal import SKILLS, Skill
@@ -43,11 +44,11 @@ class Waypoint:
         """Args: the environment's spec.
 
         Raises:
-            ValueError: there is no robot with a gripper.
+            UserError: there is no robot with a gripper.
         """
         self._low, self._high = np.array(spec.low), np.array(spec.high)
         if spec.robot is None or spec.robot.gripper is None:
-            raise ValueError("the expert of the tabletop acts in task=tabletop only: choose the expert of this task")
+            raise UserError("the expert of the tabletop acts in task=tabletop only: choose the expert of this task")
         self._gripper = spec.state.index(spec.robot.gripper)
         self.info: dict[str, Any] = {}
 
@@ -58,10 +59,10 @@ class Waypoint:
         """Return the (7,) action for this state.
 
         Raises:
-            ValueError: the observation lacks the simulator's truth.
+            UserError: the observation lacks the simulator's truth.
         """
         if observation.truth is None:
-            raise ValueError("the scripted expert needs the simulator's truth, which this observation lacks")
+            raise UserError("the scripted expert needs the simulator's truth, which this observation lacks")
         self.info = {}
         action = self._decide(observation.truth, float(observation.state[self._gripper]))
         return np.clip(action, self._low, self._high).astype(np.float32)

@@ -15,6 +15,7 @@ import numpy as np
 from dm_control import mjcf
 from dm_control.mujoco.wrapper import MjModel
 
+from vla.io.errors import UserError
 from vla.robots.cartesian import LIMIT_MARGIN, Kinematics, rotation_z
 from vla.spec import Array, RobotModel
 from vla.tasks.tabletop import fingertips, robot_spec
@@ -50,14 +51,12 @@ class FileRobot(Robot):
             meshes: drawn as hulls of few vertices ("light"), or as they are ("full").
 
         Raises:
-            ValueError: a file is missing or does not compile, a name is not in it, or a value does not fit it.
+            UserError: a file is missing or does not compile, a name is not in it, or a value does not fit it.
         """
         self._file, self._spec = file, file.read()
         start = robot_spec.checked_home(self._spec, file.joints, file.home)
         if file.open.keys() != file.closed.keys():
-            raise ValueError(
-                f"task.robot.open names {', '.join(file.open)}, task.robot.closed {', '.join(file.closed)}"
-            )
+            raise UserError(f"task.robot.open names {', '.join(file.open)}, task.robot.closed {', '.join(file.closed)}")
         robot_spec.simplify(self._spec, file.joints, file.open)
         robot_spec.set_armature(self._spec, file.joints, ARMATURE)
         body, position, rotation = robot_spec.add_tool(
@@ -110,7 +109,7 @@ class FileRobot(Robot):
         """Tabulate the opening, divide jaws that stay close at a hinge, and move the tool point between the fingertips.
 
         Raises:
-            ValueError: the opening does not change, or the tool point is far from the fingertips.
+            UserError: the opening does not change, or the tool point is far from the fingertips.
         """
         middles = self._close(sides)
         if self.widest - self.narrowest <= LEAST_TRAVEL:
@@ -125,16 +124,16 @@ class FileRobot(Robot):
             fingertips.soften(self._spec, side)
 
     def _require_grasp(self) -> None:
-        """Raise a ValueError if the fingertips are far from the tool point or hold no block."""
+        """Raise a UserError if the fingertips are far from the tool point or hold no block."""
         tool, tips = self._data.site(self.tool), [self._data.geom(tip).xpos for side in self.fingertips for tip in side]
         middle = tool.xmat.reshape(3, 3).T @ (np.mean(tips, axis=0) - tool.xpos)
         if np.linalg.norm(middle) > ASIDE:
-            raise ValueError(
+            raise UserError(
                 f"task.robot.offset: the middle between the fingertips is at {np.round(middle, 2).tolist()} m from the "
                 "tool point, forward, to the right and down: the tool point belongs there"
             )
         if self.widest - self.narrowest <= LEAST_TRAVEL:
-            raise ValueError(
+            raise UserError(
                 f"task.robot.open and task.robot.closed leave the fingertips {1000 * self.widest:.0f} and "
                 f"{1000 * self.narrowest:.0f} mm apart, which holds no block; task.robot.fingertips may name sites at "
                 "the ends of the jaws"

@@ -14,6 +14,7 @@ import mujoco
 import numpy as np
 from scipy.spatial import ConvexHull
 
+from vla.io.errors import UserError
 from vla.spec import Array
 from vla.tasks.rendering.shapes import mesh_triangles
 from vla.tasks.tabletop.model_file import require
@@ -37,7 +38,7 @@ def named(spec: mujoco.MjSpec, names: Sequence[str]) -> list[str]:
             tips += [_add(site.parent, f"vla_tip_{name}", site.type, pos=site.pos, quat=site.quat, size=site.size)]
     solid = [tip.name for tip in tips if tip.contype or tip.conaffinity]
     if not solid:
-        raise ValueError(
+        raise UserError(
             f"task.robot.fingertips names {', '.join(names)}, where nothing collides: add shapes that do, such as "
             "<collision> in a URDF"
         )

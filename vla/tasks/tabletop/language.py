@@ -9,6 +9,8 @@ from typing import Annotated, Literal
 import numpy as np
 from annotated_types import MaxLen, MinLen
 
+from vla.io.errors import UserError
+
 Phrasings = Annotated[Sequence[Annotated[str, MaxLen(300)]], MinLen(1)]
 Words = Annotated[Sequence[Annotated[str, MinLen(1), MaxLen(60)]], MinLen(1)]
 
@@ -37,7 +39,7 @@ class Grammar:
         held_out_colours: block colours that training instructions never name.
 
         Raises:
-            ValueError: a held-out part is empty, replaces nothing or overlaps with training, or a phrasing has a
+            UserError: a held-out part is empty, replaces nothing or overlaps with training, or a phrasing has a
                 malformed slot.
         """
         self.phrasings, self.words = tuple(phrasings), {slot: tuple(choices) for slot, choices in words.items()}
@@ -47,11 +49,11 @@ class Grammar:
         leaked = set(phrasings) & set(held_out_phrasings)
         leaked |= {word for slot, new in held_out_words.items() for word in new if word in words.get(slot, ())}
         if leaked:
-            raise ValueError(f"task.goal.language holds out what training also uses: {sorted(leaked)}")
+            raise UserError(f"task.goal.language holds out what training also uses: {sorted(leaked)}")
         if not held_out_phrasings or not held_out_words:
-            raise ValueError("the held-out part of task.goal.language is empty")
+            raise UserError("the held-out part of task.goal.language is empty")
         if not any(f"{{{slot}}}" in phrasing for phrasing in phrasings for slot in held_out_words):
-            raise ValueError("task.goal.language.held_out_words has no slot of the phrasings, so it replaces no word")
+            raise UserError("task.goal.language.held_out_words has no slot of the phrasings, so it replaces no word")
         self.slots = {slot for phrasing in (*phrasings, *held_out_phrasings) for slot in _slots(phrasing)} - {*words}
 
     def renamed(self, slots: Mapping[str, str]) -> Grammar:
@@ -105,9 +107,9 @@ def _slots(phrasing: str) -> set[str]:
     try:
         fields = list(Formatter().parse(phrasing))
     except ValueError as error:
-        raise ValueError(f"task.goal.language: {phrasing!r} has braces that do not match: {error}") from error
+        raise UserError(f"task.goal.language: {phrasing!r} has braces that do not match: {error}") from error
     slots = {name for _, name, _, _ in fields if name is not None}
     # A field of str.format could also access attributes or pad to any width.
     if not all(name.isidentifier() for name in slots) or any(form or conversion for _, _, form, conversion in fields):
-        raise ValueError(f"task.goal.language: in {phrasing!r} braces hold more than the name of a slot")
+        raise UserError(f"task.goal.language: in {phrasing!r} braces hold more than the name of a slot")
     return slots

@@ -16,6 +16,7 @@ from urllib.parse import unquote, urlsplit
 
 import mujoco
 
+from vla.io.errors import UserError
 from vla.io.suggestion import suggestion
 
 log = logging.getLogger(__name__)
@@ -29,15 +30,15 @@ def read(key: str, file: Path) -> mujoco.MjSpec:
     """Read a model, with absolute paths of its meshes and without its textures; `key` names the file in errors.
 
     Raises:
-        ValueError: there is no such file, no such mesh, or MuJoCo does not compile it.
+        UserError: there is no such file, no such mesh, or MuJoCo does not compile it.
     """
     path, named = Path(file).absolute(), f"task.robot.{key}={file}"
     if not path.is_file():
-        raise ValueError(f"{named}: there is no such file")
+        raise UserError(f"{named}: there is no such file")
     try:
         spec = mujoco.MjSpec.from_file(str(path))
     except (ValueError, mujoco.FatalError) as error:
-        raise ValueError(f"{named} does not compile: {_line(error)}") from error
+        raise UserError(f"{named} does not compile: {_line(error)}") from error
     for mesh in spec.meshes:
         if mesh.file:
             name = Path(mesh.file).name if spec.strippath else mesh.file
@@ -52,7 +53,7 @@ def read(key: str, file: Path) -> mujoco.MjSpec:
     try:
         spec.compile()
     except (ValueError, mujoco.FatalError) as error:
-        raise ValueError(f"{named} does not compile: {_line(error)}") from error
+        raise UserError(f"{named} does not compile: {_line(error)}") from error
     return spec
 
 
@@ -60,7 +61,7 @@ def _located(named: str, mesh: str, folder: Path, model: Path) -> Path:
     """Return the file of a mesh that is named by a path in a folder, or by an address as in ROS.
 
     Raises:
-        ValueError: an address of another kind, or of a package that is not found.
+        UserError: an address of another kind, or of a package that is not found.
     """
     if "://" not in mesh:
         return folder / mesh
@@ -69,13 +70,13 @@ def _located(named: str, mesh: str, folder: Path, model: Path) -> Path:
     if kind == "file":
         return Path("/", inside)
     if kind != "package":
-        raise ValueError(f"{named} has a mesh at {mesh}: meshes are at package://, file:// or a path")
+        raise UserError(f"{named} has a mesh at {mesh}: meshes are at package://, file:// or a path")
     installed = (prefix / "share" for prefix in _folders("AMENT_PREFIX_PATH"))
     sources = (each for folder in _folders("ROS_PACKAGE_PATH") for each in (folder, folder.parent))
     for parent in chain(model.parents, installed, sources):
         if (parent / package).is_dir():
             return parent / package / inside
-    raise ValueError(
+    raise UserError(
         f"{named} has a mesh at {mesh}: no folder {package} is above the file, in AMENT_PREFIX_PATH or in "
         "ROS_PACKAGE_PATH"
     )
@@ -107,12 +108,12 @@ def compiled(spec: mujoco.MjSpec) -> mujoco.MjModel:
     """Compile a model that was changed.
 
     Raises:
-        ValueError: it does not compile.
+        UserError: it does not compile.
     """
     try:
         return spec.compile()
     except (ValueError, mujoco.FatalError) as error:
-        raise ValueError(f"task.robot does not compile: {_line(error)}") from error
+        raise UserError(f"task.robot does not compile: {_line(error)}") from error
 
 
 def _line(error: Exception) -> str:
@@ -120,10 +121,10 @@ def _line(error: Exception) -> str:
 
 
 def require(key: str, names: Iterable[str], known: Iterable[str], kind: str) -> None:
-    """Raise a ValueError that lists the `kind` of elements that there are if one of `names` is not among them."""
+    """Raise a UserError that lists the `kind` of elements that there are if one of `names` is not among them."""
     there = [name for name in known if name]
     for name in names:
         if name not in there:
             listed = ", ".join(there[:LISTED]) + (", …" if len(there) > LISTED else "")
             hint = suggestion(name, there) or ":"
-            raise ValueError(f"task.robot.{key} names {name}, which is no {kind}{hint} there are {listed or 'none'}")
+            raise UserError(f"task.robot.{key} names {name}, which is no {kind}{hint} there are {listed or 'none'}")

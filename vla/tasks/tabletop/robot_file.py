@@ -11,6 +11,7 @@ from typing import Annotated
 import mujoco
 from annotated_types import MinLen
 
+from vla.io.errors import UserError
 from vla.io.types import Inherited, Names, Point, Positive, Text
 from vla.tasks.tabletop import model_file, robot_spec
 
@@ -62,7 +63,7 @@ class RobotFile:
         """Read the model of the arm with its hand.
 
         Raises:
-            ValueError: a file is missing or does not compile.
+            UserError: a file is missing or does not compile.
         """
         spec = model_file.read("file", self.file)
         if self.hand is not None:
@@ -77,7 +78,7 @@ class InstalledRobot(RobotFile):
         """Args: paths that begin with the name of a package, such as dm_control/third_party/kinova/jaco_arm.xml.
 
         Raises:
-            ValueError: no such package, or a path out of it.
+            UserError: no such package, or a path out of it.
         """
         super().__init__(file=_installed(file), hand=_installed(hand) if hand else None, **inherited)
 
@@ -89,5 +90,5 @@ def _installed(path: str) -> Path:
     source = Path(found.origin).absolute() if found and found.origin else Path()
     file = Path(normpath(source.parent / rest))
     if source.name != "__init__.py" or source.parents[1] == Path.cwd() or source.parent not in file.parents:
-        raise ValueError(f"task.robot: {path} must begin with the name of an installed package and stay within it")
+        raise UserError(f"task.robot: {path} must begin with the name of an installed package and stay within it")
     return file

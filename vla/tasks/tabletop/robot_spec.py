@@ -8,6 +8,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from vla.io.errors import UserError
 from vla.io.types import Names
 from vla.robots.cartesian import DOWN
 from vla.spec import Array
@@ -28,23 +29,23 @@ def checked_home(spec: mujoco.MjSpec, joints: Names, home: Sequence[float]) -> d
     """Return joint → position at home.
 
     Raises:
-        ValueError: no such joint, one that is not a hinge or not in order, or a position out of its limits.
+        UserError: no such joint, one that is not a hinge or not in order, or a position out of its limits.
     """
     require("joints", joints, (joint.name for joint in spec.joints), "joint")
     if len(home) != len(joints):
-        raise ValueError(f"task.robot.home has {len(home)} positions for {len(joints)} joints")
+        raise UserError(f"task.robot.home has {len(home)} positions for {len(joints)} joints")
     model = compiled(spec)
     carried = set(range(model.nbody))
     for name, position in zip(joints, home, strict=True):
         joint = model.joint(name)
         if int(joint.bodyid[0]) not in carried:
-            raise ValueError(f"task.robot.joints names {name} after a joint that does not carry it: base to tip")
+            raise UserError(f"task.robot.joints names {name} after a joint that does not carry it: base to tip")
         carried = descendants(model, int(joint.bodyid[0]))
         if joint.type[0] != mujoco.mjtJoint.mjJNT_HINGE:
-            raise ValueError(f"task.robot.joints names {name}, which is not a hinge")
+            raise UserError(f"task.robot.joints names {name}, which is not a hinge")
         low, high = joint.range
         if model.jnt_limited[joint.id] and not low <= position <= high:
-            raise ValueError(f"task.robot.home has {name} at {position}, outside its limits, {low:.3f} to {high:.3f}")
+            raise UserError(f"task.robot.home has {name} at {position}, outside its limits, {low:.3f} to {high:.3f}")
     return dict(zip(joints, home, strict=True))
 
 
@@ -196,7 +197,7 @@ def add_tool(
         Body that it is on, position (3,) [m] and rotation (3, 3) of the tool in that body.
 
     Raises:
-        ValueError: no such name, or no axes that point there.
+        UserError: no such name, or no axes that point there.
     """
     model = compiled(spec)
     require("tool", [name], (element.name for element in (*spec.sites, *spec.bodies)), "site or body")
@@ -210,7 +211,7 @@ def add_tool(
     axes = (base @ at.xmat.reshape(3, 3)).T @ DOWN  # columns: forward, right, down as seen from it
     turn = np.round(axes)
     if np.abs(axes).max(axis=0).min() < ALIGNED or abs(np.linalg.det(turn) - 1) > 0.1:
-        raise ValueError(
+        raise UserError(
             f"task.robot.home leaves the axes of {name} askew: one must point down and one forward, up to "
             f"{np.degrees(np.arccos(ALIGNED)):.0f} degrees; in its frame down is {np.round(axes[:, 2], 2).tolist()}, "
             f"forward {np.round(axes[:, 0], 2).tolist()}"

@@ -10,6 +10,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from vla.io.errors import UserError
 from vla.robots.cartesian import CartesianController, solve
 from vla.spec import FIRST_SEED, Array
 from vla.tasks.streams import Streams
@@ -184,7 +185,7 @@ class Simulation:
         # The sort is stable: without held-out colours it changes nothing.
         order.sort(key=lambda index: (self.compiled.block_names[index] in colours) != (held_out == "combinations"))
         if held_out != "combinations" and self.compiled.block_names[order[0]] in colours:
-            raise ValueError(
+            raise UserError(
                 "task.goal.language.held_out_colours: all blocks of a scene have such a colour, so none can be named: "
                 "hold out fewer, or raise task.randomize.distractors.count"
             )
@@ -236,12 +237,12 @@ class Simulation:
         An arm that is pushed returns afterwards, because its driver does not know.
 
         Raises:
-            ValueError: `seconds` is no whole number of physics steps.
+            UserError: `seconds` is no whole number of physics steps.
         """
         timestep = self._physics.timestep()
         substeps = round(seconds / timestep)
         if not math.isclose(substeps * timestep, seconds):
-            raise ValueError(
+            raise UserError(
                 f"the arm cannot be driven at {1 / seconds:g} Hz, as physics runs at {1 / timestep:g} Hz: choose a "
                 "whole fraction of that"
             )

@@ -7,6 +7,7 @@ from pathlib import Path
 from subprocess import PIPE, Popen
 from typing import Any
 
+from vla.io.errors import UserError
 from vla.parallel.processes import one_thread_each
 
 DURATION = 20.0  # of the measurement of another project [s]
@@ -23,17 +24,17 @@ def peer(name: str, python: str, script: str, arguments: Sequence[Any], processe
         processes: their number.
 
     Raises:
-        ValueError: the interpreter or the script fails.
+        UserError: the interpreter or the script fails.
     """
     command = [python, str(Path(__file__).parent / script), *map(str, arguments)]
     with one_thread_each():
         try:
             started = [Popen(command, stdout=PIPE, stderr=PIPE, text=True) for _ in range(processes)]
         except OSError as error:
-            raise ValueError(f"benchmark.{name} is {python}, which cannot be run: {error.strerror}") from error
+            raise UserError(f"benchmark.{name} is {python}, which cannot be run: {error.strerror}") from error
         outputs = [process.communicate() for process in started]
     failed = [errors for process, (_, errors) in zip(started, outputs, strict=True) if process.returncode]
     if failed:
         last = failed[0].strip().splitlines()[-1:] or ["no output"]
-        raise ValueError(f"benchmark.{name} is {python}, with which {name} does not run: {last[0]}")
+        raise UserError(f"benchmark.{name} is {python}, with which {name} does not run: {last[0]}")
     return sum(float(printed.split()[-1]) for printed, _ in outputs)

@@ -9,6 +9,7 @@ from typing import Annotated, TypeVar
 import numpy as np
 from annotated_types import Ge, Le
 
+from vla.io.errors import UserError
 from vla.tasks.tabletop.goals.goal import Arrangement, Goal, Referents
 
 T = TypeVar("T")
@@ -34,17 +35,17 @@ class Chain:
         """Args: name → goal, or None to omit it; number of instructions.
 
         Raises:
-            ValueError: no goal remains, one cannot be part of a chain, or there are not enough possible instructions.
+            UserError: no goal remains, one cannot be part of a chain, or there are not enough possible instructions.
         """
         self.goals = {name: goal for name, goal in goals.items() if goal is not None}
         self.length = length
         if not self.goals:
-            raise ValueError("task.goal.goals names no goal")
+            raise UserError("task.goal.goals names no goal")
         for name, goal in self.goals.items():
             if type(goal).after is Goal.after:
-                raise ValueError(f"task.goal.goals.{name} cannot be part of a chain: it does not define `after`")
+                raise UserError(f"task.goal.goals.{name} cannot be part of a chain: it does not define `after`")
             if goal.language.held_out_colours:
-                raise ValueError(
+                raise UserError(
                     f"task.goal.goals.{name}.language.held_out_colours: a chain names blocks of all colours"
                 )
         self.blocks = max(goal.blocks for goal in self.goals.values())
@@ -59,11 +60,11 @@ class Chain:
         """Draw the goals with what they name, from so many blocks: every goal that is possible is equally likely.
 
         Raises:
-            ValueError: there is no such chain.
+            UserError: there is no such chain.
         """
         links = self._continued([], Arrangement(), blocks, random_state)
         if links is None:
-            raise ValueError(
+            raise UserError(
                 f"{', '.join(self.goals)} give no chain of {self.length} instructions with {blocks} blocks: lower "
                 "task.goal.length or add goals"
             )

@@ -10,6 +10,7 @@ from typing import Literal
 
 import numpy as np
 
+from vla.io.errors import UserError
 from vla.io.types import Count
 from vla.spec import Array
 from vla.tasks.tabletop.language import Grammar
@@ -126,9 +127,9 @@ class Goal(ABC):
     def __init__(self, language: Grammar, hold_steps: Count) -> None:
         known = ["block", "other"][: self.named] + ["pad", "rest"][: self.pads] + ["absent"] * bool(self.absent)
         if unknown := sorted(language.slots - set(known)):
-            raise ValueError(f"task.goal.language has the slots {unknown}, but {type(self).__name__} fills {known}")
+            raise UserError(f"task.goal.language has the slots {unknown}, but {type(self).__name__} fills {known}")
         if strange := sorted(set(language.held_out_colours) - set(COLOURS)):
-            raise ValueError(f"task.goal.language.held_out_colours has {strange}, the colours are {', '.join(COLOURS)}")
+            raise UserError(f"task.goal.language.held_out_colours has {strange}, the colours are {', '.join(COLOURS)}")
         self.language, self.hold_steps = language, hold_steps
 
     @property

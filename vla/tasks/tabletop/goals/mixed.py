@@ -6,6 +6,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from vla.io.errors import UserError
 from vla.io.types import Share
 from vla.tasks.tabletop.goals.goal import Goal
 from vla.tasks.tabletop.goals.stay import Stay, Wait, absent_colours_needed
@@ -23,13 +24,13 @@ class Mixed:
         empty instruction.
 
         Raises:
-            ValueError: no goal remains, or the shares exceed one.
+            UserError: no goal remains, or the shares exceed one.
         """
         self.goals = {name: goal for name, goal in goals.items() if goal is not None}
         if not self.goals:
-            raise ValueError("task.goal.goals names no goal")
+            raise UserError("task.goal.goals names no goal")
         if impossible + silent > 1:
-            raise ValueError(f"task.goal.impossible and task.goal.silent are {impossible + silent:g} in all, at most 1")
+            raise UserError(f"task.goal.impossible and task.goal.silent are {impossible + silent:g} in all, at most 1")
         self.impossible, self.silent = impossible, silent
         self.blocks = max(goal.blocks for goal in self.goals.values())
         kept = [absent_colours_needed(goal.language) for goal in self.goals.values() if impossible]

@@ -10,6 +10,7 @@ from typing import Annotated, Any
 import numpy as np
 from annotated_types import Ge, Le, MinLen, Predicate
 
+from vla.io.errors import UserError
 from vla.io.types import CountRange, NonNegative, PositiveRange, Share, ascending, unique
 from vla.tasks.tabletop.compiled_scene import CompiledScene
 from vla.tasks.tabletop.randomize.randomizer import Angles, Places, rounded
@@ -32,7 +33,7 @@ class Distractors:
         """Draw the number; other axes draw for every block, so their draws do not depend on it."""
         low, high = self.count
         if high >= len(scene.block_geoms):
-            raise ValueError(f"{high} distractors need task.blocks={high + 1}, it is {len(scene.block_geoms)}")
+            raise UserError(f"{high} distractors need task.blocks={high + 1}, it is {len(scene.block_geoms)}")
         count = int(random_state.randint(low, high + 1))
         scene.present = count + 1
         return {"count": count}
@@ -46,15 +47,15 @@ class Colours:
     jitter: Share  # maximum change of each channel, 0…1
 
     def __post_init__(self) -> None:
-        """Raise a ValueError if a colour is unknown."""
+        """Raise a UserError if a colour is unknown."""
         if unknown := sorted(set(self.names) - set(COLOURS)):
-            raise ValueError(f"unknown colours {unknown}, expected some of {sorted(COLOURS)}")
+            raise UserError(f"unknown colours {unknown}, expected some of {sorted(COLOURS)}")
 
     def __call__(self, scene: CompiledScene, random_state: np.random.RandomState) -> dict[str, Any]:
         """Draw names and tints."""
         count = len(scene.block_geoms)
         if count > len(self.names):
-            raise ValueError(f"{count} blocks need as many colours, but the colour axis has {list(self.names)}")
+            raise UserError(f"{count} blocks need as many colours, but the colour axis has {list(self.names)}")
         names = [self.names[index] for index in random_state.permutation(len(self.names))[:count]]
         tint = random_state.uniform(-self.jitter, self.jitter, (count, 3))
         rgb = np.clip([COLOURS[name] for name in names] + tint, 0, 1)
@@ -83,9 +84,9 @@ class Shapes:
     names: Annotated[Sequence[str], MinLen(1)]  # to draw from
 
     def __post_init__(self) -> None:
-        """Raise a ValueError if a shape is unknown."""
+        """Raise a UserError if a shape is unknown."""
         if unknown := sorted(set(self.names) - set(SHAPES)):
-            raise ValueError(f"unknown shapes {unknown}, expected some of {sorted(SHAPES)}")
+            raise UserError(f"unknown shapes {unknown}, expected some of {sorted(SHAPES)}")
 
     def __call__(self, scene: CompiledScene, random_state: np.random.RandomState) -> dict[str, Any]:
         """Draw a shape per block."""
@@ -135,7 +136,7 @@ class Placement:
         """Draw a place for every pad and block in turn, also for those that will be absent.
 
         Raises:
-            ValueError: the rectangle is too small.
+            UserError: the rectangle is too small.
         """
         count = len(scene.block_geoms)
         # Equal room for every block, so that this draw is independent of sizes, shapes and distractors.
@@ -145,7 +146,7 @@ class Placement:
             if len(centres) == len(radii):
                 break
         else:
-            raise ValueError(
+            raise UserError(
                 f"no room for {len(PADS)} pads and {count} blocks {self.clearance} m apart in x {self.x}, y {self.y}; "
                 "widen task.randomize.placement or lower its clearance"
             )

@@ -10,6 +10,7 @@ from typing import Annotated, Any
 import numpy as np
 from annotated_types import MinLen
 
+from vla.io.errors import UserError
 from vla.io.types import Natural, Share
 from vla.tasks.tabletop.compiled_scene import CompiledScene
 from vla.tasks.tabletop.language import Words
@@ -59,10 +60,10 @@ def paraphrase(instruction: str, words: Mapping[str, str], names: Iterable[str])
         names: what the instruction names, such as colours.
 
     Raises:
-        ValueError: nothing is replaced, or a name remains.
+        UserError: nothing is replaced, or a name remains.
     """
     phrases = sorted(words, key=len, reverse=True)
     replaced = re.sub(rf"\b({'|'.join(map(re.escape, phrases))})\b", lambda found: words[found[0]], instruction)
     if replaced == instruction or set(names) & set(re.findall(r"\w+", replaced)):
-        raise ValueError(f"task.randomize.phrasing.words has no other words for all that is named in {instruction!r}")
+        raise UserError(f"task.randomize.phrasing.words has no other words for all that is named in {instruction!r}")
     return replaced
