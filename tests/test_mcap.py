@@ -98,7 +98,7 @@ def test_without_rosbags_the_sentence_says_what_to_install(tmp_path: Path) -> No
         capture_output=True,
         text=True,
     )
-    assert "ValueError: export=mcap needs the package rosbags" in done.stderr
+    assert "UserError: export=mcap needs the package rosbags" in done.stderr
 
 
 @pytest.mark.parametrize(
