@@ -31,7 +31,7 @@ def kills(root: Path) -> Trials:
     yield from killed(root, "train", train, 2, 3, weights)
     evaluate = (f"checkpoint={CHECKPOINT}", "evaluate.episodes=6", "cluster.workers=1", "output=OUT")
     yield from killed(root, "evaluate", evaluate, 1, 3, reported)
-    for format in ("lerobot", "files", "mcap"):
+    for format in ("lerobot", "files"):
         export = (*SMALL, "job=export", f"export={format}", "export.folder=OUT", "collect.folder=store", "output=wrong")
         yield from killed(root, f"export {format}", export, 1, 2, digest)
 

@@ -16,7 +16,7 @@ import numpy as np
 from arm import ROBOT
 from trials import CHECKPOINT, Trials
 
-from vla.deploy.joint_limiter import Robot
+from vla.deploy.joint_limiter import JointLimits
 from vla.deploy.messages import fill_image
 from vla.deploy.ros import RosNetwork, ros
 from vla.robots.panda import HOME
@@ -63,7 +63,7 @@ def messages(root: Path) -> Trials:
 class World:
     """Cameras, an arm that follows its commands exactly, and a person."""
 
-    def __init__(self, robot: Robot) -> None:
+    def __init__(self, robot: JointLimits) -> None:
         import rclpy
         from rclpy.executors import SingleThreadedExecutor
         from sensor_msgs.msg import Image, JointState

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from vla.deploy.control_loop import Safety
-from vla.deploy.joint_limiter import Robot
+from vla.deploy.joint_limiter import JointLimits
+from vla.deploy.safety import Safety
 from vla.robots.panda import CHAIN, JOINT_HIGH, JOINT_LOW
 from vla.spec import RobotModel, Spec
 
@@ -25,7 +25,7 @@ SPEC = Spec(
     robot=ARM,
 )
 
-ROBOT = Robot(
+ROBOT = JointLimits(
     joints=list(JOINTS),
     low=JOINT_LOW.tolist(),
     high=JOINT_HIGH.tolist(),

@@ -188,7 +188,7 @@ def server(bench: Bench) -> None:
 def ros(bench: Bench) -> None:
     """Simulator, policy and operator over ROS 2."""
     bench.run("job=deploy", "deploy=loop", "deploy.episodes=1", bench.policy(), "output=loop")
-    require((bench.folder / "loop/session.rrd").exists(), "session.rrd")
+    require(any((bench.folder / "loop/bag").glob("*.mcap")), "a bag")
 
 
 def sweep(bench: Bench) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import random
-import resource
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -13,11 +12,10 @@ import composing
 import numpy as np
 import pytest
 from arm import ROBOT, SPEC
-from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
+from rosbags.rosbag2 import StoragePlugin
 
 from vla.config.build import build
 from vla.config.experiment import plain
-from vla.deploy import bag as bag_files
 from vla.deploy.bag_import import BagDemonstrations
 from vla.deploy.settings import Topics
 from vla.spec import Episode
@@ -135,7 +133,6 @@ def test_joint_positions_of_any_robot_are_learned_from_a_bag_alone(bag: Path) ->
         ({"topics": replace(TOPICS, images={"front": "/top", "wrist": "/wrist"})}, "has no topic /top, it has"),
         ({"topics": replace(TOPICS, joint_states="/front")}, "/front is of type sensor_msgs/msg/Image, expect"),
         ({"robot": replace(ROBOT, joints=[f"fr3_joint{n}" for n in range(1, 8)])}, "lacks fr3_joint1, .* has"),
-        ({"robot": replace(ROBOT, fingers=["thumb"])}, "can be used: joint state lacks thumb; it has left"),
         ({"status": "/status"}, "no topic /status, .* choose it with expert.status=/vla_agent/status"),
         ({"spec": replace(SPEC, robot=None)}, "expert=bag needs a robot"),
         ({"spec": replace(SPEC, cameras=("top",))}, r"no topic for the cameras top: add \+expert\.topics"),
@@ -170,7 +167,9 @@ def test_without_a_correction_there_is_nothing_to_import_but_what_the_policy_did
 
 @pytest.mark.parametrize("name", ["bag.mcap", "metadata.yaml"])
 def test_a_damaged_bag_is_imported_or_refused_in_a_sentence(tmp_path: Path, name: str) -> None:
-    """Bits that flip in many places, ends that are missing, sizes that are huge."""
+    """Bits that flip in many places, ends that are missing, sizes that are huge; folders that are no bags."""
+    with pytest.raises(ValueError, match=r"is not a bag: it has no metadata\.yaml"):
+        imported(tmp_path)
     whole = bags.write(tmp_path / "bag", bags.SESSION[9:])
     data, generator = (whole / name).read_bytes(), random.Random(0)
     refused = 0
@@ -191,28 +190,3 @@ def test_a_damaged_bag_is_imported_or_refused_in_a_sentence(tmp_path: Path, name
             assert str(whole) in str(error) and "\n" not in str(error) and len(str(error)) < 1000
             refused += 1
     assert refused > 5
-
-
-@pytest.mark.parametrize("mode", [CompressionMode.STORAGE, CompressionMode.MESSAGE, CompressionMode.FILE])
-def test_a_small_bag_that_unpacks_to_a_huge_size_is_refused(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, mode: CompressionMode
-) -> None:
-    """What it may take is bounded while a bag is open, and only then."""
-    storage = StoragePlugin.MCAP if mode is CompressionMode.STORAGE else StoragePlugin.SQLITE3
-    writer = Writer(tmp_path / "bag", version=9, storage_plugin=storage)
-    writer.set_compression(mode, CompressionFormat.ZSTD)
-    text = bags.make("std_msgs/msg/String", data="\0" * (48 << 20))
-    with writer:
-        connection = writer.add_connection("/words", text.__msgtype__, typestore=bags.TYPES)
-        writer.write(connection, bags.START, bags.TYPES.serialize_cdr(text, text.__msgtype__))
-    assert sum(file.stat().st_size for file in (tmp_path / "bag").iterdir()) < 1 << 20
-    monkeypatch.setattr(bag_files, "MAX_MEMORY", 16 << 20)
-    monkeypatch.setattr(bag_files, "MAX_FILE_SIZE", 16 << 20)
-    limits = (resource.RLIMIT_DATA, resource.RLIMIT_FSIZE)
-    before = [resource.getrlimit(limit) for limit in limits]
-    with (
-        pytest.raises(ValueError, match=r"bag (needs more than 0 GiB of memory|is damaged or not a bag: .*too large)"),
-        bag_files.opened(tmp_path / "bag") as reader,
-    ):
-        list(bag_files.messages_of(reader, reader.connections, tmp_path / "bag"))
-    assert [resource.getrlimit(limit) for limit in limits] == before

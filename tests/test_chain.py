@@ -13,10 +13,10 @@ from conftest import make_tabletop
 from defaults import defaults_of
 from rerun.chunk import RrdReader
 
-from vla.deploy.joint_limiter import Robot
+from vla.deploy.joint_limiter import JointLimits
 from vla.deploy.ros import RosNetwork
 from vla.deploy.ros2 import SimulatorDeployment
-from vla.deploy.settings import Timing, Topics
+from vla.deploy.settings import Topics
 from vla.reports.evaluation import summary, write_report
 from vla.reports.run_page import write_page
 from vla.rollouts.evaluate import play
@@ -235,15 +235,14 @@ def test_disturbances_are_of_the_episode_not_of_an_instruction() -> None:
 
 def test_a_simulator_that_plays_single_instructions_refuses_a_chain(chain: Tabletop, tmp_path: Path) -> None:
     parts: dict[str, Any] = {
-        "robot": Robot(**defaults_of("deploy/robot/simulated")),
+        "robot": JointLimits(**defaults_of("deploy/robot/simulated")),
         "topics": Topics(**defaults_of("deploy/topics/isaac")),
-        "timing": Timing(10.0, 10.0, 0.0, 0.5, False, 1.0),
+        **defaults_of("deploy/simulator", seed=FIRST),
     }
     nothing: Any = None
     deployment = SimulatorDeployment(
         **parts,
         network=RosNetwork.named("loopback"),
-        seed=FIRST,
         policy=nothing,
         environment=lambda: chain,
         output=tmp_path,

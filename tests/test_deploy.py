@@ -30,7 +30,6 @@ from defaults import defaults_of
 from documented import TEXT
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
-from rerun.chunk import RrdReader
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from warm import Started
@@ -38,7 +37,6 @@ from warm import Started
 from vla.config.experiment import Experiment
 from vla.data.episodes import EpisodeStore
 from vla.deploy import messages
-from vla.deploy.bag import POLICY_INPUTS
 from vla.deploy.demo_operator import DemoOperator
 from vla.deploy.loop import Loop
 from vla.deploy.messages import SimulatedEpisode
@@ -48,7 +46,6 @@ from vla.io.images import resize
 from vla.jobs import deploy as job
 from vla.models.policy_folder import read_policy
 from vla.robots.panda import forward
-from vla.rollouts.recorder import VIEWER
 from vla.rollouts.results import Result
 from vla.tasks import gl as backend
 
@@ -112,13 +109,6 @@ class Probe:
         self.until(lambda: self._words.get_subscription_count() >= 2)
         self._words.publish(String(data=words))
 
-    def published_by(self, node: str) -> set[str]:
-        """Return the discovered topics of another node."""
-        if node not in self.node.get_node_names():
-            return set()
-        topics = self.node.get_publisher_names_and_types_by_node(node, "/")
-        return {name for name, _ in topics} - {"/rosout", "/parameter_events"}
-
     def discovered(self) -> set[str]:
         """Return the discovered nodes, topics and services."""
         graph = (self.node.get_topic_names_and_types(), self.node.get_service_names_and_types())
@@ -154,8 +144,7 @@ def test_an_instruction_moves_the_arm_and_a_signal_leaves_it_at_rest(
     number = signal.SIGTERM
     simulator = start("vla.run", "job=deploy", "deploy=simulator", CHECKPOINT)
     agent = start("vla.run", "job=deploy", "deploy=ros2", CHECKPOINT, "--ros-args", "-p", "speed_share:=0.3")
-    watch = start("vla.deploy.watch")
-    view = start("vla.deploy.view", "--save", "view.rrd")
+    record = start("vla.deploy.record", "bag")
     probe.until(lambda: probe.states and probe.commands)
     probe.until(lambda: probe.discovered() >= documented_names())  # names arrive after the first messages
     np.testing.assert_allclose(probe.commands[0].position[:7], probe.states[0].position[:7], atol=1e-3)
@@ -168,12 +157,9 @@ def test_an_instruction_moves_the_arm_and_a_signal_leaves_it_at_rest(
     last, before = probe.commands[-1].position, probe.commands[-2].position
     assert last[:7] == before[:7] and probe.moved() < 1e-3  # it braked before it ended
     simulator.send_signal(number)
-    watch.send_signal(number)
-    view.send_signal(number)
-    assert simulator.wait(10) == 0 and watch.wait(10) == 0 and view.wait(10) == 0
-    seen = {chunk.entity_path for chunk in RrdReader(home / "view.rrd").stream().to_chunks()}
-    assert {"/camera/isaac/camera/image_raw", "/joints/commanded/panda_joint7", "/words", "/world/arm"} <= seen
-    assert "running" in watch.printed()
+    record.send_signal(number)
+    assert simulator.wait(10) == 0 and record.wait(10) == 0
+    assert re.fullmatch(r"[1-9]\d+ messages in bag\n", record.printed())
 
 
 @pytest.mark.realtime
@@ -189,6 +175,8 @@ def test_the_shell_stops_and_resumes_the_agent_and_when_that_is_killed_the_simul
     probe.until(lambda: probe.moved() < 1e-4)
     assert start("vla.deploy.say", "--resume", "put the blue block on the pad").wait(30) == 0
     probe.until(lambda: probe.moved() > 1e-3)
+    state = start("vla.deploy.say", "--state").printed(30)
+    assert "  state: running\n" in state and "inference p50 [ms]: " in state
     refused = start("vla.deploy.say", "--resume", "put the blue block on the pad")
     assert "error: nothing to resume" in refused.printed(30) and refused.wait() == 1
     reset = start("vla.deploy.say", "--reset", "put the blue block on the pad")
@@ -231,9 +219,7 @@ def test_when_the_simulator_is_killed_the_agent_holds_the_arm_and_logs_the_reaso
 
 
 @pytest.mark.realtime
-def test_the_whole_loop_reports_and_its_bag_moves_an_agent_again(
-    home: Path, start: Callable[..., Started], probe: Probe
-) -> None:
+def test_the_whole_loop_reports_and_its_bag_is_learned_from(home: Path, start: Callable[..., Started]) -> None:
     limit = "task.time_limit=1.5"
     loop = start("vla.run", "job=deploy", "deploy=loop", CHECKPOINT, limit, "deploy.episodes=2", "output=loop")
     printed = loop.printed(100)
@@ -243,24 +229,6 @@ def test_the_whole_loop_reports_and_its_bag_moves_an_agent_again(
     assert report["seeds"] == [1_000_000, 1_000_001] and report["checkpoint"] == CHECKPOINT.partition("=")[2]
     # As simulated, whatever the clock says.
     assert [(each["steps"], each["motion"]["time_s"]) for each in report["per_episode"]] == [(15, 1.5), (15, 1.5)]
-    recorded = subprocess.run([VIEWER, "rrd", "stats", "loop/session.rrd"], cwd=home, capture_output=True, text=True)
-    for entity in (
-        "camera/isaac/camera/image_raw",
-        "joints/commanded/panda_joint7",
-        "gripper/measured",
-        "words",
-        "world/panda.hand",
-    ):
-        assert entity in recorded.stdout
-    probe.commands.clear()
-    start("vla.run", "job=deploy", "deploy=ros2", CHECKPOINT, "deploy.safety.tracking=9")
-    probe.until(lambda: probe.node.count_subscribers("/isaac/franka/joint_states") > 1)  # the agent subscribes, too
-    player = start("vla.deploy.bag", "play", "loop/bag", "--speed", "2")
-    probe.until(lambda: probe.published_by("vla_bag") >= {*POLICY_INPUTS})
-    assert probe.published_by("vla_bag") == {*POLICY_INPUTS}  # and no commands
-    assert player.wait(60) == 0, player.printed()
-    probe.spin(0.2)
-    assert np.ptp([command.position[:7] for command in probe.commands], axis=0).max() > 0.01
     learn_from_the_bag(home)
 
 
@@ -268,7 +236,7 @@ def test_an_episode_that_breaks_off_is_an_error_of_the_loop(tmp_path: Path, monk
     def play() -> Result:
         if results:
             return results.pop()
-        raise ValueError("timed out after 60 s")
+        raise UserError("timed out after 60 s")
 
     results = [Result(5, "success")]
     operator = SimpleNamespace(play=play, stopped=threading.Event(), status={})
@@ -326,7 +294,7 @@ def test_the_node_acts_like_the_evaluated_policy(home: Path) -> None:
         fingers = [float(observation.state[14]) / 2] * 2
         state = JointState(name=[*names, "left", "right"], position=[*observation.state[:7].tolist(), *fingers])
         state.velocity = [*observation.state[7:14].tolist(), 0.0, 0.0]
-        joints, velocities, gripper = messages.joints_from(state, robot)
+        joints, velocities, gripper = messages.JointStates(robot).read(state, 0.0) or pytest.fail("it has the arm")
         size = environment.spec.image_size
         rgb = {camera: resize(messages.image_from(message), size, "centre") for camera, message in images.items()}
         seen = Observation(rgb, np.array([*joints, *velocities, gripper], np.float32), observation.instruction)
@@ -346,14 +314,12 @@ def test_arguments_of_ros_are_split_off() -> None:
     [
         (["deploy=ros2", "agent=expert"], "plans no chunks of actions"),
         ([CHECKPOINT, "deploy=ros2", "deploy.network.profile=nowhere.xml"], "nowhere.xml"),
-        ([CHECKPOINT, "deploy=ros2", "deploy.network.domain=9999"], "9999"),
         ([CHECKPOINT, "deploy=ros2", "deploy.topics.commands='bad topic!'"], "topics.commands is 'bad topic!'"),
         ([CHECKPOINT, "deploy=ros2", "--ros-args", "--nonsense"], "--nonsense"),
-        ([CHECKPOINT, "deploy=ros2", "--ros-args", "-p", "command_hz:=0.0"], "command_hz out of range"),
-        ([CHECKPOINT, "deploy=loop", "deploy.episodes=0"], "deploy.episodes"),
+        ([CHECKPOINT, "deploy=ros2", "--ros-args", "-p", "speed_share:=2.0"], "speed_share out of range"),
         ([CHECKPOINT, "deploy=loop", "deploy.agent.command=trajectory"], "obeys deploy.agent.command=joint_state only"),
         (
-            [CHECKPOINT, "deploy=simulator", "deploy.timing.joints_hz=25"],
+            [CHECKPOINT, "deploy=simulator", "deploy.joints_hz=25"],
             "joints_hz=25 must be a multiple of the task's 10",
         ),
         ([CHECKPOINT, "deploy=ros2", "~deploy.topics.images.wrist"], "wrist"),
@@ -438,16 +404,8 @@ EPISODE = {
 @pytest.mark.parametrize(
     "wrong",
     [
-        "",
-        "{",
-        "[" * 10**5,
-        "[]",
-        *(json.dumps({**EPISODE, name: -1}) for name in ("seed", "done", "steps", "milestones")),
-        json.dumps({**EPISODE, "instruction": "a" * 1001}),
-        json.dumps({**EPISODE, "outcome": None}),
-        json.dumps({**EPISODE, "seed": float("nan")}),
-        json.dumps({**EPISODE, "more": 1}),
-        "{}",
+        *("{", "[" * 10**5, "{}"),
+        *(json.dumps({**EPISODE, **each}) for each in ({"seed": -1}, {"outcome": None}, {"instruction": "a" * 1001})),
     ],
     ids=lambda text: text[:40],
 )

@@ -142,7 +142,7 @@ print(hashlib.md5(zstd.compress(numpy.clip(numpy.cumsum(steps), 0, 255).astype("
 """
 
 
-def test_bags_do_not_depend_on_what_was_rendered_before() -> None:
+def test_compressed_data_do_not_depend_on_what_was_rendered_before() -> None:
     """Mesa brings a version of zstd of its own."""
     environment, printed = {**os.environ, "PYTHONPATH": TESTS}, set()
     for arguments in ((), ("render",)):
@@ -151,7 +151,7 @@ def test_bags_do_not_depend_on_what_was_rendered_before() -> None:
     assert len(printed) == 1
 
 
-@pytest.mark.parametrize(("name", "episodes"), [("lerobot", 60), ("mcap", 60)])
+@pytest.mark.parametrize(("name", "episodes"), [("lerobot", 60), ("files", 12)])
 def test_killed_twice_at_random_an_export_goes_on_and_ends_up_the_same(
     name: str, episodes: int, store: EpisodeStore, tmp_path: Path
 ) -> None:

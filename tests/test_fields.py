@@ -253,7 +253,7 @@ def test_stores_with_different_codecs_are_merged_without_a_further_loss(tmp_path
     assert content(tmp_path / "exact") == content(add(tmp_path / "whole", MORE[:4], LOSSLESS).folder)
 
 
-@pytest.mark.parametrize("kind", ["files", "lerobot", "mcap"])
+@pytest.mark.parametrize("kind", ["files", "lerobot"])
 def test_exports_are_those_of_a_raw_store(tmp_path: Path, kind: str) -> None:
     made = [
         exporter(kind, tmp_path / f"{codec}-{kind}").export(add(tmp_path / str(codec), EPISODES[:2], codec))

@@ -47,7 +47,7 @@ LIBRARIES = {
     "dm_env": ("vla.envs",),
     "gymnasium": ("vla.envs", "vla.tasks.gymnasium"),
     "lightning": ("vla.models.learner", "vla.data.datamodule", "vla.training", "vla.runs", "vla.jobs"),
-    "rerun": ("vla.rollouts.recorder", "vla.deploy.view"),
+    "rerun": ("vla.rollouts.recorder",),
     "rclpy": ("vla.deploy",),
     "distributed": ("vla.parallel.dask",),
     "timm": ("vla.models.vision.timm_encoders",),

@@ -9,10 +9,10 @@ import pytest
 from composing import CONF
 from defaults import defaults_of
 
-from vla.deploy.joint_limiter import JointLimiter, Robot
+from vla.deploy.joint_limiter import JointLimiter, JointLimits
 
 PERIOD = 0.02
-ROBOT = Robot(
+ROBOT = JointLimits(
     joints=["a", "b"],
     low=[-1.0, -2.0],
     high=[1.0, 2.0],
@@ -82,18 +82,12 @@ def test_a_speed_limit_that_is_lowered_on_the_way_is_reached_by_braking(limiter:
     for _ in range(50):
         limiter.step(np.array([0.9, 1.9]))
     fast = limiter.velocity
-    limiter.robot = replace(ROBOT, speed_share=0.1)
+    limiter.limits = replace(ROBOT, speed_share=0.1)
     steps = [fast, *(limiter.velocity for _ in range(30) if limiter.step(np.array([0.9, 1.9])) is not None)]
     assert (np.abs(np.diff(steps, axis=0)) <= ROBOT.max_acceleration * PERIOD + 1e-9).all()
-    assert (np.abs(fast) > limiter.robot.max_speed).any() and (
-        np.abs(steps[-1]) <= limiter.robot.max_speed + 1e-9
+    assert (np.abs(fast) > limiter.limits.max_speed).any() and (
+        np.abs(steps[-1]) <= limiter.limits.max_speed + 1e-9
     ).all()
-
-
-def test_the_first_command_is_the_measured_pose() -> None:
-    limiter = JointLimiter(ROBOT, PERIOD)
-    limiter.start(np.array([0.3, -0.4]))
-    np.testing.assert_array_equal(limiter.brake(), [0.3, -0.4])
 
 
 def test_an_arm_outside_its_limits_is_not_taken_over() -> None:
@@ -113,22 +107,15 @@ def test_without_overshoot_a_joint_at_its_goal_stays_there() -> None:
     assert limiter.resting
 
 
-WRONG = [
-    *({"low": [0.0]}, {"speed_share": 0.0}, {"acceleration_share": 1.5}, {"margin": -0.5}, {"overshoot": np.nan}),
-    {"speed_share": 2.0},
-    *({"acceleration": [0.0, 1.0]}, {"speed": [np.inf, 1.0]}, {"finger_travel": 0.0}, {"low": [1.0, -2.0]}),
-]
-
-
-@pytest.mark.parametrize("wrong", WRONG, ids=str)
-def test_a_robot_that_cannot_be_is_refused(wrong: dict) -> None:
+@pytest.mark.parametrize("wrong", [{"low": [0.0]}, {"low": [1.0, -2.0]}, {"margin": 1.5}], ids=str)
+def test_limits_that_no_arm_can_have_are_refused(wrong: dict) -> None:
     with pytest.raises(ValueError, match=r"deploy\.robot"):
         replace(ROBOT, **wrong)
 
 
 @pytest.mark.parametrize("robot", sorted(path.stem for path in (CONF / "deploy/robot").glob("*.yaml")))
 def test_every_robot_has_limits_of_every_joint(robot: str) -> None:
-    arm = Robot(**defaults_of(f"deploy/robot/{robot}"))
+    arm = JointLimits(**defaults_of(f"deploy/robot/{robot}"))
     assert (arm.min_position < arm.max_position).all() and len({*arm.joints}) == len(arm.joints) == len(arm.low)
     assert (arm.max_speed > 0.3).all() and (arm.max_acceleration > 0.7).all()  # in rad, not in degrees or turns
     assert (arm.max_speed < 7).all() and (np.abs(arm.low) < 7).all() and (np.abs(arm.high) < 7).all()

@@ -11,7 +11,7 @@ from fake_batch import make_batch, make_bc, with_text
 from toy import ARM, ARM_SPEC
 
 from vla.models.kinematics import ForwardKinematics
-from vla.robots.chain import forward_of, frame_positions
+from vla.robots.chain import forward_of
 from vla.robots.panda import CHAIN, HOME, JOINT_HIGH, JOINT_LOW, forward
 from vla.spec import Spec
 
@@ -24,13 +24,6 @@ def test_it_is_what_the_controller_calculates(autocast: bool) -> None:
     exact = np.stack([forward(each)[0][:3, [3, 0, 1]].T.reshape(9) for each in joints.reshape(-1, 7)])
     assert poses.shape == (2, 50, ForwardKinematics.WIDTH)
     np.testing.assert_allclose(poses.reshape(-1, 9).numpy(), exact, atol=1e-6)
-
-
-def test_a_view_draws_what_the_controller_calculates() -> None:
-    for joints in np.random.default_rng(0).uniform(JOINT_LOW, JOINT_HIGH, (20, 7)):
-        positions = frame_positions(CHAIN, joints)
-        assert positions.shape == (9, 3)
-        np.testing.assert_allclose(positions[-1], forward(joints)[0][:3, 3], atol=1e-12)
 
 
 def with_chain(*frames: tuple[float, ...]) -> Spec:

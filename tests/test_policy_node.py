@@ -23,12 +23,13 @@ from world import KINDS, World, positions
 
 from vla.deploy import messages
 from vla.deploy.client_observation import Keys
-from vla.deploy.control_loop import State
+from vla.deploy.safety import State
 from vla.robots.panda import HOME, forward
 
 pytestmark = pytest.mark.realtime
 
 FROZEN = Time(sec=5, nanosec=5)
+PER_JOINT = ("joints", "low", "high", "speed", "acceleration")
 
 
 @pytest.fixture
@@ -49,6 +50,7 @@ def test_the_first_command_is_the_measured_pose_and_the_arm_then_moves(world: Wo
     steps = np.diff([command.position[:7] for command in world.commands], axis=0)
     assert np.abs(steps).sum() > 0.1
     assert (np.abs(steps) <= ROBOT.max_speed * 0.02 + 1e-9).all()
+    assert world.statuses[-1].level == DiagnosticStatus.OK
 
 
 def test_observations_are_those_of_the_messages(world: World) -> None:
@@ -59,16 +61,6 @@ def test_observations_are_those_of_the_messages(world: World) -> None:
     world.live(1.0)
     status = {pair.key: pair.value for pair in world.statuses[-1].values}
     assert status["state"] == "running" and float(status["inference p99 [ms]"]) > 0
-
-
-def test_a_missing_camera_holds_the_arm_until_its_images_return(world: World) -> None:
-    world.cameras = ["front"]
-    assert world.becomes(State.HOLDING)
-    world.live(0.4)
-    assert world.commands[-1].position == world.commands[-5].position
-    assert "wrist" in world.statuses[-1].message and world.statuses[-1].level == DiagnosticStatus.WARN
-    world.cameras = ["front", "wrist"]
-    assert world.becomes(State.RUNNING)
 
 
 def test_a_bug_in_a_callback_stops_the_arm_and_not_the_process(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -100,11 +92,9 @@ def test_a_policy_server_that_goes_away_leaves_the_arm_at_rest(
     ("change", "words"),
     [
         (lambda image: setattr(image, "data", image.data[:-1]), "bytes"),
-        (lambda image: setattr(image, "encoding", "mono8"), "encoding"),
-        (lambda image: setattr(image, "step", 7), "step"),
         (lambda image: setattr(image.header, "stamp", FROZEN), "same time stamp"),
     ],
-    ids=["truncated", "encoding", "step", "frozen clock"],
+    ids=["truncated", "frozen clock"],
 )
 def test_invalid_images_hold_the_arm(world: World, change: Any, words: str, capfd: pytest.CaptureFixture[str]) -> None:
     world.changed = change
@@ -129,15 +119,6 @@ def test_simulated_time_stamps_the_images_and_holds_the_arm_when_it_is_frozen(
     assert world.state is State.HOLDING
 
 
-def test_a_slow_policy_skips_ticks_and_a_stuck_one_holds_the_arm(world: World) -> None:
-    world.policy.takes = 0.15
-    world.live(1.0)
-    assert world.state is State.RUNNING
-    assert world.agent.loop is not None and world.agent.loop.late_plans > 2
-    world.policy.takes = 1.0
-    assert world.becomes(State.HOLDING)
-
-
 def test_of_a_chunk_as_much_is_executed_as_in_evaluation(world: World) -> None:
     world.policy.chunk, world.policy.execute = 8, 3
     world.live(0.5)
@@ -146,7 +127,7 @@ def test_of_a_chunk_as_much_is_executed_as_in_evaluation(world: World) -> None:
     assert 4 <= len(world.policy.seen) - before <= 6
     world.policy.history, before = 2, len(world.policy.seen)
     world.live(1.5)
-    assert len(world.policy.seen) - before >= 12  # in training, frames of a history have no gaps
+    assert len(world.policy.seen) - before >= 8  # of 15 frames: in training, those of a history have no gaps
 
 
 def test_a_policy_that_fails_is_a_fault_that_only_deactivation_ends(world: World) -> None:
@@ -158,15 +139,6 @@ def test_a_policy_that_fails_is_a_fault_that_only_deactivation_ends(world: World
     assert not world.ask(Trigger, "resume", Trigger.Request()).success
     assert world.change(Transition.TRANSITION_DEACTIVATE) and world.change(Transition.TRANSITION_ACTIVATE)
     assert world.becomes(State.WAITING)
-
-
-def test_stop_and_resume(world: World) -> None:
-    assert world.ask(Trigger, "stop", Trigger.Request()).success
-    world.live(0.6)
-    assert world.state is State.STOPPED
-    assert world.commands[-1].position == world.commands[-5].position
-    assert world.ask(Trigger, "resume", Trigger.Request()).success
-    assert world.becomes(State.RUNNING)
 
 
 def test_a_person_takes_the_arm_over_and_hands_it_back(world: World) -> None:
@@ -194,7 +166,7 @@ def test_a_person_takes_the_arm_over_and_hands_it_back(world: World) -> None:
 
 def test_a_dry_run_commands_nothing_and_tells_what_it_would(make_world: Callable[..., World]) -> None:
     """With compressed images."""
-    world = make_world("joint_state", "--ros-args", "-p", "dry_run:=true", compressed=True)
+    world = make_world(dry_run=True, compressed=True)
     would: list[JointState] = []
     world.node.create_subscription(JointState, "/vla_agent/dry_run/commands", would.append, 100)
     world.start()
@@ -209,6 +181,8 @@ def test_an_instruction_that_is_ignored_after_a_stop_is_reported(
     world: World, capfd: pytest.CaptureFixture[str]
 ) -> None:
     assert world.ask(Trigger, "stop", Trigger.Request()).success
+    world.live(0.6)
+    assert world.commands[-1].position == world.commands[-5].position
     world.words.publish(String(data="put the blue block on the pad"))
     said = (
         "instruction ignored while stopped: 'put the blue block on the pad'; stopped by request; to continue: python -m"
@@ -255,17 +229,16 @@ def test_images_of_another_size_are_resized_and_that_is_logged_once(
     assert capfd.readouterr().err.count(said) == 2  # cameras
 
 
-def test_another_node_that_commands_the_arm_is_a_fault(world: World) -> None:
+def test_another_node_that_commands_the_arm_is_a_fault_and_one_that_sends_images_holds_it(world: World) -> None:
+    camera = world.node.create_publisher(Image, "/front", 1)
+    assert world.becomes(State.HOLDING)
+    world.node.destroy_publisher(camera)
+    assert world.becomes(State.RUNNING)
     other = world.node.create_publisher(JointState, "/commands", 1)
     assert world.becomes(State.FAULT)
     assert world.change(Transition.TRANSITION_DEACTIVATE)
     assert not world.change(Transition.TRANSITION_ACTIVATE)
     world.node.destroy_publisher(other)
-
-
-def test_two_cameras_on_one_topic_hold_the_arm(world: World) -> None:
-    world.node.create_publisher(Image, "/front", 1)
-    assert world.becomes(State.HOLDING)
 
 
 def test_wrong_requests_of_the_lifecycle_are_refused_and_survived(world: World) -> None:
@@ -311,23 +284,18 @@ def test_limits_hold_from_one_message_to_the_next(make_world: Callable[..., Worl
     assert len(reached) > 50 and np.ptp(reached, axis=0).max() > 0.05
 
 
-def test_trajectories_end_at_rest(make_world: Callable[..., World]) -> None:
+def test_trajectories_end_at_rest_and_plain_positions_have_fingers_of_their_own(
+    make_world: Callable[..., World],
+) -> None:
     world = make_world("trajectory")
+    fingers: list[Float64MultiArray] = []
+    world.node.create_subscription(Float64MultiArray, "/gripper", fingers.append, 10)
     world.start()
     world.live(0.3)
     message = max(world.commands, key=lambda command: len(command.points))
     assert list(message.joint_names) == ROBOT.joints and len(message.points) > 3
     assert not any(message.points[-1].velocities)
-    times = [point.time_from_start.sec + 1e-9 * point.time_from_start.nanosec for point in message.points]
-    assert (np.diff(times) > 0).all()
-
-
-def test_plain_positions_for_a_forward_controller(make_world: Callable[..., World]) -> None:
-    world = make_world("forward")
-    fingers: list[Float64MultiArray] = []
-    world.node.create_subscription(Float64MultiArray, "/gripper", fingers.append, 10)
-    world.start()
-    assert len(world.commands[-1].data) == 7 and list(fingers[-1].data) == [0.04, 0.04]
+    assert list(fingers[-1].data) == [0.04, 0.04]
 
 
 def test_a_twist_for_a_servo_moves_the_tool_as_fast_as_the_policy_says(make_world: Callable[..., World]) -> None:
@@ -341,21 +309,10 @@ def test_a_twist_for_a_servo_moves_the_tool_as_fast_as_the_policy_says(make_worl
 
 
 def test_ros_arguments_remap_and_set_parameters(make_world: Callable[..., World]) -> None:
-    arguments = ["--ros-args", "-r", "/front:=/isaac/front", "-p", "command_hz:=25.0", "-p", "speed_share:=0.5"]
-    world = make_world("joint_state", *arguments)
+    world = make_world("joint_state", "--ros-args", "-r", "/front:=/isaac/front", "-p", "speed_share:=0.5")
     assert world.change(Transition.TRANSITION_CONFIGURE)
-    assert world.agent.loop is not None and world.agent.loop.tick == 0.04
-    assert world.agent.loop.robot.speed_share == 0.5
-    assert world.agent.resolve_topic_name("/front") == "/isaac/front"
+    assert world.agent.loop is not None and world.agent.loop.limits.speed_share == 0.5
     assert any(name == "/isaac/front" for name, _ in world.agent.get_topic_names_and_types())
-
-
-def test_whole_numbers_among_the_limits_are_numbers(make_world: Callable[..., World]) -> None:
-    low = [-2, *ROBOT.low[1:]]
-    world = make_world(robot=replace(ROBOT, low=low, speed_share=1))
-    assert world.change(Transition.TRANSITION_CONFIGURE)
-    assert world.agent.loop is not None and world.agent.loop.robot.low == low
-    assert world.agent.set_parameters([Parameter("speed_share", value=0.1)])[0].successful
 
 
 def test_speed_is_lowered_at_any_time_and_raised_at_rest_only(world: World) -> None:
@@ -363,19 +320,18 @@ def test_speed_is_lowered_at_any_time_and_raised_at_rest_only(world: World) -> N
         return world.agent.set_parameters([Parameter("speed_share", value=value)])[0]
 
     assert set_share(0.1).successful
-    assert world.agent.loop is not None and world.agent.loop.robot.speed_share == 0.1
+    assert world.agent.loop is not None and world.agent.loop.limits.speed_share == 0.1
     assert "deactivate" in set_share(0.5).reason
     assert not set_share(2.0).successful
-    result = world.agent.set_parameters([Parameter("command_hz", value=10.0)])[0]
-    assert not result.successful and "clean up" in result.reason
-    together = [Parameter("speed_share", value=0.05), Parameter("command_hz", value=10.0)]
+    together = [Parameter("speed_share", value=0.05), Parameter("acceleration_share", value=0.5)]
     assert not world.agent.set_parameters_atomically(together).successful
-    assert world.agent.loop.robot.speed_share == 0.1
+    assert world.agent.loop.limits.speed_share == 0.1
     assert world.change(Transition.TRANSITION_DEACTIVATE)
     assert set_share(0.5).successful
 
 
 def test_a_robot_that_does_not_fit_refuses_to_configure(make_world: Callable[..., World]) -> None:
-    world = make_world("joint_state", "--ros-args", "-p", "joints:=[one, two]")
+    world = make_world()
+    world.settings.robot = replace(ROBOT, **{name: getattr(ROBOT, name)[:2] for name in PER_JOINT})
     assert not world.change(Transition.TRANSITION_CONFIGURE)
     assert world.ask(GetState, "get_state", GetState.Request()).current_state.label == "unconfigured"

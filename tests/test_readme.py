@@ -32,8 +32,7 @@ pytestmark = pytest.mark.usefixtures("recording")
 
 README = PAGES[0].read_text(encoding="utf-8")
 COMMANDS = [command for command in commands("vla.run") if command != "--help"]  # which is for `test_run`
-TOOLS = [(tool, command) for tool in ("say", "watch", "view", "bag") for command in commands(f"vla.deploy.{tool}")]
-TOOLS.remove(("bag", "play"))  # which a sentence names without its argument
+TOOLS = [(tool, command) for tool in ("say", "record") for command in commands(f"vla.deploy.{tool}")]
 HALF = "outputs/runs/half"
 METAWORLD = "metaworld"
 STANDS = {

@@ -35,8 +35,8 @@ from defaults import defaults_of
 from vla.config.build import require_no_paths
 from vla.config.experiment import plain
 from vla.deploy.control_loop import ControlLoop
-from vla.deploy.joint_limiter import Robot
-from vla.robots.chain import frame_positions
+from vla.deploy.joint_limiter import JointLimits
+from vla.robots.chain import forward_of
 from vla.spec import Spec
 from vla.tasks.tabletop.file_robot import FileRobot
 from vla.tasks.tabletop.robot_file import InstalledRobot, RobotFile
@@ -163,7 +163,7 @@ def test_the_spec_describes_the_compiled_arm(jaco: Tabletop) -> None:
     joints = kinematics.home + np.array([0.3, -0.2, 0.1, 0.4, -0.3, 0.2])
     pose, jacobian = kinematics.forward(joints)
     jacobian = jacobian.copy()
-    np.testing.assert_allclose(frame_positions(robot.chain, joints)[-1], pose[:3, 3], atol=1e-6)
+    np.testing.assert_allclose(forward_of(robot.chain)(joints)[0][:3, 3], pose[:3, 3], atol=1e-6)
     for index, step in enumerate(1e-5 * np.eye(6)):
         moved = (kinematics.forward(joints + step)[0][:3, 3] - kinematics.forward(joints - step)[0][:3, 3]) / 2e-5
         np.testing.assert_allclose(jacobian[:3, index], moved, atol=1e-6)
@@ -176,7 +176,7 @@ def test_a_cartesian_policy_moves_the_arm_that_it_was_trained_with(jaco: Tableto
     spec, arm = replace(jaco.spec, cameras=("front",), depth=()), jaco.simulation.scene.robot.kinematics
     limits = {"low": [-9.0] * 6, "high": [9.0] * 6, "speed": [2.0] * 6, "acceleration": [50.0] * 6}
     shares = {"speed_share": 1.0, "acceleration_share": 1.0}
-    robot = Robot(
+    robot = JointLimits(
         **defaults_of("deploy/robot/simulated", joints=list(spec.require_robot("this").joints), **limits, **shares)
     )
     loop = ControlLoop(spec, robot, replace(SAFETY, workspace=((-2.0,) * 3, (2.0,) * 3)), 50.0)

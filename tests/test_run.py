@@ -198,8 +198,7 @@ def test_a_policy_is_exported_as_programs(home: Path) -> None:
     policy = ("checkpoint=run", "export=program", "export.folder=program")
     here(home, "job=export", *policy)
     written = json.loads((home / "program/program.json").read_text())
-    assert written["act"]["runs"].keys() == {"model", "act.pt2", "act.onnx"}
-    assert (home / "program/act.pt2").is_file() and (home / "program/act.onnx").is_file()
+    assert written["act"]["difference"] < 1e-3 and (home / "program/act.onnx").is_file()
 
 
 def test_an_evaluation_ends_when_what_it_is_asked_is_decided(home: Path) -> None:

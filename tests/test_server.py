@@ -8,7 +8,6 @@ import os
 import re
 import signal
 import socket
-import ssl
 import sys
 import threading
 import time
@@ -26,29 +25,26 @@ from urllib.request import urlopen
 import msgpack
 import numpy as np
 import pytest
-import trustme
 from command_line import SMALL, here
 from composing import composed
 from fake_batch import as_policy, make_act, make_bc, make_denoising, make_rt1
 from toy import SPEC, ToyEnvironment
 from websockets.datastructures import Headers
-from websockets.exceptions import ConnectionClosed, InvalidMessage, InvalidStatus
+from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.http11 import Request, Response
 from websockets.sync.client import ClientConnection, connect
 from websockets.sync.server import ServerConnection, serve
 
 from vla.config.annotations import MissingLibrary, locate
 from vla.config.experiment import Experiment
-from vla.deploy import server
 from vla.deploy.client_observation import Keys
 from vla.deploy.server import PolicyServer, Service
-from vla.io.array_messages import DTYPES, LARGEST_MAP, LONGEST_LIST, pack, unpack
+from vla.io.array_messages import DTYPES, LARGEST_MAP, pack, unpack
 from vla.models.flow import Flow
 from vla.models.model import Model
 from vla.policy import Policy
 from vla.rollouts.evaluate import play
 from vla.rollouts.remote import Component, RemotePolicy
-from vla.rollouts.rollout import rollout
 from vla.spec import FIRST_SEED, LONGEST_INSTRUCTION, Array, Observation
 
 TEXTS = ("go", "lift it now", "go", "put it down")
@@ -65,8 +61,6 @@ def settings(policy: Policy, **changes: Any) -> PolicyServer:
         "largest_message": 1_000_000,
         "api_key": None,
         "origins": [],
-        "certificate": None,
-        "private_key": None,
         "policy": lambda: policy,
         "environment": ToyEnvironment,
         "output": Path(),
@@ -77,16 +71,6 @@ def settings(policy: Policy, **changes: Any) -> PolicyServer:
 def serving(policy: Policy, **changes: Any) -> AbstractContextManager[str]:
     """A server in a thread of its own, by its URL."""
     return Service(settings(policy, **changes), policy).in_thread()
-
-
-def certified(folder: Path) -> dict[str, str]:
-    """Options of a server with a certificate for this machine, and its authority's in authority.pem."""
-    authority = trustme.CA()
-    certificate = authority.issue_cert("127.0.0.1")
-    certificate.cert_chain_pems[0].write_to_path(folder / "certificate.pem")
-    certificate.private_key_pem.write_to_path(folder / "key.pem")
-    authority.cert_pem.write_to_path(folder / "authority.pem")
-    return {"certificate": str(folder / "certificate.pem"), "private_key": str(folder / "key.pem")}
 
 
 def client(url: str, **options: Any) -> ClientConnection:
@@ -131,6 +115,18 @@ def remote(url: str, **changes: Any) -> RemotePolicy:
     return RemotePolicy(**{**values, **changes})
 
 
+def before_plans(policy: Policy, monkeypatch: pytest.MonkeyPatch, do: Callable[[int], object]) -> None:
+    """Let the policy do something before it plans, given the number of observations so far."""
+    plan, asked = policy.plan, list[Observation]()
+
+    def planned(observations: Sequence[Observation], lanes: Sequence[int]) -> Array:
+        asked.extend(observations)
+        do(len(asked))
+        return plan(observations, lanes)
+
+    monkeypatch.setattr(policy, "plan", planned)
+
+
 @pytest.mark.parametrize("make", [make_bc, make_rt1], ids=["one frame", "a history"])
 def test_a_client_gets_the_chunks_of_the_policy_bit_for_bit(make: Callable[[], Any]) -> None:
     policy = as_policy(make())
@@ -143,36 +139,16 @@ def test_a_client_gets_the_chunks_of_the_policy_bit_for_bit(make: Callable[[], A
             answers.append(received(connection))
             np.testing.assert_array_equal(answers[-1]["actions"], expected.plan(observation))
     assert answers[-1]["actions"].dtype == np.float32
-    assert answers[-1]["server_timing"].keys() == {"infer_ms", "prev_total_ms"}
+    assert answers[-1]["server_timing"].keys() == {"infer_ms"}
     assert described["images"] == {"observation/image": [16, 16, 3]} and described["prompt"] == "prompt"
     assert described["action"]["names"] == list(SPEC.action) and described["history"] == policy.model.history
     np.testing.assert_array_equal(described["action"]["high"], np.array(SPEC.high, np.float32))
 
 
-def test_an_agent_in_another_process_plays_like_the_policy_here() -> None:
-    policy = as_policy(make_bc(chunk=3))
-    expected = rollout(ToyEnvironment(), as_policy(policy.model), FIRST_SEED)
-    with serving(policy) as url:
-        agent = remote(url)
-        episodes = [rollout(ToyEnvironment(), agent, FIRST_SEED) for _ in range(2)]
-        agent.close()
-    for episode in episodes:
-        np.testing.assert_array_equal(episode.executed, expected.executed)
-
-
 def test_a_slow_server_is_not_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
-    policy, gate = as_policy(make_bc(chunk=3)), threading.Event()
-    plan = policy.plan
-    asked: list[Observation] = []
-
-    def gated(observations: Sequence[Observation], lanes: Sequence[int]) -> Array:
-        asked.extend(observations)
-        assert len(asked) == 1 or gate.wait(30)
-        return plan(observations, lanes)
-
-    seen = observations(60)
+    policy, gate, seen = as_policy(make_bc(chunk=3)), threading.Event(), observations(60)
     with serving(policy) as url:
-        monkeypatch.setattr(policy, "plan", gated)
+        before_plans(policy, monkeypatch, lambda number: number == 1 or gate.wait(30))
         agent = remote(url, asynchronous=True, execute=1, spec=replace(SPEC, control_hz=200.0))
         agent.reset(seen[0].instruction, 0)
         first = as_policy(policy.model).plan(seen[0])
@@ -189,25 +165,6 @@ def test_a_slow_server_is_not_waited_for(monkeypatch: pytest.MonkeyPatch) -> Non
         agent.reset(seen[0].instruction, 0)  # whatever is awaited is dropped
         np.testing.assert_array_equal(agent.act(seen[0]), first[0])
         agent.close()
-
-
-def test_pings_are_answered_while_the_policy_computes(monkeypatch: pytest.MonkeyPatch) -> None:
-    policy, gate = as_policy(make_bc()), threading.Event()
-    plan = policy.plan
-
-    def gated(observations: Sequence[Observation], lanes: Sequence[int]) -> Array:
-        assert gate.wait(60)
-        return plan(observations, lanes)
-
-    (seen,) = observations(1)
-    with serving(policy) as url, client(url) as connection:
-        connection.recv()
-        monkeypatch.setattr(policy, "plan", gated)
-        connection.send(pack(message(seen)))
-        assert connection.ping().wait(30)
-        assert urlopen(f"{url.replace('ws://', 'http://')}/healthz").read() == b"OK\n"
-        gate.set()
-        np.testing.assert_array_equal(received(connection)["actions"], as_policy(policy.model).plan(seen))
 
 
 @pytest.mark.parametrize("make", [make_bc, make_rt1, make_act, partial(make_denoising, Flow)])
@@ -308,27 +265,18 @@ WHOLE = message(observations(1)[0])
 WRONG: dict[str, tuple[Any, str]] = {
     "text": ("hello", "is a binary message in msgpack, not text"),
     "noise": (b"\xc1\x00", "is no message in msgpack with arrays of numbers"),
-    "half": (pack(WHOLE)[:100], "is no message in msgpack"),
     "list": (pack([1, 2]), "an observation is a map, not list"),
-    "empty": (pack({}), "lacks observation/image, observation/state, prompt: it has nothing"),
     "keys": (pack({"image": 1, "prompt": "go"}), "lacks observation/image, observation/state: it has image, prompt"),
     "image": (pack({**WHOLE, "observation/image": np.zeros((4, 4), np.uint8)}), r"is an image \(H, W, 3\).*\(4, 4\)"),
     "range": (pack({**WHOLE, "observation/image": np.full((4, 4, 3), 255.0)}), "send uint8, or floats from 0 to 1"),
     "state": (pack({**WHOLE, "observation/state": np.zeros(3)}), "has 3 numbers, the policy needs 2: east, north"),
-    "finite": (pack({**WHOLE, "observation/state": [np.nan, 0.0]}), "holds a number that is not finite"),
-    "words": (pack({**WHOLE, "observation/state": "far"}), "observation/state is not a vector of numbers"),
-    "digits": (pack({**WHOLE, "observation/state": ["1", "1"]}), "observation/state is not a vector of numbers"),
     "rows": (pack({**WHOLE, "observation/state": [[1.0], [1.0, 2.0]]}), "observation/state is not a vector of numbers"),
-    "nothing": (pack({**WHOLE, "observation/state": [None, 1.0]}), "observation/state is not a vector of numbers"),
     "prompt": (
         pack({**WHOLE, "prompt": "a" * (LONGEST_INSTRUCTION + 1)}),
         "has 1001 characters, an instruction at most",
     ),
-    "prompts": (pack({**WHOLE, "prompt": ["go"]}), "prompt is an instruction, a text, not list"),
     "seed": (pack({"reset": True, "seed": -1}), "seed is -1, expected an integer"),
-    "seed as a text": (pack({"reset": True, "prompt": "go", "seed": "5"}), "seed is '5', expected an integer"),
     "half a seed": (pack({"reset": True, "prompt": "go", "seed": np.float32(0.5)}), "seed is 0.5, expected an integer"),
-    "escapes": (pack({"\x1b]0;evil\x07\nerror: none": 1}), "the observation lacks"),
     "objects": (
         msgpack.packb({b"__ndarray__": True, b"dtype": "|O", b"data": b"cos\nsystem\n", b"shape": [1]}),
         r"has the type \|O, expected one of",
@@ -339,7 +287,6 @@ WRONG: dict[str, tuple[Any, str]] = {
     ),
     "reset without a prompt": (pack({"reset": True, "seed": 7}), "prompt is an instruction"),
     "deep": (b"\x91" * 100_000 + b"\x01", "is no message in msgpack"),
-    "lists": (msgpack.packb([[0] * 1000] * (LONGEST_LIST // 1000)), "hold more than 10000 items"),
     "maps": (msgpack.packb([{}] * (LARGEST_MAP + 1)), "more than 1000 maps"),
 }
 
@@ -366,35 +313,6 @@ def test_who_sends_nonsense_is_told_why_and_disturbs_nobody() -> None:
         np.testing.assert_array_equal(received(good)["actions"], expected)
 
 
-OTHER = {
-    "post": b"POST /act HTTP/1.1\r\nHost: here\r\nContent-Length: 2\r\n\r\n{}",
-    "http/2": b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n",  # gRPC
-    "tls": b"\x16\x03\x01\x02\x00\x01\x00\x01\xfc\x03\x03" + bytes(32),
-    "noise": b"\xc1" * 4096,
-}
-
-
-def test_who_speaks_another_protocol_is_told_which_one_is_spoken_here() -> None:
-    policy = as_policy(make_bc())
-    expected = as_policy(policy.model).plan(observations(1)[0])
-    with serving(policy) as url, client(url) as good:
-        good.recv()
-        host, port = url.removeprefix("ws://").split(":")
-        for data in OTHER.values():
-            with socket.create_connection((host, int(port)), timeout=10) as bad:
-                bad.sendall(data)
-                with bad.makefile("rb") as answer:
-                    assert answer.read().endswith(b"connect to it by WebSocket with openpi's protocol\n")
-        with socket.create_connection((host, int(port)), timeout=10) as slow:
-            for part in (b"G", b"ET /healthz HTTP/1.1\r\nHost: here\r\n\r\n"):  # in two packets
-                slow.sendall(part)
-                time.sleep(0.05)
-            with slow.makefile("rb") as answer:
-                assert answer.read().endswith(b"OK\n")
-        good.send(pack(WHOLE))
-        np.testing.assert_array_equal(received(good)["actions"], expected)
-
-
 def test_only_so_many_come_in_and_only_with_the_key() -> None:
     policy = as_policy(make_bc())
     key = {"additional_headers": {"Authorization": "Api-Key open"}}
@@ -405,8 +323,10 @@ def test_only_so_many_come_in_and_only_with_the_key() -> None:
             urlopen(http)
         with pytest.raises(InvalidStatus, match="401"):
             client(url)
+        before = threading.active_count()
         with pytest.raises(ValueError, match="failed: send the API key as Authorization: Api-Key"):
             remote(url)
+        assert threading.active_count() <= before
         with client(url, **key) as connection:
             connection.recv()
             with pytest.raises(ValueError, match="failed: 1 clients are connected"):
@@ -415,58 +335,12 @@ def test_only_so_many_come_in_and_only_with_the_key() -> None:
 
 
 def test_web_pages_come_in_only_from_where_they_may() -> None:
-    key = {"Authorization": "Api-Key öpen"}
-    with serving(as_policy(make_bc()), api_key="öpen", origins=["http://localhost:3000"], connections=1) as url:
-        for origin in ("http://evil.example", "null", "", "http://localhost:3000.evil.example"):
+    with serving(as_policy(make_bc()), origins=["http://localhost:3000"]) as url:
+        for origin in ("http://evil.example", "null", "http://localhost:3000.evil.example"):
             with pytest.raises(InvalidStatus, match="403"):
-                client(url, additional_headers={"Origin": origin, **key})
-        with pytest.raises(InvalidStatus, match="403"):
-            client(url, additional_headers=[("Origin", "http://localhost:3000"), ("Origin", "null"), *key.items()])
-        for wrong in ({"Authorization": "Api-Key \xff"}, [*key.items(), *key.items()], None):
-            with pytest.raises(InvalidStatus, match="401"):
-                client(url, additional_headers=wrong)
-        with client(url, additional_headers={"Origin": "http://localhost:3000", **key}) as page:
+                client(url, additional_headers={"Origin": origin})
+        with client(url, additional_headers={"Origin": "http://localhost:3000"}) as page:
             assert received(page)["server"] == "vla"
-
-
-def test_with_a_certificate_only_clients_of_tls_are_served(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    policy, observation = as_policy(make_bc()), observations(1)[0]
-    files, expected = certified(tmp_path), as_policy(policy.model).plan(observation)
-    with serving(policy, **files) as url:
-        assert url.startswith("wss://")
-        with pytest.raises(ssl.SSLCertVerificationError), client(url):
-            pass  # nobody vouches for the server
-        with pytest.raises(InvalidMessage), client(url.replace("wss://", "ws://")):
-            pass
-        monkeypatch.setenv("SSL_CERT_FILE", str(tmp_path / "authority.pem"))
-        agent = remote(url)
-        agent.reset(observation.instruction, 0)
-        np.testing.assert_array_equal(agent.act(observation), expected[0])
-        agent.close()
-
-
-def test_tls_sends_no_session_tickets(tmp_path: Path) -> None:
-    """A client that reads in a second thread loses its request if a ticket arrives while it is sent."""
-    files = certified(tmp_path)
-    context = ssl.create_default_context(cafile=str(tmp_path / "authority.pem"))
-    with serving(as_policy(make_bc()), **files) as url:
-        address = urlsplit(url)
-        with (
-            socket.create_connection((address.hostname, address.port)) as plain,
-            context.wrap_socket(plain, server_hostname=address.hostname) as connection,
-        ):
-            connection.sendall(b"GET /healthz HTTP/1.1\r\nHost: here\r\n\r\n")
-            assert connection.recv(4096).startswith(b"HTTP/1.1 200")
-            session = connection.session
-            assert connection.version() == "TLSv1.3" and session is not None and not session.has_ticket
-
-
-def test_an_agent_that_finds_nobody_leaves_no_thread() -> None:
-    with serving(as_policy(make_bc()), api_key="open") as url:
-        before = threading.active_count()
-        with pytest.raises(ValueError, match="API key"):
-            remote(url)
-        assert threading.active_count() <= before
 
 
 def test_of_many_that_come_at_once_only_so_many_stay() -> None:
@@ -491,17 +365,11 @@ def test_of_many_that_come_at_once_only_so_many_stay() -> None:
     assert len(stayed) == 2
 
 
-def test_beyond_this_machine_nobody_listens_without_a_key(tmp_path: Path) -> None:
+def test_what_cannot_be_served_is_said_in_a_sentence() -> None:
     policy = as_policy(make_bc())
     with pytest.raises(ValueError, match=r"deploy\.host=0\.0\.0\.0 lets other machines use the policy: set"):
         settings(policy, host="0.0.0.0")
     assert settings(policy, host="0.0.0.0", api_key="open").host == "0.0.0.0"
-    with pytest.raises(ValueError, match=r"needs both deploy\.certificate and deploy\.private_key"):
-        settings(policy, certificate=str(tmp_path / "certificate.pem"))
-    (tmp_path / "certificate.pem").write_text("no certificate")
-    files = dict.fromkeys(("certificate", "private_key"), str(tmp_path / "certificate.pem"))
-    with pytest.raises(ValueError, match=r"are not a certificate and its key in PEM format"):
-        settings(policy, **files).run()
     with serving(policy) as url:
         client: Any = remote(url)
         with pytest.raises(
@@ -538,22 +406,12 @@ def test_it_serves_until_it_is_told_to_stop(number: signal.Signals, caplog: pyte
     assert asked == [b"OK\n"]
 
 
-def test_it_does_not_wait_for_clients_that_do_not_answer(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(server, "serve", partial(server.serve, open_timeout=None, close_timeout=None))  # else 10 s each
-    rescued = threading.Event()
-    hello = b"GET / HTTP/1.1\r\nHost: here\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
-    hello += b"Sec-WebSocket-Version: 13\r\nSec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\n\r\n"
+def test_it_does_not_wait_for_clients_that_do_not_answer() -> None:
     with ExitStack() as opened, serving(as_policy(make_bc())) as url:
         address = urlsplit(url)
-        for said in (b"", b"GET / HT", hello, hello + b"\x82\xff"):  # the last one began an observation
+        for said in (b"", b"GET / HT"):
             silent = opened.enter_context(socket.create_connection((address.hostname, address.port)))
             silent.sendall(said)
-            if said.startswith(hello):
-                assert silent.recv(12) == b"HTTP/1.1 101"
-        rescue = threading.Timer(60, lambda: (rescued.set(), opened.close()))
-        rescue.start()
-    rescue.cancel()
-    assert not rescued.is_set()
 
 
 def test_somebody_elses_actions_become_ours() -> None:
@@ -610,17 +468,9 @@ def test_a_server_with_other_components_units_or_image_sizes_is_noticed(caplog: 
 
 
 def test_a_late_answer_is_not_taken_for_that_of_the_next_observation(monkeypatch: pytest.MonkeyPatch) -> None:
-    policy, gate, asked = as_policy(make_bc()), threading.Event(), list[Any]()
-    plan = policy.plan
-
-    def gated(observations: Sequence[Observation], lanes: Sequence[int]) -> Array:
-        asked.extend(observations)
-        assert len(asked) != 2 or gate.wait(30)
-        return plan(observations, lanes)
-
-    seen = observations(4)
+    policy, gate, seen = as_policy(make_bc()), threading.Event(), observations(4)
     with serving(policy) as url:
-        monkeypatch.setattr(policy, "plan", gated)
+        before_plans(policy, monkeypatch, lambda number: number != 2 or gate.wait(30))
         agent = remote(url)
         agent.act(seen[0])
         agent.timeout = 0.5
@@ -635,40 +485,20 @@ def test_a_late_answer_is_not_taken_for_that_of_the_next_observation(monkeypatch
         agent.close()
 
 
-def test_a_message_over_the_limit_is_named_on_both_sides(caplog: pytest.LogCaptureFixture) -> None:
-    with serving(as_policy(make_bc()), largest_message=700) as url:
-        agent = remote(url)
-        with pytest.raises(ValueError, match=r"it closed the connection .*exceeds limit of 700 bytes"):
-            agent.plan(observations(1)[0])
-        agent.close()
-    assert "more than deploy.largest_message bytes" in caplog.text
+def test_a_server_that_fails_or_goes_away_costs_an_episode_and_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    policy, seen = as_policy(make_bc()), observations(2)
 
-
-def test_an_error_of_the_server_costs_one_episode(monkeypatch: pytest.MonkeyPatch) -> None:
-    policy, asked = as_policy(make_bc()), list[Any]()
-    plan = policy.plan
-
-    def failing(observations: Sequence[Observation], lanes: Sequence[int]) -> Array:
-        asked.extend(observations)
-        if len(asked) == 1:
+    def fail(number: int) -> None:
+        if number == 1:
             raise RuntimeError("no idea")
-        return plan(observations, lanes)
 
-    seen = observations(2)
     with serving(policy) as url:
-        monkeypatch.setattr(policy, "plan", failing)
+        before_plans(policy, monkeypatch, fail)
         agent = remote(url)
         with pytest.raises(ValueError, match=r"the policy server at .* failed"):
             agent.act(seen[0])
         agent.reset(seen[1].instruction, 1)
         np.testing.assert_array_equal(agent.act(seen[1]), as_policy(policy.model).plan(seen[1])[0])
-        agent.close()
-
-
-def test_a_server_that_goes_away_fails_the_episode_and_says_so() -> None:
-    policy = as_policy(make_bc())
-    with serving(policy) as url:
-        agent = remote(url)
         assert play(ToyEnvironment(), agent, FIRST_SEED).outcome in ("success", "timeout")
     failed = play(ToyEnvironment(), agent, FIRST_SEED)
     assert failed.outcome == "error" and f"the policy server at {url} failed: it closed the connection" in failed.error
@@ -693,11 +523,9 @@ def test_another_policy_after_a_restart_is_noticed() -> None:
 
 
 def test_an_address_is_reached_directly_whatever_proxy_the_environment_names(monkeypatch: pytest.MonkeyPatch) -> None:
-    for name in ("http_proxy", "https_proxy", "ws_proxy", "all_proxy"):
+    for name in ("http_proxy", "ws_proxy", "all_proxy"):
         monkeypatch.setenv(name, "http://127.0.0.1:9")
-    monkeypatch.setenv("socks_proxy", "socks5h://127.0.0.1:9")
     with serving(as_policy(make_bc())) as url:
-        remote(url).close()
         remote(url.replace("127.0.0.1", "localhost")).close()
 
 
@@ -705,10 +533,7 @@ def test_an_address_is_reached_directly_whatever_proxy_the_environment_names(mon
     ("url", "why"),
     [
         ("ws://127.0.0.1:99999", "Port out of range 0-65535"),
-        ("ws://127.0.0.1:http", "Port could not be cast"),
-        (f"ws://{'a' * 300}:8000", "label too long"),
         ("ws://[::1", "Invalid IPv6 URL"),
-        ("http://127.0.0.1:8000", "scheme isn't ws or wss"),
         ("127.0.0.1:8000", "scheme isn't ws or wss"),
     ],
 )
@@ -733,20 +558,6 @@ def test_a_key_and_images_go_to_the_named_server_only() -> None:
         with pytest.raises(ValueError, match=rf"agent\.url={url} leads to no policy server \(cannot follow .*{other}"):
             remote(url, api_key="s3cret")
     assert asked == ["Api-Key s3cret"]
-
-
-def test_a_server_that_describes_nothing_is_not_waited_for() -> None:
-    done = threading.Event()
-
-    def wait(connection: ServerConnection) -> None:
-        done.wait(30)
-
-    with serve(wait, "127.0.0.1", 0) as silent:
-        threading.Thread(target=silent.serve_forever, daemon=True).start()
-        url = f"ws://127.0.0.1:{silent.socket.getsockname()[1]}"
-        with pytest.raises(ValueError, match=rf"no policy server at {url} \(no answer within 0\.5 s\)"):
-            remote(url, timeout=0.5)
-        done.set()
 
 
 def test_whoever_acts_is_evaluated_by_the_same_job(tmp_path: Path) -> None:

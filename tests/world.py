@@ -27,11 +27,10 @@ from std_msgs.msg import Float64MultiArray, String
 from trajectory_msgs.msg import JointTrajectory
 
 from vla.deploy import messages
-from vla.deploy.control_loop import State
-from vla.deploy.joint_limiter import Robot
 from vla.deploy.policy_node import PolicyNode
 from vla.deploy.ros import RosNetwork
 from vla.deploy.ros2 import PolicyDeployment
+from vla.deploy.safety import State
 from vla.deploy.settings import Topics
 from vla.robots.panda import HOME, forward
 from vla.spec import Array, Observation
@@ -75,7 +74,7 @@ class World:
         arguments: list[str],
         compressed: bool = False,
         gripper: Any = None,
-        robot: Robot = ROBOT,
+        dry_run: bool = False,
     ) -> None:
         RosNetwork.named("loopback").apply()
         self.contexts = [Context(), Context()]
@@ -86,11 +85,11 @@ class World:
         self.compressed = compressed
         topics = {camera: f"/{camera}{'/compressed' if compressed else ''}" for camera in SPEC.cameras}
         self.settings = PolicyDeployment(
-            robot=robot,
+            robot=ROBOT,
             network=RosNetwork.named("loopback"),
             topics=replace(TOPICS, images=topics),
             safety=SAFETY,
-            **defaults_of("deploy/ros2", command=command, gripper=gripper),
+            **defaults_of("deploy/ros2", command=command, gripper=gripper, dry_run=dry_run),
             policy=nothing,
             environment=nothing,
             output=Path(),

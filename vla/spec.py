@@ -364,25 +364,6 @@ class Eventful(Protocol):
         ...
 
 
-class Shell(Protocol):
-    """Surface of an arm, for views of a robot."""
-
-    chain: tuple[Numbers, ...]  # of the arms that it fits, as in `RobotModel`
-
-    def shapes(self) -> list[Shape]:
-        """Return the visible solids."""
-        ...
-
-    def poses(self, joints: Array, opening: float) -> dict[str, Array]:
-        """Return body name → (7,) position [m] and quaternion wxyz in the base frame.
-
-        Args:
-            joints: (J,) [rad].
-            opening: of the gripper [m].
-        """
-        ...
-
-
 @runtime_checkable
 class Drivable(Protocol):
     """Environment whose arm also takes joint targets, independently of control periods, like a robot driver."""

@@ -8,24 +8,12 @@ from functools import partial
 from typing import Any
 
 from action_msgs.msg import GoalStatus
-from rclpy.action import ActionClient
 
-from vla.deploy.ros import action_class
-from vla.deploy.settings import FrankaGripper, GripperCommand
+from vla.deploy.lifecycle_node import GuardedLifecycleNode
 from vla.io.errors import UserError
 
 PATIENCE = 5.0  # longest wait for a server at the start [s]
 ANSWER = 1.0  # longest time until a server accepts or rejects a goal [s]
-CLOSE_BELOW, OPEN_ABOVE = 0.4, 0.6  # commanded opening of a gripper at which its goal changes
-CODES = {
-    0: "SUCCESSFUL",
-    -1: "INVALID_GOAL",
-    -2: "INVALID_JOINTS",
-    -3: "OLD_HEADER_TIMESTAMP",
-    -4: "PATH_TOLERANCE_VIOLATED",
-    -5: "GOAL_TOLERANCE_VIOLATED",
-}  # of control_msgs/action/FollowJointTrajectory
-REPLACED = (0, -1)  # codes of a goal that another one has replaced
 
 
 class GoalSender:
@@ -33,7 +21,7 @@ class GoalSender:
 
     def __init__(
         self,
-        node: Any,
+        node: GuardedLifecycleNode,
         kind: Any,
         name: str,
         complaint: Callable[[Any, bool], str],
@@ -50,7 +38,7 @@ class GoalSender:
         """
         self.name = node.resolve_topic_name(name)
         self._node, self.kind, self._complaint, self._fail, self._ended = node, kind, complaint, fail, ended
-        self._client = ActionClient(node, kind, name)
+        self._client = node.add_action_client(kind, name)
         self._newest = 0  # number of the newest goal
         self.reset()
 
@@ -101,10 +89,6 @@ class GoalSender:
         elif self._unanswered and time.monotonic() - min(self._unanswered.values()) > ANSWER:
             self._give_up(f"has not answered a goal for {ANSWER:g} s")
 
-    def destroy(self) -> None:
-        """Destroy the client."""
-        self._client.destroy()
-
     def _give_up(self, what: str) -> None:
         if self._handle is not None:
             self._handle.cancel_goal_async()
@@ -146,82 +130,3 @@ class GoalSender:
             return self._give_up(f"{what} a goal: {complaint}")
         if newest:
             self._ended()
-
-
-def trajectory_complaint(result: Any, replaced: bool) -> str:
-    """Describe a result of FollowJointTrajectory; empty if its goal was replaced and that is all."""
-    code = result.error_code
-    if replaced and code in REPLACED:
-        return ""
-    return ", ".join(filter(None, (CODES.get(code, f"error code {code}"), result.error_string)))
-
-
-class GripperGoals:
-    """Opens and closes a gripper: one goal at a time, and another one only when the commanded state changes."""
-
-    def __init__(
-        self,
-        node: Any,
-        settings: GripperCommand | FrankaGripper,
-        server: str,
-        fail: Callable[[str], None],
-    ) -> None:
-        """Args: the node; settings of the gripper; name of its action server; `fail` as in `GoalSender`.
-
-        Raises:
-            UserError: a package of messages is not installed.
-        """
-
-        def sender(kind: Any, name: str, complaint: Callable[[Any, bool], str]) -> GoalSender:
-            return GoalSender(node, kind, name, complaint, fail, self._advance)
-
-        if isinstance(settings, FrankaGripper):
-            grasp, move = (action_class(*names) for names in settings.actions)
-            speed, force = float(settings.speed), float(settings.force)  # YAML may hold whole numbers
-            opening = move.Goal(width=float(settings.open), speed=speed)
-            closing = grasp.Goal(width=float(settings.closed), speed=speed, force=force)
-            closing.epsilon.inner, closing.epsilon.outer = map(float, settings.epsilon)
-            # A missed grasp has an empty error text, so only errors of the driver count.
-            missed = sender(grasp, f"{server}/grasp", lambda result, _: result.error)
-            stuck = sender(move, f"{server}/move", lambda result, _: result.error or "it does not reach its width")
-            self._goals = {True: (stuck, opening), False: (missed, closing)}
-        else:
-            kind = action_class(*settings.actions[0])
-            # A stalled gripper has grasped something, which is no error.
-            only = sender(kind, server, lambda result, _: "" if result.stalled else "it does not reach its position")
-            self._goals = {wanted: (only, kind.Goal()) for wanted in (True, False)}
-            for wanted, position in ((True, settings.open), (False, settings.closed)):
-                command = self._goals[wanted][1].command
-                command.position, command.max_effort = float(position), float(settings.effort)
-        self.senders = {sender.name: sender for sender, _ in self._goals.values()}
-        self.reset()
-
-    def reset(self) -> None:
-        """Reset the state: the next opening is sent even if it repeats the last."""
-        self._wanted: bool | None = None  # open?
-        self._sent: bool | None = None
-
-    def command(self, opening: float) -> None:
-        """Open above `OPEN_ABOVE`, close below `CLOSE_BELOW`; `opening` is 0 closed … 1 open."""
-        if opening > OPEN_ABOVE:
-            self._wanted = True
-        elif opening < CLOSE_BELOW:
-            self._wanted = False
-        self._advance()
-
-    def hold(self) -> None:
-        """Send nothing until the next command; drop a goal that waits for the cancellation of the previous one."""
-        self._wanted = None
-
-    def _advance(self) -> None:
-        """Send the requested goal once the previous one has ended: Franka's gripper accepts one at a time."""
-        if self._wanted is None or self._wanted == self._sent:
-            return
-        busy = [sender for sender in self.senders.values() if sender.active]
-        for sender in busy:
-            sender.cancel()
-            self._sent = None
-        if not busy:
-            sender, goal = self._goals[self._wanted]
-            self._sent = self._wanted
-            sender.send(goal)

@@ -8,7 +8,6 @@ from __future__ import annotations
 import logging
 from bisect import bisect_left
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from itertools import islice
 from operator import itemgetter
 from pathlib import Path
@@ -16,12 +15,11 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from vla.data.episodes import EpisodeStore
 from vla.data.formats.imported_demonstrations import ImportedDemonstrations, Recording, action_bounds
 from vla.deploy import messages
-from vla.deploy.bag import bag_errors, message_types, messages_of, opened
+from vla.deploy.bag import bag_errors, messages_of, opened
 from vla.deploy.bag_index import BagIndex, Picture, Stretch, read_index
-from vla.deploy.joint_limiter import Robot
+from vla.deploy.joint_limiter import JointLimits
 from vla.deploy.observer import HISTORY, Observer
 from vla.deploy.settings import Topics
 from vla.io.errors import UserError
@@ -37,7 +35,7 @@ MOSTLY = 0.5  # largest share of a component's actions beyond its bounds; a larg
 log = logging.getLogger(__name__)
 
 
-class Step(NamedTuple):
+class _Step(NamedTuple):
     """One step of an episode, without its images."""
 
     at: float  # when its images were taken [s]
@@ -74,32 +72,26 @@ class BagDemonstrations(ImportedDemonstrations):
         steps: Literal["corrected", "all"],
         topics: Topics,
         status: Text,
-        robot: Robot,
+        robot: JointLimits,
         image_crop: Crop,
         *,
         spec: Spec,
     ) -> None:
-        self.spec, self._robot, self._crop = spec.without_truth, robot, image_crop
+        self.spec, self._limits, self._crop = spec.without_truth, robot, image_crop
         model = spec.require_robot("expert=bag")
         if len(robot.joints) != len(model.joints):
             raise UserError(f"the task's robot has {len(model.joints)} joints, expert.robot has {len(robot.joints)}")
         if missing := [camera for camera in spec.cameras if camera not in topics.images]:
             raise UserError(f"no topic for the cameras {', '.join(missing)}: add +expert.topics.images.{missing[0]}")
-        self._controller = recorded_controller(spec)
-        self._gripper_index = gripper_index(spec)
-        self._topics = {camera: topics.images[camera] for camera in spec.cameras}
-        self._index = read_index(_folder_of(folder), replace(topics, images=self._topics), robot, status)
+        self._controller, self._gripper = recorded_controller(spec), gripper_index(spec)
+        self._cameras = {topics.images[camera]: camera for camera in spec.cameras}  # topic → camera
+        self._index = read_index(_folder_of(folder), topics, robot, status)
+        for topic in self._cameras:
+            self._index.require(topic)
         self._stretches = _chosen(self._index, steps)
         self._steps = [self._steps_in(stretch) for stretch in self._stretches]
         self._actions = [np.array([self._action(step.at) for step in taken]) for taken in self._steps]
-        actions = np.concatenate(self._actions)
-        beyond = (actions < np.array(spec.low) - ROUNDING) | (actions > np.array(spec.high) + ROUNDING)
-        if far := [name for name, share in zip(spec.action, beyond.mean(0), strict=True) if share > MOSTLY]:
-            raise UserError(
-                f"{self._index.folder}: most actions exceed the bounds of {', '.join(far)}: set task.low and task.high "
-                "in the units of task.units"
-            )
-        self._beyond = float(beyond.any(1).mean())
+        self._require_bounds(np.concatenate(self._actions))
 
     @classmethod
     def recording(
@@ -112,20 +104,18 @@ class BagDemonstrations(ImportedDemonstrations):
         image_crop: str,
     ) -> Recording:
         """Describe a bag: its state and action are the joints, see `ImportedDemonstrations.recording`."""
-        arm = Robot(**{name: value for name, value in robot.items() if name != "_target_"})
+        limits = JointLimits(**{name: value for name, value in robot.items() if name != "_target_"})
         named = Topics(**{name: value for name, value in topics.items() if name != "_target_"})
-        with opened(_folder_of(folder)) as reader:
-            there = {connection.topic for connection in reader.connections}
-        images = {camera: topic for camera, topic in named.images.items() if topic in there} or named.images
-        index = read_index(_folder_of(folder), replace(named, images=images), arm, status)
+        index = read_index(_folder_of(folder), named, limits, status)
+        cameras = tuple(camera for camera, topic in named.images.items() if topic in index.kinds)
+        index.require(named.images[cameras[0]] if cameras else next(iter(named.images.values())))
         track = index.commands if index.commands.times else index.measured
         values = np.transpose(track.values)
-        bounds = {name: action_bounds(each) for name, each in zip(arm.joints, values, strict=True)}
-        cameras = tuple(images)
+        bounds = {name: action_bounds(each) for name, each in zip(limits.joints, values, strict=True)}
         taken = [each.at for _, each in index.inputs if isinstance(each, Picture) and each.camera == cameras[0]]
         period = float(np.median(np.diff(taken))) if len(taken) > 1 else 0.0
         rate = round(1 / period, 1) if period > 0 else 1.0
-        joints = tuple(arm.joints)
+        joints = tuple(limits.joints)
         return Recording(cameras, rate, joints, joints, bounds, len(_chosen(index, steps)))
 
     def __len__(self) -> int:
@@ -133,19 +123,16 @@ class BagDemonstrations(ImportedDemonstrations):
         return len(self._stretches)
 
     def episode(self, number: int) -> Episode:
-        """Return one episode, with its images.
-
-        Raises:
-            UserError: images are damaged.
-        """
+        """Return one episode, with its images; raise a UserError if they are damaged."""
         spec, stretch, steps = self.spec, self._stretches[number], self._steps[number]
         images = self._images(steps)
+        depth = {camera: np.zeros(spec.image_size, np.uint16) for camera in spec.depth}
         observations = [
             Observation(
-                {camera: images[camera, step.pictures[camera]] for camera in spec.cameras},
+                {camera: images[camera, stamp] for camera, stamp in step.pictures.items()},
                 step.state,
                 stretch.instruction,
-                {camera: np.zeros(spec.image_size, np.uint16) for camera in spec.depth},
+                depth,
             )
             for step in steps
         ]
@@ -157,57 +144,55 @@ class BagDemonstrations(ImportedDemonstrations):
         what = (number, "recorded", stretch.instruction, "unverified", frozenset[str](), draws)
         return Episode(*what, observations, clipped, clipped)
 
-    def fill(self, store: EpisodeStore, episodes: int) -> int:
-        """Append episodes, and log the share of clipped actions."""
-        if self._beyond:
-            log.info("%.2g %% of the actions are clipped to the bounds of the task", 100 * self._beyond)
-        return super().fill(store, episodes)
+    def _require_bounds(self, actions: Array) -> None:
+        """Log how many actions (N, D) are to be clipped; raise a UserError if they are in other units."""
+        beyond = (actions < np.array(self.spec.low) - ROUNDING) | (actions > np.array(self.spec.high) + ROUNDING)
+        if far := [name for name, share in zip(self.spec.action, beyond.mean(0), strict=True) if share > MOSTLY]:
+            raise UserError(
+                f"{self._index.folder}: most actions exceed the bounds of {', '.join(far)}: set task.low and task.high "
+                "in the units of task.units"
+            )
+        if beyond.any():
+            log.info("%.2g %% of the actions are clipped to the bounds of the task", 100 * beyond.any(1).mean())
 
-    def _steps_in(self, stretch: Stretch) -> list[Step]:
+    def _steps_in(self, stretch: Stretch) -> list[_Step]:
         """Return the steps of a stretch, made as the policy node makes its observations; a UserError without any."""
-        observer, steps, period = Observer(self.spec), list[Step](), 1 / self.spec.control_hz
+        observer, steps, period = Observer(self.spec), list[_Step](), 1 / self.spec.control_hz
         last = earliest = -np.inf
         first = bisect_left(self._index.inputs, stretch.start - HISTORY, key=itemgetter(0))
         for now, each in islice(self._index.inputs, first, None):
             if now > stretch.end:
                 break
             if not isinstance(each, Picture):
-                observer.on_joint_state(each)
+                observer.add_joint_state(each)
                 continue
-            if each.camera not in self._topics:
-                continue
-            observer.cameras.add(each.camera, np.array(each.stamp), each.at)
+            observer.add_image(each.camera, np.array(each.stamp), each.at)
             taken = observer.due(last, earliest)
             if taken is None or observer.newest is None or not stretch.start <= taken <= stretch.end - period:
                 continue
             measured = observer.measured_at(taken)
             if abs(measured.at - taken) <= MEASURED_WITHIN:
-                pictures = {camera: int(stamp) for camera, stamp in observer.cameras.images.items()}
-                steps.append(Step(taken, pictures, observer.state(measured)))
+                pictures = {camera: int(stamp) for camera, stamp in observer.images.items()}
+                steps.append(_Step(taken, pictures, observer.state(measured)))
                 last, earliest = taken, taken + period
         if not steps:
             raise UserError(
-                f"{self._index.folder} has no matching images of {', '.join(self._topics)} from {stretch.start:.1f} to "
-                f"{stretch.end:.1f} s, in '{messages.shorten(stretch.instruction)}'"
+                f"{self._index.folder} has no matching images of {', '.join(self.spec.cameras)} from "
+                f"{stretch.start:.1f} to {stretch.end:.1f} s, in '{messages.shorten(stretch.instruction)}'"
             )
         return steps
 
-    def _images(self, steps: Sequence[Step]) -> dict[tuple[str, int], Array]:
+    def _images(self, steps: Sequence[_Step]) -> dict[tuple[str, int], Array]:
         """Return camera and time of recording [ns] → image (H, W, 3)."""
-        types = message_types()
-        cameras = {topic: camera for camera, topic in self._topics.items()}
-        wanted = {(camera, stamp) for step in steps for camera, stamp in step.pictures.items()}
+        wanted = {picture for step in steps for picture in step.pictures.items()}
         span = min(stamp for _, stamp in wanted), max(stamp for _, stamp in wanted) + 1
-        images: dict[tuple[str, int], Array] = {}
-        folder = self._index.folder
+        images, folder = dict[tuple[str, int], Array](), self._index.folder
         with opened(folder) as reader:
-            connections = [connection for connection in reader.connections if connection.topic in cameras]
-            kinds = {connection.topic: connection.msgtype for connection in connections}
-            for topic, stamp, raw in messages_of(reader, connections, folder, *span):
-                if (key := (cameras[topic], stamp)) in wanted:
+            connections = [connection for connection in reader.connections if connection.topic in self._cameras]
+            for topic, stamp, message in messages_of(reader, connections, folder, *span):
+                if (key := (self._cameras[topic], stamp)) in wanted:
                     with bag_errors(folder):
-                        image = messages.image_from(types.deserialize_cdr(raw, kinds[topic]))
-                    images[key] = resize(image, self.spec.image_size, self._crop)
+                        images[key] = resize(messages.image_from(message), self.spec.image_size, self._crop)
         return images
 
     def _action(self, at: float) -> Array:
@@ -215,12 +200,12 @@ class BagDemonstrations(ImportedDemonstrations):
         index, end = self._index, at + 1 / self.spec.control_hz
         track = index.commands if index.commands.covers(at) and index.commands.covers(end) else index.measured
         motion = self._controller.motion_between(track.between(at), track.between(end))
-        if self._gripper_index is None:
+        if self._gripper is None:
             return motion
         opening = index.gripper_commands.last(end)
         if opening is None:
-            opening = float(index.openings.between(end)) / self._robot.stroke
-        return np.insert(motion, self._gripper_index, opening)
+            opening = float(index.openings.between(end)) / self._limits.stroke
+        return np.insert(motion, self._gripper, opening)
 
 
 def _folder_of(folder: Path | str | None) -> Path:

@@ -5,13 +5,11 @@ All times are seconds since the first message. Shapes: J joints, N samples.
 
 from __future__ import annotations
 
-import json
 import logging
 from bisect import bisect_right
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import asdict, dataclass, field, replace
-from functools import lru_cache
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field, replace
 from itertools import groupby
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -19,21 +17,19 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from vla.deploy import messages
-from vla.deploy.bag import bag_errors, message_types, messages_of, opened
-from vla.deploy.control_loop import REPEATED, State
-from vla.deploy.joint_limiter import Robot
+from vla.deploy.bag import messages_of, opened
+from vla.deploy.control_loop import REPEATED
+from vla.deploy.joint_limiter import JointLimits
 from vla.deploy.observer import Measured, age_of
+from vla.deploy.safety import State
 from vla.deploy.settings import Topics
 from vla.io.errors import UserError
 from vla.spec import LONGEST_INSTRUCTION, Array
 
 log = logging.getLogger(__name__)
 
-IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
-JOINTS = "sensor_msgs/msg/JointState"
-TRAJECTORY = "trajectory_msgs/msg/JointTrajectory"
-NUMBERS = "std_msgs/msg/Float64MultiArray"
-TWIST = "geometry_msgs/msg/TwistStamped"
+Handler = Callable[[int, float, Any], None]  # of a message: when it was recorded [ns] and [s], itself
+
 GAP = 0.3  # longest time between two commands of one motion [s]
 STILL, STILL_OPENING = 0.01, 0.002  # an arm that has moved less [rad], and its gripper [m], has not begun to move
 LEAD = 0.1  # of a motion that are kept before it begins and after it ends [s]
@@ -59,7 +55,7 @@ class Stretch:
 
 
 @dataclass
-class Track:
+class _Track:
     """Positions over time."""
 
     times: list[float] = field(default_factory=list)
@@ -90,18 +86,49 @@ class Track:
         return self.values[place - 1] if place else None
 
 
-@dataclass
 class BagIndex:
-    """A bag without its pixels."""
+    """A bag without its pixels, read once.
 
-    folder: Path
-    inputs: list[tuple[float, Picture | Measured]] = field(default_factory=list)  # when they arrived
-    measured: Track = field(default_factory=Track)  # joints (J,) [rad]
-    openings: Track = field(default_factory=Track)  # measured, of the gripper [m]
-    commands: Track = field(default_factory=Track)  # joints (J,) [rad]
-    # Commanded openings of the gripper, 0 … 1; None from a hand-over until the person's first command.
-    gripper_commands: Track = field(default_factory=Track)
-    stretches: list[Stretch] = field(default_factory=list)
+    Messages that the policy node would drop are left out, and so are cameras without a topic in the bag.
+    """
+
+    def __init__(self, folder: Path, topics: Topics, limits: JointLimits, status: str) -> None:
+        """Args: folder of the bag; topics, joints of the arm, and topic of the policy node's status.
+
+        Raises:
+            UserError: it is no bag, damaged or incomplete, or lacks the topic of joint states or instructions.
+        """
+        self.folder, self._limits, self._joint_states = folder, limits, messages.JointStates(limits)
+        self.inputs: list[tuple[float, Picture | Measured]] = []  # when they arrived
+        self.measured, self.openings = _Track(), _Track()  # joints (J,) [rad], opening of the gripper [m]
+        # Joints (J,) [rad], openings 0 … 1; None from a hand-over until the person's first command.
+        self.commands, self.gripper_commands = _Track(), _Track()
+        self._usable = Counter[str]()  # topic → number of messages that say something
+        self._dropped: dict[str, str] = {}  # topic → why its first unusable message is that
+        self._instruction, self._said_at = "", -np.inf
+        self._seen = set[str]()  # cameras of usable images
+        self._taken: dict[str, tuple[int, int]] = {}  # camera → time stamp of its last image
+        self._number = 0  # of the try: the next one begins with an instruction, or when the agent runs again
+        self._moments: list[tuple[float, int, bool | None, str]] = []  # of joint states: try, who moves the arm, words
+        with opened(folder) as reader:
+            self.kinds = {connection.topic: connection.msgtype for connection in reader.connections}
+            self._has_status = status in self.kinds
+            self._person: bool | None = None if self._has_status else True  # who moves the arm; None: nobody
+            self._tell_missing(topics, status)
+            self._read(reader, self._handlers(topics, status))
+        for topic in (topics.joint_states, topics.instruction):
+            self.require(topic)
+        self.inputs.sort(key=lambda each: each[0])
+        self.stretches = [*self._stretches()]
+
+    def require(self, topic: str) -> None:
+        """Raise a UserError unless there are usable messages on a topic."""
+        if topic not in self.kinds:
+            known = messages.shorten(", ".join(sorted(self.kinds)) or "nothing", 500)
+            raise UserError(f"{self.folder} has no topic {topic}, it has {known}: choose others with expert.topics")
+        if not self._usable[topic]:
+            why = self._dropped.get(topic, "there are no messages")
+            raise UserError(f"{self.folder}: no message on {topic} can be used: {why}")
 
     def corrections(self) -> list[Stretch]:
         """Return the times in which a person moved the arm, from the beginning of the motion to its end."""
@@ -130,123 +157,61 @@ class BagIndex:
         times = self.measured.times[first:last]
         return max(times[began[0]] - LEAD, start), min(times[ceased[-1]] + LEAD, end)
 
+    def _tell_missing(self, topics: Topics, status: str) -> None:
+        """Log what replaces missing topics; raise a UserError if the status has another name, as in a namespace."""
+        folder, there = self.folder, self.kinds
+        if others := [topic for topic in there if topic.endswith(status) and not self._has_status]:
+            raise UserError(
+                f"{folder} has no topic {status}, which tells who moves the arm, but {others[0]}: choose it with "
+                f"expert.status={others[0]}"
+            )
+        if not self._has_status:
+            log.info("%s has no topic %s: all motion counts as a person's", folder, status)
+        if topics.commands not in there:
+            log.info("%s has no topic %s: actions follow the measured motion", folder, topics.commands)
 
-def read_index(folder: Path, topics: Topics, robot: Robot, status: str) -> BagIndex:
-    """Read all of a bag once.
-
-    Messages that the policy node would drop are left out.
-
-    Raises:
-        UserError: it is no bag, damaged or incomplete, or lacks a topic, or all messages on one are unusable.
-    """
-    files = sorted(folder.iterdir()) if folder.is_dir() else []
-    state = tuple((file.name, file.stat().st_size, file.stat().st_mtime_ns) for file in files)
-    return _read(folder, json.dumps([asdict(topics), asdict(robot)]), status, state)
-
-
-@lru_cache(maxsize=2)
-def _read(folder: Path, settings: str, status: str, state: tuple[Any, ...]) -> BagIndex:
-    """Read a bag, cached by the `state` of its files, because composition and import both need it."""
-    topics, robot = json.loads(settings)
-    return _Reading(folder, Topics(**topics), Robot(**robot), status).index
-
-
-class _Reading:
-    """One pass through a bag."""
-
-    def __init__(self, folder: Path, topics: Topics, robot: Robot, status: str) -> None:
-        self.index = BagIndex(folder)
-        self._robot, self._joint_states = robot, messages.JointStates(robot)
-        self._instruction, self._said_at = "", -np.inf
-        self._person: bool | None = None  # whether a person moves the arm, or the policy; None: nobody
-        self._has_status, self._seen = False, set[str]()  # cameras of usable images
-        self._taken: dict[str, tuple[int, int]] = {}  # camera → time stamp of its last image
-        self._number = 0  # of the try: the next one begins with an instruction, or when the agent runs again
-        self._moments: list[tuple[float, int, bool | None, str]] = []  # of joint states: try, who moves the arm, words
-        self._dropped: dict[str, str] = {}  # topic → why its first unusable message is that
-        self._usable: Counter[str] = Counter()  # topic → messages
-        with opened(folder) as reader:
-            self._handlers = self._handle(topics, status, reader)
-            self._read(reader)
-        self._require_usable(topics)
-        self.index.inputs.sort(key=lambda each: each[0])
-        self.index.stretches = [*self._stretches()]
-
-    def _handle(self, topics: Topics, status: str, reader: Any) -> dict[str, Callable[[int, float, Any], None]]:
-        """Return topic → message handler; a UserError if a topic is missing or of another type."""
-        commands = {JOINTS: self._command, TRAJECTORY: self._trajectory, NUMBERS: self._numbers, TWIST: self._nothing}
-        wanted: dict[str, dict[str, Any]] = {}  # topic → type → handler
+    def _handlers(self, topics: Topics, status: str) -> dict[str, Handler]:
+        """Return topic → handler of its messages; a UserError if one is of another type."""
+        joint_state, numbers = "sensor_msgs/msg/JointState", "std_msgs/msg/Float64MultiArray"
+        kinds: dict[str | None, dict[str, Handler]] = {}
         for camera, topic in topics.images.items():
-            wanted[topic] = dict.fromkeys(IMAGES, lambda ns, at, m, camera=camera: self._image(camera, ns, at, m))
-        wanted |= {topics.joint_states: {JOINTS: self._joints}}
-        wanted |= {topics.instruction: {"std_msgs/msg/String": self._words}}
-        optional = {topics.commands: commands, status: {"diagnostic_msgs/msg/DiagnosticStatus": self._status}}
-        optional |= {topics.gripper: {NUMBERS: self._fingers}} if topics.gripper else {}
-        optional |= {topics.finger_states: {JOINTS: self._joints}} if topics.finger_states else {}
-        there = {connection.topic: connection.msgtype for connection in reader.connections}
-        if missing := ", ".join(topic for topic in wanted if topic not in there):
-            known = messages.shorten(", ".join(sorted(there)) or "nothing", 500)
-            raise UserError(
-                f"{self.index.folder} has no topic {missing}, it has {known}: choose others with expert.topics"
-            )
-        self._tell_missing(topics, status, there)
-        wanted |= optional
-        for topic, kinds in wanted.items():
-            if topic in there and there[topic] not in kinds:
-                raise UserError(
-                    f"{self.index.folder}: {topic} is of type {messages.shorten(there[topic])}, expected "
-                    f"{' or '.join(kinds)}"
-                )
-        self._has_status = status in there
-        self._person = None if self._has_status else True
-        return {topic: kinds[there[topic]] for topic, kinds in wanted.items() if topic in there}
-
-    def _tell_missing(self, topics: Topics, status: str, there: Mapping[str, str]) -> None:
-        """Log what replaces optional topics that are missing.
-
-        Raises:
-            UserError: the topic `status` is missing, but the bag has one of an agent in a namespace.
-        """
-        missing = {
-            topics.commands: "actions follow the measured motion",
-            topics.gripper: "actions have the measured opening of the gripper, unless commands contain fingers",
-            topics.finger_states: f"fingers are expected on {topics.joint_states}",
-            status: "all motion counts as a person's",
+            image: Handler = lambda stamp, at, message, camera=camera: self._image(camera, stamp, at, message)  # noqa: E731
+            kinds[topic] = {"sensor_msgs/msg/Image": image, "sensor_msgs/msg/CompressedImage": image}
+        kinds |= {
+            topics.joint_states: {joint_state: self._joints},
+            topics.finger_states: {joint_state: self._joints},
+            topics.instruction: {"std_msgs/msg/String": self._words},
+            topics.gripper: {numbers: self._fingers},
+            status: {"diagnostic_msgs/msg/DiagnosticStatus": self._status},
+            topics.commands: {
+                joint_state: self._command,
+                "trajectory_msgs/msg/JointTrajectory": self._trajectory,
+                numbers: self._numbers,
+                # Twists contain no joint positions: actions then follow the measured motion.
+                "geometry_msgs/msg/TwistStamped": lambda *_: None,
+            },
         }
-        if others := [topic for topic in there if topic.endswith(status) and status not in there]:
-            raise UserError(
-                f"{self.index.folder} has no topic {status}, which tells who moves the arm, but {others[0]}: choose it "
-                f"with expert.status={others[0]}"
-            )
-        for topic, instead in missing.items():
-            if topic and topic not in there:
-                log.info("%s has no topic %s: %s", self.index.folder, topic, instead)
+        found = {topic: (kind, kinds[topic]) for topic, kind in self.kinds.items() if topic in kinds}
+        for topic, (kind, handlers) in found.items():
+            if kind not in handlers:
+                raise UserError(
+                    f"{self.folder}: {topic} is of type {messages.shorten(kind)}, expected {' or '.join(handlers)}"
+                )
+        return {topic: handlers[kind] for topic, (kind, handlers) in found.items()}
 
-    def _read(self, reader: Any) -> None:
-        types = message_types()
-        connections = [connection for connection in reader.connections if connection.topic in self._handlers]
-        kinds = {connection.topic: connection.msgtype for connection in connections}
-        folder, start, read = self.index.folder, reader.start_time, 0
-        for topic, stamp, raw in messages_of(reader, connections, folder):
-            with bag_errors(folder):
-                message = types.deserialize_cdr(raw, kinds[topic])
+    def _read(self, reader: Any, handlers: dict[str, Handler]) -> None:
+        connections = [connection for connection in reader.connections if connection.topic in handlers]
+        folder, start, read = self.folder, reader.start_time, 0
+        for topic, stamp, message in messages_of(reader, connections, folder):
             read += 1
             try:
-                self._handlers[topic](stamp, (stamp - start) * 1e-9, message)
+                handlers[topic](stamp, (stamp - start) * 1e-9, message)
                 self._usable[topic] += 1
-            except ValueError as error:
+            except UserError as error:
                 self._dropped.setdefault(topic, str(error))
         expected = sum(connection.msgcount for connection in connections)
         if read < expected:
             raise UserError(f"{folder} is incomplete: {read} of {expected} messages are there, was its end cut off?")
-
-    def _require_usable(self, topics: Topics) -> None:
-        for topic in (*topics.images.values(), topics.joint_states, topics.instruction):
-            if not self._usable[topic]:
-                why = self._dropped.get(topic, "there are no messages")
-                raise UserError(f"{self.index.folder}: no message on {topic} can be used: {why}")
-
-    # Messages.
 
     def _image(self, camera: str, stamp: int, at: float, message: Any) -> None:
         taken = message.header.stamp.sec, message.header.stamp.nanosec
@@ -256,17 +221,14 @@ class _Reading:
         if camera not in self._seen or not hasattr(message, "format"):
             messages.image_from(message)  # other compressed ones are decoded when they are needed
             self._seen.add(camera)
-        age = age_of(taken, stamp * 1e-9)
-        self.index.inputs.append((at, Picture(camera, at - age, stamp)))
+        self.inputs.append((at, Picture(camera, at - age_of(taken, stamp * 1e-9), stamp)))
 
     def _joints(self, stamp: int, at: float, message: Any) -> None:
-        measured = self._joint_states.read(message, at)
-        if measured is None:
+        if (measured := self._joint_states.read(message, at)) is None:
             return
-        joints, velocities, opening = measured
-        self.index.inputs.append((at, Measured(at, joints, velocities, opening)))
-        self.index.measured.add(at, joints)
-        self.index.openings.add(at, opening)
+        self.inputs.append((at, Measured(at, *measured)))
+        self.measured.add(at, measured[0])
+        self.openings.add(at, measured[2])
         self._moments.append((at, self._number, self._person if self._instruction else None, self._instruction))
 
     def _words(self, stamp: int, at: float, message: Any) -> None:
@@ -284,42 +246,52 @@ class _Reading:
         before = self._person
         self._person = True if values.get(messages.HANDED_OVER) == "yes" else None
         if self._person and not before:
-            self.index.gripper_commands.add(at, None)  # the policy's last command is not the person's
+            self.gripper_commands.add(at, None)  # the policy's last command is not the person's
         if self._person is None and values.get("state") == State.RUNNING:
             self._person = False
         self._number += before is not None and self._person is None
 
-    def _nothing(self, stamp: int, at: float, message: Any) -> None:
-        """Ignore twist commands, which contain no joint positions: actions then follow from the measured motion."""
-
     def _command(self, stamp: int, at: float, message: Any) -> None:
-        joints, opening = messages.command_from(message.name, message.position, self._robot)
-        self.index.commands.add(at, joints)
+        joints, opening = messages.command_from(message.name, message.position, self._limits)
+        self.commands.add(at, joints)
         if opening is not None:
-            self.index.gripper_commands.add(at, opening)
+            self.gripper_commands.add(at, opening)
 
     def _trajectory(self, stamp: int, at: float, message: Any) -> None:
         for point in message.points:
             due = at + point.time_from_start.sec + point.time_from_start.nanosec * 1e-9
-            self.index.commands.add(due, messages.command_from(message.joint_names, point.positions, self._robot)[0])
+            self.commands.add(due, messages.command_from(message.joint_names, point.positions, self._limits)[0])
 
     def _numbers(self, stamp: int, at: float, message: Any) -> None:
-        self.index.commands.add(at, messages.command_from(self._robot.joints, message.data, self._robot)[0])
+        self.commands.add(at, messages.command_from(self._limits.joints, message.data, self._limits)[0])
 
     def _fingers(self, stamp: int, at: float, message: Any) -> None:
-        opening = float(np.mean(message.data)) / self._robot.finger_travel if len(message.data) else np.nan
+        opening = float(np.mean(message.data)) / self._limits.finger_travel if len(message.data) else np.nan
         if not np.isfinite(opening):
             raise UserError("finger positions that are not finite")
-        self.index.gripper_commands.add(at, opening)
+        self.gripper_commands.add(at, opening)
 
     def _stretches(self) -> Iterator[Stretch]:
         """Yield every try, with the times in which a person moved the arm."""
-        for (_, words), of_try in groupby(
-            (moment for moment in self._moments if moment[2] is not None), key=lambda moment: (moment[1], moment[3])
-        ):
+        moved = (moment for moment in self._moments if moment[2] is not None)
+        for (_, words), of_try in groupby(moved, key=lambda moment: (moment[1], moment[3])):
             moments = [*of_try]
             start, end = moments[0][0], moments[-1][0]
             runs = [(person, [*run]) for person, run in groupby(moments, key=lambda moment: moment[2])]
-            person = tuple((run[0][0], run[-1][0]) for who, run in runs if who)
             if end - start >= SHORTEST:
-                yield Stretch(words, start, end, person)
+                yield Stretch(words, start, end, tuple((run[0][0], run[-1][0]) for who, run in runs if who))
+
+
+_newest: dict[str, BagIndex] = {}  # arguments, with the state of the files → the last index
+
+
+def read_index(folder: Path, topics: Topics, limits: JointLimits, status: str) -> BagIndex:
+    """Return the index of a bag, which is kept for the next call: composition and import both need it."""
+    files = sorted(folder.iterdir()) if folder.is_dir() else []
+    state = [(file.name, file.stat().st_size, file.stat().st_mtime_ns) for file in files]
+    key = repr((folder, topics, limits, status, state))
+    if key not in _newest:
+        index = BagIndex(folder, topics, limits, status)
+        _newest.clear()
+        _newest[key] = index
+    return _newest[key]

@@ -6,6 +6,7 @@ import time
 from typing import Any
 
 import rclpy
+from diagnostic_msgs.msg import DiagnosticStatus
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
 from rclpy.duration import Duration
@@ -14,18 +15,15 @@ from std_srvs.srv import SetBool, Trigger
 
 from vla.io.errors import UserError
 
-TIMEOUT = 10.0  # of the discovery of a subscriber or service, and of a service call [s]
+TIMEOUT = 10.0  # of the discovery of a subscriber or service, of a service call, and of a status [s]
 SETTLED = 0.7  # discovery is complete after so long without a new subscriber [s]
-HAND_OVER = "/vla_agent/hand_over"
-RESUME, CHANGE, RESET = "/vla_agent/resume", "/vla_agent/change_state", "/vla_simulator/reset"
+HAND_OVER, RESUME, CHANGE = "/vla_agent/hand_over", "/vla_agent/resume", "/vla_agent/change_state"
+STATUS, RESET = "/vla_agent/status", "/vla_simulator/reset"
+HELP = "is its node running, and on the same network and domain?"
 
 
 def say(node: Any, topic: str, instruction: str) -> None:
-    """Publish an instruction once all subscribers are discovered.
-
-    Raises:
-        UserError: there is no subscriber, or one does not confirm the message.
-    """
+    """Publish an instruction once all subscribers are discovered; raise a UserError if none is, or confirms it."""
     publisher = node.create_publisher(String, topic, 1)
     subscribers, since = 0, time.monotonic()
     # Subscribers are discovered one by one, in any order: the simulator may come before the agent.
@@ -40,21 +38,25 @@ def say(node: Any, topic: str, instruction: str) -> None:
         raise UserError(f"a subscriber on {topic} does not confirm the instruction: does one of the nodes hang?")
 
 
-def resume(node: Any) -> None:
-    """Resume a stopped agent.
+def state(node: Any) -> str:
+    """Return the agent's status: its reason, then a line for each value; raise a UserError if there is no agent."""
+    heard: list[DiagnosticStatus] = []
+    node.create_subscription(DiagnosticStatus, STATUS, heard.append, 10)
+    deadline = time.monotonic() + TIMEOUT
+    while not heard and time.monotonic() < deadline:
+        rclpy.spin_once(node, timeout_sec=0.1)
+    if not heard:
+        raise UserError(f"no message on {STATUS}: {HELP}")
+    return "\n".join([heard[-1].message, *(f"  {pair.key}: {pair.value}" for pair in heard[-1].values)])
 
-    Raises:
-        UserError: there is no agent, or it is not stopped.
-    """
+
+def resume(node: Any) -> None:
+    """Resume a stopped agent; raise a UserError if there is none, or it is not stopped."""
     _require(_call(node, Trigger, RESUME, Trigger.Request()))
 
 
 def hand_over(node: Any, to_person: bool) -> None:
-    """Make the agent leave the arm to a person, or take it back.
-
-    Raises:
-        UserError: there is no agent, or it refuses, as while the arm moves.
-    """
+    """Make the agent leave the arm to a person, or take it back; raise a UserError if it refuses."""
     _require(_call(node, SetBool, HAND_OVER, SetBool.Request(data=to_person)))
 
 
@@ -71,9 +73,8 @@ def next_episode(node: Any) -> str:
         request = ChangeState.Request(transition=Transition(id=transition))
         return bool(_call(node, ChangeState, CHANGE, request).success)
 
-    reset = node.create_client(Trigger, RESET)
-    if not reset.wait_for_service(TIMEOUT):
-        raise UserError(f"no service {RESET}: is the simulator running, and on the same network and domain?")
+    if not node.create_client(Trigger, RESET).wait_for_service(TIMEOUT):
+        raise UserError(f"no service {RESET}: {HELP}")
     agent = node.create_client(ChangeState, CHANGE).wait_for_service(SETTLED)
     # The reset moves the arm: an active agent would pull it back.
     active = agent and change(Transition.TRANSITION_DEACTIVATE)
@@ -91,7 +92,7 @@ def _require(answer: Any) -> None:
 def _call(node: Any, kind: Any, service: str, request: Any) -> Any:
     client = node.create_client(kind, service)
     if not client.wait_for_service(TIMEOUT):
-        raise UserError(f"no service {service}: is its node running, and on the same network and domain?")
+        raise UserError(f"no service {service}: {HELP}")
     answer = client.call_async(request)
     rclpy.spin_until_future_complete(node, answer, timeout_sec=TIMEOUT)
     if not answer.done():

@@ -26,11 +26,7 @@ class Keys:
     prompt: Text  # instruction
 
     def observation(self, message: Any, spec: Spec, crop: Crop) -> Observation:
-        """Convert a client's observation; images are resized, and all components are checked.
-
-        Raises:
-            UserError: it does not match the spec; all missing keys are named at once.
-        """
+        """Convert a client's observation, with images resized; raise a UserError if it does not match the spec."""
         if not isinstance(message, Mapping):
             raise UserError(f"an observation is a map, not {type(message).__name__}")
         wanted = [*(self.images[camera] for camera in spec.cameras), *self.state, self.prompt]

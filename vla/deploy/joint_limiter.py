@@ -5,7 +5,6 @@ Shapes: J joints. Positions [rad], speeds [rad/s], accelerations [rad/s²].
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -22,8 +21,8 @@ REST = 1e-9  # lower speeds are rounding errors [rad/s]
 
 
 @dataclass(frozen=True)
-class Robot:
-    """Joint names and limits of an arm.
+class JointLimits:
+    """Names and limits of the joints of an arm and its gripper.
 
     Attributes:
         joints: J names, base to tip.
@@ -36,7 +35,7 @@ class Robot:
         speed_share, acceleration_share: usable share of those limits, above 0 and at most 1.
 
     Raises:
-        UserError: lists of different lengths, or a share out of range.
+        UserError: lists of different lengths, or a lowest position that is not below the highest.
     """
 
     joints: Annotated[list[Text], MinLen(1)]
@@ -57,14 +56,7 @@ class Robot:
             raise UserError(
                 "deploy.robot needs one entry per joint in each of joints, low, high, speed and acceleration"
             )
-        if not (0 < self.speed_share <= 1 and 0 < self.acceleration_share <= 1):
-            raise UserError("deploy.robot.speed_share and acceleration_share must be above 0 and at most 1")
-        # Parameters of ROS come here without the checks of a config.
-        if not all(0 < value < math.inf for value in (*self.speed, *self.acceleration, self.finger_travel)):
-            raise UserError("deploy.robot.speed, acceleration and finger_travel must be above 0 and finite")
-        if not all(0 <= value < math.inf for value in (self.margin, self.overshoot)):
-            raise UserError("deploy.robot.margin and overshoot must be at least 0 and finite")
-        if not (np.isfinite([*self.low, *self.high]).all() and (self.min_position < self.max_position).all()):
+        if not (self.min_position < self.max_position).all():
             raise UserError("deploy.robot.low must be below high by more than twice the margin, for every joint")
 
     @property
@@ -78,11 +70,6 @@ class Robot:
         return np.array(self.high) - self.margin
 
     @property
-    def stroke(self) -> float:
-        """Opening of the gripper when open [m]; tiny without fingers, as openings are divided by it."""
-        return max(self.finger_travel * len(self.fingers), 1e-6)
-
-    @property
     def max_speed(self) -> Array:
         """(J,) largest allowed speeds [rad/s]."""
         return np.array(self.speed) * self.speed_share
@@ -92,6 +79,11 @@ class Robot:
         """(J,) largest allowed accelerations [rad/s²]."""
         return np.array(self.acceleration) * self.acceleration_share
 
+    @property
+    def stroke(self) -> float:
+        """Opening of the gripper when open [m]; tiny without fingers, as openings are divided by it."""
+        return max(self.finger_travel * len(self.fingers), 1e-6)
+
 
 class JointLimiter:
     """Moves a commanded position towards goals within the limits of position, speed and acceleration.
@@ -100,32 +92,33 @@ class JointLimiter:
     make the arm oscillate and fall short.
     """
 
-    def __init__(self, robot: Robot, period: float) -> None:
-        """Args: the arm and its limits; time between commands [s]."""
-        self.robot, self._period = robot, period
-        self.position = np.zeros(len(robot.joints))
-        self.velocity = np.zeros(len(robot.joints))
+    def __init__(self, limits: JointLimits, period: float) -> None:
+        """Args: the limits; time between commands [s]."""
+        self.limits, self._period = limits, period
+        self.position = np.zeros(len(limits.joints))
+        self.velocity = np.zeros(len(limits.joints))
 
     def start(self, measured: Array) -> None:
-        """Start from the measured position (J,), at rest.
-
-        Raises:
-            UserError: the arm is outside its position limits.
-        """
-        out = (measured < self.robot.min_position) | (measured > self.robot.max_position)
+        """Start from the measured position (J,), at rest; raise a UserError if it is outside the limits."""
+        low, high = self.limits.min_position, self.limits.max_position
+        out = (measured < low) | (measured > high)
         if out.any():
             joint = int(np.argmax(out))
             raise UserError(
-                f"{self.robot.joints[joint]} is at {measured[joint]:.3f} rad, outside "
-                f"{self.robot.min_position[joint]:.3f} to {self.robot.max_position[joint]:.3f}: move it inside first"
+                f"{self.limits.joints[joint]} is at {measured[joint]:.3f} rad, outside "
+                f"{low[joint]:.3f} to {high[joint]:.3f}: move it inside first"
             )
-        self.position, self.velocity = np.array(measured, dtype=float), np.zeros(len(measured))
+        self.hold(measured)
+
+    def hold(self, position: Array) -> None:
+        """Command a position (J,), at rest, whatever the limits are."""
+        self.position, self.velocity = np.array(position, dtype=float), np.zeros(len(position))
 
     def step(self, goal: Array, remaining: float = 0.0) -> Array:
         """Return the next command (J,) towards `goal` (J,), which is due in `remaining` seconds."""
-        distance = np.clip(goal, self.robot.min_position, self.robot.max_position) - self.position
+        distance = np.clip(goal, self.limits.min_position, self.limits.max_position) - self.position
         wanted = distance / max(remaining, self._period)
-        fastest = np.minimum(self._stoppable(np.abs(distance) + self.robot.overshoot), self.robot.max_speed)
+        fastest = np.minimum(self._stoppable(np.abs(distance) + self.limits.overshoot), self.limits.max_speed)
         # Scale all joints alike, so that the tool stays on its path.
         speed = np.abs(wanted)
         share = np.min(np.divide(fastest, speed, out=np.ones_like(speed), where=speed > fastest))
@@ -141,13 +134,13 @@ class JointLimiter:
         return not self.velocity.any()
 
     def _move(self, velocity: Array) -> Array:
-        change = self.robot.max_acceleration * self._period
-        velocity = np.clip(velocity, -self.robot.max_speed, self.robot.max_speed)
+        change = self.limits.max_acceleration * self._period
+        velocity = np.clip(velocity, -self.limits.max_speed, self.limits.max_speed)
         # After the speed limit, which may have been lowered in motion: the acceleration limit has priority.
         velocity = np.clip(velocity, self.velocity - change, self.velocity + change)
         # Keep the braking distance within the position limits.
-        up = self._stoppable(self.robot.max_position - self.position)
-        down = self._stoppable(self.position - self.robot.min_position)
+        up = self._stoppable(self.limits.max_position - self.position)
+        down = self._stoppable(self.position - self.limits.min_position)
         velocity = np.clip(velocity, -down, up)
         self.velocity = np.where(np.abs(velocity) < REST, 0.0, velocity)
         self.position = self.position + self.velocity * self._period
@@ -155,7 +148,7 @@ class JointLimiter:
 
     def _stoppable(self, distance: Array) -> Array:
         """(J,) largest speed from which constant deceleration stops within `distance` (J,), this step included."""
-        change = self.robot.max_acceleration * self._period
+        change = self.limits.max_acceleration * self._period
         unit = change * self._period  # distance by which each further step of braking is longer
         steps = np.maximum(distance, 0.0) / unit
         whole = np.floor((np.sqrt(1 + 8 * steps) - 1) / 2)  # n steps cover n(n + 1)/2 of these

@@ -8,81 +8,80 @@ from __future__ import annotations
 import traceback
 from abc import abstractmethod
 from collections.abc import Callable
+from functools import wraps
 from typing import Any
 
+from rclpy.action import ActionClient
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.qos import QoSProfile
+
+from vla.io.errors import UserError
 
 SUCCESS, FAILURE = TransitionCallbackReturn.SUCCESS, TransitionCallbackReturn.FAILURE
 
 
+def transition(do: Callable[[Any, LifecycleState], Any]) -> Callable[[Any, LifecycleState], TransitionCallbackReturn]:
+    """Make a method the callback of a transition, which an exception refuses; that of a UserError is one sentence."""
+
+    @wraps(do)
+    def tried(node: GuardedLifecycleNode, state: LifecycleState) -> TransitionCallbackReturn:
+        try:
+            do(node, state)
+        except Exception as error:
+            why = error if isinstance(error, UserError) else traceback.format_exc()
+            node.get_logger().error(f"cannot {do.__name__.removeprefix('on_')}: {why}")
+            return FAILURE
+        return SUCCESS
+
+    return tried
+
+
 class GuardedLifecycleNode(LifecycleNode):
-    """Base of managed nodes; destroys the subscriptions, publishers and services that it created on cleanup."""
+    """Base of managed nodes, which tell what they create, so that a cleanup can destroy it."""
 
     def __init__(self, name: str, **options: Any) -> None:
         super().__init__(name, **options)
-        self._created: list[tuple[Callable[[Any], Any], Any]] = []
+        self._created: list[Callable[[], Any]] = []  # functions that destroy what was created
+
+    @property
+    @abstractmethod
+    def active(self) -> bool:
+        """Whether the node is active."""
 
     @abstractmethod
-    def configure(self) -> None:
-        """Prepare; a UserError refuses the transition."""
-
-    @abstractmethod
-    def activate(self) -> None:
-        """Start; a UserError refuses the transition."""
-
-    @abstractmethod
-    def brake(self) -> None:
-        """Bring the arm to rest and undo `activate`; does nothing if the node is inactive."""
-
-    @abstractmethod
-    def clean_up(self) -> None:
-        """Undo `configure`."""
-
-    @abstractmethod
-    def on_callback_error(self, reason: str) -> None:
-        """Handle an unexpected exception in a callback."""
-
-    def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Run `configure`."""
-        return self._try("configure", self.configure)
-
-    def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Run `activate`."""
-        result = self._try("activate", self.activate)
-        return super().on_activate(state) if result is SUCCESS else result
-
-    def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Run `brake` while the publishers are still active."""
-        result = self._try("deactivate", self.brake)
-        super().on_deactivate(state)
-        return result
-
-    def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Run `clean_up`."""
-        return self._try("clean up", self._clean_up)
-
-    def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Run `brake` and `clean_up`."""
-        self._try("brake", self.brake)
-        return self._try("clean up", self._clean_up)
+    def fail(self, reason: str) -> None:
+        """Stop for a reason, such as an unexpected exception in a callback."""
 
     def add_subscription(self, kind: type, topic: str, callback: Callable[[Any], None], qos: QoSProfile) -> None:
         """Subscribe to a topic."""
         subscription = self.create_subscription(kind, topic, self.guard(callback), qos)
-        self._created.append((self.destroy_subscription, subscription))
+        self._created.append(lambda: self.destroy_subscription(subscription))
 
     def add_publisher(self, kind: type, topic: str, while_active: bool = False) -> Any:
         """Create a publisher that publishes always or only `while_active`."""
-        create = self.create_lifecycle_publisher if while_active else super(LifecycleNode, self).create_publisher
-        publisher = create(kind, topic, 1 if while_active else 10)
-        destroy = self.destroy_lifecycle_publisher if while_active else self.destroy_publisher
-        self._created.append((destroy, publisher))
+        if while_active:
+            publisher: Any = self.create_lifecycle_publisher(kind, topic, 1)
+            self._created.append(lambda: self.destroy_lifecycle_publisher(publisher))
+        else:
+            publisher = super(LifecycleNode, self).create_publisher(kind, topic, 10)
+            self._created.append(lambda: self.destroy_publisher(publisher))
         return publisher
 
     def add_service(self, kind: Any, name: str, callback: Callable[[Any, Any], Any]) -> None:
         """Create a service."""
-        self._created.append((self.destroy_service, self.create_service(kind, name, callback)))
+        service = self.create_service(kind, name, callback)
+        self._created.append(lambda: self.destroy_service(service))
+
+    def add_action_client(self, kind: Any, name: str) -> ActionClient:
+        """Create the client of an action."""
+        client = ActionClient(self, kind, name)
+        self._created.append(client.destroy)
+        return client
+
+    def destroy_created(self) -> None:
+        """Destroy what was added."""
+        while self._created:
+            self._created.pop()()
 
     def guard(self, callback: Callable[..., None]) -> Callable[..., None]:
         """Wrap a callback: an exception stops the arm, not the process."""
@@ -92,38 +91,20 @@ class GuardedLifecycleNode(LifecycleNode):
                 callback(*arguments)
             except Exception:
                 self.get_logger().error(traceback.format_exc(), throttle_duration_sec=1.0)
-                self.on_callback_error("internal error of the agent, see its log")
+                self.fail("internal error of the agent, see its log")
 
         return guarded
 
-    def _clean_up(self) -> None:
-        self.clean_up()
-        for destroy, entity in self._created:
-            destroy(entity)
-        self._created = []
-
-    def _try(self, what: str, do: Callable[[], None]) -> TransitionCallbackReturn:
-        try:
-            do()
-        except ValueError as error:
-            self.get_logger().error(f"cannot {what}: {error}")
-            return FAILURE
-        except Exception:
-            self.get_logger().error(f"cannot {what}: {traceback.format_exc()}")
-            return FAILURE
-        return SUCCESS
-
     def _LifecycleNodeMixin__on_change_state(self, request: Any, response: Any) -> Any:
         """Refuse a transition that is not available in this state (ros2/rclpy#1209)."""
-        available = {transition[0]: transition[1] for transition in self._state_machine.available_transitions}
-        label = request.transition.label
-        wanted = (
-            next((key for key, name in available.items() if name == label), None) if label else request.transition.id
+        available = {each[0]: each[1] for each in self._state_machine.available_transitions}
+        label, wanted = request.transition.label, request.transition.id
+        if label:
+            wanted = next((key for key, name in available.items() if name == label), None)
+        if wanted in available:
+            return super()._LifecycleNodeMixin__on_change_state(request, response)  # type: ignore[misc]
+        self.get_logger().error(
+            f"transition {label or wanted} is not available, expected one of {', '.join(available.values())}"
         )
-        if wanted not in available:
-            self.get_logger().error(
-                f"transition {label or wanted} is not available, expected one of {', '.join(available.values())}"
-            )
-            response.success = False
-            return response
-        return super()._LifecycleNodeMixin__on_change_state(request, response)  # type: ignore[misc]
+        response.success = False
+        return response

@@ -8,16 +8,15 @@ from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass
 from multiprocessing import get_context
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
-from vla.deploy.bag import BagRecorder
+from vla.deploy.record import BagRecorder
 from vla.deploy.ros import plain_errors, ros
 from vla.deploy.ros2 import PolicyDeployment, SimulatorDeployment
 from vla.io.errors import UserError
 from vla.io.types import Count
 from vla.parallel.processes import leave_with_parent, without_triton
 from vla.rollouts.results import ERROR, Report, Result
-from vla.spec import Shell
 
 if TYPE_CHECKING:
     from vla.deploy.demo_operator import DemoOperator
@@ -34,8 +33,7 @@ class Loop:
     Attributes:
         agent, simulator: factories of the two deployments, called with `policy`, `environment` and `output`.
         episodes: number of episodes.
-        shell: factory of the surface of the arm in `session.rrd`; None draws lines between its joints.
-        record: write the inputs and commands of the agent as `session.rrd`, and all standard messages as a bag.
+        record: write all standard messages as a bag.
         policy, environment: factories of the checkpoint's policy and of its task's environment.
         output: folder of the report and the recordings.
     """
@@ -46,24 +44,19 @@ class Loop:
     simulator: Callable[..., SimulatorDeployment]
     episodes: Count
     record: bool
-    shell: Callable[[], Shell] | None
     policy: Callable[[], Policy]
     environment: Callable[[], Environment]
     output: Path
 
     def run(self) -> Report:
-        """Play all episodes, up to the first one that ends in an error.
-
-        Raises:
-            UserError: a node exited or does not respond in the first episode, or is not to move the arm.
-        """
+        """Play all episodes, up to the first that ends in an error, which is raised if there is no other."""
         with self.running() as operator:
             results: list[Result] = []
             log.info("playing %d episodes", self.episodes)
             while len(results) < self.episodes and not operator.stopped.is_set():
                 try:
                     result = operator.play()
-                except ValueError as error:
+                except UserError as error:
                     if not results:
                         raise
                     results.append(Result(results[-1].seed + 1, ERROR, error=str(error)))
@@ -76,7 +69,7 @@ class Loop:
 
     @contextmanager
     def running(self) -> Iterator[DemoOperator]:
-        """Start both nodes, and the recorders if configured; yields the operator."""
+        """Start both nodes, and the recorder if configured; yields the operator."""
         arguments = {"policy": self.policy, "environment": self.environment, "output": self.output}
         agent, simulator = self.agent(**arguments), self.simulator(**arguments)
         if agent.command != "joint_state" or agent.dry_run:
@@ -91,10 +84,10 @@ class Loop:
             with ros(agent.network, self.output) as stopped, ExitStack() as opened:
                 from vla.deploy.demo_operator import DemoOperator
 
-                operator = DemoOperator(agent.topics.instruction, simulator.timing.speed, stopped, *nodes)
+                operator = DemoOperator(agent.topics.instruction, stopped, *nodes)
                 opened.callback(operator.node.destroy_node)
-                if self.record:
-                    self._record(operator.node, opened)
+                if self.record:  # to the end: an episode that fails is the one to look at
+                    opened.enter_context(closing(BagRecorder(operator.node, self.output / "bag")))
                 yield operator
         finally:
             for node in nodes:
@@ -102,16 +95,6 @@ class Loop:
             for node in nodes:
                 node.join(timeout=5.0)
                 node.kill()
-
-    def _record(self, node: Any, opened: ExitStack) -> None:
-        """Record until `opened` is closed: an episode that fails is the one to look at."""
-        from vla.deploy.view import View
-
-        session = self.output / "session.rrd"
-        opened.callback(log.info, "rerun %s shows the inputs and commands of the agent", session)
-        opened.enter_context(closing(BagRecorder(node, self.output / "bag")))
-        shell = self.shell() if self.shell is not None else None
-        opened.enter_context(closing(View(node, session, shell)))
 
 
 def _run(node: PolicyDeployment | SimulatorDeployment) -> None:

@@ -8,24 +8,22 @@ Shapes: H by W pixels, J joints.
 from __future__ import annotations
 
 import io
-import json
 import struct
 import zlib
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Annotated, Any
 
 import numpy as np
 from annotated_types import MaxLen
 from PIL import Image
 
-from vla.deploy.control_loop import Command
-from vla.deploy.joint_limiter import Robot
+from vla.deploy.joint_limiter import JointLimits
 from vla.io.documents import STRICT, parse_json
 from vla.io.errors import UserError
 from vla.io.printable import printable
 from vla.io.types import Natural, NonNegative, Seed
-from vla.spec import LONGEST_INSTRUCTION, Array, Name, Names, Numbers, RobotModel
+from vla.spec import LONGEST_INSTRUCTION, Array, Name
 
 # Encoding → bytes per pixel, and the places of red, green and blue among them.
 ENCODINGS = {
@@ -42,17 +40,6 @@ FINGERS_AGE = 0.5  # oldest state of fingers that come in messages of their own 
 
 
 @dataclass(frozen=True)
-class ArmDescription:
-    """Facts of an arm that a view needs; the JSON text of `/vla_agent/arm`."""
-
-    __pydantic_config__ = STRICT
-
-    joints: Names  # in joint states and commands, base to tip
-    fingers: Annotated[tuple[Name, ...], MaxLen(100)]
-    chain: Annotated[tuple[Numbers, ...], MaxLen(101)]  # as in `RobotModel`, empty if unknown
-
-
-@dataclass(frozen=True)
 class SimulatedEpisode:
     """Message of the simulator about its episode; the JSON text of `/vla_simulator/episode`."""
 
@@ -66,6 +53,11 @@ class SimulatedEpisode:
     outcome: Name
     task: Annotated[str, MaxLen(100)]
     milestones: Annotated[tuple[Name, ...], MaxLen(100)]
+
+    @classmethod
+    def of(cls, message: Any) -> SimulatedEpisode:
+        """Read a std_msgs/String; raise a UserError if it is no episode."""
+        return parse_json(message.data[:LONGEST], cls, "/vla_simulator/episode")
 
 
 def shorten(text: str, longest: int = 80) -> str:
@@ -117,65 +109,35 @@ def fill_image(message: Any, image: Array, frame: str) -> Any:
     return message
 
 
-def fill_arm(message: Any, robot: Robot, model: RobotModel) -> Any:
-    """Fill a std_msgs/String with the description of the arm; returns the message."""
-    description = ArmDescription(tuple(robot.joints), tuple(robot.fingers), model.chain)
-    message.data = json.dumps(asdict(description))
-    return message
-
-
-def arm_from(message: Any) -> ArmDescription:
-    """Read the description of an arm from a std_msgs/String.
-
-    Raises:
-        UserError: it is no such description, or its chain does not fit its joints.
-    """
-    arm = parse_json(message.data, ArmDescription, "the description of the arm")
-    fits = [len(frame) for frame in arm.chain] == [7] * (len(arm.joints) + 1) and all(any(f[3:]) for f in arm.chain)
-    if arm.chain and not fits:
-        raise UserError(f"the arm's chain is not 7 numbers for each of {len(arm.joints)} joints and the tool")
-    return arm
-
-
-def episode_from(message: Any) -> SimulatedEpisode:
-    """Read a simulator's episode from a std_msgs/String; raise a UserError if it is none."""
-    return parse_json(message.data[:LONGEST], SimulatedEpisode, "/vla_simulator/episode")
-
-
 class JointStates:
     """Joint states of an arm, whose fingers come in the same messages or in others."""
 
-    def __init__(self, robot: Robot) -> None:
-        """Args: the names of the joints."""
-        self._robot, self._fingers = robot, (-np.inf, 0.0)  # when they came, opening
+    def __init__(self, limits: JointLimits) -> None:
+        """Args: the limits, of which the names of the joints matter here."""
+        self._limits, self._fingers = limits, (-np.inf, 0.0)  # when they came, opening
 
     def read(self, message: Any, at: float) -> tuple[Array, Array, float] | None:
-        """Read a sensor_msgs/JointState that came at `at` [s], as `joints_from` does; None if it has the fingers only.
+        """Read positions (J,) [rad], velocities (J,) [rad/s] and gripper opening [m] of a sensor_msgs/JointState.
+
+        Joints are found by name. Missing velocities, also NaN, become zero. A message with the fingers only returns
+        None, and gives later ones the opening for as long as `FINGERS_AGE`.
+
+        Args:
+            message: the message.
+            at: when it came [s].
 
         Raises:
-            UserError: as `joints_from`; fingers are missing if none came within the last `FINGERS_AGE`.
+            UserError: a joint is missing or named twice, the lengths differ, or a number is not finite.
         """
-        fingers, names = self._robot.fingers, {*message.name}
-        of_gripper = names >= {*fingers} and names.isdisjoint(self._robot.joints)  # which may have further joints
-        if fingers and of_gripper and len(names) < len(fingers) + len(self._robot.joints):
+        arm, fingers, names = self._limits.joints, self._limits.fingers, {*message.name}
+        of_gripper = names >= {*fingers} and names.isdisjoint(arm)  # which may have further joints
+        if fingers and of_gripper and len(names) < len(fingers) + len(arm):
             self._fingers = (at, float(_positions(message, fingers)[0].sum()))
             return None
-        recent = at - self._fingers[0] <= FINGERS_AGE and names.isdisjoint(fingers)
-        return joints_from(message, self._robot, self._fingers[1] if recent else None)
-
-
-def joints_from(message: Any, robot: Robot, opening: float | None = None) -> tuple[Array, Array, float]:
-    """Read positions (J,) [rad], velocities (J,) [rad/s] and gripper opening [m] of a sensor_msgs/JointState, by name.
-
-    Missing velocities, also NaN, become zero. With an `opening` from elsewhere the fingers need not be there.
-
-    Raises:
-        UserError: a joint is missing or named twice, the lengths differ, or a number is not finite.
-    """
-    fingers = robot.fingers if opening is None else []
-    position, velocity = _positions(message, [*robot.joints, *fingers])
-    arm = len(robot.joints)
-    return position[:arm], velocity[:arm], float(position[arm:].sum()) if opening is None else opening
+        if at - self._fingers[0] <= FINGERS_AGE and names.isdisjoint(fingers):
+            return *_positions(message, arm), self._fingers[1]
+        position, velocity = _positions(message, [*arm, *fingers])
+        return position[: len(arm)], velocity[: len(arm)], float(position[len(arm) :].sum())
 
 
 def _positions(message: Any, joints: Sequence[str]) -> tuple[Array, Array]:
@@ -190,70 +152,26 @@ def _positions(message: Any, joints: Sequence[str]) -> tuple[Array, Array]:
         raise UserError(
             f"joint state has {len(names)} names, {len(message.position)} positions, {len(message.velocity)} velocities"
         )
-    position = np.array(message.position, dtype=float)
-    velocity = np.array(message.velocity, dtype=float) if len(message.velocity) else np.zeros(len(names))
     places = [names.index(name) for name in joints]
-    position, velocity = position[places], velocity[places]
+    position = np.array(message.position, dtype=float)[places]
+    velocity = np.array(message.velocity, dtype=float)[places] if len(message.velocity) else np.zeros(len(places))
     velocity = np.where(np.isnan(velocity), 0.0, velocity)  # ros2_control's mark of a joint without one
     if not (np.isfinite(position).all() and np.isfinite(velocity).all()):
         raise UserError("joint state has a number that is not finite")
     return position, velocity
 
 
-def fill_joint_state(message: Any, robot: Robot, command: Command) -> Any:
-    """Fill a sensor_msgs/JointState with target positions of arm and fingers only, as Isaac Sim expects.
-
-    Without an opening in the command, it is of the arm alone.
-    """
-    fingers = finger_positions(robot, command)
-    message.name = [*robot.joints, *robot.fingers[: len(fingers)]]
-    message.position = [*command.position.tolist(), *fingers]
-    return message
-
-
-def fill_trajectory(
-    message: Any, point: type, duration: type, robot: Robot, commands: Sequence[Command], tick: float
-) -> Any:
-    """Fill a trajectory_msgs/JointTrajectory that starts now, with one point per tick and the last one at rest.
-
-    The arm therefore stops if no other trajectory follows. `point` and `duration` are the message classes of the parts.
-    """
-    message.joint_names = list(robot.joints)
-    for number, command in enumerate(commands, 1):
-        seconds, rest = divmod(number * tick, 1.0)
-        time_from_start = duration(sec=int(seconds), nanosec=int(rest * 1e9))
-        positions, velocities = command.position.tolist(), command.velocity.tolist()
-        if number == len(commands):
-            velocities = [0.0] * len(velocities)
-        message.points.append(point(positions=positions, velocities=velocities, time_from_start=time_from_start))
-    return message
-
-
-def fill_twist(message: Any, frame: str, velocity: Array) -> Any:
-    """Fill a geometry_msgs/TwistStamped with the (6,) velocity of the tool [m/s], [rad/s] in a frame."""
-    message.header.frame_id = frame
-    parts = (message.twist.linear, message.twist.angular)
-    for part, values in zip(parts, velocity.reshape(2, 3).tolist(), strict=True):
-        part.x, part.y, part.z = values
-    return message
-
-
-def finger_positions(robot: Robot, command: Command) -> list[float]:
-    """Return the target position of every finger joint [m]; none if the command leaves the gripper as it is."""
-    return [] if command.opening is None else [command.opening * robot.finger_travel] * len(robot.fingers)
-
-
-def command_from(names: Sequence[str], positions: Any, robot: Robot) -> tuple[Array, float | None]:
+def command_from(names: Sequence[str], positions: Any, limits: JointLimits) -> tuple[Array, float | None]:
     """Read target positions (J,) [rad] and opening 0 … 1, or None without fingers, of a command, by name.
 
     Raises:
         UserError: a joint is missing, the lengths differ, or a number is not finite.
     """
     names, positions = list(names), np.array(positions, dtype=float)
-    missing = [name for name in robot.joints if name not in names]
+    missing = [name for name in limits.joints if name not in names]
     if missing or len(names) != len(positions) or not np.isfinite(positions).all():
         problem = f"lacks {', '.join(missing)}" if missing else "needs one finite position per name"
         raise UserError(f"joint command {problem}")
-    fingers = [positions[names.index(name)] for name in robot.fingers if name in names]
-    opening = float(np.mean(fingers)) / robot.finger_travel if fingers else None
-    return positions[[names.index(name) for name in robot.joints]], opening
+    fingers = [positions[names.index(name)] for name in limits.fingers if name in names]
+    opening = float(np.mean(fingers)) / limits.finger_travel if fingers else None
+    return positions[[names.index(name) for name in limits.joints]], opening

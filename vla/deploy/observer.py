@@ -10,7 +10,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vla.deploy.camera_sync import CameraSync
 from vla.io.errors import UserError
 from vla.robots.controllers import UNITS
 from vla.spec import Array, Observation, Spec
@@ -18,6 +17,7 @@ from vla.spec import Array, Observation, Spec
 EARLY_SHARE = 0.25  # share of a control period by which an image may precede the next planned observation
 HISTORY = 1.0  # duration of the history of joint states [s]
 OLDEST = 10.0  # age from which on a time stamp is taken for one of another clock [s]
+MAX_SKEW = 0.05  # largest difference between the time stamps of one set of images [s]
 
 
 class Measured(NamedTuple):
@@ -30,7 +30,10 @@ class Measured(NamedTuple):
 
 
 class Observer:
-    """The newest matching images, with the joint state nearest to them in time."""
+    """The newest images of all cameras, with the joint state nearest to them in time.
+
+    Images within `MAX_SKEW` of each other form a matching set.
+    """
 
     def __init__(self, spec: Spec) -> None:
         """Args: the spec of the policy.
@@ -42,10 +45,23 @@ class Observer:
         if others := [name for name in spec.state if name not in self._model.components]:
             raise UserError(f"the policy's state has {', '.join(others)}, which joint states do not contain")
         self._factors = np.array([UNITS.get(unit.removesuffix("/s"), 1.0) for unit in spec.state_units])
-        self.cameras = CameraSync(spec.cameras)
+        self.fresh = 0  # matching sets since the last reset to 0, each with a newer image of every camera
+        self._newest: dict[str, tuple[float, Array]] = {}  # camera → time stamp and image
+        self._counted: dict[str, float] = {}  # camera → time stamp of its image in the last counted set
+        self._matched_at = -np.inf  # newest time stamp in the last matching set
         self._measured: deque[Measured] = deque()
 
-    def on_joint_state(self, measured: Measured) -> None:
+    def add_image(self, camera: str, image: Array, at: float) -> None:
+        """Add an image (H, W, 3) uint8 that was taken at `at`."""
+        self._newest[camera] = (at, image)
+        if self.taken_at is None:
+            return
+        times = {name: self._newest[name][0] for name in self._spec.cameras}
+        self._matched_at = max(times.values())
+        if all(taken > self._counted.get(name, -np.inf) for name, taken in times.items()):
+            self.fresh, self._counted = self.fresh + 1, times
+
+    def add_joint_state(self, measured: Measured) -> None:
         """Add a joint state."""
         self._measured.append(measured)
         while self._measured[0].at < measured.at - HISTORY:
@@ -56,6 +72,30 @@ class Observer:
         """The newest joint state."""
         return self._measured[-1] if self._measured else None
 
+    @property
+    def taken_at(self) -> float | None:
+        """Oldest time stamp of the newest images; None if these do not form a matching set."""
+        if any(camera not in self._newest for camera in self._spec.cameras):
+            return None
+        times = [self._newest[camera][0] for camera in self._spec.cameras]
+        return min(times) if max(times) - min(times) <= MAX_SKEW else None
+
+    @property
+    def images(self) -> dict[str, Array]:
+        """Camera → its newest image."""
+        return {camera: self._newest[camera][1] for camera in self._spec.cameras}
+
+    def image_problem(self, now: float, max_age: float) -> str:
+        """Describe what is missing, older than `max_age` [s] or has not matched for so long; empty if nothing is."""
+        for camera in self._spec.cameras:
+            if camera not in self._newest:
+                return f"no image of the camera {camera} yet"
+            if now - self._newest[camera][0] > max_age:
+                return f"the newest image of the camera {camera} is older than {max_age} s"
+        if now - self._matched_at > max_age:
+            return f"the images of {', '.join(self._spec.cameras)} are more than {MAX_SKEW} s apart"
+        return ""
+
     def moved(self, seconds: float) -> float:
         """Return how far a joint has moved within the last `seconds` of the history [rad]."""
         recent = [each.joints for each in self._measured if each.at >= self._measured[-1].at - seconds]
@@ -63,8 +103,7 @@ class Observer:
 
     def due(self, after: float, earliest: float) -> float | None:
         """Return when the newest images were taken, if they match, later than `after` and about from `earliest` on."""
-        taken = self.cameras.taken_at
-        early = EARLY_SHARE / self._spec.control_hz
+        taken, early = self.taken_at, EARLY_SHARE / self._spec.control_hz
         return None if taken is None or taken <= after or taken < earliest - early else taken
 
     def measured_at(self, at: float) -> Measured:
@@ -73,13 +112,12 @@ class Observer:
 
     def observation(self, at: float, instruction: str) -> Observation:
         """Return the newest images, taken at `at`, with the joint state of that time."""
-        return Observation(self.cameras.images, self.state(self.measured_at(at)), instruction)
+        return Observation(self.images, self.state(self.measured_at(at)), instruction)
 
     def state(self, measured: Measured) -> Array:
         """Return the robot state (P,) float32 in the order and units of the spec."""
-        model = self._model
-        values = dict(zip(model.joints, measured.joints, strict=True))
-        values |= dict(zip(model.velocities, measured.velocities, strict=False))
+        values = dict(zip(self._model.joints, measured.joints, strict=True))
+        values |= dict(zip(self._model.velocities, measured.velocities, strict=False))
         return np.array([values.get(name, measured.opening) for name in self._spec.state] / self._factors, np.float32)
 
 

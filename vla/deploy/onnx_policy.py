@@ -1,33 +1,91 @@
-"""A policy whose model runs as ONNX programs."""
+"""The ONNX programs of a trained policy, to run without this project, or in its place."""
+
+# T frames of history, N tokens per frame, E width of a token, L tokens of an instruction, k action chunk, D components
 
 from __future__ import annotations
 
 import hashlib
 import inspect
+import json
 import logging
-import math
+from collections.abc import Callable
 from itertools import chain
 from pathlib import Path
+from typing import Any, Literal
 
+import numpy as np
 import torch
 from filelock import FileLock
-from torch import nn
+from torch import Tensor, nn
+from torch.export import Dim, ExportedProgram
 
-from vla.deploy.export_policy import (
-    TOLERANCE,
-    inputs_of,
-    open_onnx,
-    require_onnx,
-    write_onnx,
-    write_programs,
-    write_quantized,
-)
+from vla.io.documents import lines_of
+from vla.io.errors import UserError
+from vla.io.files import atomic_path
 from vla.io.types import Count, Text
-from vla.models.model import Model, Prediction
+from vla.models.model import Batch, Model, Prediction
 from vla.policy import Policy
 from vla.spec import Spec
 
 log = logging.getLogger(__name__)
+
+Inputs = dict[str, Tensor]
+Run = Callable[[Inputs], Tensor]
+
+TOLERANCE = 1e-3  # largest difference between the outputs of a program and of the model, relative to their range
+INSTRUCTIONS = ("go", "do this first, and then something else")  # of different lengths
+
+
+class Program(nn.Module):
+    """A part of a model, as it is exported: named inputs → one output.
+
+    - encode: one frame → its cached tokens (1, 1, N, E), of a model that caches the tokens of past frames. Inputs are
+      each camera's (1, 1, H, W, 3) uint8, state (1, 1, P), present (1, 1) bool, text (1, L).
+    - act: a window of frames → the actions after its newest one, (1, k, D), not clipped to the bounds of the spec.
+      Inputs are tokens (1, T, N, E), or T frames of the inputs of encode; present (1, T), text (1, L); for a model that
+      samples its actions also noise (1, k, D), standard normal.
+    """
+
+    def __init__(self, model: Model, part: Literal["encode", "act"]) -> None:
+        super().__init__()
+        self.model, self.part = model, part
+
+    def forward(self, inputs: Inputs) -> Tensor:
+        """Return the output."""
+        rgb = {camera: inputs[camera] for camera in self.model.spec.cameras if camera in inputs}
+        batch: Batch = {"rgb": rgb, **{name: value for name, value in inputs.items() if name not in rgb}}
+        if self.part == "act":
+            return self.model.predict(batch).actions
+        tokens = self.model.encode(batch)
+        assert tokens is not None
+        return tokens
+
+
+class ProgramExporter:
+    """Writes a trained policy as `act.onnx`, and `encode.onnx` if the model caches tokens of past frames.
+
+    Each program is then compared with the model on an episode of noise; `program.json` lists the inputs and the largest
+    difference. The folder is written atomically.
+
+    Args:
+        folder: output folder, which must not exist.
+    """
+
+    def __init__(self, folder: Text | Path) -> None:
+        self._folder = Path(folder).resolve()
+
+    def export_policy(self, policy: Policy) -> Path:
+        """Write the programs of a policy, in float32 for the CPU whatever its device is; returns the folder.
+
+        Raises:
+            UserError: the folder exists, ONNX is not installed, or the output of a program differs from the model's.
+        """
+        if self._folder.exists():
+            raise UserError(f"{self._folder} exists already: choose another export.folder")
+        require_onnx("choose another export")
+        policy = Policy("cpu", "fp32", compile=False, lanes=1, model=policy.model, spec=policy.spec)
+        write_programs(policy, self._folder)
+        return self._folder
 
 
 class OnnxPolicy(Policy):
@@ -49,19 +107,132 @@ class OnnxPolicy(Policy):
     def __init__(self, threads: Count | None, quantize: bool, folder: Text | Path, *, model: Model, spec: Spec) -> None:
         require_onnx("policy=default")
         super().__init__("cpu", "fp32", compile=False, lanes=1, model=model, spec=spec)
-        suffix = "int8.onnx" if quantize else "onnx"
         programs = Path(folder).resolve() / f"{digest(model, spec)}{'_int8' if quantize else ''}"
         programs.parent.mkdir(parents=True, exist_ok=True)
         with FileLock(f"{programs}.lock"):  # several processes build the policy of an evaluation at once
             if not programs.exists():
                 log.info("exporting the model to %s", programs)
-                write = {suffix: write_quantized if quantize else write_onnx}
-                write_programs(self, programs, write, math.inf if quantize else TOLERANCE)
-        act = open_onnx(programs / f"act.{suffix}", threads)
+                write_programs(self, programs, quantize)
+        act = open_onnx(programs / "act.onnx", threads)
         self._predict_chunk = lambda batch: Prediction(act(inputs_of(batch)))
-        if (encoder := programs / f"encode.{suffix}").exists():  # the model caches tokens of past frames
+        if (encoder := programs / "encode.onnx").exists():  # the model caches tokens of past frames
             encode = open_onnx(encoder, threads)
             self._encode = lambda batch: encode(inputs_of(batch))
+
+
+def write_programs(policy: Policy, folder: Path, quantize: bool = False) -> None:
+    """Write the programs of a policy and `program.json` into a new folder, atomically.
+
+    Args:
+        policy: on the CPU, in float32 and not compiled.
+        folder: must not exist.
+        quantize: matrix products of 8-bit integers, which may differ as much as they like.
+
+    Raises:
+        UserError: the output of a program differs from the model's.
+    """
+    model, span = policy.model, torch.tensor(np.subtract(policy.spec.high, policy.spec.low), dtype=torch.float32)
+    report: dict[str, Any] = {"model": type(model).__name__, "spec": policy.spec.to_dict()}
+    with atomic_path(folder) as draft:
+        draft.mkdir(parents=True)
+        for part, steps in example_inputs(policy).items():
+            program, path = Program(model, part), draft / f"{part}.onnx"
+            _write_onnx(capture(program, steps[0]), steps[0], path, quantize)
+            difference = _difference(program, open_onnx(path), steps, span if part == "act" else None)
+            log.info("%s: largest difference %.1e", path.name, difference)
+            if not (quantize or difference <= TOLERANCE):  # also for NaN
+                raise UserError(
+                    f"{path.name} differs from the model by {difference:.1e} of the output range: this model cannot "
+                    "be exported"
+                )
+            inputs = {
+                name: {"dtype": str(value.dtype).removeprefix("torch."), "shape": list(value.shape)}
+                for name, value in steps[0].items()
+            }
+            report[part] = {"inputs": inputs, "difference": difference}
+        (draft / "program.json").write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
+
+
+def example_inputs(policy: Policy) -> dict[Literal["encode", "act"], list[Inputs]]:
+    """Return part → inputs of every step, for an episode of noise that is one step longer than the history."""
+    random, draws = np.random.default_rng(0), torch.Generator().manual_seed(0)
+    frames, windows = list[Inputs](), list[Inputs]()
+    for _ in range(policy.model.history + 1):
+        observation = policy.spec.random_observation(random)
+        policy.plan(observation)
+        window, noise = policy.window(), policy.model.sample_noise(draws)
+        if "tokens" in window:
+            frames.append(inputs_of(policy.frame(observation)))
+        windows.append(inputs_of(window if noise is None else {**window, "noise": noise}))
+    return {"encode": frames, "act": windows} if frames else {"act": windows}
+
+
+def inputs_of(batch: Batch) -> Inputs:
+    """Return the inputs of a program in a batch."""
+    return {**batch["rgb"], **{name: value for name, value in batch.items() if name != "rgb"}}
+
+
+def capture(program: Program, inputs: Inputs) -> ExportedProgram:
+    """Trace a program as one graph for instructions of any length; raise a UserError if it computes elsewhere."""
+    model = program.model
+    lengths = {model.text.tokenize([instruction]).shape[1] for instruction in INSTRUCTIONS}
+    text = {1: Dim.DYNAMIC} if len(lengths) > 1 else {}
+    shapes = {name: text if name == "text" else {} for name in inputs}
+    try:
+        return torch.export.export(program.eval(), (inputs,), dynamic_shapes=(shapes,))
+    except Exception as error:  # of many kinds
+        names = f"{type(model).__name__} with {type(model.tokenizer).__name__}"
+        raise UserError(f"{names} cannot be exported: {lines_of(error)[0]}") from error
+
+
+def open_onnx(path: Path, threads: int | None = None) -> Run:
+    """Return a function that runs an ONNX program on the CPU; raise a UserError if the file is damaged."""
+    from onnxruntime import InferenceSession, SessionOptions
+
+    options = SessionOptions()
+    options.intra_op_num_threads = threads or torch.get_num_threads()
+    # Else the idle threads of one program wait in a busy loop, and slow down the program that runs next.
+    options.add_session_config_entry("session.force_spinning_stop", "1")
+    try:
+        session = InferenceSession(path, options, providers=["CPUExecutionProvider"])
+    except Exception as error:  # of its own kinds
+        raise UserError(f"{path} is damaged: delete its folder, and export the policy again") from error
+    used = {node.name for node in session.get_inputs()}  # without inputs that the program ignores
+
+    def run(inputs: Inputs) -> Tensor:
+        given = {name: value.numpy() for name, value in inputs.items() if name in used}
+        return torch.from_numpy(session.run(None, given)[0])
+
+    return run
+
+
+def require_onnx(otherwise: str) -> None:
+    """Raise a UserError that names what to do `otherwise`, unless ONNX is installed."""
+    try:
+        import onnxruntime  # noqa: F401
+        import onnxscript  # noqa: F401
+    except ImportError as error:
+        raise UserError(f"ONNX is not installed: pip install 'vla[onnx]', or {otherwise}") from error
+
+
+def _write_onnx(captured: ExportedProgram, inputs: Inputs, path: Path, quantize: bool) -> None:
+    exact = torch.onnx.export(captured, dynamo=True, verbose=False, input_names=list(inputs), output_names=["output"])
+    assert exact is not None
+    if not quantize:
+        return exact.save(path)
+    from onnxruntime.quantization import QuantType, quantize_dynamic
+
+    model = exact.model_proto
+    del model.graph.value_info[:]  # shapes of weights, which quantisation transposes
+    quantize_dynamic(model, path, weight_type=QuantType.QUInt8, op_types_to_quantize=["MatMul", "Gemm"])
+    return None
+
+
+def _difference(program: Run, exported: Run, steps: list[Inputs], span: Tensor | None) -> float:
+    """Return the largest difference between two outputs, relative to `span` or else to the largest output."""
+    with torch.inference_mode():
+        expected, found = (torch.stack([run(inputs) for inputs in steps]) for run in (program, exported))
+        return float(((found - expected).abs() / (expected.abs().max() if span is None else span)).max())
 
 
 def digest(model: Model, spec: Spec) -> str:

@@ -66,11 +66,7 @@ class RosNetwork:
         return cls(*NETWORKS[name], domain=None)
 
     def apply(self) -> None:
-        """Set the environment variables that ROS reads at start.
-
-        Raises:
-            UserError: the profile or the domain does not exist, or the middleware ignores the profile.
-        """
+        """Set the environment variables that ROS reads at start; raise a UserError if ROS would not accept them."""
         os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = self.discovery
         if self.profile is not None:
             if not Path(self.profile).is_file():
@@ -84,9 +80,6 @@ class RosNetwork:
             os.environ["FASTRTPS_DEFAULT_PROFILES_FILE"] = self.profile
         if self.domain is not None:
             os.environ["ROS_DOMAIN_ID"] = str(self.domain)
-        domain = os.environ.get("ROS_DOMAIN_ID") or "0"
-        if not (domain.isdecimal() and int(domain) <= MAX_DOMAIN):
-            raise UserError(f"deploy.network.domain, or ROS_DOMAIN_ID, is {domain!r}, expected 0 to {MAX_DOMAIN}")
 
 
 @contextmanager
@@ -133,11 +126,7 @@ def ros(network: RosNetwork, log_folder: Path | None = None) -> Iterator[Event]:
 
 
 def action_class(package: str, name: str) -> Any:
-    """Return the class of an action.
-
-    Raises:
-        UserError: its package is not installed.
-    """
+    """Return the class of an action; raise a UserError if its package is not installed."""
     try:
         return getattr(import_module(f"{package}.action"), name)
     except (ImportError, AttributeError) as error:

@@ -1,7 +1,6 @@
 """Deployments on ROS 2: the policy, and the simulator in place of a robot.
 
-ROS is imported only in `run`. Every deployment takes factories of the checkpoint's policy and of its task's
-environment, and an output folder.
+ROS is imported only in `run`.
 """
 
 from __future__ import annotations
@@ -11,11 +10,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
-from vla.deploy.joint_limiter import Robot
-from vla.deploy.ros import RosNetwork, ros, spin
-from vla.deploy.settings import PolicySettings, Timing, Topics
+from vla.deploy.joint_limiter import JointLimits
+from vla.deploy.ros import RosNetwork, action_class, ros, spin
+from vla.deploy.settings import PolicySettings, Topics
 from vla.io.errors import UserError
-from vla.io.types import Seed
+from vla.io.types import Positive, Seed
 
 if TYPE_CHECKING:
     from vla.policy import Policy
@@ -23,29 +22,37 @@ if TYPE_CHECKING:
 
 
 @dataclass(kw_only=True)
-class PolicyDeployment(PolicySettings):
-    """The policy as a managed node.
+class _RosDeployment:
+    """What both deployments need.
 
     Attributes:
         network: where to communicate.
-        autostart: configure and activate at start; otherwise leave that to a lifecycle manager.
-        policy, environment: factories of the policy and of the task's environment.
+        policy, environment: factories of the checkpoint's policy and of its task's environment.
         output: folder of the ROS logs.
     """
 
     network: RosNetwork
-    autostart: bool
     policy: Callable[[], Policy]
     environment: Callable[[], Environment]
     output: Path
 
-    def run(self) -> None:
-        """Run until interrupted, then brake and hold.
 
-        Raises:
-            UserError: there is no policy, or it does not fit the robot, or messages are not installed.
-        """
-        self.require_messages(self.command)
+@dataclass(kw_only=True)
+class PolicyDeployment(PolicySettings, _RosDeployment):
+    """The policy as a managed node.
+
+    Attributes:
+        autostart: configure and activate at start; otherwise leave that to a lifecycle manager.
+    """
+
+    autostart: bool
+
+    def run(self) -> None:
+        """Run until interrupted, then brake and hold; raise a UserError if policy, robot and messages do not fit."""
+        if self.command == "follow_joint_trajectory":
+            action_class("control_msgs", "FollowJointTrajectory")
+        if self.gripper is not None:
+            self.gripper.goals("gripper")
         policy = self.policy()
         with ros(self.network, self.output) as stopped:
             from vla.deploy.lifecycle_node import SUCCESS
@@ -63,30 +70,27 @@ class PolicyDeployment(PolicySettings):
 
 
 @dataclass(kw_only=True)
-class SimulatorDeployment:
+class SimulatorDeployment(_RosDeployment):
     """The simulated arm of a task as a node with the topics of a real one.
 
     Attributes:
-        robot: joint names of the arm.
-        network: where to communicate.
+        robot: names of the joints of the arm.
         topics: names of the topics.
-        timing: rates and latencies.
+        joints_hz: rate of joint states and of the execution of commands.
+        camera_hz: rate of images.
+        command_timeout: the arm holds after so long without a command [s].
         seed: seed of the first episode.
-        policy, environment: factories of the policy and of the task's environment.
-        output: folder of the ROS logs.
     """
 
     needs_policy: ClassVar[bool] = False
     needs_environment: ClassVar[bool] = True
 
-    robot: Robot
-    network: RosNetwork
+    robot: JointLimits
     topics: Topics
-    timing: Timing
+    joints_hz: Positive
+    camera_hz: Positive
+    command_timeout: Positive
     seed: Seed
-    policy: Callable[[], Policy]
-    environment: Callable[[], Environment]
-    output: Path
 
     def run(self) -> None:
         """Play episodes until interrupted."""
@@ -94,7 +98,8 @@ class SimulatorDeployment:
         with ros(self.network, self.output) as stopped:
             from vla.deploy.simulator_node import SimulatorNode
 
-            node = SimulatorNode(environment, self.robot, self.topics, self.timing, self.seed)
+            rates = self.joints_hz, self.camera_hz
+            node = SimulatorNode(environment, self.robot, self.topics, rates, self.command_timeout, self.seed)
             try:
                 spin(node, stopped)
             finally:

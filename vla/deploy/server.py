@@ -21,6 +21,7 @@ from concurrent.futures import Executor, ThreadPoolExecutor
 from contextlib import asynccontextmanager, contextmanager, suppress
 from dataclasses import dataclass
 from http import HTTPStatus
+from ipaddress import ip_address
 from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -32,7 +33,6 @@ from websockets.exceptions import ConnectionClosed
 from websockets.http11 import Request, Response
 
 from vla.deploy.client_observation import Keys, instruction
-from vla.deploy.connection import Connection, is_loopback, tls
 from vla.io.array_messages import pack, unpack
 from vla.io.errors import UserError
 from vla.io.images import Crop
@@ -42,7 +42,7 @@ from vla.spec import Array, Environment, Observation
 if TYPE_CHECKING:
     from vla.policy import Policy
 
-GOODBYE = 1.0  # patience with clients when the server ends [s]
+PATIENCE = 3.0  # with clients that open or close a connection [s]
 INVALID, TOO_BIG, INTERNAL = 1007, 1009, 1011  # WebSocket close codes: invalid data, too large, error in the server
 
 log = logging.getLogger(__name__)
@@ -62,12 +62,11 @@ class PolicyServer:
         largest_message: of a client [bytes].
         api_key: what clients must send; needed to listen beyond this machine.
         origins: of web pages that may use the policy, such as http://localhost:3000.
-        certificate, private_key: PEM files for TLS.
         policy, environment: factories of the policy and of the task's environment.
         output: folder of results, unused.
 
     Raises:
-        UserError: other machines could connect without a key, or one of the two files for TLS is missing.
+        UserError: other machines could connect without a key.
     """
 
     host: Text
@@ -78,31 +77,19 @@ class PolicyServer:
     largest_message: Count
     api_key: Text | None
     origins: list[Text]
-    certificate: str | None
-    private_key: str | None
     policy: Callable[[], Policy]
     environment: Callable[[], Environment]
     output: Path
 
     def __post_init__(self) -> None:
-        if self.api_key is None and not is_loopback(self.host):
+        if self.api_key is None and not _is_loopback(self.host):
             raise UserError(
                 f"deploy.host={self.host} lets other machines use the policy: set the environment variable "
                 "VLA_API_KEY, which clients must then know, or deploy.host=127.0.0.1"
             )
-        if (self.certificate is None) != (self.private_key is None):
-            raise UserError("TLS needs both deploy.certificate and deploy.private_key")
-        for name in ("certificate", "private_key"):
-            file = getattr(self, name)
-            if file is not None and not Path(file).is_file():
-                raise UserError(f"deploy.{name}={file}: there is no such file")
 
     def run(self) -> None:
-        """Serve until interrupted.
-
-        Raises:
-            UserError: there is no policy, its cameras have no keys, or the address cannot be used.
-        """
+        """Serve until interrupted; raise a UserError if the policy or the address cannot be served."""
         policy = self.policy()
         if not hasattr(policy, "lanes"):  # an agent in its place
             raise UserError(
@@ -110,9 +97,8 @@ class PolicyServer:
             )
         if keyless := [camera for camera in policy.spec.cameras if camera not in self.keys.images]:
             raise UserError(f"the policy sees {', '.join(keyless)}: add +deploy.keys.images.{keyless[0]}=KEY")
-        service = Service(self, policy)
         try:
-            asyncio.run(service.serve())
+            asyncio.run(Service(self, policy).serve())
         except OSError as error:
             where = f"deploy.host={self.host} deploy.port={self.port}"
             raise UserError(f"cannot listen at {where}: {error.strerror}; deploy.port=0 is any free one") from error
@@ -123,27 +109,17 @@ class Service:
 
     def __init__(self, settings: PolicyServer, policy: Policy) -> None:
         self._settings, self._policy = settings, policy
-        self._metadata = pack(metadata(policy, settings.keys))
-        self._tls = None if settings.certificate is None else tls(settings.certificate, settings.private_key)
         self._waiting: asyncio.Queue[tuple[int, Observation, asyncio.Future[Array]]] = asyncio.Queue()
         self._lanes = set[int]()  # of the policy, one for each connection
 
-    @asynccontextmanager
-    async def listening(self) -> AsyncIterator[str]:
-        """Serve within the context, which is entered with the URL once the first client can be answered."""
-        settings, context, loop = self._settings, self._tls, asyncio.get_running_loop()
-        limits = {"compression": None, "max_size": settings.largest_message, "max_queue": 1}
-        request = {"process_request": self._answer_request, "create_connection": Connection, "ssl": context}
-        with ThreadPoolExecutor(1, "inference") as thread:
-            await loop.run_in_executor(thread, self._warm_up)
-            async with serve(self._talk, settings.host, settings.port, **limits, **request) as server:
-                inference = asyncio.create_task(self._infer(thread))
-                port = server.sockets[0].getsockname()[1]
-                host = f"[{settings.host}]" if ":" in settings.host else settings.host
-                yield f"{'wss' if context else 'ws'}://{host}:{port}"
-                hang_up = loop.call_later(GOODBYE, Connection.abort_all, server)
-            hang_up.cancel()
-            inference.cancel()
+    async def serve(self) -> None:
+        """Serve until SIGINT or SIGTERM."""
+        stop, loop = asyncio.Event(), asyncio.get_running_loop()
+        for number in (signal.SIGINT, signal.SIGTERM):
+            loop.add_signal_handler(number, stop.set)
+        async with self._listening() as url:
+            log.info("serving the policy at %s", url)
+            await stop.wait()
 
     @contextmanager
     def in_thread(self) -> Iterator[str]:
@@ -152,7 +128,7 @@ class Service:
             loop, url, stop = runner.get_loop(), queue.Queue[str](), asyncio.Event()
 
             async def serve() -> None:
-                async with self.listening() as here:
+                async with self._listening() as here:
                     url.put(here)
                     await stop.wait()
 
@@ -165,30 +141,32 @@ class Service:
                 loop.call_soon_threadsafe(stop.set)
                 served.result()
 
-    async def serve(self) -> None:
-        """Serve until SIGINT or SIGTERM."""
-        stop, loop = asyncio.Event(), asyncio.get_running_loop()
-        for number in (signal.SIGINT, signal.SIGTERM):
-            loop.add_signal_handler(number, stop.set)
-        async with self.listening() as url:
-            log.info("serving the policy at %s", url)
-            await stop.wait()
-
-    def _warm_up(self) -> None:
-        # The first pass through a compiled model takes up to a minute.
-        self._policy.plan(self._policy.spec.random_observation(np.random.default_rng(0)))
+    @asynccontextmanager
+    async def _listening(self) -> AsyncIterator[str]:
+        """Serve within the context, which is entered with the URL once the first client can be answered."""
+        settings, policy = self._settings, self._policy
+        options: dict[str, Any] = {
+            **{"compression": None, "max_size": settings.largest_message, "max_queue": 1},
+            **{"origins": [None, *settings.origins], "process_request": self._answer_request},  # programs send none
+            **{"open_timeout": PATIENCE, "close_timeout": PATIENCE},
+        }
+        with ThreadPoolExecutor(1, "inference") as thread:
+            # The first pass through a compiled model takes up to a minute.
+            noise = policy.spec.random_observation(np.random.default_rng(0))
+            await asyncio.get_running_loop().run_in_executor(thread, policy.plan, noise)
+            async with serve(self._talk, settings.host, settings.port, **options) as server:
+                inference = asyncio.create_task(self._infer(thread))
+                host = f"[{settings.host}]" if ":" in settings.host else settings.host
+                yield f"ws://{host}:{server.sockets[0].getsockname()[1]}"
+            inference.cancel()
 
     def _answer_request(self, connection: ServerConnection, request: Request) -> Response | None:
-        """Answer health checks; reject web pages, clients without the key, or beyond `connections`."""
+        """Answer health checks; reject clients without the key, or beyond `connections`."""
         if request.path == "/healthz":
             return connection.respond(HTTPStatus.OK, "OK\n")
-        # Browsers name the page that connects, and let any page connect to this machine.
-        if not {*request.headers.get_all("Origin")} <= {*self._settings.origins}:
-            return connection.respond(HTTPStatus.FORBIDDEN, "web pages may connect from deploy.origins only\n")
         key, given = self._settings.api_key, "".join(request.headers.get_all("Authorization"))
-        if key is not None and not hmac.compare_digest(
-            given.encode(errors="surrogateescape"), f"Api-Key {key}".encode()
-        ):
+        wanted = f"Api-Key {key}".encode()
+        if key is not None and not hmac.compare_digest(given.encode(errors="surrogateescape"), wanted):
             return connection.respond(HTTPStatus.UNAUTHORIZED, "send the API key as Authorization: Api-Key …\n")
         if len(self._lanes) >= self._settings.connections:
             return connection.respond(HTTPStatus.SERVICE_UNAVAILABLE, f"{len(self._lanes)} clients are connected\n")
@@ -196,23 +174,17 @@ class Service:
 
     async def _talk(self, connection: ServerConnection) -> None:
         """Serve one client until it leaves or sends something invalid."""
-        lane, last = next(lane for lane in count() if lane not in self._lanes), 0.0
+        lane = next(lane for lane in count() if lane not in self._lanes)
         self._lanes.add(lane)
         self._policy.reset("", lane, lane)
         try:
-            await connection.send(self._metadata)
+            await connection.send(pack(metadata(self._policy, self._settings.keys)))
             async for data in connection:
-                began = time.perf_counter()
-                answer = await self._answer(lane, data)
-                timing = answer.get("server_timing")
-                if timing and last:
-                    timing["prev_total_ms"] = last
-                await connection.send(pack(answer))
-                last = 1000 * (time.perf_counter() - began)
+                await connection.send(pack(await self._answer(lane, data)))
         except ConnectionClosed as closed:
             if closed.sent and closed.sent.code == TOO_BIG:
                 log.warning("a client's message has more than deploy.largest_message bytes: %s", closed.sent.reason)
-        except ValueError as error:
+        except UserError as error:
             await self._refuse(connection, str(error), INVALID)
         except Exception:
             log.exception("a client's observation caused an error")
@@ -237,28 +209,24 @@ class Service:
             self._policy.reset(instruction("prompt", message.get("prompt")), seed, lane)
             return {"reset": True}
         observation = self._settings.keys.observation(message, self._policy.spec, self._settings.image_crop)
-        began = time.perf_counter()
-        result: asyncio.Future[Array] = asyncio.get_running_loop().create_future()
+        began, result = time.perf_counter(), asyncio.get_running_loop().create_future()
         self._waiting.put_nowait((lane, observation, result))
-        actions = await result
-        return {"actions": actions, "server_timing": {"infer_ms": 1000 * (time.perf_counter() - began)}}
+        return {"actions": await result, "server_timing": {"infer_ms": 1000 * (time.perf_counter() - began)}}
 
     async def _infer(self, thread: Executor) -> None:
         """Run inference on queued observations until cancelled, for as many clients at once as a pass serves."""
-        loop = asyncio.get_running_loop()
         while True:
             group = [await self._waiting.get()]
             while len(group) < self._policy.lanes and not self._waiting.empty():
                 group.append(self._waiting.get_nowait())
             lanes, observations, results = zip(*group, strict=True)
+            planned = asyncio.get_running_loop().run_in_executor(thread, self._policy.plan, observations, lanes)
             try:
-                plans = await loop.run_in_executor(thread, self._policy.plan, observations, lanes)
+                for result, actions in zip(results, await planned, strict=True):
+                    result.set_result(actions)
             except Exception as error:
                 for result in results:
                     result.set_exception(error)
-            else:
-                for result, actions in zip(results, plans, strict=True):
-                    result.set_result(actions)
 
 
 def metadata(policy: Policy, keys: Keys) -> dict[str, Any]:
@@ -267,22 +235,26 @@ def metadata(policy: Policy, keys: Keys) -> dict[str, Any]:
     `horizon` is the length of a chunk, of which a client executes the first `execute` actions; a policy with a
     `history` of several frames wants to see every frame, so that the client sends an observation at every step.
     """
-    spec, size = policy.spec, [*policy.spec.image_size, 3]
+    spec = policy.spec
+    action = {"names": list(spec.action), "units": list(spec.units)}
+    bounds = {"low": np.array(spec.low, np.float32), "high": np.array(spec.high, np.float32)}
     return {
         "server": "vla",
         "policy": type(policy.model).__name__,
-        "images": {keys.images[camera]: size for camera in spec.cameras},
+        "images": {keys.images[camera]: [*spec.image_size, 3] for camera in spec.cameras},
         "state": {"keys": keys.state, "names": list(spec.state), "units": list(spec.state_units)},
         "prompt": keys.prompt,
-        "action": {
-            "names": list(spec.action),
-            "units": list(spec.units),
-            "low": np.array(spec.low, np.float32),
-            "high": np.array(spec.high, np.float32),
-        },
+        "action": {**action, **bounds},
         "control_hz": spec.control_hz,
         "horizon": policy.model.chunk,
         "execute": policy.execute,
         "history": policy.history,
         "reset": True,
     }
+
+
+def _is_loopback(host: str) -> bool:
+    """Return whether only this machine can connect to an address."""
+    with suppress(ValueError):  # a name
+        return ip_address(host).is_loopback
+    return host == "localhost"

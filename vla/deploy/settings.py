@@ -1,20 +1,19 @@
-"""Settings of the nodes: topics, rates and limits. No module of ROS is imported here."""
+"""Settings of the nodes. No module of ROS is imported here."""
 
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
-from typing import ClassVar, Literal
+from typing import Any, Literal, NamedTuple
 
-from vla.deploy.control_loop import Safety
-from vla.deploy.joint_limiter import Robot
+from vla.deploy.joint_limiter import JointLimits
 from vla.deploy.ros import action_class
+from vla.deploy.safety import Safety
 from vla.io.errors import UserError
 from vla.io.images import Crop
 from vla.io.types import NonNegative, Positive, Text
 
-FOLLOW = "follow_joint_trajectory"  # the command that is an action
-TRAJECTORY_ACTION = ("control_msgs", "FollowJointTrajectory")
 COMPRESSED = "/compressed"  # end of the topics of sensor_msgs/CompressedImage, as of image_transport
 NAME = re.compile(r"(~/|/)?[A-Za-z_]\w*(/[A-Za-z_]\w*)*", re.ASCII)  # of a topic
 
@@ -41,16 +40,13 @@ class Topics:
                 raise UserError(f"topics.{key} is {topic!r}, expected letters, digits and _ between slashes")
 
 
-@dataclass(frozen=True)
-class Timing:
-    """Rates and latencies of the simulator."""
+class _Goal(NamedTuple):
+    """A goal of an action."""
 
-    joints_hz: Positive  # rate of joint states and of command execution
-    camera_hz: Positive
-    camera_latency: NonNegative  # from exposure to publication [s]
-    command_timeout: Positive  # the arm holds after so long without a command [s]
-    clock: bool  # publish /clock, and use it for time stamps
-    speed: Positive  # ratio of simulated to real time
+    kind: Any  # class of the action
+    server: str
+    message: Any
+    complaint: Callable[[Any, bool], str]  # as in `GoalSender`
 
 
 @dataclass(frozen=True)
@@ -61,7 +57,18 @@ class GripperCommand:
     closed: float
     effort: Positive  # largest [N] or [Nm]
 
-    actions: ClassVar = (("control_msgs", "GripperCommand"),)  # packages and names
+    def goals(self, server: str) -> tuple[_Goal, _Goal]:
+        """Return the goals that close and open it; raise a UserError if the messages are not installed."""
+        kind = action_class("control_msgs", "GripperCommand")
+        closing, opening = kind.Goal(), kind.Goal()
+        for goal, position in ((closing, self.closed), (opening, self.open)):  # YAML may hold whole numbers
+            goal.command.position, goal.command.max_effort = float(position), float(self.effort)
+
+        def complaint(result: Any, replaced: bool) -> str:
+            # A stalled gripper has grasped something, which is no error.
+            return "" if result.stalled else "it does not reach its position"
+
+        return _Goal(kind, server, closing, complaint), _Goal(kind, server, opening, complaint)
 
 
 @dataclass(frozen=True)
@@ -74,7 +81,18 @@ class FrankaGripper:
     speed: Positive  # [m/s]
     force: Positive  # [N]
 
-    actions: ClassVar = (("franka_msgs", "Grasp"), ("franka_msgs", "Move"))  # packages and names: to close, to open
+    def goals(self, server: str) -> tuple[_Goal, _Goal]:
+        """Return the goals that close and open it; raise a UserError if the messages are not installed."""
+        grasp, move = (action_class("franka_msgs", name) for name in ("Grasp", "Move"))
+        speed, force = float(self.speed), float(self.force)  # YAML may hold whole numbers
+        opening = move.Goal(width=float(self.open), speed=speed)
+        closing = grasp.Goal(width=float(self.closed), speed=speed, force=force)
+        closing.epsilon.inner, closing.epsilon.outer = map(float, self.epsilon)
+        return (
+            # A missed grasp has an empty error text, so only errors of the driver count.
+            _Goal(grasp, f"{server}/grasp", closing, lambda result, _: result.error),
+            _Goal(move, f"{server}/move", opening, lambda result, _: result.error or "it does not reach its width"),
+        )
 
 
 @dataclass(kw_only=True)
@@ -82,7 +100,7 @@ class PolicySettings:
     """Settings of the policy node.
 
     Attributes:
-        robot: the arm and its limits.
+        robot: the joints of the arm and their limits.
         topics: names of the topics.
         safety: time-outs and limits.
         command: JointState with positions, JointTrajectory that ends at rest, Float64MultiArray of positions,
@@ -95,7 +113,7 @@ class PolicySettings:
         dry_run: publish the commands below ~/dry_run, where nothing obeys them.
     """
 
-    robot: Robot
+    robot: JointLimits
     topics: Topics
     safety: Safety
     command: Literal["joint_state", "trajectory", "forward", "twist", "follow_joint_trajectory"]
@@ -105,9 +123,3 @@ class PolicySettings:
     image_reliability: Literal["best_effort", "reliable"]
     image_crop: Crop
     dry_run: bool
-
-    def require_messages(self, command: str) -> None:
-        """Raise a UserError if messages that `command` or the gripper needs are not installed."""
-        arm = [TRAJECTORY_ACTION] if command == FOLLOW else []
-        for package, name in [*arm, *(self.gripper.actions if self.gripper is not None else [])]:
-            action_class(package, name)

@@ -5,24 +5,20 @@ from __future__ import annotations
 import json
 import math
 import time
-from collections import deque
 from dataclasses import asdict
-from functools import partial
 from typing import Any
 
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile
-from rclpy.time import Time
-from rosgraph_msgs.msg import Clock as ClockMessage
 from sensor_msgs.msg import Image, JointState
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
 from vla.deploy import messages
-from vla.deploy.joint_limiter import Robot
+from vla.deploy.joint_limiter import JointLimits
 from vla.deploy.messages import SimulatedEpisode
-from vla.deploy.settings import Timing, Topics
+from vla.deploy.settings import Topics
 from vla.io.errors import UserError
 from vla.spec import LONGEST_INSTRUCTION, Array, Drivable, Environment, InARow
 
@@ -33,44 +29,48 @@ class SimulatorNode(Node):
     The time of an episode starts with the first instruction, as in evaluation.
     """
 
-    def __init__(self, environment: Environment, robot: Robot, topics: Topics, timing: Timing, seed: int) -> None:
-        """Args: a `Drivable` environment; its arm; topics; rates; seed of the first episode.
+    def __init__(
+        self,
+        environment: Environment,
+        limits: JointLimits,
+        topics: Topics,
+        rates: tuple[float, float],
+        command_timeout: float,
+        seed: int,
+    ) -> None:
+        """Args: a `Drivable` environment; its arm; topics; rates of joints and cameras [Hz]; time-out of commands [s];
+        seed of the first episode.
 
         Raises:
             UserError: the environment has no robot, is not `Drivable`, or gives several instructions in a row, or a
                 control step is not a whole number of ticks.
         """
-        model = environment.spec.require_robot("deploy=simulator")
+        self._model = environment.spec.require_robot("deploy=simulator")
         if not isinstance(environment, Drivable):
             raise UserError(
                 f"deploy=simulator needs an environment that is Drivable, {type(environment).__name__} is not"
             )
         control_hz = environment.spec.control_hz
-        self._ticks_per_step = round(timing.joints_hz / control_hz)
-        if not math.isclose(self._ticks_per_step * control_hz, timing.joints_hz):
+        self._ticks_per_step = round(rates[0] / control_hz)
+        if not math.isclose(self._ticks_per_step * control_hz, rates[0]):
             raise UserError(
-                f"the simulator's joints_hz={timing.joints_hz:g} must be a multiple of the task's {control_hz:g} Hz"
+                f"the simulator's joints_hz={rates[0]:g} must be a multiple of the task's {control_hz:g} Hz"
             )
         super().__init__("vla_simulator")
-        self._drivable, self._model = environment, model
-        self.environment, self.robot, self.timing, self.seed = environment, robot, timing, seed - 1
-        self._steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self.environment, self._drivable, self._limits, self.seed = environment, environment, limits, seed - 1
+        self._period, self._frame_period, self._command_timeout = 1 / rates[0], 1 / rates[1], command_timeout
         qos = QoSProfile(depth=1)
+        latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         self._images = {
             camera: self.create_publisher(Image, topics.images[camera], qos) for camera in environment.spec.cameras
         }
         self._joints = self.create_publisher(JointState, topics.joint_states, qos)
-        latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         self._episode = self.create_publisher(String, "~/episode", latched)
-        self._clock_publisher = self.create_publisher(ClockMessage, "/clock", qos) if timing.clock else None
         self.create_subscription(JointState, topics.commands, self._on_command, qos)
         self.create_subscription(String, topics.instruction, self._on_instruction, qos)
         self.create_service(Trigger, "~/reset", self._on_reset)
-        self._delayed: deque[tuple[float, Any]] = deque()  # images that wait for the camera latency: when due, publish
-        self._elapsed = 0.0  # simulated time since the start [s]
-        self._period = 1 / timing.joints_hz
         self.reset()
-        self.create_timer(self._period / timing.speed, self._tick, clock=self._steady)
+        self.create_timer(self._period, self._tick, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
     def reset(self) -> None:
         """Start the next episode."""
@@ -80,9 +80,7 @@ class SimulatorNode(Node):
             raise UserError("deploy=simulator waits for one instruction per episode: set task.goal.length=1")
         self._target = self._hold_command()
         self._commanded_at: float | None = None
-        self._running, self._ticks = False, 0
-        self._until_frame = 0.0
-        self._delayed.clear()  # images of the episode before
+        self._running, self._ticks, self._until_frame = False, 0, 0.0
         self.get_logger().info(self.description)
         self._publish_episode()
 
@@ -103,20 +101,19 @@ class SimulatorNode(Node):
 
     def _on_command(self, message: JointState) -> None:
         try:
-            joints, opening = messages.command_from(message.name, message.position, self.robot)
-        except ValueError as error:
+            joints, opening = messages.command_from(message.name, message.position, self._limits)
+        except UserError as error:
             return self.get_logger().warning(messages.shorten(str(error), 300), throttle_duration_sec=1.0)
         self._target = (joints, self._target[1] if opening is None else opening)
         self._commanded_at = time.monotonic()
 
     def _tick(self) -> None:
         """Advance the simulation by one tick, then publish the measurements."""
-        timed_out = self._commanded_at is None or time.monotonic() - self._commanded_at > self.timing.command_timeout
-        if timed_out and self._commanded_at is not None:
+        silent = 0.0 if self._commanded_at is None else time.monotonic() - self._commanded_at
+        if silent > self._command_timeout:
             self.get_logger().warning("no commands: the arm holds its pose", throttle_duration_sec=5.0)
             self._target, self._commanded_at = self._hold_command(), None
         self._drivable.drive(*self._target, self._period)
-        self._elapsed += self._period
         self._ticks += 1
         if self._running and self._ticks % self._ticks_per_step == 0:
             self._drivable.judge()
@@ -128,31 +125,26 @@ class SimulatorNode(Node):
         self._publish()
 
     def _publish(self) -> None:
-        stamp = self._now()
-        if self._clock_publisher is not None:
-            self._clock_publisher.publish(ClockMessage(clock=stamp))
+        stamp = self.get_clock().now().to_msg()
         joints, velocities, opening = self._measured()
-        fingers = len(self.robot.fingers)
-        message = JointState(name=[*self.robot.joints, *self.robot.fingers])
+        fingers = len(self._limits.fingers)
+        message = JointState(name=[*self._limits.joints, *self._limits.fingers])
         message.position = [*joints.tolist(), *[opening / max(fingers, 1)] * fingers]
         message.velocity = [*velocities.tolist(), *[0.0] * fingers] if len(velocities) else []
         message.header.stamp = stamp
         self._joints.publish(message)
         self._until_frame -= self._period
         if self._until_frame <= 1e-9:
-            self._until_frame += 1 / self.timing.camera_hz
-            due = time.monotonic() + self.timing.camera_latency
+            self._until_frame += self._frame_period
             for camera, image in self._drivable.look().rgb.items():
                 frame = messages.fill_image(Image(), image, f"{camera}_camera_optical_frame")
                 frame.header.stamp = stamp
-                self._delayed.append((due, partial(self._images[camera].publish, frame)))
-        while self._delayed and self._delayed[0][0] <= time.monotonic():
-            self._delayed.popleft()[1]()
+                self._images[camera].publish(frame)
 
     def _hold_command(self) -> tuple[Array, float]:
         """Return the command that holds the measured pose: joints [rad] and opening 0 … 1."""
         joints, _, opening = self._measured()
-        return joints.astype(float), opening / self.robot.stroke
+        return joints.astype(float), opening / self._limits.stroke
 
     def _measured(self) -> tuple[Array, Array, float]:
         """Return joints [rad], their velocities [rad/s] and the gripper's opening [m]."""
@@ -161,12 +153,6 @@ class SimulatorNode(Node):
             state = self._drivable.look().state
         joints, velocities = (state[spec.indices(names)] for names in (model.joints, model.velocities))
         return joints, velocities, float(state[spec.indices([model.gripper])[0]]) if model.gripper else 0.0
-
-    def _now(self) -> Any:
-        """Return the time stamp of a measurement taken now."""
-        if self.timing.clock:
-            return Time(nanoseconds=int(self._elapsed * 1e9)).to_msg()
-        return self.get_clock().now().to_msg()
 
     def _publish_episode(self) -> None:
         environment = self.environment

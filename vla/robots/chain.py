@@ -13,16 +13,6 @@ from numpy.typing import ArrayLike
 from vla.spec import Array
 
 
-def frame_positions(chain: Sequence[Sequence[float]], joints: ArrayLike) -> Array:
-    """Return (J + 2, 3) positions [m] of the base, of every joint's frame and of the tool, in the base frame.
-
-    Args:
-        chain: as in `vla.spec.RobotModel`, (J + 1, 7).
-        joints: (J,) [rad].
-    """
-    return np.vstack([np.zeros(3), _frames(_links(chain), joints)[:, :3, 3]])
-
-
 def forward_of(chain: Sequence[Sequence[float]]) -> Callable[[Array], tuple[Array, Array]]:
     """Return the function of a chain that `vla.robots.cartesian.Kinematics` needs: joints to pose and Jacobian."""
     links = _links(chain)

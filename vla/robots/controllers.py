@@ -118,22 +118,11 @@ def gripper_index(spec: Spec) -> int | None:
     return spec.action.index(GRIPPER) if GRIPPER in spec.action and GRIPPER not in joints else None
 
 
-def joint_factors(spec: Spec, velocities: bool = False) -> Array:
-    """Return the (J,) factors from the units of the joints in the state to [rad], or of their velocities to [rad/s].
-
-    Raises:
-        UserError: there is no robot, or a joint has another unit.
-    """
-    robot = spec.require_robot("a position in rad")
-    units = dict(zip(spec.state, spec.state_units, strict=True))
-    names = robot.velocities if velocities else robot.joints
-    return _factors([(name, units[name].removesuffix("/s")) for name in names])
-
-
 def _joint_controller(spec: Spec, model: RobotModel, workspace: tuple[Point, Point] | None) -> JointController:
     if others := [name for name in spec.action if name not in (*model.joints, GRIPPER)]:
         raise UserError(f"the policy's action has {', '.join(others)}, which are no joints of its robot")
-    joint_factors(spec)  # those of the state must be known too
+    state = dict(zip(spec.state, spec.state_units, strict=True))
+    _factors([(name, state[name]) for name in model.joints])  # those of the state must be known too
     if workspace is not None:
         raise UserError(
             "deploy.safety.workspace cannot be kept by a policy that acts with joint positions: set it to null, and "

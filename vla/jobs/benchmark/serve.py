@@ -63,8 +63,6 @@ def _serving(experiment: Experiment, policy: Policy) -> Iterator[RemotePolicy]:
         largest_message=2**26,
         api_key=None,
         origins=[],
-        certificate=None,
-        private_key=None,
         policy=lambda: policy,
         environment=experiment.make_environment(),
         output=experiment.output,

@@ -1,0 +1,89 @@
+"""What the policy node tells about itself: its state, latencies and dropped messages."""
+
+from __future__ import annotations
+
+from collections import deque
+
+import numpy as np
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+
+from vla.deploy.control_loop import ControlLoop
+from vla.deploy.lifecycle_node import GuardedLifecycleNode
+from vla.deploy.messages import HANDED_OVER, shorten
+from vla.deploy.safety import State
+
+LEVELS = {
+    State.WAITING: DiagnosticStatus.OK,
+    State.RUNNING: DiagnosticStatus.OK,
+    State.HANDED_OVER: DiagnosticStatus.OK,
+    State.HOLDING: DiagnosticStatus.WARN,
+    State.STOPPED: DiagnosticStatus.WARN,
+    State.FAULT: DiagnosticStatus.ERROR,
+}
+MAX_MESSAGE = 300  # length of a log line or status message [characters]
+
+
+class Diagnostics:
+    """Publishes ~/status and /diagnostics, and logs what changes."""
+
+    def __init__(self, node: GuardedLifecycleNode, loop: ControlLoop, dry_run: bool) -> None:
+        self._node, self._loop, self._dry_run, self._dropped = node, loop, dry_run, 0
+        self._status = node.add_publisher(DiagnosticStatus, "~/status")
+        self._array = node.add_publisher(DiagnosticArray, "/diagnostics")
+        self._latencies: dict[str, deque[float]] = {}
+        self._reported: tuple[State | None, str] = (None, "")
+        self._ignored = ""  # message about an instruction that is ignored after a stop or a fault
+
+    def record(self, name: str, seconds: float) -> None:
+        """Add a latency."""
+        self._latencies.setdefault(name, deque(maxlen=500)).append(seconds)
+
+    def drop(self, reason: str) -> None:
+        """Count a message that cannot be used."""
+        self._dropped += 1
+        self._node.get_logger().warning(shorten(reason, MAX_MESSAGE), throttle_duration_sec=1.0)
+
+    def ignore(self, message: str) -> None:
+        """Tell once that an instruction is ignored, until the state changes."""
+        if message != self._ignored:
+            self._ignored = message
+            self._node.get_logger().warning(shorten(message, MAX_MESSAGE))
+            self.report()
+
+    def report_changes(self) -> None:
+        """Report if state or reason have changed."""
+        if (self._loop.state, self._loop.reason) != self._reported:
+            self.report()
+
+    def report(self) -> None:
+        """Publish the status, and log a changed state."""
+        loop = self._loop
+        if (loop.state, loop.reason) != self._reported:
+            self._reported, self._ignored = (loop.state, loop.reason), ""
+            line = f"{loop.state}: {shorten(loop.reason, MAX_MESSAGE)}".removesuffix(": ")
+            # Two calls, because rclpy refuses to log with changing severity from one line.
+            if LEVELS[loop.state] == DiagnosticStatus.OK:
+                self._node.get_logger().info(line)
+            else:
+                self._node.get_logger().warning(line)
+        pairs = [KeyValue(key=key, value=value) for key, value in self._values().items()]
+        text = shorten(self._ignored or loop.reason or loop.state.value, MAX_MESSAGE)
+        status = DiagnosticStatus(level=LEVELS[loop.state], name=self._node.get_name(), message=text, values=pairs)
+        self._status.publish(status)
+        array = DiagnosticArray(status=[status])
+        array.header.stamp = self._node.get_clock().now().to_msg()
+        self._array.publish(array)
+
+    def _values(self) -> dict[str, str]:
+        loop = self._loop
+        values = {
+            "state": loop.state.value,
+            HANDED_OVER: "yes" if loop.handed_over or self._dry_run else "no",
+            "instruction": shorten(loop.instruction),
+            "messages dropped": str(self._dropped),
+            "late plans": str(loop.late_plans),
+        }
+        for name, seconds in self._latencies.items():
+            middle, high = np.percentile(list(seconds), [50, 99]) * 1000
+            values |= {f"{name} p50 [ms]": f"{middle:.1f}", f"{name} p99 [ms]": f"{high:.1f}"}
+        return values

@@ -1,0 +1,68 @@
+"""Inference of a policy in a thread of its own, beside the one that commands the arm."""
+
+from __future__ import annotations
+
+import time
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import replace
+
+import numpy as np
+
+from vla.io.images import Crop, resize
+from vla.policy import Policy
+from vla.spec import Array, Observation
+
+
+class Inference:
+    """One inference at a time, always in the same thread: compiled programs are kept per thread."""
+
+    def __init__(self, policy: Policy, crop: Crop) -> None:
+        """Args: the policy; how to fit images with another aspect ratio than in training."""
+        self._policy, self._crop = policy, crop
+        self._pool = ThreadPoolExecutor(1, thread_name_prefix="policy")
+        self._running: Future[Array] | None = None
+        self._since = 0.0
+
+    @property
+    def busy(self) -> bool:
+        """Whether an inference is under way, or its result has not been taken."""
+        return self._running is not None
+
+    def warm_up(self) -> None:
+        """Run three inferences on noise: the first ones are slow."""
+        noise = self._policy.spec.random_observation(np.random.default_rng(0))
+        for _ in range(3):
+            self._pool.submit(self._plan, noise, True).result()
+        self._policy.reset("", 0)
+
+    def start(self, observation: Observation, first: bool) -> None:
+        """Start an inference; `first` begins an episode."""
+        self._running, self._since = self._pool.submit(self._plan, observation, first), time.monotonic()
+
+    def take(self) -> tuple[Array, float] | None:
+        """Return actions (k, D) to execute, and the duration [s], of an inference that is done, or raise its error."""
+        if self._running is None or not self._running.done():
+            return None
+        done, self._running = self._running, None
+        return done.result(), time.monotonic() - self._since
+
+    def forget(self) -> None:
+        """Drop an inference under way; the next one waits for it."""
+        self._running = None
+
+    def close(self) -> None:
+        """Wait for an inference under way, and end the thread."""
+        self._pool.shutdown(cancel_futures=True)
+
+    def _plan(self, observation: Observation, first: bool) -> Array:
+        if first:
+            self._policy.reset(observation.instruction, 0)
+        plan = self._policy.plan(self._resized(observation))
+        # In training the frames of a history have no gaps either.
+        return plan[: 1 if getattr(self._policy, "history", 1) > 1 else self._policy.execute]
+
+    def _resized(self, observation: Observation) -> Observation:
+        size = self._policy.spec.image_size
+        return replace(
+            observation, rgb={camera: resize(image, size, self._crop) for camera, image in observation.rgb.items()}
+        )

@@ -1,0 +1,100 @@
+"""What the policy node hears: images, joint states and instructions."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from sensor_msgs.msg import CompressedImage, Image, JointState
+from std_msgs.msg import String
+
+from vla.deploy import messages
+from vla.deploy.control_loop import ControlLoop
+from vla.deploy.diagnostics import Diagnostics
+from vla.deploy.lifecycle_node import GuardedLifecycleNode
+from vla.deploy.observer import age_of
+from vla.deploy.settings import COMPRESSED, PolicySettings
+from vla.io import images
+from vla.io.errors import UserError
+from vla.spec import LONGEST_INSTRUCTION
+
+
+class Inputs:
+    """Subscriptions that feed a control loop while the node is active, and drop what cannot be used."""
+
+    def __init__(
+        self,
+        node: GuardedLifecycleNode,
+        loop: ControlLoop,
+        settings: PolicySettings,
+        diagnostics: Diagnostics,
+        advance: Callable[[], None],
+    ) -> None:
+        """Args: the node; its loop, settings and diagnostics; `advance` is called after an image."""
+        self._node, self._loop, self._diagnostics, self._advance = node, loop, diagnostics, advance
+        self._joint_states, self._crop = messages.JointStates(loop.limits), settings.image_crop
+        self._stamps: dict[str, tuple[int, int]] = {}  # camera → time stamp of its last image
+        self._shapes: dict[str, tuple[int, ...]] = {}  # camera → shape of its last image
+        topics, reliability = settings.topics, settings.image_reliability.upper()
+        image_qos = QoSProfile(depth=1, reliability=ReliabilityPolicy[reliability])
+        for camera in loop.spec.cameras:
+            kind = CompressedImage if topics.images[camera].endswith(COMPRESSED) else Image
+            node.add_subscription(kind, topics.images[camera], partial(self._on_image, camera), image_qos)
+        best_effort = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)  # matches every publisher
+        for topic in filter(None, {topics.joint_states, topics.finger_states}):
+            node.add_subscription(JointState, topic, self._on_joint_state, best_effort)
+        node.add_subscription(String, topics.instruction, self._on_instruction, QoSProfile(depth=1))
+
+    def _on_image(self, camera: str, message: Any) -> None:
+        now = time.monotonic()
+        stamp = (message.header.stamp.sec, message.header.stamp.nanosec)
+        age = age_of(stamp, self._node.get_clock().now().nanoseconds * 1e-9)  # now: decoding takes its time
+        if not self._node.active:
+            return
+        try:
+            if stamp != (0, 0) and stamp == self._stamps.get(camera):
+                raise UserError("two images have the same time stamp: is its clock frozen?")
+            self._stamps[camera] = stamp
+            image = messages.image_from(message)
+        except UserError as error:
+            return self._diagnostics.drop(f"camera {camera}: {error}")
+        self._tell_shape(camera, image.shape)
+        self._diagnostics.record("image age", age)
+        self._loop.on_image(camera, image, now - age)
+        self._advance()
+
+    def _tell_shape(self, camera: str, shape: tuple[int, ...]) -> None:
+        """Log once how images of another size are used."""
+        if self._shapes.get(camera) != shape:
+            self._shapes[camera] = shape
+            if how := images.describe_resize(shape, self._loop.spec.image_size, self._crop):
+                self._node.get_logger().info(f"camera {camera}: {how}")
+
+    def _on_joint_state(self, message: JointState) -> None:
+        now = time.monotonic()
+        if not self._node.active:
+            return
+        try:
+            measured = self._joint_states.read(message, now)
+        except UserError as error:
+            return self._diagnostics.drop(str(error))
+        if measured is not None:
+            self._loop.on_joint_state(*measured, now)
+
+    def _on_instruction(self, message: String) -> None:
+        if not self._node.active:
+            return
+        said, loop = message.data.strip(), self._loop
+        quoted = repr(messages.shorten(message.data))
+        if (length := len(message.data)) > LONGEST_INSTRUCTION:
+            limit = f"an instruction of {length} characters, the limit is {LONGEST_INSTRUCTION}: {quoted}"
+            return self._diagnostics.drop(limit)
+        repeated = said == loop.instruction
+        if loop.on_instruction(said, time.monotonic()):
+            if not repeated:
+                self._node.get_logger().info(f"instruction: {quoted}")
+        elif said:
+            self._diagnostics.ignore(f"instruction ignored while {loop.state}: {quoted}; {loop.reason}")

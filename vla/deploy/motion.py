@@ -1,0 +1,238 @@
+"""From the actions of a policy to goals of the joints, and to commands within the limits of the arm. No ROS.
+
+All times are seconds on one monotonic clock. Shapes: J joints, k actions of a plan, D action components.
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from vla.deploy.joint_limiter import JointLimiter, JointLimits
+from vla.deploy.observer import HISTORY
+from vla.io.errors import UserError
+from vla.io.types import Point
+from vla.robots.cartesian import CartesianController
+from vla.robots.controllers import controller_for, gripper_index
+from vla.spec import Array, Spec
+
+Waypoint = tuple[float, Array, float | None]  # when due, goal of the joints (J,) [rad], opening
+
+
+LEEWAY = 0.005  # by which the tool may leave the workspace [m]: joints do not move it along a straight line
+
+
+@dataclass(frozen=True)
+class Command:
+    """Joint targets for the end of a tick."""
+
+    position: Array  # (J,) [rad]
+    velocity: Array  # (J,) [rad/s]
+    opening: float | None  # of the gripper, 0 closed … 1 open; None leaves it as it is
+
+
+@dataclass(frozen=True, eq=False)
+class _Workspace:
+    """Box that the tool point does not leave, whatever the joints do on their way between two goals."""
+
+    forward: Callable[[Array], tuple[Array, Array]]  # as in `Kinematics`
+    low: Array  # corners (3,) in the base frame [m]
+    high: Array
+
+    def step(self, limiter: JointLimiter, goal: Array, remaining: float) -> None:
+        """Let `limiter` take a step towards a goal, see there, or brake if it could not stop inside after that step.
+
+        A tool that is outside may come back, but not move further away.
+        """
+        ahead = copy.copy(limiter)
+        ahead.step(goal, remaining)
+        position, velocity = ahead.position, ahead.velocity
+        farthest = max(LEEWAY, self._outside(limiter.position))
+        while self._outside(ahead.position) <= farthest:
+            if ahead.resting:
+                limiter.position, limiter.velocity = position, velocity
+                return
+            ahead.brake()
+        limiter.brake()
+
+    def _outside(self, joints: Array) -> float:
+        """Return the distance [m] along an axis by which the tool is outside of the box; 0 or less inside."""
+        tool = self.forward(joints)[0][:3, 3]
+        return float(np.max([self.low - tool, tool - self.high]))
+
+
+class Goals:
+    """Turns the actions of a policy into goals of the joints, one control period after the other."""
+
+    def __init__(self, spec: Spec, limits: JointLimits, box: tuple[Point, Point] | None) -> None:
+        """Args: of the policy; of the arm; corners of the box for the tool point of Cartesian actions.
+
+        Raises:
+            UserError: the actions are none that the arm can execute, or the box cannot be kept.
+        """
+        model = spec.require_robot("deployment")
+        if len(limits.joints) != len(model.joints):
+            raise UserError(
+                f"the policy was trained with {len(model.joints)} joints, the robot has {len(limits.joints)}"
+            )
+        if model.gripper in spec.state and not limits.fingers:
+            raise UserError("the policy sees how far its gripper is open: name the joints in deploy.robot.fingers")
+        self._spec, self._gripper = spec, gripper_index(spec)
+        self.has_gripper = self._gripper is not None
+        reach = limits.min_position, limits.max_position, np.array(limits.speed)
+        self._controller = controller = controller_for(spec, box, reach)
+        self.workspace = None
+        if isinstance(controller, CartesianController):
+            self.workspace = _Workspace(controller.arm.forward, controller.low, controller.high)
+
+    def of(self, actions: Array, observed: float, anchor: Array) -> list[Waypoint]:
+        """Return the goals of actions (k, D); the first one begins at the time of the observation.
+
+        Cartesian actions are relative to the goal of the previous one, the first to the joints `anchor` (J,); joint
+        positions are absolute.
+
+        Raises:
+            UserError: the actions have another shape or are not finite.
+        """
+        if actions.ndim != 2 or not len(actions) or actions.shape[1] != len(self._spec.action):
+            raise UserError(f"the policy returned actions of the shape {actions.shape}")
+        if not np.isfinite(actions).all():
+            raise UserError("the policy returned numbers that are not finite")
+        actions = np.clip(actions, self._spec.low, self._spec.high)
+        ends = observed + np.arange(1, len(actions) + 1) / self._spec.control_hz
+        openings = [None] * len(actions)
+        if self._gripper is not None:  # bounds that follow from data may be beyond 0 and 1
+            openings = np.clip(actions[:, self._gripper], 0, 1).tolist()
+            actions = np.delete(actions, self._gripper, axis=1)
+        self._controller.reset(anchor)
+        goals = [self._controller.step(action).copy() for action in actions]
+        return list(zip(ends.tolist(), goals, openings, strict=True))
+
+    def tool_velocity(self, command: Command) -> Array:
+        """Return the (6,) velocity of the tool [m/s], [rad/s] in the base frame, of a command of Cartesian actions."""
+        assert isinstance(self._controller, CartesianController)
+        _, jacobian = self._controller.arm.forward(command.position)
+        return jacobian @ command.velocity
+
+
+class Motion:
+    """The commanded state of an arm: it moves along a schedule, and brakes without one."""
+
+    def __init__(self, limits: JointLimits, tick: float, workspace: _Workspace | None) -> None:
+        """Args: limits of the joints; time between commands [s]; box of the tool point, if there is one."""
+        self.limiter, self.tick = JointLimiter(limits, tick), tick
+        self._workspace = workspace
+        self.schedule: list[Waypoint] = []  # without those that are past, but for the last one
+        self._opening: float | None = 1.0
+        self._commanded: deque[tuple[float, Array]] = deque()  # at, joints
+        # Trajectory that an arm executes by itself: since when, its commands, and whether it is still to be followed.
+        self._sent: tuple[float, list[Command]] | None = None
+        self._sent_valid = False
+
+    @property
+    def started(self) -> bool:
+        """Whether there is a commanded pose."""
+        return bool(self._commanded)
+
+    def start(self, measured: Array, opening: float | None, now: float) -> None:
+        """Take an arm over at its measured joints (J,), at rest; raise a UserError if it is outside its limits."""
+        self.limiter.start(measured)
+        self._opening, self._sent, self._sent_valid = opening, None, False
+        self._commanded.clear()
+        self._record(now)
+
+    def hold(self, measured: Array) -> None:
+        """Command the measured joints (J,), so that an arm that is elsewhere is not pulled back."""
+        self.limiter.hold(measured)
+        self._sent, self._sent_valid = None, False
+
+    def follow(self, schedule: list[Waypoint], position: Array | None = None) -> None:
+        """Replace the schedule; its first goal is approached from the commanded position, or from another (J,)."""
+        if position is not None:
+            self.limiter.position = np.array(position, float)
+        self.schedule, self._sent_valid = schedule, False
+
+    def set_limits(self, limits: JointLimits) -> None:
+        """Replace the limits."""
+        self.limiter.limits, self._sent_valid = limits, False
+
+    def commanded_at(self, at: float) -> Array:
+        """Return the joints (J,) that were commanded nearest to a time."""
+        return min(self._commanded, key=lambda command: abs(command[0] - at))[1]
+
+    def advance(self, now: float) -> Command:
+        """Return the command of this tick."""
+        if self._sent is not None:
+            self._recall(*self._sent, now)
+        if not self._sent_valid:
+            self._opening = self._step(self.limiter, self.schedule, now, self._opening)
+        self._record(now)
+        return _command(self.limiter, self._opening)
+
+    def horizon(self, now: float, longest: float = math.inf) -> list[Command]:
+        """Return the commands after this tick's if no further input arrives; the last one is at rest.
+
+        Args:
+            now: the time of this tick [s].
+            longest: time [s] after which the arm brakes, if the schedule has not ended before.
+        """
+        limiter, schedule, opening = copy.copy(self.limiter), list(self.schedule), self._opening
+        commands, until = [], min(now + longest, schedule[-1][0] if schedule else now)
+        while now < until:
+            now += self.tick
+            opening = self._step(limiter, schedule, now, opening)
+            commands.append(_command(limiter, opening))
+        while not limiter.resting or not commands:
+            limiter.brake()
+            commands.append(_command(limiter, opening))
+        return commands
+
+    def commit(self, command: Command, now: float) -> list[Command] | None:
+        """Return the trajectory from this command to rest, for an arm that executes it by itself.
+
+        None if the trajectory that was sent last is still valid.
+        """
+        if self._sent_valid:
+            return None
+        ahead = [command, *self.horizon(now)]
+        self._sent, self._sent_valid = (now, ahead), True
+        return ahead
+
+    def _recall(self, since: float, ahead: list[Command], now: float) -> None:
+        """Set the commanded state from the trajectory `ahead`, sent at `since`: the arm follows that anyway.
+
+        It is that of this tick while the trajectory is valid, else that of the previous tick, because a step follows.
+        """
+        ticks = round((now - since) / self.tick) - (not self._sent_valid)
+        planned = ahead[min(max(ticks, 0), len(ahead) - 1)]
+        self.limiter.position, self.limiter.velocity = planned.position.copy(), planned.velocity.copy()
+        self._opening = planned.opening
+
+    def _step(self, limiter: JointLimiter, schedule: list[Waypoint], now: float, opening: float | None) -> float | None:
+        """Move towards the next goal within limits and workspace, or brake; returns the opening to command."""
+        if not schedule:
+            limiter.brake()
+            return opening
+        # Goals that are already due are skipped, but the last one is held.
+        while len(schedule) > 1 and schedule[0][0] <= now:
+            schedule.pop(0)
+        end, goal, opening = schedule[0]
+        if self._workspace is None:
+            limiter.step(goal, end - now)
+        else:
+            self._workspace.step(limiter, goal, end - now)
+        return opening
+
+    def _record(self, now: float) -> None:
+        self._commanded.append((now + self.tick, self.limiter.position.copy()))
+        while self._commanded[0][0] < now - HISTORY:
+            self._commanded.popleft()
+
+
+def _command(limiter: JointLimiter, opening: float | None) -> Command:
+    return Command(limiter.position.copy(), limiter.velocity.copy(), opening)
