@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from vla.reports import fonts
+from vla.reports import pictures as fonts
 from vla.reports.pictures import save, svgs
 
 STIX = Path(matplotlib.get_data_path(), "fonts/ttf/STIXGeneral.ttf")

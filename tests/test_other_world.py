@@ -28,7 +28,7 @@ from vla.data.verification import require_whole, verify_store
 from vla.policy import Policy
 from vla.reports.dataset_card import store_table, write_card
 from vla.reports.evaluation import plot_report, write_report
-from vla.reports.resets import save_contact_sheet
+from vla.reports.observations import save_contact_sheet
 from vla.reports.run_page import write_page
 from vla.reports.sweep import tabulate
 from vla.rollouts.evaluate import evaluate

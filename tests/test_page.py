@@ -26,7 +26,7 @@ from vla.config.origin import Commit, Origin
 from vla.io.files import warn_on_error
 from vla.reports.comparison import compare_runs, read_runs
 from vla.reports.evaluation import write_report
-from vla.reports.first_batch import draw_samples
+from vla.reports.observations import draw_samples
 from vla.reports.run_page import write_page
 from vla.reports.sweep import tabulate
 from vla.reports.training_curves import training_sections

@@ -14,7 +14,7 @@ from toy_recordable import make_environment
 
 from vla.reports.evaluation import plot_report, write_report
 from vla.reports.factors import factors
-from vla.reports.resets import draws_table, save_contact_sheet
+from vla.reports.observations import draws_table, save_contact_sheet
 from vla.rollouts.results import Report, Result
 from vla.rollouts.statistics import wilson_interval
 from vla.spec import FIRST_SEED

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from PIL import Image
 from rich.console import Console
 
-from vla.reports.conditions import conditions_table, plot_conditions
+from vla.reports.result_tables import conditions_table, plot_conditions
 from vla.rollouts.results import Report, Result, compare_conditions
 from vla.spec import FIRST_SEED
 

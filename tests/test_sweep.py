@@ -14,8 +14,9 @@ from matplotlib.figure import Figure
 from rich.console import Console
 
 from vla.reports.comparison import compare_rows
+from vla.reports.comparison_page import results_table
 from vla.reports.evaluation import write_report
-from vla.reports.sweep import console_table, tabulate
+from vla.reports.sweep import tabulate
 from vla.reports.tables import Table
 from vla.rollouts.comparison import compare_samples
 from vla.rollouts.results import Report, Result
@@ -88,10 +89,10 @@ def test_the_console_has_a_row_per_choice_and_of_many_conditions_the_first(tmp_p
     cell(tmp_path, 0, ["model=bc"], 9)
     cell(tmp_path, 1, ["model=[rt1]"], 7, dark=0)
     rows = read_rows(tmp_path)
-    shown = printed(console_table(rows))
+    shown = printed(results_table(rows))
     assert "90.0 (59.6-98.2)" in shown and "0.0 (0.0-43.4)" in shown and "[rt1]" in shown and "dark" in shown
     cell(tmp_path, 2, ["model=act"], 7, conditions=tuple(f"dark_{number}" for number in range(4)))
-    assert "seen [%]" in (shown := printed(console_table(read_rows(tmp_path)))) and "dark" not in shown
+    assert "seen [%]" in (shown := printed(results_table(read_rows(tmp_path)))) and "dark" not in shown
 
 
 def test_cells_that_failed_are_left_out_and_a_sweep_without_any_writes_nothing(tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ from vla.config.experiment import Experiment
 from vla.io.files import writing
 from vla.io.printable import show
 from vla.io.types import Count, Seed
-from vla.reports.resets import draws_table, save_contact_sheet
+from vla.reports.observations import draws_table, save_contact_sheet
 from vla.rollouts.rollout import close_agent, rollout
 
 log = logging.getLogger(__name__)

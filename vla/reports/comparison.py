@@ -11,14 +11,13 @@ from typing import Any
 from vla.config.check import conditions, with_changes
 from vla.config.differences import at
 from vla.io.errors import UserError
-from vla.reports.conditions import secondary_table
+from vla.reports.result_tables import secondary_table
 from vla.reports.tables import DIFFERENCE, Table, difference
 from vla.rollouts.comparison import Comparison, compare_pairs, compare_samples, concluded
 from vla.rollouts.results import ERROR, Report, Result, concluded_secondary, pairs_of, secondary_of
 from vla.rollouts.statistics import effective_episodes
 from vla.runs.folder import Run, require_run
 from vla.runs.sweep import SweepRow
-from vla.spec import IN_DISTRIBUTION
 
 CASE = ("second", "minus first", "condition")  # heads of what was compared
 
@@ -42,17 +41,12 @@ def read_runs(folders: Sequence[Path]) -> dict[str, Run]:
     """
     if not folders:
         raise UserError("name the runs to compare, as in report.runs=[RUN,RUN]")
-    read = [require_run(folder) for folder in folders]
-    return dict(zip(_names(folders), read, strict=True))
-
-
-def _names(folders: Sequence[Path]) -> list[str]:
-    """Return the shortest path suffixes of equal length that distinguish the folders."""
+    runs = [require_run(folder) for folder in folders]
     paths = [folder.resolve().parts for folder in folders]
-    for length in range(1, max(map(len, paths)) + 1):
+    for length in range(1, max(map(len, paths)) + 1):  # the shortest ends of their paths that tell them apart
         names = ["/".join(path[-length:]) for path in paths]
         if len(set(names)) == len(names):
-            return names
+            return dict(zip(names, runs, strict=True))
     raise UserError(f"a run is named twice: {', '.join(map(str, folders))}")
 
 
@@ -104,18 +98,15 @@ def _repeats_training_condition(runs: Sequence[Run], condition: str) -> bool:
 def _compared(one: SweepRow, other: SweepRow, condition: str) -> tuple[Comparison, Mapping[str, Comparison]] | None:
     """Compare two rows under a condition, see `compare`; None in different worlds, or in samples that stopped early."""
     runs = one.runs[0], other.runs[0]
-    anytime = any(
-        run.reports[condition].anytime for row in (one, other) for run in row.runs if condition in run.reports
-    )
-    single = len(one.runs) == len(other.runs) == 1
-    if single and (together := common_episodes(*runs, condition)):
+    reports = [run.reports[condition] for row in (one, other) for run in row.runs if condition in run.reports]
+    anytime = any(report.anytime for report in reports)
+    if len(one.runs) == len(other.runs) == 1 and (together := common_episodes(*runs, condition)):
         return compare_pairs(pairs_of(together), anytime), secondary_of(together, anytime)
     first, second = (_by_seed(run, condition) for run in runs)
     shared = first.keys() & second.keys()
     alike = all(first[seed][1] == second[seed][1] for seed in shared)  # of samples all must be of the same world
-    if anytime or not (
-        first and second and alike and (shared or _scenes(runs[0], condition) == _scenes(runs[1], condition))
-    ):
+    alike = alike if shared else _scenes(runs[0], condition) == _scenes(runs[1], condition)
+    if anytime or not (first and second and alike):
         return None
     samples = [effective_episodes(row.played[condition]) for row in (one, other)]
     episodes = one.episodes[condition] + other.episodes[condition]
@@ -126,9 +117,9 @@ def remarks(runs: Mapping[str, Run], compared: Sequence[RunComparison] | None = 
     """Return remark → the runs, by name, that it is about; with comparisons also which pairs have none."""
     found = {(each.one, each.other) for each in compared or ()}
     pairs = [] if compared is None else [pair for pair in combinations(runs, 2) if pair not in found]
-    versions = [run.report.versions for run in runs.values() if run.report]
-    libraries = dict.fromkeys(library for each in versions for library in each)
-    versions_of = {each: dict.fromkeys(one[each] for one in versions if each in one) for each in libraries}
+    versions: dict[str, dict[str, None]] = {}
+    for library, version in (each for run in runs.values() if run.report for each in run.report.versions.items()):
+        versions.setdefault(library, {})[version] = None
     failed = [
         f"{len(report.errors)} of {len(report.results)} in {name} ({condition})"
         for name, run in runs.items()
@@ -137,9 +128,7 @@ def remarks(runs: Mapping[str, Run], compared: Sequence[RunComparison] | None = 
     ]
     told = {
         "not compared, because no episode is the same in both": [f"{one} and {other}" for one, other in pairs],
-        "evaluated with different versions": [
-            f"{library} {' and '.join(names)}" for library, names in versions_of.items() if len(names) > 1
-        ],
+        "evaluated with different versions": [f"{n} {' and '.join(v)}" for n, v in versions.items() if len(v) > 1],
         "episodes that ended in errors, which count nowhere": failed,
     }
     return {remark: ", ".join(about) for remark, about in told.items() if about}
@@ -177,21 +166,19 @@ def common_episodes(one: Run, other: Run, condition: str) -> list[tuple[Result, 
 
 
 def _by_seed(run: Run, condition: str) -> dict[int, tuple[Result, Any]]:
-    """Return seed → result under a condition, and a key that is equal for equal scene and instruction."""
-    results = [result for result in run.reports.get(condition, Report(())).results if result.outcome != ERROR]
-    if condition == IN_DISTRIBUTION:
-        # A world may tell nothing of what it drew.
-        scenes = _scenes(run, condition)
-        return {result.seed: (result, (result.instruction, result.draws or scenes)) for result in results}
-    return {result.seed: (result, _scenes(run, condition)) for result in results}
+    """Return seed → result under a condition, and a key that is equal for equal scene and instruction.
+
+    Of other conditions than the first, and of some worlds, only the config tells what was drawn.
+    """
+    results, scenes = run.reports.get(condition, Report(())).results, _scenes(run, condition)
+    return {each.seed: (each, (each.instruction, each.draws or scenes)) for each in results if each.outcome != ERROR}
 
 
 def _scenes(run: Run, condition: str) -> tuple[Any, ...]:
     """Return the config values that determine the scenes: the task, and the changes of a condition."""
     config = run.report.config if run.report else {}
     network = at(config, "evaluate.networks", {}).get(condition)
-    distant = network and (network, at(config, "evaluate.by_clock", None))
-    return at(config, "task"), _changes(run, condition), distant
+    return at(config, "task"), _changes(run, condition), network and (network, at(config, "evaluate.by_clock", None))
 
 
 def _changes(run: Run, condition: str) -> dict[str, Any] | None:

@@ -23,7 +23,7 @@ from vla.rollouts.recordings import shown
 from vla.runs.folder import PAGE, RECORDING, RECORDINGS, Run
 from vla.runs.sweep import DEMONSTRATIONS, SweepRow, conditions_of
 
-COMPARISON, LINKS = "comparison.html", "pages"
+COMPARISON, SWEEP = "comparison.html", "sweep.html"
 CONDITIONS = 4  # maximum number of conditions on a terminal
 FAILURES = 3  # moving pictures per run
 
@@ -38,10 +38,10 @@ def write_comparison(
     Raises:
         UserError: a moving picture is damaged.
     """
-    legend = dict(zip((row.name for row in rows), cycle(COLOURS), strict=False))
-    cells = [
-        (row.name if len(row.runs) == 1 else run.folder.name, legend[row.name], run) for row in rows for run in row.runs
-    ]
+    legend, cells = _legend(rows), list[tuple[str, str, Run]]()
+    for row in rows:
+        single = len(row.runs) == 1
+        cells += [(row.name if single else run.folder.name, legend[row.name], run) for run in row.runs]
     few = {name: run for name, _, run in cells} if len(cells) <= len(COLOURS) else {}
     parts = [
         results_table(rows, page.parent),
@@ -64,7 +64,7 @@ def results_table(rows: Sequence[SweepRow], folder: Path | None = None) -> Table
     for row in rows:
         rates = [rate(row.interval(each)) if each in row.played else ABSENT for each in conditions]
         lines.append([*row.choices.values(), *rates, *_costs(row, seeds), *([_links(row, folder)] if folder else [])])
-    heads = [*rows[0].choices, *(f"{name} [%]" for name in conditions), *costs, *([LINKS] if folder else [])]
+    heads = [*rows[0].choices, *(f"{name} [%]" for name in conditions), *costs, *(["pages"] if folder else [])]
     details = [f"{name} [%]" for name in conditions[1:]] if len(conditions) > CONDITIONS else []
     return Table(heads, lines, "Success and cost", details=[*details, *costs])
 
@@ -92,17 +92,14 @@ def success_panels(rows: Sequence[SweepRow]) -> Panels:
         return {each: partial(_plot_demonstrations, rows=rows, condition=each) for each in conditions_of(list(rows))}
     panels: Panels = {}
     for condition in conditions_of(list(rows)):
-        played = {
-            row.name: (row.interval(condition), colour)
-            for row, colour in zip(rows, cycle(COLOURS), strict=False)
-            if condition in row.played
-        }
-        rates, colours = (
-            {name: interval for name, (interval, _) in played.items()},
-            [each for _, each in played.values()],
-        )
-        panels[condition] = partial(plot_rates, rates=rates, colours=colours)
+        rates = {row.name: row.interval(condition) for row in rows if condition in row.played}
+        panels[condition] = partial(plot_rates, rates=rates, colours=_legend(rows))
     return panels
+
+
+def _legend(rows: Sequence[SweepRow]) -> dict[str, str]:
+    """Return name of a row → colour."""
+    return dict(zip((row.name for row in rows), cycle(COLOURS), strict=False))
 
 
 def _plot_demonstrations(axes: Axes, rows: Sequence[SweepRow], condition: str) -> None:

@@ -17,8 +17,8 @@ from vla.data.index import NOT_NEEDED, Entry, listed
 from vla.data.verification import StoreReport, entries_by_config, episode_of
 from vla.io.files import write_text
 from vla.reports.factors import numeric
+from vla.reports.observations import reset_panels, spans
 from vla.reports.pictures import BLUE, GREEN, RED, Panels, plot_counts, save
-from vla.reports.resets import reset_panels, spans
 from vla.reports.tables import Table
 from vla.spec import in_brackets
 
@@ -68,30 +68,28 @@ def _text(findings: StoreReport) -> str:
         (name, unit, *(f"{each:.4g}" for each in four))
         for name, unit, four in zip(spec.action, spec.units, numbers, strict=True)
     ]
-    heads = ("action", "unit", "minimum", "maximum", "mean", "standard deviation")
     chosen = [f"Chosen by `inspect.where={condition}`.\n" for condition in store.config.get("where", ())]
     configs = [
         f"{len(entries)} seeds, {listed([entry.seed for entry in entries])}:\n\n```json\n"
         f"{json.dumps(config, indent=1, ensure_ascii=False)}\n```\n"
         for config, entries in entries_by_config(store)
     ]
+    frame = f" in frame {spec.robot.frame}" if spec.robot else ""
+    heads = ("action", "unit", "minimum", "maximum", "mean", "standard deviation")
     paragraphs = [
         f"# {store.folder.name}\n",
         "![First frames, outcomes, actions and draws](card.png)\n",
         store_table(findings).markdown(),
         "## One step\n",
         Table(("state", "unit"), [*zip(spec.state, spec.state_units, strict=True)]).markdown(),
-        "`action` is the label to imitate, `executed` was sent to the robot"
-        f"{f' in frame {spec.robot.frame}' if spec.robot else ''}:\n",
+        f"`action` is the label to imitate, `executed` was sent to the robot{frame}:\n",
         Table(heads, components).markdown(),
-        *(["Depth is in mm.\n"] if spec.depth else []),
         "## Draws\n",
         Table(("draw", "range"), [*spans([_draws(findings.whole)]).items()]).markdown(),
         "## Configuration\n",
         *chosen,
         *configs,
-        "## Training on this store\n",
-        "With the task and the expert above on the command line:\n",
+        "Training on this store, with the task and the expert above on the command line:\n",
         f"```\npython -m vla.run job=train collect.folder=FOLDER collect.episodes={len(findings.whole)}\n```\n",
     ]
     return "\n".join(paragraphs)

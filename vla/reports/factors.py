@@ -1,17 +1,23 @@
-"""Randomised factors of a report's episodes, over which success is compared."""
+"""Panels of an evaluation's episodes: outcomes, lengths, and success over what was randomised."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
 
 from vla.data.draws import flat
-from vla.rollouts.results import Result
+from vla.reports.pictures import GREEN, GREY, RED, Interval, Panels, error_bars, plot_counts, rate_limits
+from vla.reports.tables import in_words
+from vla.rollouts.results import ERROR, Report, Result
+from vla.rollouts.statistics import wilson_interval
 
 BINS = 5  # quantile groups of a numeric factor
-GROUPS = 8  # maximum number of groups of a factor
+GROUPS, FACTORS = 8, 8  # maximum number of groups of a factor, and of factors that are drawn
+LENGTH_BINS = 30  # approximate number of bars in the histogram of lengths
 
 
 def factors(played: Sequence[Result]) -> dict[str, list[Any]]:
@@ -63,3 +69,66 @@ def association(values: Sequence[Any], played: Sequence[Result]) -> float:
         return 0.0
     squares = sum(len(group) * (good[group].mean() - rate) ** 2 for group in split)
     return float(squares / (rate * (1 - rate)) / (len(split) - 1))
+
+
+def episode_panels(report: Report) -> Panels:
+    """Return panels of outcomes, lengths, and success over the factors with the strongest association."""
+    played = [result for result in report.results if result.outcome != ERROR]
+    ordered = sorted(factors(played).items(), key=lambda factor: -association(factor[1], played))
+    shown = dict(ordered[:FACTORS])
+    rates = {name: _rates_of(values, played) for name, values in shown.items() if not isinstance(values[0], tuple)}
+    limits = rate_limits(min((low for each in rates.values() for _, low, _ in each), default=0.0))  # shared
+    outcomes = {in_words(name): count for name, count in report.outcome_counts.items()}
+    colours = [{"success": GREEN, ERROR: GREY}.get(name, RED) for name in report.outcome_counts]
+    panels: Panels = {
+        "outcomes": partial(plot_counts, counts=outcomes, colours=colours),
+        "length of episodes [steps]": partial(_plot_lengths, played=played),
+    }
+    for name, values in shown.items():
+        if name in rates:
+            panels[name] = partial(_plot_rates, values=values, rates=rates[name], limits=limits)
+        else:
+            panels[name] = partial(_plot_points, points=values, played=played)
+    return panels
+
+
+def _plot_lengths(axes: Axes, played: Sequence[Result]) -> None:
+    """Plot a histogram of the steps until success or failure."""
+    steps = [[result.steps for result in played if result.success == good] for good in (True, False)]
+    lengths = steps[0] + steps[1] or [0]
+    width = max(1, round((max(lengths) - min(lengths)) / LENGTH_BINS))
+    edges = np.arange(min(lengths), max(lengths) + width + 1, width) - 0.5  # whole numbers lie inside the bins
+    axes.hist(steps, bins=list(edges), stacked=True, color=[GREEN, RED])
+    axes.locator_params(integer=True, nbins=5)
+
+
+def _plot_points(axes: Axes, points: Sequence[tuple[float, float]], played: Sequence[Result]) -> None:
+    """Scatter successes and failures over a two-dimensional factor, failures on top."""
+    for good, colour, marker in ((True, GREEN, "o"), (False, RED, "X")):
+        chosen = [point for point, result in zip(points, played, strict=True) if result.success == good]
+        across, along = np.array(chosen).reshape(-1, 2).T
+        axes.scatter(across, along, c=colour, marker=marker, s=16, alpha=0.75, linewidths=0)
+    axes.set_aspect("equal", adjustable="datalim")
+
+
+def _rates_of(values: Sequence[Any], played: Sequence[Result]) -> list[Interval]:
+    """Return the success rate of each group of a factor, with its interval."""
+    counts = [(sum(played[index].success for index in group), len(group)) for group in groups(values)]
+    return [(good / count, *wilson_interval(good, count)) for good, count in counts]
+
+
+def _plot_rates(axes: Axes, values: Sequence[Any], rates: Sequence[Interval], limits: tuple[float, float]) -> None:
+    """Plot the success rate with its interval per group of values; a group of numbers is placed at its mean."""
+    split = groups(values)
+    if numeric(values):
+        places = [float(np.mean([values[index] for index in group])) for group in split]
+        whole = all(isinstance(value, int) for value in values)
+        axes.locator_params(axis="x", nbins=4, integer=whole)  # long tick labels would overlap
+    else:
+        places = list(range(len(split)))
+        axes.set_xticks(places, [str(values[group[0]])[:10] for group in split], fontsize=8)
+        axes.set_xlim(-0.5, len(split) - 0.5)
+    middle, reach = error_bars(rates)
+    axes.errorbar(places, middle, reach, fmt="o-", color=GREEN, ecolor=GREY, linewidth=0.7, capsize=3, clip_on=False)
+    axes.set_ylim(limits)
+    axes.grid(axis="y", alpha=0.2)

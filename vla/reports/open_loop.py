@@ -32,15 +32,7 @@ def components(result: OpenLoop) -> list[ComponentError]:
 def write_errors(
     result: OpenLoop, path: Path, checkpoint: str | None, config: Mapping[str, Any], facts: Mapping[str, Any]
 ) -> None:
-    """Write the errors as JSON atomically, in the units of the spec.
-
-    Args:
-        result: of the evaluation.
-        path: of the file.
-        checkpoint: the evaluated policy.
-        config: the resolved config.
-        facts: further entries, such as chosen options, parameters and latency.
-    """
+    """Write the errors as JSON atomically, in the units of the spec, with `facts` such as parameters and latency."""
     per_episode = zip(result.seeds, result.recorded, result.errors.tolist(), strict=True)
     content = {
         "seeds": result.seeds,

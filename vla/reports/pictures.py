@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import io
+import logging
 import math
 import re
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -16,10 +18,13 @@ import numpy as np
 from markupsafe import Markup
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.font_manager import FontProperties, findfont, findSystemFonts, fontManager, get_font
+from matplotlib.text import Text
 
 from vla.io.files import atomic_path
-from vla.reports.fonts import use_fonts
 from vla.spec import Array
+
+log = logging.getLogger(__name__)
 
 Interval = tuple[float, float, float]  # success rate and its 95 % confidence interval
 Panels = dict[str, Callable[[Axes], object]]  # title → what draws the rest
@@ -43,15 +48,15 @@ def rate_limits(lowest: float) -> tuple[float, float]:
     return max(0.0, math.floor(10 * lowest) / 10), 1.0
 
 
-def plot_rates(axes: Axes, rates: Mapping[str, Interval], colours: Iterable[str]) -> None:
+def plot_rates(axes: Axes, rates: Mapping[str, Interval], colours: Mapping[str, str]) -> None:
     """Plot a line per name with its success rate and interval, and a vertical line at the first rate."""
-    for row, (interval, colour) in enumerate(zip(rates.values(), colours, strict=False)):
-        middle, reach = error_bars([interval])
-        axes.errorbar(middle, row, xerr=reach, fmt="o", color=colour, capsize=3, clip_on=False)
-    middles, lows, _ = zip(*rates.values(), strict=True)
+    middles, reach = error_bars(rates.values())
+    for row, name in enumerate(rates):
+        colour, ends = colours.get(name, GREEN), reach[:, row, None]
+        axes.errorbar(middles[row], row, xerr=ends, fmt="o", color=colour, capsize=3, clip_on=False)
     axes.axvline(middles[0], color=GREY, linewidth=0.8, linestyle=":")
     axes.set_yticks(range(len(rates)), [*rates])
-    axes.set(ylim=(len(rates) - 0.5, -0.5), xlim=rate_limits(min(lows)))
+    axes.set(ylim=(len(rates) - 0.5, -0.5), xlim=rate_limits(min(low for _, low, _ in rates.values())))
     axes.grid(alpha=0.2)
 
 
@@ -124,3 +129,36 @@ def _svg(title: str, draw: Callable[[Axes], object]) -> Markup:
     svg = file.getvalue()
     svg = re.sub(r"<metadata>.*?</metadata>", "", svg[svg.index("<svg") :], flags=re.DOTALL)
     return Markup(re.sub(r' xmlns(:\w+)?="[^"]*"', "", svg).replace(INK, "currentColor"))
+
+
+def use_fonts(figure: Figure) -> None:
+    """Let the texts of a figure fall back on fonts of the machine; one sentence says if none has a character."""
+    texts = [text for text in figure.findobj(Text) if isinstance(text, Text)]
+    families = families_with(frozenset(each for text in texts for each in text.get_text() if ord(each) > 0x24F))
+    for text in texts if families else ():
+        text.set_fontfamily([*text.get_fontfamily(), *families])
+
+
+@cache
+def families_with(characters: frozenset[str]) -> list[str]:
+    """Return the families of as few fonts as have the characters together: matplotlib's own, then the best one."""
+    files = (findfont(FontProperties()), *sorted(findSystemFonts(), key=lambda file: ("Regular" not in file, file)))
+    fonts, missing, found = {file: _within(file, characters) for file in files if characters}, characters, list[str]()
+    while missing and fonts[best := max(fonts, key=lambda file: len(fonts[file] & missing))] & missing:
+        fontManager.addfont(best)  # its own list may be older
+        found.append(get_font(best).family_name)
+        missing -= fonts[best]
+    if missing:
+        log.warning(
+            "no font of this machine has some of the characters to be drawn, so pictures show boxes in their place: "
+            "install one, such as the package fonts-noto-cjk for Chinese, Japanese and Korean"
+        )
+    return found
+
+
+def _within(file: str, characters: frozenset[str]) -> frozenset[str]:
+    """Return which of the characters a font has; none of what cannot be read."""
+    try:
+        return frozenset(each for each in characters if get_font(file).get_char_index(ord(each)))
+    except (OSError, RuntimeError):
+        return frozenset()

@@ -7,13 +7,12 @@ from pathlib import Path
 from vla.config.differences import ABSENT, at
 from vla.data.index import listed
 from vla.io.files import warn_on_error
-from vla.reports.conditions import conditions_table, secondary_table
-from vla.reports.evaluation import report_panels
+from vla.reports.factors import episode_panels
 from vla.reports.index import INDEX, RUNS, entry, write_index
 from vla.reports.open_loop import errors_table
 from vla.reports.page import Section, render
 from vla.reports.pictures import GREEN, svgs
-from vla.reports.result_tables import rate_tables, rounds_table
+from vla.reports.result_tables import conditions_table, rate_tables, rounds_table, secondary_table
 from vla.reports.tables import Table, config_value, duration, in_words, links, percent, rate
 from vla.reports.training_curves import training_sections
 from vla.rollouts.moving_picture import read_moving_pictures
@@ -42,32 +41,34 @@ def write_page(folder: Path) -> Path:
     report = run.reports.get(IN_DISTRIBUTION)
     others = run.report.conditions if run.report else {}
     compared = {name: part.comparison for name, part in others.items() if part.comparison}
+    changes = [[each.key, config_value(each.here), config_value(each.default)] for each in run.changes or ()]
     parts = [
         Section("", facts=_facts(run)),
         *([errors_table(run.errors.components, len(run.errors.seeds))] if run.errors else []),
         Section("", picture=folder / ERRORS_PLOT if run.errors else None),
         _rollouts(run),
-        Section("Episodes", EPISODES, panels=svgs(report_panels(report)) if report else {}),
+        Section("Episodes", EPISODES, panels=svgs(episode_panels(report)) if report else {}),
         *([conditions_table(run.reports, compared)] if others else []),
         secondary_table({(name,): part.secondary for name, part in others.items()}, ["condition"]),
         *(rate_tables(report) if report else ()),
         *training_sections([(GREEN, run.metrics)]),
-        rounds_table(run),
+        rounds_table(run.report.rounds if run.report else ()),
         Section("First training batch", WINDOWS, picture=folder / SAMPLES),
         *_origins(run),
-        Table(("key", "here", "default"), _changes(run), "Differences from the default configuration"),
+        Table(("key", "here", "default"), changes, "Differences from the default configuration"),
     ]
+    title, (ended, warning) = folder.resolve().name, _ended(run)
     interval = rate((report.success, *report.interval)) if report else ""
     page = render(
         folder / PAGE,
-        " · ".join(filter(None, (run.policy, _tasks(run)))) or folder.resolve().name,
+        " · ".join(filter(None, (run.policy, _tasks(run)))) or title,
         parts,
         any(each.anytime for each in run.reports.values()),
-        subtitle=folder.resolve().name,
-        warning=_warning(run),
+        subtitle=title,
+        warning=warning,
         rate=f"{percent(report.success)} %" if report else "",
         of=str(report).splitlines()[-1] if report else "",
-        entry=entry(run.policy, _tasks(run), interval, str(report.episodes) if report else "", _ended(run)),
+        entry=entry(run.policy, _tasks(run), interval, str(report.episodes) if report else "", ended),
     )
     runs = folder.resolve().parent
     if runs.name == RUNS:
@@ -83,18 +84,14 @@ def _tasks(run: Run) -> str:
     return ", ".join(tasks) if len(tasks) <= NAMED else f"{len(tasks)} tasks"
 
 
-def _ended(run: Run) -> str:
-    """Return how a training ended that was not completed."""
-    ended = run.training.ended if run.training else "done"
-    return "" if ended == "done" else ended if ended == "interrupted" else "failed"
-
-
-def _warning(run: Run) -> str:
-    if not run.training or not _ended(run):
-        return ""
+def _ended(run: Run) -> tuple[str, str]:
+    """Return how a training ended that was not completed, in a word and in a sentence."""
+    if not run.training or run.training.ended == "done":
+        return "", ""
     if run.training.ended != "interrupted":
-        return f"Training failed: {run.training.ended}"
-    return f"Training was interrupted after {run.training.steps} steps; resume={_near(run.folder)} continues it."
+        return "failed", f"Training failed: {run.training.ended}"
+    after = f"Training was interrupted after {run.training.steps} steps"
+    return "interrupted", f"{after}; resume={_near(run.folder)} continues it."
 
 
 def _near(path: Path, *folders: Path) -> Path:
@@ -131,23 +128,19 @@ def _facts(run: Run) -> dict[str, str]:
 def _rollouts(run: Run) -> Section:
     """Return the moving pictures, what the recording has, and how to play an episode again."""
     pictures, facts = read_moving_pictures(run.folder / RECORDINGS), dict[str, str]()
-    if (run.folder / RECORDING).is_file():
-        facts["recording"] = links({RECORDING: RECORDING}) + f"{_recorded(run)}; rerun {RECORDING} plays it in 3-D"
-        policy = f"checkpoint={_near(Path(run.report.checkpoint))} " if run.report and run.report.checkpoint else ""
+    if (run.folder / RECORDING).is_file() and run.report:
+        results, recorded = [each for each in run.report.per_episode if each.outcome != ERROR], {*run.report.recorded}
+        counts = [
+            f"{sum(each.seed in recorded for each in played)} of {len(played)} {name}"
+            for name, good in (("failures", False), ("successes", True))
+            if (played := [each for each in results if each.success == good])
+        ]
+        facts["recording"] = (
+            links({RECORDING: RECORDING}) + f" has {' and '.join(counts)}; rerun {RECORDING} plays them"
+        )
+        policy = f"checkpoint={_near(Path(run.report.checkpoint))} " if run.report.checkpoint else ""
         facts["another one"] = f"{policy}evaluate.seed=SEED evaluate.episodes=1 evaluate.recordings=all"
     return Section("Rollouts", ROLLOUTS, facts, rollouts=[(caption, pictures[caption]) for caption in shown(pictures)])
-
-
-def _recorded(run: Run) -> str:
-    """Return which episodes the recording has; empty if that is unknown."""
-    if not run.report or not run.report.recorded:
-        return ""
-    recorded, parts = {*run.report.recorded}, list[str]()
-    for name, good in (("failures", False), ("successes", True)):
-        played = [each for each in run.report.per_episode if each.success == good and each.outcome != ERROR]
-        if played:
-            parts.append(f"{sum(each.seed in recorded for each in played)} of {len(played)} {name}")
-    return f" has {' and '.join(parts)}"
 
 
 def _origins(run: Run) -> list[Section]:
@@ -164,7 +157,3 @@ def _origins(run: Run) -> list[Section]:
         facts = {"command": origin.command, "git commit": commits, "host": origin.host, "processor": origin.processor}
         sections.append(Section(f"Origin{part}", facts={name: fact for name, fact in facts.items() if fact}))
     return sections
-
-
-def _changes(run: Run) -> list[list[str]]:
-    return [[each.key, config_value(each.here), config_value(each.default)] for each in run.changes or ()]

@@ -3,19 +3,15 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import Sequence
 from pathlib import Path
 
 from vla.config.differences import at
 from vla.io.files import atomic_path, warn_on_error, write_text
 from vla.reports.comparison import compare_rows, differences_table, remarks
-from vla.reports.comparison_page import results_table, success_panels, write_comparison
+from vla.reports.comparison_page import SWEEP, results_table, success_panels, write_comparison
 from vla.reports.pictures import save
-from vla.reports.tables import Table
 from vla.runs.cells import failures
 from vla.runs.sweep import SweepRow, read_rows
-
-SWEEP, OVERVIEW = "sweep.html", "sweep.png"
 
 
 def tabulate(folder: Path) -> list[SweepRow]:
@@ -30,17 +26,12 @@ def tabulate(folder: Path) -> list[SweepRow]:
         texts = [*(table.markdown() for table in tables), "".join(f"- failed: {line}\n" for line in failed)]
         write_text(folder / "sweep.md", "\n".join(filter(None, texts)))
         size = 4, max(2.5, 0.5 + 0.25 * len(rows))
-        save(folder / OVERVIEW, success_panels(rows), 4, size, "success, 95 % CI")
+        save(folder / "sweep.png", success_panels(rows), 4, size, "success, 95 % CI")
         with warn_on_error(folder / SWEEP):
             facts = {f"failed cell {number}": line for number, line in enumerate(failed, 1)}
             facts |= remarks({run.folder.name: run for row in rows for run in row.runs})
             write_comparison(folder / SWEEP, f"Sweep {folder.resolve().name}", rows, compared, facts)
     return rows
-
-
-def console_table(rows: Sequence[SweepRow]) -> Table:
-    """Tabulate success and its interval per row and condition; of many conditions a terminal shows only the first."""
-    return results_table(rows)
 
 
 def _write_csv(rows: list[SweepRow], path: Path) -> None:
