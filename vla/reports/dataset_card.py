@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections import Counter
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -20,7 +21,7 @@ from vla.reports.factors import numeric
 from vla.reports.observations import reset_panels, spans
 from vla.reports.pictures import BLUE, GREEN, RED, Panels, plot_counts, save
 from vla.reports.tables import Table
-from vla.spec import in_brackets
+from vla.spec import Array, in_brackets
 
 WORDS, SENTENCES = 8, 12  # maximum number of bars for words and for instructions
 FRAMES, COLUMNS = 4, 4  # episodes whose first images are shown, panels per row
@@ -117,7 +118,7 @@ def _panels(findings: StoreReport) -> Panels:
     """Return panels of first images, outcomes, lengths, instructions, action labels and draws."""
     entries, spec = findings.whole, findings.store.spec
     shown = [entries[place] for place in sorted({*np.linspace(0, len(entries) - 1, FRAMES).round().astype(int)})]
-    first = [episode_of(findings.store, entry).observations[0] for entry in shown]
+    first = [replace(episode_of(findings.store, entry).observations[0], depth={}) for entry in shown]
     panels = reset_panels([entry.seed for entry in shown], first)
     outcomes, instructions = findings.outcomes, _most([entry.instruction for entry in entries], SENTENCES)
     colours = [GREEN if name == "success" else RED for name in outcomes]
@@ -128,11 +129,17 @@ def _panels(findings: StoreReport) -> Panels:
         bins = np.linspace(spec.low[index], spec.high[index], 42)
         # A limit in float32 can lie outside the bins.
         labels = np.clip(findings.actions[:, index], bins[0], bins[-1])
-        panels[name + in_brackets(spec.units[index])] = partial(Axes.hist, x=labels, bins=bins, color=BLUE, log=True)
+        panels[name + in_brackets(spec.units[index])] = partial(_plot_labels, labels=labels, bins=bins)
     for name, values in _draws(entries).items():
         if len({str(value) for value in values}) > 1:
             panels[name] = partial(_plot_values, values=values)
     return panels
+
+
+def _plot_labels(axes: Axes, labels: Array, bins: Array) -> None:
+    axes.hist(labels, bins, color=BLUE, log=True)
+    axes.yaxis.set_major_formatter("{x:g}")
+    axes.yaxis.set_minor_formatter("")
 
 
 def _plot_values(axes: Axes, values: Sequence[Any]) -> None:

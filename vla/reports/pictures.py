@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
+from textwrap import fill
 from typing import Any
 
 import matplotlib
@@ -61,13 +62,11 @@ def plot_rates(axes: Axes, rates: Mapping[str, Interval], colours: Mapping[str, 
 
 
 def plot_counts(axes: Axes, counts: Mapping[str, int], colours: Iterable[str]) -> None:
-    """Plot one labelled bar per word, the first on top, with its count on the right."""
-    most = max([1, *counts.values()])
+    """Plot one bar per word with its count, the first on top."""
     axes.barh(range(len(counts)), list(counts.values()), color=[*colours], alpha=0.45, height=0.8)
     for row, (name, count) in enumerate(counts.items()):
-        axes.text(most / 60, row, name, fontsize=8, va="center", clip_on=True)
-        axes.text(1.2 * most, row, str(count), fontsize=8, va="center", ha="right")
-    axes.set(ylim=(max(len(counts), 4) - 0.5, -0.5), xlim=(0, 1.2 * most), xticks=[], yticks=[])
+        axes.text(0, row, f" {count}  {name}", fontsize=8, va="center", clip_on=True)
+    axes.set(ylim=(max(len(counts), 4) - 0.5, -0.5), xticks=[], yticks=[])
     axes.spines[["left", "bottom"]].set_visible(False)
 
 
@@ -103,7 +102,7 @@ def save(
         figure.suptitle(title, fontsize=12, fontweight="bold")
         for number, (name, draw) in enumerate(panels.items()):
             axes = figure.add_subplot(rows, columns, number + 1)
-            axes.set_title(name)
+            axes.set_title(fill(name, int(14 * size[0])))
             draw(axes)
         use_fonts(figure)
         with atomic_path(path) as draft:

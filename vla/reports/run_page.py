@@ -135,9 +135,7 @@ def _rollouts(run: Run) -> Section:
             for name, good in (("failures", False), ("successes", True))
             if (played := [each for each in results if each.success == good])
         ]
-        facts["recording"] = (
-            links({RECORDING: RECORDING}) + f" has {' and '.join(counts)}; rerun {RECORDING} plays them"
-        )
+        facts["recording"] = links({RECORDING: RECORDING}) + f" has {' and '.join(counts)}; rerun {RECORDING} plays it"
         policy = f"checkpoint={_near(Path(run.report.checkpoint))} " if run.report.checkpoint else ""
         facts["another one"] = f"{policy}evaluate.seed=SEED evaluate.episodes=1 evaluate.recordings=all"
     return Section("Rollouts", ROLLOUTS, facts, rollouts=[(caption, pictures[caption]) for caption in shown(pictures)])
