@@ -137,6 +137,7 @@ def _panels(findings: StoreReport) -> Panels:
 
 
 def _plot_labels(axes: Axes, labels: Array, bins: Array) -> None:
+    axes.locator_params(axis="x", nbins=5)
     axes.hist(labels, bins, color=BLUE, log=True)
     axes.yaxis.set_major_formatter("{x:g}")
     axes.yaxis.set_minor_formatter("")
@@ -152,6 +153,7 @@ def _plot_values(axes: Axes, values: Sequence[Any]) -> None:
         axes.scatter(across, along, s=10, c=BLUE, alpha=0.5, linewidths=0)
         axes.set_aspect("equal", adjustable="datalim")
     else:
+        axes.locator_params(axis="x", nbins=5)
         axes.hist(items, int(np.clip(np.sqrt(len(items)), 8, 32)), color=BLUE)
 
 
