@@ -50,7 +50,7 @@ def test_the_card_tells_what_is_there(tmp_path: Path, figures: list[Figure]) -> 
     assert '"size": 1.0' in text and "collect.episodes=4" in text
     found = {axes.get_title(): axes for axes in figures[0].axes}
     assert bars(found["outcomes of all seeds"]) == [4, 1]
-    assert {"success", "timeout"} <= texts(found["outcomes of all seeds"])
+    assert {" 4  success", " 1  timeout"} <= texts(found["outcomes of all seeds"])
     assert sum(heights(found["length of episodes [steps]"])) == 4
     for component in ("x [m]", "y [m]", "gripper"):
         assert sum(heights(found[component])) == steps

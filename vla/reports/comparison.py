@@ -34,11 +34,7 @@ class RunComparison:
 
 
 def read_runs(folders: Sequence[Path]) -> dict[str, Run]:
-    """Return name → run.
-
-    Raises:
-        UserError: no folder is given, a folder is no run or given twice, or a file in it is damaged.
-    """
+    """Return name → run; a UserError if no folder is given, or one twice, or one is no run or has a damaged file."""
     if not folders:
         raise UserError("name the runs to compare, as in report.runs=[RUN,RUN]")
     runs = [require_run(folder) for folder in folders]
@@ -70,11 +66,8 @@ def compare(pairs: Iterable[tuple[SweepRow, SweepRow]], margin: float) -> list[R
 
     Single trainings are compared on the episodes that both played, by paired tests and in secondary metrics; without
     any, and with several trainings, as independent samples of size `effective_episodes`. Conditions that repeat the
-    training condition are left out. Verdicts take all comparisons into account, those on secondary metrics separately.
-
-    Args:
-        pairs: the first and the second row of each comparison.
-        margin: non-inferiority margin of the success rate, 0…1.
+    training condition are left out. Verdicts take all comparisons into account, those on secondary metrics separately;
+    `margin`, 0…1, is how much less success counts as not worse.
     """
     found = [
         RunComparison(one.name, other.name, condition, *compared)

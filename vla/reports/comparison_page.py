@@ -31,12 +31,9 @@ FAILURES = 3  # moving pictures per run
 def write_comparison(
     page: Path, title: str, rows: Sequence[SweepRow], compared: Sequence[RunComparison], remarks: Mapping[str, str]
 ) -> Path:
-    """Write a page on rows and their comparisons, and return its path.
+    """Write a page on rows and their comparisons, and return its path; a UserError if a moving picture is damaged.
 
     Of more runs than there are colours it has neither moving pictures nor the differences of their configurations.
-
-    Raises:
-        UserError: a moving picture is damaged.
     """
     legend, cells = _legend(rows), list[tuple[str, str, Run]]()
     for row in rows:

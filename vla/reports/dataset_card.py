@@ -51,10 +51,7 @@ def store_table(findings: StoreReport) -> Table:
 
 
 def write_card(findings: StoreReport) -> Path:
-    """Write `card.md` and `card.png` into the store's folder atomically, and return the path of `card.md`.
-
-    At least one episode must be intact. The content is deterministic.
-    """
+    """Write `card.md` and `card.png` into the folder of a store with intact episodes; return the path of `card.md`."""
     assert findings.whole, "no episode is intact"
     folder = findings.store.folder
     save(folder / "card.png", _panels(findings), COLUMNS, (4, 1.9), f"{len(findings.whole)} episodes")

@@ -24,17 +24,10 @@ def write_report(
     compared: Mapping[str, Comparison] | None = None,
     secondary: Mapping[str, Mapping[str, Comparison]] | None = None,
 ) -> None:
-    """Write a report as JSON atomically.
+    """Write the report of the first condition as JSON atomically, with the evaluated policy and the resolved config.
 
-    Args:
-        report: of the first condition.
-        path: of the file.
-        checkpoint: the evaluated policy.
-        config: the resolved config.
-        facts: further entries, such as chosen options, parameters and latency.
-        conditions: condition → report on the same seeds.
-        compared: condition → comparison of its success with the first.
-        secondary: condition → comparisons of its milestones and motion with the first.
+    `facts` are further entries, such as chosen options, parameters and latency. `conditions` have other reports on the
+    same seeds, `compared` and `secondary` their comparisons with the first, in success and in milestones and motion.
     """
     content = {
         **summary(report),

@@ -50,9 +50,8 @@ def errors_table(errors: Sequence[ComponentError], episodes: int) -> Table:
     """Tabulate the errors over so many episodes with their intervals, in readable units."""
     rows = [[each.name, *each.readable()] for each in errors]
     note = (
-        "Open loop: the policy saw recorded observations, on which its actions have no effect. The errors tell how "
-        "well it imitates the recordings, not how often it succeeds. The constant action is the mean of the training "
-        "episodes."
+        "Open loop: actions have no effect on what is seen next, so the errors tell how well the policy imitates the "
+        "recordings, not how often it succeeds. The constant action is the mean of the training episodes."
     )
     heads = ("component", "unit", "error", "95 % CI", "of a constant action")
     return Table(heads, rows, f"Mean absolute errors on {episodes} held-out episodes", note)

@@ -32,10 +32,7 @@ WINDOWS = "The newest images of each window, its instruction, and each component
 def write_page(folder: Path) -> Path:
     """Write the page of a run from the files in its folder, and return its path; missing files are omitted.
 
-    In a folder named `runs` that lists them, the list is written again.
-
-    Raises:
-        UserError: a file is damaged.
+    In a folder named `runs` the list of them is written again. Raises a UserError if a file is damaged.
     """
     run = read_run(folder)
     report = run.reports.get(IN_DISTRIBUTION)

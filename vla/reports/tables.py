@@ -51,7 +51,7 @@ class Table:
     def markdown(self) -> str:
         """Return the table without title and note; pipes and line breaks in cells are escaped."""
         lines = [self.heads, ["---"] * len(self.heads), *self.rows]
-        cells = [[cell.replace("|", "\\|").replace("\n", " ") for cell in line] for line in lines]
+        cells = [[cell.replace("|", "\\|").replace("\n", "<br>") for cell in line] for line in lines]
         return "".join(f"| {' | '.join(line)} |\n" for line in cells)
 
 
