@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import yaml
@@ -32,7 +33,7 @@ class Table:
     note: str = ""
     details: Sequence[str] = ()  # heads of columns for which a terminal is too narrow
 
-    @property
+    @cached_property
     def numeric(self) -> list[bool]:
         """Whether a column has numbers only, and is aligned at the right."""
         return [all(map(NUMBER.fullmatch, cells)) and any(cells) for cells in zip(*self.rows, strict=True)]
