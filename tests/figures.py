@@ -34,12 +34,6 @@ def spans(axes: Axes) -> list[tuple[float, float]]:
     return [_rounded(*(ends[:, 0] if ends[0, 0] != ends[1, 0] else ends[:, 1])) for ends in segments]
 
 
-def curves(axes: Axes) -> dict[str, Points]:
-    """Label of a line without error bars → its points."""
-    lines = [line for line in axes.get_lines() if not line.get_label().startswith("_")]  # type: ignore[union-attr]
-    return {str(line.get_label()): [_rounded(x, y) for x, y in line.get_xydata().tolist()] for line in lines}
-
-
 def bars(axes: Axes) -> list[float]:
     """The sizes of the bars that lie, in order."""
     return [patch.get_width() for patch in axes.patches if isinstance(patch, Rectangle)]

@@ -6,7 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from vla.reports.comparison import compare_runs, read_runs
+from vla.reports.comparison import compare_runs, read_runs, remarks, rows_of
 from vla.reports.comparison_page import write_comparison
 from vla.reports.evaluation import write_report
 from vla.rollouts.results import Report, Result, compare_conditions
@@ -70,4 +70,5 @@ def a_run(
 def compared(folders: list[Path], target: Path) -> Path:
     """The page of `job=report`."""
     runs = read_runs(folders)
-    return write_comparison(runs, compare_runs(runs, 0.02), target)
+    found, page = compare_runs(runs, 0.02), target / "comparison.html"
+    return write_comparison(page, f"{len(runs)} runs", rows_of(runs), found, remarks(runs, found))

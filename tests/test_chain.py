@@ -191,7 +191,7 @@ def test_a_report_tells_how_many_were_completed_in_a_row(tmp_path: Path) -> None
     assert told["mean_in_a_row"]["ci_low"] < told["mean_in_a_row"]["number"] == 2.5 < told["mean_in_a_row"]["ci_high"]
     write_report(report, tmp_path / "report.json", None, {})
     page = write_page(tmp_path).read_text()
-    assert "Instructions completed in a row" in page and "On average 2.50 were" in page and ">3/4</td>" in page
+    assert "Instructions completed in a row" in page and "on average 2.50" in page and ">3/4</td>" in page
     assert json.loads((tmp_path / "report.json").read_text())["per_episode"][2]["completed"] == [2, 4]
 
 

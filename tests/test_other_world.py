@@ -17,6 +17,7 @@ from fake_batch import as_policy
 from hydra import compose, initialize_config_dir
 from lightning import Trainer
 from omegaconf import DictConfig
+from PIL import Image
 from rerun.chunk import RrdReader
 
 from vla.config.check import with_changes
@@ -27,7 +28,7 @@ from vla.data.verification import require_whole, verify_store
 from vla.policy import Policy
 from vla.reports.dataset_card import store_table, write_card
 from vla.reports.evaluation import plot_report, write_report
-from vla.reports.resets import contact_sheet
+from vla.reports.observations import save_contact_sheet
 from vla.reports.run_page import write_page
 from vla.reports.sweep import tabulate
 from vla.rollouts.evaluate import evaluate
@@ -134,15 +135,16 @@ def test_what_needs_a_robot_is_refused_in_one_sentence() -> None:
 def test_a_store_is_verified_and_described(folder: Path) -> None:
     findings = verify_store(EpisodeStore(folder))
     require_whole(findings)
-    assert store_table(findings).row_count > 10
+    assert len(store_table(findings).rows) > 10
     card = write_card(findings).read_text()
     step = card.split("## One step")[1].split("## Draws")[0]
     assert "east | m" in step and "frame" not in step and "Depth" not in step
 
 
-def test_resets_are_shown() -> None:
+def test_resets_are_shown(tmp_path: Path) -> None:
     environment = toy.make_environment()
-    sheet = np.array(contact_sheet([0, 1], [environment.reset(seed) for seed in (0, 1)]), int)
+    save_contact_sheet([0, 1], [environment.reset(seed) for seed in (0, 1)], tmp_path / "sheet.png")
+    sheet = np.array(Image.open(tmp_path / "sheet.png").convert("RGB"), int)
     assert (np.ptp(sheet, axis=-1) > 60).sum() > 1000  # pixels in colour, of which text has none
 
 

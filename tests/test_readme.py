@@ -117,14 +117,13 @@ def require_floors(measures: dict[str, dict[str, Any]]) -> None:
     """Every stage was measured, against a floor of its own; how fast it was is for no test to judge."""
     stages = ("physics", "rendering", "expert, controller, judge", "images into arrays", "replay", "storing")
     precisions = ("fp32", "bf16") if has_bfloat16() else ("fp32",)
-    watched = ("", ": data-wait", ": MFU", ": memory", ": loss")
     assert set(measures) == {
         *("collect", *(f"collect: {stage}" for stage in stages), f"collect: {cores()} processes"),
         *(f"collect: rendering, {name}" for name in ("fast", "smooth", "mujoco")),
         *("loader", "loader: 1 frame", "loader: 6 frames"),
         *(f"loader: 3 x 224 px, {codec}{of}" for codec in ("lossless", "jpeg") for of in ("", ", 2500 x 100 steps")),
-        *(f"train: {precision}{what}" for precision in precisions for what in watched),
-        *("train: loader alone", "policy", "policy: every frame anew"),
+        *(f"train: {precision}" for precision in precisions),
+        "policy",
     }
     for name, measure in measures.items():
         assert set(measure) == {"value", "unit", "n", "floor", "ratio", "others"} and measure["n"] > 0, name

@@ -21,8 +21,8 @@ from vla.io.files import warn_on_error, writing
 from vla.io.printable import printable, show
 from vla.io.versions import installed_versions
 from vla.policy import costs
-from vla.reports.conditions import SecondaryRows, conditions_table, plot_conditions, secondary_table
 from vla.reports.evaluation import plot_report, write_report
+from vla.reports.result_tables import SecondaryRows, conditions_table, plot_conditions, secondary_table
 from vla.reports.run_page import write_page
 from vla.rollouts.evaluate import RecorderFactory, evaluate
 from vla.rollouts.memory import make_nearest, make_without, open_memory

@@ -25,7 +25,7 @@ from vla.io.printable import show
 from vla.jobs.collect import demonstrations
 from vla.models.policy_folder import read_policy
 from vla.policy import costs
-from vla.reports.open_loop import errors_table, plot_errors, write_errors
+from vla.reports.open_loop import components, errors_table, plot_errors, write_errors
 from vla.reports.run_page import write_page
 from vla.rollouts.open_loop import OpenLoop, open_loop
 from vla.rollouts.rollout import close_agent
@@ -83,7 +83,7 @@ def evaluate_open_loop(experiment: Experiment, checkpoint: Path | None) -> float
         page = None
         with warn_on_error(output / PAGE):
             page = write_page(output)
-    show(errors_table(result))
+    show(errors_table(components(result), len(result.seeds)))
     written = [path for path in (page, output / ERRORS, output / ERRORS_PLOT) if path and path.is_file()]
     names = ", ".join([str(written[0]), *(path.name for path in written[1:])])
     log.info("wrote %s: open-loop errors, which are not a success rate", names)

@@ -9,10 +9,10 @@ from tempfile import TemporaryDirectory
 
 from vla.config.check import Job
 from vla.config.experiment import Experiment
-from vla.io.files import atomic_path, writing
+from vla.io.files import writing
 from vla.io.printable import show
 from vla.io.types import Count, Seed
-from vla.reports.resets import contact_sheet, draws_table
+from vla.reports.observations import draws_table, save_contact_sheet
 from vla.rollouts.rollout import close_agent, rollout
 
 log = logging.getLogger(__name__)
@@ -42,7 +42,6 @@ def run(experiment: Experiment) -> None:
 
             merge(recordings, output / "preview.rrd")
             written.append(output / "preview.rrd")
-    with atomic_path(output / "preview.png") as draft:
-        contact_sheet(list(seeds), first).save(draft)
+    save_contact_sheet(list(seeds), first, output / "preview.png")
     show(draws_table(list(seeds), draws))
     log.info("wrote %s", " and ".join(map(str, written)))

@@ -9,9 +9,8 @@ from vla.config.check import Job
 from vla.config.experiment import Experiment
 from vla.io.printable import show
 from vla.io.types import Text
-from vla.reports.comparison import CASE, compare_runs, read_runs, remarks, runs_table, secondary_rows
-from vla.reports.comparison_page import write_comparison
-from vla.reports.conditions import secondary_table
+from vla.reports.comparison import compare_runs, differences_table, read_runs, remarks, rows_of, secondary_differences
+from vla.reports.comparison_page import COMPARISON, write_comparison
 
 log = logging.getLogger(__name__)
 
@@ -22,10 +21,11 @@ def run(experiment: Experiment) -> None:
     """Write `comparison.html`, and print how the runs differ."""
     runs = read_runs([Path(folder) for folder in experiment["report"]["runs"]])
     compared = compare_runs(runs, experiment["evaluate"]["margin"])
-    if compared:
-        show(runs_table(compared))
-    for remark in remarks(runs, compared):
-        log.info("%s", remark)
-    if rows := secondary_rows(compared):
-        show(secondary_table(rows, CASE))
-    log.info("wrote %s", write_comparison(runs, compared, Path(experiment["output"])))
+    for table in (differences_table(compared), secondary_differences(compared)):
+        if table.rows:
+            show(table)
+    for remark, about in (found := remarks(runs, compared)).items():
+        log.info("%s: %s", remark, about)
+    title = f"{len(runs)} runs" if len(runs) > 1 else next(iter(runs))
+    page = Path(experiment["output"]) / COMPARISON
+    log.info("wrote %s", write_comparison(page, title, rows_of(runs), compared, found))

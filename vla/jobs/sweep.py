@@ -37,13 +37,13 @@ class SweepTable(Callback):
 
     def on_multirun_end(self, config: DictConfig, **kwargs: Any) -> None:
         """Print the table of the sweep, and name its page; end the process with an error if there are no cells."""
-        from vla.reports.sweep import SWEEP, console_table  # imports matplotlib
+        from vla.reports.comparison_page import SWEEP, results_table  # imports matplotlib
 
         folder = Path(config.hydra.sweep.dir)
         if not (folder.is_dir() and cells(folder, OVERRIDES)):
             print("error: the sweep has no cells: one of its ranges or choices is empty", file=sys.stderr)
             sys.exit(1)
         if rows := read_rows(folder):
-            show(console_table(rows))
+            show(results_table(rows))
         if (page := folder / SWEEP).exists():
             print(f"wrote {page}")

@@ -26,7 +26,7 @@ from vla.models.model import Model
 from vla.models.policy_folder import POLICY
 from vla.models.tokenizers.tokenization_error import describe_tokenization_error, out_of_bounds
 from vla.parallel.limits import cores
-from vla.reports.first_batch import SHOWN, draw_samples
+from vla.reports.observations import SHOWN, draw_samples
 from vla.reports.run_page import write_page
 from vla.rollouts.collect import collection_time
 from vla.runs.files import Training

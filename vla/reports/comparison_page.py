@@ -1,125 +1,135 @@
-"""The page that compares several runs, `comparison.html`."""
+"""The page that compares rows, `comparison.html` of runs and `sweep.html` of a sweep."""
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping, Sequence
+from functools import partial
+from itertools import cycle
 from pathlib import Path
+from urllib.parse import quote
+
+from markupsafe import Markup
+from matplotlib.axes import Axes
 
 from vla.config.differences import ABSENT, at, differences
-from vla.reports.comparison import CASE, RunComparison, remarks, secondary_rows
-from vla.reports.html import (
-    DIFFERENCE,
-    PageTable,
-    code,
-    difference,
-    duration,
-    in_words,
-    links,
-    links_to,
-    named,
-    rate,
-    render,
-    secondary,
-    value,
-)
-from vla.reports.posteriors import Outcome, draw_posteriors
-from vla.reports.training_curves import colours, draw_runs
-from vla.rollouts.moving_picture import Caption, read_moving_pictures
+from vla.reports.comparison import RunComparison, differences_table, secondary_differences
+from vla.reports.page import Section, render
+from vla.reports.pictures import COLOURS, Panels, error_bars, plot_rates, svgs
+from vla.reports.tables import Table, config_value, duration, links, percent, rate
+from vla.reports.training_curves import training_sections
+from vla.rollouts.moving_picture import read_moving_pictures
 from vla.rollouts.recordings import shown
-from vla.runs.folder import RECORDINGS, Run
-from vla.spec import IN_DISTRIBUTION
+from vla.runs.folder import PAGE, RECORDING, RECORDINGS, Run
+from vla.runs.sweep import DEMONSTRATIONS, SweepRow, conditions_of
 
-COMPARISON = "comparison.html"
+COMPARISON, SWEEP = "comparison.html", "sweep.html"
+CONDITIONS = 4  # maximum number of conditions on a terminal
 FAILURES = 3  # moving pictures per run
 
 
-def write_comparison(runs: Mapping[str, Run], compared: Sequence[RunComparison], target: Path) -> Path:
-    """Write a page on several runs, by name, and their comparisons into the folder `target`, and return its path.
+def write_comparison(
+    page: Path, title: str, rows: Sequence[SweepRow], compared: Sequence[RunComparison], remarks: Mapping[str, str]
+) -> Path:
+    """Write a page on rows and their comparisons, and return its path; a UserError if a moving picture is damaged.
 
-    Raises:
-        UserError: a moving picture is damaged.
+    Of more runs than there are colours it has neither moving pictures nor the differences of their configurations.
     """
-    lines = dict(zip(runs, colours(len(runs)), strict=True))
-    reports = {name: run.reports[IN_DISTRIBUTION] for name, run in runs.items() if run.report}
-    outcomes = {
-        name: Outcome(report.successes, report.episodes, (report.success, *report.interval), lines[name])
-        for name, report in reports.items()
-    }
-    return render(
-        target / COMPARISON,
-        "comparison.html",
-        title=f"{len(runs)} runs" if len(runs) > 1 else next(iter(runs)),
-        results=_results(runs, lines, target),
-        posteriors=draw_posteriors(outcomes, compared) if len(outcomes) == len(runs) else None,
-        lines=lines,
-        curves=draw_runs({name: run.metrics for name, run in runs.items()}),
-        pairs=_pairs(compared),
-        remarks=remarks(runs, compared),
-        secondary=secondary(secondary_rows(compared), CASE, "Differences in secondary metrics"),
-        anytime=any(report.anytime for run in runs.values() for report in run.reports.values()),
-        differences=_config_differences(runs),
-        rollouts={name: found for name, run in runs.items() if (found := _failures(run))},
-        links={name: links(links_to(run.folder, target)) for name, run in runs.items()},
-    )
+    legend, cells = _legend(rows), list[tuple[str, str, Run]]()
+    for row in rows:
+        single = len(row.runs) == 1
+        cells += [(row.name if single else run.folder.name, legend[row.name], run) for run in row.runs]
+    few = {name: run for name, _, run in cells} if len(cells) <= len(COLOURS) else {}
+    parts = [
+        results_table(rows, page.parent),
+        Section("Remarks", facts=remarks),
+        Section("Success", panels=svgs(success_panels(rows)), lines=legend),
+        differences_table(compared),
+        secondary_differences(compared),
+        *training_sections([(colour, run.metrics) for _, colour, run in cells]),
+        _config_differences(few),
+        *(_failures(name, run) for name, run in few.items()),
+    ]
+    return render(page, title, parts, any(report.anytime for _, _, run in cells for report in run.reports.values()))
 
 
-def _results(runs: Mapping[str, Run], lines: Mapping[str, str], target: Path) -> PageTable:
-    """Tabulate success under every condition, and costs."""
-    conditions = list(dict.fromkeys(condition for run in runs.values() for condition in run.reports))
-    heads = ["run", *(f"{in_words(name)} [%]" for name in conditions), *COSTS, ""]
-    rows = []
-    for name, run in runs.items():
-        rates = {each: rate((report.success, *report.interval)) for each, report in run.reports.items()}
-        cells = [rates.get(each, ABSENT) for each in conditions]
-        rows.append([named(name, lines[name]), *cells, *_costs(run), links(links_to(run.folder, target))])
-    return PageTable(heads, rows, "Success and cost")
+def results_table(rows: Sequence[SweepRow], folder: Path | None = None) -> Table:
+    """Tabulate success under every condition, and costs, in a page in `folder` also links to the pages of the runs."""
+    conditions, seeds = conditions_of(list(rows)), any(len(row.runs) > 1 for row in rows)
+    costs = [*(["each seed [%]"] if seeds else []), "parameters [M]", "action [ms]", "steps", "training"]
+    lines = []
+    for row in rows:
+        rates = [rate(row.interval(each)) if each in row.played else ABSENT for each in conditions]
+        lines.append([*row.choices.values(), *rates, *_costs(row, seeds), *([_links(row, folder)] if folder else [])])
+    heads = [*rows[0].choices, *(f"{name} [%]" for name in conditions), *costs, *(["pages"] if folder else [])]
+    details = [f"{name} [%]" for name in conditions[1:]] if len(conditions) > CONDITIONS else []
+    return Table(heads, lines, "Success and cost", details=[*details, *costs])
 
 
-COSTS = ("policy", "parameters [M]", "action [ms]", "steps", "time")
-
-
-def _costs(run: Run) -> list[str]:
+def _costs(row: SweepRow, seeds: bool) -> list[str]:
+    run, training = row.runs[0], row.runs[0].training
     logged = max((steps[-1] + 1 for steps, _ in run.metrics.values()), default=ABSENT)
     return [
-        run.policy or ABSENT,
-        ABSENT if run.parameters is None else f"{run.parameters / 1e6:.2f}",
-        f"{run.report.latency_ms:.1f}" if run.report and run.report.latency_ms else ABSENT,
-        str(run.training.steps if run.training else logged),
-        duration(run.training.seconds) if run.training else ABSENT,
+        *([", ".join(map(percent, row.rates))] if seeds else []),
+        f"{row.parameters / 1e6:.2f}" if row.parameters else ABSENT,
+        f"{row.latency:.1f}" if row.latencies else ABSENT,
+        str(training.steps if training else logged),
+        duration(training.seconds) if training else ABSENT,
     ]
 
 
-def _pairs(compared: Sequence[RunComparison]) -> PageTable:
-    rows = [
-        [
-            f"{each.one} and {each.other}",
-            in_words(each.condition),
-            str(each.found.episodes),
-            *(["different episodes", ""] if each.found.only_first is None else _alone(each)),
-            *difference(each.found),
-        ]
-        for each in compared
-    ]
-    note = (
-        "Success of the second run minus that of the first, on the episodes that both played, and in how many of these "
-        "one succeeded alone; or, where they played different episodes of the same world, on all of them."
-    )
-    heads = ("runs", "condition", "episodes", "only the first succeeds", "only the second succeeds", *DIFFERENCE)
-    return PageTable(heads, rows, "Differences in success", note)
+def _links(row: SweepRow, folder: Path) -> Markup:
+    files = [run.folder / name for run in row.runs for name in (PAGE, RECORDING) if (run.folder / name).is_file()]
+    return links({f"{file.parent.name}/{file.name}": quote(os.path.relpath(file, folder)) for file in files})
 
 
-def _alone(pair: RunComparison) -> list[str]:
-    return [str(pair.found.only_first), str(pair.found.only_second)]
+def success_panels(rows: Sequence[SweepRow]) -> Panels:
+    """Return a panel per condition: success of every row, or over the number of demonstrations if that varies."""
+    if DEMONSTRATIONS in rows[0].choices:
+        return {each: partial(_plot_demonstrations, rows=rows, condition=each) for each in conditions_of(list(rows))}
+    panels: Panels = {}
+    for condition in conditions_of(list(rows)):
+        rates = {row.name: row.interval(condition) for row in rows if condition in row.played}
+        panels[condition] = partial(plot_rates, rates=rates, colours=_legend(rows))
+    return panels
 
 
-def _config_differences(runs: Mapping[str, Run]) -> PageTable:
+def _legend(rows: Sequence[SweepRow]) -> dict[str, str]:
+    """Return name of a row → colour."""
+    return dict(zip((row.name for row in rows), cycle(COLOURS), strict=False))
+
+
+def _plot_demonstrations(axes: Axes, rows: Sequence[SweepRow], condition: str) -> None:
+    """Plot success under one condition over the number of demonstrations, a line per other choice."""
+    lines: dict[str, list[SweepRow]] = {}
+    for row in sorted(rows, key=_demonstrations):
+        if condition in row.played:
+            others = [value for key, value in row.choices.items() if key != DEMONSTRATIONS]
+            lines.setdefault(" ".join(others), []).append(row)
+    for (name, line), colour in zip(lines.items(), cycle(COLOURS), strict=False):
+        rates, reach = error_bars(row.interval(condition) for row in line)
+        axes.errorbar([*map(_demonstrations, line)], rates, reach, fmt="o-", color=colour, capsize=3, label=name)
+    axes.set(xscale="log", ylim=(0, 1), xticks=sorted({*map(_demonstrations, rows)}))
+    axes.xaxis.set_major_formatter("{x:g}")
+    axes.xaxis.set_minor_formatter("")
+    axes.grid(alpha=0.2)
+    if len(lines) > 1:
+        axes.legend(frameon=False)
+
+
+def _demonstrations(row: SweepRow) -> int:
+    choice = row.choices[DEMONSTRATIONS]  # "default" in a cell of another sweep in the folder
+    return int(choice) if choice.isdecimal() else int(at(row.runs[0].config, DEMONSTRATIONS, 0))
+
+
+def _config_differences(runs: Mapping[str, Run]) -> Table:
     """Tabulate the dotted keys that differ, with their value in each run."""
-    first, *others = (run.config for run in runs.values())
+    first, *others = [run.config for run in runs.values()] or [{}]
     keys = dict.fromkeys(key for other in others for key, _, _ in differences(first, other))
-    rows = [[code(key), *(value(at(run.config, key)) for run in runs.values())] for key in keys]
-    return PageTable(["key", *runs], rows, "Differences in configuration")
+    rows = [[key, *(config_value(at(run.config, key)) for run in runs.values())] for key in keys]
+    return Table(["key", *runs], rows, "Differences in configuration")
 
 
-def _failures(run: Run) -> list[tuple[Caption, Path]]:
+def _failures(name: str, run: Run) -> Section:
     pictures = read_moving_pictures(run.folder / RECORDINGS)
-    return [(caption, pictures[caption]) for caption in shown(pictures, FAILURES, 0)]
+    return Section(f"Failures of {name}", rollouts=[(each, pictures[each]) for each in shown(pictures, FAILURES, 0)])

@@ -1,91 +1,48 @@
-"""Randomised factors of a report's episodes, over which success is compared."""
+"""Panels of an evaluation's episodes: outcomes, lengths, and success over what was randomised."""
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterator, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
 
 from vla.data.draws import flat
-from vla.rollouts.results import Result
+from vla.reports.pictures import GREEN, GREY, RED, Interval, Panels, error_bars, plot_counts, rate_limits
+from vla.reports.tables import in_words
+from vla.rollouts.results import ERROR, Report, Result
+from vla.rollouts.statistics import wilson_interval
 
 BINS = 5  # quantile groups of a numeric factor
-GROUPS = 8  # maximum number of groups in a factor's panel
-COLOURS = (".rgb", ".diffuse")  # draws of three numbers whose mean is a brightness
+GROUPS, FACTORS = 8, 8  # maximum number of groups of a factor, and of factors that are drawn
+LENGTH_BINS = 30  # approximate number of bars in the histogram of lengths
 
 
 def factors(played: Sequence[Result]) -> dict[str, list[Any]]:
-    """Return title → value per episode, of every draw that all episodes have and that forms a few groups.
+    """Return name → value per episode, of every draw that all episodes have and that forms a few groups.
 
-    A pair of numbers is one factor, a point, and of a colour its brightness; each item of another list is a factor.
-    Of draws that are equal in all episodes the first counts.
+    A pair of numbers is a point, each item of another list is a factor. Of equal draws the first counts.
     """
-    rows = [
-        {name: value for axis, draw in flat(result.draws).items() for name, value in _items(axis, draw)}
-        for result in played
-    ]
-    names = [name for name in (rows[0] if rows else {}) if all(name in row for row in rows)]
+    rows = [dict(item for draw in flat(result.draws).items() for item in _items(*draw)) for result in played]
     columns = dict[str, list[Any]]()
-    for name in names:
-        if (values := [row[name] for row in rows]) not in columns.values():
+    for name in rows[0] if rows else ():
+        values = [row.get(name) for row in rows]
+        if None not in values and values not in columns.values():
             columns[name] = values
-    listed = _listed(played)
-    return {in_words(name, listed): values for name, values in columns.items() if 1 < len(groups(values)) <= GROUPS}
+    return {name: values for name, values in columns.items() if 1 < len(groups(values)) <= GROUPS}
 
 
 def _items(name: str, value: Any) -> Iterator[tuple[str, Any]]:
-    if isinstance(value, dict):  # an object in a list, which forms no groups
-        return
-    if not isinstance(value, list):
+    if isinstance(value, list):
+        if len(value) == 2 and all(isinstance(item, float) for item in value):
+            yield name, tuple(value)
+        else:
+            for index, item in enumerate(value):
+                yield from _items(f"{name}[{index}]", item)
+    elif not isinstance(value, dict):  # an object in a list forms no groups
         yield name, value
-    elif _is_point(value):
-        yield name, tuple(value)
-    elif name.endswith(COLOURS) and len(value) == 3 and numeric(value):
-        yield f"{name.rpartition('.')[0]}.brightness", sum(value) / 3
-    else:
-        for index, item in enumerate(value):
-            yield from _items(f"{name}[{index}]", item)
-
-
-def in_words(name: str, listed: dict[str, str] | None = None) -> str:
-    """Convert the dotted name of a draw to a title: "colour.names[0]" becomes "colour: name 1".
-
-    `listed` maps a list to the objects of its items: with "colour.names" → "block" the title is "colour: name of
-    block 1".
-    """
-    path, indices = name.partition("[")[0], [int(index) + 1 for index in re.findall(r"\[(\d+)\]", name)]
-    *axis, leaf = path.replace("_", " ").split(".")
-    if indices:
-        leaf, thing = leaf.removesuffix("s"), (listed or {}).get(path)
-        leaf += f" {indices[0]}" if thing in (None, leaf) else f" of {thing} {indices[0]}"
-        leaf += "".join(f", component {index}" for index in indices[1:])
-    return f"{' '.join(axis)}: {leaf}" if axis else leaf
-
-
-def _listed(played: Sequence[Result]) -> dict[str, str]:
-    """Infer dotted name of a list → the objects that its items describe.
-
-    Objects have positions: a list of points under a plural name, such as "blocks". Another list with equal lengths in
-    every episode describes the same objects, unless its length is always three, like a position or a colour.
-    """
-    lists: dict[str, list[list[Any]]] = {}
-    for result in played:
-        for name, value in flat(result.draws).items():
-            if isinstance(value, list):
-                lists.setdefault(name, []).append(value)
-    lengths = {name: tuple(map(len, values)) for name, values in lists.items() if len(values) == len(played)}
-    things = {
-        lengths[name]: name.rpartition(".")[2].removesuffix("s")
-        for name in lengths
-        if name.endswith("s") and all(value and all(map(_is_point, value)) for value in lists[name])
-    }
-    return {name: things[each] for name, each in lengths.items() if each in things and set(each) != {3}}
-
-
-def _is_point(value: Any) -> bool:
-    return isinstance(value, list) and len(value) == 2 and all(isinstance(item, float) for item in value)
 
 
 def numeric(values: Sequence[Any]) -> bool:
@@ -112,3 +69,66 @@ def association(values: Sequence[Any], played: Sequence[Result]) -> float:
         return 0.0
     squares = sum(len(group) * (good[group].mean() - rate) ** 2 for group in split)
     return float(squares / (rate * (1 - rate)) / (len(split) - 1))
+
+
+def episode_panels(report: Report) -> Panels:
+    """Return panels of outcomes, lengths, and success over the factors with the strongest association."""
+    played = [result for result in report.results if result.outcome != ERROR]
+    ordered = sorted(factors(played).items(), key=lambda factor: -association(factor[1], played))
+    shown = dict(ordered[:FACTORS])
+    rates = {name: _rates_of(values, played) for name, values in shown.items() if not isinstance(values[0], tuple)}
+    limits = rate_limits(min((low for each in rates.values() for _, low, _ in each), default=0.0))  # shared
+    outcomes = {in_words(name): count for name, count in report.outcome_counts.items()}
+    colours = [{"success": GREEN, ERROR: GREY}.get(name, RED) for name in report.outcome_counts]
+    panels: Panels = {
+        "outcomes": partial(plot_counts, counts=outcomes, colours=colours),
+        "length of episodes [steps]": partial(_plot_lengths, played=played),
+    }
+    for name, values in shown.items():
+        if name in rates:
+            panels[name] = partial(_plot_rates, values=values, rates=rates[name], limits=limits)
+        else:
+            panels[name] = partial(_plot_points, points=values, played=played)
+    return panels
+
+
+def _plot_lengths(axes: Axes, played: Sequence[Result]) -> None:
+    """Plot a histogram of the steps until success or failure."""
+    steps = [[result.steps for result in played if result.success == good] for good in (True, False)]
+    lengths = steps[0] + steps[1] or [0]
+    width = max(1, round((max(lengths) - min(lengths)) / LENGTH_BINS))
+    edges = np.arange(min(lengths), max(lengths) + width + 1, width) - 0.5  # whole numbers lie inside the bins
+    axes.hist(steps, bins=list(edges), stacked=True, color=[GREEN, RED])
+    axes.locator_params(integer=True, nbins=5)
+
+
+def _plot_points(axes: Axes, points: Sequence[tuple[float, float]], played: Sequence[Result]) -> None:
+    """Scatter successes and failures over a two-dimensional factor, failures on top."""
+    for good, colour, marker in ((True, GREEN, "o"), (False, RED, "X")):
+        chosen = [point for point, result in zip(points, played, strict=True) if result.success == good]
+        across, along = np.array(chosen).reshape(-1, 2).T
+        axes.scatter(across, along, c=colour, marker=marker, s=16, alpha=0.75, linewidths=0)
+    axes.set_aspect("equal", adjustable="datalim")
+
+
+def _rates_of(values: Sequence[Any], played: Sequence[Result]) -> list[Interval]:
+    """Return the success rate of each group of a factor, with its interval."""
+    counts = [(sum(played[index].success for index in group), len(group)) for group in groups(values)]
+    return [(good / count, *wilson_interval(good, count)) for good, count in counts]
+
+
+def _plot_rates(axes: Axes, values: Sequence[Any], rates: Sequence[Interval], limits: tuple[float, float]) -> None:
+    """Plot the success rate with its interval per group of values; a group of numbers is placed at its mean."""
+    split = groups(values)
+    if numeric(values):
+        places = [float(np.mean([values[index] for index in group])) for group in split]
+        whole = all(isinstance(value, int) for value in values)
+        axes.locator_params(axis="x", nbins=4, integer=whole)  # long tick labels would overlap
+    else:
+        places = list(range(len(split)))
+        axes.set_xticks(places, [str(values[group[0]])[:10] for group in split], fontsize=8)
+        axes.set_xlim(-0.5, len(split) - 0.5)
+    middle, reach = error_bars(rates)
+    axes.errorbar(places, middle, reach, fmt="o-", color=GREEN, ecolor=GREY, linewidth=0.7, capsize=3, clip_on=False)
+    axes.set_ylim(limits)
+    axes.grid(axis="y", alpha=0.2)

@@ -8,8 +8,7 @@ from __future__ import annotations
 import json
 import logging
 import re
-from collections.abc import Iterator
-from dataclasses import asdict, dataclass, field
+from collections.abc import Iterator, Sequence
 from datetime import datetime
 from html import unescape
 from pathlib import Path
@@ -17,33 +16,22 @@ from urllib.parse import quote
 
 from filelock import FileLock
 
-from vla.config.differences import ABSENT
-from vla.io.documents import STRICT, parse_json
-from vla.reports.html import PageTable, links, rate, render
+from vla.io.documents import parse_json
+from vla.io.errors import UserError
+from vla.reports.page import render
+from vla.reports.tables import Table, links
 from vla.runs.folder import PAGE
 
 log = logging.getLogger(__name__)
 
 RUNS, INDEX, LOCK = "runs", "index.html", ".index.lock"
 HEAD = 1 << 14  # [bytes] of a page, within which its entry is
+HEADS = ("run", "written", "policy", "task", "success [%]", "episodes", "training")
 
 
-@dataclass(frozen=True)
-class Entry:
-    """What a list says of a run."""
-
-    __pydantic_config__ = STRICT
-
-    policy: str
-    task: str
-    success: tuple[float, float, float] | None  # rate and its interval
-    episodes: int | None
-    remark: str  # interrupted, failed, or empty
-    written: str = field(default_factory=lambda: datetime.now().isoformat(" ", "milliseconds"))
-
-    def to_json(self) -> str:
-        """Return the entry for the head of a page."""
-        return json.dumps(asdict(self), ensure_ascii=False)
+def entry(policy: str, task: str, success: str, episodes: str, training: str) -> str:
+    """Return what a list says of a run whose page is written now, for the head of that page."""
+    return json.dumps([datetime.now().isoformat(" "), policy, task, success, episodes, training])
 
 
 def write_index(runs: Path) -> Path:
@@ -52,33 +40,18 @@ def write_index(runs: Path) -> Path:
     Of processes that do so at once the last one lists the pages of all.
     """
     with FileLock(runs / LOCK):
-        listed = sorted(_entries(runs), key=lambda run: run[1].written, reverse=True)
-        rows = [
-            [
-                links({name: f"{quote(name)}/{PAGE}"}),
-                entry.written[:16],
-                entry.policy or ABSENT,
-                entry.task or ABSENT,
-                rate(entry.success) if entry.success else ABSENT,
-                ABSENT if entry.episodes is None else str(entry.episodes),
-                entry.remark,
-            ]
-            for name, entry in listed
-        ]
-        heads = ("run", "written", "policy", "task", "success [%]", "episodes", "training")
-        count = f"{len(rows)} run{'s' * (len(rows) != 1)}"
-        return render(runs / INDEX, "index.html", title=count, table=PageTable(heads, rows))
+        listed = sorted(_entries(runs), key=lambda run: run[1][0], reverse=True)
+        rows = [[links({name: f"{quote(name)}/{PAGE}"}), told[0][:16], *told[1:]] for name, told in listed]
+        return render(runs / INDEX, f"{len(rows)} run{'s' * (len(rows) != 1)}", [Table(HEADS, rows)])
 
 
-def _entries(runs: Path) -> Iterator[tuple[str, Entry]]:
+def _entries(runs: Path) -> Iterator[tuple[str, Sequence[str]]]:
     """Yield name and entry of every run; pages of other programs have none."""
-    for page in runs.glob(f"*/{PAGE}"):
-        if not page.is_file():
-            continue
+    for page in filter(Path.is_file, runs.glob(f"*/{PAGE}")):
         with page.open("rb") as file:
             head = file.read(HEAD).decode("utf-8", "replace")
         if found := re.search(r'<meta name="vla-run" content="([^"]*)">', head):
             try:
-                yield page.parent.name, parse_json(unescape(found[1]), Entry, str(page))
-            except ValueError as error:
+                yield page.parent.name, parse_json(unescape(found[1]), tuple[str, str, str, str, str, str], str(page))
+            except UserError as error:
                 log.warning("%s is not listed: %s", page, error)

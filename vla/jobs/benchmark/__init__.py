@@ -1,7 +1,7 @@
 """`job=benchmark`: throughput and latency of every stage, next to a floor that is measured in the same run.
 
 The floor is a reference value in the same unit: the unavoidable part of the work, a whole step, another renderer or
-another project. `ratio` is value / floor. Each stage is a module of this package with a function `measures`.
+another project. `ratio` is value / floor. Each stage is a function of its name in a module of this package.
 """
 
 from __future__ import annotations
@@ -11,22 +11,22 @@ from importlib import import_module
 from typing import Annotated, Literal
 
 from annotated_types import MinLen
-from rich import print as show
-from rich.table import Table
 
 from vla.config.check import TRAINING, Job
 from vla.config.experiment import Experiment
 from vla.io.files import write_json
+from vla.io.printable import show
 from vla.io.types import Count
-from vla.jobs.benchmark.machine import OtherLoad, is_unreliable, machine
-from vla.jobs.benchmark.measure import Measure
+from vla.jobs.benchmark.measure import BUSY, Measure, OtherLoad, machine
+from vla.parallel.limits import cores
 
 log = logging.getLogger(__name__)
 
+Stage = Literal["collect", "loader", "train", "policy", "evaluate", "deploy", "serve"]
 JOB = Job(
     (*TRAINING, "policy"),
     {
-        "names": Annotated[list[Literal["collect", "loader", "train", "policy", "deploy", "serve"]], MinLen(1)],
+        "names": Annotated[list[Stage], MinLen(1)],
         "episodes": Count,
         "batches": Count,
         "steps": Count,
@@ -38,6 +38,7 @@ JOB = Job(
     },
     adopts=True,
 )
+MODULES = dict.fromkeys(("policy", "evaluate", "deploy", "serve"), "acting")  # others are named like their stage
 
 
 def run(experiment: Experiment) -> dict[str, Measure]:
@@ -45,26 +46,18 @@ def run(experiment: Experiment) -> dict[str, Measure]:
 
     Both name the processor, and how many of its cores other programs used during a stage.
     """
-    here = machine()
-    show(f"{here['processor']}, {here['cores']} cores, {' '.join(here['instructions'])}")
-    measures: dict[str, Measure] = {}
-    busy: dict[str, float] = {}
+    from vla.reports.tables import Table  # imports matplotlib
+
+    here, found = machine(), dict[str, Measure]()
     for name in experiment["benchmark"]["names"]:
-        others = OtherLoad()
-        found = import_module(f"vla.jobs.benchmark.{name}").measures(experiment)
-        used = others.cores()
-        measures |= {key: {**each, "others": None if used is None else round(used, 2)} for key, each in found.items()}
-        if used is not None and is_unreliable(used):
-            busy[name] = used
-    write_json(experiment.output / "benchmark.json", {"machine": here, "measures": measures})
-    table = Table("stage", "value", "unit", "n", "floor", "ratio", r"others \[cores]")
-    for name, each in measures.items():
-        table.add_row(name, *map(str, each.values()))
-    show(table)
-    for name, used in busy.items():
-        log.warning(
-            "%s is slower here than on an idle machine, and its ratios are less exact: other programs used %.1f cores "
-            "meanwhile",
-            *(name, used),
-        )
-    return measures
+        stage, others = getattr(import_module(f"{__name__}.{MODULES.get(name, name)}"), name), OtherLoad()
+        measured, used = stage(experiment), others.cores()
+        found |= {key: {**each, "others": round(used, 2)} for key, each in measured.items()}
+        if used > BUSY * cores():
+            slower = "is slower here than on an idle machine, and its ratios are less exact"
+            log.warning("%s %s: other programs used %.1f cores meanwhile", name, slower, used)
+    write_json(experiment.output / "benchmark.json", {"machine": here, "measures": found})
+    heads = ("stage", "value", "unit", "n", "floor", "ratio", "others [cores]")
+    rows = [[name, *map(str, each.values())] for name, each in found.items()]
+    show(Table(heads, rows, ", ".join(map(str, here.values()))))
+    return found

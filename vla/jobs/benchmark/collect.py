@@ -1,16 +1,15 @@
-"""Throughput of collection and its breakdown, and the throughput of robosuite."""
+"""Throughput of collection and its breakdown, the renderers of a task, and the throughput of robosuite."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
 from functools import partial
 from tempfile import TemporaryDirectory
+from typing import Any
 
 from vla.config.experiment import Experiment
+from vla.config.substitutes import options
 from vla.data.episodes import EpisodeStore
-from vla.jobs.benchmark.baselines.peer import DURATION, peer
-from vla.jobs.benchmark.measure import HasMinimalStep, Measure, measure, timed
-from vla.jobs.benchmark.rendering import renderings
+from vla.jobs.benchmark.measure import DURATION, HasMinimalStep, Measure, measure, peer, timed
 from vla.parallel.limits import cores
 from vla.parallel.pool import LocalCluster
 from vla.parallel.processes import WorkerFactory
@@ -18,66 +17,56 @@ from vla.rollouts.collect import DemonstrationWorker
 from vla.rollouts.rollout import replay, rollout
 from vla.spec import Agent, Environment, Episode
 
+FRAMES = 10  # of a renderer before it is the next one's turn
 
-def measures(experiment: Experiment) -> dict[str, Measure]:
-    """Measure control steps per second.
 
-    - collect: rollouts of one process with all cameras; the floor is physics and rendering, with `minimal_step`.
-    - breakdown of the time of a step, including replay and storage; the floor is the whole step.
-    - the images of a step by each renderer; the floor is the fastest.
-    - all processes, including verification; the floor is that of one process times their number.
-    - robosuite on the same work as the floor, if `benchmark.robosuite` names a Python interpreter.
+def collect(experiment: Experiment) -> dict[str, Measure]:
+    """Measure control steps per second of one process with all cameras; the floor is physics and rendering alone.
+
+    Then the parts of a step, whose floor is the whole step; its images by each renderer, whose floor is the fastest;
+    all processes, whose floor is that of one times their number; and robosuite, if `benchmark.robosuite` names it.
     """
-    asked = experiment["benchmark"]
+    asked, unit = experiment["benchmark"], "control steps/s"
     makers = experiment.make_environment(), experiment.make_expert()
     environment = makers[0]()
     expert = makers[1](environment)
     rollout(environment, expert, 0)  # warm-up: compiles shaders
-    calls = environment.minimal_step() if isinstance(environment, HasMinimalStep) else {}
-    episodes, taken = _timed_parts(environment, expert, calls, asked["episodes"])
+    episodes, taken = _timed_parts(environment, expert, asked["episodes"])
     steps = sum(len(episode.actions) for episode in episodes)
-    floor, full, blind = {name: taken[name] for name in calls}, taken["full"], taken["blind"]
     with TemporaryDirectory() as folder:
         store = EpisodeStore.create_or_open(folder, environment.spec, {})
         with store.writing():
-            _, storing = timed(partial(_keep, store, episodes))
+            taken["storing"] = timed(partial(_keep, store, episodes))[1]
     environment.close()
-    physics, rendering = floor.get("physics", 0.0), floor.get("rendering", 0.0)
-    stages = {
-        **floor,
-        "expert, controller, judge": blind - physics,
-        "images into arrays": full - blind - rendering,
-        "replay": taken["replay"],
-        "storing": storing,
-    }
-    least = steps / sum(floor.values()) if floor else None
-    found = {"collect": measure(steps / full, "control steps/s", steps, least)}
-    whole = 1000 * (full + taken["replay"] + storing) / steps
-    for name, seconds in stages.items():
+    full, blind = taken.pop("full"), taken.pop("blind")
+    physics, rendering = taken.get("physics", 0.0), taken.get("rendering", 0.0)
+    floor = steps / (physics + rendering) if physics else None
+    found = {"collect": measure(steps / full, unit, steps, floor)}
+    whole = 1000 * (full + taken["replay"] + taken["storing"]) / steps
+    taken |= {"expert, controller, judge": blind - physics, "images into arrays": full - blind - rendering}
+    for name, seconds in taken.items():
         found[f"collect: {name}"] = measure(1000 * seconds / steps, "ms/step", steps, whole)
-    found |= renderings(experiment)
+    found |= _renderers(experiment)
     work = partial(DemonstrationWorker, *makers)
-    alone, together = (_attempts(work, count, asked["episodes"]) for count in (1, cores()))
-    found[f"collect: {cores()} processes"] = measure(*together, cores() * alone[0])
+    rates = {count: _verified(work, count, asked["episodes"]) for count in (1, cores())}
+    found[f"collect: {cores()} processes"] = measure(rates[cores()], unit, steps, cores() * rates[1])
     if asked["robosuite"] is not None:
         arguments = (*environment.spec.image_size, DURATION)
-        for count, (rate, unit, n) in ((1, alone), (cores(), together)):
-            rival = peer("robosuite", asked["robosuite"], "robosuite_lift.py", arguments, count)
-            if count == 1:  # robosuite verifies nothing: the same work is a rollout without verification
-                found["collect, against robosuite"] = measure(steps / full, unit, steps, rival)
-            found[f"collect: verified, against {count} of robosuite"] = measure(rate, unit, n, rival)
+        rivals = {n: peer("robosuite", asked["robosuite"], "robosuite_lift.py", arguments, n) for n in rates}
+        # robosuite verifies nothing: the same work is a rollout without verification.
+        found["collect, against robosuite"] = measure(steps / full, unit, steps, rivals[1])
+        for count, rival in rivals.items():
+            found[f"collect: verified, against {count} of robosuite"] = measure(rates[count], unit, steps, rival)
     return found
 
 
-def _timed_parts(
-    environment: Environment, expert: Agent, calls: Mapping[str, Callable[[], object]], count: int
-) -> tuple[list[Episode], dict[str, float]]:
-    """Return episodes, and the time [s] of: "full" rollouts, "blind" ones, "replay", and each call in every state.
+def _timed_parts(environment: Environment, expert: Agent, count: int) -> tuple[list[Episode], dict[str, float]]:
+    """Return episodes, and the time [s] of "full" rollouts, "blind" ones, "replay", and each call of `minimal_step`.
 
-    The parts of one episode follow each other, so that what else runs on the machine slows all parts alike.
+    The parts of an episode follow each other, so that what else runs on the machine slows all alike.
     """
-    episodes: list[Episode] = []
-    taken = dict.fromkeys(("full", "blind", "replay", *calls), 0.0)
+    calls = environment.minimal_step() if isinstance(environment, HasMinimalStep) else {}
+    episodes, taken = list[Episode](), dict.fromkeys((*calls, "full", "blind", "replay"), 0.0)
     for seed in range(count):
         episode, seconds = timed(partial(rollout, environment, expert, seed))
         episodes.append(episode)
@@ -95,18 +84,32 @@ def _timed_parts(
 
 def _keep(store: EpisodeStore, episodes: list[Episode]) -> None:
     for episode in episodes:
-        if episode.success:
-            store.append(episode)
-        else:
-            store.fail(episode)
+        (store.append if episode.success else store.fail)(episode)
 
 
-def _attempts(make: WorkerFactory, processes: int, episodes_each: int) -> tuple[float, str, int]:
-    """Return the rate of verified control steps of concurrent processes after a warm-up, its unit, and their number."""
+def _renderers(experiment: Experiment) -> dict[str, Measure]:
+    """Measure a step's images by every renderer of the task in turns; one with settings of the user's is "chosen"."""
+    own, choice = experiment["task"].get("renderer"), options("task/renderer")
+    if own is None or own["_target_"] not in [node["_target_"] for node in choice.values()]:
+        return {}
+    nodes = choice if own in choice.values() else {**choice, "chosen": own}
+    worlds: dict[str, Any] = {name: experiment.make_environment({"renderer": each})() for name, each in nodes.items()}
+    seconds, rounds = dict.fromkeys(worlds, 0.0), experiment["benchmark"]["episodes"]
+    for seed in range(rounds):
+        for name, world in worlds.items():
+            world.reset(seed)
+            draw = world.minimal_step()["rendering"]
+            seconds[name] += timed(lambda draw=draw: [draw() for _ in range(FRAMES)])[1]
+    for world in worlds.values():
+        world.close()
+    times = {f"collect: rendering, {name}": 1000 * each / FRAMES / rounds for name, each in seconds.items()}
+    return {name: measure(each, "ms/step", FRAMES * rounds, min(times.values())) for name, each in times.items()}
+
+
+def _verified(make: WorkerFactory, processes: int, episodes_each: int) -> float:
+    """Return the rate of verified control steps [1/s] of concurrent processes after a warm-up."""
     with LocalCluster(processes, "beside").pool(make) as pool:
-        for attempt in [pool.submit(seed) for seed in range(2 * processes)]:
-            attempt.result()
-        seeds = range(processes * episodes_each)
-        episodes, seconds = timed(lambda: [attempt.result() for attempt in [pool.submit(seed) for seed in seeds]])
-    steps = sum(len(episode.actions) for episode in episodes)
-    return steps / seconds, "control steps/s", steps
+        play = lambda seeds: [attempt.result() for attempt in [pool.submit(seed) for seed in seeds]]  # noqa: E731
+        play(range(2 * processes))
+        episodes, seconds = timed(partial(play, range(processes * episodes_each)))
+    return sum(len(episode.actions) for episode in episodes) / seconds

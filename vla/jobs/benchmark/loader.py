@@ -6,7 +6,6 @@ from dataclasses import replace
 from itertools import cycle
 from math import prod
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -16,14 +15,10 @@ from vla.config.experiment import Experiment, plain
 from vla.data.episodes import EpisodeStore
 from vla.data.header import Codec
 from vla.data.window_batches import aligned_empty
-from vla.jobs.benchmark.baselines.peer import DURATION, peer
-from vla.jobs.benchmark.measure import Measure, measure, timed
+from vla.jobs.benchmark.measure import DURATION, Measure, measure, peer, timed
 from vla.jobs.collect import demonstrations
 from vla.rollouts.rollout import rollout
 from vla.spec import Episode
-
-if TYPE_CHECKING:
-    from vla.data.datamodule import WindowDataModule
 
 ROUNDS = 5  # of the loader and of its floor, in turns; the fastest counts
 LARGE = 224  # height and width of large images [px]
@@ -31,23 +26,17 @@ EPISODES, STEPS = 2500, 100  # of a store whose size is extrapolated
 PEER_EPISODES = 50  # maximum number of episodes for LeRobot's loader
 
 
-def measures(experiment: Experiment) -> dict[str, Measure]:
-    """Measure training windows per second, with the history of the model and with other ones.
+def loader(experiment: Experiment) -> dict[str, Measure]:
+    """Measure windows per second with the history of the model and others; the floor is a bare gather of the images.
 
-    The floor is a bare gather of the same images, decoded. Where the size of images is an option of the task, so is a
-    store of large ones from three cameras, with the codec for their size and as JPEG; the floor of what many of these
-    episodes take on the disk is what they take raw. If `benchmark.lerobot` names a Python interpreter, the floor of two
-    further measures is LeRobot's loader on the same episodes.
+    Where the size of images is an option of the task, so is a store of large ones from three cameras in two codecs; the
+    floor of its size is the raw one. If `benchmark.lerobot` names a Python with LeRobot, so is its loader as a floor.
     """
-    asked = experiment["benchmark"]
-    store = demonstrations(experiment)
+    asked, store = experiment["benchmark"], demonstrations(experiment)
     model = experiment.fitted_learner(store).model
     alone = experiment.with_values({"collect.more": None})  # the floor reads one store
-    names = {1: "loader: 1 frame", 6: "loader: 6 frames"}
-    found = {
-        name: _loading(alone.data(store, frames, model.chunk), store, frames, asked["batches"])
-        for frames, name in [(model.history, "loader"), *names.items()]
-    }
+    names = {"loader": model.history, "loader: 1 frame": 1, "loader: 6 frames": 6}
+    found = {name: _loading(alone, store, frames, model.chunk) for name, frames in names.items()}
     if "image_size" in experiment["task"]:
         found |= _of_large_images(alone.with_values({"task.image_size": [LARGE, LARGE]}), model.chunk)
     if asked["lerobot"] is not None:
@@ -55,8 +44,8 @@ def measures(experiment: Experiment) -> dict[str, Measure]:
         with TemporaryDirectory() as folder:
             export = plain(compose("export=lerobot", f"output={folder}").export)
             dataset = build(export, "export").export(some, experiment.cluster())
-            for frames, name in names.items():
-                rival = peer("lerobot", asked["lerobot"], "lerobot_windows.py", (dataset, frames, DURATION))
+            for name in [*names][1:]:
+                rival = peer("lerobot", asked["lerobot"], "lerobot_windows.py", (dataset, names[name], DURATION))
                 own = found[name]
                 found[f"{name}, against LeRobot"] = measure(own["value"], own["unit"], own["n"], rival)
     return found
@@ -77,7 +66,7 @@ def _of_large_images(experiment: Experiment, chunk: int) -> dict[str, Measure]:
                 for episode in episodes:
                     store.append(episode)
             name, steps = f"loader: 3 x {LARGE} px, {codec.images}", store.episodes[-1].end
-            found[name] = _loading(every.data(store, 1, chunk), store, 1, experiment["benchmark"]["batches"])
+            found[name] = _loading(every, store, 1, chunk)
             size = sum(store.size(field, entry) for field in store.fields for entry in store.episodes) / steps
             raw = sum(prod(shape) * dtype.itemsize for shape, dtype in store.fields.values())
             of_many = measure(EPISODES * STEPS * size / 1e9, "GB", steps, EPISODES * STEPS * raw / 1e9)
@@ -95,7 +84,8 @@ def _from_three_cameras(episode: Episode) -> Episode:
     return replace(episode, outcome="success", observations=observations)
 
 
-def _loading(data: WindowDataModule, store: EpisodeStore, history: int, batches: int) -> Measure:
+def _loading(experiment: Experiment, store: EpisodeStore, history: int, chunk: int) -> Measure:
+    data, batches = experiment.data(store, history, chunk), experiment["benchmark"]["batches"]
     data.setup("fit")
     images = [store.rows(f"rgb_{camera}")[:] for camera in store.spec.cameras]
     starts = np.array([entry.start for entry in store.episodes])
@@ -113,9 +103,8 @@ def _loading(data: WindowDataModule, store: EpisodeStore, history: int, batches:
                 image.take(index, axis=0, out=array, mode="clip")  # "clip" writes into `out` without a buffer
 
     def load() -> None:
-        stream = iter(data.train_dataloader())
-        for _ in range(batches):
-            next(stream)
+        for _ in zip(range(batches), data.train_dataloader(), strict=False):
+            pass
 
     bare()  # warm-up: reads the images from the disk
     floor, own = np.min([(timed(bare)[1], timed(load)[1]) for _ in range(ROUNDS)], axis=0)

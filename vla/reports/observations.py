@@ -1,0 +1,106 @@
+"""Pictures of observations, of resets of a world and of training windows, and a table of what was drawn."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib import colormaps
+from matplotlib.axes import Axes
+
+from vla.data.draws import flat, leaves
+from vla.reports.pictures import GREEN, MIDDLE, Panels, plot_image, save
+from vla.reports.tables import Table
+from vla.spec import Array, Observation, Spec, readable
+
+SHOWN = 6  # windows of the first training batch
+
+
+def save_contact_sheet(seeds: Sequence[int], observations: Sequence[Observation], path: Path) -> None:
+    """Draw the first observations of several episodes into a PNG file, written atomically."""
+    save(path, reset_panels(seeds, observations), 2, (6.5, 2.2))
+
+
+def reset_panels(seeds: Sequence[int], observations: Sequence[Observation]) -> Panels:
+    """Return a panel per episode: the colour image of every camera, then its depth image, from near (blue) to far (red)
+    in one range for all episodes, and without returns black."""
+    ranges = {name: _depth_range([each.depth[name] for each in observations]) for name in observations[0].depth}
+    panels: Panels = {}
+    for seed, seen in zip(seeds, observations, strict=True):
+        depth = [_coloured(seen.depth[name], *ends) for name, ends in ranges.items()]
+        image = np.concatenate([*seen.rgb.values(), *depth], axis=1)
+        panels[f"seed {seed}: {seen.instruction}"] = partial(plot_image, image=image)
+    return panels
+
+
+def _coloured(depth: Array, low: float, high: float) -> Array:
+    """Return the colours (H, W, 3) of depths (H, W) [mm]."""
+    colours = colormaps["turbo"](np.clip((depth - low) / (high - low), 0, 1))[..., :3]
+    return (255 * colours).astype(np.uint8)
+
+
+def _depth_range(images: Sequence[Array]) -> tuple[float, float]:
+    """Return a near and a far percentile [mm] of the pixels with a return."""
+    depth = np.stack(images)
+    low, high = np.percentile(depth[depth > 0], (1, 90)) if depth.any() else (0.0, 1.0)
+    return float(low), float(max(high, low + 1.0))
+
+
+def draws_table(seeds: Sequence[int], draws: Sequence[Mapping[str, Any]]) -> Table:
+    """Tabulate the draws of several resets: range of numbers or set of words, and the values of the first reset."""
+    first, rows = flat(draws[0]), []
+    for name, span in spans(draws).items():
+        values = [f"{leaf:.3g}" if isinstance(leaf, float) else str(leaf) for leaf in leaves(first.get(name))]
+        rows.append([name, span, " ".join(values)])
+    return Table(("draw", "range", f"seed {seeds[0]}"), rows, f"{len(draws)} resets")
+
+
+def spans(draws: Sequence[Mapping[str, Any]]) -> dict[str, str]:
+    """Return dotted name → range of the numbers, or set of the words, drawn under that name."""
+    drawn: dict[str, list[Any]] = {}
+    for draw in draws:
+        for name, value in flat(draw).items():
+            drawn.setdefault(name, []).extend(leaves(value))
+    return {
+        name: f"{min(values):.4g} … {max(values):.4g}"
+        if values and all(isinstance(value, (int, float)) for value in values)
+        else ", ".join(sorted({str(value) for value in values}))
+        for name, values in drawn.items()
+    }
+
+
+def draw_samples(batch: dict[str, Any], spec: Spec, path: Path) -> None:
+    """Draw the newest frame of every window of a batch with its action label into a PNG file, written atomically.
+
+    Args:
+        batch: `rgb` of each camera (B, T, H, W, 3) uint8, `action` (B, T, k, D) and B `instruction`s.
+        spec: of the demonstrations.
+        path: of the PNG.
+    """
+    actions = np.asarray(batch["action"])[:, -1, 0]  # (B, D)
+    panels: Panels = {}
+    for index, sentence in enumerate(batch["instruction"]):
+        frames = [np.asarray(images)[index, -1] for images in batch["rgb"].values()]  # (H, W, 3) each
+        panels[f"{index + 1}: {sentence}"] = partial(_plot, frames=frames, action=actions[index], spec=spec)
+    save(path, panels, 2, (6, 2), ink=MIDDLE)
+
+
+def _plot(axes: Axes, frames: list[Array], action: Array, spec: Spec) -> None:
+    """Plot the images, and beside them a bar per component (D,) of the action within its range, with its value."""
+    height = frames[0].shape[0]
+    plot_image(axes, np.concatenate([frame for frame in frames if frame.shape[0] == height], axis=1))
+    left, step = axes.get_xlim()[1] + 1.0 * height, height / len(action)
+    reach = np.maximum(np.abs(spec.low), np.abs(spec.high))
+    shares = np.clip(action / reach, -1, 1)
+    places = step * (np.arange(len(action)) + 0.5)
+    axes.barh(places, 0.5 * height * shares, 0.6 * step, left=left, color=GREEN, clip_on=False)
+    for place, name, value, unit in zip(places, spec.action, action, spec.units, strict=True):
+        factor, shown = readable(unit)
+        number = factor * float(value)
+        text = f"{round(number, 1) + 0.0:.1f} {shown}" if shown else f"{round(number, 4) + 0.0:.2g}"  # never "-0.0"
+        axes.text(left - 0.55 * height, place, name, ha="right", va="center", fontsize=7)
+        axes.text(left + 0.55 * height, place, text, va="center", fontsize=7)
+    axes.set_xlim(right=left + height)

@@ -1,0 +1,72 @@
+"""Self-contained HTML pages: a title and parts, which are tables and sections."""
+
+from __future__ import annotations
+
+from base64 import b64encode
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+from jinja2 import Environment, FileSystemLoader, StrictUndefined
+from markupsafe import Markup
+
+from vla.io.files import write_text
+from vla.reports.tables import Table, in_words
+from vla.rollouts.moving_picture import Caption
+
+WILSON = "Wilson's; those of several trainings account for correlation within trainings and within scenes"
+ANYTIME = "anytime-valid, by betting, because playing stopped as soon as it was clear"
+NOTES = (
+    "Rates have 95 % confidence intervals ({}). p is of McNemar's exact test on episodes with the same seeds, and of "
+    "Fisher's on others, with Newcombe's intervals; p Holm is adjusted for all comparisons in the table, so that at "
+    "most 5 % of tables have a false difference. The verdict is a difference with p Holm of at most 0.05, not worse if "
+    "the interval, which is not adjusted, excludes a loss of that many percentage points, and open otherwise."
+)
+
+
+@dataclass(frozen=True)
+class Section:
+    """Part of a page, left out if it has none of its contents."""
+
+    title: str
+    note: str = ""
+    facts: Mapping[str, str] = field(default_factory=dict)  # name → text or markup
+    panels: Mapping[str, Markup] = field(default_factory=dict)  # title → SVG
+    lines: Mapping[str, str] = field(default_factory=dict)  # name → colour in the panels
+    rollouts: Sequence[tuple[Caption, Path]] = ()
+    picture: Path | None = None
+
+    @property
+    def rows(self) -> bool:
+        """Whether there is anything to show, as a table has rows."""
+        return bool(self.facts or self.panels or self.rollouts or (self.picture and self.picture.is_file()))
+
+
+def render(path: Path, title: str, parts: Sequence[Table | Section], anytime: bool = False, **content: Any) -> Path:
+    """Write a page of the parts that are not empty, atomically, and return its path.
+
+    Of a run `content` has `subtitle`, `warning`, the large `rate` and what it is `of`, and the `entry` of an index.
+    With `anytime` the results are valid whatever the reason to stop playing.
+    """
+    loader = FileSystemLoader(Path(__file__).parent)
+    environment = Environment(
+        loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
+    )
+    environment.filters.update(embedded=_embedded, in_words=in_words)
+    content = dict.fromkeys(("subtitle", "warning", "rate", "of", "entry"), "") | content
+    text = environment.get_template("page.html").render(
+        title=title,
+        parts=[part for part in parts if part.rows],
+        written=f"{datetime.now():%Y-%m-%d %H:%M}",
+        notes=NOTES.format(ANYTIME if anytime else WILSON),
+        **content,
+    )
+    write_text(path, text)
+    return path
+
+
+def _embedded(picture: Path) -> str:
+    """Return a picture as a data URL."""
+    return f"data:image/{picture.suffix[1:]};base64,{b64encode(picture.read_bytes()).decode()}"

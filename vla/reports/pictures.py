@@ -1,0 +1,163 @@
+"""Pictures of results: panels, drawn together into one PNG file, or each as SVG in the colour of a page's text."""
+
+from __future__ import annotations
+
+import io
+import logging
+import math
+import re
+import warnings
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from functools import cache
+from pathlib import Path
+from textwrap import fill
+from typing import Any
+
+import matplotlib
+import numpy as np
+from markupsafe import Markup
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.font_manager import FontProperties, findfont, findSystemFonts, fontManager, get_font
+from matplotlib.text import Text
+
+from vla.io.files import atomic_path
+from vla.spec import Array
+
+log = logging.getLogger(__name__)
+
+Interval = tuple[float, float, float]  # success rate and its 95 % confidence interval
+Panels = dict[str, Callable[[Axes], object]]  # title → what draws the rest
+
+GREEN, RED, BLUE, GREY = "#2e9e5b", "#d2483f", "#3b76c4", "#8a8f98"
+COLOURS = (GREEN, BLUE, RED, "#d9942b", "#8a5bb8", "#2f9fa3", "#b5628f", GREY)  # of rows
+INK = "#010203"  # black, and on a page the colour of its text
+MIDDLE = "#7a7f86"  # readable on white and on black, of PNG files on a page
+SIZE = (3.4, 2.3)  # of a panel [inch]
+RIGHT, BOTTOM, TOP = 0.96, 0.12, 0.96  # ends of its axes on a page
+
+
+def error_bars(rates: Iterable[Interval]) -> tuple[Array, Array]:
+    """Return the rates (N,) and the lengths (2, N) of their error bars, below and above."""
+    middle, low, high = np.array([*rates]).reshape(-1, 3).T
+    return middle, np.abs([middle - low, high - middle])
+
+
+def rate_limits(lowest: float) -> tuple[float, float]:
+    """Return the limits of an axis of rates from about `lowest` on, where differences of high ones are visible."""
+    return max(0.0, math.floor(10 * lowest) / 10), 1.0
+
+
+def plot_rates(axes: Axes, rates: Mapping[str, Interval], colours: Mapping[str, str]) -> None:
+    """Plot a line per name with its success rate and interval, and a vertical line at the first rate."""
+    middles, reach = error_bars(rates.values())
+    for row, name in enumerate(rates):
+        colour, ends = colours.get(name, GREEN), reach[:, row, None]
+        axes.errorbar(middles[row], row, xerr=ends, fmt="o", color=colour, capsize=3, clip_on=False)
+    axes.axvline(middles[0], color=GREY, linewidth=0.8, linestyle=":")
+    axes.set_yticks(range(len(rates)), [*rates])
+    axes.set(ylim=(len(rates) - 0.5, -0.5), xlim=rate_limits(min(low for _, low, _ in rates.values())))
+    axes.grid(alpha=0.2)
+
+
+def plot_counts(axes: Axes, counts: Mapping[str, int], colours: Iterable[str]) -> None:
+    """Plot one bar per word with its count, the first on top."""
+    axes.barh(range(len(counts)), list(counts.values()), color=[*colours], alpha=0.45, height=0.8)
+    for row, (name, count) in enumerate(counts.items()):
+        axes.text(0, row, f" {count}  {name}", fontsize=8, va="center", clip_on=True)
+    axes.set(ylim=(max(len(counts), 4) - 0.5, -0.5), xticks=[], yticks=[])
+    axes.spines[["left", "bottom"]].set_visible(False)
+
+
+def plot_image(axes: Axes, image: Array) -> None:
+    """Show an image (H, W, 3), whose upper left corner is the origin, without axes."""
+    axes.imshow(image, interpolation="nearest", extent=(0, image.shape[1], image.shape[0], 0))
+    axes.axis("off")
+
+
+@contextmanager
+def _style(ink: str = INK) -> Iterator[None]:
+    """Style of everything that is drawn."""
+    settings: Any = {"text.parse_math": False, "font.size": 9, "axes.titlesize": 9, "axes.linewidth": 0.6}
+    settings |= {f"axes.spines.{side}": False for side in ("top", "right")} | {"svg.fonttype": "none"}
+    settings |= {f"{part}.color": ink for part in ("text", "xtick", "ytick", "grid")}
+    settings |= {f"axes.{part}": ink for part in ("edgecolor", "labelcolor", "titlecolor")}
+    with matplotlib.rc_context(settings), warnings.catch_warnings():
+        warnings.filterwarnings("ignore", r"Glyph \d+ .*missing from")  # `use_fonts` says it once, browsers have more
+        yield
+
+
+def save(
+    path: Path, panels: Panels, columns: int, size: tuple[float, float] = SIZE, title: str = "", ink: str = INK
+) -> None:
+    """Draw panels, each of `size` [inch], in rows of `columns` into a PNG file, atomically.
+
+    It has texts and axes in the colour `ink`, other than black on a transparent background.
+    """
+    columns = min(columns, len(panels))
+    rows = -(-len(panels) // columns)
+    with _style(ink):
+        figure = Figure((size[0] * columns, size[1] * rows + 0.4 * bool(title)), layout="constrained")
+        figure.suptitle(title, fontsize=12, fontweight="bold")
+        for number, (name, draw) in enumerate(panels.items()):
+            axes = figure.add_subplot(rows, columns, number + 1)
+            axes.set_title(fill(name, int(14 * size[0])))
+            draw(axes)
+        use_fonts(figure)
+        with atomic_path(path) as draft:
+            figure.savefig(draft, format="png", dpi=110, transparent=ink != INK)
+
+
+def svgs(panels: Panels) -> dict[str, Markup]:
+    """Return title → SVG without the title, in the colour of the page's text and with nothing from outside."""
+    return {title: _svg(title, draw) for title, draw in panels.items()}
+
+
+def _svg(title: str, draw: Callable[[Axes], object]) -> Markup:
+    file = io.StringIO()
+    with _style(), matplotlib.rc_context({"svg.hashsalt": title}):  # identifiers are unique on a page
+        figure = Figure(SIZE)
+        axes = figure.add_axes((0.0, BOTTOM, RIGHT, TOP - BOTTOM))
+        draw(axes)
+        # Only the left margin depends on what is drawn; a layout engine takes as long as drawing the figure twice.
+        box = axes.yaxis.get_tightbbox()
+        left = 0.01 - min(0.0, box.x0 if box else 0.0) / figure.bbox.width
+        axes.set_position((left, BOTTOM, RIGHT - left, TOP - BOTTOM))
+        figure.savefig(file, format="svg", transparent=True, metadata={"Date": None})
+    svg = file.getvalue()
+    svg = re.sub(r"<metadata>.*?</metadata>", "", svg[svg.index("<svg") :], flags=re.DOTALL)
+    return Markup(re.sub(r' xmlns(:\w+)?="[^"]*"', "", svg).replace(INK, "currentColor"))
+
+
+def use_fonts(figure: Figure) -> None:
+    """Let the texts of a figure fall back on fonts of the machine; one sentence says if none has a character."""
+    texts = [text for text in figure.findobj(Text) if isinstance(text, Text)]
+    families = families_with(frozenset(each for text in texts for each in text.get_text() if ord(each) > 0x24F))
+    for text in texts if families else ():
+        text.set_fontfamily([*text.get_fontfamily(), *families])
+
+
+@cache
+def families_with(characters: frozenset[str]) -> list[str]:
+    """Return the families of as few fonts as have the characters together: matplotlib's own, then the best one."""
+    files = (findfont(FontProperties()), *sorted(findSystemFonts(), key=lambda file: ("Regular" not in file, file)))
+    fonts, missing, found = {file: _within(file, characters) for file in files if characters}, characters, list[str]()
+    while missing and fonts[best := max(fonts, key=lambda file: len(fonts[file] & missing))] & missing:
+        fontManager.addfont(best)  # its own list may be older
+        found.append(get_font(best).family_name)
+        missing -= fonts[best]
+    if missing:
+        log.warning(
+            "no font of this machine has some of the characters to be drawn, so pictures show boxes in their place: "
+            "install one, such as the package fonts-noto-cjk for Chinese, Japanese and Korean"
+        )
+    return found
+
+
+def _within(file: str, characters: frozenset[str]) -> frozenset[str]:
+    """Return which of the characters a font has; none of what cannot be read."""
+    try:
+        return frozenset(each for each in characters if get_font(file).get_char_index(ord(each)))
+    except (OSError, RuntimeError):
+        return frozenset()

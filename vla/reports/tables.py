@@ -1,0 +1,100 @@
+"""Tables of results: the same one for a terminal, as Markdown and on a page, and what its cells say."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import yaml
+from markupsafe import Markup
+from rich.box import SIMPLE_HEAD
+from rich.markup import escape
+from rich.table import Table as RichTable
+
+from vla.config.differences import ABSENT
+from vla.reports.pictures import Interval
+from vla.rollouts.comparison import Comparison
+
+LONG = 200  # characters of a config value that are shown
+NUMBER = re.compile(r"([+-]?\d[\d.,/e+ -]*( \(.*\))?|-|)")
+DIFFERENCE = ("difference [points]", "p", "p Holm", "verdict")  # heads of `difference`
+
+
+@dataclass(frozen=True)
+class Table:
+    """Table of texts, and of `links` where only a page shows them."""
+
+    heads: Sequence[str]
+    rows: Sequence[Sequence[str]]
+    title: str = ""
+    note: str = ""
+    details: Sequence[str] = ()  # heads of columns for which a terminal is too narrow
+
+    @cached_property
+    def numeric(self) -> list[bool]:
+        """Whether a column has numbers only, and is aligned at the right."""
+        return [all(map(NUMBER.fullmatch, cells)) and any(cells) for cells in zip(*self.rows, strict=True)]
+
+    def __rich__(self) -> RichTable:
+        """Return the table for a terminal of 80 columns."""
+        shown = [column for column, head in enumerate(self.heads) if head not in self.details]
+        narrow: dict[str, Any] = {"box": SIMPLE_HEAD, "collapse_padding": True, "pad_edge": False}
+        table = RichTable(title=escape(self.title), caption=escape(self.note), **narrow)
+        for column in shown:
+            table.add_column(escape(self.heads[column]))
+        for row in self.rows:
+            table.add_row(*(escape(row[column]) for column in shown))
+        return table
+
+    def markdown(self) -> str:
+        """Return the table without title and note; pipes and line breaks in cells are escaped."""
+        lines = [self.heads, ["---"] * len(self.heads), *self.rows]
+        cells = [[cell.replace("|", "\\|").replace("\n", "<br>") for cell in line] for line in lines]
+        return "".join(f"| {' | '.join(line)} |\n" for line in cells)
+
+
+def rate(interval: Interval) -> str:
+    """Return a success rate with its interval, in percent."""
+    return "{} ({}-{})".format(*map(percent, interval))
+
+
+def percent(share: float) -> str:
+    """Return a share in percent."""
+    return f"{100 * share:.1f}"
+
+
+def difference(found: Comparison | None) -> list[str]:
+    """Return a difference in success as the cells of `DIFFERENCE`; empty ones without a comparison."""
+    if found is None:
+        return [""] * len(DIFFERENCE)
+    middle, low, high = (f"{100 * each:+.1f}" for each in (found.difference, found.ci_low, found.ci_high))
+    together = "" if found.p_holm is None else f"{found.p_holm:.2g}"
+    return [f"{middle} ({low} to {high})", f"{found.p:.2g}", together, found.verdict]
+
+
+def links(addresses: Mapping[str, str]) -> Markup:
+    """Return links, text → address."""
+    return Markup(" ").join(Markup('<a href="{}">{}</a>').format(at, text) for text, at in addresses.items())
+
+
+def config_value(content: Any) -> str:
+    """Return a config value on one line of YAML, cut if it is long."""
+    text = yaml.safe_dump(content, default_flow_style=True, width=10**6, allow_unicode=True, sort_keys=False)
+    text = text.strip().removesuffix("...").strip()
+    return content if content == ABSENT else text if len(text) <= LONG else f"{text[:LONG]}…"
+
+
+def in_words(name: str) -> str:
+    """Return the name of a condition, an outcome or a milestone with spaces."""
+    return name.replace("_", " ")
+
+
+def duration(seconds: float) -> str:
+    """Return a duration [s] in words."""
+    minutes, rest = divmod(round(seconds), 60)
+    if minutes >= 60:
+        return f"{minutes // 60} h {minutes % 60:02d} min"
+    return f"{minutes} min {rest:02d} s" if minutes else f"{rest} s"
