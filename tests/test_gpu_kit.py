@@ -60,7 +60,7 @@ def test_without_time_nothing_is_started_and_what_was_noted_stays(tmp_path: Path
 
 
 def test_the_rates_of_a_training_leave_out_the_loader(tmp_path: Path) -> None:
-    measures = {"train: bf16": 120, "train: bf16: MFU": 999, "train: loader alone": 9999}
+    measures = {"train: bf16": 120, "train: bf16: memory": 999, "train: loader alone": 9999}
     eager = {"benchmark": {"measures": {name: {"value": value} for name, value in measures.items()}}}
     (tmp_path / "c.json").write_text(json.dumps({"eager": eager, "compiled": {"status": "ran past its limit"}}))
     assert notes.rates_of(tmp_path / "c.json") == {"eager": 120.0}

@@ -27,7 +27,6 @@ from vla.models.diffusion import Diffusion
 from vla.models.learner import Learner
 from vla.models.model import Model
 from vla.spec import FIRST_SEED, Array, Observation
-from vla.training import throughput
 from vla.training.checkpoints import SAVE_EVERY, GracefulStop, PeriodicCheckpoint
 from vla.training.closed_loop import ClosedLoop
 from vla.training.throughput import TrainingProgressBar
@@ -128,20 +127,12 @@ def test_other_demonstrations_are_refused(folder: Path, tmp_path: Path) -> None:
         )
 
 
-def test_it_logs_how_fast_it_is_and_what_it_waits_for(
-    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(throughput, "training_flops", lambda model, batch: 1e10 * len(batch["action"]))
-    monkeypatch.setattr(throughput, "matmul_flops", lambda *_: 1e30)
+def test_it_logs_how_fast_it_is_and_what_it_waits_for(folder: Path, tmp_path: Path) -> None:
     train(make_bc(), folder, tmp_path)
     with (tmp_path / "metrics.csv").open(newline="") as file:
         pace = [row for row in csv.DictReader(file) if row["pace/samples_per_s"]]
     assert len(pace) == STEPS // 2
-    for row in pace:
-        assert 0 <= float(row["pace/waiting"]) <= 1
-        # The rate is that of samples, each of 1e10 FLOP, on a device with a peak of 1e30 FLOP/s.
-        samples = float(row["pace/samples_per_s"])
-        assert samples > 0 and 1e20 * float(row["pace/mfu"]) == pytest.approx(samples, rel=1e-4)
+    assert all(float(row["pace/samples_per_s"]) > 0 and 0 <= float(row["pace/waiting"]) <= 1 for row in pace)
 
 
 def test_out_of_memory_errors_name_the_options_to_lower() -> None:

@@ -21,7 +21,6 @@ DECADE = 10.0  # ratio of maximum to minimum above which a loss has a logarithmi
 # Metrics of the speed → title.
 PACE = {
     "pace/samples_per_s": "samples/s",
-    "pace/mfu": "MFU, share of the peak",
     "pace/waiting": "waiting for data, share of the time",
     "pace/memory_gb": "memory [GB]",
 }

@@ -24,7 +24,6 @@ from vla.jobs.benchmark.measure import Measure, measure
 from vla.jobs.benchmark.memory import peak, reset_peak
 from vla.jobs.collect import demonstrations
 from vla.jobs.machine import computes_on_cpu, has_bfloat16
-from vla.models.flops import matmul_flops, peak_flops, training_flops
 from vla.runs.folder import CHECKPOINTS
 from vla.training.trainer import PRECISIONS, explain_memory_errors, make_trainer, quiet_lightning
 
@@ -32,7 +31,6 @@ log = logging.getLogger(__name__)
 
 WARM_UP = 3  # steps of a round that are not timed: they allocate and compile
 WAITING = "[_TrainingEpochLoop].train_dataloader_next"  # what Lightning's profiler calls it
-PEAK_SECONDS = 0.5  # duration of the measurement of an unknown peak, per round
 
 
 def measures(experiment: Experiment) -> dict[str, Measure]:
@@ -40,9 +38,6 @@ def measures(experiment: Experiment) -> dict[str, Measure]:
 
     - Throughput of trainer and loader; the floor is forward pass, backward pass and optimiser step alone, on one batch.
     - data-wait: time that a step waits for its batch; the floor is the duration of the step.
-    - MFU: FLOP/s of the model; the floor is the peak of the device, so the ratio is the model FLOPs utilisation. If no
-      data sheet gives the peak, it is the best rate of this run in the same precision: of matrix products of several
-      sizes (for mixed precision also in float32) or of the model.
     - memory: peak, on a CPU the increase by training; the floor is gradients and the optimiser's two moments.
     - loss: mean of the second half of the steps; the floor is that of the first combination, which starts from the same
       weights and trains on the same batches.
@@ -70,8 +65,7 @@ def measures(experiment: Experiment) -> dict[str, Measure]:
         loading.append(trials[0].load())
     found: dict[str, Measure] = {}
     for trial in trials:
-        fastest_rate = max(max(other.peak, other.rate) for other in trials if other.precision == trial.precision)
-        found |= trial.measures(fastest_rate, trials[0].loss)
+        found |= trial.measures(trials[0].loss)
     fastest = max(trial.samples / trial.best.seconds for trial in trials)
     found["train: loader alone"] = measure(trials[0].samples / min(loading), "samples/s", trials[0].samples, fastest)
     return found
@@ -106,10 +100,10 @@ class Trial(lightning.Callback):
     """
 
     def __init__(self, experiment: Experiment, store: EpisodeStore, precision: str, compiled: bool) -> None:
-        self.precision, self.name = precision, f"{precision} compile" if compiled else precision
+        self.name = f"{precision} compile" if compiled else precision
         self.steps = experiment["benchmark"]["steps"]
         self.samples = self.steps * experiment["data"]["batch_size"]
-        self.loss = self.peak = self._flops = 0.0
+        self.loss = 0.0
         self._store = store
         changes = {
             "learner.compile": compiled,
@@ -124,11 +118,6 @@ class Trial(lightning.Callback):
         self._learner = self._experiment.fitted_learner(store)
         self._start = copy.deepcopy(self._learner.state_dict())
         self._rounds: list[Timing] = []
-
-    @property
-    def rate(self) -> float:
-        """Highest rate of the model [FLOP/s], in training or alone."""
-        return self._flops * self.steps / min(min(each.seconds, each.alone) for each in self._rounds)
 
     @property
     def best(self) -> Timing:
@@ -198,25 +187,18 @@ class Trial(lightning.Callback):
             loss.backward()
             optimizer.step()
         self._alone = _now(device) - started
-        self._flops = self._flops or training_flops(model, self._batch)
-        precision = PRECISIONS[self.precision]
-        known = peak_flops(device, precision)
-        self.peak = max(self.peak, known or matmul_flops(device, precision, PEAK_SECONDS))
-        self._whose = "the data sheet" if known else "measured rates"
         del self._batch
 
-    def measures(self, peak: float, loss: float) -> dict[str, Measure]:
-        """Return name → measure of the fastest round, given the peak of the device [FLOP/s] and a reference loss."""
+    def measures(self, loss: float) -> dict[str, Measure]:
+        """Return name → measure of the fastest round, given a reference loss."""
         best, alone = self.best, min(each.alone for each in self._rounds)
         weights = sum(each.nbytes for each in self._learner.parameters() if each.requires_grad)
         rate, megabytes = self.samples / best.seconds, min(each.memory for each in self._rounds) / 1e6
-        flops = self._flops * self.steps / best.seconds
         found = {
             "": measure(rate, "samples/s", self.samples, self.samples / alone),
             ": data-wait": measure(
                 1000 * best.waiting / self.steps, "ms/step", self.steps, 1000 * best.seconds / self.steps
             ),
-            ": MFU": measure(flops / 1e9, f"GFLOP/s, peak of {self._whose}", self.steps, peak / 1e9),
             ": memory": measure(megabytes, "MB", self.steps, 3 * weights / 1e6),
             ": loss": measure(self.loss, "mean", self.steps, loss),
         }
