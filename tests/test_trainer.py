@@ -27,7 +27,7 @@ from vla.models.diffusion import Diffusion
 from vla.models.learner import Learner
 from vla.models.model import Model
 from vla.spec import FIRST_SEED, Array, Observation
-from vla.training.checkpoints import SAVE_EVERY, GracefulStop, PeriodicCheckpoint
+from vla.training.checkpoints import SAVE_EVERY, GracefulStop
 from vla.training.closed_loop import ClosedLoop
 from vla.training.throughput import TrainingProgressBar
 from vla.training.trainer import explain_memory_errors, make_trainer
@@ -324,14 +324,16 @@ def interrupted(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[
 
 def test_where_gradients_are_accumulated_nothing_is_saved_within_a_step(tmp_path: Path) -> None:
     saved = []
-    trainer: Any = SimpleNamespace(global_step=SAVE_EVERY, enable_validation=False, val_check_batch=None)
+    trainer: Any = SimpleNamespace(
+        accumulate_grad_batches=2, enable_validation=False, val_check_batch=None, should_stop=False
+    )
+    trainer.strategy = SimpleNamespace(reduce_boolean_decision=lambda decision, all: decision)
     trainer.save_checkpoint = lambda path, weights_only: saved.append(trainer.global_step)
-    checkpoint = PeriodicCheckpoint(tmp_path)
-    nothing: Any = None
-    checkpoint.on_train_start(trainer, nothing)  # resumed from a save at that step
-    for step in (SAVE_EVERY, SAVE_EVERY, SAVE_EVERY + 1, 2 * SAVE_EVERY, 2 * SAVE_EVERY):
-        trainer.global_step = step
-        checkpoint.on_train_batch_end(trainer, nothing, None, None, 0)
+    graceful_stop, nothing = GracefulStop(tmp_path), None
+    # Resumed from a save at step 500, whose batches are 998 and 999.
+    for batch in range(1000, 2002):
+        trainer.global_step = (batch + 1) // 2
+        graceful_stop.on_train_batch_end(trainer, nothing, None, None, batch)  # type: ignore[arg-type]
     assert saved == [2 * SAVE_EVERY]
 
 

@@ -25,7 +25,7 @@ from vla.io.errors import UserError
 from vla.models.checkpoint import read_header
 from vla.parallel.limits import cores
 from vla.runs.folder import METRICS, metric_rows
-from vla.training.checkpoints import AtomicCheckpointIO, PeriodicCheckpoint
+from vla.training.checkpoints import AtomicCheckpointIO
 from vla.training.ema import EMA
 from vla.training.throughput import Throughput, TrainingProgressBar
 
@@ -69,7 +69,7 @@ class SyncBatchNorm(TorchSyncBatchNorm):
 
 
 def make_trainer(config: Mapping[str, Any], checkpoints: Path | None, *callbacks: Callback) -> Trainer:
-    """Create the trainer of a config, with EMA and, if a checkpoint folder is given, logging and periodic checkpoints.
+    """Create the trainer of a config, with EMA and, if a checkpoint folder is given, logging.
 
     The given callbacks run before EMA at the end of a validation, so that they use the EMA weights.
 
@@ -82,7 +82,7 @@ def make_trainer(config: Mapping[str, Any], checkpoints: Path | None, *callbacks
     if config["learner"].get("ema"):
         all_callbacks.append(EMA(config["learner"]["ema"]))
     if checkpoints is not None:
-        all_callbacks += [Throughput(), PeriodicCheckpoint(checkpoints)]
+        all_callbacks.append(Throughput())
         options = {"logger": _loggers(config, checkpoints.parent)}
     all_callbacks.append(StepSeeding(config["seed"]))  # after callbacks that may use random numbers
     try:
