@@ -101,14 +101,13 @@ def test_rounds_continue_the_training_of_their_policy(tmp_path: Path, tabletop: 
     assert training.task == composed().task and training.collect.episodes == composed().collect.episodes
 
 
-@pytest.mark.parametrize(("option", "part"), [("minilm", "name"), ("both", "sentence.name")])
 def test_a_policy_finds_the_encoder_of_its_instructions_in_a_package(
-    option: str, part: str, tmp_path: Path, tabletop: Tabletop, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, tabletop: Tabletop, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     content = zipped_folder(write_encoder(tmp_path / "encoder"))
     monkeypatch.syspath_prepend(install(tmp_path / "site", "model.zip", content))
-    values = [f"model.text.{part}.source={NAME}", f"model.text.{part}.sha256={digest(content)}"]
-    policy, checkpoint = trained(tmp_path, tabletop, f"model/text={option}", *values)
+    values = [f"model.text.name.source={NAME}", f"model.text.name.sha256={digest(content)}"]
+    policy, checkpoint = trained(tmp_path, tabletop, "model/text=minilm", *values)
     action = policy.act(tabletop.reset(0))
     assert np.array_equal(make_policy(CPU, checkpoint, tabletop).act(tabletop.reset(0)), action)
     learner = Experiment.of(finetune(composed(*SMALL, f"pretrained={checkpoint}"), [])).learner(

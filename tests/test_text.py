@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import subprocess
 import sys
-from functools import partial
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -15,13 +13,10 @@ from conftest import CONF
 from defaults import defaults_of
 from hydra.utils import instantiate
 from omegaconf import OmegaConf
-from tiny_encoder import write_encoder
 
 from vla.config.build import check_node
 from vla.config.compose import axes
-from vla.models.text.both import Both
 from vla.models.text.colours import in_basic_terms
-from vla.models.text.huggingface import HuggingFace
 from vla.models.text.ngrams import NGrams
 from vla.models.text.tensor_cache import TensorCache
 from vla.tasks.tabletop.scene import COLOURS
@@ -203,21 +198,3 @@ def test_a_cache_holds_what_was_used_last_within_its_bytes() -> None:
     get("x" * 10_000, 1)
     assert cache.size <= 20_000
     assert get("a", 1).shape == (1,)
-
-
-def test_both_are_n_grams_beside_a_sentence_encoder(tmp_path: Path) -> None:
-    folder = str(write_encoder(tmp_path))
-    options: dict[str, Any] = defaults_of("model/text/ngrams", vocabulary=2**24, dropout=0.0)
-    torch.manual_seed(0)
-    small: dict[str, Any] = {**options, "vocabulary": 64}
-    ngrams, sentence = NGrams(width=3, **small), HuggingFace(folder, width=4)
-    large = Both(partial(NGrams, **options), partial(HuggingFace, folder), width=2)
-    exact = large.ngrams.tokenize(SENTENCES)
-    assert exact.max() > 2**23 and torch.equal(large.tokenize(SENTENCES)[:, 16:].long(), exact)
-    both = Both(lambda width: ngrams, lambda width: sentence, width=7)
-    expected = torch.cat([part(part.tokenize(SENTENCES)) for part in (ngrams, sentence)], 1)
-    torch.testing.assert_close(both(both.tokenize(SENTENCES)), expected)
-    both = Both(partial(NGrams, **small), partial(HuggingFace, folder), width=7)
-    assert both(both.tokenize(SENTENCES)).shape == (3, 7)
-    with pytest.raises(ValueError, match=r"ngrams\.word_dropout must be null beside a sentence encoder"):
-        Both(partial(NGrams, **{**options, "word_dropout": 0.1}), partial(HuggingFace, folder), width=2)

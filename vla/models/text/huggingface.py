@@ -59,7 +59,7 @@ class SentenceEncoder:
         try:
             self.network, self._output = _network(folder)
             self._tokenizer = _tokenizer(folder, self.network.config)
-            self.length = len(self.embed("a sentence"))  # E
+            self.embed("a sentence")
         except Exception as error:  # transformers, tokenizers and safetensors have no error in common
             reason = lines_of(error)[0]
             raise UserError(f"{folder} is no text encoder as save_pretrained writes them: {reason}") from error
@@ -111,8 +111,8 @@ class HuggingFace(TextEncoder):
         with _folder(name) as folder:
             self.encoder = SentenceEncoder(folder)
             self._revision = folder.name if folder.parent.name == "snapshots" else None  # in the hub's cache
-        self.length = self.encoder.length
-        self.projection = nn.Sequential(nn.LayerNorm(self.length), nn.Linear(self.length, width))
+        length = len(self.encoder.embed("a sentence"))
+        self.projection = nn.Sequential(nn.LayerNorm(length), nn.Linear(length, width))
         log.info("text encoder loaded from %s", self._name)
 
     def tokenize(self, sentences: list[str]) -> Tensor:
