@@ -153,7 +153,7 @@ def wrong_weights(folder: Path) -> list[str]:
 @pytest.mark.parametrize(
     ("prepare", "message"),
     [
-        (unknown_name, "it has vit_small_patch16_dinov3"),
+        (unknown_name, "did you mean vit_small_patch16_dinov3"),
         (no_folder, "/nowhere/at/all is no folder"),
         (wrong_weights, "does not hold the weights of timm's test_vit"),
     ],

@@ -6,7 +6,6 @@ Shapes: N images, C channels, H by W pixels, h by w positions of a feature map.
 from __future__ import annotations
 
 import logging
-from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +15,7 @@ from torch import Tensor, nn
 
 from vla.io.documents import lines_of
 from vla.io.errors import UserError
+from vla.io.suggestion import suggestion
 from vla.io.types import Pixels, Width
 from vla.models.hub import fetch
 from vla.models.packaged import PackagedFile
@@ -70,7 +70,9 @@ class FilmEfficientNet(ImageEncoder):
 
     def __init__(self, name: str, pretrained: Pretrained, channels: Width, *, text_width: int) -> None:
         super().__init__(channels)
-        net = load_backbone(name, pretrained, kind="efficientnet")
+        net = load_backbone(name, pretrained)
+        if not hasattr(net, "conv_stem"):
+            raise UserError(f"model.image.name={name} is no EfficientNet: model/image=timm takes any network of timm")
         self.normalize = Normalize(net)
         self.stem = nn.Sequential(net.conv_stem, net.bn1)
         self.blocks = nn.ModuleList(block for stage in net.blocks for block in stage)
@@ -138,11 +140,10 @@ class FilmBackbone(ImageEncoder):
         return self.film(self.projection(features), text)
 
 
-def load_backbone(name: str, pretrained: Pretrained, kind: str = "", size: int | None = None) -> Any:
+def load_backbone(name: str, pretrained: Pretrained, size: int | None = None) -> Any:
     """Create a timm network without its classifier; `pretrained` as in `FilmEfficientNet`.
 
     Args:
-        kind: required part of the name.
         size: height and width of the images [px], for networks with a fixed input size.
 
     Raises:
@@ -150,10 +151,9 @@ def load_backbone(name: str, pretrained: Pretrained, kind: str = "", size: int |
     """
     import timm  # slow to import, not needed by every policy
 
-    known = {*timm.list_models(f"*{kind}*"), *timm.list_pretrained(f"*{kind}*")}
+    known = [*timm.list_models(), *timm.list_pretrained()]
     if name not in known:
-        close = ", ".join(get_close_matches(name, known, 5, 0))
-        raise UserError(f"timm has no {kind or 'network'} called '{name}', it has {close} and others")
+        raise UserError(f"model.image.name={name} is no network of timm{suggestion(name, known)}")
     config: Any = timm.get_pretrained_cfg(name)
     options: dict[str, Any] = {"num_classes": 0, "img_size": size if config.fixed_input_size else None}
     path = _weights_file(name, config.hf_hub_id, pretrained)
@@ -181,15 +181,13 @@ def _weights_file(name: str, repository: str | None, pretrained: Pretrained) -> 
     if not pretrained:
         return None
     if isinstance(pretrained, str) and pretrained != "auto":
-        if not (path := Path(pretrained)).is_file():
+        if not Path(pretrained).is_file():
             raise UserError(
-                f"model.image.pretrained is true, false, auto or a weights file, and there is no file {path}"
+                f"model.image.pretrained is true, false, auto or a weights file, and there is no file {pretrained}"
             )
-        return path
+        return Path(pretrained)
     try:
-        if repository is None:
-            raise OSError("timm names none")
-        return fetch(repository, WEIGHTS) / WEIGHTS
+        return fetch(repository or f"timm/{name}", WEIGHTS) / WEIGHTS
     except OSError as error:
         if pretrained is True:
             raise UserError(
