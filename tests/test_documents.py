@@ -31,12 +31,15 @@ def test_a_file_is_read_as_its_type(tmp_path: Path) -> None:
     assert read_json(tmp_path / "a.json", Header) == read_yaml(tmp_path / "a.yaml", Header) == Header(1, ("x",))
 
 
-def test_a_pipe_or_a_device_is_not_read(tmp_path: Path) -> None:
+def test_a_pipe_a_device_or_a_file_that_is_too_large_is_not_read(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe")
     (tmp_path / "endless").symlink_to("/dev/zero")
     for name in ("pipe", "endless"):
         with pytest.raises(UserError, match=rf"{name} is a folder, a pipe or a device, not a file"):
             read_json(tmp_path / name, Header)
+    (tmp_path / "a.json").write_text("[0, 0, 0, 0]")
+    with pytest.raises(UserError, match=r"a\.json has 12 bytes, more than the 4"):
+        read_json(tmp_path / "a.json", list, largest=4)
 
 
 @pytest.mark.parametrize(
@@ -71,12 +74,6 @@ def test_json_of_another_kind_is_refused_by_name(text: str | bytes, kind: Any, s
 def test_yaml_that_is_not_plain_is_refused_by_name(text: str | bytes, says: str) -> None:
     with pytest.raises(UserError, match=rf"^run .*{says}"):
         parse_yaml(text, Any, "run")
-
-
-def test_a_file_that_is_too_large_is_not_read(tmp_path: Path) -> None:
-    (tmp_path / "a.json").write_text("[0, 0, 0, 0]")
-    with pytest.raises(UserError, match=r"a\.json has 12 bytes, more than the 4"):
-        read_json(tmp_path / "a.json", list, largest=4)
 
 
 def test_a_configuration_out_of_a_file_is_plain_and_resolved() -> None:

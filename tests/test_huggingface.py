@@ -31,13 +31,6 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_encoder(tmp_path_factory.mktemp("encoders") / "bert")
 
 
-def calls_of(encoder: HuggingFace) -> list[Any]:
-    """A list that grows by one with each pass through the frozen network."""
-    calls: list[Any] = []
-    encoder.encoder.network.register_forward_hook(lambda *_: calls.append(1))
-    return calls
-
-
 def test_a_sentence_is_the_mean_over_its_tokens_whatever_stands_beside_it(folder: Path) -> None:
     encoder = HuggingFace(str(folder), width=8)
     together = encoder.tokenize(SENTENCES)
@@ -47,13 +40,17 @@ def test_a_sentence_is_the_mean_over_its_tokens_whatever_stands_beside_it(folder
     assert torch.equal(encoder.tokenize(SENTENCES[1:2])[0], together[1])
     assert together.shape == (3, 16) and encoder(together).shape == (3, 8)
     assert torch.isfinite(encoder(together)).all()
+    long = "put the red block on the pad " * 9  # which is cut
+    assert torch.equal(encoder.tokenize([long]), encoder.tokenize([long + "on the blue pad"]))
 
 
 def test_every_distinct_sentence_goes_through_the_network_once(folder: Path) -> None:
-    encoder = HuggingFace(str(folder), width=8)
-    calls = calls_of(encoder)
+    encoder, calls = HuggingFace(str(folder), width=8), list[int]()
+    encoder.encoder.network.register_forward_hook(lambda *_: calls.append(1))
+    with torch.inference_mode():
+        encoder.tokenize(SENTENCES)
     for _ in range(3):
-        encoder.tokenize(SENTENCES * 2)
+        encoder(encoder.tokenize(SENTENCES * 2)).sum().backward()  # also from vectors made in inference mode
         copy.deepcopy(encoder).tokenize(SENTENCES)  # as the averaging of weights makes one
     assert len(calls) == len(SENTENCES)
 
@@ -70,13 +67,6 @@ def test_the_projection_learns_and_the_encoder_does_not(folder: Path) -> None:
     assert model.train().loss(batch)["loss"].item() < untrained
     assert not torch.equal(text.projection.state_dict()["1.weight"], projection["1.weight"])
     assert all(torch.equal(frozen[name], value) for name, value in text.encoder.network.state_dict().items())
-
-
-def test_vectors_made_in_inference_mode_can_be_learned_from(folder: Path) -> None:
-    encoder = HuggingFace(str(folder), width=8)
-    with torch.inference_mode():
-        encoder.tokenize(SENTENCES)
-    encoder(encoder.tokenize(SENTENCES)).sum().backward()
 
 
 TOWERS: dict[str, Callable[[], Any]] = {
@@ -113,12 +103,6 @@ def test_of_an_encoder_with_a_decoder_only_the_encoder_is_read(tmp_path: Path) -
     assert torch.allclose(encoder.tokenize(SENTENCES)[0], expected, atol=1e-6)
 
 
-def test_a_long_text_is_cut(folder: Path) -> None:
-    encoder = HuggingFace(str(folder), width=8)
-    long = "put the red block on the pad " * 9
-    assert torch.equal(encoder.tokenize([long]), encoder.tokenize([long + "on the blue pad"]))
-
-
 def test_a_state_names_the_encoder_and_no_other_one_takes_its_place(folder: Path, tmp_path: Path) -> None:
     encoder = HuggingFace(str(folder), width=8)
     state = encoder.state_dict()
@@ -127,17 +111,13 @@ def test_a_state_names_the_encoder_and_no_other_one_takes_its_place(folder: Path
     parameters = list(moved.parameters())
     moved.load_state_dict(state)
     assert all(mine is before for mine, before in zip(moved.parameters(), parameters, strict=True))
-    assert torch.equal(moved(moved.tokenize(SENTENCES)), encoder(encoder.tokenize(SENTENCES)))
+    again = pickle.loads(pickle.dumps(moved))  # for a worker process
+    assert torch.equal(again(again.tokenize(SENTENCES)), encoder(encoder.tokenize(SENTENCES)))
     other = transformers.BertModel(transformers.BertConfig(**sizes(), hidden_act="relu"))
     torch.nn.init.ones_(other.embeddings.word_embeddings.weight)
     other.save_pretrained(tmp_path / "moved")
     with pytest.raises(UserError, match=r"moved is another text encoder than in training: .* begins with \w{8}, not"):
         HuggingFace(str(tmp_path / "moved"), width=8).load_state_dict(state)
-
-
-def test_a_process_of_its_own_gets_the_whole_encoder(folder: Path) -> None:
-    encoder = HuggingFace(str(folder), width=8)
-    assert torch.equal(pickle.loads(pickle.dumps(encoder)).tokenize(SENTENCES), encoder.tokenize(SENTENCES))
 
 
 def test_a_configuration_cannot_make_transformers_fetch_or_run_code(folder: Path, tmp_path: Path) -> None:
