@@ -88,9 +88,9 @@ def test_what_does_not_fit_the_actions_is_refused() -> None:
         RT1Bins(spec=replace(SPEC, units=("m", "m", "kg")), **defaults_of("tokenizer/rt1"))
     with pytest.raises(UserError, match="2 components, the spec has 3: x, y, gripper"):
         Uniform(spec=SPEC, statistics=Bounds(np.zeros(2), np.ones(2)), **defaults_of("tokenizer/uniform"))
-    for limits in ({"low": (-0.05, 0.05, 0.0)}, {"high": (0.05, float("inf"), 1.0)}):
+    for spec in (replace(SPEC, low=(-0.05, 0.05, 0.0)), replace(SPEC, high=(0.05, float("inf"), 1.0))):
         with pytest.raises(UserError, match="the spec must give y a range"):
-            Uniform(spec=replace(SPEC, **limits), statistics=BOUNDS, **defaults_of("tokenizer/uniform"))
+            Uniform(spec=spec, statistics=BOUNDS, **defaults_of("tokenizer/uniform"))
 
 
 @pytest.mark.parametrize(
