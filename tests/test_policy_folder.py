@@ -62,11 +62,9 @@ def test_a_policy_replaces_the_one_before_it_and_leaves_nothing_beside(tmp_path:
 
 
 def test_what_modules_keep_besides_weights_is_in_the_file_of_the_weights(tmp_path: Path) -> None:
-    within = {"_extra_state": {"name": "x", "weights": {"a.b": torch.ones(2), "a.c": torch.ones(2)[:1]}}}
+    within = {"_extra_state": {"name": "x"}, "a.b": torch.ones(2)[:1]}
     save_policy(tmp_path, CONFIG, state=within)
-    found = read_policy(tmp_path).state
-    assert found["_extra_state"]["name"] == "x"
-    assert {name: len(each) for name, each in found["_extra_state"]["weights"].items()} == {"a.b": 2, "a.c": 1}
+    assert read_policy(tmp_path).state == within
 
 
 def test_what_is_no_policy_is_said_with_what_would_be_one(tmp_path: Path) -> None:
@@ -183,18 +181,10 @@ HOSTILE: dict[str, tuple[Callable[[Path], object], str]] = {
     "a link upwards": (link("model.safetensors", "../outside"), "is a link that leaves the folder"),
     "a link to a device": (link("model.safetensors", "/dev/zero"), "is a link that leaves the folder"),
     "a link to nothing": (link("training.json", "nothing"), r"has no training\.json"),
-    "a list": (
-        text("config.json", "[]"),
-        r"config\.json is of no policy of this project: it lacks task, tokenizer, mo",
-    ),
+    "a list": (text("config.json", "[]"), r"config\.json is damaged or of another kind"),
     "no JSON": (text("config.json", "{"), r"config\.json is damaged or of another kind"),
     "no text": (lambda folder: (folder / "config.json").write_bytes(b"\xff\xfe\x00"), r"config\.json is damaged"),
-    "a key twice": (text("config.json", '{"task": {}, "task": {"a": 1}}'), "a key stands twice"),
-    "a deep key twice": (text("training.json", '{"figures": {"a": 1, "a": 2}}'), "a key stands twice"),
     "deep JSON": (text("config.json", DEEP), r"config\.json is damaged or of another kind: .*recursion"),
-    "many levels": (key("config.json", task=json.loads('{"a":' * 99 + "1" + "}" * 99)), "more than 64 levels"),
-    "many values": (key("config.json", task={"a": [0] * 10**5}), r"more than \d+ values"),
-    "not a number": (text("config.json", '{"task": {"a": NaN}}'), r"config\.json is damaged .*NaN"),
     "an endless number": (text("config.json", '{"task": {"a": ' + "9" * 5000 + "}}"), r"config\.json is damaged"),
     "a huge file": (lambda folder: os.truncate(folder / "config.json", 10**12), "has 1000000000000 bytes, more than"),
     "a reference": (
@@ -245,7 +235,7 @@ HOSTILE: dict[str, tuple[Callable[[Path], object], str]] = {
     ),
     "names of folders": (
         weights(lambda state: {f"../{name}": value for name, value in state.items()}),
-        r"model\.safetensors is damaged: ",
+        "does not fit the model",
     ),
     "a further name": (weights(lambda state: {**state, "..": torch.ones(1)}), "does not fit the model"),
     "a missing name": (weights(lambda state: dict([*state.items()][1:])), "does not fit the model"),
@@ -295,8 +285,6 @@ def test_what_weights_do_not_fill_is_not_allocated(tmp_path: Path, make: Callabl
 
 
 def test_parts_that_come_with_the_weights_are_no_larger_than_their_file(tmp_path: Path) -> None:
-    """As a text encoder is, which is made as its state is loaded."""
-
     class Late(torch.nn.Module):
         def set_extra_state(self, state: object) -> None:
             torch.nn.Linear(10**6, 10**6)

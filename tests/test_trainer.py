@@ -16,22 +16,19 @@ import lightning
 import pytest
 import torch
 import toy
-from defaults import defaults_of
 from fake_batch import as_policy, make_act, make_batch, make_bc, make_denoising, make_rt1
 from omegaconf import OmegaConf
-from reading import windows
-from resuming import STEPS, STOP, VALIDATED, config, same, train
+from resuming import STEPS, STOP, VALIDATED, same, train
 from small_training import fit, make_learner
 
+from vla.io.errors import UserError
 from vla.models.diffusion import Diffusion
-from vla.models.learner import Learner
 from vla.models.model import Model
 from vla.spec import FIRST_SEED, Array, Observation
-from vla.training import throughput
-from vla.training.checkpoints import SAVE_EVERY, GracefulStop, PeriodicCheckpoint
+from vla.training.checkpoints import SAVE_EVERY, GracefulStop
 from vla.training.closed_loop import ClosedLoop
 from vla.training.throughput import TrainingProgressBar
-from vla.training.trainer import explain_memory_errors, make_trainer
+from vla.training.trainer import explain_memory_errors
 
 MODELS: dict[str, Callable[[], Model]] = {
     "bc": lambda: make_bc(shift=(64, 64)),
@@ -119,29 +116,12 @@ def test_gradients_that_are_gathered_over_batches_are_not_cut_in_half(folder: Pa
     assert same(whole["current_model_state"], rest["current_model_state"])
 
 
-def test_other_demonstrations_are_refused(folder: Path, tmp_path: Path) -> None:
-    train(make_bc(), folder, tmp_path, stop=2)
-    learner = Learner(model=make_bc(), spec=toy.SPEC, config={}, **defaults_of("learner/default", lr=0.001))
-    with pytest.raises(ValueError, match="was started with other demonstrations"):
-        make_trainer(config(), None).fit(
-            learner, datamodule=windows(folder, episodes=8), ckpt_path=tmp_path / "checkpoints/last.ckpt"
-        )
-
-
-def test_it_logs_how_fast_it_is_and_what_it_waits_for(
-    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(throughput, "training_flops", lambda model, batch: 1e10 * len(batch["action"]))
-    monkeypatch.setattr(throughput, "matmul_flops", lambda *_: 1e30)
+def test_it_logs_how_fast_it_is_and_what_it_waits_for(folder: Path, tmp_path: Path) -> None:
     train(make_bc(), folder, tmp_path)
     with (tmp_path / "metrics.csv").open(newline="") as file:
         pace = [row for row in csv.DictReader(file) if row["pace/samples_per_s"]]
     assert len(pace) == STEPS // 2
-    for row in pace:
-        assert 0 <= float(row["pace/waiting"]) <= 1
-        # The rate is that of samples, each of 1e10 FLOP, on a device with a peak of 1e30 FLOP/s.
-        samples = float(row["pace/samples_per_s"])
-        assert samples > 0 and 1e20 * float(row["pace/mfu"]) == pytest.approx(samples, rel=1e-4)
+    assert all(float(row["pace/samples_per_s"]) > 0 and 0 <= float(row["pace/waiting"]) <= 1 for row in pace)
 
 
 def test_out_of_memory_errors_name_the_options_to_lower() -> None:
@@ -149,20 +129,13 @@ def test_out_of_memory_errors_name_the_options_to_lower() -> None:
     batch = make_batch(3)
     batch["rgb"] = {name: image[:, :, :1, :1].expand(-1, -1, 10**8, 10**8, -1) for name, image in batch["rgb"].items()}
     sizes = OmegaConf.create({"data": {"batch_size": 4}, "model": {"history": 3, "image_size": None, "width": 32}})
-    wanted = r"lower data\.batch_size \(now 4\), model\.history \(now 3\), model\.width"
-    with pytest.raises(ValueError, match=wanted), explain_memory_errors(sizes):
+    wanted = r"lower data\.batch_size \(now 4\), model\.history \(now 3\), model\.width .*trainer\.precision=bf16"
+    with pytest.raises(UserError, match=wanted), explain_memory_errors(sizes):
         fit(make_learner(make_rt1()), batch, 1)
-
-
-@pytest.mark.parametrize("error", [torch.OutOfMemoryError("CUDA out of memory"), MemoryError()])
-def test_memory_of_a_gpu_or_of_the_loader_is_named_alike(error: Exception) -> None:
-    sizes = OmegaConf.create({"data": {"batch_size": 4}, "model": {}})
-    with pytest.raises(ValueError, match=r"trainer\.precision=bf16"), explain_memory_errors(sizes):
-        raise error
-
-
-def test_other_errors_stay_what_they_are() -> None:
-    with pytest.raises(RuntimeError, match="shapes"), explain_memory_errors(OmegaConf.create({})):
+    for error in (torch.OutOfMemoryError("CUDA out of memory"), MemoryError()):
+        with pytest.raises(UserError, match=wanted), explain_memory_errors(sizes):
+            raise error
+    with pytest.raises(RuntimeError, match="shapes"), explain_memory_errors(sizes):
         raise RuntimeError("shapes differ")
 
 
@@ -242,15 +215,13 @@ def test_between_validations_no_environment_is_held(folder: Path, tmp_path: Path
     """Fifty compiled scenes of Meta-World would take 4 GB from the demonstrations in memory."""
     held: list[int] = []
 
-    class Counted(toy.ToyEnvironment):
-        def __init__(self) -> None:
-            super().__init__()
-            held.append(1)
+    def make() -> toy.ToyEnvironment:
+        held.append(1)
+        environment = toy.ToyEnvironment()
+        environment.close = lambda: held.append(-1)  # type: ignore[method-assign]
+        return environment
 
-        def close(self) -> None:
-            held.append(-1)
-
-    played = ClosedLoop(Counted, lambda model: toy.ToyExpert(), range(2), tmp_path / "run")
+    played = ClosedLoop(make, lambda model: toy.ToyExpert(), range(2), tmp_path / "run")
     train(make_bc(), folder, tmp_path / "run", killer=played)
     assert len(held) >= 4 and held == [1, -1] * (len(held) // 2)
 
@@ -290,25 +261,19 @@ def test_damaged_training_curves_cost_no_training(
 ) -> None:
     train(make_bc(), folder, tmp_path, stop=2, max_steps=3)
     last = tmp_path / "checkpoints/last.ckpt"
-    for damage in ("", "epoch,val/loss\n1,2\n", "step,val/loss\nlast,2\n", "step,val/loss\n" + "9" * 30 + ",2\n", "\0"):
-        (tmp_path / "metrics.csv").write_text(damage)
-        assert train(make_bc(), folder, tmp_path / "rest", checkpoint=last, max_steps=3)["global_step"] == 3
+    (tmp_path / "metrics.csv").write_text("step,val/loss\nlast,2\n")
+    assert train(make_bc(), folder, tmp_path / "rest", checkpoint=last, max_steps=3)["global_step"] == 3
     assert f"the training curves begin anew: {tmp_path / 'metrics.csv'} is damaged in line 2" in caplog.text
-
-
-LOOP = "epoch_loop.batch_progress"
 
 
 @pytest.mark.parametrize(
     ("key", "value"),
     [
-        *(("loops", value) for value in ({}, {"fit_loop": None}, [1])),
-        ("loops", {"fit_loop": {LOOP: {"total": {"ready": -1}}}}),
-        ("loops", {"fit_loop": {LOOP: {"total": {"ready": "x"}}}}),
-        *(("optimizer_states", value) for value in (None, [3], [{"state": {}, "param_groups": []}])),
-        *(("lr_schedulers", value) for value in (None, [3])),
+        ("loops", {}),
+        ("loops", {"fit_loop": {"epoch_loop.batch_progress": {"total": {"ready": "x"}}}}),
+        ("optimizer_states", [{"state": {}, "param_groups": []}]),
+        ("lr_schedulers", None),
         ("WindowDataModule", {"windows": "others"}),
-        ("WindowDataModule", None),
         ("state_dict", {"model.x": 3}),
         ("current_model_state", {"model.x": 3}),
     ],
@@ -321,7 +286,7 @@ def test_a_damaged_state_of_a_training_is_refused_by_name(
     last.parent.mkdir()
     torch.save({**interrupted, key: value}, last)
     played = ClosedLoop(toy.make_environment, lambda model: toy.ToyExpert(), range(1), tmp_path)
-    with pytest.raises(ValueError, match=r"^\S+/last\.ckpt cannot be resumed: .+"):
+    with pytest.raises(UserError, match=r"^\S+/last\.ckpt cannot be resumed: .+"):
         train(make_bc(), folder, tmp_path, checkpoint=last, killer=played)
 
 
@@ -333,14 +298,16 @@ def interrupted(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[
 
 def test_where_gradients_are_accumulated_nothing_is_saved_within_a_step(tmp_path: Path) -> None:
     saved = []
-    trainer: Any = SimpleNamespace(global_step=SAVE_EVERY, enable_validation=False, val_check_batch=None)
+    trainer: Any = SimpleNamespace(
+        accumulate_grad_batches=2, enable_validation=False, val_check_batch=None, should_stop=False
+    )
+    trainer.strategy = SimpleNamespace(reduce_boolean_decision=lambda decision, all: decision)
     trainer.save_checkpoint = lambda path, weights_only: saved.append(trainer.global_step)
-    checkpoint = PeriodicCheckpoint(tmp_path)
-    nothing: Any = None
-    checkpoint.on_train_start(trainer, nothing)  # resumed from a save at that step
-    for step in (SAVE_EVERY, SAVE_EVERY, SAVE_EVERY + 1, 2 * SAVE_EVERY, 2 * SAVE_EVERY):
-        trainer.global_step = step
-        checkpoint.on_train_batch_end(trainer, nothing, None, None, 0)
+    graceful_stop, nothing = GracefulStop(tmp_path), None
+    # Resumed from a save at step 500, whose batches are 998 and 999.
+    for batch in range(1000, 2002):
+        trainer.global_step = (batch + 1) // 2
+        graceful_stop.on_train_batch_end(trainer, nothing, None, None, batch)  # type: ignore[arg-type]
     assert saved == [2 * SAVE_EVERY]
 
 

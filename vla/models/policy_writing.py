@@ -43,7 +43,7 @@ and in a program it is `vla.api.load_policy(FOLDER)`.
 def write_policy(folder: Path, content: Mapping[str, Any]) -> None:
     """Write a policy, which replaces the one in `folder`, of what Lightning saves of a training.
 
-    What is no tensor in the state of the model must be plain, or a mapping of plain values and of name → tensor.
+    What is no tensor in the state of the model must be plain.
 
     Raises:
         OSError: it cannot be written; an existing one is unchanged.
@@ -58,8 +58,14 @@ def write_policy(folder: Path, content: Mapping[str, Any]) -> None:
     states = [part for part in content.values() if isinstance(part, dict)]  # that of the data module among them
     windows = next((part["windows"] for part in states if isinstance(part.get("windows"), str)), "")
     figures = {name: value for name, value in content["figures"].items() if math.isfinite(value)}
-    plain, tensors = _split(weights_of(content))
-    weights = save(tensors, plain)
+    state = weights_of(content)
+    # Contiguous, and without shared memory, as the format demands.
+    tensors = {
+        name: value.detach().cpu().clone(memory_format=torch.contiguous_format)
+        for name, value in state.items()
+        if isinstance(value, Tensor)
+    }
+    weights = save(tensors, {name: json.dumps(value) for name, value in state.items() if name not in tensors})
     digest, steps, versions = hashlib.sha256(weights).hexdigest(), content["global_step"], installed_versions()
     training = files.Training(steps, windows, seed, validation, digest, versions, figures)
     count = sum(tensor.numel() for tensor in tensors.values())
@@ -73,22 +79,6 @@ def write_policy(folder: Path, content: Mapping[str, Any]) -> None:
         for file in draft.iterdir():
             with file.open("rb") as written:
                 os.fsync(written.fileno())
-
-
-def _split(state: Mapping[str, Any]) -> tuple[dict[str, str], dict[str, Tensor]]:
-    """Return what is plain in a state, as name → JSON, and the tensors; those within other parts have their path."""
-    plain, tensors = dict[str, str](), dict[str, Tensor]()
-    for name, value in state.items():
-        if isinstance(value, Tensor):
-            tensors[name] = value
-            continue
-        inner = {key: part for key, part in value.items() if isinstance(part, dict)} if isinstance(value, dict) else {}
-        parts = {key: part for key, part in inner.items() if all(isinstance(each, Tensor) for each in part.values())}
-        plain[name] = json.dumps({key: each for key, each in value.items() if key not in parts} if parts else value)
-        tensors |= {f"{name}/{key}/{each}": tensor for key, part in parts.items() for each, tensor in part.items()}
-    # Contiguous, and without shared memory, as the format demands.
-    whole = torch.contiguous_format
-    return plain, {name: each.detach().cpu().clone(memory_format=whole) for name, each in tensors.items()}
 
 
 def _card(config: Mapping[str, Any], spec: Mapping[str, Any], training: files.Training, count: int) -> str:

@@ -31,10 +31,12 @@ SAVE_EVERY = 500  # steps
 
 
 class GracefulStop(Checkpoint):
-    """Saves and stops after the current step at the first SIGINT or SIGTERM, and stops at once at the second.
+    """Saves `last.ckpt` every `SAVE_EVERY` steps, and stops a training at signals.
 
-    All processes of a training stop together. As a Lightning `Checkpoint` it runs after all other callbacks. It adds
-    `finished` and the training time `seconds` to every checkpoint.
+    At the first SIGINT or SIGTERM it saves and stops after the current step, in all processes together, at the second
+    at once. Where a validation follows a step, it comes first: a checkpoint from before would skip it when resumed. As
+    a Lightning `Checkpoint` it runs after all other callbacks. It adds `finished` and the training time `seconds` to
+    every checkpoint.
     """
 
     def __init__(self, checkpoints: Path) -> None:
@@ -78,16 +80,15 @@ class GracefulStop(Checkpoint):
     def on_train_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
     ) -> None:
-        """Stop if requested, unless gradients are being accumulated or a validation follows."""
+        """Save and stop as due, unless gradients are being accumulated or a validation follows."""
         self._step_complete = (batch_idx + 1) % trainer.accumulate_grad_batches == 0
-        if not _validates(trainer):
-            self._stop(trainer)
+        every = trainer.val_check_batch  # counted from the start of the training
+        validates = trainer.enable_validation and every and (trainer.fit_loop.total_batch_idx + 1) % every == 0
+        if not validates:
+            self.on_validation_end(trainer, pl_module)
 
     def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Stop after the validation of a step: a checkpoint from before would skip it when resumed."""
-        self._stop(trainer)
-
-    def _stop(self, trainer: Trainer) -> None:
+        """Save and stop as due."""
         if not self._step_complete:
             return
         # A signal to one process after this point takes effect in the next step.
@@ -97,6 +98,8 @@ class GracefulStop(Checkpoint):
             trainer.should_stop = True
             trainer.limit_val_batches = 0  # else Lightning validates again before it stops
             log.info("interrupted after %d steps, see %s; resume=last continues", trainer.global_step, self._path)
+        elif trainer.global_step % SAVE_EVERY == 0:
+            trainer.save_checkpoint(self._path, weights_only=False)
 
     def on_save_checkpoint(self, trainer: Trainer, pl_module: LightningModule, checkpoint: dict[str, Any]) -> None:
         """Add `finished` and `seconds`."""
@@ -122,41 +125,6 @@ class GracefulStop(Checkpoint):
                 raise
             what = str(error) if isinstance(error, ValueError) else f"{type(error).__name__}: {error}"
             raise UserError(f"{checkpoint} cannot be resumed: {what[:1000]}") from error
-
-
-class PeriodicCheckpoint(Checkpoint):
-    """Saves `last.ckpt` every `SAVE_EVERY` steps; if validation runs at that step, after it."""
-
-    def __init__(self, checkpoints: Path) -> None:
-        self._path, self._due, self._step = checkpoints / LAST, False, -1
-
-    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Count from this step: where gradients are accumulated, several batches have it."""
-        self._step = trainer.global_step
-
-    def on_train_batch_end(
-        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
-    ) -> None:
-        """Save if due, unless a validation follows."""
-        step = trainer.global_step
-        self._due, self._step = step != self._step and step % SAVE_EVERY == 0, step
-        if not _validates(trainer):
-            self._save(trainer)
-
-    def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Save if due."""
-        self._save(trainer)
-
-    def _save(self, trainer: Trainer) -> None:
-        if self._due:
-            self._due = False
-            trainer.save_checkpoint(self._path, weights_only=False)
-
-
-def _validates(trainer: Trainer) -> bool:
-    """Return whether a validation follows this batch, counted from the start of the training."""
-    every = trainer.val_check_batch
-    return bool(trainer.enable_validation and every and (trainer.fit_loop.total_batch_idx + 1) % every == 0)
 
 
 class AtomicCheckpointIO(TorchCheckpointIO):

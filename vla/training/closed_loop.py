@@ -5,10 +5,9 @@ from __future__ import annotations
 import logging
 import pickle
 from collections.abc import Callable, Sequence
-from contextlib import ExitStack, closing
+from contextlib import closing
 from functools import partial
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 import torch
@@ -76,7 +75,6 @@ class ClosedLoop(Callback):
         self._make_environment, self._seeds, self._workers = make_environment, seeds, workers
         self._make_player = partial(_Player, make_environment, make_policy)
         self._pool: ProcessPool | None = None
-        self._opened = ExitStack()
         self._path = run / BEST
         self._plays = self._played = False
         self.success, self.best = 0.0, -1.0
@@ -85,12 +83,11 @@ class ClosedLoop(Callback):
         """Enter the context; workers start in the first validation and wait for the next ones."""
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, where: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: Any) -> None:
         """End the workers."""
-        self._pool = None
-        self._opened.__exit__(kind, error, where)
+        if self._pool is not None:
+            self._pool.__exit__(*error)
+            self._pool = None
 
     def on_fit_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Build the environment before training, in case this machine cannot."""
@@ -131,7 +128,7 @@ class ClosedLoop(Callback):
                 with learner.evaluating():
                     return self._make_player().play(learner.model, seeds)
             if self._pool is None:
-                self._pool = self._opened.enter_context(ProcessPool(self._make_player, workers))
+                self._pool = ProcessPool(self._make_player, workers).__enter__()
             model = pickle.dumps(learner.model)
             parts = [seeds[worker::workers] for worker in range(workers)]
             pending = [self._pool.submit((model, part)) for part in parts]

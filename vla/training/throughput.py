@@ -9,31 +9,23 @@ import torch
 from lightning import Callback, LightningModule, Trainer
 from lightning.pytorch.callbacks import RichProgressBar
 
-from vla.models.flops import matmul_flops, peak_flops, training_flops
-from vla.models.learner import Learner
-
-PEAK_SECONDS = 0.1  # duration of the measurement of an unknown peak
-
 
 class Throughput(Callback):
     """Logs throughput between two log steps, without validation.
 
     - `pace/samples_per_s`: samples per second of all processes.
     - `pace/waiting`: share of the time in which this process waited for data, from `waited` [s] of the data loader.
-    - `pace/mfu`: model FLOPs utilisation (arXiv 2204.02311). Without a data sheet the peak is the best rate measured so
-      far, of matrix products or of the training itself.
     - `pace/memory_gb`: peak memory, on GPUs.
 
     Lightning's `ThroughputMonitor` synchronises the GPU in every step and does not measure data loading.
     """
 
     def __init__(self) -> None:
-        self._flops = self._peak = 0.0  # per step of this process; of its device [FLOP/s]
         self._batches, self._began, self._paused, self._waited = 0, 0.0, 0.0, 0.0
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Start the measurement."""
-        self._restart(trainer)
+        self._batches, self._began, self._waited = 0, time.perf_counter(), _waited(trainer)
 
     def on_validation_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Pause the measurement."""
@@ -42,15 +34,6 @@ class Throughput(Callback):
     def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Resume the measurement."""
         self._began += time.perf_counter() - self._paused
-
-    def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, batch: Any, batch_idx: int) -> None:
-        """Count the FLOPs of the first batch; all batches have the same size."""
-        assert isinstance(pl_module, Learner)
-        if not self._flops and pl_module.device_mesh is None:
-            device = pl_module.device
-            self._flops = training_flops(pl_module.model, batch)
-            self._peak = peak_flops(device, trainer.precision) or matmul_flops(device, trainer.precision, PEAK_SECONDS)
-            self._restart(trainer)
 
     def on_train_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
@@ -61,22 +44,14 @@ class Throughput(Callback):
         if not every or (batch_idx + 1) % every:
             return
         seconds = time.perf_counter() - self._began
-        samples = self._batches * trainer.world_size * len(batch["action"])
         pace = {
-            "pace/samples_per_s": samples / seconds,
+            "pace/samples_per_s": self._batches * trainer.world_size * len(batch["action"]) / seconds,
             "pace/waiting": (_waited(trainer) - self._waited) / seconds,
         }
-        if self._flops:  # unknown for sharded weights, which cannot be copied
-            rate = self._flops * self._batches / seconds
-            self._peak = max(self._peak, rate)
-            pace["pace/mfu"] = rate / self._peak
         if pl_module.device.type == "cuda":
             pace["pace/memory_gb"] = torch.cuda.max_memory_allocated(pl_module.device) / 1e9
         pl_module.log_dict(pace)
-        self._restart(trainer)
-
-    def _restart(self, trainer: Trainer) -> None:
-        self._batches, self._began, self._waited = 0, time.perf_counter(), _waited(trainer)
+        self.on_train_start(trainer, pl_module)
 
 
 def _waited(trainer: Trainer) -> float:

@@ -15,6 +15,7 @@ import numpy as np
 import torch
 from lightning import Callback, LightningModule, Trainer
 from lightning.pytorch.accelerators import CPUAccelerator
+from lightning.pytorch.callbacks import Checkpoint
 from lightning.pytorch.loggers import CSVLogger, Logger
 from lightning.pytorch.plugins.layer_sync import TorchSyncBatchNorm
 from lightning.pytorch.strategies import ParallelStrategy
@@ -25,7 +26,7 @@ from vla.io.errors import UserError
 from vla.models.checkpoint import read_header
 from vla.parallel.limits import cores
 from vla.runs.folder import METRICS, metric_rows
-from vla.training.checkpoints import AtomicCheckpointIO, PeriodicCheckpoint
+from vla.training.checkpoints import AtomicCheckpointIO
 from vla.training.ema import EMA
 from vla.training.throughput import Throughput, TrainingProgressBar
 
@@ -69,7 +70,7 @@ class SyncBatchNorm(TorchSyncBatchNorm):
 
 
 def make_trainer(config: Mapping[str, Any], checkpoints: Path | None, *callbacks: Callback) -> Trainer:
-    """Create the trainer of a config, with EMA and, if a checkpoint folder is given, logging and periodic checkpoints.
+    """Create the trainer of a config, with EMA and, if a checkpoint folder is given, logging.
 
     The given callbacks run before EMA at the end of a validation, so that they use the EMA weights.
 
@@ -77,49 +78,48 @@ def make_trainer(config: Mapping[str, Any], checkpoints: Path | None, *callbacks
         UserError: the machine lacks what the config requires, or a logger's package is missing.
     """
     _keep_freed_memory()
-    all_callbacks: list[Callback] = [TrainingProgressBar(), *callbacks]
-    options: dict[str, Any] = {"logger": False, "enable_checkpointing": False}
-    if config["learner"].get("ema"):
-        all_callbacks.append(EMA(config["learner"]["ema"]))
-    if checkpoints is not None:
-        all_callbacks += [Throughput(), PeriodicCheckpoint(checkpoints)]
-        options = {"logger": _loggers(config, checkpoints.parent)}
-    all_callbacks.append(StepSeeding(config["seed"]))  # after callbacks that may use random numbers
-    try:
-        node = dict(config["trainer"])
-        options["precision"] = PRECISIONS[node.pop("precision")]
-        if node.get("sync_batchnorm"):
-            options["plugins"] = [SyncBatchNorm()]
-        trainer: Trainer = build(node, "trainer", callbacks=all_callbacks, **options)
-        if isinstance(trainer.strategy, ParallelStrategy) and trainer.strategy.cluster_environment:
-            # Compare the number of processes with the cluster now; Lightning would only at the start of training.
-            trainer.strategy.cluster_environment.validate_settings(trainer.num_devices, trainer.num_nodes)
-    except RuntimeError as error:  # a cluster started another number of processes
-        raise UserError(f"training cannot start in this environment: {error}") from error
-    except (MisconfigurationException, ValueError) as error:
-        names = ("accelerator", "devices", "num_nodes", "strategy", "precision")
-        values = {name: config["trainer"][name] for name in names if name in config["trainer"]}
-        options_text = [f"trainer.{name}={value}" for name, value in values.items() if not isinstance(value, dict)]
-        raise UserError(
-            f"{' '.join(options_text)} is not available here ({error}): try trainer=cpu or trainer=auto"
-        ) from error
-    _require_cores(trainer)
-    trainer.strategy.checkpoint_io = AtomicCheckpointIO()
-    return trainer
-
-
-def _require_cores(trainer: Trainer) -> None:
-    """Raise a UserError for more processes on this CPU than it has cores, unless a cluster started them.
-
-    Two are always allowed, as the smallest training of several processes to try.
-    """
+    decay = config["learner"].get("ema")
+    trainer = _trainer(
+        config["trainer"],
+        callbacks=[
+            TrainingProgressBar(),
+            *callbacks,
+            *([EMA(decay)] if decay else []),
+            *([Throughput()] if checkpoints else []),
+            StepSeeding(config["seed"]),  # after callbacks that may use random numbers
+        ],
+        logger=_loggers(config, checkpoints.parent) if checkpoints else False,
+        enable_checkpointing=any(isinstance(each, Checkpoint) for each in callbacks),  # else Lightning adds its own
+    )
     environment = getattr(trainer.strategy, "cluster_environment", None)
     external = environment is not None and environment.creates_processes_externally
+    # Two processes are always allowed, as the smallest training of several to try.
     if isinstance(trainer.accelerator, CPUAccelerator) and not external and trainer.num_devices > max(cores(), 2):
         raise UserError(
             f"trainer.devices={trainer.num_devices} asks for more processes than this machine has cores: set "
             f"trainer.devices={cores()} or fewer"
         )
+    trainer.strategy.checkpoint_io = AtomicCheckpointIO()
+    return trainer
+
+
+def _trainer(node: Mapping[str, Any], **options: Any) -> Trainer:
+    """Build the trainer of a node; a UserError if the machine, or a cluster, lacks what it requires."""
+    options |= {"precision": PRECISIONS[node["precision"]]}
+    if node.get("sync_batchnorm"):
+        options["plugins"] = [SyncBatchNorm()]
+    try:
+        own = {name: value for name, value in node.items() if name != "precision"}
+        trainer: Trainer = build(own, "trainer", **options)
+        if isinstance(trainer.strategy, ParallelStrategy) and trainer.strategy.cluster_environment:
+            # Compare the number of processes with the cluster now; Lightning would only at the start of training.
+            trainer.strategy.cluster_environment.validate_settings(trainer.num_devices, trainer.num_nodes)
+    except (MisconfigurationException, RuntimeError, ValueError) as error:
+        names = ("accelerator", "devices", "num_nodes", "strategy", "precision")
+        chosen = {name: node[name] for name in names if isinstance(node.get(name), str | int)}
+        options_text = " ".join(f"trainer.{name}={value}" for name, value in chosen.items())
+        raise UserError(f"{options_text} is not available here ({error}): try trainer=cpu or trainer=auto") from error
+    return trainer
 
 
 @contextmanager

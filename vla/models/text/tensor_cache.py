@@ -12,7 +12,7 @@ ENTRY = 500  # of the objects of an entry [bytes], measured
 
 
 class TensorCache:
-    """Cache of the most recently used tensors, by keys that hold a text.
+    """Cache of the most recently used tensors, by keys that hold a text; in another process it begins empty.
 
     Args:
         most: upper bound of its memory [bytes]; a tensor that alone exceeds it is not kept.
@@ -22,6 +22,9 @@ class TensorCache:
         self._most, self.size = most, 0  # [bytes]
         self._entries: OrderedDict[Hashable, tuple[Tensor, int]] = OrderedDict()
         self._lock = Lock()
+
+    def __reduce__(self) -> tuple[type[TensorCache], tuple[int]]:
+        return TensorCache, (self._most,)
 
     def get(self, text: str, make: Callable[[], Tensor], *options: Hashable) -> Tensor:
         """Return the tensor of a text and further options; `make` computes one that is not there."""

@@ -1,14 +1,15 @@
-"""Tokenisation error of actions."""
+"""What actions lose as tokens.
 
-# N chunks, k actions of a chunk, D action components, L tokens of a sequence
+Shapes: N chunks, k actions of a chunk, D action components.
+"""
 
 from __future__ import annotations
 
 import numpy as np
 import torch
 
-from vla.models.tokenizers.tokenizer import ActionTokenizer
-from vla.spec import Spec, readable
+from vla.models.tokenizers.tokenizer import MIN_SPAN, ActionTokenizer
+from vla.spec import Spec
 
 
 def out_of_bounds(tokenizer: ActionTokenizer, chunks: np.ndarray) -> float:
@@ -17,23 +18,10 @@ def out_of_bounds(tokenizer: ActionTokenizer, chunks: np.ndarray) -> float:
     return float(((actions < tokenizer.low - slack) | (actions > tokenizer.high + slack)).float().mean())
 
 
-def describe_tokenization_error(tokenizer: ActionTokenizer, chunks: np.ndarray, spec: Spec) -> str:
-    """Describe the error of (N, k, D) chunks after tokenisation in one line: mean error, bias and maximum error.
-
-    For each unit and each of the three, it is the worst component, in readable units.
-    """
+def rounding(tokenizer: ActionTokenizer, chunks: np.ndarray, spec: Spec) -> tuple[str, float]:
+    """Return the component of (N, k, D) chunks that loses most as tokens, and its mean error, a share of its range."""
     actions = torch.from_numpy(np.array(chunks, np.float32))
-    tokens = tokenizer.tokenize(actions)  # (N, L)
-    error = (tokenizer.detokenize(tokens) - actions).flatten(0, 1)  # (N·k, D)
-    errors = []
-    for unit in dict.fromkeys(spec.units):
-        of_unit = [index for index, other in enumerate(spec.units) if other == unit]
-        scale, name = readable(unit)
-        part = scale * error[:, of_unit]
-        bias, largest = part.mean(0).abs().max(), part.abs().max()
-        named = name or f"of {', '.join(spec.action[index] for index in of_unit)}"
-        errors.append(f"{part.abs().mean(0).max():.3f} {named} (bias {bias:.3f}, at most {largest:.3f})")
-    valid = torch.ones(actions.shape[:2], dtype=torch.bool)
-    length = tokenizer.loss_mask(tokens, valid, valid[:, 0]).sum()
-    per_action = f"{length / (len(chunks) * chunks.shape[1]):.3g} tokens per action"
-    return f"{', '.join(errors)}; {tokenizer.vocabulary_usage(tokens)}; {per_action}"
+    error = (tokenizer.detokenize(tokenizer.tokenize(actions)) - actions).abs().mean((0, 1)).numpy()  # (D,)
+    span = np.maximum(chunks.max((0, 1)) - chunks.min((0, 1)), MIN_SPAN * (np.array(spec.high) - np.array(spec.low)))
+    worst = int((error / span).argmax())
+    return spec.action[worst], float(error[worst] / span[worst])

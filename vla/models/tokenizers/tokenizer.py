@@ -6,7 +6,6 @@ dimensions.
 
 from __future__ import annotations
 
-import logging
 import math
 from abc import ABC, abstractmethod
 from typing import Protocol
@@ -19,8 +18,6 @@ from torch import Tensor, nn
 from vla.io.errors import UserError
 from vla.io.types import Bins, Natural, NonNegative
 from vla.spec import Spec
-
-log = logging.getLogger(__name__)
 
 # Fixed bounds of RT-1: 1 m, a right angle, and a gripper command of one (arXiv 2212.06817).
 RT1_BOUNDS = {"m": 1.0, "rad": math.pi / 2, "1": 1.0}
@@ -86,10 +83,6 @@ class ActionTokenizer(nn.Module, ABC):
     def loss_mask(self, tokens: Tensor, valid: Tensor, unperturbed: Tensor) -> Tensor:
         """Return the (…, L) bool loss mask, given the (…, k) bool mask of actions and the (…) one of whole chunks."""
 
-    @abstractmethod
-    def vocabulary_usage(self, tokens: Tensor) -> str:
-        """Describe how much of the vocabulary appears in (N, L) tokens, for the log."""
-
     def token_losses(self, logits: Tensor, tokens: Tensor, actions: Tensor) -> Tensor:
         """Return the (…, L) losses of (…, L, K) logits against the (…, L) tokens of (…, k, D) actions."""
         return _hard_cross_entropy(logits, tokens)
@@ -148,11 +141,6 @@ class PerComponent(ActionTokenizer):
     def actions(self, logits: Tensor, tokens: Tensor) -> Tensor:
         """Decode (…, k·D, K) logits as (…, k, D) actions."""
         return self.decode_logits(self._split(logits, -2))
-
-    def vocabulary_usage(self, tokens: Tensor) -> str:
-        """Describe the smallest and largest number of used bins over the components."""
-        counts = [len(of_one.unique()) for of_one in self._split(tokens, -1).unbind(-1)]
-        return f"{min(counts)} to {max(counts)} of {self.bins} bins used"
 
     def _split(self, values: Tensor, dim: int) -> Tensor:
         return values.unflatten(dim, (-1, self.components))
@@ -268,14 +256,7 @@ def data_bounds(spec: Spec, statistics: ActionStatistics | None, margin: float =
             f"the statistics describe actions of {low.size} components, the spec has {len(spec.action)}: "
             f"{', '.join(spec.action)}"
         )
-    min_span = MIN_SPAN * (allowed_high - allowed_low)
-    constant = [name for name, narrow in zip(spec.action, high - low < min_span, strict=True) if narrow]
-    if constant:
-        names = ", ".join(constant)
-        log.info(
-            "components that hardly vary in the demonstrations, with bins over %g of the range: %s", MIN_SPAN, names
-        )
-    span = np.maximum(high - low, min_span)
+    span = np.maximum(high - low, MIN_SPAN * (allowed_high - allowed_low))
     half = (0.5 + margin) * span
     return (low + high) / 2 - half, (low + high) / 2 + half
 

@@ -6,8 +6,6 @@ Shapes: N images, C channels, H by W pixels, h by w positions of a feature map.
 from __future__ import annotations
 
 import logging
-from difflib import get_close_matches
-from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +13,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from vla.io.documents import lines_of
 from vla.io.errors import UserError
+from vla.io.suggestion import suggestion
 from vla.io.types import Pixels, Width
 from vla.models.hub import fetch
 from vla.models.packaged import PackagedFile
@@ -24,6 +24,7 @@ from vla.models.vision.image_tokenizer import FiLM, ImageEncoder
 log = logging.getLogger(__name__)
 
 WEIGHTS = "model.safetensors"  # file name of timm's weights on the hub
+Pretrained = bool | str | PackagedFile
 
 
 def synchronised(model: nn.Module) -> nn.Module:
@@ -62,21 +63,16 @@ class FilmEfficientNet(ImageEncoder):
         name: an EfficientNet of timm.
         pretrained: true downloads timm's weights or fails; false initialises at random; "auto" downloads them or
             initialises at random with a warning; another text is the path of a weights file (.safetensors or .pth),
-            which may also lie in a Python package. Empty if a checkpoint is loaded next.
+            which may also lie in a Python package.
         channels: C of the feature map.
         text_width: length of the text vector.
     """
 
-    def __init__(
-        self,
-        name: str,
-        pretrained: bool | str | PackagedFile,
-        channels: Width,
-        *,
-        text_width: int,
-    ) -> None:
+    def __init__(self, name: str, pretrained: Pretrained, channels: Width, *, text_width: int) -> None:
         super().__init__(channels)
-        net = load_backbone(name, pretrained, kind="efficientnet")
+        net = load_backbone(name, pretrained)
+        if not hasattr(net, "conv_stem"):
+            raise UserError(f"model.image.name={name} is no EfficientNet: model/image=timm takes any network of timm")
         self.normalize = Normalize(net)
         self.stem = nn.Sequential(net.conv_stem, net.bn1)
         self.blocks = nn.ModuleList(block for stage in net.blocks for block in stage)
@@ -112,14 +108,7 @@ class FilmBackbone(ImageEncoder):
     """
 
     def __init__(
-        self,
-        name: str,
-        pretrained: bool | str | PackagedFile,
-        frozen: bool,
-        size: Pixels | None,
-        channels: Width,
-        *,
-        text_width: int,
+        self, name: str, pretrained: Pretrained, frozen: bool, size: Pixels | None, channels: Width, *, text_width: int
     ) -> None:
         super().__init__(channels)
         self.backbone = load_backbone(name, pretrained, size=size)
@@ -151,11 +140,10 @@ class FilmBackbone(ImageEncoder):
         return self.film(self.projection(features), text)
 
 
-def load_backbone(name: str, pretrained: bool | str | PackagedFile, kind: str = "", size: int | None = None) -> Any:
+def load_backbone(name: str, pretrained: Pretrained, size: int | None = None) -> Any:
     """Create a timm network without its classifier; `pretrained` as in `FilmEfficientNet`.
 
     Args:
-        kind: required part of the name.
         size: height and width of the images [px], for networks with a fixed input size.
 
     Raises:
@@ -163,53 +151,43 @@ def load_backbone(name: str, pretrained: bool | str | PackagedFile, kind: str = 
     """
     import timm  # slow to import, not needed by every policy
 
-    pattern = f"*{kind}*"
-    known = {*timm.list_models(pattern), *timm.list_pretrained(pattern)}
+    known = [*timm.list_models(), *timm.list_pretrained()]
     if name not in known:
-        close = ", ".join(get_close_matches(name, known, 5, 0))
-        raise UserError(f"timm has no {kind or 'network'} called '{name}', it has {close} and others")
+        raise UserError(f"model.image.name={name} is no network of timm{suggestion(name, known)}")
     config: Any = timm.get_pretrained_cfg(name)
     options: dict[str, Any] = {"num_classes": 0, "img_size": size if config.fixed_input_size else None}
-    if isinstance(pretrained, PackagedFile):
-        folder = pretrained.from_hub(WEIGHTS)
-        source = folder / WEIGHTS if folder else pretrained
-    else:
-        source = _weights_file(name, config.hf_hub_id, pretrained)
-    if source is None:
+    path = _weights_file(name, config.hf_hub_id, pretrained)
+    if path is None:
         return timm.create_model(name, **options)
-    path = source.source if isinstance(source, PackagedFile) else source
+    classifiers = (config.classifier,) if isinstance(config.classifier, str) else config.classifier or ()
+    prefixes = tuple(f"{each}." for each in classifiers)
     # Without a classifier in network and file, timm loads the weights strictly.
-    weights = _without_classifier(_renamed(_read(source), name), config.classifier)
-    if not weights:
-        raise UserError(f"{path} holds no weights")
+    weights = {key: value for key, value in _read(path, name).items() if not key.startswith(prefixes)}
     overlay = {"state_dict": weights, "classifier": None, "num_classes": 0}
     try:
         net: Any = timm.create_model(name, pretrained=True, pretrained_cfg_overlay=overlay, **options)
     except RuntimeError as error:
-        raise UserError(f"{path} does not hold the weights of timm's {name}: {str(error).splitlines()[-1]}") from error
+        raise UserError(f"{path} does not hold the weights of timm's {name}: {lines_of(error)[-1]}") from error
     del net.pretrained_cfg["state_dict"]
     log.info("%s: weights loaded from %s", name, path)
     return net
 
 
-def _weights_file(name: str, repository: str | None, pretrained: bool | str) -> Path | None:
+def _weights_file(name: str, repository: str | None, pretrained: Pretrained) -> Path | None:
     """Return the file of the initial weights, downloaded if necessary; None for random initialisation."""
-    if pretrained == "":
-        return None
+    if isinstance(pretrained, PackagedFile):
+        found = pretrained.locate(WEIGHTS)
+        return found / WEIGHTS if found.is_dir() else found
     if not pretrained:
-        log.info("%s is built without pretrained weights", name)
         return None
     if isinstance(pretrained, str) and pretrained != "auto":
-        path = Path(pretrained)
-        if not path.is_file():
+        if not Path(pretrained).is_file():
             raise UserError(
-                f"model.image.pretrained is true, false, auto or a weights file, and there is no file {path}"
+                f"model.image.pretrained is true, false, auto or a weights file, and there is no file {pretrained}"
             )
-        return path
+        return Path(pretrained)
     try:
-        if repository is None:
-            raise OSError("timm names none")
-        return fetch(repository, WEIGHTS) / WEIGHTS
+        return fetch(repository or f"timm/{name}", WEIGHTS) / WEIGHTS
     except OSError as error:
         if pretrained is True:
             raise UserError(
@@ -220,42 +198,27 @@ def _weights_file(name: str, repository: str | None, pretrained: bool | str) -> 
         return None
 
 
-def _read(source: Path | PackagedFile) -> dict[str, Tensor]:
-    """Read weights; of a pickle only tensors are read."""
-    from safetensors.torch import load_file
+def _read(path: Path, name: str) -> dict[str, Tensor]:
+    """Read the weights of the network `name`; of a pickle only tensors are read.
 
-    path = source.source if isinstance(source, PackagedFile) else source
-    content = BytesIO(source.read()) if isinstance(source, PackagedFile) else source
-    try:
-        if isinstance(content, Path) and content.suffix == ".safetensors":
-            return load_file(content)
-        weights = dict(torch.load(content, map_location="cpu", weights_only=True))
-        if not all(isinstance(each, Tensor) for each in weights.values()):
-            raise UserError("it holds something else than tensors")
-        return weights
-    except Exception as error:  # a pickle can raise nearly anything
-        raise UserError(f"{path} cannot be read as weights, it is damaged or something else") from error
-
-
-def _renamed(weights: dict[str, Tensor], name: str) -> dict[str, Tensor]:
-    """Return weights under timm's names if they have those of efficientnet_pytorch.
-
-    Both packages register their layers in the order of execution, so the tensors stand in the same order. Unless also
-    the last parts of all names and the shapes agree, nothing is renamed, and timm refuses them.
+    Weights of efficientnet_pytorch get timm's names: both packages register their layers in the order of execution, so
+    the tensors stand in the same order. If their shapes disagree, timm refuses them.
     """
     import timm
+    from safetensors.torch import load_file
 
-    if "_conv_stem.weight" not in weights:
-        return weights
-    with torch.device("meta"):
-        own = timm.create_model(name).state_dict()
-    kinds = [[(key.rpartition(".")[2], value.shape) for key, value in state.items()] for state in (own, weights)]
-    return dict(zip(own, weights.values(), strict=True)) if kinds[0] == kinds[1] else weights
-
-
-def _without_classifier(weights: dict[str, Tensor], classifier: str | tuple[str, ...] | None) -> dict[str, Tensor]:
-    names = (classifier,) if isinstance(classifier, str) else classifier or ()
-    return {key: value for key, value in weights.items() if not key.startswith(tuple(f"{name}." for name in names))}
+    try:
+        if path.suffix == ".safetensors":
+            return load_file(path)
+        weights: dict[str, Tensor] = dict(torch.load(path, map_location="cpu", weights_only=True))
+        if not weights or not all(isinstance(each, Tensor) for each in weights.values()):
+            raise ValueError
+    except Exception as error:  # a pickle can raise nearly anything
+        raise UserError(f"{path} cannot be read as weights, it is damaged or something else") from error
+    if "_conv_stem.weight" in weights:
+        with torch.device("meta"):
+            weights = dict(zip(timm.create_model(name).state_dict(), weights.values(), strict=False))
+    return weights
 
 
 def _output_channels(block: nn.Module) -> int:
