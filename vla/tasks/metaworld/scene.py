@@ -11,7 +11,7 @@ from PIL import Image
 from vla.io.errors import UserError
 from vla.spec import Array
 from vla.tasks.metaworld.package import simulator
-from vla.tasks.rendering.renderer import WHOLE, Renderer, RendererFactory, View
+from vla.tasks.rendering.renderer import WHOLE, Renderer, RendererFactory, Views
 
 HALF_TURN = np.array([0.0, 0.0, 0.0, 1.0])  # about the optical axis, quaternion wxyz
 # LeRobot (src/lerobot/envs/metaworld.py) moves this camera, which hangs upside down, and turns its pictures.
@@ -71,7 +71,7 @@ class Scene:
         height, width = image_size if drawn is None else (drawn, drawn)
         self._places = [known.index(CAMERA if name == HAND else name) for name in cameras]
         seen = self._places if drawn is None else sorted(set(self._places))  # all of a camera's picture once
-        self._view = View(seen, height, width, site_groups=(0, 1, 2), aspect=1.0)
+        self._view = Views(seen, height, width, site_groups=(0, 1, 2), aspect=1.0)
         self._camera = camera
         self._renderer_factory = renderer
         self._renderer: Renderer | None = None

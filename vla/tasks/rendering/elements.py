@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 
 from vla.spec import Array
-from vla.tasks.rendering.renderer import View
+from vla.tasks.rendering.renderer import Views
 
 OPAQUE = 0.995  # smallest alpha of an opaque element in MuJoCo
 DEFAULT_RGBA = (0.5, 0.5, 0.5, 1.0)  # of a geom that shows its material's colour
@@ -21,7 +21,7 @@ class Elements:
 
     kind: Array  # (E,) mjtGeom
     mesh: Array  # (E,) id of the mesh, or -1
-    size: Array  # (E, 3) along x, y and z [m]
+    size: Array  # (E, 3) half sizes along x, y and z [m]
     rgba: Array  # (E, 4)
     material: Array  # (E,) id, or -1
     texture: Array  # (E,) id, or -1
@@ -34,10 +34,12 @@ class Elements:
         return self.seen & (self.rgba[:, 3] >= OPAQUE)
 
 
-def elements_of(model: mujoco.MjModel, view: View) -> Elements:
+def elements_of(model: mujoco.MjModel, views: Views) -> Elements:
     """Read the elements' present appearance from a model."""
-    both = lambda name: np.concatenate([getattr(model, f"geom_{name}"), getattr(model, f"site_{name}")])  # noqa: E731
-    kind, material, rgba = both("type"), both("matid"), both("rgba")
+    kind, material, rgba, size, group = (
+        np.concatenate([getattr(model, f"geom_{name}"), getattr(model, f"site_{name}")])
+        for name in ("type", "matid", "rgba", "size", "group")
+    )
     mesh = np.concatenate([model.geom_dataid, np.full(model.nsite, -1, np.int32)])
     light, texture = np.tile(np.array([0.0, 0.5, 0.5], np.float32), (len(kind), 1)), np.full(len(kind), -1, np.int32)
     with_material = np.flatnonzero(material >= 0)
@@ -48,29 +50,21 @@ def elements_of(model: mujoco.MjModel, view: View) -> Elements:
         names = ("mat_emission", "mat_specular", "mat_shininess")
         light[with_material] = np.stack([getattr(model, name)[chosen] for name in names], axis=1)
         texture[with_material] = model.mat_texid[chosen, RGB_ROLE]
-    groups = np.clip(both("group"), 0, mujoco.mjNGROUP - 1)
-    shown = np.concatenate(
-        [
-            np.isin(groups[: model.ngeom], list(view.geom_groups)),
-            np.isin(groups[model.ngeom :], list(view.site_groups)),
-        ]
-    )
-    return Elements(kind, mesh, _sizes(kind, both("size")), rgba, material, texture, light, shown & (rgba[:, 3] > 0))
-
-
-def _sizes(kind: Array, size: Array) -> Array:
-    """Return (E, 3) half sizes along x, y and z [m] of MuJoCo's sizes, which start with the radius of round shapes."""
-    sizes = size.astype(np.float32)
+    group = np.clip(group, 0, mujoco.mjNGROUP - 1)
+    shown = np.isin(group, list(views.geom_groups))
+    shown[model.ngeom :] = np.isin(group[model.ngeom :], list(views.site_groups))
+    # MuJoCo's sizes start with the radius of round shapes.
+    size = size.astype(np.float32)
     round_ = np.isin(kind, (mujoco.mjtGeom.mjGEOM_CAPSULE, mujoco.mjtGeom.mjGEOM_CYLINDER))
-    sizes[round_] = sizes[round_][:, [0, 0, 1]]
+    size[round_] = size[round_][:, [0, 0, 1]]
     ball = kind == mujoco.mjtGeom.mjGEOM_SPHERE
-    sizes[ball] = sizes[ball][:, [0, 0, 0]]
-    return sizes
+    size[ball] = size[ball][:, [0, 0, 0]]
+    return Elements(kind, mesh, size, rgba, material, texture, light, shown & (rgba[:, 3] > 0))
 
 
-def unsupported(model: mujoco.MjModel, view: View) -> list[str]:
+def unsupported(model: mujoco.MjModel, views: Views) -> list[str]:
     """Name what MuJoCo's renderer would draw of a model and the fast one does not."""
-    elements = elements_of(model, view)
+    elements = elements_of(model, views)
     infinite = (elements.kind == mujoco.mjtGeom.mjGEOM_PLANE) & (elements.size[:, :2] <= 0).any(axis=1)
     sky = (model.tex_type == mujoco.mjtTexture.mjTEXTURE_SKYBOX).any()
     odd = (mujoco.mjtLightType.mjLIGHT_POINT, mujoco.mjtLightType.mjLIGHT_IMAGE)

@@ -16,7 +16,7 @@ from vla.io.types import Count, ImageSize, Names, Point, Positive
 from vla.spec import FIRST_SEED, Array, Observation, Shape, Spec
 from vla.tasks.blind import Blindable
 from vla.tasks.gl import require_backend
-from vla.tasks.rendering.renderer import Renderer, RendererFactory, View
+from vla.tasks.rendering.renderer import Renderer, RendererFactory, Views
 from vla.tasks.tabletop.expert import Waypoint
 from vla.tasks.tabletop.file_robot import FileRobot
 from vla.tasks.tabletop.goals.chain import Chain
@@ -222,7 +222,7 @@ class Tabletop(Blindable):
         if self._renderer is None:
             compiled, (height, width) = self.simulation.compiled, self.spec.image_size
             cameras = [compiled.cameras[name] for name in self.spec.cameras]
-            view = View(cameras, height, width, geom_groups=(VISIBLE,))
+            view = Views(cameras, height, width, geom_groups=(VISIBLE,))
             self._renderer = self._renderer_factory.open(compiled.model, view)
         return self._renderer
 
