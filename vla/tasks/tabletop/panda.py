@@ -30,7 +30,7 @@ from vla.tasks.tabletop.robot import (
     ROBOT_CONTACT,
     VISIBLE,
     CameraPose,
-    Robot,
+    TabletopRobot,
     look_at,
     spread,
 )
@@ -89,7 +89,7 @@ def read_corners(path: Path) -> Array:
     return np.unique(np.fromfile(path, triangle, offset=84)["corners"].reshape(-1, 3), axis=0)
 
 
-class Panda(Robot):
+class Panda(TabletopRobot):
     """Seven position-servoed joints with gravity compensation and a gripper whose fingers share one servo."""
 
     prefix = "panda/"

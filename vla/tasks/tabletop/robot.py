@@ -57,7 +57,7 @@ def spread(points: Array, count: int) -> Array:
     return points[chosen]
 
 
-class Robot:
+class TabletopRobot:
     """An arm with position servos and a gripper whose two sides close along the y axis of the tool.
 
     The z axis of the tool points out of the gripper. A gripper command is 0 when closed and `travel` when open.

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from dm_control import mjcf
 
-from vla.tasks.tabletop.robot import PHYSICS, VISIBLE, CameraPose, Robot, look_at
+from vla.tasks.tabletop.robot import PHYSICS, VISIBLE, CameraPose, TabletopRobot, look_at
 
 COLOURS: dict[str, tuple[float, float, float]] = {
     "red": (0.85, 0.10, 0.10),
@@ -55,7 +55,7 @@ class Block:
 class Scene:
     """The complete scene; `CompiledScene` indexes its compiled model."""
 
-    def __init__(self, robot: Robot, blocks: int, shadows: bool = True) -> None:
+    def __init__(self, robot: TabletopRobot, blocks: int, shadows: bool = True) -> None:
         """Args: the robot; number of blocks; whether the lamp casts shadows."""
         self._root = mjcf.RootElement(model="tabletop")
         self._root.compiler.angle = "radian"

@@ -350,7 +350,7 @@ class Simulation:
             "skill": np.array([float(SKILLS.index(now.skill))]),
             "tolerance": np.array([now.tolerance]),
             "widest": np.array([self.scene.robot.widest]),  # opening of the gripper
-            "tip": np.array(self.scene.robot.tip),  # (4,) as of `Robot`
+            "tip": np.array(self.scene.robot.tip),  # (4,) as of `TabletopRobot`
         }
 
     @property
