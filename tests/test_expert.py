@@ -55,7 +55,7 @@ def test_wide_randomisation_is_within_the_experts_reach(goal: str) -> None:
 def test_wide_fingers_push_with_their_upright_side_and_are_not_led_astray_while_they_touch() -> None:
     """In episodes in which the wedge of these fingers lifted the block or pressed it down."""
     environment = make_tabletop("task/robot=jaco", "task/goal=push")
-    forward, aside, below, middle = environment.simulation.scene.robot.tip
+    forward, aside, below, middle = environment.simulation.compiled.robot.tip
     assert forward < aside < 0.05 and 0 < below < 0.02 and middle == 0
     stubborn = perturbed(environment.spec, unturned=1.0, start=0.0)
     with environment.blind():

@@ -47,7 +47,7 @@ def test_depth_is_the_distance_along_the_optical_axis(tabletop: Tabletop) -> Non
     compiled = environment.simulation.compiled
     # Look at bare table, far from everything.
     position, spot = np.array([0.9, -0.6, 0.5]), np.array([0.7, -0.6, 0.0])
-    from vla.tasks.tabletop.scene import look_at
+    from vla.tasks.tabletop.robot import look_at
 
     camera = compiled.cameras["front"]
     compiled.model.cam_pos[camera] = position

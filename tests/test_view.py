@@ -26,7 +26,7 @@ from vla.deploy.view import View, expected_pictures
 from vla.io.types import Images
 from vla.robots.panda import CHAIN
 from vla.spec import RobotModel, Shell
-from vla.tasks.tabletop.arm import Arm
+from vla.tasks.tabletop.panda import PandaShell
 
 FIGURES = ("image age p50", "image age p99", "inference p50", "inference p99", "tick p50", "tick p99", "wait p50")
 
@@ -135,7 +135,7 @@ def test_the_arm_stands_as_joint_states_say(drawn: Callable[..., dict[str, list[
         ("/joint_states", JointState(name=names, position=[float("nan")] * 9)),
         ("/joint_states", JointState(name=names[:3], position=[0.0] * 3)),
         ("/joint_states", still),
-        shell=Arm(),
+        shell=PandaShell(),
     )
     assert "/world/arm" not in chunks
     (hand,) = values(chunks["/world/panda.hand"], "translation")
@@ -152,7 +152,7 @@ def test_any_other_arm_is_drawn_as_lines_between_its_joints(drawn: Callable[...,
     chunks = drawn(
         described(joints, ["claw"], chain),
         ("/states", JointState(name=["claw", *joints], position=[0.01, *positions])),
-        shell=Arm(),
+        shell=PandaShell(),
     )
     (lines,) = values(chunks["/world/arm"], "strips")
     np.testing.assert_allclose(lines, [[0, 0, 0.1 * each] for each in range(7)] + [[-0.1, 0, 0.6]], atol=1e-6)

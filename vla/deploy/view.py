@@ -269,7 +269,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m vla.deploy.view", description=__doc__.splitlines()[0])
     parser.add_argument("--save", type=Path, metavar="FILE.rrd", help="write a recording instead of opening the viewer")
     parser.add_argument("--network", choices=NETWORKS, default="loopback")
-    parser.add_argument("--shell", metavar="CLASS", help="surface of the arm, such as vla.tasks.tabletop.arm.Arm")
+    parser.add_argument(
+        "--shell", metavar="CLASS", help="surface of the arm, such as vla.tasks.tabletop.panda.PandaShell"
+    )
     parser.add_argument(
         "--expected", type=Path, metavar="STORE", help="episodes whose pictures the cameras should give"
     )

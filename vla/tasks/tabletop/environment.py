@@ -17,6 +17,7 @@ from vla.spec import FIRST_SEED, Array, Observation, Shape, Spec
 from vla.tasks.blind import Blindable
 from vla.tasks.gl import require_backend
 from vla.tasks.rendering.renderer import Renderer, RendererFactory, Views
+from vla.tasks.tabletop.compiled_scene import CompiledScene
 from vla.tasks.tabletop.expert import Waypoint
 from vla.tasks.tabletop.file_robot import FileRobot
 from vla.tasks.tabletop.goals.chain import Chain
@@ -26,7 +27,7 @@ from vla.tasks.tabletop.panda import Panda
 from vla.tasks.tabletop.randomize.randomizer import Randomizer
 from vla.tasks.tabletop.robot import VISIBLE
 from vla.tasks.tabletop.robot_file import RobotFile
-from vla.tasks.tabletop.scene import COLOURS, Scene
+from vla.tasks.tabletop.scene import COLOURS
 from vla.tasks.tabletop.simulation import CONTROL_HZ, Simulation
 
 TRANSLATION = 0.04  # largest translation per step [m]
@@ -99,7 +100,7 @@ class Tabletop(Blindable):
             truth=(("tcp", 3), ("block", 3), ("destination", 3), ("faces", 2)),
             robot=arm,
         )
-        scene = Scene(chosen, blocks=blocks, shadows=shadows)
+        scene = CompiledScene(chosen, blocks, shadows)
         self.simulation = Simulation(goal, randomize, scene, low, high, time_limit)
         known = self.simulation.compiled.cameras
         if unknown := sorted(set(cameras) - set(known)):
@@ -210,11 +211,10 @@ class Tabletop(Blindable):
         return {"physics": step, "rendering": lambda: self.renderer.render(compiled.data)}
 
     def close(self) -> None:
-        """Free physics and GL."""
+        """Free GL."""
         if self._renderer is not None:
             self._renderer.close()
             self._renderer = None
-        self.simulation.close()
 
     @property
     def renderer(self) -> Renderer:

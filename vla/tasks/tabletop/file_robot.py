@@ -12,14 +12,12 @@ from typing import Literal
 
 import mujoco
 import numpy as np
-from dm_control import mjcf
-from dm_control.mujoco.wrapper import MjModel
 
 from vla.io.errors import UserError
 from vla.robots.cartesian import LIMIT_MARGIN, Kinematics, rotation_z
 from vla.spec import Array, RobotModel
 from vla.tasks.tabletop import fingertips, robot_spec
-from vla.tasks.tabletop.robot import PHYSICS, TabletopRobot
+from vla.tasks.tabletop.robot import PHYSICS, TabletopRobot, attributes
 from vla.tasks.tabletop.robot_file import RobotFile, compiled, require
 
 PREFIX = "robot/"  # of the names of all elements in the scene
@@ -69,17 +67,11 @@ class FileRobot(TabletopRobot):
         if meshes == "light":
             robot_spec.use_convex_hulls(spec)
 
-    def _attached(self, scene: mujoco.MjSpec) -> mujoco.MjModel:
-        """Return the compiled model of a scene with the robot in it."""
+    def attach(self, scene: mujoco.MjSpec) -> None:
+        """Add the robot to a scene."""
         turn = (np.cos(self._file.yaw / 2), 0.0, 0.0, np.sin(self._file.yaw / 2))
         place = scene.worldbody.add_frame(pos=self._file.place, quat=turn)
         scene.attach(self._spec.copy(), frame=place, prefix=PREFIX)
-        return compiled(scene)
-
-    def compile(self, scene: mjcf.RootElement) -> mjcf.Physics:
-        """Compile a scene together with the robot."""
-        world = mujoco.MjSpec.from_string(scene.to_xml_string(), assets=scene.get_assets())
-        return mjcf.Physics.from_model(MjModel(self._attached(world)))
 
     def _grip(self, name: str, travel: float) -> str:
         """Return the name of the gripper's actuator `name`, or of a position servo added to the joint `name`."""
@@ -132,8 +124,9 @@ class FileRobot(TabletopRobot):
         Returns the middle between the fingertips, the geoms `sides`, in the frame of the tool, for openings in
         ascending order, (N, 3) [m].
         """
-        option = " ".join(f'{name}="{value}"' for name, value in PHYSICS.items())
-        self._model = model = self._attached(mujoco.MjSpec.from_string(f"<mujoco><option {option}/></mujoco>"))
+        alone = mujoco.MjSpec.from_string(f"<mujoco><option {attributes(**PHYSICS)}/></mujoco>")
+        self.attach(alone)
+        self._model = model = compiled(alone)
         self._data = data = mujoco.MjData(model)
         self.fingertips, self.tool = [[PREFIX + tip for tip in side] for side in sides], PREFIX + robot_spec.TOOL
         names = [model.joint(index).name for index in range(model.njnt)]
