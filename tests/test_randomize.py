@@ -12,9 +12,9 @@ from conftest import make_tabletop
 
 from vla.config.compose import axes
 from vla.spec import Array
-from vla.tasks.streams import Streams
 from vla.tasks.tabletop.environment import Tabletop
 from vla.tasks.tabletop.randomize.blocks import Colours, Distractors, Masses, Placement, Shapes
+from vla.tasks.world import Streams
 
 DEFAULT = {"distractors", "colour", "size", "mass", "friction", "placement", "arm", "light", "camera", "table"}
 # What is asked for, which "naming" changes, is no draw, and a disturbance is no property of the scene.

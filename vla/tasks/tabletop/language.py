@@ -58,15 +58,12 @@ class Grammar:
 
     def renamed(self, slots: Mapping[str, str]) -> Grammar:
         """Return the grammar with other names for some slots, old → new, which are replaced in that order."""
-
-        def rename(phrasings: Sequence[str]) -> list[str]:
-            renamed = list(phrasings)
+        phrasings = list[list[str]]()
+        for renamed in (self.phrasings, self.held_out_phrasings):
             for old, new in slots.items():
                 renamed = [phrasing.replace(f"{{{old}}}", f"{{{new}}}") for phrasing in renamed]
-            return renamed
-
-        phrasings = rename(self.phrasings), self.words, rename(self.held_out_phrasings), self.held_out_words
-        return Grammar(*phrasings, self.held_out_colours)
+            phrasings.append(list(renamed))
+        return Grammar(phrasings[0], self.words, phrasings[1], self.held_out_words, self.held_out_colours)
 
     @property
     def held_out_kinds(self) -> tuple[HeldOut, ...]:

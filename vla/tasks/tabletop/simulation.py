@@ -13,7 +13,6 @@ import numpy as np
 from vla.io.errors import UserError
 from vla.robots.cartesian import CartesianController, solve
 from vla.spec import FIRST_SEED, Array
-from vla.tasks.streams import Streams
 from vla.tasks.tabletop.compiled_scene import CompiledScene
 from vla.tasks.tabletop.disturber import PUSH_STEP, Disturber
 from vla.tasks.tabletop.goals.chain import Chain
@@ -24,6 +23,7 @@ from vla.tasks.tabletop.outcome import OutcomeClassifier
 from vla.tasks.tabletop.randomize.language import paraphrase
 from vla.tasks.tabletop.randomize.randomizer import Randomizer
 from vla.tasks.tabletop.scene import COLOURS, PADS
+from vla.tasks.world import Streams
 
 CONTROL_HZ = 10.0
 WORKSPACE = ((0.25, -0.40, 0.008), (0.75, 0.40, 0.50))  # corners of the box that bounds the tool point [m]
