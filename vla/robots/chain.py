@@ -14,12 +14,7 @@ from vla.spec import Array
 
 
 def frame_positions(chain: Sequence[Sequence[float]], joints: ArrayLike) -> Array:
-    """Return (J + 2, 3) positions [m] of the base, of every joint's frame and of the tool, in the base frame.
-
-    Args:
-        chain: as in `vla.spec.RobotModel`, (J + 1, 7).
-        joints: (J,) [rad].
-    """
+    """Return (J + 2, 3) positions [m] of base, joints' frames and tool in the base frame, for joints (J,) [rad]."""
     return np.vstack([np.zeros(3), _frames(_links(chain), joints)[:, :3, 3]])
 
 

@@ -19,9 +19,8 @@ from vla.tasks.rendering.renderer import Renderer, RendererFactory, Views
 from vla.tasks.tabletop.compiled_scene import CompiledScene
 from vla.tasks.tabletop.expert import Waypoint
 from vla.tasks.tabletop.file_robot import FileRobot
-from vla.tasks.tabletop.goals.chain import Chain
 from vla.tasks.tabletop.goals.goal import Goal
-from vla.tasks.tabletop.goals.mixed import Mixed
+from vla.tasks.tabletop.goals.several import Chain, Mixed
 from vla.tasks.tabletop.panda import Panda
 from vla.tasks.tabletop.randomize.randomizer import Randomizer
 from vla.tasks.tabletop.robot import VISIBLE

@@ -16,6 +16,7 @@ from vla.robots.panda import (
     FLANGE,
     HAND_TO_TCP,
     HAND_YAW,
+    HOME,
     JOINT_HIGH,
     JOINT_LOW,
     MAX_OPENING,
@@ -67,6 +68,7 @@ ARM = RobotModel(
     velocities=tuple(f"{joint}_velocity" for joint in JOINTS),
     gripper="gripper",
     chain=CHAIN,
+    home=tuple(HOME.tolist()),
 )
 
 

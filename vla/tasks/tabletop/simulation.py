@@ -15,9 +15,8 @@ from vla.robots.cartesian import CartesianController, solve
 from vla.spec import FIRST_SEED, Array
 from vla.tasks.tabletop.compiled_scene import CompiledScene
 from vla.tasks.tabletop.disturber import PUSH_STEP, Disturber
-from vla.tasks.tabletop.goals.chain import Chain
 from vla.tasks.tabletop.goals.goal import SKILLS, Goal, Referents, WorldState, current
-from vla.tasks.tabletop.goals.mixed import Mixed
+from vla.tasks.tabletop.goals.several import Chain, Mixed
 from vla.tasks.tabletop.language import HeldOut
 from vla.tasks.tabletop.outcome import OutcomeClassifier
 from vla.tasks.tabletop.randomize.language import paraphrase
