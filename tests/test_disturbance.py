@@ -20,7 +20,7 @@ from vla.tasks.tabletop.compiled_scene import Kind
 from vla.tasks.tabletop.environment import Tabletop
 from vla.tasks.tabletop.expert import Waypoint
 from vla.tasks.tabletop.goals.goal import WorldState
-from vla.tasks.tabletop.randomize.disturbance import Disturbances
+from vla.tasks.tabletop.randomize.episode import Disturbances
 
 KINDS: tuple[Kind, ...] = get_args(Kind)
 STILL = np.array([0, 0, 0, 0, 0, 0, 1.0])

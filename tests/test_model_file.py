@@ -81,14 +81,6 @@ def test_meshes_of_packages_are_found(
     assert np.ptp(model.mesh_vert, axis=0).max() == pytest.approx(0.06 * np.sqrt(2), rel=0.1)
 
 
-def test_an_arm_with_meshes_of_its_package_acts(tmp_path: Path) -> None:
-    write_mesh(tmp_path / "my_arm" / "meshes" / "link.stl")
-    (tmp_path / "my_arm" / "arm.urdf").write_text(urdf("package://my_arm/meshes/link.stl"))
-    environment = make(tmp_path / "my_arm" / "arm.urdf")
-    assert successes(environment, range(4)) == 4
-    environment.close()
-
-
 TEXTURED = """<asset><texture name="skin" type="2d" file="none.png"/><material name="skin" texture="skin"
     rgba="0.1 0.2 0.3 1"/></asset>"""
 

@@ -92,36 +92,6 @@ def test_pictures_of_a_hundred_scenes_equal_mujocos(wide: tuple[Tabletop, Render
     assert np.max(differences) < 5  # at the edges of shadows
 
 
-def test_no_object_is_missing(wide: tuple[Tabletop, Renderer, ReferenceRenderer]) -> None:
-    environment, first, _ = wide
-    model = environment.simulation.compiled.model
-    head = model.vis.headlight
-    before = [np.array(values) for values in (head.ambient, head.diffuse, model.light_active)]
-    segmenter, option = mujoco.Renderer(model, SIZE, SIZE), mujoco.MjvOption()
-    segmenter.enable_segmentation_rendering()
-    option.geomgroup[:] = [group == 2 for group in range(mujoco.mjNGROUP)]
-    for seed in range(20):
-        data = start(environment, seed)
-        model.geom_matid[:] = -1
-        identity = np.arange(model.ngeom)
-        model.geom_rgba[:, :3] = (
-            np.stack([10 * (identity % 25) + 5, 100 * (identity // 25) + 50, 0 * identity], 1) / 255
-        )
-        head.ambient, head.diffuse, model.light_active[:] = 1, 0, False
-        first.update()
-        rgb = first.render(data)[0].astype(int)
-        seen = np.where(rgb.any(axis=3), rgb[..., 0] // 10 + 25 * (rgb[..., 1] // 100), -1)
-        for camera in (0, 1):
-            segmenter.update_scene(data, camera, option)
-            ids, kinds = np.moveaxis(segmenter.render(), 2, 0)
-            expected = np.where(kinds == mujoco.mjtObj.mjOBJ_GEOM, ids, -1)
-            assert (seen[camera] == expected)[expected >= 0].mean() > 0.99
-            found, counts = np.unique(expected, return_counts=True)
-            assert set(found[(counts > 5) & (found >= 0)]) <= set(seen[camera].ravel())
-    segmenter.close()
-    head.ambient, head.diffuse, model.light_active[:] = before
-
-
 def test_changes_of_a_model_are_taken_over(wide: tuple[Tabletop, Renderer, ReferenceRenderer]) -> None:
     """A renderer that has seen other episodes draws the same bytes as a new one."""
     environment, first, _ = wide

@@ -19,7 +19,7 @@ from vla.tasks.tabletop.goals.goal import SKILLS, Goal, Referents, WorldState, c
 from vla.tasks.tabletop.goals.several import Chain, Mixed
 from vla.tasks.tabletop.language import HeldOut
 from vla.tasks.tabletop.outcome import OutcomeClassifier
-from vla.tasks.tabletop.randomize.language import paraphrase
+from vla.tasks.tabletop.randomize.episode import paraphrase
 from vla.tasks.tabletop.randomize.randomizer import Randomizer
 from vla.tasks.tabletop.scene import COLOURS, PADS
 from vla.tasks.world import Streams
