@@ -30,12 +30,10 @@ class PictureSettings:
     renderer: RendererFactory
     cameras: tuple[str, ...]  # names in the model, or HAND
     image_size: tuple[int, int]  # height and width of the pictures [px]
-    window: Sequence[float] | None  # top, left, bottom, right of what CAMERA shows, as shares of its picture; None: all
-    hand_size: float  # height and width of what HAND shows, as shares of CAMERA's picture
-    # Height and width at which all of a camera's picture is drawn, to be cut to its window and averaged [px]; None: the
-    # window is drawn in the size of the pictures.
+    window: Sequence[float] | None  # this and what follows: see `MetaWorld`
+    hand_size: float
     drawn: int | None
-    shadows: int  # edge of the shadow map [texels]; 0: no shadows
+    shadows: int
 
 
 class TaskScene:

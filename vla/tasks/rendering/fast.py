@@ -23,8 +23,7 @@ from vla.tasks.gl import has_egl
 from vla.tasks.rendering import shaders, shapes, uniforms
 from vla.tasks.rendering.context import Context, shared_context
 from vla.tasks.rendering.decimate import decimate
-from vla.tasks.rendering.elements import Elements, elements_of, unsupported
-from vla.tasks.rendering.geometry import Buffers, Geometry
+from vla.tasks.rendering.geometry import Buffers, Elements, Geometry, elements_of, unsupported
 from vla.tasks.rendering.projections import ModelCameras, clip_range
 from vla.tasks.rendering.renderer import Renderer, Views
 from vla.tasks.rendering.shadows import STATE, Shadows
@@ -52,7 +51,6 @@ class Fast:
 
     samples: Literal[1, 4]  # per pixel, which are averaged; 4 draws twice as many rows and columns, for smooth edges
     soft: Annotated[int, Ge(0), Le(4)]  # texels around the nearest one over which the edges of shadows are averaged
-    light: Literal["auto", "vertex", "pixel"]  # at vertices as in MuJoCo, or pixels; auto: pixels for spots only
     faces: Annotated[int, Ge(100)] | None  # most faces of a mesh, heavier ones are decimated for pictures; None: all
 
     @staticmethod
@@ -132,7 +130,7 @@ class FastRenderer:
         """Compile the shaders, a program per kind of texture, and give each texture that all read a unit."""
         gl, settings, lights = self._gl, self._settings, uniforms.drawn_lights(self._model).tolist()
         spot = self._model.light_type == uniforms.SPOT
-        pixel = settings.light == "pixel" or (settings.light == "auto" and bool(spot[lights].any()))
+        pixel = bool(spot[lights].any())  # light at vertices, as in MuJoCo, would miss the edge of a spot
         lamps = {1 + lights.index(lamp): bool(spot[lamp]) for lamp in self._lamps}
         kinds: tuple[shaders.Skin, ...] = ("none", "2d", "cube")
         self._programs = {

@@ -9,19 +9,7 @@ from typing import Literal
 import mujoco
 import numpy as np
 
-from vla.robots.panda import (
-    CHAIN,
-    FINGER_SPEED,
-    FINGER_TRAVEL,
-    FLANGE,
-    HAND_TO_TCP,
-    HAND_YAW,
-    HOME,
-    JOINT_HIGH,
-    JOINT_LOW,
-    MAX_OPENING,
-    PANDA,
-)
+from vla.robots import panda
 from vla.spec import Array, RobotModel, Shape
 from vla.tasks.tabletop.compiled_scene import CompiledScene
 from vla.tasks.tabletop.robot import (
@@ -67,8 +55,8 @@ ARM = RobotModel(
     frame="panda_link0",
     velocities=tuple(f"{joint}_velocity" for joint in JOINTS),
     gripper="gripper",
-    chain=CHAIN,
-    home=tuple(HOME.tolist()),
+    chain=panda.CHAIN,
+    home=tuple(panda.HOME.tolist()),
 )
 
 
@@ -94,13 +82,13 @@ class Panda(TabletopRobot):
     """Seven position-servoed joints with gravity compensation and a gripper whose fingers share one servo."""
 
     prefix = "panda/"
-    arm, kinematics, lead = ARM, PANDA, LEAD
+    arm, kinematics, lead = ARM, panda.PANDA, LEAD
     joints = servos = tuple(f"panda/joint{index}" for index in range(1, 8))
     fingers, grips, tool = ("panda/left_finger", "panda/right_finger"), ("panda/fingers",), "panda/tcp"
     fingertips = (("panda/left_pad",), ("panda/right_pad",))
     tip = (0.012, 0.012, 0.008, 0.0)  # half the diagonal of the square fingertips
-    closed, opened = np.zeros(1), np.array([FINGER_TRAVEL])
-    travel, finger_speed, widest = FINGER_TRAVEL, FINGER_SPEED, MAX_OPENING
+    closed, opened = np.zeros(1), np.array([panda.FINGER_TRAVEL])
+    travel, finger_speed, widest = panda.FINGER_TRAVEL, panda.FINGER_SPEED, panda.MAX_OPENING
 
     def __init__(self, meshes: Literal["light", "full"] = "light") -> None:
         """Args: meshes: visual meshes, "light" (1 200 faces) or "full" (134 000). Collision meshes are the same."""
@@ -122,20 +110,20 @@ class Panda(TabletopRobot):
 
 def _mjcf(meshes: str) -> str:
     """Return the model of the robot."""
-    limits = [attributes(range=(low, high)) for low, high in zip(JOINT_LOW, JOINT_HIGH, strict=True)]
+    limits = [attributes(range=(low, high)) for low, high in zip(panda.JOINT_LOW, panda.JOINT_HIGH, strict=True)]
     links, servos = "", ""
     for index, (mass, com, inertia) in enumerate(LINKS):
-        name, place = f"joint{index + 1}", attributes(pos=CHAIN[index][:3], quat=CHAIN[index][3:])
+        name, place = f"joint{index + 1}", attributes(pos=panda.CHAIN[index][:3], quat=panda.CHAIN[index][3:])
         links += f"""<body name="link{index + 1}" gravcomp="1" {place}>
             <inertial {attributes(mass=mass, pos=com, fullinertia=inertia)}/>
             <joint name="{name}" axis="0 0 1" limited="true" {limits[index]} armature="{ARMATURE}"/>
             {_geoms(f"link{index + 1}", DARK if index == 4 else SHELL)}"""
         gains = attributes(
-            kp=STIFFNESS[index], kv=STIFFNESS[index] * LEAD, ctrlrange=(JOINT_LOW[index], JOINT_HIGH[index])
+            kp=STIFFNESS[index], kv=STIFFNESS[index] * LEAD, ctrlrange=(panda.JOINT_LOW[index], panda.JOINT_HIGH[index])
         )
         force = attributes(forcerange=(-TORQUE[index], TORQUE[index]))
         servos += f'<position name="{name}" joint="{name}" {gains} {force}/>'
-    travel, force = attributes(ctrlrange=(0, FINGER_TRAVEL)), attributes(forcerange=(-GRIP_FORCE, GRIP_FORCE))
+    travel, force = attributes(ctrlrange=(0, panda.FINGER_TRAVEL)), attributes(forcerange=(-GRIP_FORCE, GRIP_FORCE))
     return f"""<mujoco model="panda">
   <compiler angle="radian"/>
   <asset>{_assets(meshes)}</asset>
@@ -144,10 +132,10 @@ def _mjcf(meshes: str) -> str:
       <inertial mass="0.629769" pos="-0.041018 -0.00014 0.049974" diaginertia="0.00315 0.00388 0.004285"/>
       {_geoms("link0", SHELL)}
       {links}
-      <body name="hand" gravcomp="1" {attributes(pos=(0, 0, FLANGE), euler=(0, 0, HAND_YAW))}>
+      <body name="hand" gravcomp="1" {attributes(pos=(0, 0, panda.FLANGE), euler=(0, 0, panda.HAND_YAW))}>
         <inertial mass="{HAND_MASS}" pos="-0.01 0 0.03" diaginertia="0.001 0.0025 0.0017"/>
         {_geoms("hand", SHELL)}
-        <site name="tcp" size="0.004" group="4" {attributes(pos=(0, 0, HAND_TO_TCP))}/>
+        <site name="tcp" size="0.004" group="4" {attributes(pos=(0, 0, panda.HAND_TO_TCP))}/>
         <camera name="wrist" {WRIST.mjcf((1, 0, 0))}/>
         {_finger("left", 0.0)}
         {_finger("right", np.pi)}
@@ -191,7 +179,7 @@ def _finger(side: str, turn: float) -> str:
     return f"""<body name="{side}_finger" gravcomp="1" {attributes(pos=(0, 0, FINGER_OFFSET), euler=(0, 0, turn))}>
           <inertial mass="{FINGER_MASS}" pos="0 0 0" diaginertia="2.375e-6 2.375e-6 7.5e-7"/>
           <joint name="{side}_finger" type="slide" axis="0 1 0" limited="true" armature="0.05"
-                 {attributes(range=(0, FINGER_TRAVEL))}/>
+                 {attributes(range=(0, panda.FINGER_TRAVEL))}/>
           {_geoms("finger", DARK, collides=False)}
           <geom name="{side}_pad" type="box" size="0.0085 0.004 0.0085" pos="0 0.0045 0.0445" mass="0" {tip}/>
         </body>"""
@@ -200,7 +188,7 @@ def _finger(side: str, turn: float) -> str:
 class PandaShell:
     """Shapes of the Panda, and poses of its bodies for given joint positions, without rendering: a `vla.spec.Shell`."""
 
-    chain = CHAIN
+    chain = panda.CHAIN
 
     def __init__(self) -> None:
         self._scene = CompiledScene(Panda(), blocks=0)
