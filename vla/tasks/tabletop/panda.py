@@ -118,12 +118,9 @@ def _mjcf(meshes: str) -> str:
             <inertial {attributes(mass=mass, pos=com, fullinertia=inertia)}/>
             <joint name="{name}" axis="0 0 1" limited="true" {limits[index]} armature="{ARMATURE}"/>
             {_geoms(f"link{index + 1}", DARK if index == 4 else SHELL)}"""
-        gains = attributes(
-            kp=STIFFNESS[index], kv=STIFFNESS[index] * LEAD, ctrlrange=(panda.JOINT_LOW[index], panda.JOINT_HIGH[index])
-        )
-        force = attributes(forcerange=(-TORQUE[index], TORQUE[index]))
-        servos += f'<position name="{name}" joint="{name}" {gains} {force}/>'
-    travel, force = attributes(ctrlrange=(0, panda.FINGER_TRAVEL)), attributes(forcerange=(-GRIP_FORCE, GRIP_FORCE))
+        gains = attributes(kp=STIFFNESS[index], kv=STIFFNESS[index] * LEAD, forcerange=(-TORQUE[index], TORQUE[index]))
+        servos += f'<position name="{name}" joint="{name}" ctrl{limits[index]} {gains}/>'
+    force = attributes(forcerange=(-GRIP_FORCE, GRIP_FORCE))
     return f"""<mujoco model="panda">
   <compiler angle="radian"/>
   <asset>{_assets(meshes)}</asset>
@@ -150,7 +147,8 @@ def _mjcf(meshes: str) -> str:
   </equality>
   <actuator>
     {servos}
-    <position name="fingers" tendon="fingers" kp="{GRIP_STIFFNESS}" kv="{GRIP_DAMPING}" {travel} {force}/>
+    <position name="fingers" tendon="fingers" kp="{GRIP_STIFFNESS}" kv="{GRIP_DAMPING}" {force}
+              {attributes(ctrlrange=(0, panda.FINGER_TRAVEL))}/>
   </actuator>
 </mujoco>"""
 
