@@ -25,7 +25,7 @@ class JointController:
     """Takes actions that are joint targets."""
 
     def __init__(self, order: list[int], factors: Array) -> None:
-        """Args: (J,) index of each joint among the components of the motion; (J,) factors from its unit to [rad]."""
+        """Take each joint's index among the components of the motion, (J,), and factor from its unit to [rad]."""
         self._order, self._factors = order, factors
 
     def reset(self, joints: Array) -> None:
@@ -110,11 +110,8 @@ def acts_on_joints(spec: Spec) -> bool:
 
 
 def recorded_controller(spec: Spec) -> CartesianController | JointController:
-    """Build the controller for recorded actions, without a limit of the workspace.
-
-    Raises:
-        UserError: the arm or the actions are of another kind.
-    """
+    """Build the controller for recorded actions, without a limit of the workspace (UserError: the arm or the actions
+    are of another kind)."""
     return controller_for(spec, None if acts_on_joints(spec) else ((-math.inf,) * 3, (math.inf,) * 3))
 
 
@@ -125,11 +122,8 @@ def gripper_index(spec: Spec) -> int | None:
 
 
 def joint_factors(spec: Spec, velocities: bool = False) -> Array:
-    """Return the (J,) factors from the units of the joints in the state to [rad], or of their velocities to [rad/s].
-
-    Raises:
-        UserError: there is no robot, or a joint has another unit.
-    """
+    """Return the (J,) factors from the units of the joints in the state to [rad], or of their velocities to [rad/s]
+    (UserError: there is no robot, or a joint has another unit)."""
     robot = spec.require_robot("a position in rad")
     units = {name: unit.removesuffix("/s") for name, unit in zip(spec.state, spec.state_units, strict=True)}
     return _factors(robot.velocities if velocities else robot.joints, units)

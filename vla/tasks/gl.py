@@ -77,11 +77,7 @@ def _egl_devices() -> list[str]:
 
 
 def require_backend() -> None:
-    """Require that MuJoCo can render.
-
-    Raises:
-        UserError: no GL backend works on this machine.
-    """
+    """Require that MuJoCo can render (UserError: no GL backend works on this machine)."""
     if os.environ.get("MUJOCO_GL") == NO_BACKEND:
         raise UserError(
             f"this machine cannot render with MUJOCO_GL={os.environ.get(FAILED_BACKENDS, NO_BACKEND)}: install the "

@@ -40,11 +40,7 @@ class TaskScene:
     """Simulator of a task with the cameras as LeRobot has them; its renderer is made with the first picture."""
 
     def __init__(self, task: str, settings: PictureSettings) -> None:
-        """Args: name of the task; its pictures.
-
-        Raises:
-            UserError: there is no such camera.
-        """
+        """Compile a task; a UserError if it lacks a camera."""
         self._settings, self.simulator = settings, simulator(task)
         model, cameras, window = self.simulator.model, settings.cameras, settings.window
         self.model = model

@@ -143,7 +143,7 @@ class Geometry:
     """Vertices of the elements drawn: opaque ones by texture, planes after the others, the sky, transparent ones."""
 
     def __init__(self, model: mujoco.MjModel, mesh: Callable[[int, bool], Surface]) -> None:
-        """Args: the model; a function from a mesh's id, and whether it has a texture, to its triangles."""
+        """Take the model, and a function from a mesh's id, and whether it has a texture, to its triangles."""
         self._model, self._mesh = model, mesh
         self._far = clip_range(model)[1]
         quality = model.vis.quality

@@ -32,7 +32,7 @@ class Shadows:
     """
 
     def __init__(self, gl: Any, model: mujoco.MjModel, lamps: Sequence[int], soft: int) -> None:
-        """Args: the context; the model; ids of the lights; texels over which the edges of shadows are averaged."""
+        """Take the context, the model, ids of the lights, and texels over which the edges of shadows are averaged."""
         self._gl, self._lamps, self._soft = gl, list(lamps), soft
         self._edge = int(model.vis.quality.shadowsize)
         self._still, self._drawn = ([self._target() for _ in self._lamps] for _ in range(2))

@@ -47,7 +47,7 @@ class CameraUniforms:
     """A buffer with a block per camera: its projection and position, shadow projections, lights."""
 
     def __init__(self, gl: Any, model: mujoco.MjModel, cameras: ModelCameras, lamps: Sequence[int]) -> None:
-        """Args: the context; the model; its cameras; ids of the lights with a shadow map."""
+        """Take the context, the model, its cameras, and ids of the lights with a shadow map."""
         self._model, self._cameras, self._lamps, self._lights = model, cameras, list(lamps), drawn_lights(model)
         floats = CAMERA + 16 * len(lamps) + 4 * ROWS * (1 + len(self._lights))
         self._blocks = np.zeros((len(cameras.ids), -(-4 * floats // ALIGNMENT) * ALIGNMENT // 4), np.float32)

@@ -60,11 +60,7 @@ class CompiledScene:
     """The scene as MuJoCo's model and state: indices of its elements, and changes to it without recompilation."""
 
     def __init__(self, robot: TabletopRobot, blocks: int, shadows: bool = True) -> None:
-        """Args: the robot; number of blocks; whether the lamp casts shadows.
-
-        Raises:
-            UserError: the robot's model does not compile.
-        """
+        """Compile the scene, with or without shadows of the lamp; a UserError if the robot's model does not compile."""
         model = self.model = compile_scene(robot, blocks, shadows)
         self.data, self.robot = mujoco.MjData(model), robot
         self.joints = np.array([model.joint(name).qposadr[0] for name in robot.joints])

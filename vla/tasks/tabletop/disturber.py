@@ -48,7 +48,7 @@ class Disturber:
     """
 
     def __init__(self, drawn: Disturbance, scene: CompiledScene) -> None:
-        """Args: what was drawn for the episode; the scene."""
+        """Take what was drawn for the episode, and the scene."""
         self._drawn, self._scene = drawn, scene
         self._steps_left = 0  # of a push or a drop
         self._possible_for = 0  # [steps]

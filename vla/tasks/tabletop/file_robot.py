@@ -85,11 +85,8 @@ class FileRobot(TabletopRobot):
         return robot_spec.add_servo(spec, name, stiffness, LEAD * stiffness, force)
 
     def _measure_gripper(self, sides: list[list[str]]) -> None:
-        """Tabulate the opening, divide jaws that stay close at a hinge, and move the tool point between the fingertips.
-
-        Raises:
-            UserError: the opening does not change, or the tool point is far from the fingertips.
-        """
+        """Tabulate the opening, divide jaws that stay close at a hinge, and move the tool point between the fingertips
+        (UserError: the opening does not change, or the tool point is far from the fingertips)."""
         middles = self._close(sides)
         if self.widest - self.narrowest <= LEAST_TRAVEL:
             sides = fingertips.far_ends(self._spec, self._model, self._data, sides, PREFIX)

@@ -32,12 +32,14 @@ class Grammar:
         held_out_words: Mapping[str, Words],
         held_out_colours: Sequence[str],
     ) -> None:
-        """Args:
-        phrasings: training phrasings.
-        words: slot → training synonyms.
-        held_out_phrasings: phrasings for evaluation only.
-        held_out_words: slot → synonyms for evaluation only.
-        held_out_colours: block colours that training instructions never name.
+        """Take what training says, and what is held out from it.
+
+        Args:
+            phrasings: training phrasings.
+            words: slot → training synonyms.
+            held_out_phrasings: phrasings for evaluation only.
+            held_out_words: slot → synonyms for evaluation only.
+            held_out_colours: block colours that training instructions never name.
 
         Raises:
             UserError: a held-out part is empty, replaces nothing or overlaps with training, or a phrasing has a

@@ -31,7 +31,7 @@ class OutcomeClassifier:
     """
 
     def __init__(self, hold_steps: int) -> None:
-        """Args: consecutive control steps for which the goal must hold."""
+        """Take the number of consecutive control steps for which the goal must hold."""
         self._hold_steps, self._held_for = hold_steps, 0
         self._near = self._lifted = self._lifted_other = self._dropped = self._holding = False
         self._skill: Skill | None = None

@@ -91,7 +91,7 @@ class Panda(TabletopRobot):
     travel, finger_speed, widest = panda.FINGER_TRAVEL, panda.FINGER_SPEED, panda.MAX_OPENING
 
     def __init__(self, meshes: Literal["light", "full"] = "light") -> None:
-        """Args: meshes: visual meshes, "light" (1 200 faces) or "full" (134 000). Collision meshes are the same."""
+        """Choose the visual meshes, "light" (1 200 faces) or "full" (134 000). Collision meshes are the same."""
         self._meshes = meshes
 
     def attach(self, scene: mujoco.MjSpec) -> None:

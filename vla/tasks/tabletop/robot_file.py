@@ -76,11 +76,7 @@ class RobotFile:
     target: Point
 
     def read(self) -> mujoco.MjSpec:
-        """Read the model of the arm with its hand.
-
-        Raises:
-            UserError: a file is missing or does not compile.
-        """
+        """Read the model of the arm with its hand (UserError: a file is missing or does not compile)."""
         spec = read(self.file, "file")
         if self.hand is not None:
             hand = read(self.hand, "hand")
@@ -97,11 +93,8 @@ class InstalledRobot(RobotFile):
     """An arm whose files are in an installed package, which is not imported."""
 
     def __init__(self, file: Text, hand: Text | None, **inherited: Inherited) -> None:
-        """Take paths that begin with the name of a package, such as dm_control/third_party/kinova/jaco_arm.xml.
-
-        Raises:
-            UserError: no such package, or a path out of it.
-        """
+        """Take paths that begin with the name of a package, such as dm_control/third_party/kinova/jaco_arm.xml
+        (UserError: no such package, or a path out of it)."""
         super().__init__(file=_installed(file), hand=_installed(hand) if hand else None, **inherited)
 
 
@@ -117,11 +110,8 @@ def _installed(path: str) -> Path:
 
 
 def read(file: Path, key: str) -> mujoco.MjSpec:
-    """Read a model, with absolute paths of its meshes and without its textures; `key` names the file in errors.
-
-    Raises:
-        UserError: there is no such file, no such mesh, or MuJoCo does not compile it.
-    """
+    """Read a model, with absolute paths of its meshes and without its textures; `key` names the file in errors
+    (UserError: there is no such file, no such mesh, or MuJoCo does not compile it)."""
     path, named = Path(file).absolute(), f"task.robot.{key}={file}"
     if not path.is_file():
         raise UserError(f"{named}: there is no such file")
@@ -145,11 +135,8 @@ def read(file: Path, key: str) -> mujoco.MjSpec:
 
 
 def _located(named: str, mesh: str, folder: Path, model: Path) -> Path:
-    """Return the file of a mesh that is named by a path in a folder, or by an address as in ROS.
-
-    Raises:
-        UserError: an address of another kind, or of a package that is not found.
-    """
+    """Return the file of a mesh that is named by a path in a folder, or by an address as in ROS (UserError: an address
+    of another kind, or of a package that is not found)."""
     if "://" not in mesh:
         return folder / mesh
     kind, package, rest, *_ = urlsplit(mesh)

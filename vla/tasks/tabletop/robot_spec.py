@@ -25,11 +25,8 @@ Eq = mujoco.mjtEq
 
 
 def checked_home(spec: mujoco.MjSpec, joints: Names, home: Sequence[float]) -> dict[str, float]:
-    """Return joint → position at home.
-
-    Raises:
-        UserError: no such joint, one that is not a hinge or not in order, or a position out of its limits.
-    """
+    """Return joint → position at home (UserError: no such joint, one that is not a hinge or not in order, or a position
+    out of its limits)."""
     require("joints", joints, (joint.name for joint in spec.joints), "joint")
     if len(home) != len(joints):
         raise UserError(f"task.robot.home has {len(home)} positions for {len(joints)} joints")

@@ -33,11 +33,8 @@ FRONT = CameraPose(position=(1.02, 0.0, 0.52), target=(0.5, 0.0, 0.05), fovy=45.
 
 
 def compile_scene(robot: TabletopRobot, blocks: int, shadows: bool) -> mujoco.MjModel:
-    """Compile the scene with a robot and a number of blocks, cubes before randomisation.
-
-    Raises:
-        UserError: the robot's model does not compile.
-    """
+    """Compile the scene with a robot and a number of blocks, cubes before randomisation (UserError: the robot's model
+    does not compile)."""
     spec = mujoco.MjSpec.from_string(_surroundings(shadows))
     robot.attach(spec)
     for name in (f"block{index}" for index in range(blocks)):

@@ -56,13 +56,15 @@ class Simulation:
         high: Array,
         time_limit: float,
     ) -> None:
-        """Args:
-        goal: goal, mixture of goals, or chain of goals.
-        randomize: axis name → randomizer, or None to disable the axis.
-        compiled: the world.
-        low: lower bounds (7,) of an action.
-        high: upper bounds (7,) of an action.
-        time_limit: time for an instruction, per block to be moved [s].
+        """Begin no episode yet.
+
+        Args:
+            goal: goal, mixture of goals, or chain of goals.
+            randomize: axis name → randomizer, or None to disable the axis.
+            compiled: the world.
+            low: lower bounds (7,) of an action.
+            high: upper bounds (7,) of an action.
+            time_limit: time for an instruction, per block to be moved [s].
         """
         self.goals, self.randomize, self.compiled = goal, randomize, compiled
         self._low, self._high, self._time_limit = low, high, time_limit

@@ -26,8 +26,8 @@ class Mixed:
     """
 
     def __init__(self, goals: Mapping[str, Goal | None], impossible: Share, silent: Share) -> None:
-        """Args: name → goal, or None to omit it; share of the episodes with an absent block; share of those with an
-        empty instruction.
+        """Take name → goal, or None to omit it, and shares of the episodes with an absent block and with an empty
+        instruction.
 
         Raises:
             UserError: no goal remains, or the shares exceed one.
@@ -65,11 +65,8 @@ class Chain:
     name, absent = "chain", 0
 
     def __init__(self, goals: Mapping[str, Goal | None], length: Annotated[int, Ge(1), Le(9)]) -> None:
-        """Args: name → goal, or None to omit it; number of instructions.
-
-        Raises:
-            UserError: no goal remains, one cannot be part of a chain, or there are not enough possible instructions.
-        """
+        """Take name → goal, or None to omit it, and the number of instructions (UserError: no goal remains, one cannot
+        be part of a chain, or there are not enough possible instructions)."""
         self.goals, self.length = _chosen(goals), length
         for name, goal in self.goals.items():
             if type(goal).after is Goal.after:
@@ -87,11 +84,8 @@ class Chain:
         return self
 
     def plan(self, blocks: int, random_state: np.random.RandomState) -> list[Link]:
-        """Draw the goals with what they name, from so many blocks: every goal that is possible is equally likely.
-
-        Raises:
-            UserError: there is no such chain.
-        """
+        """Draw the goals with what they name, from so many blocks: every goal that is possible is equally likely
+        (UserError: there is no such chain)."""
         links = self._continued([], Arrangement(), blocks, random_state)
         if links is None:
             raise UserError(

@@ -20,7 +20,7 @@ class Lift(Goal):
     """Lift the named block and keep it up."""
 
     def __init__(self, height: Positive, **inherited: Inherited) -> None:
-        """Args: required height above the start [m]."""
+        """Take the required height above the start [m]."""
         super().__init__(**inherited)
         self.height = height
 
@@ -43,7 +43,7 @@ class PickPlace(Goal):
     """Put the named block on the pad and let go of it."""
 
     def __init__(self, radius: Positive, **inherited: Inherited) -> None:
-        """Args: maximum distance between the centres of block and pad [m]."""
+        """Take the maximum distance between the centres of block and pad [m]."""
         super().__init__(**inherited)
         self.radius = radius
 
@@ -86,8 +86,8 @@ class Push(Goal):
     pads = 2
 
     def __init__(self, radius: Positive, highest: Positive, **inherited: Inherited) -> None:
-        """Args: largest distance between the centres of block and pad, and largest rise of the block above its start,
-        while the instruction is carried out [m]."""
+        """Take the largest distance between the centres of block and pad, and the largest rise of the block above its
+        start, while the instruction is carried out [m]."""
         super().__init__(**inherited)
         self.radius, self.highest = radius, highest
 
@@ -130,7 +130,7 @@ class Stay(Goal):
     """Leave everything in place, because the instruction names a block that is not on the table."""
 
     def __init__(self, language: Grammar, pads: Count) -> None:
-        """Args: grammar; number of pads on the table."""
+        """Take a grammar and the number of pads on the table."""
         self.pads, self.absent = pads, absent_colours_needed(language)
         super().__init__(language, REST_STEPS)
 
@@ -151,7 +151,7 @@ class Wait(Stay):
     """Leave everything in place, because the instruction is empty."""
 
     def __init__(self, pads: Count) -> None:
-        """Args: number of pads on the table."""
+        """Take the number of pads on the table."""
         super().__init__(Silence(), pads)
         self.absent = 0
 
