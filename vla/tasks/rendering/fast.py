@@ -61,7 +61,7 @@ class Fast:
         return f"the fast renderer needs EGL, which this machine lacks (packages {PACKAGES})", "mujoco"
 
     def open(self, model: mujoco.MjModel, views: Views) -> Renderer:
-        """Make a renderer of `model`; a UserError without EGL, as a store names its renderer and none may replace it."""
+        """Make a renderer of `model`; a UserError without EGL: a store names its renderer, so none replaces it."""
         try:
             context = shared_context()
         except Exception as error:  # moderngl raises plain exceptions
