@@ -6,12 +6,14 @@ import numpy as np
 
 from vla.deploy.joint_limiter import JointLimits
 from vla.deploy.safety import Safety
-from vla.robots.panda import CHAIN, JOINT_HIGH, JOINT_LOW
+from vla.robots.panda import CHAIN, HOME, JOINT_HIGH, JOINT_LOW
 from vla.spec import RobotModel, Spec
 
 JOINTS = tuple(f"panda_joint{number}" for number in range(1, 8))
 
-ARM = RobotModel(JOINTS, "panda_link0", tuple(f"{joint}_velocity" for joint in JOINTS), "gripper", CHAIN)
+ARM = RobotModel(
+    JOINTS, "panda_link0", tuple(f"{joint}_velocity" for joint in JOINTS), "gripper", CHAIN, tuple(HOME.tolist())
+)
 SPEC = Spec(
     cameras=("front", "wrist"),
     image_size=(8, 8),

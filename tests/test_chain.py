@@ -27,13 +27,9 @@ from vla.rollouts.rollout import replay, rollout
 from vla.rollouts.statistics import bounded_mean_interval, wilson_interval
 from vla.spec import FIRST_SEED, Array, Observation
 from vla.tasks.tabletop.expert import Waypoint
-from vla.tasks.tabletop.goals.chain import Chain
 from vla.tasks.tabletop.goals.goal import Arrangement, Goal
-from vla.tasks.tabletop.goals.lift import Lift
-from vla.tasks.tabletop.goals.pick_place import PickPlace
-from vla.tasks.tabletop.goals.place import Place
-from vla.tasks.tabletop.goals.push import Push
-from vla.tasks.tabletop.goals.stack import Stack
+from vla.tasks.tabletop.goals.several import Chain
+from vla.tasks.tabletop.goals.skills import Lift, PickPlace, Place, Push, Stack
 from vla.tasks.tabletop.language import Grammar
 
 if TYPE_CHECKING:

@@ -28,7 +28,7 @@ from vla.robots.cartesian import LIMIT_MARGIN
 from vla.robots.panda import FINGER_TRAVEL, JOINT_HIGH, JOINT_LOW, JOINT_SPEED
 from vla.spec import FIRST_SEED
 from vla.tasks.tabletop.environment import Tabletop
-from vla.tasks.tabletop.goals.stay import REST_STEPS
+from vla.tasks.tabletop.goals.skills import REST_STEPS
 from vla.tasks.tabletop.simulation import WORKSPACE
 
 LEVELS = sorted({level for levels in axes().values() for level in levels} - {"swapped"})

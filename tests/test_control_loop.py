@@ -13,7 +13,7 @@ from arm import ARM, FORWARD, ROBOT, SAFETY, SPEC
 from vla.deploy.control_loop import REPEATED, ControlLoop
 from vla.deploy.motion import LEEWAY, Command
 from vla.deploy.safety import Safety, State
-from vla.robots.panda import CHAIN, HOME, JOINT_HIGH, forward
+from vla.robots.panda import HOME, JOINT_HIGH, forward
 from vla.spec import Observation
 
 IMAGE = np.zeros((8, 8, 3), np.uint8)
@@ -474,7 +474,7 @@ OTHER: Any = {"action": ("x", "y"), "units": ("m", "m"), "low": (0, 0), "high": 
             "the kinematics of the arm of 7 joints, and the checkpoint lacks its kinematic chain: train",
         ),
         (
-            {"spec": replace(SPEC, robot=replace(ARM, chain=(*CHAIN[1:], CHAIN[0])))},
+            {"spec": replace(SPEC, robot=replace(ARM, home=()))},
             "arm of 7 joints, and the checkpoint lacks its home posture: train with",
         ),
         ({"safety": replace(SAFETY, workspace=None)}, "needs a box for the tool point"),

@@ -20,7 +20,7 @@ from vla.tasks.tabletop.compiled_scene import Kind
 from vla.tasks.tabletop.environment import Tabletop
 from vla.tasks.tabletop.expert import Waypoint
 from vla.tasks.tabletop.goals.goal import WorldState
-from vla.tasks.tabletop.randomize.disturbance import Disturbances
+from vla.tasks.tabletop.randomize.episode import Disturbances
 
 KINDS: tuple[Kind, ...] = get_args(Kind)
 STILL = np.array([0, 0, 0, 0, 0, 0, 1.0])
@@ -106,7 +106,7 @@ def test_a_push_displaces_the_arm_whatever_is_commanded(world: Tabletop) -> None
             for number in range(8):
                 world.step(action * (number > 3))
                 at.append(task.world_state().tool)
-                joints, kinematics = task.compiled.data.qpos[task.compiled.joints], task.scene.robot.kinematics
+                joints, kinematics = task.compiled.data.qpos[task.compiled.joints], task.compiled.robot.kinematics
                 assert (joints >= kinematics.lowest).all() and (joints <= kinematics.highest).all()
             [(step, _)] = world.events
             assert step == 4 and math.dist(at[0], at[4]) < 0.003

@@ -34,28 +34,25 @@ def perturbed(spec: Spec, **changes: Any) -> Perturbed:
 
 @pytest.mark.parametrize("goal", GOALS)
 def test_the_expert_solves_every_goal_even_when_it_is_led_astray(goal: str) -> None:
-    environment = make_tabletop(f"task/goal={goal}")
-    with environment.blind():
-        assert all(rollout(environment, Waypoint(environment.spec), seed).success for seed in range(6))
-        led_astray = perturbed(environment.spec)
-        assert sum(rollout(environment, led_astray, seed).success for seed in range(8)) >= 7
-    environment.close()
-
-
-@pytest.mark.parametrize("goal", GOALS)
-def test_wide_randomisation_is_within_the_experts_reach(goal: str) -> None:
+    """Its label depends on the state alone, and every action stays within the spec."""
     environment = make_tabletop(f"task/goal={goal}", "task/randomize=wide")
-    expert = Waypoint(environment.spec)
+    spec = environment.spec
     with environment.blind():
-        outcomes = [rollout(environment, expert, seed).outcome for seed in range(8)]
+        assert sum(rollout(environment, Waypoint(spec), seed).success for seed in range(8)) >= 7
+        led_astray = perturbed(spec, noise=0.3)
+        episodes = [rollout(environment, led_astray, seed) for seed in range(8)]
     environment.close()
-    assert outcomes.count("success") >= 7
+    assert sum(episode.success for episode in episodes) >= 7
+    for actions in (episodes[0].actions, episodes[0].executed):
+        assert (np.array(spec.low, np.float32) <= actions).all() and (actions <= np.array(spec.high, np.float32)).all()
+    for observation, action in zip(episodes[0].observations, episodes[0].actions, strict=True):
+        np.testing.assert_array_equal(Waypoint(spec).act(observation), action)
 
 
 def test_wide_fingers_push_with_their_upright_side_and_are_not_led_astray_while_they_touch() -> None:
     """In episodes in which the wedge of these fingers lifted the block or pressed it down."""
     environment = make_tabletop("task/robot=jaco", "task/goal=push")
-    forward, aside, below, middle = environment.simulation.scene.robot.tip
+    forward, aside, below, middle = environment.simulation.compiled.robot.tip
     assert forward < aside < 0.05 and 0 < below < 0.02 and middle == 0
     stubborn = perturbed(environment.spec, unturned=1.0, start=0.0)
     with environment.blind():
@@ -121,22 +118,6 @@ def test_a_slow_episode_executes_a_share_of_its_motions_and_labels_the_whole(tab
     shares = slowly.executed[:, :6][moved] / slowly.actions[:, :6][moved]
     assert shares.min() >= 0.4 and shares.max() <= 0.5 and np.ptp(shares) < 1e-3
     np.testing.assert_array_equal(slowly.executed[:, 6], slowly.actions[:, 6])
-
-
-def test_labels_depend_on_the_state_alone(tabletop: Tabletop) -> None:
-    """A fresh expert, shown a state from the middle of an episode, says what the one that lived through it said."""
-    with tabletop.blind():
-        episode = rollout(tabletop, perturbed(tabletop.spec), 8)
-    for observation, action in zip(episode.observations, episode.actions, strict=True):
-        np.testing.assert_array_equal(Waypoint(tabletop.spec).act(observation), action)
-
-
-def test_actions_stay_within_the_spec(tabletop: Tabletop) -> None:
-    with tabletop.blind():
-        episode = rollout(tabletop, perturbed(tabletop.spec, noise=1.0), 2)
-    for actions in (episode.actions, episode.executed):
-        assert (actions >= np.array(tabletop.spec.low, np.float32)).all()
-        assert (actions <= np.array(tabletop.spec.high, np.float32)).all()
 
 
 def test_without_the_simulators_truth_the_expert_says_so(tabletop: Tabletop) -> None:

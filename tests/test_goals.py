@@ -11,14 +11,8 @@ from tabletop_states import HALF, state
 
 from vla.spec import Array
 from vla.tasks.tabletop.goals.goal import Goal, Referents, WorldState
-from vla.tasks.tabletop.goals.lift import Lift
-from vla.tasks.tabletop.goals.mixed import Mixed
-from vla.tasks.tabletop.goals.pick_place import PickPlace
-from vla.tasks.tabletop.goals.pick_place_two import PickPlaceTwo
-from vla.tasks.tabletop.goals.place import Place
-from vla.tasks.tabletop.goals.push import Push
-from vla.tasks.tabletop.goals.stack import Stack
-from vla.tasks.tabletop.goals.stay import Stay, Wait
+from vla.tasks.tabletop.goals.several import Mixed
+from vla.tasks.tabletop.goals.skills import Lift, PickPlace, PickPlaceTwo, Place, Push, Stack, Stay, Wait
 from vla.tasks.tabletop.language import Grammar
 
 GRAMMAR = Grammar(["{move} {block}"], {"move": ["move"]}, ["{block}"], {"move": ["shift"]}, [])

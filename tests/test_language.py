@@ -12,7 +12,6 @@ from composing import composed
 from conftest import CONF, make_tabletop
 from hydra.errors import InstantiationException
 from hydra.utils import instantiate
-from matplotlib.colors import XKCD_COLORS, rgb_to_hsv, to_rgb
 
 from vla.config.check import conditions
 from vla.config.compose import axes
@@ -20,7 +19,7 @@ from vla.config.experiment import plain
 from vla.io.documents import read_yaml
 from vla.spec import FIRST_SEED
 from vla.tasks.tabletop.language import Grammar, HeldOut, Silence
-from vla.tasks.tabletop.randomize.language import paraphrase
+from vla.tasks.tabletop.randomize.episode import paraphrase
 from vla.tasks.tabletop.scene import COLOURS, PADS
 
 GRAMMAR = Grammar(
@@ -82,28 +81,10 @@ def test_no_word_that_names_something_unseen_is_in_any_training_instruction() ->
     new = {word for others in UNSEEN.values() for other in others for word in other.split()} - GRAMMATICAL
     assert {"crimson", "scarlet", "navy", "emerald", "golden", "cube", "brick", "disc", "spot", "tomato"} <= new
     assert {"red", "block", "pad", "black", "put"} <= heard() and not new & heard()
-
-
-def test_every_unseen_name_means_one_thing_of_the_scene() -> None:
     named = [name for others in UNSEEN.values() for name in others]
     assert len(named) == len(set(named))
-    assert {*UNSEEN} == {f"the {colour} block" for colour in COLOURS} | {
-        "the pad",
-        *(f"the {pad} pad" for pad in PADS),
-    }
-
-    def hue(rgb: Any) -> float:
-        return float(rgb_to_hsv(rgb)[0])
-
-    surveyed = 0  # by Munroe, see xkcd.com/color/rgb
-    for colour in COLOURS:
-        for word in {word for name in UNSEEN[f"the {colour} block"] for word in name.split()} - {"brick"}:
-            if f"xkcd:{word}" in XKCD_COLORS:
-                other = hue(to_rgb(f"xkcd:{word}"))
-                apart = {name: abs((hue(rgb) - other + 0.5) % 1 - 0.5) for name, rgb in COLOURS.items()}
-                assert min(apart, key=lambda name: apart[name]) == colour, word
-                surveyed += 1
-    assert surveyed > 15
+    things = [*(f"{colour} block" for colour in COLOURS), "pad", *(f"{pad} pad" for pad in PADS)]
+    assert {*UNSEEN} == {f"the {thing}" for thing in things}
 
 
 def test_an_instruction_with_unseen_names_is_the_plain_one_with_other_names() -> None:
@@ -162,26 +143,6 @@ def test_in_a_mixture_some_colours_are_named_with_some_goals_in_evaluation_only(
     assert new and all(draw["named"]["colour"] == held_out[draw["named"]["goal"]] for draw in new)
 
 
-def test_named_blocks_do_not_depend_on_held_out_phrasing() -> None:
-    environment = make_tabletop("task/randomize=wide")
-    with environment.blind():
-        for seed in range(FIRST_SEED, FIRST_SEED + 10):
-            environment.reset(seed)
-            new = environment.draws
-            phrasing, environment.simulation.randomize = (
-                environment.simulation.randomize,
-                {
-                    **environment.simulation.randomize,
-                    "phrasing": None,
-                },
-            )
-            environment.reset(seed)
-            environment.simulation.randomize = phrasing
-            assert environment.draws["named"] == new["named"]
-            assert environment.draws["language"] != new["language"]
-    environment.close()
-
-
 def test_the_same_scene_is_asked_for_another_block() -> None:
     one = make_tabletop("task/randomize=wide")
     other = make_tabletop("task/randomize=wide", "task/randomize/naming=swapped")
@@ -219,19 +180,6 @@ def test_held_out_colours_exist_and_leave_one_to_name() -> None:
     with environment.blind(), pytest.raises(ValueError, match="all blocks of a scene have such a colour"):
         for seed in range(20):
             environment.reset(seed)
-
-
-def test_what_cannot_be_done_is_about_a_block_that_is_not_there() -> None:
-    environment = make_tabletop("task/goal=stay", "task/randomize=wide")
-    with environment.blind():
-        for seed in range(20):
-            instruction = environment.reset(seed).instruction
-            compiled = environment.simulation.compiled
-            assert not any(colour in instruction for colour in compiled.block_names[: compiled.present])
-            assert any(colour in instruction for colour in COLOURS)
-    environment.close()
-    with pytest.raises(InstantiationException, match=r"task\.blocks must be from 2 to 5"):
-        make_tabletop("task/goal=stay", "task.blocks=6")
 
 
 def test_the_standard_benchmark_also_asks_for_nothing_and_for_what_cannot_be_done() -> None:

@@ -12,7 +12,7 @@ import pytest
 from arm_models import arguments_of, chosen, fingers, make, mjcf, successes, urdf
 from command_line import here
 
-from vla.tasks.tabletop import model_file
+from vla.tasks.tabletop import robot_file
 from vla.tasks.tabletop.file_robot import FileRobot
 from vla.tasks.tabletop.robot_file import RobotFile
 
@@ -81,14 +81,6 @@ def test_meshes_of_packages_are_found(
     assert np.ptp(model.mesh_vert, axis=0).max() == pytest.approx(0.06 * np.sqrt(2), rel=0.1)
 
 
-def test_an_arm_with_meshes_of_its_package_acts(tmp_path: Path) -> None:
-    write_mesh(tmp_path / "my_arm" / "meshes" / "link.stl")
-    (tmp_path / "my_arm" / "arm.urdf").write_text(urdf("package://my_arm/meshes/link.stl"))
-    environment = make(tmp_path / "my_arm" / "arm.urdf")
-    assert successes(environment, range(4)) == 4
-    environment.close()
-
-
 TEXTURED = """<asset><texture name="skin" type="2d" file="none.png"/><material name="skin" texture="skin"
     rgba="0.1 0.2 0.3 1"/></asset>"""
 
@@ -102,7 +94,7 @@ def test_textures_are_not_needed_and_one_sentence_says_so(
         skin = '<material name="skin"><texture filename="package://none/none.png"/></material>'
         text = urdf().replace('<link name="base">', f'{skin}<link name="base">')
     (tmp_path / "arm.xml").write_text(text)
-    with caplog.at_level(logging.INFO, model_file.__name__):
+    with caplog.at_level(logging.INFO, robot_file.__name__):
         models = [RobotFile(**arguments_of(tmp_path / "arm.xml")).read().compile() for _ in range(2)]
     said = "its textures are left out, and shapes have the colours of their materials"
     assert [record.message for record in caplog.records] == [f"task.robot.file={tmp_path / 'arm.xml'}: {said}"]

@@ -438,5 +438,5 @@ def test_a_recorded_world_says_what_contradicts_itself() -> None:
         ValueError, match=r"task\.joints names x without a unit of a position, rad, deg, m: name it with"
     ):
         Recorded(**{**made, "joints": "all"}, state=["x"], action=["x"], low=[0.0], high=[1.0])  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match="joints must be a list of names, all or null, got some"):
+    with pytest.raises(ValueError, match="robot names s, o, m, e, which is not in the state"):
         Recorded(**{**made, "joints": "some"}, state=["x"], action=["x"], low=[0.0], high=[1.0])  # type: ignore[arg-type]

@@ -22,7 +22,7 @@ from torch.nn.functional import normalize, one_hot
 from vla.models.text.huggingface import HuggingFace
 from vla.models.text.ngrams import NGrams
 from vla.tasks.tabletop.language import Grammar
-from vla.tasks.tabletop.randomize.language import paraphrase
+from vla.tasks.tabletop.randomize.episode import paraphrase
 from vla.tasks.tabletop.scene import COLOURS, PADS
 
 SAMPLE = 200  # instructions of a goal

@@ -95,7 +95,7 @@ class CartesianController:
     motion = (("dx", "m"), ("dy", "m"), ("dz", "m"), ("rx", "rad"), ("ry", "rad"), ("rz", "rad"))
 
     def __init__(self, arm: Kinematics, period: float, low: ArrayLike, high: ArrayLike) -> None:
-        """Args: the arm; control period [s]; corners (3,) of the box for the tool point in the base frame [m]."""
+        """Take the arm, its control period [s] and corners (3,) of the box for the tool point in the base frame [m]."""
         self.arm, self.period, self.low, self.high = arm, period, np.asarray(low), np.asarray(high)
         self.reset(arm.home)
 

@@ -6,34 +6,27 @@ Shapes: J joints.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable
 
 import numpy as np
 
 from vla.io.errors import UserError
 from vla.io.types import Point
-from vla.robots import panda
 from vla.robots.cartesian import CartesianController, Kinematics
 from vla.robots.chain import forward_of
 from vla.spec import Array, RobotModel, Spec
 
 GRIPPER = "gripper"  # action component that opens the gripper at 1 and closes it at 0, unless it is a joint
-
 SLACK = 0.1  # by which the bounds of an opening may exceed 0 and 1
-# Unit of a joint → factor to [rad], or to [m] of a prismatic one.
-UNITS = {"rad": 1.0, "deg": math.pi / 180, "m": 1.0}
+UNITS = {"rad": 1.0, "deg": math.pi / 180, "m": 1.0}  # unit of a joint → factor to [rad], or to [m] of a prismatic one
 
 
 class JointController:
-    """Takes actions that are joint targets.
+    """Takes actions that are joint targets."""
 
-    Args:
-        order: (J,) index of each joint among the components of the motion.
-        factors: (J,) from its unit to [rad].
-    """
-
-    def __init__(self, order: Sequence[int], factors: Array) -> None:
-        self._order, self._factors = list(order), factors
+    def __init__(self, order: list[int], factors: Array) -> None:
+        """Take each joint's index among the components of the motion, (J,), and factor from its unit to [rad]."""
+        self._order, self._factors = order, factors
 
     def reset(self, joints: Array) -> None:
         """Do nothing: targets are absolute."""
@@ -57,7 +50,7 @@ def controller_for(
     Args:
         spec: of the policy.
         workspace: opposite corners of the box for the tool point of Cartesian motion, in the base frame [m].
-        limits: (J,) smallest and largest positions [rad] and speeds [rad/s] of the arm; None: the Panda's own, or none.
+        limits: (J,) smallest and largest positions [rad] and speeds [rad/s] of the arm; None: there are none.
 
     Raises:
         UserError: the kinematics are not known, the actions are of another kind, or the box cannot be kept.
@@ -80,10 +73,7 @@ def controller_for(
 
 
 def _kinematics(model: RobotModel, limits: tuple[Array, Array, Array] | None) -> Kinematics:
-    """Return the kinematics of the Panda, or those of another arm's chain."""
     count = len(model.joints)
-    if np.shape(model.chain) == np.shape(panda.CHAIN) and np.allclose(model.chain, panda.CHAIN):
-        return panda.PANDA if limits is None else Kinematics(panda.forward, panda.HOME, *limits)
     if not model.chain or not model.home:
         raise UserError(
             f"Cartesian actions need the kinematics of the arm of {count} joints, and the checkpoint lacks its "
@@ -94,35 +84,10 @@ def _kinematics(model: RobotModel, limits: tuple[Array, Array, Array] | None) ->
     return Kinematics(forward_of(model.chain), np.array(model.home), low, high, speed)
 
 
-def acts_on_joints(spec: Spec) -> bool:
-    """Return whether the actions in `spec` are joint positions; a UserError if it has no robot."""
-    return {*spec.require_robot("deployment").joints} <= {*spec.action}
-
-
-def recorded_controller(spec: Spec) -> CartesianController | JointController:
-    """Build the controller for recorded actions, without a limit of the workspace.
-
-    Raises:
-        UserError: the arm or the actions are of another kind.
-    """
-    return controller_for(spec, None if acts_on_joints(spec) else ((-math.inf,) * 3, (math.inf,) * 3))
-
-
-def gripper_index(spec: Spec) -> int | None:
-    """Return the index of the gripper's opening in an action; None if there is none or it is a joint of the arm.
-
-    Raises:
-        UserError: the spec has no robot.
-    """
-    joints = spec.require_robot("deployment").joints
-    return spec.action.index(GRIPPER) if GRIPPER in spec.action and GRIPPER not in joints else None
-
-
 def _joint_controller(spec: Spec, model: RobotModel, workspace: tuple[Point, Point] | None) -> JointController:
     if others := [name for name in spec.action if name not in (*model.joints, GRIPPER)]:
         raise UserError(f"the policy's action has {', '.join(others)}, which are no joints of its robot")
-    state = dict(zip(spec.state, spec.state_units, strict=True))
-    _factors([(name, state[name]) for name in model.joints])  # those of the state must be known too
+    joint_factors(spec)  # those of the state must be known too
     if workspace is not None:
         raise UserError(
             "deploy.safety.workspace cannot be kept by a policy that acts with joint positions: set it to null, and "
@@ -134,19 +99,43 @@ def _joint_controller(spec: Spec, model: RobotModel, workspace: tuple[Point, Poi
             f"the action {GRIPPER} must be an opening, 0 closed to 1 open, and is from {spec.low[gripper]:g} to "
             f"{spec.high[gripper]:g}: scale it before training"
         )
-    units = dict(zip(spec.action, spec.units, strict=True))
     motion = [name for index, name in enumerate(spec.action) if index != gripper]
-    order = [motion.index(name) for name in model.joints]
-    return JointController(order, _factors([(name, units[name]) for name in model.joints]))
+    units = dict(zip(spec.action, spec.units, strict=True))
+    return JointController([motion.index(name) for name in model.joints], _factors(model.joints, units))
 
 
-def _factors(joints: list[tuple[str, str]]) -> Array:
-    if unknown := [joint for joint in joints if joint[1] not in UNITS]:
+def acts_on_joints(spec: Spec) -> bool:
+    """Return whether the actions in `spec` are joint positions; a UserError if it has no robot."""
+    return {*spec.require_robot("deployment").joints} <= {*spec.action}
+
+
+def recorded_controller(spec: Spec) -> CartesianController | JointController:
+    """Build the controller for recorded actions, without a limit of the workspace (UserError: the arm or the actions
+    are of another kind)."""
+    return controller_for(spec, None if acts_on_joints(spec) else ((-math.inf,) * 3, (math.inf,) * 3))
+
+
+def gripper_index(spec: Spec) -> int | None:
+    """Return the index of the gripper's opening in an action; None if there is none or it is a joint of the arm."""
+    joints = spec.require_robot("deployment").joints
+    return spec.action.index(GRIPPER) if GRIPPER in spec.action and GRIPPER not in joints else None
+
+
+def joint_factors(spec: Spec, velocities: bool = False) -> Array:
+    """Return the (J,) factors from the units of the joints in the state to [rad], or of their velocities to [rad/s]
+    (UserError: there is no robot, or a joint has another unit)."""
+    robot = spec.require_robot("a position in rad")
+    units = {name: unit.removesuffix("/s") for name, unit in zip(spec.state, spec.state_units, strict=True)}
+    return _factors(robot.velocities if velocities else robot.joints, units)
+
+
+def _factors(joints: Iterable[str], units: dict[str, str]) -> Array:
+    if unknown := [(name, units[name]) for name in joints if units[name] not in UNITS]:
         raise UserError(
             f"the joints {_listed(unknown)} have no unit of a position, {', '.join(UNITS)}: name it with task.units "
             "before training"
         )
-    return np.array([UNITS[unit] for _, unit in joints])
+    return np.array([UNITS[units[name]] for name in joints])
 
 
 def _listed(components: list[tuple[str, str]]) -> str:

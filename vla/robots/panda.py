@@ -50,8 +50,6 @@ def _link(a: float, d: float, turn: int) -> Array:
 
 
 _LINKS = np.stack([_link(*parameters) for parameters in DENAVIT_HARTENBERG])
-
-
 _TOOL = np.eye(4)
 _TOOL[:3, :3] = rotation_z(HAND_YAW)
 _TOOL[2, 3] = FLANGE + HAND_TO_TCP

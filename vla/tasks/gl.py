@@ -46,14 +46,11 @@ def choose_backend() -> None:
     with suppress(ImportError):  # the system's library: after Mesa it would be Mesa's, and bags would have other bytes
         import backports.zstd  # noqa: F401
     chosen = os.environ.get("MUJOCO_GL")
-    if (
-        os.environ.get("DISPLAY")
-        or sys.platform != "linux"
-        or chosen in (NO_BACKEND, os.environ.get(WORKING_BACKEND, NO_BACKEND))
-    ):
+    known = chosen in (NO_BACKEND, os.environ.get(WORKING_BACKEND, NO_BACKEND))
+    if known or os.environ.get("DISPLAY") or sys.platform != "linux":
         return
     candidates = [chosen] if chosen else ["egl", "osmesa"]
-    works = next((name for name in candidates if _runs(PROBE, MUJOCO_GL=name)), None)
+    works = next((name for name in candidates if _output(PROBE, MUJOCO_GL=name) is not None), None)
     os.environ["MUJOCO_GL"] = works or NO_BACKEND
     os.environ[WORKING_BACKEND if works else FAILED_BACKENDS] = works or " or ".join(candidates)
 
@@ -80,11 +77,7 @@ def _egl_devices() -> list[str]:
 
 
 def require_backend() -> None:
-    """Require that MuJoCo can render.
-
-    Raises:
-        UserError: no GL backend works on this machine.
-    """
+    """Require that MuJoCo can render (UserError: no GL backend works on this machine)."""
     if os.environ.get("MUJOCO_GL") == NO_BACKEND:
         raise UserError(
             f"this machine cannot render with MUJOCO_GL={os.environ.get(FAILED_BACKENDS, NO_BACKEND)}: install the "
@@ -95,16 +88,12 @@ def require_backend() -> None:
 def has_egl() -> bool:
     """Return whether the fast renderer can draw on this machine."""
     if EGL_WORKS not in os.environ:
-        os.environ[EGL_WORKS] = str(_runs(EGL_PROBE))
+        os.environ[EGL_WORKS] = str(_output(EGL_PROBE) is not None)
     return os.environ[EGL_WORKS] == "True"
 
 
-def _runs(code: str, **settings: str) -> bool:
-    return _output(code, **settings) is not None
-
-
 def _output(code: str, **settings: str) -> str | None:
-    # In a process of its own, which a failing GL backend can abort.
+    """Return what code prints in a process of its own, which a failing GL backend can abort; None if it fails."""
     environment = {**os.environ, **settings}
     done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True)
     return done.stdout if done.returncode == 0 else None

@@ -10,7 +10,6 @@ from typing import Annotated, Any
 import gymnasium
 import numpy as np
 from annotated_types import MinLen
-from gymnasium.envs.registration import EnvSpec
 from gymnasium.error import Error
 from gymnasium.spaces import Box
 
@@ -18,18 +17,17 @@ from vla.io.errors import UserError
 from vla.io.images import resize
 from vla.io.types import Count, ImageSize, Names, Positive, Text
 from vla.spec import Array, Numbers, Observation, Spec
-from vla.tasks.blind import Blindable
 from vla.tasks.gl import choose_backend
 from vla.tasks.recorded import units_of
+from vla.tasks.world import World
 
 log = logging.getLogger(__name__)
 
 OBSERVATION, INFO, RENDER = "observation", "info", "render"
-MISSING = object()
 PATHS = (f"{OBSERVATION}.", f"{INFO}.")
 
 
-class Gymnasium(Blindable):
+class Gymnasium(World):
     """A gymnasium environment, of whose observation and `info` a mapping takes images, state, truth and success.
 
     A value is named by a dotted path: `observation.pixels.top` is the entry `top` of the entry `pixels` of the
@@ -80,17 +78,13 @@ class Gymnasium(Blindable):
             UserError: the package is not installed or does not contain the environment, an action has no bounds, an
                 observation lacks a path, or arguments do not fit each other.
         """
-        truth = truth or {}
+        super().__init__()
+        self._truth, self._images, self._success, self._instruction = truth or {}, images, success, instruction
         self._environment = _make(package, id, options or {}, steps, render=RENDER in images.values())
-        self._images, self._success, self._truth, self._instruction = images, success, truth, instruction
-        self._size, self._state = (image_size[0], image_size[1]), tuple(state)
-        self.task, self.milestones = id, frozenset[str]()
-        self.done, self.outcome = True, "timeout"
-        self.draws: dict[str, Any] = {}
+        self._size, self._state, self.task = (image_size[0], image_size[1]), tuple(state), id
         space = self._environment.action_space
         if not isinstance(space, Box) or len(space.shape) != 1:
             raise UserError(f"{id} has the actions {space}: task=gymnasium takes a Box with one axis")
-        bounds = _bounds(space, low, high)
         values = self._values(*self._environment.reset(seed=0))
         alike = len({path.rpartition(".")[2] for path in state}) < len(state)  # then whole paths tell components apart
         names = [name for path, given in state.items() for name in _named(path, _get(values, path), given, alike)]
@@ -106,10 +100,10 @@ class Gymnasium(Blindable):
             state_units=state_units,
             action=actions,
             units=action_units,
-            low=bounds[0],
-            high=bounds[1],
+            low=_bound("low", low, space.low),
+            high=_bound("high", high, space.high),
             control_hz=float(rate),
-            truth=tuple((name, np.size(_get(values, path))) for name, path in truth.items()),
+            truth=tuple((name, np.size(_get(values, path))) for name, path in self._truth.items()),
         )
         self.spec = Spec.from_dict(spec.to_dict(), f"task.id={id}")
         self._observe(values)  # refuses images that are none
@@ -124,15 +118,14 @@ class Gymnasium(Blindable):
 
     def step(self, action: Array) -> Observation:
         """Apply one (D,) action, clipped to the bounds."""
-        if self.done:
-            raise UserError("the episode is over; call reset(seed) before step(action)")
+        self._require_running()
         clipped = np.clip(action, self.spec.low, self.spec.high).astype(self._environment.action_space.dtype)
         observation, _, terminated, truncated, info = self._environment.step(clipped)
         values = self._values(observation, info)
-        success = bool(_get(values, self._success, default=False))
-        self.outcome = "success" if success else "failure" if terminated else "timeout"
-        self.done = success or terminated or truncated
-        self._success_reported |= _get(values, self._success, default=MISSING) is not MISSING
+        reported = _get(values, self._success, None)
+        self.outcome = "success" if reported else "failure" if terminated else "timeout"
+        self.done = bool(reported) or terminated or truncated
+        self._success_reported |= reported is not None
         if self.done and not self._success_reported:
             self._success_reported = True
             log.warning("in a whole episode the environment gave no %s, task.success: that is a failure", self._success)
@@ -147,9 +140,9 @@ class Gymnasium(Blindable):
         return {OBSERVATION: observation, INFO: info, **({RENDER: self._environment.render()} if drawn else {})}
 
     def _observe(self, values: Mapping[str, Any]) -> Observation:
-        pictures = {} if self._blind else {name: _get(values, path) for name, path in self._images.items()}
+        images = {} if self._blind else self._images
         return Observation(
-            rgb={name: _resized(name, picture, self._size) for name, picture in pictures.items()},
+            rgb={name: _resized(name, _get(values, path), self._size) for name, path in images.items()},
             state=np.concatenate([np.ravel(_get(values, path)) for path in self._state]).astype(np.float32),
             instruction=str(_get(values, said)) if (said := self._instruction).startswith(PATHS) else said,
             truth={name: np.ravel(_get(values, path)).astype(np.float32) for name, path in self._truth.items()},
@@ -167,7 +160,9 @@ def _make(package: str, id: str, options: Mapping[str, object], steps: int | Non
         spec = gymnasium.spec(id) if ":" not in id else None
     except Error as error:
         raise UserError(f"task.id={id} is not registered by {package}: {error}") from error
-    if spec is None or _home(spec) != package:
+    entry = spec.entry_point if spec else ""
+    module = entry if isinstance(entry, str) else getattr(entry, "__module__", "")
+    if spec is None or module.partition(":")[0].partition(".")[0] != package:
         raise UserError(
             f"task.id={id} is no environment of task.package={package}: name the package that contains its class, and "
             "the id without a module"
@@ -182,44 +177,26 @@ def _make(package: str, id: str, options: Mapping[str, object], steps: int | Non
         raise UserError(f"task.options={dict(options)} does not fit {id}: {error}") from error
 
 
-def _bounds(space: Box, low: Numbers | float | None, high: Numbers | float | None) -> list[tuple[float, ...]]:
-    """Return the low and high bounds of an action, as given or else of its space.
-
-    Raises:
-        UserError: there is no bound, or more or fewer than components.
-    """
-    found = []
-    for name, given, own in (("low", low, space.low), ("high", high, space.high)):
-        if given is None:
-            bound = tuple(float(str(value)) for value in own)  # 0.1, not the 0.10000000149 of float32
-        else:
-            bound = (float(given),) * len(own) if isinstance(given, int | float) else tuple(given)
-        if len(bound) != len(own):
-            raise UserError(f"task.{name} has {len(bound)} numbers, an action has {len(own)} components")
-        if not np.isfinite(bound).all():
-            raise UserError(f"the actions {space} have no bounds: set task.{name}, a number, or one per component")
-        found.append(bound)
-    return found
+def _bound(name: str, given: Numbers | float | None, own: Array) -> tuple[float, ...]:
+    """Return the low or high bounds of an action, as given or else of its space; a UserError if they do not fit it."""
+    if given is None:
+        bound = tuple(float(str(value)) for value in own)  # 0.1, not the 0.10000000149 of float32
+    else:
+        bound = (float(given),) * len(own) if isinstance(given, int | float) else tuple(given)
+    if len(bound) != len(own):
+        raise UserError(f"task.{name} has {len(bound)} numbers, an action has {len(own)} components")
+    if not np.isfinite(bound).all():
+        raise UserError(f"the actions have no bounds: set task.{name}, a number, or one per component")
+    return bound
 
 
-def _home(spec: EnvSpec) -> str:
-    """Return the package of an environment's class or factory."""
-    entry = spec.entry_point
-    module = entry if isinstance(entry, str) else getattr(entry, "__module__", "")
-    return module.partition(":")[0].partition(".")[0]
-
-
-def _get(values: Any, path: str, default: Any = None) -> Any:
-    """Return the value at a dotted path.
-
-    Raises:
-        UserError: there is none, and no default.
-    """
+def _get(values: Any, path: str, *default: Any) -> Any:
+    """Return the value at a dotted path; a UserError if there is none, and no default."""
     found = values
     for name in path.split("."):
         if not isinstance(found, Mapping) or name not in found:
-            if default is not None:
-                return default
+            if default:
+                return default[0]
             there = ", ".join(map(str, found)) if isinstance(found, Mapping) else "no further names"
             raise UserError(f"there is no {path} in what the environment returns: instead of {name} there is {there}")
         found = found[name]
@@ -227,11 +204,8 @@ def _get(values: Any, path: str, default: Any = None) -> Any:
 
 
 def _named(path: str, values: Any, names: Names | None, whole: bool = False) -> tuple[str, ...]:
-    """Return the names of the components of an array, by default the last part of its path, or all, and numbers.
-
-    Raises:
-        UserError: there are more or fewer components than names.
-    """
+    """Return the names of the components of an array, by default the last part of its path, or all, and numbers; a
+    UserError if there are more or fewer components than names."""
     size = np.size(values)
     if names is None:
         name = path.partition(".")[2] if whole else path.rpartition(".")[2]

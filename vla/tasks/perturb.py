@@ -55,11 +55,7 @@ class Perturbation:
             raise UserError(f"expert.perturb has {low} numbers in low, {high} in high, {move} in move")
 
     def reset(self, spec: Spec, seed: int) -> None:
-        """Draw the pace of an episode and its first excursion.
-
-        Raises:
-            UserError: the actions lack a named component.
-        """
+        """Draw the pace of an episode and its first excursion (UserError: the actions lack a named component)."""
         groups = self.move, (self.turn,) if self.turn else (), (self.gripper,) if self.gripper else ()
         if unknown := [name for group in groups for name in group if name not in spec.action]:
             raise UserError(f"expert.perturb names {', '.join(unknown)}; actions have {', '.join(spec.action)}")
@@ -116,11 +112,7 @@ class Perturbed:
     """An expert with perturbed actions; `info["clean"]` is the expert's own action, the label to imitate."""
 
     def __init__(self, spec: Spec, expert: Callable[..., Agent], perturb: Perturbation) -> None:
-        """Args:
-        spec: the environment's spec.
-        expert: factory of the expert, called with `spec`.
-        perturb: the perturbation.
-        """
+        """Perturb the expert that `expert` makes for `spec`, that of the environment."""
         self._spec, self._expert, self._perturb = spec, expert(spec=spec), perturb
         self.memoryless = bool(getattr(self._expert, "memoryless", False))  # of the label
         self.looks = bool(getattr(self._expert, "looks", True))
@@ -133,11 +125,7 @@ class Perturbed:
         self._perturb.reset(self._spec, seed)
 
     def act(self, observation: Observation) -> Array:
-        """Return the (D,) float32 action to execute.
-
-        Raises:
-            UserError: the observation lacks the simulator's truth.
-        """
+        """Return the (D,) float32 action to execute (UserError: the observation lacks the simulator's truth)."""
         clean = self._expert.act(observation)
         self.info = {**self._expert.info, "clean": clean}
         if observation.truth is None:

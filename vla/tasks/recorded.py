@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Literal
 
 from vla.io.errors import UserError
 from vla.io.types import ImageSize, Positive, Text
@@ -13,16 +14,8 @@ from vla.spec import Cameras, Names, Numbers, RobotModel, Spec, SpecOnly
 def units_of(
     units: str | Mapping[str, str], state: Sequence[str], action: Sequence[str]
 ) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Return the units of the components of state and action.
-
-    Args:
-        units: of all components, or of some by name; the others have "1".
-        state: names of its components.
-        action: names of its components.
-
-    Raises:
-        UserError: a name is of no component.
-    """
+    """Return the units of the components of state and action, given one of all, or those of some by name, where the
+    others have "1"; a UserError if a name is of no component."""
     if isinstance(units, str):
         return (units,) * len(state), (units,) * len(action)
     if unknown := [name for name in units if name not in (*state, *action)]:
@@ -59,12 +52,10 @@ class Recorded(SpecOnly):
         units: Text | dict[str, Text],
         low: Numbers,
         high: Numbers,
-        joints: Names | Text | None,
+        joints: Names | Literal["all"] | None,
     ) -> None:
         state_units, action_units = units_of(units, state, action)
-        if isinstance(joints, str):
-            if joints != "all":
-                raise UserError(f"task.joints must be a list of names, all or null, got {joints}")
+        if joints == "all":
             joints = tuple(action)
         known = {**dict(zip(state, state_units, strict=True)), **dict(zip(action, action_units, strict=True))}
         if lacking := [name for name in joints or () if known.get(name, "rad") not in UNITS]:

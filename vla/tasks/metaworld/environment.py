@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from functools import partial
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from annotated_types import Ge, Gt, Le, Predicate
@@ -13,10 +13,10 @@ from vla.io.errors import UserError
 from vla.io.types import ImageSize, Names, Natural, Share, Text
 from vla.parallel.limits import free_memory
 from vla.spec import Array, Observation, Spec
-from vla.tasks.blind import Blindable
 from vla.tasks.metaworld.package import tasks_of
-from vla.tasks.metaworld.scene import CAMERA, HAND, Scene
+from vla.tasks.metaworld.scene import CAMERA, HAND, PictureSettings, TaskScene
 from vla.tasks.rendering.renderer import RendererFactory
+from vla.tasks.world import World
 
 CONTROL_HZ = 80.0  # five substeps of 2.5 ms
 REACH = 0.01  # largest displacement of the hand per step, along each axis [m]
@@ -36,7 +36,7 @@ def within(window: Sequence[float]) -> bool:
 Window = Annotated[tuple[Share, Share, Share, Share], Predicate(within)]
 
 
-class MetaWorld(Blindable):
+class MetaWorld(World):
     """Fifty tasks of a Sawyer arm, one of them per episode: the seed determines which, in turn.
 
     Success is the first step that Meta-World calls one; an episode ends with it, or when its steps are used up. The
@@ -58,7 +58,7 @@ class MetaWorld(Blindable):
         shadows: Natural,
         steps: Annotated[int, Ge(1), Le(MOST_STEPS)],
     ) -> None:
-        """Compile nothing yet.
+        """Check the tasks; scenes are compiled when first played.
 
         Args:
             tasks: a benchmark of Meta-World, or names of its tasks.
@@ -79,6 +79,7 @@ class MetaWorld(Blindable):
         Raises:
             UserError: `metaworld` is not installed, or a task is unknown or has no sentence.
         """
+        super().__init__()
         known = self._known = tasks_of("mt50")  # the truth names a task by its place here
         self.tasks = tuple(tasks_of(tasks) if isinstance(tasks, str) else tasks)
         listed = {*self.tasks, *sentences, *(name for names in tiers.values() for name in names)}
@@ -100,20 +101,10 @@ class MetaWorld(Blindable):
             cut=tuple(name for name in cameras if name == HAND or (name == CAMERA and window is not None)),
         )
         self._sentences, self._steps = sentences, steps
-        self._make_scene = partial(
-            Scene,
-            renderer=renderer,
-            cameras=self.spec.cameras,
-            image_size=self.spec.image_size,
-            window=window,
-            hand_size=hand_size,
-            drawn=drawn,
-            shadows=shadows,
-        )
-        self._scenes: dict[str, Scene] = {}
-        self.done, self.outcome, self.task = True, "timeout", ""
-        self.milestones: frozenset[str] = frozenset()
-        self.draws: dict[str, Any] = {}
+        size = self.spec.image_size
+        settings = PictureSettings(renderer, self.spec.cameras, size, window, hand_size, drawn, shadows)
+        self._make_scene = partial(TaskScene, settings=settings)
+        self._scenes: dict[str, TaskScene] = {}
         self.tool: Array = np.zeros(3)
 
     def task_of(self, seed: int) -> str:
@@ -131,8 +122,7 @@ class MetaWorld(Blindable):
 
     def step(self, action: Array) -> Observation:
         """Apply one (4,) action, clipped to the spec's bounds, for one control period."""
-        if self.done:
-            raise UserError("the episode is over; call reset(seed) before step(action)")
+        self._require_running()
         observation, solved = self._scene.step(_command(np.clip(action, self.spec.low, self.spec.high)))
         self.outcome = "success" if solved else "timeout"
         self._taken += 1
@@ -144,7 +134,7 @@ class MetaWorld(Blindable):
         while self._scenes:
             self._scenes.popitem()[1].close()
 
-    def _scene_of(self, task: str) -> Scene:
+    def _scene_of(self, task: str) -> TaskScene:
         """Return the scene of a task; where memory is scarce, replace the newest.
 
         A scene takes a quarter of a second and some 80 MB. Tasks take turns, so the oldest ones are needed first.

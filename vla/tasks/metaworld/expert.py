@@ -19,11 +19,7 @@ class Scripted:
     memoryless = True  # of all fifty experts of Meta-World 3.0.0
 
     def __init__(self, *, spec: Spec) -> None:
-        """Args: the environment's spec.
-
-        Raises:
-            UserError: it is not that of Meta-World.
-        """
+        """Act in an environment of this spec; a UserError if it is not that of Meta-World."""
         if spec.state != STATE:
             raise UserError("expert=metaworld acts in task=metaworld only: choose the expert of this task")
         self.info: dict[str, Any] = {}
@@ -35,11 +31,7 @@ class Scripted:
         self._expert = None
 
     def act(self, observation: Observation) -> Array:
-        """Return the (4,) float32 action of the expert.
-
-        Raises:
-            UserError: the observation lacks the simulator's truth.
-        """
+        """Return the (4,) float32 action of the expert (UserError: the observation lacks the simulator's truth)."""
         if observation.truth is None:
             raise UserError("expert=metaworld needs the simulator's truth, which this observation lacks")
         if self._expert is None:

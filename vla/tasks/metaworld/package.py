@@ -22,11 +22,7 @@ WELD = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, -1.0, 0.0, 0.0, 0.0, 5.0)
 
 @cache
 def metaworld() -> ModuleType:
-    """Import the package and make its simulator construct models with this MuJoCo.
-
-    Raises:
-        UserError: it is not installed.
-    """
+    """Import the package and make its simulator construct models with this MuJoCo (UserError: it is not installed)."""
     try:
         from metaworld import env_dict, sawyer_xyz_env
     except ImportError as error:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import mujoco
 import numpy as np
@@ -11,7 +12,7 @@ from PIL import Image
 from vla.io.errors import UserError
 from vla.spec import Array
 from vla.tasks.metaworld.package import simulator
-from vla.tasks.rendering.renderer import WHOLE, Renderer, RendererFactory, View
+from vla.tasks.rendering.renderer import WHOLE, Renderer, RendererFactory, Views
 
 HALF_TURN = np.array([0.0, 0.0, 0.0, 1.0])  # about the optical axis, quaternion wxyz
 # LeRobot (src/lerobot/envs/metaworld.py) moves this camera, which hangs upside down, and turns its pictures.
@@ -22,58 +23,47 @@ MIDDLE = (0.0, 0.0, -0.075)  # of that part, 3 cm below the fingertips, from the
 CURRENT, BEFORE = slice(18), slice(18, 36)  # of an observation (39,): hand, gripper, objects now and one step before
 
 
-class Scene:
+@dataclass(frozen=True)
+class PictureSettings:
+    """What pictures of all tasks have in common."""
+
+    renderer: RendererFactory
+    cameras: tuple[str, ...]  # names in the model, or HAND
+    image_size: tuple[int, int]  # height and width of the pictures [px]
+    window: Sequence[float] | None  # this and what follows: see `MetaWorld`
+    hand_size: float
+    drawn: int | None
+    shadows: int
+
+
+class TaskScene:
     """Simulator of a task with the cameras as LeRobot has them; its renderer is made with the first picture."""
 
-    def __init__(
-        self,
-        task: str,
-        renderer: RendererFactory,
-        cameras: Sequence[str],
-        image_size: tuple[int, int],
-        window: Sequence[float] | None,
-        hand_size: float,
-        drawn: int | None,
-        shadows: int,
-    ) -> None:
-        """Args:
-        task: name of the task.
-        renderer: makes the renderer of the pictures.
-        cameras: names in the model, or HAND.
-        image_size: height and width of the pictures [px].
-        window: top, left, bottom and right of what CAMERA shows, as shares of its picture; None: all.
-        hand_size: height and width of what HAND shows, as shares of CAMERA's picture.
-        drawn: height and width at which all of a camera's picture is drawn, to be cut to its window and averaged [px];
-            None: the window is drawn in the size of the pictures.
-        shadows: edge of the shadow map [texels]; 0: no shadows.
-
-        Raises:
-            UserError: there is no such camera.
-        """
-        self.simulator = simulator(task)
-        model = self.model = self.simulator.model
+    def __init__(self, task: str, settings: PictureSettings) -> None:
+        """Compile a task; a UserError if it lacks a camera."""
+        self._settings, self.simulator = settings, simulator(task)
+        model, cameras, window = self.simulator.model, settings.cameras, settings.window
+        self.model = model
         known = [model.camera(number).name for number in range(model.ncam)]
         if unknown := [name for name in cameras if name not in (*known, HAND)]:
             raise UserError(
                 f"task.cameras names {', '.join(unknown)}; Meta-World has {', '.join(known)}, and {HAND}, which is "
                 f"the part of {CAMERA} around the hand"
             )
-        camera = known.index(CAMERA)
+        camera = self._camera = known.index(CAMERA)
         model.cam_pos[camera] = CAMERA_PLACE
         turned = np.empty(4)
         mujoco.mju_mulQuat(turned, model.cam_quat[camera].copy(), HALF_TURN)
         model.cam_quat[camera] = turned
-        model.vis.quality.shadowsize = shadows
+        model.vis.quality.shadowsize = settings.shadows
         model.mat_reflectance[:] = 0  # of the renderers none draws it, and in no task does it show from corner2
-        self._image_size, self._drawn = image_size, drawn
         self._windows = np.array([window if window and name == CAMERA else WHOLE for name in cameras], float)
-        self._hands, self._hand_size = [number for number, name in enumerate(cameras) if name == HAND], hand_size
-        height, width = image_size if drawn is None else (drawn, drawn)
+        self._hands = [number for number, name in enumerate(cameras) if name == HAND]
         self._places = [known.index(CAMERA if name == HAND else name) for name in cameras]
-        seen = self._places if drawn is None else sorted(set(self._places))  # all of a camera's picture once
-        self._view = View(seen, height, width, site_groups=(0, 1, 2), aspect=1.0)
-        self._camera = camera
-        self._renderer_factory = renderer
+        # All of a camera's picture is drawn once.
+        seen = self._places if settings.drawn is None else sorted(set(self._places))
+        height, width = settings.image_size if settings.drawn is None else (settings.drawn, settings.drawn)
+        self._views = Views(seen, height, width, site_groups=(0, 1, 2), aspect=1.0)
         self._renderer: Renderer | None = None
         self._changed = True
 
@@ -101,17 +91,17 @@ class Scene:
     def pictures(self) -> Array:
         """Draw every camera's picture (cameras, H, W, 3) uint8."""
         if self._renderer is None:
-            self._renderer = self._renderer_factory.open(self.model, self._view)
+            self._renderer = self._settings.renderer.open(self.model, self._views)
         elif self._changed:
             self._renderer.update()
         self._changed = False
         for number in self._hands:
             self._windows[number] = self._around_the_hand()
-        if self._drawn is None:
+        if self._settings.drawn is None:
             return self._renderer.render(self.simulator.data, self._windows)[0]
-        pictures = dict(zip(self._view.cameras, self._renderer.render(self.simulator.data)[0], strict=True))
+        pictures = dict(zip(self._views.cameras, self._renderer.render(self.simulator.data)[0], strict=True))
         shown = zip(self._places, self._windows, strict=True)
-        return np.stack([_cut(pictures[camera], window, self._image_size) for camera, window in shown])
+        return np.stack([_cut(pictures[camera], window, self._settings.image_size) for camera, window in shown])
 
     def _around_the_hand(self) -> Array:
         """Return the window (4,) of CAMERA's picture around the fingertips, of whole pixels of LeRobot's picture."""
@@ -119,9 +109,10 @@ class Scene:
         there = self.simulator.get_endeff_pos() + MIDDLE - data.cam_xpos[self._camera]
         across, up, behind = data.cam_xmat[self._camera].reshape(3, 3).T @ there
         half = -behind * np.tan(np.radians(fovy / 2))  # of the whole picture, at that distance
-        corner = np.array([(1 - up / half) / 2, (1 + across / half) / 2]) - self._hand_size / 2
-        upper, left = (np.rint(LEROBOT * corner) / LEROBOT).clip(0, 1 - self._hand_size)
-        return np.array([upper, left, upper + self._hand_size, left + self._hand_size])
+        size = self._settings.hand_size
+        corner = np.array([(1 - up / half) / 2, (1 + across / half) / 2]) - size / 2
+        upper, left = (np.rint(LEROBOT * corner) / LEROBOT).clip(0, 1 - size)
+        return np.array([upper, left, upper + size, left + size])
 
     def close(self) -> None:
         """Free physics and GL."""

@@ -20,27 +20,24 @@ from annotated_types import Ge, Le
 from vla.io.errors import UserError
 from vla.spec import Array
 from vla.tasks.gl import has_egl
-from vla.tasks.rendering import lights, shaders, shapes
-from vla.tasks.rendering.buffers import Buffers
-from vla.tasks.rendering.cameras import Cameras
+from vla.tasks.rendering import shaders, shapes, uniforms
 from vla.tasks.rendering.context import Context, shared_context
 from vla.tasks.rendering.decimate import decimate
-from vla.tasks.rendering.elements import Elements, elements_of, unsupported
-from vla.tasks.rendering.geometry import Geometry
-from vla.tasks.rendering.renderer import Renderer, View
-from vla.tasks.rendering.shadows import RIM, STATE, Shadows
+from vla.tasks.rendering.geometry import Buffers, Elements, Geometry, elements_of, unsupported
+from vla.tasks.rendering.projections import ModelCameras, clip_range
+from vla.tasks.rendering.renderer import Renderer, Views
+from vla.tasks.rendering.shadows import STATE, Shadows
 from vla.tasks.rendering.textures import Textures
 
 log = logging.getLogger(__name__)
 BEHIND = 0.3  # factor on the alpha of a plane seen from behind, as in MuJoCo
-ALIGNMENT = 256  # of a camera's block in its buffer [bytes], enough for every machine
-GAP = 120  # largest number of invisible indices to draw between two runs, which is faster than a second draw call
+GAP = 120  # largest number of invisible indices to draw between two calls, which is faster than a second call
 MARGIN = 1.01  # factor on the radius of elements, against rounding
 PACKAGES = "libegl1, libgl1 and libgl1-mesa-dri"
 
 
 @dataclass(frozen=True)
-class Run:
+class DrawCall:
     """Triangles that one call draws."""
 
     texture: int  # id, or -1
@@ -54,7 +51,6 @@ class Fast:
 
     samples: Literal[1, 4]  # per pixel, which are averaged; 4 draws twice as many rows and columns, for smooth edges
     soft: Annotated[int, Ge(0), Le(4)]  # texels around the nearest one over which the edges of shadows are averaged
-    light: Literal["auto", "vertex", "pixel"]  # at vertices as in MuJoCo, or pixels; auto: pixels for spots only
     faces: Annotated[int, Ge(100)] | None  # most faces of a mesh, heavier ones are decimated for pictures; None: all
 
     @staticmethod
@@ -64,12 +60,8 @@ class Fast:
             return None
         return f"the fast renderer needs EGL, which this machine lacks (packages {PACKAGES})", "mujoco"
 
-    def open(self, model: mujoco.MjModel, view: View) -> Renderer:
-        """Make a renderer of `model`.
-
-        Raises:
-            UserError: this machine has no EGL. Nothing else draws in its place, because a store names its renderer.
-        """
+    def open(self, model: mujoco.MjModel, views: Views) -> Renderer:
+        """Make a renderer of `model`; a UserError without EGL: a store names its renderer, so none replaces it."""
         try:
             context = shared_context()
         except Exception as error:  # moderngl raises plain exceptions
@@ -77,106 +69,95 @@ class Fast:
                 f"the fast renderer needs EGL, which this machine lacks ({error}): install the packages "
                 f"{PACKAGES}, or choose task/renderer=mujoco"
             ) from error
-        return FastRenderer(context, model, view, self)
+        return FastRenderer(context, model, views, self)
 
 
 class FastRenderer:
     """Pictures of one model by OpenGL 3.3."""
 
-    def __init__(self, context: Context, model: mujoco.MjModel, view: View, settings: Fast) -> None:
-        """Args: the context; the model; what to draw of it; settings."""
-        self._context, self._gl = context, context.gl
-        self._model, self._view, self._settings = model, view, settings
-        self._cameras = Cameras(model, view)
-        missing = unsupported(model, view)
-        if missing:
+    def __init__(self, context: Context, model: mujoco.MjModel, views: Views, settings: Fast) -> None:
+        self._context, self._gl, self._settings = context, context.gl, settings
+        self._model, self._views = model, views
+        self._cameras = ModelCameras(model, views)
+        if missing := unsupported(model, views):
             log.warning(f"the fast renderer leaves out {', '.join(missing)}; task/renderer=mujoco draws them")
-        self._near, self._far = lights.clip_range(model)
         sky = np.flatnonzero(model.tex_type == mujoco.mjtTexture.mjTEXTURE_SKYBOX)
         self._sky = int(sky[0]) if len(sky) else -1
         self._geometry = Geometry(model, self._mesh)
+        casting = model.light_castshadow if model.vis.quality.shadowsize else np.zeros(model.nlight, bool)
+        self._lamps = [int(light) for light in uniforms.drawn_lights(model) if casting[light]]
         with context.used_by(self):
             self._make_targets()
+            self._shadows = Shadows(self._gl, model, self._lamps, settings.soft)
             self._make_tables()
             self._textures = Textures(context.gl, model)
             self._make_programs()
             self._make_buffers()
+            self._uniforms = uniforms.CameraUniforms(self._gl, model, self._cameras, self._lamps)
         self.update()
 
-    def _mesh(self, mesh: int) -> shapes.Shape:
+    def _mesh(self, mesh: int, textured: bool) -> shapes.Surface:
         vertices, faces = shapes.mesh_triangles(self._model, mesh)
         if self._settings.faces is not None and len(faces) > self._settings.faces:
-            return shapes.decimated(*decimate(vertices, faces, self._settings.faces))
+            texcoord = shapes.mesh_texcoord(self._model, mesh) if textured else None
+            return shapes.smoothed(*decimate(vertices, faces, texcoord, self._settings.faces))
         return shapes.mesh(self._model, mesh)
 
     def _make_targets(self) -> None:
-        """Make the framebuffer, the cameras' pictures one above the other, and the shadow maps."""
-        gl, view = self._gl, self._view
-        width, height = view.width, view.height * len(view.cameras)
+        """Make the framebuffer with the cameras' pictures one above the other, so that one reading takes them all."""
+        gl, width, height = self._gl, self._views.width, self._views.height * len(self._views.cameras)
         self._fine = 2 if self._settings.samples == 4 else 1  # rows and columns per pixel
         size = self._fine * width, self._fine * height
         self._drawn = gl.framebuffer(gl.renderbuffer(size, 4), self._context.depth_renderbuffer(size))
         self._averaged = gl.framebuffer(gl.renderbuffer((width, height), 4)) if self._fine == 2 else self._drawn
-        model = self._model
-        self._lights = lights.drawn(model)
-        casting = model.light_castshadow if model.vis.quality.shadowsize else np.zeros(model.nlight, bool)
-        self._lamps = [int(light) for light in self._lights if casting[light]]
-        self._shadows = Shadows(gl, model, self._lamps, self._settings.soft)
 
     def _make_tables(self) -> None:
-        model, gl = self._model, self._gl
-        count = model.ngeom + model.nsite + 1  # the last one is the sky
+        """Make the textures of poses and appearance: changing a row of one is how an element moves."""
+        count = self._model.ngeom + self._model.nsite + 1  # the last one is the sky
         self._poses = np.zeros((count, shaders.POSE, 4), np.float32)
         self._poses[-1] = np.eye(3, 4)
         self._table = np.zeros((count, shaders.TEXELS, 4), np.float32)
-        self._pose_texture = gl.texture((shaders.POSE, count), 4, dtype="f4")
-        self._table_texture = gl.texture((shaders.TEXELS, count), 4, dtype="f4")
+        self._pose_texture = self._gl.texture((shaders.POSE, count), 4, dtype="f4")
+        self._table_texture = self._gl.texture((shaders.TEXELS, count), 4, dtype="f4")
         for texture in (self._pose_texture, self._table_texture):
             texture.filter = moderngl.NEAREST, moderngl.NEAREST
 
     def _make_programs(self) -> None:
-        gl, settings = self._gl, self._settings
-        spot = self._model.light_type == lights.SPOT
-        pixel = settings.light == "pixel" or (settings.light == "auto" and bool(spot[self._lights].any()))
-        spots = [bool(spot[lamp]) for lamp in self._lamps]
-        numbers = [1 + list(self._lights).index(lamp) for lamp in self._lamps]
-        kinds: tuple[shaders.Texture, ...] = ("none", "2d", "cube")
+        """Compile the shaders, a program per kind of texture, and give each texture that all read a unit."""
+        gl, settings, lights = self._gl, self._settings, uniforms.drawn_lights(self._model).tolist()
+        spot = self._model.light_type == uniforms.SPOT
+        pixel = bool(spot[lights].any())  # light at vertices, as in MuJoCo, would miss the edge of a spot
+        lamps = {1 + lights.index(lamp): bool(spot[lamp]) for lamp in self._lamps}
+        kinds: tuple[shaders.Skin, ...] = ("none", "2d", "cube")
         self._programs = {
-            kind: gl.program(**shaders.scene_program(1 + len(self._lights), numbers, spots, kind, pixel, settings.soft))
+            kind: gl.program(**shaders.scene_program(1 + len(lights), lamps, kind, pixel, settings.soft))
             for kind in kinds
         }
         units = {"poses": self._pose_texture, "table": self._table_texture}
         units |= {f"shadow{number}": depth for number, depth in enumerate(self._shadows.maps)}
         self._units = list(units.values())
         self._bind()
-        for unit, name in enumerate(units):
+        self._skin = len(units)  # the unit of the texture of what is being drawn
+        for unit, name in enumerate((*units, "skin")):
             for program in (*self._programs.values(), self._shadows.program):
                 if name in program:
                     program[name] = unit
-        self._skin = len(units)  # the unit of the texture of what is being drawn
-        for program in self._programs.values():
-            if "skin" in program:
-                program["skin"] = self._skin
-        floats = shaders.CAMERA + 16 * len(self._lamps) + 4 * lights.ROWS * (1 + len(self._lights))
-        rows = -(-4 * floats // ALIGNMENT) * ALIGNMENT // 4
-        self._blocks = np.zeros((len(self._cameras.ids), rows), np.float32)
-        self._camera_buffer = gl.buffer(reserve=self._blocks.nbytes)
 
     def _bind(self) -> None:
-        """Bind the textures that all programs read to their units."""
+        """Bind the textures that all programs read to their units, which another renderer may have used."""
         for unit, texture in enumerate(self._units):
             texture.use(unit)
 
     def _make_buffers(self) -> None:
-        gl = self._gl
-        self._seen = Buffers(gl)
+        """Make the buffer of all geometry, and its reading by each program, which skips what that does not use."""
+        self._seen = Buffers(self._gl)
         names = "in_position", "in_normal", "in_coordinate", "in_element"
         self._scene = {}
         for kind, program in self._programs.items():
             taken = [name if name in program else None for name in names]
             form = " ".join(f"{n}f" if name else f"{4 * n}x" for n, name in zip((3, 3, 3, 1), taken, strict=True))
             content = [(self._seen.vertices, form, *(name for name in taken if name))]
-            self._scene[kind] = gl.vertex_array(program, content, self._seen.indices)
+            self._scene[kind] = self._gl.vertex_array(program, content, self._seen.indices)
 
     def update(self, textures: Collection[int] = ()) -> None:
         """Upload what has changed in the model; `textures` are the ids of those whose pixels have."""
@@ -184,12 +165,12 @@ class FastRenderer:
             if changed:
                 self._bind()
             self._textures.upload(set(textures))
-            elements = self._elements = elements_of(self._model, self._view)
+            elements = self._elements = elements_of(self._model, self._views)
             self._planes = np.flatnonzero(elements.seen & (elements.kind == mujoco.mjtGeom.mjGEOM_PLANE)).tolist()
             self._geometry.update(elements, self._sky >= 0)
-            self._place_blocks()
+            self._place_elements()
             self._cameras.update()
-            self._light_places: bytes | None = None
+            self._uniforms.stale = True
             sites = np.linalg.norm(elements.size[self._model.ngeom :], axis=1)
             self._bounds = np.append(self._model.geom_rbound, sites)  # radius of each element [m]
             table = self._new_table(elements)
@@ -197,35 +178,36 @@ class FastRenderer:
                 self._table = table
                 self._table_texture.write(table)
 
-    def _place_blocks(self) -> None:
+    def _place_elements(self) -> None:
         """Upload the elements' triangles, and note where they are."""
-        blocks, sky = self._geometry.blocks, len(self._elements.kind)
-        self._seen.update([block.seen for block in blocks])
-        ends = np.cumsum([0, *(block.seen.triangles.size for block in blocks)])
-        self._runs = {
-            block.element: Run(self._texture_of(block.element), int(start), block.seen.triangles.size)
-            for block, start in zip(blocks, ends, strict=False)
+        placed, sky = self._geometry.elements, len(self._elements.kind)
+        self._seen.update([each.seen for each in placed])
+        ends = np.cumsum([0, *(each.seen.triangles.size for each in placed)]).tolist()
+        self._calls = {
+            each.element: DrawCall(self._texture_of(each.element), start, each.seen.triangles.size)
+            for each, start in zip(placed, ends, strict=False)
         }
-        order = list(self._runs)
+        order = list(self._calls)
         solid, self._transparent = order[: self._geometry.solid], order[self._geometry.solid :]
         self._opaque = np.array([element for element in solid if element != sky], int)
-        radius = {block.element: block.radius for block in blocks}
+        radius = {each.element: each.radius for each in placed}
         radius |= dict.fromkeys(self._planes, np.inf)  # they may move along with a camera
         self._radii = MARGIN * np.array([radius[element] for element in self._opaque])
-        self._merged: dict[bytes, list[Run]] = {}  # whether each opaque element is in sight → what to draw
-        self._shadows.update([block for block in blocks if block.element != sky])
+        # Elements enter and leave a picture seldom, so the merged calls are kept for every set that was in sight.
+        self._merged: dict[bytes, list[DrawCall]] = {}  # whether each opaque element is in sight → what to draw
+        self._shadows.update([each for each in placed if each.element != sky])
 
     def _texture_of(self, element: int) -> int:
         texture = self._sky if element == len(self._elements.kind) else int(self._elements.texture[element])
         return texture if texture in self._textures.placed else -1
 
-    def _kind(self, texture: int) -> shaders.Texture:
+    def _kind(self, texture: int) -> shaders.Skin:
         return "none" if texture < 0 else "cube" if self._textures.is_cube(texture) else "2d"
 
-    def _draw_run(self, run: Run) -> None:
-        if run.texture >= 0:
-            self._textures.placed[run.texture].use(self._skin)
-        self._scene[self._kind(run.texture)].render(moderngl.TRIANGLES, vertices=run.count, first=run.start)
+    def _draw(self, call: DrawCall) -> None:
+        if call.texture >= 0:
+            self._textures.placed[call.texture].use(self._skin)
+        self._scene[self._kind(call.texture)].render(moderngl.TRIANGLES, vertices=call.count, first=call.start)
 
     def _new_table(self, elements: Elements) -> Array:
         """Return (E + 1, TEXELS, 4) float32, the appearance of all elements and the sky."""
@@ -246,7 +228,7 @@ class FastRenderer:
             if changed:
                 self._bind()
             self._upload_poses(data)
-            self._upload_cameras(data, windows)
+            self._uniforms.update(data, windows, self._shadows)
             self._shadows.cast(self._poses)
             self._drawn.use()
             self._gl.enable_only(STATE)
@@ -258,44 +240,16 @@ class FastRenderer:
             return self._read_colours(), self._metres(np.ascontiguousarray(depth[:, :: self._fine, :: self._fine]))
 
     def _upload_poses(self, data: mujoco.MjData) -> None:
-        geoms, sites = self._model.ngeom, self._model.nsite
-        poses = self._poses
+        geoms, poses = self._model.ngeom, self._poses
         poses[:geoms, :, :3], poses[:geoms, :, 3] = data.geom_xmat.reshape(-1, 3, 3), data.geom_xpos
-        if self._view.site_groups:
-            poses[geoms : geoms + sites, :, :3] = data.site_xmat.reshape(-1, 3, 3)
-            poses[geoms : geoms + sites, :, 3] = data.site_xpos
+        if self._views.site_groups:
+            poses[geoms:-1, :, :3], poses[geoms:-1, :, 3] = data.site_xmat.reshape(-1, 3, 3), data.site_xpos
         self._pose_texture.write(poses)
-
-    def _place_lights(self, data: mujoco.MjData) -> None:
-        """Note the shadow maps' projections and write the lights into the cameras' blocks, where a light has moved."""
-        places = data.light_xpos.tobytes() + data.light_xdir.tobytes()
-        if places == self._light_places:
-            return
-        self._light_places = places
-        table = lights.rows(self._model)
-        table[1:, 3, :3], table[1:, 4, :3] = data.light_xpos[self._lights], data.light_xdir[self._lights]
-        inner = 0.5 * (1 - RIM / max(1, self._model.vis.quality.shadowsize))
-        onto_texture = np.array([[inner, 0, 0, 0.5], [0, inner, 0, 0.5], [0, 0, 0.5, 0.5], [0, 0, 0, 1]])
-        projections = [lights.shadow_projection(self._model, data, lamp) for lamp in self._lamps]
-        self._shadows.aim(data.light_xpos[self._lamps], projections)
-        columns = [(onto_texture @ projection).T.ravel() for projection in projections]
-        content = np.concatenate([*columns, table.ravel()])
-        self._blocks[:, shaders.CAMERA : shaders.CAMERA + content.size] = content
-
-    def _upload_cameras(self, data: mujoco.MjData, windows: Array | None) -> None:
-        """Write every camera's block: its projection and position, shadow projections and lights."""
-        self._place_lights(data)
-        blocks, cameras = self._blocks, self._cameras
-        blocks[:, :16] = cameras.place(data, windows).swapaxes(1, 2).reshape(-1, 16)
-        blocks[:, 16:19] = cameras.eyes
-        head = shaders.CAMERA + 16 * len(self._lamps) + 16
-        blocks[:, head : head + 3] = -cameras.axes[:, :, 2]  # the direction of the headlight
-        self._camera_buffer.write(blocks)
 
     def _aim(self, number: int) -> None:
         """Choose the camera that the next calls draw for."""
-        size, width, height = self._blocks[number].nbytes, self._fine * self._view.width, self._fine * self._view.height
-        self._camera_buffer.bind_to_uniform_block(0, offset=number * size, size=size)
+        width, height = self._fine * self._views.width, self._fine * self._views.height
+        self._uniforms.choose(number)
         self._gl.viewport = 0, number * height, width, height
 
     def _draw_opaque(self) -> None:
@@ -303,19 +257,22 @@ class FastRenderer:
         seen = self._cameras.may_see(self._poses[self._opaque, :, 3], self._radii)
         for number, mask in enumerate(seen):
             self._aim(number)
-            runs = self._merged.get(key := mask.tobytes())
-            if runs is None:
-                runs = self._merged[key] = _merged([self._runs[element] for element in self._opaque[mask].tolist()])
-            for run in runs:
-                self._draw_run(run)
+            calls = self._merged.get(key := mask.tobytes())
+            if calls is None:
+                calls = self._merged[key] = _merged([self._calls[element] for element in self._opaque[mask].tolist()])
+            for call in calls:
+                self._draw(call)
 
     def _draw_skies(self) -> Array:
-        """Draw the sky for the cameras that see it; return the depth buffer as `_read_depth` does."""
+        """Draw the sky for the cameras that see it; return the depth buffer as `_read_depth` does.
+
+        Depth has to be read anyway, and a reading is cheaper than a sky behind a picture that things fill.
+        """
         depth = self._read_depth()
         numbers = [number for number, seen in enumerate(depth) if self._sky >= 0 and seen.max() >= 1]
         for number in numbers:
             self._aim(number)
-            self._draw_run(self._runs[len(self._elements.kind)])
+            self._draw(self._calls[len(self._elements.kind)])
         return self._read_depth() if numbers else depth
 
     def _draw_transparent(self) -> None:
@@ -337,14 +294,14 @@ class FastRenderer:
         gl = self._gl
         gl.enable(moderngl.BLEND)
         gl.blend_func = moderngl.SRC_ALPHA, moderngl.ONE_MINUS_SRC_ALPHA
-        self._drawn.depth_mask = False
+        self._drawn.depth_mask = False  # what is transparent hides nothing, and has no depth
         self._leave_out_shadows(True)
         for element in [*order, *order[::-1]]:
-            run, alpha = self._runs[element], float(self._elements.rgba[element, 3])
-            self._programs[self._kind(run.texture)]["alpha"] = alpha * (BEHIND if element in behind else 1.0)
+            call, alpha = self._calls[element], float(self._elements.rgba[element, 3])
+            self._programs[self._kind(call.texture)]["alpha"] = alpha * (BEHIND if element in behind else 1.0)
             if element in behind:
                 gl.disable(moderngl.CULL_FACE)
-            self._draw_run(run)
+            self._draw(call)
             gl.enable(moderngl.CULL_FACE)
         self._leave_out_shadows(False)
         self._drawn.depth_mask = True
@@ -357,14 +314,13 @@ class FastRenderer:
 
     def _read_depth(self) -> Array:
         """Read the depth buffer (cameras, rows, columns) float32, 0 at the near plane and 1 at the far one."""
-        view = self._view
-        depth = np.empty((len(view.cameras), self._fine * view.height, self._fine * view.width), np.float32)
+        views = self._views
+        depth = np.empty((len(views.cameras), self._fine * views.height, self._fine * views.width), np.float32)
         self._drawn.read_into(depth, attachment=-1, components=1, dtype="f4", alignment=1)
         return depth
 
     def _read_colours(self) -> Array:
-        view = self._view
-        rgb = np.empty((len(view.cameras), view.height, view.width, 3), np.uint8)
+        rgb = np.empty((len(self._views.cameras), self._views.height, self._views.width, 3), np.uint8)
         if self._averaged is not self._drawn:
             self._context.halve(self._drawn, self._averaged)
         self._averaged.read_into(rgb, components=3, alignment=1)
@@ -372,7 +328,7 @@ class FastRenderer:
 
     def _metres(self, reading: Array) -> Array:
         """Convert readings of the depth buffer, 0 at the near plane and 1 at the far one, to depth [m], in place."""
-        near, far = self._near, self._far
+        near, far = clip_range(self._model)
         nothing = reading >= 1 if reading.max() >= 1 else None
         depth = np.multiply(reading, near - far, out=reading)
         depth += far
@@ -388,13 +344,13 @@ class FastRenderer:
         context.clean()
 
 
-def _merged(runs: Collection[Run]) -> list[Run]:
-    """Join runs with the same texture that follow each other with a small gap, if any."""
-    merged: list[Run] = []
-    for run in runs:
+def _merged(calls: Collection[DrawCall]) -> list[DrawCall]:
+    """Join calls with the same texture that follow each other with a small gap, if any."""
+    merged: list[DrawCall] = []
+    for call in calls:
         last = merged[-1] if merged else None
-        if last and last.texture == run.texture and run.start - last.start - last.count <= GAP:
+        if last and last.texture == call.texture and call.start - last.start - last.count <= GAP:
             merged.pop()
-            run = Run(run.texture, last.start, run.start + run.count - last.start)
-        merged.append(run)
+            call = DrawCall(call.texture, last.start, call.start + call.count - last.start)
+        merged.append(call)
     return merged

@@ -1,8 +1,8 @@
-"""All geometry of a model in one buffer of vertices and one of indices."""
+"""Drawn elements of a model, geoms and sites, and all their geometry in one buffer of vertices and one of indices."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -11,13 +11,84 @@ import numpy as np
 
 from vla.spec import Array
 from vla.tasks.rendering import shapes
-from vla.tasks.rendering.elements import Elements
-from vla.tasks.rendering.lights import clip_range
-from vla.tasks.rendering.shapes import Shape
+from vla.tasks.rendering.projections import clip_range
+from vla.tasks.rendering.renderer import Views
+from vla.tasks.rendering.shapes import Surface
 
 HORIZON = 1.05  # half the extent of an infinite plane over the distance of the far clipping plane, as in MuJoCo
 SKY_DISTANCE = 0.7  # of the sky over the distance of the far clipping plane, as in MuJoCo
 Kind = mujoco.mjtGeom
+OPAQUE = 0.995  # smallest alpha of an opaque element in MuJoCo
+DEFAULT_RGBA = (0.5, 0.5, 0.5, 1.0)  # of a geom that shows its material's colour
+RGB_ROLE = int(mujoco.mjtTextureRole.mjTEXROLE_RGB)
+
+
+@dataclass(frozen=True)
+class Elements:
+    """Appearance of all geoms, then all sites of a model; rows (E, …)."""
+
+    kind: Array  # (E,) mjtGeom
+    mesh: Array  # (E,) id of the mesh, or -1
+    size: Array  # (E, 3) half sizes along x, y and z [m]
+    rgba: Array  # (E, 4)
+    material: Array  # (E,) id, or -1
+    texture: Array  # (E,) id, or -1
+    light: Array  # (E, 3) emission, specular, shininess
+    seen: Array  # (E,) bool
+
+    @property
+    def opaque(self) -> Array:
+        """Mask (E,) of the elements that are drawn without blending."""
+        return self.seen & (self.rgba[:, 3] >= OPAQUE)
+
+
+def elements_of(model: mujoco.MjModel, views: Views) -> Elements:
+    """Read the elements' present appearance from a model."""
+    kind, material, rgba, size, group = (
+        np.concatenate([getattr(model, f"geom_{name}"), getattr(model, f"site_{name}")])
+        for name in ("type", "matid", "rgba", "size", "group")
+    )
+    mesh = np.concatenate([model.geom_dataid, np.full(model.nsite, -1, np.int32)])
+    light, texture = np.tile(np.array([0.0, 0.5, 0.5], np.float32), (len(kind), 1)), np.full(len(kind), -1, np.int32)
+    with_material = np.flatnonzero(material >= 0)
+    if len(with_material):
+        chosen = material[with_material]
+        plain = (rgba[with_material] == np.array(DEFAULT_RGBA, np.float32)).all(axis=1)
+        rgba[with_material[plain]] = model.mat_rgba[chosen[plain]]
+        names = ("mat_emission", "mat_specular", "mat_shininess")
+        light[with_material] = np.stack([getattr(model, name)[chosen] for name in names], axis=1)
+        texture[with_material] = model.mat_texid[chosen, RGB_ROLE]
+    group = np.clip(group, 0, mujoco.mjNGROUP - 1)
+    shown = np.isin(group, list(views.geom_groups))
+    shown[model.ngeom :] = np.isin(group[model.ngeom :], list(views.site_groups))
+    # MuJoCo's sizes start with the radius of round shapes.
+    size = size.astype(np.float32)
+    round_ = np.isin(kind, (mujoco.mjtGeom.mjGEOM_CAPSULE, mujoco.mjtGeom.mjGEOM_CYLINDER))
+    size[round_] = size[round_][:, [0, 0, 1]]
+    ball = kind == mujoco.mjtGeom.mjGEOM_SPHERE
+    size[ball] = size[ball][:, [0, 0, 0]]
+    return Elements(kind, mesh, size, rgba, material, texture, light, shown & (rgba[:, 3] > 0))
+
+
+def unsupported(model: mujoco.MjModel, views: Views) -> list[str]:
+    """Name what MuJoCo's renderer would draw of a model and the fast one does not."""
+    elements = elements_of(model, views)
+    infinite = (elements.kind == mujoco.mjtGeom.mjGEOM_PLANE) & (elements.size[:, :2] <= 0).any(axis=1)
+    sky = (model.tex_type == mujoco.mjtTexture.mjTEXTURE_SKYBOX).any()
+    odd = (mujoco.mjtLightType.mjLIGHT_POINT, mujoco.mjtLightType.mjLIGHT_IMAGE)
+    drawn = elements.material[elements.seen & (elements.material >= 0)]
+    present = {
+        "height fields": (elements.seen & (elements.kind == mujoco.mjtGeom.mjGEOM_HFIELD)).any(),
+        "skins": model.nskin,
+        "flexible bodies": model.nflex,
+        "spatial tendons": (model.wrap_type != mujoco.mjtWrap.mjWRAP_JOINT).any(),
+        "reflections": (model.mat_reflectance[drawn] > 0).any(),
+        "haze at the horizon": sky and (elements.seen & infinite).any(),
+        "lights of the types point and image": np.isin(model.light_type, odd).any(),
+        "textures of one or two channels": (model.tex_nchannel < 3).any(),
+        "slider-cranks": (model.actuator_trntype == mujoco.mjtTrn.mjTRN_SLIDERCRANK).any(),
+    }
+    return [name for name, there in present.items() if there]
 
 
 @dataclass(frozen=True)
@@ -27,9 +98,37 @@ class Part:
     vertices: Array  # (V, floats of a vertex) float32
     triangles: Array  # (T, 3) int32, from 0
 
+    def fits(self, other: Part) -> bool:
+        """Return whether another part differs in nothing but what its vertices contain."""
+        same = len(self.vertices) == len(other.vertices)
+        return self is other or (same and np.array_equal(self.triangles, other.triangles))
+
+
+class Buffers:
+    """Vertices and indices of all elements, one after the other, uploaded again only where they have changed."""
+
+    def __init__(self, gl: Any) -> None:
+        self.vertices, self.indices = gl.buffer(reserve=4), gl.buffer(reserve=4)
+        self._parts: list[Part] = []
+
+    def update(self, parts: Sequence[Part]) -> None:
+        """Write the parts that have changed, or all of them where their layout has."""
+        old, self._parts = self._parts, list(parts)
+        starts = np.cumsum([0, *(len(part.vertices) for part in parts)])
+        if len(old) == len(parts) and all(before.fits(part) for before, part in zip(old, parts, strict=True)):
+            for before, part, start in zip(old, parts, starts, strict=False):
+                if before is not part:
+                    self.vertices.write(part.vertices, offset=int(start) * part.vertices[0].nbytes)
+        elif parts:
+            indices = [part.triangles + start for part, start in zip(parts, starts, strict=False)]
+            content = np.concatenate([part.vertices for part in parts]), np.concatenate(indices, dtype=np.int32)
+            for buffer, values in zip((self.vertices, self.indices), content, strict=True):
+                buffer.orphan(values.nbytes)
+                buffer.write(values)
+
 
 @dataclass(frozen=True)
-class Block:
+class ElementTriangles:
     """One element's triangles."""
 
     element: int
@@ -43,8 +142,8 @@ class Block:
 class Geometry:
     """Vertices of the elements drawn: opaque ones by texture, planes after the others, the sky, transparent ones."""
 
-    def __init__(self, model: mujoco.MjModel, mesh: Callable[[int], Shape]) -> None:
-        """Args: the model; a function from a mesh's id to its shape."""
+    def __init__(self, model: mujoco.MjModel, mesh: Callable[[int, bool], Surface]) -> None:
+        """Take the model, and a function from a mesh's id, and whether it has a texture, to its triangles."""
         self._model, self._mesh = model, mesh
         self._far = clip_range(model)[1]
         quality = model.vis.quality
@@ -52,38 +151,36 @@ class Geometry:
         self._sphere, self._box = shapes.sphere(self._slices, self._stacks // 2 * 2), shapes.box()
         self._cylinder = shapes.cylinder(self._slices)
         self._reach = np.append(model.geom_rbound, model.site_size.max(axis=1))
-        self._known: dict[int, Block] = {}  # element → its present block
-        self.blocks: list[Block] = []
+        self._known: dict[int, ElementTriangles] = {}  # element → its present triangles
+        self.elements: list[ElementTriangles] = []
 
     def update(self, elements: Elements, sky: bool) -> None:
-        """Make the blocks of the elements' present shapes; equal ones stay the same objects."""
+        """Make the triangles of the elements' present shapes; equal ones stay the same objects."""
         opaque = np.flatnonzero(elements.opaque)
         planes = elements.kind == Kind.mjGEOM_PLANE
         # Large things are mostly behind small ones, and what is hidden when it is drawn costs little.
         order = opaque[np.lexsort((opaque, self._reach[opaque], elements.texture[opaque], planes[opaque]))]
-        blocks = [self._block(elements, int(element)) for element in np.flatnonzero(elements.seen & ~elements.opaque)]
-        solid = [self._block(elements, int(element)) for element in order]
+        blended = [self._of(elements, int(each)) for each in np.flatnonzero(elements.seen & ~elements.opaque)]
+        solid = [self._of(elements, int(element)) for element in order]
         if sky:
             solid.append(self._sky(len(elements.kind)))
-        solid = [block for block in solid if len(block.seen.triangles)]
+        solid = [each for each in solid if len(each.seen.triangles)]
         self.solid = len(solid)
-        self.blocks = [*solid, *(block for block in blocks if len(block.seen.triangles))]
+        self.elements = [*solid, *(each for each in blended if len(each.seen.triangles))]
 
-    def _block(self, elements: Elements, element: int) -> Block:
-        material, texture = int(elements.material[element]), int(elements.texture[element])
-        mapping = (
-            (*self._model.mat_texrepeat[material], int(self._model.mat_texuniform[material])) if texture >= 0 else ()
-        )
+    def _of(self, elements: Elements, element: int) -> ElementTriangles:
+        model, material, texture = self._model, int(elements.material[element]), int(elements.texture[element])
+        mapping = (*model.mat_texrepeat[material], int(model.mat_texuniform[material])) if texture >= 0 else ()
         kind, mesh = int(elements.kind[element]), int(elements.mesh[element])
         key = (kind, mesh, elements.size[element].tobytes(), texture, *mapping)
         known = self._known.get(element)
         if known is None or known.key != key:
-            shape = self._shape(kind, mesh, elements.size[element].astype(float))
-            coordinates = self._coordinates(shape, kind, mesh, elements.size[element], texture, mapping)
-            known = self._known[element] = _packed(element, key, shape, coordinates)
+            surface = self._surface(kind, mesh, elements.size[element].astype(float), texture >= 0)
+            coordinates = self._coordinates(surface, kind, mesh, elements.size[element], texture, mapping)
+            known = self._known[element] = _packed(element, key, surface, coordinates)
         return known
 
-    def _shape(self, kind: int, mesh: int, size: Array) -> Shape:
+    def _surface(self, kind: int, mesh: int, size: Array, textured: bool) -> Surface:
         if kind in (Kind.mjGEOM_SPHERE, Kind.mjGEOM_ELLIPSOID):
             return self._sphere.scaled(size)
         if kind == Kind.mjGEOM_BOX:
@@ -95,45 +192,45 @@ class Geometry:
         if kind == Kind.mjGEOM_PLANE:
             return shapes.plane(*(half if half > 0 else HORIZON * self._far for half in size[:2]))
         if kind in (Kind.mjGEOM_MESH, Kind.mjGEOM_SDF) and mesh >= 0:
-            return self._mesh(mesh)
+            return self._mesh(mesh, textured)
         nothing = np.empty((0, 3))
-        return Shape(nothing, nothing, nothing[:, :2], nothing, np.empty((0, 3), np.int32))
+        return Surface(nothing, nothing, nothing[:, :2], nothing, np.empty((0, 3), np.int32))
 
     def _coordinates(
-        self, shape: Shape, kind: int, mesh: int, size: Array, texture: int, mapping: tuple[float, ...]
+        self, surface: Surface, kind: int, mesh: int, size: Array, texture: int, mapping: tuple[float, ...]
     ) -> Array:
         """Return texture coordinates (V, 3): two for a plane picture, a direction for a cube."""
         if texture < 0:
-            return np.zeros((len(shape.position), 3))
+            return np.zeros((len(surface.position), 3))
         if self._model.tex_type[texture] != mujoco.mjtTexture.mjTEXTURE_2D:
-            return shape.raw * (size if mapping[2] else 1.0)
+            return surface.raw * (size if mapping[2] else 1.0)
         repeat = np.array([each if each > 0 else 1.0 for each in mapping[:2]])
         extent = np.where(size[:2] > 0, size[:2], 1.0)
         if kind == Kind.mjGEOM_PLANE and (size[:2] <= 0).any():
-            flat = np.where(size[:2] > 0, shape.texcoord, shape.position[:, :2] * [0.5, -0.5])
+            flat = np.where(size[:2] > 0, surface.texcoord, surface.position[:, :2] * [0.5, -0.5])
             flat = flat * repeat * (extent if mapping[2] else 1.0) - 0.5
         elif mesh < 0 or self._model.mesh_texcoordadr[mesh] >= 0:
-            flat = shape.texcoord * repeat * (extent if mapping[2] else 1.0)
+            flat = surface.texcoord * repeat * (extent if mapping[2] else 1.0)
         else:  # projected along z
-            flat = shape.position[:, :2] * [0.5, -0.5] * repeat / (1.0 if mapping[2] else extent) - 0.5
+            flat = surface.position[:, :2] * [0.5, -0.5] * repeat / (1.0 if mapping[2] else extent) - 0.5
         return np.concatenate([flat, np.zeros((len(flat), 1))], axis=1)
 
-    def _sky(self, element: int) -> Block:
+    def _sky(self, element: int) -> ElementTriangles:
         """Return the cylinder around the camera that shows the sky, seen from inside."""
         if element not in self._known:
-            shape = shapes.cylinder(self._slices)
-            position = shape.position * SKY_DISTANCE * self._far
-            inside = replace(shape, position=position, triangles=shape.triangles[:, ::-1])
-            self._known[element] = _packed(element, (), inside, shape.raw[:, [0, 2, 1]] * [1, 1, -1])
+            around = self._cylinder
+            position = around.position * SKY_DISTANCE * self._far
+            inside = replace(around, position=position, triangles=around.triangles[:, ::-1])
+            self._known[element] = _packed(element, (), inside, around.raw[:, [0, 2, 1]] * [1, 1, -1])
         return self._known[element]
 
 
-def _packed(element: int, key: tuple[Any, ...], shape: Shape, coordinates: Array) -> Block:
-    number = np.full((len(shape.position), 1), element)
-    vertices = np.concatenate([shape.position, shape.normal, coordinates, number], axis=1, dtype=np.float32)
-    outline = shape.outline
-    places = np.concatenate([shape.position[outline.vertices], number[: len(outline.vertices)]], axis=1)
-    seen = Part(vertices, np.ascontiguousarray(shape.triangles, np.int32))
+def _packed(element: int, key: tuple[Any, ...], surface: Surface, coordinates: Array) -> ElementTriangles:
+    number = np.full((len(surface.position), 1), element)
+    vertices = np.concatenate([surface.position, surface.normal, coordinates, number], axis=1, dtype=np.float32)
+    outline = surface.outline
+    places = np.concatenate([surface.position[outline.vertices], number[: len(outline.vertices)]], axis=1)
+    seen = Part(vertices, np.ascontiguousarray(surface.triangles, np.int32))
     casting = Part(places.astype(np.float32), outline.triangles)
-    radius = float(np.sqrt(np.square(shape.position).sum(axis=1).max(initial=0.0)))
-    return Block(element, key, seen, casting, outline.closed, radius)
+    radius = float(np.sqrt(np.square(surface.position).sum(axis=1).max(initial=0.0)))
+    return ElementTriangles(element, key, seen, casting, outline.closed, radius)

@@ -8,27 +8,26 @@ import mujoco
 import numpy as np
 
 from vla.spec import Array
-from vla.tasks.rendering.lights import clip_range
-from vla.tasks.rendering.renderer import WHOLE, View
+from vla.tasks.rendering.projections import clip_range
+from vla.tasks.rendering.renderer import WHOLE, Views
 
 
 class Reference:
     """Factory of MuJoCo's own renderer, whose settings are in the model's `visual` element."""
 
-    def open(self, model: mujoco.MjModel, view: View) -> ReferenceRenderer:
+    def open(self, model: mujoco.MjModel, views: Views) -> ReferenceRenderer:
         """Make a renderer of `model`, with a GL context in this thread."""
-        return ReferenceRenderer(model, view)
+        return ReferenceRenderer(model, views)
 
 
 class ReferenceRenderer:
     """MuJoCo's classic renderer without reflections."""
 
-    def __init__(self, model: mujoco.MjModel, view: View) -> None:
-        """Args: the model; what to draw of it."""
-        self._model, self._view = model, view
+    def __init__(self, model: mujoco.MjModel, views: Views) -> None:
+        self._model, self._views = model, views
         # The off-screen buffer is allocated with the context, so its size must be set first.
-        model.vis.global_.offwidth, model.vis.global_.offheight = view.width, view.height
-        self._gl = mujoco.GLContext(view.width, view.height)
+        model.vis.global_.offwidth, model.vis.global_.offheight = views.width, views.height
+        self._gl = mujoco.GLContext(views.width, views.height)
         self._gl.make_current()
         self._context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100)
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self._context)
@@ -36,11 +35,11 @@ class ReferenceRenderer:
         self._scene = mujoco.MjvScene(model, maxgeom=model.ngeom + model.nsite + 50)
         self._scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = False
         self._option = mujoco.MjvOption()
-        self._option.geomgroup[:] = [group in view.geom_groups for group in range(mujoco.mjNGROUP)]
-        self._option.sitegroup[:] = [group in view.site_groups for group in range(mujoco.mjNGROUP)]
+        self._option.geomgroup[:] = [group in views.geom_groups for group in range(mujoco.mjNGROUP)]
+        self._option.sitegroup[:] = [group in views.site_groups for group in range(mujoco.mjNGROUP)]
         self._camera = mujoco.MjvCamera()
         self._camera.type = mujoco.mjtCamera.mjCAMERA_FIXED
-        self._rect = mujoco.MjrRect(0, 0, view.width, view.height)
+        self._rect = mujoco.MjrRect(0, 0, views.width, views.height)
 
     def update(self, textures: Collection[int] = ()) -> None:
         """Upload changed textures; MuJoCo reads everything else at each frame."""
@@ -52,21 +51,19 @@ class ReferenceRenderer:
     def render(self, data: mujoco.MjData, windows: Array | None = None) -> tuple[Array, Array]:
         """Draw colours (cameras, H, W, 3) uint8 and depth (cameras, H, W) float32 [m]."""
         self._gl.make_current()
-        view = self._view
-        rgb = np.empty((len(view.cameras), view.height, view.width, 3), np.uint8)
-        depth = np.empty((len(view.cameras), view.height, view.width), np.float32)
-        for number, camera in enumerate(view.cameras):
+        views = self._views
+        rgb = np.empty((len(views.cameras), views.height, views.width, 3), np.uint8)
+        depth = np.empty(rgb.shape[:3], np.float32)
+        for number, camera in enumerate(views.cameras):
             self._draw(data, camera, None if windows is None else windows[number])
-            # OpenGL's lowest row is the first one.
             mujoco.mjr_readPixels(rgb[number], depth[number], self._rect, self._context)
-        return rgb[:, ::-1], self._metres(depth[:, ::-1])
+        return rgb[:, ::-1], self._metres(depth[:, ::-1])  # OpenGL's lowest row is the first one
 
     def _draw(self, data: mujoco.MjData, camera: int, window: Sequence[float] | None) -> None:
         self._camera.fixedcamid = camera
-        mujoco.mjv_updateScene(
-            self._model, data, self._option, None, self._camera, mujoco.mjtCatBit.mjCAT_ALL.value, self._scene
-        )
-        if window is None and self._view.aspect is not None:
+        every = mujoco.mjtCatBit.mjCAT_ALL.value
+        mujoco.mjv_updateScene(self._model, data, self._option, None, self._camera, every, self._scene)
+        if window is None and self._views.aspect is not None:
             window = WHOLE
         if window is not None:
             for eye in self._scene.camera:
@@ -77,7 +74,7 @@ class ReferenceRenderer:
         """Narrow what an eye of the scene's camera sees to a window of it."""
         above, height = eye.frustum_top, eye.frustum_top - eye.frustum_bottom
         # MuJoCo calls it a width, and draws twice as much; without it the aspect of the pictures decides.
-        half = eye.frustum_width or (self._view.aspect or self._view.width / self._view.height) * height / 2
+        half = eye.frustum_width or (self._views.aspect or self._views.width / self._views.height) * height / 2
         eye.frustum_center += half * (left + right - 1)
         eye.frustum_width = half * (right - left)
         eye.frustum_top, eye.frustum_bottom = above - top * height, above - bottom * height
@@ -85,9 +82,7 @@ class ReferenceRenderer:
     def _metres(self, reading: Array) -> Array:
         """Convert a reverse-z buffer, 1 at the near plane and 0 at the far one, to depth [m]."""
         near, far = clip_range(self._model)
-        depth = near * far / (near + reading * (far - near))
-        depth *= reading > 0
-        return depth
+        return near * far / (near + reading * (far - near)) * (reading > 0)
 
     def close(self) -> None:
         """Free the GL context; otherwise a traceback is printed when Python exits."""

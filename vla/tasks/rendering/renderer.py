@@ -14,7 +14,7 @@ WHOLE = (0.0, 0.0, 1.0, 1.0)  # window of all that a camera sees: top, left, bot
 
 
 @dataclass(frozen=True)
-class View:
+class Views:
     """Cameras and elements of a model to draw, and the size of the images."""
 
     cameras: Sequence[int]  # ids in the model, in the order of the pictures
@@ -58,6 +58,6 @@ class Renderer(Protocol):
 class RendererFactory(Protocol):
     """Makes renderers of one kind with the same settings."""
 
-    def open(self, model: mujoco.MjModel, view: View) -> Renderer:
+    def open(self, model: mujoco.MjModel, views: Views) -> Renderer:
         """Make a renderer of `model`."""
         ...

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Literal
-
-from vla.tasks.rendering.lights import ROWS
 
 POSE = 3  # texels of an element's pose: rows of a 3 x 4 matrix
 TEXELS = 4  # of an element's appearance: colour, light, what it follows, rate of texture coordinates there
+ROWS = 6  # of a light: ambient, diffuse, specular, position, direction, attenuation
 CAMERA = 20  # floats of a camera's block before shadow projections and lights: projection and eye
-Texture = Literal["none", "2d", "cube"]
+Skin = Literal["none", "2d", "cube"]
 
 PLACE = """
 uniform sampler2D poses;
@@ -69,20 +68,17 @@ vec3 shine(int number, vec3 place, vec3 normal, vec3 colour, vec4 material) {
 """
 
 
-def scene_program(
-    lights: int, lamps: Sequence[int], spots: Sequence[bool], texture: Texture, pixel: bool, soft: int
-) -> dict[str, str]:
+def scene_program(lights: int, lamps: Mapping[int, bool], skin: Skin, pixel: bool, soft: int) -> dict[str, str]:
     """Return the sources of the shaders of pictures.
 
     Args:
         lights: number of lights, the headlight first.
-        lamps: numbers of the lights with a shadow map.
-        spots: whether each of these is a spot light.
-        texture: kind of texture.
+        lamps: number of each light with a shadow map → whether it is a spot light.
+        skin: kind of texture.
         pixel: whether to compute light per pixel instead of per vertex.
         soft: texels around the nearest one over which shadows are averaged.
     """
-    count = len(lamps)
+    count, spots = len(lamps), list(lamps.values())
     shared = f"""#version 330
 layout(std140) uniform Camera {{
     mat4 projection;
@@ -91,14 +87,14 @@ layout(std140) uniform Camera {{
     vec4 lights[{lights * ROWS}];
 }};
 {LIGHT.replace("ROWS", str(ROWS))}"""
-    passed = {"none": [], "2d": ["vec2 coordinate"], "cube": ["vec3 coordinate"]}[texture]
+    passed = {"none": [], "2d": ["vec2 coordinate"], "cube": ["vec3 coordinate"]}[skin]
     passed += [f"vec{4 if spot else 3} shadow_at{number}" for number, spot in enumerate(spots)]
     passed += ["vec3 position", "vec3 normal", "vec3 colour", "vec4 material"] if pixel else []
     passed += [] if pixel else ["vec3 base", *(f"vec3 lit{number}" for number in range(count))]
-    shaded = _shaded(lights, lamps)
+    shaded = _shaded(lights, list(lamps))
     return {
-        "vertex_shader": shared + _vertex(passed, shaded, spots, texture, pixel),
-        "fragment_shader": shared + _fragment(passed, shaded, count, texture, pixel, soft),
+        "vertex_shader": shared + _vertex(passed, shaded, spots, skin, pixel),
+        "fragment_shader": shared + _fragment(passed, shaded, count, skin, pixel, soft),
     }
 
 
@@ -108,23 +104,20 @@ def _declared(way: str, names: Sequence[str]) -> str:
 
 def _shaded(lights: int, lamps: Sequence[int]) -> str:
     """Return statements that set `base` and every `lit`, clamped as OpenGL clamps a vertex's colour."""
-    shine = "shine({}, position, normal, colour, material)".format
-    sums = " + ".join(
-        ["vec3(material.w) + material.x * colour", *(shine(number) for number in range(lights) if number not in lamps)]
-    )
-    lines = [f"base = clamp({sums}, 0.0, 1.0);"]
-    for index, number in enumerate(lamps):
-        lines.append(f"lit{index} = clamp({shine(number)}, 0.0, 1.0);")
-    return "\n    ".join(lines)
+    shine = [f"shine({number}, position, normal, colour, material)" for number in range(lights)]
+    others = [shine[number] for number in range(lights) if number not in lamps]
+    sums = {"base": " + ".join(["vec3(material.w) + material.x * colour", *others])}
+    sums |= {f"lit{index}": shine[number] for index, number in enumerate(lamps)}
+    return "\n    ".join(f"{name} = clamp({value}, 0.0, 1.0);" for name, value in sums.items())
 
 
-def _vertex(passed: Sequence[str], shaded: str, spots: Sequence[bool], texture: Texture, pixel: bool) -> str:
+def _vertex(passed: Sequence[str], shaded: str, spots: Sequence[bool], skin: Skin, pixel: bool) -> str:
     lookups = [
         f"shadow_at{number} = (shadow_projection[{number}] * vec4(position, 1.0)).{'xyzw' if spot else 'xyz'};"
         for number, spot in enumerate(spots)
     ]
     moved = "in_coordinate + shift * texelFetch(table, ivec2(3, element), 0).xyz"
-    coordinate = {"none": "", "2d": f"coordinate = ({moved}).xy;", "cube": f"coordinate = {moved};"}[texture]
+    coordinate = {"none": "", "2d": f"coordinate = ({moved}).xy;", "cube": f"coordinate = {moved};"}[skin]
     return f"""
 {PLACE}
 {_declared("out", passed)}
@@ -144,41 +137,33 @@ void main() {{
 }}"""
 
 
-def _fragment(passed: Sequence[str], shaded: str, count: int, texture: Texture, pixel: bool, soft: int) -> str:
+def _fragment(passed: Sequence[str], shaded: str, count: int, skin: Skin, pixel: bool, soft: int) -> str:
     samplers = [f"sampler2DShadow shadow{number}" for number in range(count)]
-    samplers += {"none": [], "2d": ["sampler2D skin"], "cube": ["samplerCube skin"]}[texture]
-    texel = {"none": "vec4(1.0)", "2d": "texture(skin, coordinate)", "cube": "texture(skin, coordinate)"}[texture]
+    samplers += {"none": [], "2d": ["sampler2D skin"], "cube": ["samplerCube skin"]}[skin]
     names = ", ".join(["base", *(f"lit{number}" for number in range(count))])
     local = f"vec3 {names};\n    {shaded.replace('normal,', 'normalize(normal),')}" if pixel else ""
-    sums = [
-        f"sum += lit{number} * max(unshadowed, shown(shadow{number}, shadow_at{number}));" for number in range(count)
-    ]
+    lit = [f"sum += lit{each} * max(unshadowed, shown(shadow{each}, shadow_at{each}));" for each in range(count)]
     return f"""
 uniform float unshadowed;
 uniform float alpha;
 {_declared("uniform", samplers)}
 {_declared("in", passed)}
 out vec4 picture;
-{_taps(soft)}
+{_shown("vec3", soft)}
+{_shown("vec4", soft)}
 void main() {{
     {local}
     vec3 sum = base;
-    {" ".join(sums)}
-    picture = vec4(sum, alpha) * {texel};
+    {" ".join(lit)}
+    picture = vec4(sum, alpha) * {"vec4(1.0)" if skin == "none" else "texture(skin, coordinate)"};
 }}"""
 
 
-def _taps(soft: int) -> str:
-    """Return functions that look up which share of a place's surroundings a lamp shines on."""
+def _shown(kind: str, soft: int) -> str:
+    """Return the function that looks up which share of a place's surroundings a lamp shines on; a spot light's place is
+    a vec4, and is divided by its last component."""
+    look, scale, end = ("texture", "1.0", "") if kind == "vec3" else ("textureProj", "at.w", ", 0.0")
     taps = [(x, y) for x in range(-soft, soft + 1) for y in range(-soft, soft + 1)]
-    functions = []
-    for kind, look, scale in (("vec3", "texture", "1.0"), ("vec4", "textureProj", "at.w")):
-        sums = [
-            f"{look}(map, at + {kind}({x}.0 * texel.x, {y}.0 * texel.y, 0.0{', 0.0' if kind == 'vec4' else ''}))"
-            for x, y in taps
-        ]
-        body = f"vec2 texel = {scale} / vec2(textureSize(map, 0));\n    return ({' + '.join(sums)}) / {len(taps)}.0;"
-        functions.append(
-            f"float shown(sampler2DShadow map, {kind} at) {{\n    {body if soft else f'return {look}(map, at);'}\n}}"
-        )
-    return "\n".join(functions)
+    sums = [f"{look}(map, at + {kind}({x}.0 * texel.x, {y}.0 * texel.y, 0.0{end}))" for x, y in taps]
+    averaged = f"vec2 texel = {scale} / vec2(textureSize(map, 0));\n    return ({' + '.join(sums)}) / {len(taps)}.0;"
+    return f"float shown(sampler2DShadow map, {kind} at) {{\n    {averaged if soft else f'return {look}(map, at);'}\n}}"

@@ -12,8 +12,7 @@ import numpy as np
 
 from vla.spec import Array
 from vla.tasks.rendering import shaders
-from vla.tasks.rendering.buffers import Buffers
-from vla.tasks.rendering.geometry import Block
+from vla.tasks.rendering.geometry import Buffers, ElementTriangles
 
 SLOPE, UNITS = 1.5, 4.0  # offset of shadow maps against surfaces that shade themselves, as in MuJoCo
 RIM = 2  # texels of a shadow map, both sides together, that stay empty: shadows at its edge would never end
@@ -33,7 +32,7 @@ class Shadows:
     """
 
     def __init__(self, gl: Any, model: mujoco.MjModel, lamps: Sequence[int], soft: int) -> None:
-        """Args: the context; the model; ids of the lights; texels over which the edges of shadows are averaged."""
+        """Take the context, the model, ids of the lights, and texels over which the edges of shadows are averaged."""
         self._gl, self._lamps, self._soft = gl, list(lamps), soft
         self._edge = int(model.vis.quality.shadowsize)
         self._still, self._drawn = ([self._target() for _ in self._lamps] for _ in range(2))
@@ -58,13 +57,13 @@ class Shadows:
         target.color_mask = False, False, False, False
         return target
 
-    def update(self, blocks: Sequence[Block]) -> None:
+    def update(self, casters: Sequence[ElementTriangles]) -> None:
         """Upload the triangles that cast shadows."""
         fixed = set(self._fixed.tolist())
         kinds = [(still, closed) for still in (True, False) for closed in (True, False)]
-        groups = [[block for block in blocks if (block.element in fixed, block.closed) == kind] for kind in kinds]
-        self._buffers.update([block.casting for group in groups for block in group])
-        ends = np.cumsum([0, *(sum(block.casting.triangles.size for block in group) for group in groups)]).tolist()
+        groups = [[each.casting for each in casters if (each.element in fixed, each.closed) == kind] for kind in kinds]
+        self._buffers.update([part for group in groups for part in group])
+        ends = np.cumsum([0, *(sum(part.triangles.size for part in group) for group in groups)]).tolist()
         self._spans: list[Span] = [(first, end - first) for first, end in pairwise(ends)]
         self._state = None
 

@@ -11,6 +11,7 @@ import numpy as np
 from vla.spec import Array
 
 SMOOTH = 0.8  # smallest cosine between a mesh's normal at a vertex and that of a face that is shaded smoothly
+VERTEX = ("position", "normal", "texcoord", "raw")  # what a `Surface` has of every vertex
 WELD = 1e-6  # largest distance between vertices at the same place, over the shape's size
 
 
@@ -24,7 +25,7 @@ class Outline:
 
 
 @dataclass(frozen=True)
-class Shape:
+class Surface:
     """Triangles with normals and texture coordinates."""
 
     position: Array  # (V, 3) [m]
@@ -32,13 +33,13 @@ class Shape:
     texcoord: Array  # (V, 2), 0…1 over the shape
     raw: Array  # (V, 3) position before scaling, the direction in a cube texture
     triangles: Array  # (T, 3) int32, indices of vertices, counterclockwise from outside
-    source: Shape | None = None  # of which this one was stretched
+    source: Surface | None = None  # of which this one was stretched
 
-    def scaled(self, size: Array) -> Shape:
+    def scaled(self, size: Array) -> Surface:
         """Return the shape stretched by `size` (3,)."""
         normal = self.normal / size
         normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-        return Shape(self.position * size, normal, self.texcoord, self.raw, self.triangles, self)
+        return Surface(self.position * size, normal, self.texcoord, self.raw, self.triangles, self)
 
     @cached_property
     def outline(self) -> Outline:
@@ -67,16 +68,12 @@ def _closed(position: Array, triangles: Array) -> bool:
     return bool(volume > 0 and (there == back).all())
 
 
-def join(*shapes: Shape) -> Shape:
+def join(*shapes: Surface) -> Surface:
     """Return one shape of several."""
     starts = np.cumsum([0, *(len(shape.position) for shape in shapes)])
-    return Shape(
-        np.concatenate([shape.position for shape in shapes]),
-        np.concatenate([shape.normal for shape in shapes]),
-        np.concatenate([shape.texcoord for shape in shapes]),
-        np.concatenate([shape.raw for shape in shapes]),
-        np.concatenate([shape.triangles + start for shape, start in zip(shapes, starts, strict=False)]),
-    )
+    position, normal, texcoord, raw = (np.concatenate([getattr(each, name) for each in shapes]) for name in VERTEX)
+    triangles = np.concatenate([each.triangles + start for each, start in zip(shapes, starts, strict=False)])
+    return Surface(position, normal, texcoord, raw, triangles)
 
 
 def _patch(rows: int, columns: int) -> tuple[Array, Array, Array]:
@@ -88,7 +85,7 @@ def _patch(rows: int, columns: int) -> tuple[Array, Array, Array]:
     return row, column, triangles.astype(np.int32)
 
 
-def sphere(slices: int, stacks: int, low: float = -1.0, high: float = 1.0) -> Shape:
+def sphere(slices: int, stacks: int, low: float = -1.0, high: float = 1.0) -> Surface:
     """Return the unit sphere between two elevations [quarter turns], with `stacks` rows."""
     row, column, triangles = _patch(stacks, slices)
     elevation, azimuth = np.pi / 2 * (low + (high - low) * row / stacks), 2 * np.pi * column / slices
@@ -97,19 +94,19 @@ def sphere(slices: int, stacks: int, low: float = -1.0, high: float = 1.0) -> Sh
     u = np.where(ring == 0, column + 0.5, column) / slices
     first, second, third = (position[triangles[:, corner]] for corner in range(3))
     flat = np.linalg.norm(np.cross(second - first, third - first), axis=1) < 1e-9  # at the poles
-    return Shape(position, position, np.stack([u, 1 - row / stacks], 1), position, triangles[~flat])
+    return Surface(position, position, np.stack([u, 1 - row / stacks], 1), position, triangles[~flat])
 
 
-def tube(slices: int) -> Shape:
+def tube(slices: int) -> Surface:
     """Return an open cylinder of radius 1 from z = -1 to 1."""
     row, column, triangles = _patch(1, slices)
     azimuth = 2 * np.pi * column / slices
     position = np.stack([np.cos(azimuth), np.sin(azimuth), 2.0 * row - 1], 1)
     texcoord = np.stack([column / slices, 1.0 - row], 1)
-    return Shape(position, position * [1, 1, 0], texcoord, position, triangles)
+    return Surface(position, position * [1, 1, 0], texcoord, position, triangles)
 
 
-def disk(slices: int, side: int) -> Shape:
+def disk(slices: int, side: int) -> Surface:
     """Return a disk of radius 1 at z = side, -1 or 1, that looks away from the origin."""
     azimuth = 2 * np.pi * np.arange(slices) / slices
     rim = np.stack([np.cos(azimuth), np.sin(azimuth), np.full(slices, float(side))], 1)
@@ -117,26 +114,26 @@ def disk(slices: int, side: int) -> Shape:
     here = np.arange(slices)
     triangles = np.stack([np.zeros(slices, int), 1 + here, 1 + (here + 1) % slices], 1)[:, ::side]
     normal = np.tile([0.0, 0.0, side], (slices + 1, 1))
-    return Shape(position, normal, 0.5 + 0.5 * position[:, :2], position, triangles.astype(np.int32))
+    return Surface(position, normal, 0.5 + 0.5 * position[:, :2], position, triangles.astype(np.int32))
 
 
-def cylinder(slices: int) -> Shape:
+def cylinder(slices: int) -> Surface:
     """Return a closed cylinder of radius 1 from z = -1 to 1."""
     return join(disk(slices, -1), tube(slices), disk(slices, 1))
 
 
-def capsule(slices: int, stacks: int, radius: float, half_length: float) -> Shape:
+def capsule(slices: int, stacks: int, radius: float, half_length: float) -> Surface:
     """Return a capsule along z [m]."""
     parts = [tube(slices).scaled(np.array([radius, radius, half_length]))]
     for side in (-1, 1):
         cap = sphere(slices, stacks // 2, *sorted((0.0, float(side))))
         # Texture coordinates run from one pole to the equator and again from there.
         position = cap.position * radius + [0, 0, side * half_length]
-        parts.append(Shape(position, cap.normal, cap.texcoord, cap.raw + np.array([0, 0, side]), cap.triangles))
+        parts.append(Surface(position, cap.normal, cap.texcoord, cap.raw + np.array([0, 0, side]), cap.triangles))
     return join(*parts)
 
 
-def box() -> Shape:
+def box() -> Surface:
     """Return the cube from -1 to 1."""
     faces = []
     across = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]], float)
@@ -145,17 +142,17 @@ def box() -> Shape:
             position, normal = np.full((4, 3), float(side)), np.zeros((4, 3))
             position[:, first], position[:, second], normal[:, axis] = across[:, 0], across[:, 1], side
             triangles = np.array([[0, 1, 2], [0, 2, 3]], np.int32)[:, :: side * straight]
-            faces.append(Shape(position, normal, 0.5 + across * [0.5, -0.5], position, triangles))
+            faces.append(Surface(position, normal, 0.5 + across * [0.5, -0.5], position, triangles))
     return join(*faces)
 
 
-def plane(half_x: float, half_y: float) -> Shape:
+def plane(half_x: float, half_y: float) -> Surface:
     """Return a rectangle in z = 0 that looks along z [m]."""
     across = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]], float)
     position = np.concatenate([across * [half_x, half_y], np.zeros((4, 1))], 1)
     normal = np.tile([0.0, 0.0, 1.0], (4, 1))
     triangles = np.array([[0, 1, 2], [0, 2, 3]], np.int32)
-    return Shape(position, normal, 0.5 + across * [0.5, -0.5], position, triangles)
+    return Surface(position, normal, 0.5 + across * [0.5, -0.5], position, triangles)
 
 
 def mesh_triangles(model: mujoco.MjModel, mesh: int) -> tuple[Array, Array]:
@@ -165,29 +162,36 @@ def mesh_triangles(model: mujoco.MjModel, mesh: int) -> tuple[Array, Array]:
     return vertices, model.mesh_face[face : face + model.mesh_facenum[mesh]]
 
 
-def mesh(model: mujoco.MjModel, number: int) -> Shape:
+def mesh_texcoord(model: mujoco.MjModel, mesh: int) -> Array | None:
+    """Return the texture coordinates (F, 3 corners, 2) of a mesh's faces, or None if it has none."""
+    face, start = model.mesh_faceadr[mesh], model.mesh_texcoordadr[mesh]
+    if start < 0:
+        return None
+    return model.mesh_texcoord[start + model.mesh_facetexcoord[face : face + model.mesh_facenum[mesh]]]
+
+
+def mesh(model: mujoco.MjModel, number: int) -> Surface:
     """Return the triangles of a model's mesh, with its own normals where they are near those of the faces."""
     vertices, faces = mesh_triangles(model, number)
     start, stop = model.mesh_faceadr[number], model.mesh_faceadr[number] + model.mesh_facenum[number]
     corners = vertices[faces]  # (F, 3 corners, 3)
     normals = model.mesh_normal[model.mesh_normaladr[number] + model.mesh_facenormal[start:stop]]
-    if model.mesh_texcoordadr[number] >= 0:
-        texcoord = model.mesh_texcoord[model.mesh_texcoordadr[number] + model.mesh_facetexcoord[start:stop]]
-    else:
-        normals = _sharpened(corners, normals)
-        texcoord = np.zeros((*corners.shape[:2], 2), np.float32)
+    texcoord = mesh_texcoord(model, number)
+    if texcoord is None:
+        return _shared(corners, _sharpened(corners, normals), np.zeros((*corners.shape[:2], 2), np.float32))
     return _shared(corners, normals, texcoord)
 
 
-def decimated(vertices: Array, faces: Array) -> Shape:
-    """Return a shape of triangles (V, 3) and (F, 3), with normals averaged where faces meet at a flat angle."""
+def smoothed(vertices: Array, faces: Array, texcoord: Array) -> Surface:
+    """Return triangles (V, 3) and (F, 3) with texture coordinates (F, 3 corners, 2) and with normals that are averaged
+    where faces meet at a flat angle."""
     corners = vertices[faces]
     across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     smooth = np.zeros_like(vertices)
     for corner in range(3):
         np.add.at(smooth, faces[:, corner], across)
     smooth /= np.maximum(np.linalg.norm(smooth, axis=1, keepdims=True), 1e-20)
-    return _shared(corners, _sharpened(corners, smooth[faces]), np.zeros((*corners.shape[:2], 2), np.float32))
+    return _shared(corners, _sharpened(corners, smooth[faces]), texcoord)
 
 
 def _sharpened(corners: Array, normals: Array) -> Array:
@@ -198,12 +202,11 @@ def _sharpened(corners: Array, normals: Array) -> Array:
     return np.where(near[:, :, None], normals, across[:, None])
 
 
-def _shared(corners: Array, normals: Array, texcoord: Array) -> Shape:
+def _shared(corners: Array, normals: Array, texcoord: Array) -> Surface:
     """Return a shape whose triangles share equal vertices, of arrays (F, 3 corners, …)."""
     rows = np.concatenate([corners, normals, texcoord], axis=2).reshape(-1, 8).astype(np.float32)
     rows = np.ascontiguousarray(rows + 0.0)  # no negative zeros
-    _, first, inverse = np.unique(
-        rows.view(np.dtype((np.void, rows.itemsize * 8))), return_index=True, return_inverse=True
-    )
+    whole = rows.view(np.dtype((np.void, rows.itemsize * 8)))
+    _, first, inverse = np.unique(whole, return_index=True, return_inverse=True)
     kept = rows[first]
-    return Shape(kept[:, :3], kept[:, 3:6], kept[:, 6:], kept[:, :3], inverse.reshape(-1, 3).astype(np.int32))
+    return Surface(kept[:, :3], kept[:, 3:6], kept[:, 6:], kept[:, :3], inverse.reshape(-1, 3).astype(np.int32))

@@ -15,15 +15,14 @@ class Textures:
     """Textures with three or four channels, by their id in the model."""
 
     def __init__(self, gl: moderngl.Context, model: mujoco.MjModel) -> None:
-        """Args: the context; the model."""
         self._model = model
         self.placed: dict[int, moderngl.Texture | moderngl.TextureCube] = {}
-        for texture in np.flatnonzero(model.tex_nchannel >= 3):
+        for texture in np.flatnonzero(model.tex_nchannel >= 3).tolist():
             width, height = int(model.tex_width[texture]), int(model.tex_height[texture])
             flat = bool(model.tex_type[texture] == mujoco.mjtTexture.mjTEXTURE_2D)
             made = gl.texture((width, height), 4) if flat else gl.texture_cube((width, width), 4)
             made.filter = moderngl.LINEAR_MIPMAP_LINEAR, moderngl.LINEAR
-            self.placed[int(texture)] = made
+            self.placed[texture] = made
         self.upload(self.placed)
 
     def is_cube(self, texture: int) -> bool:
@@ -46,12 +45,9 @@ class Textures:
     def _pixels(self, texture: int) -> Array:
         """Return (height, width, 4) uint8, linear as MuJoCo's renderer shows it."""
         model = self._model
-        height, width = int(model.tex_height[texture]), int(model.tex_width[texture])
-        channels, start = int(model.tex_nchannel[texture]), int(model.tex_adr[texture])
-        pixels = np.full((height, width, 4), 255, np.uint8)
-        pixels[..., :channels] = model.tex_data[start : start + height * width * channels].reshape(
-            height, width, channels
-        )
+        shape = int(model.tex_height[texture]), int(model.tex_width[texture]), int(model.tex_nchannel[texture])
+        pixels, start = np.full((*shape[:2], 4), 255, np.uint8), int(model.tex_adr[texture])
+        pixels[..., : shape[2]] = model.tex_data[start : start + np.prod(shape)].reshape(shape)
         if model.tex_colorspace[texture] == mujoco.mjtColorSpace.mjCOLORSPACE_SRGB:
             encoded = np.arange(256) / 255
             linear = np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)

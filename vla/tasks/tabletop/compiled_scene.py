@@ -7,14 +7,20 @@ from typing import Literal
 
 import mujoco
 import numpy as np
-from dm_control import mjcf
 
 from vla.spec import Array, Shape
 from vla.tasks.rendering.shapes import mesh_triangles
-from vla.tasks.tabletop.robot import VISIBLE
-from vla.tasks.tabletop.scene import BLOCK_DENSITY, BLOCK_HALF_SIZE, COLOURS, PAD_THICKNESS, PADS, Scene
+from vla.tasks.tabletop.robot import VISIBLE, TabletopRobot
+from vla.tasks.tabletop.scene import BLOCK_DENSITY, BLOCK_HALF_SIZE, COLOURS, PAD_THICKNESS, PADS, compile_scene
 
 AWAY = (-1.5, 0.0, -3.0)  # position of blocks and pads that are absent [m]
+SHAPES: dict[mujoco.mjtGeom, Literal["mesh", "box", "cylinder", "sphere", "capsule"]] = {
+    mujoco.mjtGeom.mjGEOM_MESH: "mesh",
+    mujoco.mjtGeom.mjGEOM_BOX: "box",
+    mujoco.mjtGeom.mjGEOM_CYLINDER: "cylinder",
+    mujoco.mjtGeom.mjGEOM_SPHERE: "sphere",
+    mujoco.mjtGeom.mjGEOM_CAPSULE: "capsule",
+}
 
 
 @dataclass(frozen=True)
@@ -42,64 +48,46 @@ class Disturbance:
     high: tuple[float, float]  # the opposite corner [m]
 
 
+# Fields of the model that randomisation may change; everything else stays as compiled.
+RANDOMISABLE = (
+    *("geom_type", "geom_matid", "geom_contype", "geom_conaffinity", "geom_rgba", "geom_size", "geom_friction"),
+    *("geom_rbound", "geom_aabb", "bvh_aabb", "body_mass", "body_inertia", "body_gravcomp", "actuator_gainprm"),
+    *("actuator_biasprm", "light_pos", "light_dir", "light_diffuse", "cam_pos", "cam_quat", "cam_fovy"),
+)
+
+
 class CompiledScene:
-    """Indices of a scene's elements in its compiled model, and the nominal model for resets."""
+    """The scene as MuJoCo's model and state: indices of its elements, and changes to it without recompilation."""
 
-    # Model fields that randomisation may change; everything else stays as compiled.
-    RANDOMISABLE = (
-        "geom_type",
-        "geom_matid",
-        "geom_contype",
-        "geom_conaffinity",
-        "geom_rgba",
-        "geom_size",
-        "geom_friction",
-        "geom_rbound",
-        "geom_aabb",
-        "body_mass",
-        "body_inertia",
-        "body_gravcomp",
-        "actuator_gainprm",
-        "actuator_biasprm",
-        "light_pos",
-        "light_dir",
-        "light_diffuse",
-        "cam_pos",
-        "cam_quat",
-        "cam_fovy",
-        "bvh_aabb",
-    )
-
-    def __init__(self, scene: Scene, physics: mjcf.Physics) -> None:
-        """Args: the scene and its compiled physics."""
-        self.model: mujoco.MjModel = physics.model.ptr
-        self.data: mujoco.MjData = physics.data.ptr
-        bind, robot = physics.bind, scene.robot
-        self.robot = robot
-        self.joints = np.array([self.model.joint(name).qposadr[0] for name in robot.joints])
-        self.velocities = np.array([self.model.joint(name).dofadr[0] for name in robot.joints])
-        self.fingers = np.array([self.model.joint(name).qposadr[0] for name in robot.fingers])
-        self._side = {self.model.geom(name).id: side for side, tips in enumerate(robot.fingertips) for name in tips}
-        self.tcp = self.model.site(robot.tool).id
-        self.arm_actuators = np.array([self.model.actuator(name).id for name in robot.servos])
-        self._grips = np.array([self.model.actuator(name).id for name in robot.grips])
-        self.block_geoms = np.array([bind(block.geom).element_id for block in scene.blocks], dtype=int)
-        self.block_bodies = self.model.geom_bodyid[self.block_geoms]
-        free = self.model.body_jntadr[self.block_bodies]
-        self.block_positions = self.model.jnt_qposadr[free]  # address of x y z, quaternion wxyz
-        self.block_velocities = self.model.jnt_dofadr[free]
-        self.zones = [int(self.model.body(f"{name}_pad").mocapid[0]) for name in PADS]
-        self.cameras = {"front": self.model.camera("front").id, "wrist": self.model.camera(f"{robot.prefix}wrist").id}
-        bodies = [self.model.body(body).name for body in self.model.geom_bodyid]
+    def __init__(self, robot: TabletopRobot, blocks: int, shadows: bool = True) -> None:
+        """Compile the scene, with or without shadows of the lamp; a UserError if the robot's model does not compile."""
+        model = self.model = compile_scene(robot, blocks, shadows)
+        self.data, self.robot = mujoco.MjData(model), robot
+        self.joints = np.array([model.joint(name).qposadr[0] for name in robot.joints])
+        self.velocities = np.array([model.joint(name).dofadr[0] for name in robot.joints])
+        self.fingers = np.array([model.joint(name).qposadr[0] for name in robot.fingers])
+        self._side = {model.geom(name).id: side for side, tips in enumerate(robot.fingertips) for name in tips}
+        self.tcp = model.site(robot.tool).id
+        self.arm_actuators = np.array([model.actuator(name).id for name in robot.servos])
+        self._grips = np.array([model.actuator(name).id for name in robot.grips])
+        self.block_geoms = np.array([model.geom(f"block{index}").id for index in range(blocks)], dtype=int)
+        self.block_bodies = model.geom_bodyid[self.block_geoms]
+        free = model.body_jntadr[self.block_bodies]
+        self.block_positions = model.jnt_qposadr[free]  # address of x y z, quaternion wxyz
+        self.block_velocities = model.jnt_dofadr[free]
+        self.zones = [int(model.body(f"{name}_pad").mocapid[0]) for name in PADS]
+        self.cameras = {"front": model.camera("front").id, "wrist": model.camera(f"{robot.prefix}wrist").id}
+        bodies = [model.body(body).name for body in model.geom_bodyid]
         self.robot_geoms = np.flatnonzero([body.startswith(robot.prefix) for body in bodies])
-        self._materials = {name: int(self.model.geom_matid[self.model.geom(name).id]) for name in ("table", "floor")}
-        self.model.geom_matid[:] = -1  # plain surfaces render faster without a material
-        self._nominal = {name: getattr(self.model, name).copy() for name in self.RANDOMISABLE}
-        self._scratch = mujoco.MjData(self.model)
+        self._materials = {name: int(model.geom_matid[model.geom(name).id]) for name in ("table", "floor")}
+        model.geom_matid[:] = -1  # plain surfaces render faster without a material
+        self._nominal = {name: getattr(model, name).copy() for name in RANDOMISABLE}
+        self._scratch = mujoco.MjData(model)
         self.stale_textures: set[int] = set()  # ids of textures that a renderer has not uploaded yet
 
     def restore(self) -> None:
-        """Undo every randomisation: nominal model, three blocks in a row, arm at home."""
+        """Begin anew without randomisation: nominal model, three blocks in a row, arm at home."""
+        mujoco.mj_resetData(self.model, self.data)
         for name, value in self._nominal.items():
             getattr(self.model, name)[:] = value
         count = len(self.block_geoms)
@@ -159,22 +147,27 @@ class CompiledScene:
 
     def finish(self, pads: int) -> None:
         """Make model and state consistent after all changes, with `pads` pads on the table."""
-        for index in range(len(self.block_geoms)):
-            if index >= self.present:
-                self._take_away(index)
-        for pad in range(pads, len(PADS)):
-            self.data.mocap_pos[self.zones[pad]] = AWAY
-        mujoco.mj_setConst(self.model, self._scratch)  # without it, physics explodes after a change of mass
-        here = self.block_positions[: self.present]
+        model, here = self.model, self.block_positions[: self.present]
+        for start in self.block_positions[self.present :]:
+            self.data.qpos[start : start + 7] = (*AWAY, 1, 0, 0, 0)
+        absent = self.block_geoms[self.present :]
+        model.geom_contype[absent] = model.geom_conaffinity[absent] = 0
+        model.body_gravcomp[self.block_bodies[self.present :]] = 1.0
+        self.data.mocap_pos[self.zones[pads:]] = AWAY
+        mujoco.mj_setConst(model, self._scratch)  # without it, physics explodes after a change of mass
         self.data.qpos[here + 2] = self.extents[: self.present, 2]
 
-    def _take_away(self, index: int) -> None:
-        """Move a block out of sight and contact."""
-        geom = self.block_geoms[index]
-        self.model.geom_contype[geom] = self.model.geom_conaffinity[geom] = 0
-        self.model.body_gravcomp[self.block_bodies[index]] = 1.0
-        start = self.block_positions[index]
-        self.data.qpos[start : start + 7] = (*AWAY, 1, 0, 0, 0)
+    def forward_without_servos(self) -> None:
+        """Compute what follows from the state, with servos that do nothing yet."""
+        option, off = self.model.opt, int(mujoco.mjtDisableBit.mjDSBL_ACTUATION)
+        option.disableflags |= off
+        mujoco.mj_forward(self.model, self.data)
+        option.disableflags &= ~off
+
+    def require_stable(self) -> None:
+        """Raise a FloatingPointError if physics has become unstable in this episode."""
+        if (counts := self.data.warning.number).any():
+            raise FloatingPointError(f"physics is unstable: {mujoco.mjtWarning(int(counts.argmax())).name}")
 
     def place_pad(self, pad: int, x: float, y: float) -> None:
         """Put pad `pad` on the table at (x, y) [m]."""
@@ -228,15 +221,8 @@ class CompiledScene:
     def shapes(self) -> list[Shape]:
         """Return the visible shapes."""
         model, shapes = self.model, []
-        kinds: dict[int, Literal["mesh", "box", "cylinder", "sphere", "capsule"]] = {
-            int(mujoco.mjtGeom.mjGEOM_MESH): "mesh",
-            int(mujoco.mjtGeom.mjGEOM_BOX): "box",
-            int(mujoco.mjtGeom.mjGEOM_CYLINDER): "cylinder",
-            int(mujoco.mjtGeom.mjGEOM_SPHERE): "sphere",
-            int(mujoco.mjtGeom.mjGEOM_CAPSULE): "capsule",
-        }
         for geom in np.flatnonzero(model.geom_group == VISIBLE):
-            kind = kinds.get(int(model.geom_type[geom]))
+            kind = SHAPES.get(mujoco.mjtGeom(model.geom_type[geom]))
             if kind is None:
                 continue
             vertices = faces = None

@@ -32,7 +32,7 @@ ABOVE = 0.02  # height of the gripper above an object at which it can be moved [
 BESIDE = 0.09  # horizontal distance from the gripper at which it can be moved, too [m]
 GAP = 0.02  # between a moved object and its neighbours [m]
 DIRECTIONS = 24  # tried until one is free
-GOLDEN = math.pi * (3 - math.sqrt(5))  # angle between a direction and the next one to try [rad]
+GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))  # between a direction and the next one to try [rad]
 
 Target = tuple[Literal["pad", "block"], int]  # kind and index of the object at the destination of a subgoal
 
@@ -48,22 +48,19 @@ class Disturber:
     """
 
     def __init__(self, drawn: Disturbance, scene: CompiledScene) -> None:
-        """Args: what was drawn for the episode; the scene."""
+        """Take what was drawn for the episode, and the scene."""
         self._drawn, self._scene = drawn, scene
         self._steps_left = 0  # of a push or a drop
         self._possible_for = 0  # [steps]
         self.motion: Array | None = None
-        self.offset = np.zeros(3)
-        self.opens = False
+        self.offset, self.opens = np.zeros(3), False
         self.events: list[tuple[int, str]] = []
 
     def override(self, action: Array) -> Array:
         """Return the action (7,) to execute in place of `action`."""
         if self.motion is not None:
             action = np.array([*self.motion, 0, 0, 0, action[6]])
-        if self.opens:
-            action = np.append(action[:6], 1.0)
-        return action
+        return np.append(action[:6], 1.0) if self.opens else action
 
     def update(self, step: int, state: WorldState, now: Subgoal) -> bool:
         """Continue a push or a drop, or let a disturbance happen that is due; return whether an object was moved.
@@ -94,42 +91,35 @@ class Disturber:
             return True
         if now.done or now.skill == "stay":
             return False
+        if kind == "move_block":
+            return bool(np.linalg.norm(state.tool - state.positions[block]) < APPROACH) and state.resting(block)
         lifted = bool(state.held[block] and state.positions[block, 2] > state.extents[block, 2] + CLEAR)
-        if kind == "drop":
-            return lifted
-        if kind == "move_target":
-            return lifted or bool(now.skill == "push" and state.touched[block])
-        near = np.linalg.norm(state.tool - state.positions[block]) < APPROACH
-        return bool(near) and state.resting(block)
+        return lifted or bool(kind == "move_target" and now.skill == "push" and state.touched[block])
 
     def _happen(self, state: WorldState, now: Subgoal) -> str:
         """Start the disturbance and return its description; an empty string if there is no free place."""
-        kind, distance = self._drawn.kind, self._drawn.distance
+        kind, distance = self._drawn.kind, f"{100 * self._drawn.distance:.1f} cm"
         if kind == "drop":
             self.opens, self._steps_left = True, OPEN_STEPS
             return "drop: the gripper opens"
         if kind == "push":
-            return self._push(state)
+            place = next(self._around(state.tool), None)
+            if place is None:
+                return ""
+            self._steps_left = max(1, math.ceil(self._drawn.distance / PUSH_STEP))
+            self.motion = self.offset = np.append(place - state.tool[:2], 0.0) / self._steps_left
+            return f"push: the arm is pushed by {distance}"
         target: Target | None = ("block", now.block) if kind == "move_block" else _target(state, now)
         if target is None or (place := self._free_place(state, target)) is None:
             return ""
         what, index = target
         (self._scene.place_pad if what == "pad" else self._scene.move_block)(index, *place)
-        return f"{kind}: the {what} is moved by {100 * distance:.1f} cm"
-
-    def _push(self, state: WorldState) -> str:
-        """Begin a push in the first direction that ends in the area."""
-        for place in self._around(state.tool):
-            self._steps_left = max(1, math.ceil(self._drawn.distance / PUSH_STEP))
-            self.motion = np.append(place - state.tool[:2], 0.0) / self._steps_left
-            self.offset = self.motion
-            return f"push: the arm is pushed by {100 * self._drawn.distance:.1f} cm"
-        return ""
+        return f"{kind}: the {what} is moved by {distance}"
 
     def _around(self, start: Array) -> Iterator[Array]:
         """Yield the places (2,) at the drawn distance from `start` that are in the area, the drawn direction first."""
         for number in range(DIRECTIONS):
-            angle = self._drawn.angle + number * GOLDEN
+            angle = self._drawn.angle + number * GOLDEN_ANGLE
             place = start[:2] + self._drawn.distance * np.array([math.cos(angle), math.sin(angle)])
             if (place >= self._drawn.low).all() and (place <= self._drawn.high).all():
                 yield place
@@ -138,11 +128,12 @@ class Disturber:
         """Return the first place (2,) for an object away from its neighbours and the gripper, or None."""
         what, index = target
         radii = np.linalg.norm(state.extents, axis=1)  # of the blocks, whatever face is up
-        blocks = [number for number in range(len(radii)) if target != ("block", number) and not state.held[number]]
-        pads = [number for number in range(len(state.pads)) if target != ("pad", number)]
-        others = [(state.positions[number], radii[number]) for number in blocks]
-        others += [(state.pads[number], PAD_RADIUS) for number in pads]
-        start, radius = (state.pads[index], PAD_RADIUS) if what == "pad" else (state.positions[index], radii[index])
+        things: dict[Target, tuple[Array, float]] = {
+            ("pad", pad): (at, PAD_RADIUS) for pad, at in enumerate(state.pads)
+        }
+        things |= {("block", block): (at, radii[block]) for block, at in enumerate(state.positions)}
+        start, radius = things.pop(target)
+        others = [thing for (kind, other), thing in things.items() if kind == "pad" or not state.held[other]]
         if what == "block" and not _clear_of_gripper(state, index, start):
             return None
         for place in self._around(start):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from statistics import NormalDist
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import mujoco
 import numpy as np
@@ -14,20 +14,20 @@ from annotated_types import Le
 from vla.io.errors import UserError
 from vla.io.types import Count, ImageSize, Names, Point, Positive
 from vla.spec import FIRST_SEED, Array, Observation, Shape, Spec
-from vla.tasks.blind import Blindable
 from vla.tasks.gl import require_backend
-from vla.tasks.rendering.renderer import Renderer, RendererFactory, View
+from vla.tasks.rendering.renderer import Renderer, RendererFactory, Views
+from vla.tasks.tabletop.compiled_scene import CompiledScene
 from vla.tasks.tabletop.expert import Waypoint
 from vla.tasks.tabletop.file_robot import FileRobot
-from vla.tasks.tabletop.goals.chain import Chain
 from vla.tasks.tabletop.goals.goal import Goal
-from vla.tasks.tabletop.goals.mixed import Mixed
+from vla.tasks.tabletop.goals.several import Chain, Mixed
 from vla.tasks.tabletop.panda import Panda
 from vla.tasks.tabletop.randomize.randomizer import Randomizer
 from vla.tasks.tabletop.robot import VISIBLE
 from vla.tasks.tabletop.robot_file import RobotFile
-from vla.tasks.tabletop.scene import COLOURS, Scene
+from vla.tasks.tabletop.scene import COLOURS
 from vla.tasks.tabletop.simulation import CONTROL_HZ, Simulation
+from vla.tasks.world import World
 
 TRANSLATION = 0.04  # largest translation per step [m]
 ROTATION = 0.25  # largest rotation per step [rad]
@@ -35,7 +35,7 @@ MILLIMETRES = 1000.0  # of a metre
 QUANTILES = np.array([NormalDist().inv_cdf((index + 0.5) / 256) for index in range(256)])  # of the normal distribution
 
 
-class Tabletop(Blindable):
+class Tabletop(World):
     """`Simulation` as an `Environment` with camera observations, also `Drawable`, `Drivable`, `Eventful` and
     `InARow`.
 
@@ -74,17 +74,19 @@ class Tabletop(Blindable):
             robot: an arm from a file; None: the Panda.
 
         Raises:
-            UserError: an unknown camera, more blocks than colours, or a robot that does not work.
-            UserError: this machine cannot render.
+            UserError: an unknown camera, more blocks than colours, a robot that does not work, or a machine that cannot
+                render.
         """
+        super().__init__()
         require_backend()
         most = len(COLOURS) - goal.absent
         if not goal.blocks <= blocks <= most:
             raise UserError(f"task.blocks must be from {goal.blocks} to {most}, one colour each, got {blocks}")
-        chosen = FileRobot(robot, meshes) if robot else Panda(meshes=meshes)
-        arm, joints = chosen.arm, len(chosen.joints)
-        low = np.array([-TRANSLATION] * 3 + [-ROTATION] * 3 + [0.0])
-        high = np.array([TRANSLATION] * 3 + [ROTATION] * 3 + [1.0])
+        scene = CompiledScene(FileRobot(robot, meshes) if robot else Panda(meshes), blocks, shadows)
+        if unknown := sorted(set(cameras) - set(scene.cameras)):
+            raise UserError(f"unknown cameras {unknown}; task.cameras may list {sorted(scene.cameras)}")
+        arm, joints = scene.robot.arm, len(scene.joints)
+        motion = (TRANSLATION,) * 3 + (ROTATION,) * 3
         self.spec = Spec(
             cameras=tuple(cameras),
             image_size=(image_size[0], image_size[1]),
@@ -92,21 +94,15 @@ class Tabletop(Blindable):
             state_units=("rad",) * joints + ("rad/s",) * joints + ("m",),
             action=("dx", "dy", "dz", "rx", "ry", "rz", "gripper"),
             units=("m", "m", "m", "rad", "rad", "rad", "1"),
-            low=tuple(low.tolist()),
-            high=tuple(high.tolist()),
+            low=(*(-each for each in motion), 0.0),
+            high=(*motion, 1.0),
             control_hz=CONTROL_HZ,
             depth=tuple(cameras),
             truth=(("tcp", 3), ("block", 3), ("destination", 3), ("faces", 2)),
             robot=arm,
         )
-        scene = Scene(chosen, blocks=blocks, shadows=shadows)
-        self.simulation = Simulation(goal, randomize, scene, low, high, time_limit)
-        known = self.simulation.compiled.cameras
-        if unknown := sorted(set(cameras) - set(known)):
-            raise UserError(f"unknown cameras {unknown}; task.cameras may list {sorted(known)}")
-        self.done, self.outcome, self.task = True, "timeout", ""
-        self.milestones: frozenset[str] = frozenset()
-        self.draws: dict[str, Any] = {}
+        bounds = np.array(self.spec.low), np.array(self.spec.high)
+        self.simulation = Simulation(goal, randomize, scene, *bounds, time_limit)
         self._renderer_factory = renderer
         self._renderer: Renderer | None = None
         self._changed = True
@@ -118,10 +114,8 @@ class Tabletop(Blindable):
             self._skip_to(int(self.simulation.streams(seed, "start").randint(len(self.simulation.requests))))
         self._changed = True  # in the model, for the renderer
         # Separate streams, so that a replay without images has the same joint noise.
-        self._joint_noise, self._image_noise = (
-            self.simulation.streams(seed, "joint noise"),
-            np.random.default_rng([seed, 1]),
-        )
+        self._joint_noise = self.simulation.streams(seed, "joint noise")
+        self._image_noise = np.random.default_rng([seed, 1])
         self.task, self.draws = self.simulation.name, self.simulation.draws
         self._update_outcome(done=False)
         return self.look()
@@ -141,8 +135,7 @@ class Tabletop(Blindable):
 
     def step(self, action: Array) -> Observation:
         """Apply one (7,) action, clipped to the spec's bounds, for one control period."""
-        if self.done:
-            raise UserError("the episode is over; call reset(seed) before step(action)")
+        self._require_running()
         self.simulation.step(action)
         self._update_outcome(self.simulation.over)
         return self.look()
@@ -210,11 +203,10 @@ class Tabletop(Blindable):
         return {"physics": step, "rendering": lambda: self.renderer.render(compiled.data)}
 
     def close(self) -> None:
-        """Free physics and GL."""
+        """Free GL."""
         if self._renderer is not None:
             self._renderer.close()
             self._renderer = None
-        self.simulation.close()
 
     @property
     def renderer(self) -> Renderer:
@@ -222,27 +214,26 @@ class Tabletop(Blindable):
         if self._renderer is None:
             compiled, (height, width) = self.simulation.compiled, self.spec.image_size
             cameras = [compiled.cameras[name] for name in self.spec.cameras]
-            view = View(cameras, height, width, geom_groups=(VISIBLE,))
+            view = Views(cameras, height, width, geom_groups=(VISIBLE,))
             self._renderer = self._renderer_factory.open(compiled.model, view)
         return self._renderer
 
     def look(self) -> Observation:
         """Return the current observation."""
-        compiled = self.simulation.compiled
-        if self._blind:
-            if compiled.noise.image:  # draw the noise of the omitted images, so that later images do not change
-                self._image_noise.bytes(3 * len(self.spec.cameras) * math.prod(self.spec.image_size))
-            return Observation({}, self._state(), self.simulation.instruction, {}, self.simulation.truth())
-        if self._changed:
-            self.renderer.update(compiled.stale_textures)
-            compiled.stale_textures.clear()
-            self._changed = False
-        pictures, metres = self.renderer.render(compiled.data)
-        if compiled.noise.image:
-            pictures = self._grainy(pictures)
-        rgb = dict(zip(self.spec.cameras, pictures, strict=True))
-        millimetres = np.rint(metres * np.float32(MILLIMETRES)).astype(np.uint16)
-        depth = dict(zip(self.spec.cameras, millimetres, strict=True))
+        compiled, rgb, depth = self.simulation.compiled, {}, {}
+        if not self._blind:
+            if self._changed:
+                self.renderer.update(compiled.stale_textures)
+                compiled.stale_textures.clear()
+                self._changed = False
+            pictures, metres = self.renderer.render(compiled.data)
+            if compiled.noise.image:
+                pictures = self._grainy(pictures)
+            millimetres = np.rint(metres * np.float32(MILLIMETRES)).astype(np.uint16)
+            rgb = dict(zip(self.spec.cameras, pictures, strict=True))
+            depth = dict(zip(self.spec.cameras, millimetres, strict=True))
+        elif compiled.noise.image:  # draw the noise of the omitted images, so that later images do not change
+            self._image_noise.bytes(3 * len(self.spec.cameras) * math.prod(self.spec.image_size))
         return Observation(rgb, self._state(), self.simulation.instruction, depth, self.simulation.truth())
 
     def _grainy(self, pictures: Array) -> Array:

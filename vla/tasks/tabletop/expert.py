@@ -41,11 +41,7 @@ class Waypoint:
     memoryless = True
 
     def __init__(self, spec: Spec) -> None:
-        """Args: the environment's spec.
-
-        Raises:
-            UserError: there is no robot with a gripper.
-        """
+        """Act in an environment of this spec; a UserError if it has no robot with a gripper."""
         self._low, self._high = np.array(spec.low), np.array(spec.high)
         if spec.robot is None or spec.robot.gripper is None:
             raise UserError("the expert of the tabletop acts in task=tabletop only: choose the expert of this task")
@@ -56,11 +52,7 @@ class Waypoint:
         """Do nothing: the expert has no state."""
 
     def act(self, observation: Observation) -> Array:
-        """Return the (7,) action for this state.
-
-        Raises:
-            UserError: the observation lacks the simulator's truth.
-        """
+        """Return the (7,) action for this state (UserError: the observation lacks the simulator's truth)."""
         if observation.truth is None:
             raise UserError("the scripted expert needs the simulator's truth, which this observation lacks")
         self.info = {}

@@ -12,16 +12,13 @@ from typing import Literal
 
 import mujoco
 import numpy as np
-from dm_control import mjcf
-from dm_control.mujoco.wrapper import MjModel
 
 from vla.io.errors import UserError
 from vla.robots.cartesian import LIMIT_MARGIN, Kinematics, rotation_z
 from vla.spec import Array, RobotModel
 from vla.tasks.tabletop import fingertips, robot_spec
-from vla.tasks.tabletop.model_file import compiled, require
-from vla.tasks.tabletop.robot import PHYSICS, Robot
-from vla.tasks.tabletop.robot_file import RobotFile
+from vla.tasks.tabletop.robot import PHYSICS, TabletopRobot, attributes
+from vla.tasks.tabletop.robot_file import RobotFile, compiled, require
 
 PREFIX = "robot/"  # of the names of all elements in the scene
 FREQUENCY = 100.0  # natural frequency of a joint of the arm with its servo, at home [rad/s]
@@ -38,61 +35,43 @@ BESIDE = 0.005  # how far beside this middle it may be [m]
 BELOW = 0.012  # how far fingertips may reach below the tool point, so that they do not touch the table [m]
 
 
-class FileRobot(Robot):
+class FileRobot(TabletopRobot):
     """The arm of a `RobotFile`."""
 
     prefix, travel, finger_speed, lead = PREFIX, 1.0, 1 / CLOSING, LEAD
 
     def __init__(self, file: RobotFile, meshes: Literal["light", "full"]) -> None:
-        """Read the files and measure the gripper.
-
-        Args:
-            file: what to read.
-            meshes: drawn as hulls of few vertices ("light"), or as they are ("full").
+        """Read the files and measure the gripper; meshes are drawn as hulls of few vertices ("light"), or as they are.
 
         Raises:
             UserError: a file is missing or does not compile, a name is not in it, or a value does not fit it.
         """
         self._file, self._spec = file, file.read()
-        start = robot_spec.checked_home(self._spec, file.joints, file.home)
+        spec, home = self._spec, robot_spec.checked_home(self._spec, file.joints, file.home)
         if file.open.keys() != file.closed.keys():
             raise UserError(f"task.robot.open names {', '.join(file.open)}, task.robot.closed {', '.join(file.closed)}")
-        robot_spec.simplify(self._spec, file.joints, file.open)
-        robot_spec.set_armature(self._spec, file.joints, ARMATURE)
-        body, position, rotation = robot_spec.add_tool(
-            self._spec, file.tool, start, rotation_z(file.yaw), np.array(file.offset)
-        )
-        robot_spec.add_camera(body, position, rotation, np.array(file.camera), np.array(file.target))
-        sides = [fingertips.named(self._spec, side) for side in file.fingertips]
-        self._add_servos(start)
-        self._measure_gripper(sides)
-        self.kinematics = self._kinematics()
-        velocities = tuple(f"{joint}_velocity" for joint in file.joints)
-        chain = self._chain()
-        self.arm = RobotModel(tuple(file.joints), "world", velocities, "gripper", chain, tuple(file.home))
-        if meshes == "light":
-            robot_spec.use_convex_hulls(self._spec, compiled(self._spec))
-
-    def _attached(self, scene: mujoco.MjSpec) -> mujoco.MjModel:
-        """Return the compiled model of a scene with the robot in it."""
-        turn = (np.cos(self._file.yaw / 2), 0.0, 0.0, np.sin(self._file.yaw / 2))
-        place = scene.worldbody.add_frame(pos=self._file.place, quat=turn)
-        scene.attach(self._spec.copy(), frame=place, prefix=PREFIX)
-        return compiled(scene)
-
-    def compile(self, scene: mjcf.RootElement) -> mjcf.Physics:
-        """Compile a scene together with the robot."""
-        world = mujoco.MjSpec.from_string(scene.to_xml_string(), assets=scene.get_assets())
-        return mjcf.Physics.from_model(MjModel(self._attached(world)))
-
-    def _add_servos(self, home: dict[str, float]) -> None:
-        """Add servos to the joints of the arm, as stiff as its inertia at home allows, and to those of the gripper."""
-        file, spec = self._file, self._spec
-        strength = zip(home, robot_spec.stiffness(spec, home, FREQUENCY), strict=True)
+        robot_spec.simplify(spec, file.joints, file.open)
+        robot_spec.set_armature(spec, file.joints, ARMATURE)
+        tool = robot_spec.add_tool(spec, file.tool, home, rotation_z(file.yaw), np.array(file.offset))
+        robot_spec.add_camera(*tool, np.array(file.camera), np.array(file.target))
+        sides = [fingertips.named(spec, side) for side in file.fingertips]
+        strength = zip(home, robot_spec.stiffness(spec, home, FREQUENCY), strict=True)  # as much as its inertia allows
         servos = [robot_spec.add_servo(spec, name, k, LEAD * k, None) for name, k in strength]
         grips = [self._grip(name, max(abs(file.open[name] - file.closed[name]), 1e-3)) for name in file.open]
         self.joints, self.servos, self.grips = ([PREFIX + each for each in names] for names in (home, servos, grips))
         self.closed, self.opened = (np.array([each[name] for name in file.open]) for each in (file.closed, file.open))
+        self._measure_gripper(sides)
+        self.kinematics = self._kinematics()
+        velocities = tuple(f"{joint}_velocity" for joint in file.joints)
+        self.arm = RobotModel(tuple(file.joints), "world", velocities, "gripper", self._chain(), tuple(file.home))
+        if meshes == "light":
+            robot_spec.use_convex_hulls(spec)
+
+    def attach(self, scene: mujoco.MjSpec) -> None:
+        """Add the robot to a scene."""
+        turn = (np.cos(self._file.yaw / 2), 0.0, 0.0, np.sin(self._file.yaw / 2))
+        place = scene.worldbody.add_frame(pos=self._file.place, quat=turn)
+        scene.attach(self._spec.copy(), frame=place, prefix=PREFIX)
 
     def _grip(self, name: str, travel: float) -> str:
         """Return the name of the gripper's actuator `name`, or of a position servo added to the joint `name`."""
@@ -106,11 +85,8 @@ class FileRobot(Robot):
         return robot_spec.add_servo(spec, name, stiffness, LEAD * stiffness, force)
 
     def _measure_gripper(self, sides: list[list[str]]) -> None:
-        """Tabulate the opening, divide jaws that stay close at a hinge, and move the tool point between the fingertips.
-
-        Raises:
-            UserError: the opening does not change, or the tool point is far from the fingertips.
-        """
+        """Tabulate the opening, divide jaws that stay close at a hinge, and move the tool point between the fingertips
+        (UserError: the opening does not change, or the tool point is far from the fingertips)."""
         middles = self._close(sides)
         if self.widest - self.narrowest <= LEAST_TRAVEL:
             sides = fingertips.far_ends(self._spec, self._model, self._data, sides, PREFIX)
@@ -142,13 +118,12 @@ class FileRobot(Robot):
     def _close(self, sides: list[list[str]]) -> Array:
         """Tabulate the positions of the finger joints and the opening for commands from open to closed, by simulation.
 
-        Args: sides: geoms of either side.
-
-        Returns:
-            Middle between the fingertips in the frame of the tool, for openings in ascending order, (N, 3) [m].
+        Returns the middle between the fingertips, the geoms `sides`, in the frame of the tool, for openings in
+        ascending order, (N, 3) [m].
         """
-        option = " ".join(f'{name}="{value}"' for name, value in PHYSICS.items())
-        self._model = model = self._attached(mujoco.MjSpec.from_string(f"<mujoco><option {option}/></mujoco>"))
+        alone = mujoco.MjSpec.from_string(f"<mujoco><option {attributes(**PHYSICS)}/></mujoco>")
+        self.attach(alone)
+        self._model = model = compiled(alone)
         self._data = data = mujoco.MjData(model)
         self.fingertips, self.tool = [[PREFIX + tip for tip in side] for side in sides], PREFIX + robot_spec.TOOL
         names = [model.joint(index).name for index in range(model.njnt)]
@@ -171,7 +146,7 @@ class FileRobot(Robot):
         return table[:, 1:4]
 
     def _extents(self, middle: float = 0.0) -> tuple[float, float, float, float]:
-        """Return the extents of the closed fingertips about `middle` on the tool's y axis, as of `Robot.tip`."""
+        """Return the extents of the closed fingertips about `middle` on the tool's y axis, see `tip`."""
         tips = [tip for side in self.fingertips for tip in side]
         corners = fingertips.points(self._model, self._data, tips, self._data.site(self.tool))
         forward, aside = np.abs(corners[:, :2] - [0.0, middle]).max(axis=0)
@@ -189,12 +164,9 @@ class FileRobot(Robot):
     def _kinematics(self) -> Kinematics:
         model, data, home = self._model, self._data, np.array(self._file.home)
         joints = [model.joint(name) for name in self.joints]
-        positions, dofs = (
-            [int(at[0]) for at in each] for each in zip(*((j.qposadr, j.dofadr) for j in joints), strict=True)
-        )
+        positions, dofs = [int(joint.qposadr[0]) for joint in joints], [int(joint.dofadr[0]) for joint in joints]
         limits = np.array([j.range if model.jnt_limited[j.id] else (-np.inf, np.inf) for j in joints])
-        site = model.site(self.tool).id
-        jacobian = np.empty((6, model.nv))
+        site, jacobian = model.site(self.tool).id, np.empty((6, model.nv))
 
         def forward(joints: Array) -> tuple[Array, Array]:
             data.qpos[positions] = joints
@@ -211,22 +183,12 @@ class FileRobot(Robot):
     def _chain(self) -> tuple[tuple[float, ...], ...]:
         """Return the chain of the arm, as in `vla.spec.RobotModel`, with every joint's axis as its z axis."""
         tool, _ = self.kinematics.forward(np.zeros(len(self.joints)))
-        indices = [self._model.joint(name).id for name in self.joints]
-        frames = [_frame(self._data.xanchor[index], self._data.xaxis[index]) for index in indices]
-        return tuple(_relative(before, frame) for before, frame in pairwise([np.eye(4), *frames, tool]))
-
-
-def _frame(position: Array, axis: Array) -> Array:
-    """Return a pose (4, 4) with the z axis along `axis`."""
-    pose, turn = np.eye(4), np.empty(4)
-    mujoco.mju_quatZ2Vec(turn, axis)
-    rotation = np.empty(9)
-    mujoco.mju_quat2Mat(rotation, turn)
-    pose[:3, :3], pose[:3, 3] = rotation.reshape(3, 3), position
-    return pose
-
-
-def _relative(before: Array, pose: Array) -> tuple[float, ...]:
-    """Return offset [m] and quaternion wxyz of a pose in the one before."""
-    within = np.linalg.inv(before) @ pose
-    return tuple(np.round([*within[:3, 3], *robot_spec.quaternion(within[:3, :3])], 9).tolist())
+        frames, turn, rotation = [np.eye(4)], np.empty(4), np.empty(9)
+        for index in (self._model.joint(name).id for name in self.joints):
+            mujoco.mju_quatZ2Vec(turn, self._data.xaxis[index])
+            mujoco.mju_quat2Mat(rotation, turn)
+            frames.append(np.eye(4))
+            frames[-1][:3, :3], frames[-1][:3, 3] = rotation.reshape(3, 3), self._data.xanchor[index]
+        links = (np.linalg.inv(before) @ frame for before, frame in pairwise([*frames, tool]))
+        rows = ([*link[:3, 3], *robot_spec.quaternion(link[:3, :3])] for link in links)
+        return tuple(tuple(np.round(row, 9).tolist()) for row in rows)

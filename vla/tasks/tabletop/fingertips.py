@@ -17,8 +17,8 @@ from scipy.spatial import ConvexHull
 from vla.io.errors import UserError
 from vla.spec import Array
 from vla.tasks.rendering.shapes import mesh_triangles
-from vla.tasks.tabletop.model_file import require
 from vla.tasks.tabletop.robot import FINGERTIP_CONTACT, HIDDEN, ROBOT_CONTACT
+from vla.tasks.tabletop.robot_file import require
 from vla.tasks.tabletop.robot_spec import TOOL, add_hull
 
 FAR_END = 0.03  # length of a jaw's part that holds a block [m]
@@ -106,15 +106,15 @@ def far_ends(
     tool = data.site(prefix + TOOL)
     shapes = [{tip: _triangles(model, data, prefix + tip, tool) for tip in side} for side in sides]
     level = min(max(shape[..., 2].max() for shape in side.values()) for side in shapes) - FAR_END
-    ends: list[list[str]] = []
-    for tips in shapes:
-        ends.append([])
+    ends: list[list[str]] = [[], []]
+    for side, tips in zip(ends, shapes, strict=True):
         for tip, shape in tips.items():
             body = data.body(prefix + spec.geom(tip).parent.name)
             turn = tool.xmat.reshape(3, 3).T @ body.xmat.reshape(3, 3)
             start = (tool.xpos - body.xpos) @ body.xmat.reshape(3, 3)
-            end, rest = (_beyond(shape, side * (shape[..., 2] - level)) for side in (1, -1))
-            ends[-1] += _divide(spec, tip, start + end @ turn, start + rest @ turn)
+            end, rest = (_beyond(shape, sign * (shape[..., 2] - level)) for sign in (1, -1))
+            if len(end):
+                side.append(_divide(spec, tip, start + end @ turn, start + rest @ turn) if len(rest) else tip)
     return ends
 
 
@@ -127,18 +127,13 @@ def _beyond(triangles: Array, heights: Array) -> Array:
     return np.concatenate([starts[here >= 0], starts[cross] + share * (ends[cross] - starts[cross])])
 
 
-def _divide(spec: mujoco.MjSpec, tip: str, end: Array, rest: Array) -> list[str]:
-    """Let the hulls of two parts of a geom, points (N, 3) in the frame of its body, collide in its place.
-
-    Returns:
-        Name of the hull of `end`, or of the geom if it is not divided; nothing if there is no end.
-    """
-    if not len(end):
-        return []
-    if not len(rest) or not add_hull(spec, f"{tip}_end", end):
-        return [tip]
+def _divide(spec: mujoco.MjSpec, tip: str, end: Array, rest: Array) -> str:
+    """Let the hulls of two parts of a geom, points (N, 3) in the frame of its body, collide in its place; return the
+    name of the hull of `end`, or of the geom if that is flat."""
+    if not add_hull(spec, f"{tip}_end", end):
+        return tip
     whole = spec.geom(tip)
     whole.contype = whole.conaffinity = 0
     for name in [f"{tip}_end", *([f"{tip}_rest"] if add_hull(spec, f"{tip}_rest", rest) else [])]:
         _add(whole.parent, name, mujoco.mjtGeom.mjGEOM_MESH, meshname=name)
-    return [f"{tip}_end"]
+    return f"{tip}_end"

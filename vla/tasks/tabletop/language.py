@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from copy import copy
 from string import Formatter
 from typing import Annotated, Literal
 
@@ -31,12 +32,14 @@ class Grammar:
         held_out_words: Mapping[str, Words],
         held_out_colours: Sequence[str],
     ) -> None:
-        """Args:
-        phrasings: training phrasings.
-        words: slot → training synonyms.
-        held_out_phrasings: phrasings for evaluation only.
-        held_out_words: slot → synonyms for evaluation only.
-        held_out_colours: block colours that training instructions never name.
+        """Take what training says, and what is held out from it.
+
+        Args:
+            phrasings: training phrasings.
+            words: slot → training synonyms.
+            held_out_phrasings: phrasings for evaluation only.
+            held_out_words: slot → synonyms for evaluation only.
+            held_out_colours: block colours that training instructions never name.
 
         Raises:
             UserError: a held-out part is empty, replaces nothing or overlaps with training, or a phrasing has a
@@ -58,20 +61,19 @@ class Grammar:
 
     def renamed(self, slots: Mapping[str, str]) -> Grammar:
         """Return the grammar with other names for some slots, old → new, which are replaced in that order."""
-
-        def rename(phrasings: Sequence[str]) -> list[str]:
-            renamed = list(phrasings)
-            for old, new in slots.items():
-                renamed = [phrasing.replace(f"{{{old}}}", f"{{{new}}}") for phrasing in renamed]
-            return renamed
-
-        phrasings = rename(self.phrasings), self.words, rename(self.held_out_phrasings), self.held_out_words
-        return Grammar(*phrasings, self.held_out_colours)
+        grammar = copy(self)
+        for old, new in slots.items():
+            for name in ("phrasings", "held_out_phrasings"):
+                renamed = (phrasing.replace(f"{{{old}}}", f"{{{new}}}") for phrasing in getattr(grammar, name))
+                setattr(grammar, name, tuple(renamed))
+        grammar.slots = {slots.get(slot, slot) for slot in self.slots}
+        return grammar
 
     @property
     def held_out_kinds(self) -> tuple[HeldOut, ...]:
         """Kinds of held-out instructions that this grammar can generate."""
-        return ("words", "phrasings", "combinations") if self.held_out_colours else ("words", "phrasings")
+        kinds: tuple[HeldOut, ...] = ("words", "phrasings") if self.held_out_words else ()
+        return (*kinds, "combinations") if self.held_out_colours else kinds
 
     def say(self, slots: Mapping[str, str], held_out: HeldOut | None, random_state: np.random.RandomState) -> str:
         """Draw an instruction with the goal's `slots` filled; one part of it is held out, or nothing if None."""
@@ -92,15 +94,6 @@ class Silence(Grammar):
     def __init__(self) -> None:
         self.phrasings = self.held_out_phrasings = ("",)
         self.words, self.held_out_words, self.held_out_colours, self.slots = {}, {}, (), set()
-
-    def renamed(self, slots: Mapping[str, str]) -> Silence:
-        """Return the grammar itself: it has no slots."""
-        return self
-
-    @property
-    def held_out_kinds(self) -> tuple[HeldOut, ...]:
-        """Return nothing: nothing can be held out."""
-        return ()
 
 
 def _slots(phrasing: str) -> set[str]:

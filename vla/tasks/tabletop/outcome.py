@@ -31,9 +31,8 @@ class OutcomeClassifier:
     """
 
     def __init__(self, hold_steps: int) -> None:
-        """Args: consecutive control steps for which the goal must hold."""
-        self._hold_steps = hold_steps
-        self._held_for = 0
+        """Take the number of consecutive control steps for which the goal must hold."""
+        self._hold_steps, self._held_for = hold_steps, 0
         self._near = self._lifted = self._lifted_other = self._dropped = self._holding = False
         self._skill: Skill | None = None
         self._height, self._block = 0.0, -1
@@ -45,9 +44,8 @@ class OutcomeClassifier:
         block, self._skill = now.block, now.skill
         if block != self._block:
             self._block, self._near, self._lifted, self._holding, self._dropped = block, False, False, False, False
-        self._near |= bool(
-            np.linalg.norm(state.tool - state.positions[block]) < (PUSH if now.skill == "push" else REACH)
-        )
+        near = PUSH if now.skill == "push" else REACH
+        self._near |= bool(np.linalg.norm(state.tool - state.positions[block]) < near)
         lifted = state.held & (state.positions[:, 2] > state.extents[:, 2] + CLEAR)
         self._lifted_other |= any(up for index, up in enumerate(lifted) if index not in named)
         if lifted[block]:
@@ -55,8 +53,7 @@ class OutcomeClassifier:
             self._dropped = False
             self._height = state.positions[block, 2] - state.extents[block, 2]
         elif self._holding and not state.touched[block]:
-            self._holding = False
-            self._dropped = self._height > FALL
+            self._holding, self._dropped = False, self._height > FALL
 
     @property
     def success(self) -> bool:
@@ -70,15 +67,13 @@ class OutcomeClassifier:
             return "success"
         if self._skill == "stay":
             return "did_not_stay"
-        if not self._lifted:
-            if self._lifted_other:
-                return "wrong_object"
-            if self._skill == "push" and self._near:
-                return "not_placed"
-            return "missed_grasp" if self._near else "never_reached"
-        if self._holding:
-            return "timeout"
-        return "dropped" if self._dropped else "not_placed"
+        if self._lifted:
+            return "timeout" if self._holding else "dropped" if self._dropped else "not_placed"
+        if self._lifted_other:
+            return "wrong_object"
+        if self._skill == "push" and self._near:
+            return "not_placed"
+        return "missed_grasp" if self._near else "never_reached"
 
     @property
     def milestones(self) -> frozenset[str]:

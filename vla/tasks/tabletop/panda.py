@@ -8,20 +8,8 @@ from typing import Literal
 
 import mujoco
 import numpy as np
-from dm_control import mjcf
 
-from vla.robots.panda import (
-    CHAIN,
-    FINGER_SPEED,
-    FINGER_TRAVEL,
-    FLANGE,
-    HAND_TO_TCP,
-    HAND_YAW,
-    JOINT_HIGH,
-    JOINT_LOW,
-    MAX_OPENING,
-    PANDA,
-)
+from vla.robots import panda
 from vla.spec import Array, RobotModel
 from vla.tasks.tabletop.robot import (
     CORNERS,
@@ -30,8 +18,8 @@ from vla.tasks.tabletop.robot import (
     ROBOT_CONTACT,
     VISIBLE,
     CameraPose,
-    Robot,
-    look_at,
+    TabletopRobot,
+    attributes,
     spread,
 )
 
@@ -59,7 +47,6 @@ GRIP_FORCE = 20.0  # of both fingers together [N]; the Franka Hand gives up to 7
 
 SHELL = (0.93, 0.94, 0.95, 1.0)
 DARK = (0.22, 0.23, 0.25, 1.0)
-NO_CONTACT = {"contype": 0, "conaffinity": 0}
 WRIST = CameraPose(position=(0.085, 0.0, 0.035), target=(0.02, 0.0, 0.12), fovy=75.0)  # in the hand's frame
 JOINTS = tuple(f"panda_joint{index}" for index in range(1, 8))
 ARM = RobotModel(
@@ -67,7 +54,8 @@ ARM = RobotModel(
     frame="panda_link0",
     velocities=tuple(f"{joint}_velocity" for joint in JOINTS),
     gripper="gripper",
-    chain=CHAIN,
+    chain=panda.CHAIN,
+    home=tuple(panda.HOME.tolist()),
 )
 
 
@@ -89,121 +77,26 @@ def read_corners(path: Path) -> Array:
     return np.unique(np.fromfile(path, triangle, offset=84)["corners"].reshape(-1, 3), axis=0)
 
 
-class Panda(Robot):
+class Panda(TabletopRobot):
     """Seven position-servoed joints with gravity compensation and a gripper whose fingers share one servo."""
 
     prefix = "panda/"
-    arm, kinematics, lead = ARM, PANDA, LEAD
+    arm, kinematics, lead = ARM, panda.PANDA, LEAD
     joints = servos = tuple(f"panda/joint{index}" for index in range(1, 8))
     fingers, grips, tool = ("panda/left_finger", "panda/right_finger"), ("panda/fingers",), "panda/tcp"
     fingertips = (("panda/left_pad",), ("panda/right_pad",))
     tip = (0.012, 0.012, 0.008, 0.0)  # half the diagonal of the square fingertips
-    closed, opened = np.zeros(1), np.array([FINGER_TRAVEL])
-    travel, finger_speed, widest = FINGER_TRAVEL, FINGER_SPEED, MAX_OPENING
+    closed, opened = np.zeros(1), np.array([panda.FINGER_TRAVEL])
+    travel, finger_speed, widest = panda.FINGER_TRAVEL, panda.FINGER_SPEED, panda.MAX_OPENING
 
     def __init__(self, meshes: Literal["light", "full"] = "light") -> None:
-        """Args: meshes: visual meshes, "light" (1 200 faces) or "full" (134 000). Collision meshes are the same."""
-        self.root = mjcf.RootElement(model="panda")
-        self.root.compiler.angle = "radian"
+        """Choose the visual meshes, "light" (1 200 faces) or "full" (134 000). Collision meshes are the same."""
         self._meshes = meshes
-        self._add_assets()
-        body = self.root.worldbody.add("body", name="link0")
-        body.add(
-            "inertial", mass=0.629769, pos=(-0.041018, -0.00014, 0.049974), diaginertia=(0.00315, 0.00388, 0.004285)
-        )
-        self._add_mesh(body, "link0", SHELL)
-        for index, link in enumerate(LINKS):
-            body = self._add_link(body, index, link)
-        self._add_gripper(body)
 
-    def _add_assets(self) -> None:
-        folder = mesh_folder()
-        names = [*(f"link{index}" for index in range(8)), "hand", "finger"]
-        for name in names:
-            self.root.asset.add("mesh", name=name, file=str(folder / "collision" / f"{name}.stl"))
-            if self._meshes == "light":
-                # Convex hulls of the collision meshes; with shadows, every face is rendered twice per camera.
-                corners = spread(read_corners(folder / "collision" / f"{name}.stl"), CORNERS)
-                self.root.asset.add("mesh", name=f"{name}_seen", vertex=corners.ravel())
-            else:
-                self.root.asset.add("mesh", name=f"{name}_seen", file=str(folder / "visual" / f"{name}.stl"))
-
-    def _add_mesh(self, body: mjcf.Element, mesh: str, rgba: tuple[float, ...], collide: bool = True) -> None:
-        body.add("geom", type="mesh", mesh=f"{mesh}_seen", group=VISIBLE, rgba=rgba, mass=0, **NO_CONTACT)
-        if collide:
-            body.add("geom", type="mesh", mesh=mesh, group=HIDDEN, mass=0, **ROBOT_CONTACT)
-
-    def _add_link(self, parent: mjcf.Element, index: int, link: Link) -> mjcf.Element:
-        body = parent.add("body", name=f"link{index + 1}", pos=CHAIN[index][:3], quat=CHAIN[index][3:], gravcomp=1)
-        mass, com, inertia = link
-        body.add("inertial", mass=mass, pos=com, fullinertia=inertia)
-        limits = (JOINT_LOW[index], JOINT_HIGH[index])
-        joint = body.add(
-            "joint", name=f"joint{index + 1}", axis=(0, 0, 1), range=limits, limited=True, armature=ARMATURE
-        )
-        self.root.actuator.add(
-            "position",
-            name=f"joint{index + 1}",
-            joint=joint,
-            kp=STIFFNESS[index],
-            kv=STIFFNESS[index] * LEAD,
-            ctrlrange=limits,
-            forcerange=(-TORQUE[index], TORQUE[index]),
-        )
-        self._add_mesh(body, f"link{index + 1}", DARK if index == 4 else SHELL)
-        return body
-
-    def _add_gripper(self, link: mjcf.Element) -> None:
-        hand = link.add("body", name="hand", pos=(0, 0, FLANGE), euler=(0, 0, HAND_YAW), gravcomp=1)
-        hand.add("inertial", mass=HAND_MASS, pos=(-0.01, 0, 0.03), diaginertia=(0.001, 0.0025, 0.0017))
-        self._add_mesh(hand, "hand", SHELL)
-        hand.add("site", name="tcp", pos=(0, 0, HAND_TO_TCP), size=(0.004,), group=4)
-        axes = look_at(WRIST.position, WRIST.target, (1, 0, 0))
-        hand.add("camera", name="wrist", pos=WRIST.position, xyaxes=(*axes[:, 0], *axes[:, 1]), fovy=WRIST.fovy)
-        fingers = []
-        for side, euler in (("left", (0, 0, 0)), ("right", (0, 0, np.pi))):
-            finger = hand.add("body", name=f"{side}_finger", pos=(0, 0, FINGER_OFFSET), euler=euler, gravcomp=1)
-            finger.add("inertial", mass=FINGER_MASS, pos=(0, 0, 0), diaginertia=(2.375e-6, 2.375e-6, 7.5e-7))
-            fingers.append(
-                finger.add(
-                    "joint",
-                    name=f"{side}_finger",
-                    type="slide",
-                    axis=(0, 1, 0),
-                    range=(0, FINGER_TRAVEL),
-                    limited=True,
-                    armature=0.05,
-                )
-            )
-            self._add_mesh(finger, "finger", DARK, collide=False)
-            # The soft fingertip is the only part of a finger that collides.
-            finger.add(
-                "geom",
-                name=f"{side}_pad",
-                type="box",
-                size=(0.0085, 0.004, 0.0085),
-                pos=(0, 0.0045, 0.0445),
-                rgba=DARK,
-                group=VISIBLE,
-                mass=0,
-                **FINGERTIP_CONTACT,
-                **ROBOT_CONTACT,
-            )
-        tendon = self.root.tendon.add("fixed", name="fingers")
-        for joint in fingers:
-            tendon.add("joint", joint=joint, coef=0.5)
-        self.root.equality.add(
-            "joint", joint1=fingers[0], joint2=fingers[1], solref=(0.005, 1), solimp=(0.95, 0.99, 0.001)
-        )
-        self.root.actuator.add(
-            "position",
-            name="fingers",
-            tendon=tendon,
-            kp=GRIP_STIFFNESS,
-            kv=GRIP_DAMPING,
-            ctrlrange=(0, FINGER_TRAVEL),
-            forcerange=(-GRIP_FORCE, GRIP_FORCE),
-        )
+    def attach(self, scene: mujoco.MjSpec) -> None:
+        """Add the robot to a scene."""
+        robot = mujoco.MjSpec.from_string(_mjcf(self._meshes))
+        scene.attach(robot, frame=scene.worldbody.add_frame(), prefix=self.prefix)
 
     def grip(self, opening: float) -> tuple[float, float]:
         """Return half the opening, for both fingers and their common servo."""
@@ -212,3 +105,78 @@ class Panda(Robot):
     def opening(self, model: mujoco.MjModel, data: mujoco.MjData) -> float:
         """Return the sum of both fingers' positions [m]."""
         return float(sum(data.joint(finger).qpos[0] for finger in self.fingers))
+
+
+def _mjcf(meshes: str) -> str:
+    """Return the model of the robot."""
+    limits = [attributes(range=(low, high)) for low, high in zip(panda.JOINT_LOW, panda.JOINT_HIGH, strict=True)]
+    links, servos = "", ""
+    for index, (mass, com, inertia) in enumerate(LINKS):
+        name, place = f"joint{index + 1}", attributes(pos=panda.CHAIN[index][:3], quat=panda.CHAIN[index][3:])
+        links += f"""<body name="link{index + 1}" gravcomp="1" {place}>
+            <inertial {attributes(mass=mass, pos=com, fullinertia=inertia)}/>
+            <joint name="{name}" axis="0 0 1" limited="true" {limits[index]} armature="{ARMATURE}"/>
+            {_geoms(f"link{index + 1}", DARK if index == 4 else SHELL)}"""
+        gains = attributes(kp=STIFFNESS[index], kv=STIFFNESS[index] * LEAD, forcerange=(-TORQUE[index], TORQUE[index]))
+        servos += f'<position name="{name}" joint="{name}" ctrl{limits[index]} {gains}/>'
+    force = attributes(forcerange=(-GRIP_FORCE, GRIP_FORCE))
+    return f"""<mujoco model="panda">
+  <compiler angle="radian"/>
+  <asset>{_assets(meshes)}</asset>
+  <worldbody>
+    <body name="link0">
+      <inertial mass="0.629769" pos="-0.041018 -0.00014 0.049974" diaginertia="0.00315 0.00388 0.004285"/>
+      {_geoms("link0", SHELL)}
+      {links}
+      <body name="hand" gravcomp="1" {attributes(pos=(0, 0, panda.FLANGE), euler=(0, 0, panda.HAND_YAW))}>
+        <inertial mass="{HAND_MASS}" pos="-0.01 0 0.03" diaginertia="0.001 0.0025 0.0017"/>
+        {_geoms("hand", SHELL)}
+        <site name="tcp" size="0.004" group="4" {attributes(pos=(0, 0, panda.HAND_TO_TCP))}/>
+        <camera name="wrist" {WRIST.mjcf((1, 0, 0))}/>
+        {_finger("left", 0.0)}
+        {_finger("right", np.pi)}
+      </body>{"</body>" * len(LINKS)}
+    </body>
+  </worldbody>
+  <tendon>
+    <fixed name="fingers"><joint joint="left_finger" coef="0.5"/><joint joint="right_finger" coef="0.5"/></fixed>
+  </tendon>
+  <equality>
+    <joint joint1="left_finger" joint2="right_finger" solref="0.005 1" solimp="0.95 0.99 0.001"/>
+  </equality>
+  <actuator>
+    {servos}
+    <position name="fingers" tendon="fingers" kp="{GRIP_STIFFNESS}" kv="{GRIP_DAMPING}" {force}
+              {attributes(ctrlrange=(0, panda.FINGER_TRAVEL))}/>
+  </actuator>
+</mujoco>"""
+
+
+def _assets(meshes: str) -> str:
+    """Return the meshes that collide and those that are seen."""
+    folder, text = mesh_folder(), ""
+    for name in (*(f"link{index}" for index in range(8)), "hand", "finger"):
+        file = folder / "collision" / f"{name}.stl"
+        # Convex hulls of the collision meshes; with shadows, every face is rendered twice per camera.
+        light = attributes(vertex=spread(read_corners(file), CORNERS)) if meshes == "light" else ""
+        text += f'<mesh name="{name}" file="{file}"/>'
+        text += f'<mesh name="{name}_seen" {light or attributes(file=str(folder / "visual" / f"{name}.stl"))}/>'
+    return text
+
+
+def _geoms(mesh: str, rgba: tuple[float, ...], collides: bool = True) -> str:
+    seen = f'mesh="{mesh}_seen" contype="0" conaffinity="0" {attributes(group=VISIBLE, rgba=rgba)}'
+    solid = f'mesh="{mesh}" {attributes(group=HIDDEN, **ROBOT_CONTACT)}'
+    return "".join(f'<geom type="mesh" mass="0" {each}/>' for each in (seen, solid)[: 1 + collides])
+
+
+def _finger(side: str, turn: float) -> str:
+    """Return a finger, of which nothing but the soft fingertip collides."""
+    tip = attributes(rgba=DARK, group=VISIBLE, **FINGERTIP_CONTACT, **ROBOT_CONTACT)
+    return f"""<body name="{side}_finger" gravcomp="1" {attributes(pos=(0, 0, FINGER_OFFSET), euler=(0, 0, turn))}>
+          <inertial mass="{FINGER_MASS}" pos="0 0 0" diaginertia="2.375e-6 2.375e-6 7.5e-7"/>
+          <joint name="{side}_finger" type="slide" axis="0 1 0" limited="true" armature="0.05"
+                 {attributes(range=(0, panda.FINGER_TRAVEL))}/>
+          {_geoms("finger", DARK, collides=False)}
+          <geom name="{side}_pad" type="box" size="0.0085 0.004 0.0085" pos="0 0.0045 0.0445" mass="0" {tip}/>
+        </body>"""

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import mujoco
 import numpy as np
-from dm_control import mjcf
+from numpy.typing import ArrayLike
 
 from vla.robots.cartesian import Kinematics
 from vla.spec import Array, RobotModel
@@ -29,6 +28,19 @@ VISIBLE, HIDDEN = 2, 3  # groups of geoms: in pictures, for collisions only
 CORNERS = 64  # vertices of every "light" mesh
 
 
+def attributes(**values: ArrayLike) -> str:
+    """Format attributes of MJCF: text, booleans, numbers and sequences of numbers, without loss of precision."""
+    return " ".join(f'{name}="{_text(value)}"' for name, value in values.items())
+
+
+def _text(value: ArrayLike) -> str:
+    if isinstance(value, str):
+        return value
+    if isinstance(value, bool):
+        return str(value).lower()
+    return " ".join(f"{number:.17g}" for number in np.ravel(value).tolist())
+
+
 @dataclass(frozen=True)
 class CameraPose:
     """A camera that looks from `position` at `target`, with a vertical field of view."""
@@ -36,6 +48,11 @@ class CameraPose:
     position: tuple[float, float, float]  # [m]
     target: tuple[float, float, float]  # [m]
     fovy: float  # [degrees]
+
+    def mjcf(self, up: tuple[int, int, int]) -> str:
+        """Return the attributes of the camera in MJCF; `up` is a direction to the upper edge of its pictures."""
+        axes = look_at(self.position, self.target, up)
+        return attributes(pos=self.position, xyaxes=axes[:, :2].T, fovy=self.fovy)
 
 
 def look_at(position: Sequence[float] | Array, target: Sequence[float] | Array, up: Sequence[float] | Array) -> Array:
@@ -57,14 +74,13 @@ def spread(points: Array, count: int) -> Array:
     return points[chosen]
 
 
-class Robot:
+class TabletopRobot:
     """An arm with position servos and a gripper whose two sides close along the y axis of the tool.
 
     The z axis of the tool points out of the gripper. A gripper command is 0 when closed and `travel` when open.
     Elements have their names in the compiled scene; a camera `wrist` is among them.
     """
 
-    root: Any = None  # `mjcf.RootElement` to attach to a scene, unless `compile` does
     prefix: str  # of the names of all its elements
     arm: RobotModel  # for the spec
     kinematics: Kinematics
@@ -83,9 +99,9 @@ class Robot:
     tip: Sequence[float]
     tool: str  # site
 
-    def compile(self, scene: mjcf.RootElement) -> mjcf.Physics:
-        """Compile a scene together with the robot."""
-        return mjcf.Physics.from_mjcf_model(scene)
+    def attach(self, scene: mujoco.MjSpec) -> None:
+        """Add the robot to a scene."""
+        raise NotImplementedError
 
     def grip(self, opening: float) -> tuple[Array | float, float]:
         """Return the positions of the finger joints and the gripper command for an opening [m]."""

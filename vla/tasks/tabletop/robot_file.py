@@ -1,21 +1,37 @@
-"""A robot arm with a gripper from files in MJCF or URDF, as a configuration describes it."""
+"""A robot arm with a gripper in MJCF or URDF, as a configuration describes it.
+
+The files are data, which MuJoCo compiles. Names that they lack, files that are missing and models that do not compile
+end in one sentence.
+"""
 
 from __future__ import annotations
 
+import logging
+import os
+from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import cache
 from importlib.util import find_spec
+from itertools import chain
 from os.path import normpath
 from pathlib import Path
 from typing import Annotated
+from urllib.parse import unquote, urlsplit
 
 import mujoco
 from annotated_types import MinLen
 
 from vla.io.errors import UserError
+from vla.io.suggestion import suggestion
 from vla.io.types import Inherited, Names, Point, Positive, Text
-from vla.tasks.tabletop import model_file, robot_spec
+
+log = logging.getLogger(__name__)
 
 Values = Annotated[dict[str, float], MinLen(1)]
+HAND = "hand_"  # in front of the names in a hand's own file
+# What a model says of the world around it: that of the tabletop holds, and MuJoCo warns of every difference.
+OF_THE_WORLD = ("option", "authored", "visual", "stat", "memory", "nstack", "nconmax", "njmax", "nuserdata")
+LISTED = 30  # names in an error
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,14 +76,16 @@ class RobotFile:
     target: Point
 
     def read(self) -> mujoco.MjSpec:
-        """Read the model of the arm with its hand.
-
-        Raises:
-            UserError: a file is missing or does not compile.
-        """
-        spec = model_file.read("file", self.file)
+        """Read the model of the arm with its hand (UserError: a file is missing or does not compile)."""
+        spec = read(self.file, "file")
         if self.hand is not None:
-            robot_spec.attach_hand(spec, model_file.read("hand", self.hand), self.mount)
+            hand = read(self.hand, "hand")
+            names = (element.name for element in (*spec.sites, *spec.bodies))
+            require("mount", [self.mount or ""], names, "site or body of the arm")
+            if site := spec.site(self.mount):
+                spec.attach(hand, site=site, prefix=HAND)
+            else:
+                spec.attach(hand, frame=spec.body(self.mount).add_frame(), prefix=HAND)
         return spec
 
 
@@ -75,11 +93,8 @@ class InstalledRobot(RobotFile):
     """An arm whose files are in an installed package, which is not imported."""
 
     def __init__(self, file: Text, hand: Text | None, **inherited: Inherited) -> None:
-        """Args: paths that begin with the name of a package, such as dm_control/third_party/kinova/jaco_arm.xml.
-
-        Raises:
-            UserError: no such package, or a path out of it.
-        """
+        """Take paths that begin with the name of a package, such as dm_control/third_party/kinova/jaco_arm.xml
+        (UserError: no such package, or a path out of it)."""
         super().__init__(file=_installed(file), hand=_installed(hand) if hand else None, **inherited)
 
 
@@ -92,3 +107,90 @@ def _installed(path: str) -> Path:
     if source.name != "__init__.py" or source.parents[1] == Path.cwd() or source.parent not in file.parents:
         raise UserError(f"task.robot: {path} must begin with the name of an installed package and stay within it")
     return file
+
+
+def read(file: Path, key: str) -> mujoco.MjSpec:
+    """Read a model, with absolute paths of its meshes and without its textures; `key` names the file in errors
+    (UserError: there is no such file, no such mesh, or MuJoCo does not compile it)."""
+    path, named = Path(file).absolute(), f"task.robot.{key}={file}"
+    if not path.is_file():
+        raise UserError(f"{named}: there is no such file")
+    try:
+        spec = mujoco.MjSpec.from_file(str(path))
+    except (ValueError, mujoco.FatalError) as error:
+        raise UserError(f"{named} does not compile: {' '.join(str(error).split())}") from error
+    for mesh in spec.meshes:
+        if mesh.file:
+            name = Path(mesh.file).name if spec.strippath else mesh.file
+            mesh.file = str(_located(named, name, path.parent / (spec.compiler.meshdir or ""), path))
+    spec.compiler.meshdir = ""
+    _drop_textures(spec, named, path)
+    plain = mujoco.MjSpec()
+    for name in (*OF_THE_WORLD, *(name for name in dir(plain) if name.startswith("nuser_"))):
+        setattr(spec, name, getattr(plain, name))
+    # URDF: keep shapes that do not collide, and links that do not move, which the tool may be one of.
+    spec.compiler.discardvisual = spec.compiler.fusestatic = False
+    compiled(spec, named)
+    return spec
+
+
+def _located(named: str, mesh: str, folder: Path, model: Path) -> Path:
+    """Return the file of a mesh that is named by a path in a folder, or by an address as in ROS (UserError: an address
+    of another kind, or of a package that is not found)."""
+    if "://" not in mesh:
+        return folder / mesh
+    kind, package, rest, *_ = urlsplit(mesh)
+    inside = unquote(rest).lstrip("/")
+    if kind == "file":
+        return Path("/", inside)
+    if kind != "package":
+        raise UserError(f"{named} has a mesh at {mesh}: meshes are at package://, file:// or a path")
+    installed = (prefix / "share" for prefix in _folders("AMENT_PREFIX_PATH"))
+    sources = (each for folder in _folders("ROS_PACKAGE_PATH") for each in (folder, folder.parent))
+    for parent in chain(model.parents, installed, sources):
+        if (parent / package).is_dir():
+            return parent / package / inside
+    raise UserError(
+        f"{named} has a mesh at {mesh}: no folder {package} is above the file, in AMENT_PREFIX_PATH or in "
+        "ROS_PACKAGE_PATH"
+    )
+
+
+def _folders(variable: str) -> list[Path]:
+    return [Path(folder) for folder in os.environ.get(variable, "").split(os.pathsep) if folder]
+
+
+def _drop_textures(spec: mujoco.MjSpec, named: str, path: Path) -> None:
+    """Take textures, which are not drawn and so need not exist, out of a model."""
+    text = path.read_bytes()
+    in_urdf = b"<robot" in text and b"<texture" in text  # MuJoCo itself ignores these
+    if in_urdf or any(texture.file or any(texture.cubefiles) for texture in spec.textures):
+        _say(f"{named}: its textures are left out, and shapes have the colours of their materials")
+    for material in spec.materials:
+        material.textures = [""] * len(material.textures)
+    for texture in [*spec.textures]:
+        spec.delete(texture)
+
+
+@cache
+def _say(sentence: str) -> None:
+    """Log a sentence, once in a process."""
+    log.info("%s", sentence)
+
+
+def compiled(spec: mujoco.MjSpec, named: str = "task.robot") -> mujoco.MjModel:
+    """Compile a model that was changed; a UserError says that `named` does not compile."""
+    try:
+        return spec.compile()
+    except (ValueError, mujoco.FatalError) as error:
+        raise UserError(f"{named} does not compile: {' '.join(str(error).split())}") from error
+
+
+def require(key: str, names: Iterable[str], known: Iterable[str], kind: str) -> None:
+    """Raise a UserError that lists the `kind` of elements that there are if one of `names` is not among them."""
+    there = [name for name in known if name]
+    for name in names:
+        if name not in there:
+            listed = ", ".join(there[:LISTED]) + (", …" if len(there) > LISTED else "")
+            hint = suggestion(name, there) or ":"
+            raise UserError(f"task.robot.{key} names {name}, which is no {kind}{hint} there are {listed or 'none'}")

@@ -13,24 +13,20 @@ from vla.io.types import Names
 from vla.robots.cartesian import DOWN
 from vla.spec import Array
 from vla.tasks.rendering.shapes import mesh_triangles
-from vla.tasks.tabletop.model_file import compiled, require
 from vla.tasks.tabletop.robot import CORNERS, HIDDEN, ROBOT_CONTACT, VISIBLE, look_at, spread
+from vla.tasks.tabletop.robot_file import compiled, require
 
-HAND = "hand_"  # in front of the names in a hand's own file
 TOOL, SERVO, WRIST = "vla_tool", "vla_servo_", "wrist"  # names of what is added
 ALIGNED = 0.9  # smallest cosine between the axes of the tool's site and forward, left, down at home
 FOVY = 75.0  # of the wrist camera [degrees]
 SEEN_GROUPS = 3  # the first groups, which MuJoCo draws
 UNCOLOURED = (0.5, 0.5, 0.5, 1.0)  # what MuJoCo gives geoms without a colour
-TENDON = mujoco.mjtTrn.mjTRN_TENDON
+Eq = mujoco.mjtEq
 
 
 def checked_home(spec: mujoco.MjSpec, joints: Names, home: Sequence[float]) -> dict[str, float]:
-    """Return joint → position at home.
-
-    Raises:
-        UserError: no such joint, one that is not a hinge or not in order, or a position out of its limits.
-    """
+    """Return joint → position at home (UserError: no such joint, one that is not a hinge or not in order, or a position
+    out of its limits)."""
     require("joints", joints, (joint.name for joint in spec.joints), "joint")
     if len(home) != len(joints):
         raise UserError(f"task.robot.home has {len(home)} positions for {len(joints)} joints")
@@ -49,15 +45,13 @@ def checked_home(spec: mujoco.MjSpec, joints: Names, home: Sequence[float]) -> d
     return dict(zip(joints, home, strict=True))
 
 
-def attach_hand(spec: mujoco.MjSpec, hand: mujoco.MjSpec, mount: str | None) -> None:
-    """Attach a hand to the site or body `mount` of an arm."""
-    names = [element.name for element in (*spec.sites, *spec.bodies)]
-    require("mount", [mount or ""], names, "site or body of the arm")
-    site, body = spec.site(mount), spec.body(mount)
-    if site is not None:
-        spec.attach(hand, site=site, prefix=HAND)
-    else:
-        spec.attach(hand, frame=body.add_frame(), prefix=HAND)
+def descendants(model: mujoco.MjModel, body: int) -> set[int]:
+    """Return a body and all bodies that it carries."""
+    found = {body}
+    for child in range(body + 1, model.nbody):  # parents come before their children
+        if model.body_parentid[child] in found:
+            found.add(child)
+    return found
 
 
 def simplify(spec: mujoco.MjSpec, joints: Collection[str], grips: Collection[str]) -> None:
@@ -68,15 +62,19 @@ def simplify(spec: mujoco.MjSpec, joints: Collection[str], grips: Collection[str
     """
     model = compiled(spec)
     hand = descendants(model, int(model.joint(list(joints)[-1]).bodyid[0]))
-    for body, masses in zip(spec.bodies, range(model.nbody), strict=True):
-        _fix_inertia(body, model, masses)
-        body.name = body.name or f"vla_body{masses}"
+    for index, body in enumerate(spec.bodies):
+        body.name, body.gravcomp = body.name or f"vla_body{index}", 1.0  # its servos carry no weight
+        if index and model.body_mass[index]:  # as compiled, whatever happens to its shapes
+            body.explicitinertial, body.fullinertia = True, np.full(6, np.nan)
+            body.mass, body.inertia = model.body_mass[index], model.body_inertia[index]
+            body.ipos, body.iquat = model.body_ipos[index], model.body_iquat[index]
     for joint in spec.joints:
         joint.name = joint.name or f"vla_joint{joint.id}"
     fixed = {j.name: j for j in spec.joints if j.name not in joints and model.jnt_bodyid[j.id] not in hand}
     slack = _drop_couplings(spec, model, fixed)
     for element in [*spec.actuators]:
-        if element.name not in grips or element.target in (slack if element.trntype == TENDON else fixed):
+        moved = slack if element.trntype == mujoco.mjtTrn.mjTRN_TENDON else fixed
+        if element.name not in grips or element.target in moved:
             spec.delete(element)
     for element in (*fixed.values(), *spec.lights, *spec.cameras, *spec.sensors, *spec.keys, *spec.pairs, *spec.tuples):
         spec.delete(element)
@@ -100,33 +98,16 @@ def _drop_couplings(spec: mujoco.MjSpec, model: mujoco.MjModel, fixed: Collectio
         if any(each.name in fixed for each in over) if of_joints else len({part[each.parent.id] for each in over}) < 2:
             slack.add(tendon.name)
             spec.delete(tendon)
-    for tie, first, second in zip([*spec.equalities], model.eq_obj1id, model.eq_obj2id, strict=True):
-        ends = [int(first), int(second)]
-        if tie.objtype == mujoco.mjtObj.mjOBJ_SITE:
-            ends = model.site_bodyid[ends].tolist()
-        gone = {mujoco.mjtEq.mjEQ_JOINT: fixed, mujoco.mjtEq.mjEQ_TENDON: slack}.get(tie.type)
-        loose = tie.type in (mujoco.mjtEq.mjEQ_CONNECT, mujoco.mjtEq.mjEQ_WELD) and part[ends[0]] == part[ends[1]]
-        if loose or (gone is not None and (tie.name1 in gone or tie.name2 in gone)):
+    gone = {Eq.mjEQ_JOINT: fixed, Eq.mjEQ_TENDON: slack}
+    for tie, *ends in zip([*spec.equalities], model.eq_obj1id, model.eq_obj2id, strict=True):
+        if tie.type in (Eq.mjEQ_CONNECT, Eq.mjEQ_WELD):
+            bodies = model.site_bodyid[ends] if tie.objtype == mujoco.mjtObj.mjOBJ_SITE else ends
+            useless = part[bodies[0]] == part[bodies[1]]
+        else:
+            useless = not {tie.name1, tie.name2}.isdisjoint(gone.get(tie.type, ()))
+        if useless:
             spec.delete(tie)
     return slack
-
-
-def descendants(model: mujoco.MjModel, body: int) -> set[int]:
-    """Return a body and all bodies that it carries."""
-    found = {body}
-    for child in range(body + 1, model.nbody):  # parents come before their children
-        if model.body_parentid[child] in found:
-            found.add(child)
-    return found
-
-
-def _fix_inertia(body: Any, model: mujoco.MjModel, index: int) -> None:
-    """Give a body the mass of the compiled one, and let its servos carry no weight."""
-    body.gravcomp = 1.0
-    if index and model.body_mass[index]:
-        body.explicitinertial, body.fullinertia = True, np.full(6, np.nan)
-        body.mass, body.inertia = model.body_mass[index], model.body_inertia[index]
-        body.ipos, body.iquat = model.body_ipos[index], model.body_iquat[index]
 
 
 def _simplify_geoms(spec: mujoco.MjSpec, model: mujoco.MjModel) -> None:
@@ -151,31 +132,34 @@ def _simplify_geoms(spec: mujoco.MjSpec, model: mujoco.MjModel) -> None:
 
 def set_armature(spec: mujoco.MjSpec, joints: Iterable[str], least: float) -> None:
     """Give joints a reflected inertia of their motors of at least `least` [kg m²]."""
-    for name in joints:
-        joint = spec.joint(name)
+    for joint in map(spec.joint, joints):
         joint.armature = max(joint.armature, least)
 
 
 def add_servo(spec: mujoco.MjSpec, joint: str, stiffness: float, damping: float, force: float | None) -> str:
-    """Add a position servo to a joint; return its name."""
+    """Add a position servo to a joint; return its name. Nothing is left to the defaults of the file."""
     servo = spec.add_actuator(name=SERVO + joint, target=joint, trntype=mujoco.mjtTrn.mjTRN_JOINT)
-    # Nothing is left to the defaults of the file.
-    servo.dyntype, servo.gaintype = mujoco.mjtDyn.mjDYN_NONE, mujoco.mjtGain.mjGAIN_FIXED
-    servo.biastype, servo.gear = mujoco.mjtBias.mjBIAS_AFFINE, np.eye(6)[0]
+    servo.dyntype, servo.gear = mujoco.mjtDyn.mjDYN_NONE, np.eye(6)[0]
     servo.gainprm[:] = servo.biasprm[:] = 0.0
-    servo.gainprm[0], servo.biasprm[1:3] = stiffness, (-stiffness, -damping)
+    servo.set_to_position(kp=stiffness, kv=damping)
     servo.ctrllimited = servo.actlimited = mujoco.mjtLimited.mjLIMITED_FALSE
     servo.forcelimited, servo.forcerange = force is not None, (-(force or 0.0), force or 0.0)
     return SERVO + joint
 
 
-def stiffness(spec: mujoco.MjSpec, home: dict[str, float], frequency: float) -> list[float]:
-    """Return stiffnesses [N m/rad] with which joints, with the arm at `home`, have a natural frequency [rad/s]."""
+def at_home(spec: mujoco.MjSpec, home: dict[str, float]) -> tuple[mujoco.MjModel, mujoco.MjData]:
+    """Compile a model and place its joints at `home`, joint → position."""
     model = compiled(spec)
     data = mujoco.MjData(model)
     for name, position in home.items():
         data.joint(name).qpos[0] = position
     mujoco.mj_forward(model, data)
+    return model, data
+
+
+def stiffness(spec: mujoco.MjSpec, home: dict[str, float], frequency: float) -> list[float]:
+    """Return stiffnesses [N m/rad] with which joints, with the arm at `home`, have a natural frequency [rad/s]."""
+    model, data = at_home(spec, home)
     inertia = np.empty((model.nv, model.nv))
     mujoco.mj_fullM(model, data, inertia)
     return [frequency**2 * inertia[dof, dof] for dof in (model.joint(name).dofadr[0] for name in home)]
@@ -184,14 +168,10 @@ def stiffness(spec: mujoco.MjSpec, home: dict[str, float], frequency: float) -> 
 def add_tool(
     spec: mujoco.MjSpec, name: str, home: dict[str, float], base: Array, offset: Array
 ) -> tuple[Any, Array, Array]:
-    """Add the site of the tool, whose axes are those of the site or body `name`.
+    """Add the site of the tool at `offset` (3,) [m] from the site or body `name`, with the axes of that.
 
-    Args:
-        spec: changed.
-        name: of a site or body.
-        home: joint → position; in this posture the tool's x axis is the one that points forward, its z axis down.
-        base: (3, 3) rotation of the base.
-        offset: (3,) from `name` in the frame of the tool [m].
+    The x axis is the one that points forward at `home`, the z axis the one that points down; `base` (3, 3) is the
+    rotation of the base.
 
     Returns:
         Body that it is on, position (3,) [m] and rotation (3, 3) of the tool in that body.
@@ -199,15 +179,11 @@ def add_tool(
     Raises:
         UserError: no such name, or no axes that point there.
     """
-    model = compiled(spec)
     require("tool", [name], (element.name for element in (*spec.sites, *spec.bodies)), "site or body")
-    data = mujoco.MjData(model)
-    for joint, position in home.items():
-        data.joint(joint).qpos[0] = position
-    mujoco.mj_kinematics(model, data)
+    _, data = at_home(spec, home)
     site = spec.site(name)
     body = site.parent if site is not None else spec.body(name)
-    at = data.site(name) if site is not None else data.body(name)
+    at, around = data.site(name) if site is not None else data.body(name), data.body(body.id)
     axes = (base @ at.xmat.reshape(3, 3)).T @ DOWN  # columns: forward, right, down as seen from it
     turn = np.round(axes)
     if np.abs(axes).max(axis=0).min() < ALIGNED or abs(np.linalg.det(turn) - 1) > 0.1:
@@ -216,7 +192,6 @@ def add_tool(
             f"{np.degrees(np.arccos(ALIGNED)):.0f} degrees; in its frame down is {np.round(axes[:, 2], 2).tolist()}, "
             f"forward {np.round(axes[:, 0], 2).tolist()}"
         )
-    around = data.body(body.name) if body.name else data.body(body.id)
     frame = around.xmat.reshape(3, 3)
     rotation = frame.T @ at.xmat.reshape(3, 3) @ turn
     position = frame.T @ (at.xpos - around.xpos) + rotation @ offset
@@ -225,10 +200,8 @@ def add_tool(
 
 
 def add_camera(body: Any, position: Array, rotation: Array, camera: Array, target: Array) -> None:
-    """Add the wrist camera to the body of the tool, whose pose in it is given.
-
-    It is at `camera` and looks at `target`, (3,) in the frame of the tool [m].
-    """
+    """Add the wrist camera, which is at `camera` (3,) and looks at `target` (3,) in the frame of the tool [m], to the
+    tool's body, in which its pose is given."""
     axes = look_at(camera, target, (1, 0, 0))
     body.add_camera(name=WRIST, pos=position + rotation @ camera, quat=quaternion(rotation @ axes), fovy=FOVY)
 
@@ -241,29 +214,23 @@ def move_tool(spec: mujoco.MjSpec, shift: Array) -> None:
         each.pos = each.pos + moved
 
 
-def use_convex_hulls(spec: mujoco.MjSpec, model: mujoco.MjModel) -> None:
+def use_convex_hulls(spec: mujoco.MjSpec) -> None:
     """Draw the convex hull of a few vertices in place of every mesh; collisions stay as they are."""
-    hulls: dict[str, bool] = {}
+    model, hulls = compiled(spec), dict[str, bool]()
     for geom in [geom for geom in spec.geoms if geom.group == VISIBLE and geom.meshname]:
         hull = f"vla_hull_{geom.meshname}"
         if hull not in hulls:
-            hulls[hull] = add_hull(spec, hull, _vertices(model, geom.meshname))
-        if not hulls[hull]:
-            continue
-        if geom.contype or geom.conaffinity:
+            index, turn = model.mesh(geom.meshname).id, np.empty(9)
+            mujoco.mju_quat2Mat(turn, model.mesh_quat[index])  # vertices are in the mesh's own frame of inertia
+            vertices = mesh_triangles(model, index)[0].astype(float) @ turn.reshape(3, 3).T + model.mesh_pos[index]
+            hulls[hull] = add_hull(spec, hull, vertices)
+        if hulls[hull] and (geom.contype or geom.conaffinity):
             seen = geom.parent.add_geom(name=f"{geom.name}_seen", type=mujoco.mjtGeom.mjGEOM_MESH, meshname=hull)
             seen.pos, seen.quat, seen.rgba, seen.group = geom.pos, geom.quat, geom.rgba, VISIBLE
             seen.material, seen.mass, seen.contype, seen.conaffinity = "", 0.0, 0, 0
             geom.group = HIDDEN
-        else:
+        elif hulls[hull]:
             geom.meshname = hull
-
-
-def _vertices(model: mujoco.MjModel, mesh: str) -> Array:
-    """Return the vertices (N, 3) of a mesh as in its file [m]; they are stored in the mesh's own frame of inertia."""
-    index, turn = model.mesh(mesh).id, np.empty(9)
-    mujoco.mju_quat2Mat(turn, model.mesh_quat[index])
-    return np.asarray(mesh_triangles(model, index)[0], float) @ turn.reshape(3, 3).T + model.mesh_pos[index]
 
 
 def add_hull(spec: mujoco.MjSpec, name: str, points: Array) -> bool:

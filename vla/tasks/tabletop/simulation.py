@@ -13,17 +13,16 @@ import numpy as np
 from vla.io.errors import UserError
 from vla.robots.cartesian import CartesianController, solve
 from vla.spec import FIRST_SEED, Array
-from vla.tasks.streams import Streams
 from vla.tasks.tabletop.compiled_scene import CompiledScene
 from vla.tasks.tabletop.disturber import PUSH_STEP, Disturber
-from vla.tasks.tabletop.goals.chain import Chain
 from vla.tasks.tabletop.goals.goal import SKILLS, Goal, Referents, WorldState, current
-from vla.tasks.tabletop.goals.mixed import Mixed
+from vla.tasks.tabletop.goals.several import Chain, Mixed
 from vla.tasks.tabletop.language import HeldOut
 from vla.tasks.tabletop.outcome import OutcomeClassifier
-from vla.tasks.tabletop.randomize.language import paraphrase
+from vla.tasks.tabletop.randomize.episode import paraphrase
 from vla.tasks.tabletop.randomize.randomizer import Randomizer
-from vla.tasks.tabletop.scene import COLOURS, PADS, Scene
+from vla.tasks.tabletop.scene import COLOURS, PADS
+from vla.tasks.world import Streams
 
 CONTROL_HZ = 10.0
 WORKSPACE = ((0.25, -0.40, 0.008), (0.75, 0.40, 0.50))  # corners of the box that bounds the tool point [m]
@@ -36,7 +35,7 @@ class Request:
     goal: Goal
     referents: Referents
     instruction: str
-    held_out: str  # part of the instruction that training never says, "names" if these are replaced, or "none"
+    held_out: str  # held-out part of the instruction: a kind, "names" for replaced names, or "none"
 
 
 class Simulation:
@@ -52,73 +51,64 @@ class Simulation:
         self,
         goal: Goal | Mixed | Chain,
         randomize: Mapping[str, Randomizer | None],
-        scene: Scene,
+        compiled: CompiledScene,
         low: Array,
         high: Array,
         time_limit: float,
     ) -> None:
-        """Args:
-        goal: goal, mixture of goals, or chain of goals.
-        randomize: axis name → randomizer, or None to disable the axis.
-        scene: the world.
-        low: lower bounds (7,) of an action.
-        high: upper bounds (7,) of an action.
-        time_limit: time for an instruction, per block to be moved [s].
+        """Begin no episode yet.
+
+        Args:
+            goal: goal, mixture of goals, or chain of goals.
+            randomize: axis name → randomizer, or None to disable the axis.
+            compiled: the world.
+            low: lower bounds (7,) of an action.
+            high: upper bounds (7,) of an action.
+            time_limit: time for an instruction, per block to be moved [s].
         """
-        self.goals, self.randomize, self.scene = goal, randomize, scene
-        self._time_limit = time_limit
-        self._low, self._high = low, high
-        self._physics = scene.compile()
-        self.compiled = CompiledScene(scene, self._physics)
-        self.substeps = round(1 / CONTROL_HZ / self._physics.timestep())
-        self.controller = CartesianController(scene.robot.kinematics, 1 / CONTROL_HZ, *WORKSPACE)
+        self.goals, self.randomize, self.compiled = goal, randomize, compiled
+        self._low, self._high, self._time_limit = low, high, time_limit
+        self._timestep = compiled.model.opt.timestep
+        self.substeps = round(1 / CONTROL_HZ / self._timestep)
+        self.controller = CartesianController(compiled.robot.kinematics, 1 / CONTROL_HZ, *WORKSPACE)
         self.draws: dict[str, Any] = {}
         self.instruction = ""
         self.disturber: Disturber | None = None
         self.streams = Streams()
 
     def reset(self, seed: int) -> None:
-        """Start the episode of `seed`."""
-        with self._physics.reset_context():
-            self._sample(seed)
-
-    def close(self) -> None:
-        """Free the physics."""
-        self._physics.free()
-
-    def _sample(self, seed: int) -> None:
-        """Randomise the compiled model in place, then draw goal and instruction."""
-        self.compiled.restore()
+        """Start the episode of `seed`: randomise the compiled model in place, then draw goal and instruction."""
+        compiled, data = self.compiled, self.compiled.data
+        compiled.restore()
         axes = {name: axis for name, axis in self.randomize.items() if axis is not None}
-        draws = {name: axis(self.compiled, self.streams(seed, name)) for name, axis in axes.items()}
+        draws = {name: axis(compiled, self.streams(seed, name)) for name, axis in axes.items()}
         goal = self.goals.draw(self.streams(seed, "goal"))
-        self.compiled.present = max(self.compiled.present, goal.blocks)
+        compiled.present = max(compiled.present, goal.blocks)
         if "distractors" in draws:
-            draws["distractors"] = {"count": self.compiled.present - 1}  # a goal may need more than were drawn
+            draws["distractors"] = {"count": compiled.present - 1}  # a goal may need more than were drawn
         self._pads = goal.pads
-        self.compiled.finish(goal.pads)
-        self._physics.forward()
+        compiled.finish(goal.pads)
+        mujoco.mj_forward(compiled.model, data)
         self.name, self.requests = goal.name, self._requests(goal, seed)
-        data = self.compiled.data
-        self.controller.reset(data.qpos[self.compiled.joints])
-        self._command = np.append(self.controller.joints, self.compiled.grip)
-        data.ctrl[:] = self.compiled.controls(self._command[None])[0]
-        delay = round(self.compiled.latency / self._physics.timestep())
+        self.controller.reset(data.qpos[compiled.joints])
+        self._command = np.append(self.controller.joints, compiled.grip)
+        data.ctrl[:] = compiled.controls(self._command[None])[0]
+        delay = round(compiled.latency / self._timestep)
         self._late = np.tile(data.ctrl, (delay, 1))  # controls that are delayed by the latency, oldest first
-        self._start()
         self._axes = draws
-        self.draws = self._described()
+        self._start()
+        compiled.forward_without_servos()
 
     def _requests(self, goal: Goal | Chain, seed: int) -> list[Request]:
         """Draw what the instructions of the episode ask for."""
-        if isinstance(goal, Chain):
-            present, skip = self.compiled.present, self.compiled.skip
-            links = [
-                (link, replace(named, blocks=tuple((block + skip) % present for block in named.blocks)))
-                for link, named in goal.plan(present, self.streams(seed, "chain"))
-            ]
-            return [self._request(*link, seed, f" {number}") for number, link in enumerate(links, start=1)]
-        return [self._request(goal, None, seed)]
+        if not isinstance(goal, Chain):
+            return [self._request(goal, None, seed)]
+        present, skip = self.compiled.present, self.compiled.skip
+        links = [
+            (link, replace(named, blocks=tuple((block + skip) % present for block in named.blocks)))
+            for link, named in goal.plan(present, self.streams(seed, "chain"))
+        ]
+        return [self._request(*link, seed, f" {number}") for number, link in enumerate(links, start=1)]
 
     def _request(self, goal: Goal, referents: Referents | None, seed: int, stream: str = "") -> Request:
         """Draw an instruction and, unless given, what it names; `stream` is added to the names of random streams."""
@@ -134,10 +124,15 @@ class Simulation:
         return Request(goal, referents, said, held_out or "none")
 
     def _start(self) -> None:
-        """Start the episode with its first request."""
+        """Start the episode with its first request, and describe its draws."""
         self._steps, drawn = 0, self.compiled.disturbance
         self.disturber, self._shove = Disturber(drawn, self.compiled) if drawn else None, np.zeros(3)
         self._begin(0)
+        first, *others = self.requests
+        language: dict[str, Any] = {"instruction": first.instruction, "held_out": first.held_out}
+        if others:
+            language["then"] = [request.instruction for request in others]
+        self.draws = {"named": self._named(), **self._axes, "language": language}
 
     def _begin(self, number: int) -> None:
         """Start the time of a request, with the places where the blocks are now."""
@@ -152,15 +147,6 @@ class Simulation:
         """Make the current request the only one of the episode, which begins with it."""
         self.name, self.requests = self.goal.name, [self.requests[self.current]]
         self._start()
-        self.draws = self._described()
-
-    def _described(self) -> dict[str, Any]:
-        """Return the draws of the episode."""
-        first, *others = self.requests
-        language: dict[str, Any] = {"instruction": first.instruction, "held_out": first.held_out}
-        if others:
-            language["then"] = [request.instruction for request in others]
-        return {"named": self._named(), **self._axes, "language": language}
 
     def _held_out(self, goal: Goal, random_state: np.random.RandomState, seed: int) -> HeldOut | None:
         """Draw which part of the instruction is held out; None in training and in the rest of an evaluation."""
@@ -180,43 +166,41 @@ class Simulation:
 
     def _choose(self, goal: Goal, held_out: HeldOut | None, random_state: np.random.RandomState) -> Referents:
         """Draw the named blocks and pads; the first block has a colour that the instruction may name."""
-        colours = goal.language.held_out_colours
+        colours, names = goal.language.held_out_colours, self.compiled.block_names
         order = [int(index) for index in random_state.permutation(self.compiled.present)]
         # The sort is stable: without held-out colours it changes nothing.
-        order.sort(key=lambda index: (self.compiled.block_names[index] in colours) != (held_out == "combinations"))
-        if held_out != "combinations" and self.compiled.block_names[order[0]] in colours:
+        order.sort(key=lambda index: (names[index] in colours) != (held_out == "combinations"))
+        if held_out != "combinations" and names[order[0]] in colours:
             raise UserError(
                 "task.goal.language.held_out_colours: all blocks of a scene have such a colour, so none can be named: "
                 "hold out fewer, or raise task.randomize.distractors.count"
             )
         skip = self.compiled.skip % len(order)
         order = order[skip:] + order[:skip]
-        pads = [int(index) for index in random_state.permutation(goal.pads)]
-        return Referents(tuple(order[: goal.named]), tuple(pads))
+        return Referents(tuple(order[: goal.named]), tuple(random_state.permutation(goal.pads).tolist()))
 
     def _slots(self, goal: Goal, referents: Referents, seed: int) -> dict[str, str]:
         """Return the words that fill the goal's slots of an instruction."""
-        blocks = zip(("block", "other"), referents.blocks, strict=False)
-        pads = zip(("pad", "rest"), referents.pads, strict=False)
-        slots = {slot: self.compiled.block_names[index] for slot, index in blocks}
+        names = self.compiled.block_names
+        slots = {slot: names[index] for slot, index in zip(("block", "other"), referents.blocks, strict=False)}
         if goal.absent:
-            unnamed = {*self.compiled.block_names[: self.compiled.present], *goal.language.held_out_colours}
+            unnamed = {*names[: self.compiled.present], *goal.language.held_out_colours}
             missing = [name for name in COLOURS if name not in unnamed]
             slots["absent"] = missing[self.streams(seed, "absent").randint(len(missing))]
-        return slots | {slot: list(PADS)[index] for slot, index in pads}
+        return slots | {slot: list(PADS)[index] for slot, index in zip(("pad", "rest"), referents.pads, strict=False)}
 
     def _named(self) -> dict[str, Any]:
         """Return the draws of the first named block, for reports on what success depends on."""
-        index = self.referents.blocks[0]
-        x, y, _ = self.compiled.block_centres()[index]
-        rotation = self.compiled.data.geom_xmat[self.compiled.block_geoms[index]].reshape(3, 3)
+        index, compiled = self.referents.blocks[0], self.compiled
+        x, y, _ = compiled.block_centres()[index]
+        rotation = compiled.data.geom_xmat[compiled.block_geoms[index]].reshape(3, 3)
         return {
             "goal": type(self.goal).__name__,
             "index": index,
             "position": [round(float(x), 5), round(float(y), 5)],
-            "colour": self.compiled.block_names[index],
+            "colour": compiled.block_names[index],
             "yaw": round(float(np.arctan2(rotation[1, 0], rotation[0, 0])), 5),
-            "half_size": round(float(self.compiled.extents[index, 0]), 5),
+            "half_size": round(float(compiled.extents[index, 0]), 5),
         }
 
     def step(self, action: Array) -> None:
@@ -224,11 +208,8 @@ class Simulation:
         action = np.clip(action, self._low, self._high)
         if self.disturber:
             action = self.disturber.override(action)
-        robot, grip = self.scene.robot, self._command[-1]
-        furthest = robot.finger_speed / CONTROL_HZ
-        goal = np.append(self.controller.step(action[:6]), action[6] * robot.travel)
-        goal[-1] = grip + np.clip(goal[-1] - grip, -furthest, furthest)
-        self._advance(goal, self.substeps)
+        furthest = self.compiled.robot.finger_speed / CONTROL_HZ
+        self._advance(self.controller.step(action[:6]), action[6], furthest, self.substeps)
         self.judge()
 
     def follow(self, joints: Array, opening: float, seconds: float) -> None:
@@ -239,50 +220,47 @@ class Simulation:
         Raises:
             UserError: `seconds` is no whole number of physics steps.
         """
-        timestep = self._physics.timestep()
-        substeps = round(seconds / timestep)
-        if not math.isclose(substeps * timestep, seconds):
+        substeps = round(seconds / self._timestep)
+        if not math.isclose(substeps * self._timestep, seconds):
             raise UserError(
-                f"the arm cannot be driven at {1 / seconds:g} Hz, as physics runs at {1 / timestep:g} Hz: choose a "
-                "whole fraction of that"
+                f"the arm cannot be driven at {1 / seconds:g} Hz, as physics runs at {1 / self._timestep:g} Hz: choose "
+                "a whole fraction of that"
             )
         if self.disturber:
-            joints, opening = self._disturbed(joints, opening, substeps * timestep)
-        robot, grip = self.scene.robot, self._command[-1]
-        furthest = robot.finger_speed * substeps * timestep
-        finger = grip + np.clip(opening * robot.travel - grip, -furthest, furthest)
-        self._advance(np.append(joints, finger), substeps)
+            joints, opening = self._disturbed(self.disturber, joints, opening, seconds)
+        self._advance(joints, opening, self.compiled.robot.finger_speed * substeps * self._timestep, substeps)
 
-    def _disturbed(self, joints: Array, opening: float, seconds: float) -> tuple[Array, float]:
+    def _disturbed(self, disturber: Disturber, joints: Array, opening: float, seconds: float) -> tuple[Array, float]:
         """Return joint targets and opening under the disturbance; the tool is pushed no faster than by an action."""
-        assert self.disturber
         furthest = PUSH_STEP * CONTROL_HZ * seconds
-        self._shove += np.clip(self.disturber.offset - self._shove, -furthest, furthest)
+        self._shove += np.clip(disturber.offset - self._shove, -furthest, furthest)
         if self._shove.any():
-            kinematics = self.scene.robot.kinematics
+            kinematics = self.compiled.robot.kinematics
             start = kinematics.forward(joints)
             target = start[0].copy()
             target[:3, 3] = np.clip(target[:3, 3] + self._shove, *WORKSPACE)
             joints = solve(kinematics, target, joints, start)
-        return joints, 1.0 if self.disturber.opens else opening
+        return joints, 1.0 if disturber.opens else opening
 
-    def _advance(self, goal: Array, substeps: int) -> None:
-        """Step physics with targets interpolated to `goal`; a lead compensates the servo's damping, so the arm does not
-        lag."""
-        increment = (goal - self._command) / substeps
+    def _advance(self, joints: Array, opening: float, furthest: float, substeps: int) -> None:
+        """Step physics with targets interpolated to joints [rad] and to an opening 0…1, at most `furthest` away."""
+        model, data, robot = self.compiled.model, self.compiled.data, self.compiled.robot
+        grip = self._command[-1]
+        finger = grip + np.clip(opening * robot.travel - grip, -furthest, furthest)
+        increment = (np.append(joints, finger) - self._command) / substeps
         commands = self._command + np.arange(1, substeps + 1)[:, None] * increment
         targets = commands.copy()
-        targets[:, :-1] += self.scene.robot.lead / self._physics.timestep() * increment[:-1]
+        # A lead compensates the damping of the servos, so that the arm does not lag.
+        targets[:, :-1] += robot.lead / self._timestep * increment[:-1]
         self._command = commands[-1]
         controls = np.concatenate([self._late, self.compiled.controls(targets)])
         self._late = controls[substeps:]
-        model, data = self.compiled.model, self.compiled.data
         ctrl = data.ctrl
-        with self._physics.check_invalid_state():
-            for now in controls[:substeps]:
-                ctrl[:] = now
-                mujoco.mj_step2(model, data)
-                mujoco.mj_step1(model, data)
+        for now in controls[:substeps]:
+            ctrl[:] = now
+            mujoco.mj_step2(model, data)
+            mujoco.mj_step1(model, data)
+        self.compiled.require_stable()
 
     def judge(self) -> None:
         """Update the outcome after a control period; the next request, if there is one, follows a success."""
@@ -307,11 +285,11 @@ class Simulation:
         return self._cached[1]
 
     def _measure(self) -> WorldState:
-        compiled, present = self.compiled, self.compiled.present
+        compiled, data, present = self.compiled, self.compiled.data, self.compiled.present
         fingers: list[set[int]] = [set() for _ in range(present)]
         for finger, block in compiled.touching():
             fingers[block].add(finger)
-        velocities = compiled.data.qvel[compiled.block_velocities[:present, None] + np.arange(3)]  # (B, 3)
+        velocities = data.qvel[compiled.block_velocities[:present, None] + np.arange(3)]  # (B, 3)
         return WorldState(
             positions=compiled.block_centres(),
             starts=self._starts,
@@ -320,9 +298,9 @@ class Simulation:
             lifts=self._lifts,
             held=np.array([len(touching) == 2 for touching in fingers]),
             touched=np.array([bool(touching) for touching in fingers]),
-            pads=compiled.data.mocap_pos[compiled.zones[: self._pads]].copy(),
-            tool=compiled.data.site_xpos[compiled.tcp].copy(),
-            arm_speed=float(np.abs(compiled.data.qvel[compiled.velocities]).max()),
+            pads=data.mocap_pos[compiled.zones[: self._pads]].copy(),
+            tool=data.site_xpos[compiled.tcp].copy(),
+            arm_speed=float(np.abs(data.qvel[compiled.velocities]).max()),
         )
 
     def truth(self) -> dict[str, Array]:
@@ -331,26 +309,24 @@ class Simulation:
         faces: cosine and sine of four times the yaw from the fingers to the block's faces, because a cube is symmetric
         under quarter turns.
         """
-        compiled, state = self.compiled, self.world_state()
-        subgoals = self.goal.subgoals(state, self.referents)
-        now = current(subgoals)
+        compiled, state, pose = self.compiled, self.world_state(), self.controller.pose
+        now = current(self.goal.subgoals(state, self.referents))
         block = compiled.data.geom_xmat[compiled.block_geoms[now.block]].reshape(3, 3)
         edge = block[:, int(np.argmin(np.abs(block[2])))]  # the most horizontal edge, for any face up
-        gripper = self.controller.pose[:, 0]
-        quarters = 4 * (np.arctan2(edge[1], edge[0]) - np.arctan2(gripper[1], gripper[0]))
+        quarters = 4 * (np.arctan2(edge[1], edge[0]) - np.arctan2(pose[1, 0], pose[0, 0]))
         return {
             "tcp": state.tool,
             "block": state.positions[now.block],
             "destination": now.destination,
-            "commanded": self.controller.pose.copy(),  # (4, 4)
-            "commanded_position": self.controller.pose[:3, 3].copy(),
+            "commanded": pose.copy(),  # (4, 4)
+            "commanded_position": pose[:3, 3].copy(),
             "faces": np.array([np.cos(quarters), np.sin(quarters)]),
             "half_size": state.extents[now.block],  # (3,)
             "grasped": np.array([float(state.held[now.block])]),
             "skill": np.array([float(SKILLS.index(now.skill))]),
             "tolerance": np.array([now.tolerance]),
-            "widest": np.array([self.scene.robot.widest]),  # opening of the gripper
-            "tip": np.array(self.scene.robot.tip),  # (4,) as of `Robot`
+            "widest": np.array([compiled.robot.widest]),  # opening of the gripper
+            "tip": np.array(compiled.robot.tip),  # (4,) as of `TabletopRobot`
         }
 
     @property

@@ -1,1 +1,1 @@
-"""Goals of the tabletop, one per file."""
+"""Goals of the tabletop."""

@@ -151,8 +151,3 @@ class Goal(ABC):
         A goal that does not define this takes no part in chains.
         """
         return None
-
-
-def placed(state: WorldState, block: int, pad: int, radius: float) -> bool:
-    """Return whether a block rests on a pad, released."""
-    return state.away(block, state.pads[pad]) < radius and state.resting(block)

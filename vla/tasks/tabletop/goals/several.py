@@ -1,4 +1,4 @@
-"""Several goals one after the other, without a reset in between."""
+"""Several goals: a mixture of which one is drawn per episode, and a chain without a reset in between."""
 
 from __future__ import annotations
 
@@ -10,10 +10,43 @@ import numpy as np
 from annotated_types import Ge, Le
 
 from vla.io.errors import UserError
+from vla.io.types import Share
 from vla.tasks.tabletop.goals.goal import Arrangement, Goal, Referents
+from vla.tasks.tabletop.goals.skills import Stay, Wait, absent_colours_needed
 
 T = TypeVar("T")
 Link = tuple[Goal, Referents]
+
+
+class Mixed:
+    """A mixture of goals, one drawn per episode; `blocks` and `absent` are the maxima over the goals.
+
+    In a share of the episodes the instruction of the drawn goal names a block that is not on the table, and in another
+    share there is none: the robot must then leave everything in place.
+    """
+
+    def __init__(self, goals: Mapping[str, Goal | None], impossible: Share, silent: Share) -> None:
+        """Take name → goal, or None to omit it, and shares of the episodes with an absent block and with an empty
+        instruction.
+
+        Raises:
+            UserError: no goal remains, or the shares exceed one.
+        """
+        self.goals = _chosen(goals)
+        if impossible + silent > 1:
+            raise UserError(f"task.goal.impossible and task.goal.silent are {impossible + silent:g} in all, at most 1")
+        self.impossible, self.silent = impossible, silent
+        self.blocks = max(goal.blocks for goal in self.goals.values())
+        kept = [absent_colours_needed(goal.language) for goal in self.goals.values() if impossible]
+        self.absent = max([goal.absent for goal in self.goals.values()] + kept)
+
+    def draw(self, random_state: np.random.RandomState) -> Goal:
+        """Draw a goal, then whether to replace it by `Stay` or `Wait`; the drawn goal does not depend on the shares."""
+        goal = self.goals[str(random_state.choice(list(self.goals)))]
+        lot = random_state.uniform()
+        if lot < self.impossible:
+            return Stay.instead_of(goal)
+        return Wait(goal.pads) if lot < self.impossible + self.silent else goal
 
 
 class Chain:
@@ -32,15 +65,9 @@ class Chain:
     name, absent = "chain", 0
 
     def __init__(self, goals: Mapping[str, Goal | None], length: Annotated[int, Ge(1), Le(9)]) -> None:
-        """Args: name → goal, or None to omit it; number of instructions.
-
-        Raises:
-            UserError: no goal remains, one cannot be part of a chain, or there are not enough possible instructions.
-        """
-        self.goals = {name: goal for name, goal in goals.items() if goal is not None}
-        self.length = length
-        if not self.goals:
-            raise UserError("task.goal.goals names no goal")
+        """Take name → goal, or None to omit it, and the number of instructions (UserError: no goal remains, one cannot
+        be part of a chain, or there are not enough possible instructions)."""
+        self.goals, self.length = _chosen(goals), length
         for name, goal in self.goals.items():
             if type(goal).after is Goal.after:
                 raise UserError(f"task.goal.goals.{name} cannot be part of a chain: it does not define `after`")
@@ -57,11 +84,8 @@ class Chain:
         return self
 
     def plan(self, blocks: int, random_state: np.random.RandomState) -> list[Link]:
-        """Draw the goals with what they name, from so many blocks: every goal that is possible is equally likely.
-
-        Raises:
-            UserError: there is no such chain.
-        """
+        """Draw the goals with what they name, from so many blocks: every goal that is possible is equally likely
+        (UserError: there is no such chain)."""
         links = self._continued([], Arrangement(), blocks, random_state)
         if links is None:
             raise UserError(
@@ -86,6 +110,14 @@ class Chain:
                     if found is not None:
                         return found
         return None
+
+
+def _chosen(goals: Mapping[str, Goal | None]) -> dict[str, Goal]:
+    """Return the goals that are not None; a UserError if there is none."""
+    chosen = {name: goal for name, goal in goals.items() if goal is not None}
+    if not chosen:
+        raise UserError("task.goal.goals names no goal")
+    return chosen
 
 
 def _shuffled(values: Sequence[T], random_state: np.random.RandomState) -> list[T]:

@@ -1,0 +1,135 @@
+"""Projections of the world into pictures and into shadow maps, and what cameras see."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+
+from vla.spec import Array
+from vla.tasks.rendering.renderer import Views
+
+UPSIDE_DOWN = np.diag([1.0, -1.0, 1.0, 1.0])  # the first row of the framebuffer becomes the top of the picture
+DIRECTIONAL = 1  # mjtLightType, a name that MuJoCo 3.3.0 lacks, with which `reference` works
+WIDEST = 160.0  # field of view of a spot light's shadow map [degrees]
+
+
+def clip_range(model: mujoco.MjModel) -> tuple[float, float]:
+    """Return the distances of the near and the far clipping plane [m]."""
+    extent = float(model.stat.extent)
+    return float(model.vis.map.znear) * extent, float(model.vis.map.zfar) * extent
+
+
+def frustum(left: float, right: float, bottom: float, top: float, near: float, far: float) -> Array:
+    """Return the perspective projection matrix (4, 4) of a frustum, given its rectangle at the near plane [m]."""
+    across, up, deep = right - left, top - bottom, far - near
+    return np.array(
+        [
+            [2 * near / across, 0, (right + left) / across, 0],
+            [0, 2 * near / up, (top + bottom) / up, 0],
+            [0, 0, -(far + near) / deep, -2 * far * near / deep],
+            [0, 0, -1, 0],
+        ]
+    )
+
+
+def box(half_width: float, half_height: float, near: float, far: float) -> Array:
+    """Return the orthographic projection matrix (4, 4) of a box around the optical axis; lengths in [m]."""
+    deep = far - near
+    return np.array(
+        [[1 / half_width, 0, 0, 0], [0, 1 / half_height, 0, 0], [0, 0, -2 / deep, -(far + near) / deep], [0, 0, 0, 1]]
+    )
+
+
+def inverse_pose(position: Array, axes: Array) -> Array:
+    """Return transformations (…, 4, 4) into frames at `position` (…, 3) with `axes` (…, 3, 3), one per row."""
+    view = np.zeros((*position.shape[:-1], 4, 4))
+    view[..., :3, :3], view[..., 3, 3] = axes, 1
+    view[..., :3, 3] = -(axes @ position[..., None])[..., 0]
+    return view
+
+
+def shadow_projection(model: mujoco.MjModel, data: mujoco.MjData, light: int) -> Array:
+    """Return the projection (4, 4) of the world into a light's shadow map, -1…1."""
+    near, far = clip_range(model)
+    if model.light_type[light] == DIRECTIONAL:
+        reach = float(model.vis.map.shadowclip * model.stat.extent)
+        projection = box(reach, reach, near, far)
+    else:
+        angle = min(2 * float(model.light_cutoff[light]) * float(model.vis.map.shadowscale), WIDEST)
+        half = near * np.tan(np.radians(angle / 2))
+        projection = frustum(-half, half, -half, half, near, far)
+    forward = data.light_xdir[light]
+    up = _cross(forward, np.array([-1.0, 0.0, 0.0]))
+    if up @ up <= 0.01:
+        up = _cross(forward, np.array([0.0, 1.0, 0.0]))
+    up /= np.linalg.norm(up)
+    axes = np.stack([_cross(forward, up), up, -forward])
+    return projection @ inverse_pose(data.light_xpos[light], axes)
+
+
+def _cross(one: Array, other: Array) -> Array:
+    """Return the cross product (3,), a tenth of the time of numpy's."""
+    product = np.empty(3)
+    mujoco.mju_cross(product, one, other)
+    return product
+
+
+class ModelCameras:
+    """The cameras of a model that are drawn, in the present state."""
+
+    def __init__(self, model: mujoco.MjModel, views: Views) -> None:
+        self._model, self._views, self.ids = model, views, np.array(views.cameras)
+
+    def update(self) -> None:
+        """Take over the model's present lenses."""
+        self._whole = np.stack([self._lens(camera) for camera in self.ids])
+        self._show(None)
+
+    def _show(self, windows: Array | None) -> None:
+        """Set the crop of each camera's field of view, (cameras, 4), see `Renderer.render`."""
+        lenses = self._whole if windows is None else _enlarging(windows) @ self._whole
+        self._lenses, self._windows = UPSIDE_DOWN @ lenses, windows
+        across, up, deep, ahead = self._lenses.swapaxes(0, 1)
+        sides = np.stack([ahead + across, ahead - across, ahead + up, ahead - up, ahead + deep], axis=1)
+        self._sides = sides / np.linalg.norm(sides[:, :, :3], axis=2, keepdims=True)  # of the frustums, looking inwards
+
+    def place(self, data: mujoco.MjData, windows: Array | None) -> Array:
+        """Move the cameras to where they are in a state; return projections of the world (cameras, 4, 4)."""
+        if windows is not None or self._windows is not None:
+            self._show(windows)
+        self.eyes, self.axes = data.cam_xpos[self.ids], data.cam_xmat[self.ids].reshape(-1, 3, 3)
+        poses = inverse_pose(self.eyes, self.axes.swapaxes(1, 2))
+        self._sides_there = self._sides @ poses
+        return self._lenses @ poses
+
+    def may_see(self, centres: Array, radii: Array) -> Array:
+        """Return which spheres at `centres` (N, 3), of `radii` (N,) [m], reach into a picture: (cameras, N) bool."""
+        distances = self._sides_there[:, :, :3] @ centres.T + self._sides_there[:, :, 3:]
+        return (distances > -radii).all(axis=1)
+
+    def behind(self, number: int, plane: Array) -> bool:
+        """Return whether a camera sees a plane of pose (3, 4) from behind."""
+        return bool((self.eyes[number] - plane[:, 3]) @ plane[:, 2] < 0)
+
+    def _lens(self, camera: int) -> Array:
+        """Return a camera's projection (4, 4)."""
+        model, (near, far) = self._model, clip_range(self._model)
+        aspect, fovy = self._views.aspect or self._views.width / self._views.height, float(model.cam_fovy[camera])
+        if model.cam_projection[camera] == mujoco.mjtProjection.mjPROJ_ORTHOGRAPHIC:
+            return box(aspect * fovy / 2, fovy / 2, near, far)
+        if model.cam_sensorsize[camera, 1]:
+            focal, centre = model.cam_intrinsic[camera, :2], model.cam_intrinsic[camera, 2:]
+            half = model.cam_sensorsize[camera] / 2
+            low, high = near / focal * (half - centre), near / focal * (half + centre)
+            return frustum(-low[0], high[0], -high[1], low[1], near, far)
+        half = near * np.tan(np.radians(fovy / 2))
+        return frustum(-aspect * half, aspect * half, -half, half, near, far)
+
+
+def _enlarging(windows: Array) -> Array:
+    """Return transforms of clip space (cameras, 4, 4) after which windows (cameras, 4) fill the pictures."""
+    top, left, bottom, right = windows.T
+    transforms = np.tile(np.eye(4), (len(windows), 1, 1))
+    transforms[:, 0, 0], transforms[:, 0, 3] = 1 / (right - left), (1 - left - right) / (right - left)
+    transforms[:, 1, 1], transforms[:, 1, 3] = 1 / (bottom - top), (top + bottom - 1) / (bottom - top)
+    return transforms

@@ -1,0 +1,161 @@
+"""The goals that one instruction sets, one class each."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from vla.io.types import Count, Inherited, Positive
+from vla.tasks.tabletop.goals.goal import AT_REST, Arrangement, Goal, Referents, Subgoal, WorldState
+from vla.tasks.tabletop.language import Grammar, Silence
+
+LEFT = 0.06  # distance at which the tool has left a block [m]
+SAG = 0.006  # tolerance of a stacked block's height [m]
+UP = np.array([0.0, 0.0, 1.0])
+ARM_AT_REST = 0.05  # speed of the fastest joint below which the arm is at rest [rad/s]
+REST_STEPS = 15  # consecutive control steps for which it must rest
+UNMOVED = 0.01  # largest displacement of a block that counts as none [m]
+
+
+class Lift(Goal):
+    """Lift the named block and keep it up."""
+
+    def __init__(self, height: Positive, **inherited: Inherited) -> None:
+        """Take the required height above the start [m]."""
+        super().__init__(**inherited)
+        self.height = height
+
+    def subgoals(self, state: WorldState, referents: Referents) -> list[Subgoal]:
+        """Hold the block a little above the required height."""
+        (block,) = referents.blocks
+        start = state.starts[block, 2]
+        destination = np.array([*state.positions[block, :2], start + self.height + 0.03])
+        done = state.held[block] and state.positions[block, 2] - start > self.height
+        return [Subgoal(block, destination, "hold", bool(done))]
+
+    def after(self, arrangement: Arrangement, referents: Referents) -> Arrangement | None:
+        """See `Goal`."""
+        (block,) = referents.blocks
+        possible = arrangement.held is None and arrangement.allows(block)
+        return arrangement.lifted(block) if possible else None
+
+
+class PickPlace(Goal):
+    """Put the named block on the pad and let go of it."""
+
+    def __init__(self, radius: Positive, **inherited: Inherited) -> None:
+        """Take the maximum distance between the centres of block and pad [m]."""
+        super().__init__(**inherited)
+        self.radius = radius
+
+    def subgoals(self, state: WorldState, referents: Referents) -> list[Subgoal]:
+        """Place the block on the pad's centre."""
+        return [self._placed(state, referents.blocks[0], referents.pads[0])]
+
+    def _placed(self, state: WorldState, block: int, pad: int, further: bool = True) -> Subgoal:
+        """Return the subgoal that a block rests on a pad, released, and something `further` holds."""
+        there = state.away(block, state.pads[pad]) < self.radius and state.resting(block)
+        return Subgoal(block, state.on_table(block, state.pads[pad]), "place", there and further)
+
+
+class PickPlaceTwo(PickPlace):
+    """Put one named block on one named pad, then another one on the other."""
+
+    named, moves, pads = 2, 2, 2
+
+    def subgoals(self, state: WorldState, referents: Referents) -> list[Subgoal]:
+        """Place and leave the first block, then place the second."""
+        (first, second), (one, other) = referents.blocks, referents.pads
+        left = bool(np.linalg.norm(state.tool - state.positions[first]) > LEFT)
+        return [self._placed(state, first, one, left), self._placed(state, second, other)]
+
+
+class Place(PickPlace):
+    """Put the named block on the named pad of two and let go of it."""
+
+    pads = 2
+
+    def after(self, arrangement: Arrangement, referents: Referents) -> Arrangement | None:
+        """See `Goal`."""
+        (block,), (pad, _) = referents.blocks, referents.pads
+        return arrangement.on_pad(block, pad) if arrangement.allows(block) else None
+
+
+class Push(Goal):
+    """Push the named block onto the named pad without lifting it."""
+
+    pads = 2
+
+    def __init__(self, radius: Positive, highest: Positive, **inherited: Inherited) -> None:
+        """Take the largest distance between the centres of block and pad, and the largest rise of the block above its
+        start, while the instruction is carried out [m]."""
+        super().__init__(**inherited)
+        self.radius, self.highest = radius, highest
+
+    def subgoals(self, state: WorldState, referents: Referents) -> list[Subgoal]:
+        """Push the block onto the pad's centre."""
+        (block,), (pad, _) = referents.blocks, referents.pads
+        there = state.away(block, state.pads[pad]) < self.radius and state.speeds[block] < AT_REST
+        done = bool(there and state.lifts[block] < self.highest)
+        return [Subgoal(block, state.on_table(block, state.pads[pad]), "push", done)]
+
+    def after(self, arrangement: Arrangement, referents: Referents) -> Arrangement | None:
+        """See `Goal`: the block must stand on the table, and the gripper be empty."""
+        (block,), (pad, _) = referents.blocks, referents.pads
+        possible = arrangement.held is None and arrangement.allows(block) and block not in arrangement.on_blocks
+        return arrangement.on_pad(block, pad) if possible else None
+
+
+class Stack(Goal):
+    """Put one named block on top of another and let go of it."""
+
+    named, blocks = 2, 3  # with two blocks the lower one would be unambiguous
+
+    def subgoals(self, state: WorldState, referents: Referents) -> list[Subgoal]:
+        """Place the upper block centred on top of the lower one."""
+        upper, lower = referents.blocks
+        top = state.positions[lower] + UP * state.extents[lower, 2]
+        destination = top + UP * state.extents[upper, 2]
+        free = state.speeds[upper] < AT_REST and not state.touched[upper]
+        level = abs(state.positions[upper, 2] - destination[2]) < SAG
+        done = bool(free and level and state.away(upper, top) < state.extents[lower, 0])
+        return [Subgoal(upper, destination, "place", done, tolerance=0.007)]
+
+    def after(self, arrangement: Arrangement, referents: Referents) -> Arrangement | None:
+        """See `Goal`: towers have two blocks."""
+        upper, lower = referents.blocks
+        return arrangement.on_block(upper, lower) if arrangement.allows(upper) else None
+
+
+class Stay(Goal):
+    """Leave everything in place, because the instruction names a block that is not on the table."""
+
+    def __init__(self, language: Grammar, pads: Count) -> None:
+        """Take a grammar and the number of pads on the table."""
+        self.pads, self.absent = pads, absent_colours_needed(language)
+        super().__init__(language, REST_STEPS)
+
+    @classmethod
+    def instead_of(cls, goal: Goal) -> Stay:
+        """Return the goal for the instructions of another one, but for the first block, which is absent."""
+        return cls(goal.language.renamed({"block": "absent", "other": "block"}), goal.pads)
+
+    def subgoals(self, state: WorldState, referents: Referents) -> list[Subgoal]:
+        """Keep every block in place and the arm at rest."""
+        (block,) = referents.blocks
+        moved = np.linalg.norm(state.positions - state.starts, axis=1)
+        done = state.arm_speed < ARM_AT_REST and bool((moved < UNMOVED).all())
+        return [Subgoal(block, state.positions[block], "stay", done)]
+
+
+class Wait(Stay):
+    """Leave everything in place, because the instruction is empty."""
+
+    def __init__(self, pads: Count) -> None:
+        """Take the number of pads on the table."""
+        super().__init__(Silence(), pads)
+        self.absent = 0
+
+
+def absent_colours_needed(language: Grammar) -> int:
+    """Return the number of colours to keep absent from the table, so that one of them is not held out from training."""
+    return 1 + len(language.held_out_colours)

@@ -1,0 +1,111 @@
+"""Randomizers of what is said and of what happens in the course of an episode."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Annotated, Any
+
+import numpy as np
+from annotated_types import MinLen, Predicate
+
+from vla.io.errors import UserError
+from vla.io.types import Natural, NaturalRange, Share, unique
+from vla.tasks.tabletop.compiled_scene import CompiledScene, Disturbance, Kind
+from vla.tasks.tabletop.language import Words
+from vla.tasks.tabletop.randomize.randomizer import Lengths, Places
+
+
+@dataclass(frozen=True)
+class Phrasing:
+    """Share of held-out instructions in an evaluation."""
+
+    held_out: Share  # share of an evaluation's episodes, 0…1
+
+    def __call__(self, scene: CompiledScene, random_state: np.random.RandomState) -> dict[str, Any]:
+        """Set the share; the task draws from its own stream."""
+        scene.held_out = self.held_out
+        return {"held_out": self.held_out}
+
+
+@dataclass(frozen=True)
+class Paraphrase:
+    """Other words for the blocks and pads that an instruction of an evaluation names."""
+
+    words: Annotated[Mapping[str, Words], MinLen(1)]  # phrase of an instruction → phrases to draw from in its place
+
+    def __call__(self, scene: CompiledScene, random_state: np.random.RandomState) -> dict[str, Any]:
+        """Draw a replacement for every phrase, whether the instruction has it or not."""
+        scene.paraphrases = {phrase: others[random_state.randint(len(others))] for phrase, others in self.words.items()}
+        return {"held_out": 1.0}
+
+
+@dataclass(frozen=True)
+class TargetChoice:
+    """Choice of another target block than the unmodified episode has, in the same scene."""
+
+    skip: Natural  # number of blocks to skip in the order of naming
+
+    def __call__(self, scene: CompiledScene, random_state: np.random.RandomState) -> dict[str, Any]:
+        """Set the number; nothing is drawn."""
+        scene.skip = self.skip
+        return {"skip": self.skip}
+
+
+def paraphrase(instruction: str, words: Mapping[str, str], names: Iterable[str]) -> str:
+    """Replace phrases of an instruction, the longest first, so that none of the `names` remains.
+
+    Args:
+        words: phrase → what replaces it.
+        names: what the instruction names, such as colours.
+
+    Raises:
+        UserError: nothing is replaced, or a name remains.
+    """
+    phrases = sorted(words, key=len, reverse=True)
+    replaced = re.sub(rf"\b({'|'.join(map(re.escape, phrases))})\b", lambda found: words[found[0]], instruction)
+    if replaced == instruction or set(names) & set(re.findall(r"\w+", replaced)):
+        raise UserError(f"task.randomize.phrasing.words has no other words for all that is named in {instruction!r}")
+    return replaced
+
+
+@dataclass(frozen=True)
+class Disturbances:
+    """Pushes of the arm, drops of the held block, and moves of the block or its destination, one kind per episode."""
+
+    kinds: Annotated[Sequence[Kind], MinLen(1), Predicate(unique)]  # to draw from
+    times: NaturalRange  # range of how often it happens
+    start: NaturalRange  # range of the number of control steps before a push, not counting the first step
+    delay: NaturalRange  # the same for other kinds: steps whose preconditions hold before the disturbance happens
+    push: Lengths  # range of the distance by which the arm is pushed [m]
+    move: Lengths  # of that by which an object is moved [m]
+    x: Places  # area of the table in which a push or a move ends [m]
+    y: Places
+
+    def __call__(self, scene: CompiledScene, random_state: np.random.RandomState) -> dict[str, Any]:
+        """Draw kind, number, time, distance and direction; whether it happens also depends on the agent."""
+        # The same numbers at every level.
+        kind, times, delay, distance, angle = random_state.uniform(size=5).tolist()
+        chosen = self.kinds[int(kind * len(self.kinds))]
+        number = _whole(self.times, times)
+        if number == 0:
+            return {"kind": "none", "times": 0, "delay": 0, "distance": 0.0, "angle": 0.0}
+        low, high = {"drop": (0.0, 0.0), "push": self.push}.get(chosen, self.move)
+        drawn = {
+            "kind": chosen,
+            "times": number,
+            "delay": _whole(self.start if chosen == "push" else self.delay, delay),
+            "distance": round(low + distance * (high - low), 5),
+            "angle": round(2 * math.pi * angle, 5),
+        }
+        low_corner, high_corner = zip(self.x, self.y, strict=True)
+        scene.disturbance = Disturbance(**drawn, low=low_corner, high=high_corner)
+        return drawn
+
+
+def _whole(bounds: tuple[int, int], share: float) -> int:
+    """Return the integer of a range, ends included, at a share 0…1 of it."""
+    low, high = bounds
+    return low + int(share * (high - low + 1))

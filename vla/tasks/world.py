@@ -1,0 +1,57 @@
+"""What worlds share: the state of an episode, steps without images, and named random streams."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+from zlib import crc32
+
+import numpy as np
+
+from vla.io.errors import UserError
+
+
+class World:
+    """Base class of worlds, with what `vla.spec.Environment` says of an episode; none has begun.
+
+    A world draws no images while `_blind` is true.
+    """
+
+    def __init__(self) -> None:
+        self.done, self.outcome, self.task = True, "timeout", ""
+        self.milestones: frozenset[str] = frozenset()
+        self.draws: dict[str, Any] = {}
+        self._blind = False
+
+    def _require_running(self) -> None:
+        """Raise a UserError if no episode has begun, or the last one is over."""
+        if self.done:
+            raise UserError("the episode is over; call reset(seed) before step(action)")
+
+    @contextmanager
+    def blind(self) -> Iterator[None]:
+        """Return no images within this context, which makes steps several times faster."""
+        before, self._blind = self._blind, True
+        try:
+            yield
+        finally:
+            self._blind = before
+
+
+class Streams:
+    """Random streams of an environment, by name.
+
+    A stream depends only on the episode's seed and its name, so draws from one do not change another. Streams are
+    cached, because creating one takes ten times as long as seeding it.
+    """
+
+    def __init__(self) -> None:
+        self._made: dict[str, np.random.RandomState] = {}
+
+    def __call__(self, seed: int, name: str) -> np.random.RandomState:
+        """Return the stream called `name`, seeded for the episode `seed`."""
+        if name not in self._made:
+            self._made[name] = np.random.RandomState()
+        self._made[name].seed(np.random.SeedSequence([seed, crc32(name.encode())]).generate_state(8))
+        return self._made[name]
