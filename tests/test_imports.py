@@ -22,7 +22,7 @@ MODULES = {
 # Parts import those of the rows above and nothing of their own row but themselves, lazy imports counted.
 LAYERS = (
     ("vla.io",),
-    ("vla.spec", "vla.parallel"),
+    ("vla.spec", "vla.parallel", "vla.schedule"),
     ("vla.robots",),
     ("vla.models", "vla.data", "vla.tasks"),
     ("vla.policy", "vla.rollouts"),

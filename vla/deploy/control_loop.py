@@ -20,6 +20,7 @@ from vla.io.errors import UserError
 from vla.io.types import Count, Point, Positive
 from vla.robots.cartesian import CartesianController
 from vla.robots.controllers import controller_for, gripper_index
+from vla.schedule import Schedule
 from vla.spec import Array, Observation, Spec
 
 Waypoint = tuple[float, Array, float | None]  # when due, goal of the joints, opening
@@ -117,10 +118,9 @@ class ControlLoop:
         self.handed_over = False
         self._observer = Observer(self.spec)
         self._commanded: deque[tuple[float, Array]] = deque()  # at, joints
-        self._schedule: list[Waypoint] = []
+        self._schedule = Schedule[Waypoint](1 / self.spec.control_hz)
         self._pending: tuple[float, float, Array] | None = None  # requested at, observed at, commanded then
         self._outdated = False  # True if what is pending is not to be executed
-        self._next_inference = -np.inf
         self._opening: float | None = 1.0
         self.acting = False  # True if the last command is an action of the policy
         # Trajectory that the arm executes by itself: since when, its commands.
@@ -162,7 +162,8 @@ class ControlLoop:
         if repeated:
             return self.state not in (State.STOPPED, State.FAULT)
         self.instruction, self._instructed_at = instruction.strip(), now
-        self._schedule, self._next_inference, self._sent_valid, self._outdated = [], -np.inf, False, True
+        self._schedule.clear()
+        self._sent_valid, self._outdated = False, True
         if self.state is State.STOPPED and self._timed_out:
             self.resume(now)
         return self.state not in (State.STOPPED, State.FAULT)
@@ -227,10 +228,10 @@ class ControlLoop:
 
     def next_observation(self, now: float) -> Observation | None:
         """Return the observation for the policy if an inference is due; then call `set_plan` or `reject_plan`."""
-        observed = self._observer.due(self._last_observed, self._next_inference)
+        observed = self._observer.due(self._last_observed, self._schedule.end)
         if self.state is not State.RUNNING or self._pending is not None or observed is None:
             return None
-        if self._schedule and now > self._schedule[-1][0] + 0.5 / self.spec.control_hz:
+        if self._schedule.newest and now > self._schedule.end + 0.5 / self.spec.control_hz:
             self.late_plans += 1
         # Anchor on the pose commanded at that time. The measured pose lags behind it; the last goal runs ahead of an
         # arm that its limits slow down, and the policy would overshoot.
@@ -269,8 +270,8 @@ class ControlLoop:
         if not self._follows_positions and (measured := self._observer.newest) is not None:
             self.limiter.position = np.array(measured.joints, float)
         ends = observed + period * np.arange(1, len(actions) + 1)
-        self._schedule, self._sent_valid = list(zip(ends.tolist(), goals, openings, strict=True)), False
-        self._next_inference = float(ends[-1])
+        self._schedule.add(list(zip(ends.tolist(), goals, openings, strict=True)), observed)
+        self._sent_valid = False
         return None
 
     def reject_plan(self, reason: str) -> None:
@@ -289,7 +290,7 @@ class ControlLoop:
         self._supervise(now)
         if not self._commanded:
             return None
-        self.acting = self.state is State.RUNNING and bool(self._schedule)
+        self.acting = self.state is State.RUNNING and self._schedule.newest is not None
         if self._sent is not None:
             self._follow_sent(*self._sent, now)
         if not self._sent_valid:
@@ -302,8 +303,13 @@ class ControlLoop:
         if not self.acting:
             self.limiter.brake()
             return
-        end, goal, self._opening = _next_of(self._schedule, now)
+        end, goal, self._opening = self._waypoint(now)
         self._step(self.limiter, goal, end - now)
+
+    def _waypoint(self, now: float) -> Waypoint:
+        """Return what is due next: until the next plan arrives, the last of the newest plan."""
+        assert self._schedule.newest is not None
+        return (self._schedule.at(now) or [self._schedule.newest.actions[-1]])[-1]
 
     def _step(self, limiter: JointLimiter, goal: Array, remaining: float) -> None:
         """Move towards a goal that is due in `remaining` seconds, within the limits and the workspace."""
@@ -321,10 +327,9 @@ class ControlLoop:
         """
         limiter, opening = copy.copy(self.limiter), self._opening
         commands, until = [], now + longest
-        schedule = list(self._schedule) if self.state is State.RUNNING else []
-        while schedule and now < min(schedule[-1][0], until):
+        while self.state is State.RUNNING and now < min(self._schedule.end, until):
             now += self.tick
-            end, goal, opening = _next_of(schedule, now)
+            end, goal, opening = self._waypoint(now)
             self._step(limiter, goal, end - now)
             commands.append(Command(limiter.position.copy(), limiter.velocity.copy(), opening))
         while not limiter.resting or not commands:
@@ -447,18 +452,11 @@ class ControlLoop:
         if state is not self.state:
             self._sent_valid = False
         if state is not self.state and state is not State.RUNNING:
-            self._observer.cameras.fresh, self._schedule, self._outdated = 0, [], True
-            self._next_inference = self._last_observed = -np.inf
+            self._schedule.clear()
+            self._observer.cameras.fresh, self._outdated, self._last_observed = 0, True, -np.inf
         self.state, self.reason = state, reason
 
     def _record(self, now: float) -> None:
         self._commanded.append((now + self.tick, self.limiter.position.copy()))
         while self._commanded[0][0] < now - HISTORY:
             self._commanded.popleft()
-
-
-def _next_of(schedule: list[Waypoint], now: float) -> Waypoint:
-    """Drop the waypoints that are already due, but keep at least one; return the first that remains."""
-    while len(schedule) > 1 and schedule[0][0] <= now:
-        schedule.pop(0)
-    return schedule[0]

@@ -104,8 +104,6 @@ def require_possible(experiment: Experiment) -> None:
     _require_unseen(experiment)
     _statements(experiment)
     _networks(experiment)
-    if experiment["evaluate"]["by_clock"] and not experiment["evaluate"]["networks"]:
-        raise UserError("evaluate.by_clock is about evaluate.networks, and there are none: add evaluate=latency")
     if not experiment.playable and experiment["evaluate"]["conditions"]:
         raise UserError("evaluate.conditions change a world, and a recording has none: omit them")
     if (folder := experiment["evaluate"]["nearest"]) is not None:
@@ -312,10 +310,7 @@ def _other_agents(experiment: Experiment, make_agent: AgentFactory) -> dict[str,
     the nearest demonstration."""
     asked = experiment["evaluate"]
     impaired = {f"without_{each}": partial(make_without, make_agent, each) for each in asked["without"]}
-    distant = {
-        name: partial(make_over_network, make_agent, network, by_clock=asked["by_clock"])
-        for name, network in _networks(experiment).items()
-    }
+    distant = {name: partial(make_over_network, make_agent, network) for name, network in _networks(experiment).items()}
     folder = asked["nearest"]
     replayed = {NEAREST: partial(make_nearest, Path(folder).resolve())} if folder else {}
     return {**impaired, **replayed, **distant}

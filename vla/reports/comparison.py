@@ -209,9 +209,7 @@ def _by_seed(run: Run, condition: str) -> dict[int, tuple[Result, Any]]:
 def _scenes(run: Run, condition: str) -> tuple[Any, ...]:
     """Return the config values that determine the scenes: the task, and the changes of a condition."""
     config = run.report.config if run.report else {}
-    network = at(config, "evaluate.networks", {}).get(condition)
-    distant = network and (network, at(config, "evaluate.by_clock", None))
-    return at(config, "task"), _changes(run, condition), distant
+    return at(config, "task"), _changes(run, condition), at(config, "evaluate.networks", {}).get(condition)
 
 
 def _changes(run: Run, condition: str) -> dict[str, Any] | None:

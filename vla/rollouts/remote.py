@@ -76,7 +76,7 @@ class RemotePolicy:
         execute: actions of each chunk to execute; null: as many as the server says, or all.
         asynchronous: act at the spec's control rate by the clock, and go on with the chunk, or hold, while the server
             computes the next one; else wait for it.
-        ensemble: as of `vla.rollouts.realtime.Schedule`; null: only the newest chunk counts.
+        ensemble: as of `vla.rollouts.realtime.Network`; null: only the newest chunk counts.
         timeout: longest time to wait for an answer [s].
         api_key: sent to `url` alone, as Authorization: Api-Key …
         spec: of the environment.
