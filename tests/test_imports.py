@@ -49,11 +49,10 @@ LIBRARIES = {
     "lightning": ("vla.models.learner", "vla.data.datamodule", "vla.training", "vla.runs", "vla.jobs"),
     "rerun": ("vla.rollouts.recorder", "vla.deploy.view"),
     "rclpy": ("vla.deploy",),
-    "distributed": ("vla.parallel.dask",),
     "timm": ("vla.models.vision.timm_encoders",),
     "transformers": ("vla.models.text.huggingface",),
 }
-HEAVY = ("torch", "lightning", "mujoco", "dm_control", "rerun", "matplotlib", "distributed")
+HEAVY = ("torch", "lightning", "mujoco", "dm_control", "rerun", "matplotlib")
 
 
 def within(module: str, parts: tuple[str, ...]) -> bool:

@@ -11,7 +11,7 @@ import pytest
 import toy_recordable as toy
 from scipy.special import betaln
 
-from vla.parallel.pool import LocalCluster
+from vla.parallel.pool import Cluster
 from vla.rollouts.comparison import Pairs, compare_pairs
 from vla.rollouts.evaluate import evaluate
 from vla.rollouts.recordings import keep_recordings
@@ -116,7 +116,7 @@ def test_a_comparison_is_decided_after_the_first_episode_or_round_that_tells() -
 def test_an_evaluation_stops_when_it_is_clear_whatever_the_number_of_workers() -> None:
     until = AgainstBar(0.5).is_decided
     alone = evaluate(toy.make_environment, toy.make_agent, None, SEEDS, until=until)
-    assert evaluate(toy.make_environment, toy.make_agent, None, SEEDS, LocalCluster(2, "beside"), until=until) == alone
+    assert evaluate(toy.make_environment, toy.make_agent, None, SEEDS, Cluster(2, "beside"), until=until) == alone
     assert alone.anytime and [result.seed for result in alone.results] == [*SEEDS[: alone.episodes]]
     assert until(alone) and not any(until(Report(alone.results[:played])) for played in range(alone.episodes))
     assert alone.interval[0] > 0.5 and "anytime-valid 95 % CI" in str(alone)
@@ -136,7 +136,7 @@ def test_recordings_of_episodes_that_do_not_count_are_removed(tmp_path: Path) ->
     folder = tmp_path / "recordings"
     until = AgainstBar(0.5).is_decided
     report = evaluate(
-        toy.make_environment, toy.make_agent, toy.make_recorder(folder), SEEDS, LocalCluster(2, "beside"), until=until
+        toy.make_environment, toy.make_agent, toy.make_recorder(folder), SEEDS, Cluster(2, "beside"), until=until
     )
     recorded = keep_recordings(report, folder, tmp_path / "rollouts.rrd", "all")
     assert sorted(recorded) == [each.seed for each in report.results]

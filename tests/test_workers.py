@@ -14,6 +14,7 @@ from typing import Any
 
 import pytest
 
+from vla.io.errors import UserError
 from vla.parallel.pool import Crashed, ProcessPool
 
 
@@ -95,7 +96,7 @@ def test_a_process_that_is_killed_while_it_starts_is_replaced(tmp_path: Path) ->
 
 def test_a_process_that_cannot_start_says_why(monkeypatch: pytest.MonkeyPatch) -> None:
     (ended,) = results(partial(Doubling, status=3), 1)
-    assert type(ended) is ValueError and "could not start: it ended with exit status 3, see its output" in str(ended)
+    assert type(ended) is UserError and "could not start: it ended with exit status 3, see its output" in str(ended)
     assert "cluster.workers=1" in str(ended)
     only_here = ModuleType("only_here")
     only_here.Doubling = type("Doubling", (Doubling,), {"__module__": "only_here"})  # type: ignore[attr-defined]

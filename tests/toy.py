@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from vla.data.episodes import EpisodeStore
-from vla.parallel.pool import LocalCluster
+from vla.parallel.pool import Cluster
 from vla.rollouts.collect import collect
 from vla.spec import Array, Environment, Observation, RobotModel, Spec
 
@@ -215,7 +215,7 @@ def make_lost_expert(environment: Environment) -> ToyExpert:
 def make_store(folder: Path, make: Callable[[], ToyEnvironment] = make_environment) -> EpisodeStore:
     """A store of the expert's first episodes."""
     store = EpisodeStore.create_or_open(folder, make().spec, {})
-    collect(store, make, make_expert, EPISODES, LocalCluster(1, "beside"), seed=0)
+    collect(store, make, make_expert, EPISODES, Cluster(1, "beside"), seed=0)
     return store
 
 

@@ -319,7 +319,7 @@ class Multitask(Protocol):
 
 
 @runtime_checkable
-class InARow(Protocol):
+class MultiInstruction(Protocol):
     """Environment that gives several instructions in an episode, each when the one before is completed.
 
     It succeeds when all are completed, and fails as soon as one does.
@@ -330,7 +330,7 @@ class InARow(Protocol):
 
 
 @runtime_checkable
-class Traceable(Protocol):
+class HasTool(Protocol):
     """Environment that exposes the tool position, so that reports contain path length and smoothness."""
 
     @property
@@ -340,7 +340,7 @@ class Traceable(Protocol):
 
 
 @runtime_checkable
-class Drawable(Protocol):
+class HasScene(Protocol):
     """Environment that a recorder can draw in three dimensions."""
 
     viewpoint: tuple[Point, Point]  # position of the viewer and the point looked at [m]
@@ -355,7 +355,7 @@ class Drawable(Protocol):
 
 
 @runtime_checkable
-class Eventful(Protocol):
+class HasEvents(Protocol):
     """Environment with events that the agent does not cause, such as disturbances; recordings mark their steps."""
 
     @property
@@ -384,7 +384,7 @@ class Shell(Protocol):
 
 
 @runtime_checkable
-class Drivable(Protocol):
+class TakesJointTargets(Protocol):
     """Environment whose arm also takes joint targets, independently of control periods, like a robot driver."""
 
     def drive(self, joints: Array, opening: float, seconds: float) -> None:
@@ -407,8 +407,8 @@ class Drivable(Protocol):
 class Agent(Protocol):
     """Source of actions: an expert, a policy, a person.
 
-    One that also has `looks`, whether its next action may depend on the images, gets no others rendered: false while a
-    planned chunk is executed and no new instruction discards it; always for experts on the truth.
+    One that also has `looks`, whether its next action may depend on the images, gets no others rendered: False while a
+    planned chunk is executed and no new instruction discards it; always False for experts that read the truth.
     """
 
     @property

@@ -256,7 +256,7 @@ def _play(
     """
     asked, task = experiment["evaluate"], experiment["task"]
     seeds: Sequence[int] = range(asked["seed"], asked["seed"] + asked["episodes"])
-    cluster, needs = experiment.cluster(), [checkpoint.resolve()] if checkpoint else []
+    cluster = experiment.cluster()
     named = (experiment["agent"] or {}).get("folder")
     here = experiment["cluster"].get("policy") == "here"  # then lanes are workers
     lanes = 1 if here else (experiment["policy"] or {}).get("lanes", 1)
@@ -268,13 +268,8 @@ def _play(
     recorder = experiment.make_recorder(recordings)
     if recorder:
         recordings.mkdir(exist_ok=True)
-        needs.append(recordings)
     if not len(kept):
         clear(recordings)
-    if asked["nearest"]:
-        needs.append(Path(asked["nearest"]).resolve())
-    if folder:
-        needs.append(folder)
 
     def played(
         name: str,
@@ -287,9 +282,7 @@ def _play(
         environment, wanted = experiment.make_environment(changes), asked["recordings"]
         until = until if asked["until"] else None
         known, keep = kept.of(name), partial(kept.add, name)
-        report = evaluate(
-            environment, agent, recorder, seeds, cluster, name, needs, until, wanted, turns, known, keep, lanes
-        )
+        report = evaluate(environment, agent, recorder, seeds, cluster, name, until, wanted, turns, known, keep, lanes)
         return replace(report, tiers=task.get("tiers") or {})  # of worlds that have them
 
     world = experiment.world() if asked["until"] else None

@@ -67,12 +67,11 @@ def collect(
     seed: int,
     multitask: Multitask | None = None,
     keep_failures: bool = False,
-    needs: Sequence[Path] = (),
 ) -> Summary:
     """Roll the expert out on `seed`, `seed` + 1, … until the store holds `episodes` successes.
 
     Existing episodes are kept. If another process is collecting into the same store, wait for it. Each process of
-    `cluster` calls the two factories once and accesses the paths `needs`. `multitask` tells the task of a seed; its
+    `cluster` calls the two factories once. `multitask` tells the task of a seed; its
     tasks get equal shares. With `keep_failures` every seed gives an episode: failures are stored and count too.
 
     Raises:
@@ -92,7 +91,7 @@ def collect(
                 try:
                     make = partial(DemonstrationWorker, make_environment, make_expert, keep_failures)
                     fill = partial(_fill, store, episodes=episodes, seed=seed, multitask=multitask, keep=keep_failures)
-                    _fill_with(cluster, make, needs, store, fill)
+                    _fill_with(cluster, make, store, fill)
                 finally:
                     _save_collection_time(store.folder, time.monotonic() - began)
     stored = len(store.episodes)
@@ -132,14 +131,12 @@ def _save_collection_time(folder: Path, seconds: float) -> None:
             write_text(file, f"{before + seconds:.1f}\n")
 
 
-def _fill_with(
-    cluster: Cluster, make: WorkerFactory, needs: Sequence[Path], store: EpisodeStore, fill: Callable[[Pool], None]
-) -> None:
+def _fill_with(cluster: Cluster, make: WorkerFactory, store: EpisodeStore, fill: Callable[[Pool], None]) -> None:
     """Fill the store, restarting workers that died: in long collections processes occasionally crash outside Python."""
     while True:
         tried = len(store.tried)
         try:
-            with cluster.pool(make, needs) as pool:
+            with cluster.pool(make) as pool:
                 return fill(pool)
         except WorkersLost as lost:
             if len(store.tried) == tried:

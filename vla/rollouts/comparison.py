@@ -34,7 +34,7 @@ class Comparison:
     difference: float  # a rate's is from -1 to 1
     ci_low: float  # of its 95 % confidence interval
     ci_high: float
-    p: float  # two-sided, for equal rates, or for an amount that is as often larger as smaller
+    p: float  # two-sided, for equal rates, or for a median difference of zero
     episodes: int  # number of pairs; without pairs, of all episodes
     only_first: int | None = None  # pairs in which only the first succeeded, or had more; None without pairs
     only_second: int | None = None

@@ -39,7 +39,6 @@ def evaluate(
     seeds: Sequence[int],
     cluster: Cluster = THIS_PROCESS,
     name: str = "evaluating",
-    needs: Sequence[Path] = (),
     until: Callable[[Report], bool] | None = None,
     recordings: Recordings = "all",
     turns: int = 1,
@@ -52,7 +51,7 @@ def evaluate(
     `recordings` says which episodes are recorded. Unless that is all, it is known at the end only which they are: these
     are played once more and recorded.
 
-    Every process of the `cluster` calls the factories once and accesses the paths `needs`. Errors of a factory end the
+    Every process of the `cluster` calls the factories once. Errors of a factory end the
     evaluation; errors of an episode, or a crash of its process, are reported in its result.
 
     With `until` the evaluation stops as soon as `until(report on the first n seeds)` is true; n is a multiple of
@@ -87,7 +86,7 @@ def evaluate(
                 return True
         return False
 
-    with cluster.pool(make, needs) as pool, Progress(*columns, TimeRemainingColumn()) as bar:
+    with cluster.pool(make) as pool, Progress(*columns, TimeRemainingColumn()) as bar:
         task = bar.add_task("", total=len(seeds), completed=len(results), note="")
         missing = [] if clear() else [seed for seed in seeds if seed not in results]
         size = 1 if lanes == 1 else ROUNDS * lanes

@@ -3,8 +3,8 @@
 The capital of bets at the odds of a hypothesis, 1 at first, is a test martingale. If the hypothesis is true, the
 capital ever reaches 20 with a probability of at most 1/20 (J. Ville, "Étude critique de la notion de collectif",
 1939). The hypotheses with a capital below 20 form a 95 % confidence sequence (I. Waudby-Smith, A. Ramdas, "Estimating
-means of bounded random variables by betting", Journal of the Royal Statistical Society B 86, 2024): the intervals after
-all numbers of episodes cover the truth together with a probability of 95 %.
+means of bounded random variables by betting", Journal of the Royal Statistical Society B 86, 2024): the intervals cover
+the truth simultaneously, for all n, with probability 95 %.
 
 The capital is spread evenly over `BETS` constant bets. For successes and failures it is that of the mixture with the
 density Beta(1/2, 1/2) (R. Krichevsky, V. Trofimov, "The performance of universal encoding", IEEE Transactions on

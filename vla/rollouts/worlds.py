@@ -16,7 +16,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from vla.io.errors import UserError
-from vla.spec import Agent, Agents, Array, Environment, Episode, InARow, Observation, Recorder, Spec, Traceable
+from vla.spec import Agent, Agents, Array, Environment, Episode, HasTool, MultiInstruction, Observation, Recorder, Spec
 
 
 class Worlds(Protocol):
@@ -61,7 +61,7 @@ class Stage:
         self._seed, self._seen, self._clean, self._executed = seed, list[Observation](), list[Array](), list[Array]()
         # Now, because the tool of a world may exist from its first episode on.
         world = self.environment
-        self._traced = world if isinstance(world, Traceable) else None
+        self._traced = world if isinstance(world, HasTool) else None
         self._tool = [self._traced.tool] if self._traced else []
         self._recording = self._recorder if recorded else None
         if self._recording is not None:
@@ -256,5 +256,5 @@ def copied(seen: Observation) -> Observation:
 
 
 def _completed(environment: Environment) -> tuple[int, int] | None:
-    several = isinstance(environment, InARow) and environment.instructions > 1
+    several = isinstance(environment, MultiInstruction) and environment.instructions > 1
     return (environment.completed, environment.instructions) if several else None

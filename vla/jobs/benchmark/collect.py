@@ -12,7 +12,7 @@ from vla.jobs.benchmark.baselines.peer import DURATION, peer
 from vla.jobs.benchmark.measure import HasMinimalStep, Measure, measure, timed
 from vla.jobs.benchmark.rendering import renderings
 from vla.parallel.limits import cores
-from vla.parallel.pool import LocalCluster
+from vla.parallel.pool import Cluster
 from vla.parallel.processes import WorkerFactory
 from vla.rollouts.collect import DemonstrationWorker
 from vla.rollouts.rollout import replay, rollout
@@ -103,7 +103,7 @@ def _keep(store: EpisodeStore, episodes: list[Episode]) -> None:
 
 def _attempts(make: WorkerFactory, processes: int, episodes_each: int) -> tuple[float, str, int]:
     """Return the rate of verified control steps of concurrent processes after a warm-up, its unit, and their number."""
-    with LocalCluster(processes, "beside").pool(make) as pool:
+    with Cluster(processes, "beside").pool(make) as pool:
         for attempt in [pool.submit(seed) for seed in range(2 * processes)]:
             attempt.result()
         seeds = range(processes * episodes_each)
