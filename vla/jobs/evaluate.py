@@ -24,11 +24,12 @@ from vla.policy import costs
 from vla.reports.conditions import SecondaryRows, conditions_table, plot_conditions, secondary_table
 from vla.reports.evaluation import plot_report, write_report
 from vla.reports.run_page import write_page
+from vla.rollouts.comparison import compare_conditions, compare_secondary_metrics
 from vla.rollouts.evaluate import RecorderFactory, evaluate
 from vla.rollouts.memory import make_nearest, make_without, open_memory
 from vla.rollouts.realtime import Network, make_over_network
 from vla.rollouts.recordings import clear, keep_recordings
-from vla.rollouts.results import Report, compare_conditions, compare_secondary_metrics
+from vla.rollouts.results import Report
 from vla.rollouts.rollout import AgentFactory
 from vla.rollouts.shared_policy import shared_policy
 from vla.rollouts.statements import AgainstBar, AgainstRun, Statement, differs_clearly

@@ -14,8 +14,16 @@ from vla.config.check import conditions, with_changes
 from vla.config.differences import at
 from vla.io.errors import UserError
 from vla.reports.conditions import COMPARED, NARROW, SecondaryRows, short_texts
-from vla.rollouts.comparison import Comparison, compare_pairs, compare_samples, concluded
-from vla.rollouts.results import ERROR, Report, Result, concluded_secondary, pairs_of, secondary_of
+from vla.rollouts.comparison import (
+    Comparison,
+    compare_pairs,
+    compare_samples,
+    concluded,
+    concluded_secondary,
+    pairs_of,
+    secondary_of,
+)
+from vla.rollouts.results import ERROR, Report, Result
 from vla.rollouts.statistics import effective_episodes
 from vla.runs.folder import Run, require_run
 from vla.runs.sweep import SweepRow
