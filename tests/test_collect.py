@@ -25,8 +25,8 @@ from vla.data.verification import verify_store
 from vla.parallel.pool import Cluster
 from vla.rollouts.collect import (
     COLLECTION_TIME,
+    MAX_FAILURES,
     NOT_REPEATABLE,
-    PATIENCE,
     DemonstrationWorker,
     Summary,
     collect,
@@ -234,7 +234,7 @@ def test_demonstrations_never_come_from_the_seeds_of_evaluations(tmp_path: Path)
 
 
 def test_an_expert_without_hope_is_given_up(tmp_path: Path) -> None:
-    words = rf"failed on {PATIENCE} seeds of (red|blue) in a row \({{'timeout': {PATIENCE}}}\)"
+    words = rf"failed on {MAX_FAILURES} seeds of (red|blue) in a row \({{'timeout': {MAX_FAILURES}}}\)"
     with pytest.raises(ValueError, match=words):
         gather(tmp_path, make_expert=toy.make_lost_expert)
     assert EpisodeStore(tmp_path).episodes == []

@@ -29,7 +29,7 @@ from vla.data.window_batches import WindowBatcher
 from vla.jobs.collect import JOB, complete_store
 from vla.parallel.pool import Cluster
 from vla.rollouts.collect import collect
-from vla.rollouts.memory import NearestDemonstration
+from vla.rollouts.memorisation import NearestDemonstration
 from vla.spec import Episode
 
 RAW, LOSSLESS, JPEG = CODECS

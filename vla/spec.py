@@ -283,22 +283,18 @@ class Environment(Protocol):
 
     def reset(self, seed: int) -> Observation:
         """Start the episode of `seed`: the same seed gives the same episode, bit for bit."""
-        ...
 
     def step(self, action: Array) -> Observation:
         """Apply one (D,) action for one control period and return the next observation."""
-        ...
 
     def blind(self) -> AbstractContextManager[None]:
         """Return a context in which observations carry no images, which makes steps cheap.
 
         Later images do not depend on whether the context was used.
         """
-        ...
 
     def close(self) -> None:
         """Free the resources of the environment."""
-        ...
 
 
 class SpecOnly:
@@ -315,7 +311,6 @@ class Multitask(Protocol):
 
     def task_of(self, seed: int) -> str:
         """Return the task of the episode of `seed`; every task in `tasks` recurs within a few consecutive seeds."""
-        ...
 
 
 @runtime_checkable
@@ -336,7 +331,6 @@ class HasTool(Protocol):
     @property
     def tool(self) -> Array:
         """(3,) true position of the tool centre point, or another point of the tool, in a fixed frame [m]."""
-        ...
 
 
 @runtime_checkable
@@ -347,11 +341,9 @@ class HasScene(Protocol):
 
     def shapes(self) -> list[Shape]:
         """Return the visible solids of the current episode."""
-        ...
 
     def poses(self) -> dict[str, Array]:
         """Return body name → (7,) position [m] and quaternion wxyz in the world."""
-        ...
 
 
 @runtime_checkable
@@ -361,7 +353,6 @@ class HasEvents(Protocol):
     @property
     def events(self) -> Sequence[tuple[int, str]]:
         """Return (step, description) of every event so far; step is the observation just before or just after it."""
-        ...
 
 
 class Shell(Protocol):
@@ -393,15 +384,12 @@ class TakesJointTargets(Protocol):
         Raises:
             UserError: physics cannot step for so long.
         """
-        ...
 
     def judge(self) -> None:
         """Update the outcome after one control period of driving; the episode may end."""
-        ...
 
     def look(self) -> Observation:
         """Return the current observation."""
-        ...
 
 
 class Agent(Protocol):
@@ -414,16 +402,13 @@ class Agent(Protocol):
     @property
     def info(self) -> dict[str, Any]:
         """What is known about the last action, for recorders: "clean" (D,), "probabilities" (D, K)."""
-        ...
 
     def reset(self, instruction: str, seed: int) -> None:
         """Start an episode, or a new instruction within it, without history; `seed` initialises the random generator of
         the agent, if it has one."""
-        ...
 
     def act(self, observation: Observation, /) -> Array:
         """Return the (D,) float32 action to execute now."""
-        ...
 
 
 @runtime_checkable
@@ -432,7 +417,6 @@ class Agents(Protocol):
 
     def reset(self, instruction: str, seed: int, lane: int) -> None:
         """Start an episode, or a new instruction within it, in a lane; as of `Agent`."""
-        ...
 
     def act(self, observations: Sequence[Observation], lanes: Sequence[int], /) -> Array:
         """Return the actions (n, D) float32 to execute now in n lanes, given what each of them sees.
@@ -440,15 +424,12 @@ class Agents(Protocol):
         Raises:
             UserError: an observation does not fit; no lane has acted then.
         """
-        ...
 
     def about(self, lane: int) -> dict[str, Any]:
         """Return what is known about the last action of a lane, as `Agent.info`."""
-        ...
 
     def looking(self, lane: int) -> bool:
         """Return whether the next action of a lane may depend on the images, as `looks` of an `Agent`."""
-        ...
 
 
 @runtime_checkable
@@ -463,15 +444,12 @@ class Recorder(Protocol):
 
     def start(self, environment: Environment) -> None:
         """Begin an episode; one that has not ended is discarded."""
-        ...
 
     def step(self, observation: Observation, action: Array, info: Mapping[str, Any]) -> None:
         """Record one step: the observation and the (D,) action chosen for it."""
-        ...
 
     def end(self, episode: Episode) -> None:
         """Finish the episode."""
-        ...
 
 
 class Exporter(Protocol):
@@ -482,7 +460,6 @@ class Exporter(Protocol):
 
         Returns the path of the export.
         """
-        ...
 
 
 class PolicyExporter(Protocol):
@@ -490,7 +467,6 @@ class PolicyExporter(Protocol):
 
     def export_policy(self, policy: Any) -> Any:
         """Write a `vla.policy.Policy`; returns the path of the export."""
-        ...
 
 
 class Deployment(Protocol):
@@ -503,7 +479,6 @@ class Deployment(Protocol):
 
     def run(self) -> Any:
         """Run until finished or interrupted; returns a `vla.rollouts.results.Report` if success was measured."""
-        ...
 
 
 def readable(unit: str) -> tuple[float, str]:

@@ -26,7 +26,7 @@ from vla.reports.evaluation import plot_report, write_report
 from vla.reports.run_page import write_page
 from vla.rollouts.comparison import compare_conditions, compare_secondary_metrics
 from vla.rollouts.evaluate import RecorderFactory, evaluate
-from vla.rollouts.memory import make_nearest, make_without, open_memory
+from vla.rollouts.memorisation import make_nearest, make_without, open_memory
 from vla.rollouts.realtime import Network, make_over_network
 from vla.rollouts.recordings import clear, keep_recordings
 from vla.rollouts.results import Report

@@ -31,11 +31,9 @@ class Worker(Protocol):
 
     def attempt(self, item: Any, /) -> Any:
         """Return the result of one item."""
-        ...
 
     def close(self) -> None:
         """Free the resources of the worker."""
-        ...
 
 
 WorkerFactory = Callable[[], Worker]

@@ -40,7 +40,6 @@ class Planner(Agents, Protocol):
 
     def plan(self, observations: Sequence[Observation], lanes: Sequence[int], /) -> Array:
         """Return the chunks (n, k, D) of n lanes."""
-        ...
 
 
 @contextmanager
