@@ -12,7 +12,7 @@ import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -50,6 +50,16 @@ class Network:
 IDEAL = Network(latency=0.0, jitter=0.0, loss=0.0, ensemble=None)
 
 
+class Answer(Protocol):
+    """A chunk that is under way, as a `concurrent.futures.Future`."""
+
+    def done(self) -> bool:
+        """Return whether it has arrived, or never will."""
+
+    def result(self) -> Array | None:
+        """Wait for the chunk (k, D), and return it, or None if it was lost; raises what the policy raised."""
+
+
 class RealTime:
     """Acts at every step with the newest chunk that has arrived, and holds where there is none.
 
@@ -61,13 +71,10 @@ class RealTime:
     def __init__(
         self, spec: Spec, link: SimulatedLink | BackgroundLink, execute: Callable[[], int], ensemble: float | None
     ) -> None:
-        """Begin without a chunk.
+        """Act by a link to a policy.
 
-        Args:
-            spec: of the actions.
-            link: to the policy.
-            execute: returns the number of actions after which the next observation is sent, once an answer is there.
-            ensemble: as of `Network`; with one, every observation is sent.
+        `execute` returns the number of actions after which the next observation is sent, once an answer is there. With
+        an `ensemble`, see `Network`, every observation is sent.
         """
         self._link, self._execute, self._ensemble = link, execute, ensemble
         columns = zip(spec.action, spec.units, spec.low, spec.high, strict=True)
@@ -77,20 +84,21 @@ class RealTime:
         self.reset(0)
 
     def reset(self, seed: int) -> None:
-        """Start an episode."""
+        """Start an episode, once the policy is idle."""
         self._link.reset(seed)
         self._schedule, self._step, self._observed = Schedule[Array](), 0, 0
+        self._answer: Answer | None = None
         self._last: Array | None = None
 
     def act(self, observation: Observation) -> Array:
         """Return the action (D,) to execute now. Raises what the policy raises."""
+        first = self._last is None
         self._link.tick()
-        self._take(wait=False)
-        execute = 1 if self._ensemble is not None or self._last is None else self._execute()
-        if not self._link.busy and self._schedule.wants_plan(self._step, execute):
-            self._link.send(observation)
-            self._observed = self._step
-            self._take(wait=self._last is None)
+        self._take()
+        execute = 1 if first or self._ensemble is not None else self._execute()
+        if self._answer is None and self._schedule.wants_plan(self._step, execute):
+            self._answer, self._observed = self._link.send(observation, first), self._step
+            self._take(wait=first)
         if actions := self._schedule.at(self._step):
             self._step += 1  # only now: while the arm holds, no action becomes obsolete
             self._last = actions[-1] if self._ensemble is None else averaged(actions, self._ensemble)
@@ -98,10 +106,11 @@ class RealTime:
         assert self._last is not None, "the first answer has actions"
         return np.where(self._relative, 0, self._last).astype(np.float32)
 
-    def _take(self, wait: bool) -> None:
-        actions = self._link.receive(wait) if self._link.busy else None
-        if actions is not None:
-            self._schedule.add(list(actions), self._observed)
+    def _take(self, wait: bool = False) -> None:
+        if self._answer is not None and (wait or self._answer.done()):
+            answer, self._answer = self._answer, None
+            if (actions := answer.result()) is not None:
+                self._schedule.add(list(actions), self._observed)
 
 
 def averaged(actions: Sequence[Array], ensemble: float) -> Array:
@@ -124,26 +133,35 @@ class SimulatedLink:
 
     def reset(self, seed: int) -> None:
         """Start an episode."""
-        self._random = np.random.default_rng([seed, 3])
-        self._now, self.busy = 0, False
+        self._random, self.now = np.random.default_rng([seed, 3]), 0
 
     def tick(self) -> None:
         """Begin a control step."""
-        self._now += 1
+        self.now += 1
 
-    def send(self, observation: Observation) -> None:
-        """Compute the chunk, and draw when it arrives; a server computes one that is lost on its way back, too."""
-        seconds, self._lost = self._network.draw(self._random)
+    def send(self, observation: Observation, first: bool) -> Delayed:
+        """Compute the chunk, and draw when it arrives; the `first` one is waited for until it is not lost."""
+        seconds, lost = self._network.draw(self._random)
         steps = math.ceil(seconds * self._hz - 1e-9)
-        self._due = self._now + (max(steps, 1) if self._lost else steps)
-        self._actions, self.busy = self._plan(observation), True
+        actions = self._plan(observation)  # also where it is lost: on its way back
+        return Delayed(self, self.now + (max(steps, 1) if lost else steps), None if lost and not first else actions)
 
-    def receive(self, wait: bool) -> Array | None:
-        """Return the chunk (k, D) if it has arrived, which ends the wait; with `wait` it always has."""
-        if self._now < self._due and not wait:
-            return None
-        self.busy = False
-        return None if self._lost and not wait else self._actions
+
+@dataclass(frozen=True)
+class Delayed:
+    """A chunk that arrives at the step `due` of a simulated link."""
+
+    link: SimulatedLink
+    due: int
+    actions: Array | None  # None: lost
+
+    def done(self) -> bool:
+        """See `Answer`."""
+        return self.link.now >= self.due
+
+    def result(self) -> Array | None:
+        """See `Answer`."""
+        return self.actions
 
 
 class BackgroundLink:
@@ -153,19 +171,12 @@ class BackgroundLink:
         """Start the thread of a policy that acts `control_hz` times per second [Hz]."""
         self._plan, self._period = plan, 1 / control_hz
         self._thread = ThreadPoolExecutor(1, "policy")
-        self._answer: Future[Array] | None = None
-        self.reset(0)
-
-    @property
-    def busy(self) -> bool:
-        """True while an answer is awaited."""
-        return self._answer is not None
+        self._next = 0.0  # when the next control step begins
 
     def reset(self, seed: int) -> None:
         """Start an episode once the policy is idle."""
-        if self._answer is not None:
-            self._answer.exception()
-        self._answer, self._next = None, 0.0
+        self._thread.submit(int).result()  # after what was submitted before
+        self._next = 0.0
 
     def tick(self) -> None:
         """Wait for the next control step."""
@@ -173,16 +184,9 @@ class BackgroundLink:
         time.sleep(max(0.0, self._next - now))
         self._next = max(now, self._next) + self._period
 
-    def send(self, observation: Observation) -> None:
+    def send(self, observation: Observation, first: bool) -> Future[Array]:
         """Let the thread plan."""
-        self._answer = self._thread.submit(self._plan, observation)
-
-    def receive(self, wait: bool) -> Array | None:
-        """Return the chunk (k, D) if it is there, or with `wait` once it is; raises what the policy raised."""
-        if self._answer is None or not (wait or self._answer.done()):
-            return None
-        answer, self._answer = self._answer, None
-        return answer.result()
+        return self._thread.submit(self._plan, observation)
 
     def close(self) -> None:
         """End the thread once the policy is idle."""
