@@ -95,14 +95,8 @@ def compare_amounts(first: Amounts, second: Amounts, anytime: bool = False) -> C
     """Compare an amount in pairs of episodes: the median difference, its interval, and the exact sign test.
 
     The sign test is McNemar's with "had more" for "succeeded alone"; pairs without a difference do not count in it. It
-    assumes nothing about the distribution. With `anytime` it is valid whatever the reason to stop playing.
-
-    Args:
-        first: amounts of the first policy or condition.
-        second: those of the second one in the same episodes.
-
-    Returns:
-        None if there are too few pairs to find any difference.
+    assumes nothing about the distribution. With `anytime` it is valid whatever the reason to stop playing. Returns None
+    if there are too few pairs to find any difference.
     """
     differences = np.subtract(second, first)
     if (interval := median_interval(differences, anytime)) is None:
@@ -117,11 +111,8 @@ def concluded(comparisons: Mapping[Key, Comparison], margin: float | None) -> di
 
     S. Holm, "A simple sequentially rejective multiple test procedure", Scandinavian Journal of Statistics 6 (1979).
     Pairs that never differ cannot give a small p-value, so they do not count (R. E. Tarone, "A modified Bonferroni
-    method for discrete data", Biometrics 46, 1990).
-
-    Args:
-        comparisons: those made together.
-        margin: non-inferiority margin of the success rate, 0…1; None if it is not about success.
+    method for discrete data", Biometrics 46, 1990). The `margin` of non-inferiority, 0…1, is None if it is not about
+    success.
     """
     left = sum(
         each.only_first is None or each.only_first + (each.only_second or 0) > 0 for each in comparisons.values()
@@ -210,11 +201,8 @@ def secondary_of(together: Sequence[tuple[Result, Result]], anytime: bool) -> di
 def compare_conditions(reports: Mapping[str, Report], margin: float) -> dict[str, Comparison]:
     """Return condition → comparison of its success with that of the first condition, which has none.
 
-    Pairs with an error do not count. Where episodes were played until it was clear, one report may be longer.
-
-    Args:
-        reports: by condition.
-        margin: non-inferiority margin of the success rate, 0…1.
+    Pairs with an error do not count. Where episodes were played until it was clear, one report may be longer. The
+    `margin` of non-inferiority is a difference of rates, 0…1.
 
     Raises:
         UserError: the reports have different seeds.

@@ -42,11 +42,9 @@ class RerunRecorder:
     """
 
     def __init__(self, folder: str | os.PathLike[str], pictures: Natural) -> None:
-        """Create the folder of the recordings; files are named by `recording_name`.
+        """Create the folder of the recordings, in which files are named by `recording_name`.
 
-        Args:
-            folder: of the recordings.
-            pictures: number of episodes of each outcome of which there is also a moving picture, the first ones.
+        Of the first episodes of each outcome, so many as `pictures`, there is also a moving picture.
         """
         self._folder, self._pictures = Path(folder), pictures
         self._folder.mkdir(parents=True, exist_ok=True)
@@ -160,10 +158,7 @@ class _Writer:
                 self._series(_path("action", unit, "clean"), episode.actions[:, which], names, width=0.75)
 
     def tokens(self, steps: Array, probabilities: Array) -> None:
-        """Write one image per step: a row per action component, with its lowest bin on the left.
-
-        Args: steps (N,) and their probabilities (N, D, K); each row is scaled by its maximum.
-        """
+        """Write the probabilities (N, D, K) of steps (N,) as images: a row per component, scaled by its maximum."""
         components, bins = probabilities.shape[1:]
         row, columns = TOKENS[0] // components, np.arange(TOKENS[1]) * bins // TOKENS[1]  # [px]
         # The square root makes small probabilities visible.
