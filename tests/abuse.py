@@ -103,10 +103,8 @@ WRONG = (
         "logger=wandb",
         "logger=mlflow",
         "tokenizer=fast",
-        "cluster=dask cluster.address=x",
     ),
     *(
-        "cluster=dask cluster.address=tcp://127.0.0.1:1 job=collect",
         "trainer=gpu",
         "trainer=fsdp",
         "trainer.precision=8",

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import time
+from collections.abc import Callable
 from pathlib import Path
 
 from vla.rollouts.collect import COLLECTION_TIME
@@ -17,3 +19,11 @@ def content(folder: Path) -> dict[str, bytes]:
 def lines(folder: Path) -> int:
     index = folder / "index.jsonl"
     return index.read_bytes().count(b"\n") if index.exists() else 0
+
+
+def until(condition: Callable[[], bool]) -> None:
+    """Wait until a condition holds, or fail after two minutes."""
+    give_up = time.monotonic() + 120
+    while not condition():
+        assert time.monotonic() < give_up
+        time.sleep(0.01)

@@ -19,7 +19,7 @@ import pytest
 import warm
 from filelock import FileLock
 
-from vla.parallel.processes import THREAD_SETTINGS, raise_gc_thresholds, without_triton
+from vla.parallel.processes import THREAD_SETTINGS, ease_garbage_collection, without_triton
 from vla.tasks.gl import choose_backend, has_egl
 
 if TYPE_CHECKING:
@@ -43,7 +43,7 @@ has_egl()  # once, for the programs that tests start
 without_triton()
 
 warm.compose_faster()
-raise_gc_thresholds()
+ease_garbage_collection()
 
 # What a shell runs in the background ignores interrupts, and so would the programs that tests start and interrupt.
 signal.signal(signal.SIGINT, signal.default_int_handler)

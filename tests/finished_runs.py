@@ -9,7 +9,8 @@ from typing import Any
 from vla.reports.comparison import compare_runs, read_runs, remarks, rows_of
 from vla.reports.comparison_page import write_comparison
 from vla.reports.evaluation import write_report
-from vla.rollouts.results import Report, Result, compare_conditions
+from vla.rollouts.comparison import compare_conditions
+from vla.rollouts.results import Report, Result
 from vla.runs.folder import save_config
 from vla.spec import FIRST_SEED
 

@@ -194,10 +194,3 @@ def test_without_gl_the_error_says_what_to_install(tmp_path: Path) -> None:
         text=True,
     )
     assert done.returncode == 1 and "libegl1" in done.stderr and "Traceback" not in done.stderr
-
-
-@pytest.mark.parametrize("name", ["RANK", "LOCAL_RANK", "SLURM_STEP_NUM_TASKS"])
-def test_a_rank_that_is_no_number_is_named(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv(name, "x")
-    done = here(tmp_path, "resume=last", "output=nowhere/now", ok=False)
-    assert done.stderr == f"error: the environment variable {name} must be a number of a launcher, got 'x': unset it\n"

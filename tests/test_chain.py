@@ -19,7 +19,7 @@ from vla.deploy.ros2 import SimulatorDeployment
 from vla.deploy.settings import Topics
 from vla.reports.evaluation import summary, write_report
 from vla.reports.run_page import write_page
-from vla.rollouts.evaluate import play
+from vla.rollouts.evaluate import play_episode
 from vla.rollouts.moving_picture import read_moving_pictures
 from vla.rollouts.recorder import RerunRecorder, recording_name
 from vla.rollouts.results import Report, Result
@@ -133,8 +133,8 @@ def test_the_next_instruction_comes_when_one_is_completed(chain: Tabletop, tmp_p
 
 def test_a_chain_ends_where_one_instruction_fails_and_its_outcome_is_about_that_one(chain: Tabletop) -> None:
     with chain.blind():
-        result = play(chain, Tiring(Waypoint(chain.spec), most=1), SECOND)
-        again = play(chain, Tiring(Waypoint(chain.spec), most=1), SECOND)
+        result = play_episode(chain, Tiring(Waypoint(chain.spec), most=1), SECOND)
+        again = play_episode(chain, Tiring(Waypoint(chain.spec), most=1), SECOND)
         chain.reset(SECOND)
         assert chain.completed == 0 and chain.instructions == 3
     assert result.completed == (1, 3) and result.outcome not in ("success", "error") and result.steps > 100

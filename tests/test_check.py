@@ -188,7 +188,7 @@ def test_a_class_stands_only_where_its_kind_is_asked_for() -> None:
 
 
 def test_build_gives_plain_containers_runtime_arguments_and_nested_factories() -> None:
-    cluster = build({"_target_": "vla.parallel.pool.LocalCluster", "policy": "beside"}, "cluster", workers=3)
+    cluster = build({"_target_": "vla.parallel.pool.Cluster", "policy": "beside"}, "cluster", workers=3)
     assert cluster.workers == 3
     image = {"_target_": "vla.models.vision.image_tokenizer.FilmConv", "_partial_": True, "channels": [8]}
     image |= {"kernels": [3], "strides": [2], "chroma": True, "positions": False}

@@ -22,11 +22,11 @@ from vla.config.experiment import Experiment
 from vla.data.episodes import EpisodeStore
 from vla.data.index import NOT_NEEDED
 from vla.data.verification import verify_store
-from vla.parallel.pool import LocalCluster
+from vla.parallel.pool import Cluster
 from vla.rollouts.collect import (
     COLLECTION_TIME,
+    MAX_FAILURES,
     NOT_REPEATABLE,
-    PATIENCE,
     DemonstrationWorker,
     Summary,
     collect,
@@ -37,14 +37,14 @@ from vla.spec import FIRST_SEED, Episode, Observation
 
 SCRIPT = """
 import sys, toy
-from vla.parallel.pool import LocalCluster
+from vla.parallel.pool import Cluster
 from vla.rollouts.collect import collect
 from vla.data.episodes import EpisodeStore
 
 if __name__ == "__main__":
     store = EpisodeStore.create_or_open(sys.argv[1], toy.SPEC, {})
     workers, episodes = int(sys.argv[2]), int(sys.argv[3])
-    collect(store, toy.make_slow_environment, toy.make_expert, episodes, LocalCluster(workers, "beside"), seed=0)
+    collect(store, toy.make_slow_environment, toy.make_expert, episodes, Cluster(workers, "beside"), seed=0)
 """
 
 
@@ -56,7 +56,7 @@ def gather(
     make_expert: AgentFactory = toy.make_expert,
 ) -> Summary:
     store = EpisodeStore.create_or_open(folder, toy.SPEC, {})
-    return collect(store, make_environment, make_expert, episodes, LocalCluster(workers, "beside"), seed=0)
+    return collect(store, make_environment, make_expert, episodes, Cluster(workers, "beside"), seed=0)
 
 
 @pytest.fixture(scope="module")
@@ -112,7 +112,7 @@ def test_a_larger_count_adds_only_what_is_missing(tmp_path: Path, whole: Path) -
 def in_turn(folder: Path, episodes: int, workers: int = 1) -> Summary:
     store = EpisodeStore.create_or_open(folder, toy.SPEC, {})
     makers = toy.make_in_turn, toy.make_expert
-    return collect(store, *makers, episodes, LocalCluster(workers, "beside"), 0, toy.make_in_turn())
+    return collect(store, *makers, episodes, Cluster(workers, "beside"), 0, toy.make_in_turn())
 
 
 def test_tasks_that_the_seed_tells_get_equal_shares_at_any_time(tmp_path: Path) -> None:
@@ -229,12 +229,12 @@ def test_a_worker_that_dies_is_reported_and_costs_nothing(tmp_path: Path, whole:
 def test_demonstrations_never_come_from_the_seeds_of_evaluations(tmp_path: Path) -> None:
     store = EpisodeStore.create_or_open(tmp_path, toy.SPEC, {})
     with pytest.raises(ValueError, match="seeds from 1000000 on are reserved for evaluation"):  # one fails
-        collect(store, toy.make_environment, toy.make_expert, 4, LocalCluster(1, "beside"), FIRST_SEED - 4)
+        collect(store, toy.make_environment, toy.make_expert, 4, Cluster(1, "beside"), FIRST_SEED - 4)
     assert store.episodes and all(entry.seed < FIRST_SEED for entry in store.tried)
 
 
 def test_an_expert_without_hope_is_given_up(tmp_path: Path) -> None:
-    words = rf"failed on {PATIENCE} seeds of (red|blue) in a row \({{'timeout': {PATIENCE}}}\)"
+    words = rf"failed on {MAX_FAILURES} seeds of (red|blue) in a row \({{'timeout': {MAX_FAILURES}}}\)"
     with pytest.raises(ValueError, match=words):
         gather(tmp_path, make_expert=toy.make_lost_expert)
     assert EpisodeStore(tmp_path).episodes == []
@@ -293,7 +293,7 @@ def test_a_store_goes_on_from_its_own_first_seed(tmp_path: Path, episodes: int) 
     gather(tmp_path, episodes=2)
     store = EpisodeStore(tmp_path)
     with pytest.raises(ValueError, match=r"starts at seed 0, not 7: set collect\.seed=0"):
-        collect(store, toy.make_environment, toy.make_expert, episodes, LocalCluster(1, "beside"), seed=7)
+        collect(store, toy.make_environment, toy.make_expert, episodes, Cluster(1, "beside"), seed=7)
 
 
 def test_a_disk_that_fills_up_costs_nothing_that_was_committed(tmp_path: Path, whole: Path) -> None:

@@ -13,7 +13,6 @@ from vla.rollouts.comparison import (
     Comparison,
     Pairs,
     compare_amounts,
-    compare_pairs,
     compare_samples,
     concluded,
     fisher,
@@ -34,15 +33,8 @@ def test_intervals_equal_those_of_other_programs() -> None:
     np.testing.assert_allclose(newcombe(48, 80, 56, 70), (0.052431, 0.333873), atol=1e-6)
     np.testing.assert_allclose(newcombe(3, 10, 19, 20), (0.294207, 0.846558), atol=1e-6)
     assert newcombe_paired(Pairs(0, 0, 0, 0)) == (-1, 1)
-
-
-def test_the_order_of_the_policies_only_changes_the_sign() -> None:
-    for pairs in (Pairs(20, 3, 9, 8), Pairs(50, 0, 4, 0), Pairs(0, 6, 6, 2)):
-        low, high = newcombe_paired(pairs)
-        there = newcombe_paired(pairs._replace(first=pairs.second, second=pairs.first))
-        assert there == pytest.approx((-high, -low))
-    low, high = newcombe(3, 10, 19, 20)
-    assert newcombe(19, 20, 3, 10) == pytest.approx((-high, -low))
+    low, high = newcombe_paired(Pairs(20, 3, 9, 8))
+    assert newcombe_paired(Pairs(20, 9, 3, 8)) == pytest.approx((-high, -low))  # the order only changes the sign
 
 
 @pytest.mark.parametrize("shares", [(0.88, 0.07, 0.03, 0.02), (0.5, 0.2, 0.2, 0.1), (0.2, 0.1, 0.6, 0.1)])
@@ -78,15 +70,6 @@ def test_p_values_are_adjusted_step_by_step() -> None:
     found = concluded({"a": a_comparison(0.03), "b": a_comparison(1.0, 0.0, differ=0)}, 0.02)
     assert [each.p_holm for each in found.values()] == pytest.approx([0.03, 1.0])
     assert concluded({}, 0.02) == {}
-
-
-def test_together_they_rarely_find_what_is_not_there() -> None:
-    random, wrong = np.random.default_rng(0), 0
-    compared = [compare_pairs(Pairs(60, lost, 40 - lost, 0)) for lost in range(41)]
-    for _ in range(300):
-        tests = {n: compared[lost] for n, lost in enumerate(random.binomial(40, 0.5, 20))}
-        wrong += any(each.verdict in ("better", "worse") for each in concluded(tests, 0.02).values())
-    assert wrong <= 0.05 * 300
 
 
 def test_the_interval_of_a_median_is_scipys() -> None:

@@ -18,7 +18,7 @@ from vla.data.datamodule import Prefetcher, held_out
 from vla.data.episodes import EpisodeStore, observations_of
 from vla.data.verification import derive_store
 from vla.data.window_batches import WindowBatcher, perturbed
-from vla.parallel.pool import LocalCluster
+from vla.parallel.pool import Cluster
 from vla.rollouts.collect import collect
 from vla.spec import Array, Episode
 
@@ -234,9 +234,7 @@ def test_training_leaves_the_store_as_it_is(folder: Path, tmp_path: Path) -> Non
     before = {path.name: path.stat() for path in store.iterdir()} | {".": store.stat()}
     # What job=train does: it looks whether there are episodes enough, and trains on them.
     complete = EpisodeStore.create_or_open(store, toy.SPEC, {})
-    assert (
-        collect(complete, toy.make_environment, toy.make_expert, EPISODES, LocalCluster(1, "beside"), seed=0).added == 0
-    )
+    assert collect(complete, toy.make_environment, toy.make_expert, EPISODES, Cluster(1, "beside"), seed=0).added == 0
     seen = fit(store, 5).seen
     assert all(torch.equal(one, two) for one, two in zip(seen, fit(folder, 5).seen, strict=True))
     after = {path.name: path.stat() for path in store.iterdir()} | {".": store.stat()}

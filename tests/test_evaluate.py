@@ -15,7 +15,7 @@ from rerun.chunk import RrdReader
 
 from vla.config.experiment import Experiment
 from vla.jobs.evaluate import require_possible
-from vla.parallel.pool import LocalCluster
+from vla.parallel.pool import Cluster
 from vla.reports.evaluation import summary, write_report
 from vla.rollouts.evaluate import evaluate
 from vla.rollouts.recordings import chosen, keep_recordings
@@ -131,7 +131,7 @@ def test_a_report_of_errors_alone_has_the_widest_interval() -> None:
 
 def test_two_workers_report_what_one_reports() -> None:
     alone = evaluate(toy.make_environment, toy.make_agent, None, SEEDS)
-    assert evaluate(toy.make_environment, toy.make_agent, None, SEEDS, LocalCluster(2, "beside")) == alone
+    assert evaluate(toy.make_environment, toy.make_agent, None, SEEDS, Cluster(2, "beside")) == alone
     assert [result.seed for result in alone.results] == list(SEEDS)
     assert alone.outcome_counts == {"success": 8, "timeout": 2}
     first = alone.results[0]
@@ -172,7 +172,7 @@ def test_a_motion_that_no_report_can_hold_is_an_error_of_its_episode(tmp_path: P
 
 
 def test_an_episode_that_kills_its_process_is_an_error_and_the_others_are_played() -> None:
-    report = evaluate(toy.make_deadly_environment, toy.make_agent, None, SEEDS, LocalCluster(2, "beside"))
+    report = evaluate(toy.make_deadly_environment, toy.make_agent, None, SEEDS, Cluster(2, "beside"))
     assert [error.seed for error in report.errors] == [toy.DEADLY_SEED]
     assert report.errors[0].error == (
         "a worker process crashed twice: it ended with exit status 1; cluster.workers=1 shows the traceback"
@@ -183,14 +183,14 @@ def test_an_episode_that_kills_its_process_is_an_error_and_the_others_are_played
 def test_a_process_that_dies_once_costs_nothing(tmp_path: Path) -> None:
     expected = evaluate(toy.make_environment, toy.make_agent, None, SEEDS)
     make_environment = partial(toy.OnceDeadlyEnvironment, tmp_path / "died")
-    assert evaluate(make_environment, toy.make_agent, None, SEEDS, LocalCluster(2, "beside")) == expected
+    assert evaluate(make_environment, toy.make_agent, None, SEEDS, Cluster(2, "beside")) == expected
     assert (tmp_path / "died").exists()
 
 
 @pytest.mark.parametrize("workers", [1, 2])
 def test_an_environment_that_cannot_be_built_ends_the_evaluation(workers: int) -> None:
     with pytest.raises(ValueError, match="no such mesh"):
-        evaluate(toy.make_impossible_environment, toy.make_agent, None, SEEDS[:2], LocalCluster(workers, "beside"))
+        evaluate(toy.make_impossible_environment, toy.make_agent, None, SEEDS[:2], Cluster(workers, "beside"))
 
 
 def test_seeds_of_training_are_refused() -> None:

@@ -125,8 +125,8 @@ if __name__ == "__main__":  # worker processes import this file
     from pathlib import Path
     from vla.config.build import build
     from vla.data.episodes import EpisodeStore
-    from vla.parallel.pool import LocalCluster
-    cluster = LocalCluster(int(sys.argv[1]), "beside")
+    from vla.parallel.pool import Cluster
+    cluster = Cluster(int(sys.argv[1]), "beside")
     build({config}, "export").export(EpisodeStore(Path({store!r}), {episodes}), cluster)
 """
 

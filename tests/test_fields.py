@@ -27,9 +27,9 @@ from vla.data.image_codec import decode, encode
 from vla.data.verification import derive_store, episode_of, require_whole, verify_store
 from vla.data.window_batches import WindowBatcher
 from vla.jobs.collect import JOB, complete_store
-from vla.parallel.pool import LocalCluster
+from vla.parallel.pool import Cluster
 from vla.rollouts.collect import collect
-from vla.rollouts.memory import NearestDemonstration
+from vla.rollouts.memorisation import NearestDemonstration
 from vla.spec import Episode
 
 RAW, LOSSLESS, JPEG = CODECS
@@ -107,7 +107,7 @@ def test_a_collection_grows_to_the_same_bytes(tmp_path: Path, codec: Codec) -> N
     for folder, steps, workers in (("whole", [6], 2), ("grown", [2, 3, 6], 1)):
         for episodes in steps:
             store = EpisodeStore.create_or_open(tmp_path / folder, ARM_SPEC, CONFIG, codec)
-            collect(store, make_arm, make_expert, episodes, LocalCluster(workers, "beside"), seed=0)
+            collect(store, make_arm, make_expert, episodes, Cluster(workers, "beside"), seed=0)
         (tmp_path / folder / "seconds.txt").unlink()
     assert content(tmp_path / "grown") == content(tmp_path / "whole")
     assert len(EpisodeStore(tmp_path / "grown").episodes) == 6
@@ -303,4 +303,4 @@ def test_what_another_process_adds_does_not_disturb_a_reader(tmp_path: Path) -> 
     np.testing.assert_array_equal(rows[0 : len(rows)], before)
     assert reader.rows("rgb_front").shape == rows.shape
     store = EpisodeStore(tmp_path)
-    assert collect(store, make_environment, make_expert, 4, LocalCluster(1, "beside"), seed=0).added == 0
+    assert collect(store, make_environment, make_expert, 4, Cluster(1, "beside"), seed=0).added == 0

@@ -22,7 +22,7 @@ MODULES = {
 # Parts import those of the rows above and nothing of their own row but themselves, lazy imports counted.
 LAYERS = (
     ("vla.io",),
-    ("vla.spec", "vla.parallel"),
+    ("vla.spec", "vla.parallel", "vla.schedule"),
     ("vla.robots",),
     ("vla.models", "vla.data", "vla.tasks"),
     ("vla.policy", "vla.rollouts"),
@@ -49,11 +49,10 @@ LIBRARIES = {
     "lightning": ("vla.models.learner", "vla.data.datamodule", "vla.training", "vla.runs", "vla.jobs"),
     "rerun": ("vla.rollouts.recorder",),
     "rclpy": ("vla.deploy",),
-    "distributed": ("vla.parallel.dask",),
     "timm": ("vla.models.vision.timm_encoders",),
     "transformers": ("vla.models.text.huggingface",),
 }
-HEAVY = ("torch", "lightning", "mujoco", "dm_control", "rerun", "matplotlib", "distributed")
+HEAVY = ("torch", "lightning", "mujoco", "dm_control", "rerun", "matplotlib")
 
 
 def within(module: str, parts: tuple[str, ...]) -> bool:

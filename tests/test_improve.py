@@ -23,7 +23,7 @@ from vla.data.verification import derive_store, episode_of, verify_store
 from vla.data.window_batches import WindowBatcher
 from vla.jobs import improve
 from vla.models.policy_folder import read_policy
-from vla.parallel.pool import LocalCluster
+from vla.parallel.pool import Cluster
 from vla.rollouts.collect import collect
 from vla.rollouts.rollout import replay, rollout
 from vla.rollouts.supervised import Supervised, make_supervised, require_memoryless
@@ -44,7 +44,7 @@ def supervised(beta: float) -> Supervised:
 def label(folder: Path, workers: int, episodes: int = 12) -> EpisodeStore:
     store = EpisodeStore.create_or_open(folder, toy.SPEC, {})
     agent = partial(make_supervised, toy.make_wanderer, toy.make_expert, 0.4, 5)
-    collect(store, toy.make_environment, agent, episodes, LocalCluster(workers, "beside"), 100, keep_failures=True)
+    collect(store, toy.make_environment, agent, episodes, Cluster(workers, "beside"), 100, keep_failures=True)
     return EpisodeStore(folder)
 
 

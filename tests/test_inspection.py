@@ -17,7 +17,7 @@ from toy_episodes import CONFIG, EPISODES, MORE, add, change, content, flip
 from vla.data.episodes import EpisodeStore
 from vla.data.index import listed
 from vla.data.verification import derive_store, episode_of, find_episode, require_whole, verify_store
-from vla.parallel.pool import LocalCluster
+from vla.parallel.pool import Cluster
 from vla.rollouts.collect import collect
 from vla.spec import Episode
 
@@ -157,7 +157,7 @@ def test_collection_goes_on_in_a_repaired_store(tmp_path: Path) -> None:
     change(tmp_path / "store" / "action.bin", lambda data: flip(data, 0))
     derive_store([EpisodeStore(store.folder, damaged=True)], tmp_path / "repaired", repair=True)
     repaired = EpisodeStore.create_or_open(tmp_path / "repaired", ARM_SPEC, CONFIG)
-    summary = collect(repaired, make_arm, make_expert, episodes=4, cluster=LocalCluster(1, "beside"), seed=0)
+    summary = collect(repaired, make_arm, make_expert, episodes=4, cluster=Cluster(1, "beside"), seed=0)
     assert (summary.tried, summary.failures) == (5, {"timeout": 1}) and summary.success_rate == 0.8
     assert [(entry.seed, entry.outcome) for entry in repaired.tried][::5] == [(0, "damaged"), (5, "success")]
 
@@ -199,11 +199,9 @@ def test_a_store_that_was_put_together_serves_training_and_does_not_grow(tmp_pat
     chosen = EpisodeStore.create_or_open(tmp_path / "chosen", ARM_SPEC, {"task": {"size": 3.0}})
     assert [entry.seed for entry in chosen.episodes] == [1, 2] and chosen.derived
     assert len(chosen.statistics.actions) == len(EPISODES[1].actions) + len(EPISODES[2].actions)
-    assert (
-        collect(chosen, make_environment, make_expert, episodes=2, cluster=LocalCluster(1, "beside"), seed=0).added == 0
-    )
+    assert collect(chosen, make_environment, make_expert, episodes=2, cluster=Cluster(1, "beside"), seed=0).added == 0
     with pytest.raises(ValueError, match=r"cannot grow: set collect\.episodes=2"):
-        collect(chosen, make_environment, make_expert, episodes=3, cluster=LocalCluster(1, "beside"), seed=0)
+        collect(chosen, make_environment, make_expert, episodes=3, cluster=Cluster(1, "beside"), seed=0)
     change(chosen.folder / "index.jsonl", lambda data: data[: data.index(b"\n") + 1])
     with pytest.raises(ValueError, match="has lost lines: derive it again"):
         verify_store(EpisodeStore(chosen.folder, damaged=True))

@@ -25,12 +25,9 @@ def test_wilson_interval_equals_values_worked_out_by_hand() -> None:
     assert wilson_interval(0, 0) == (0, 1)
 
 
-def test_of_one_training_every_episode_counts() -> None:
+def test_trainings_that_do_the_same_tell_no_more_than_one_whose_every_episode_counts() -> None:
     assert pooled_interval(outcomes("1101101111")) == pytest.approx(wilson_interval(8, 10))
     assert pooled_interval([{}]) == (0, 1)
-
-
-def test_trainings_that_do_the_same_tell_no_more_than_one() -> None:
     for same in ("1101101111", "1111111111", "0000000000"):
         assert pooled_interval(outcomes(same, same, same)) == pytest.approx(pooled_interval(outcomes(same)))
 

@@ -43,22 +43,22 @@ def test_an_episode_is_that_of_the_world_under_the_names_of_lerobot() -> None:
     bounds = cast(gymnasium.spaces.Box, vector.single_action_space)
     np.testing.assert_allclose(bounds.low, [-0.04] * 3 + [-0.25] * 3 + [0], rtol=1e-6)
     np.testing.assert_allclose(bounds.high, [0.04] * 3 + [0.25] * 3 + [1], rtol=1e-6)
-    own = [world.env.reset(seed=FIRST_SEED)[0], *(world.env.step(action[0])[0] for _ in range(3))]
+    inner = world.environment
+    own = [inner.reset(FIRST_SEED), *(inner.step(action[0]) for _ in range(3))]
     for renamed, expected in zip(seen, own, strict=True):
-        assert {*renamed} == {"pixels", "agent_pos", "velocities"} and said == expected["instruction"]
+        assert {*renamed} == {"pixels", "agent_pos", "velocities"} and said == expected.instruction
         for camera in ("front", "wrist"):
-            np.testing.assert_array_equal(renamed["pixels"][camera][0], expected[camera])
-        np.testing.assert_array_equal(renamed["agent_pos"][0], expected["state"][[*range(7), 14]])
-        np.testing.assert_array_equal(renamed["velocities"][0], expected["state"][7:14])
+            np.testing.assert_array_equal(renamed["pixels"][camera][0], expected.rgb[camera])
+        np.testing.assert_array_equal(renamed["agent_pos"][0], expected.state[[*range(7), 14]])
+        np.testing.assert_array_equal(renamed["velocities"][0], expected.state[7:14])
     vector.close()
 
 
 def test_no_episode_of_lerobot_is_one_of_training() -> None:
     """Its default seed is 1000, its environments are reset without one when an episode ends, and ours keep theirs."""
     world = LeRobotEnvironment("tabletop", 50, SMALL)
-    inner, played = world.env.unwrapped.environment, list[int]()  # type: ignore[attr-defined]
-    really = inner.reset
-    inner.reset = lambda seed: (played.append(seed), really(seed))[1]
+    played, really = list[int](), world.environment.reset
+    world.environment.reset = lambda seed: (played.append(seed), really(seed))[1]  # type: ignore[method-assign]
     for seed in (1000, FIRST_SEED + 7, None, None):
         world.reset(seed=seed)
     world.close()

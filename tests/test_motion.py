@@ -13,9 +13,10 @@ import toy
 
 from vla.reports.evaluation import write_report
 from vla.reports.run_page import write_page
+from vla.rollouts.comparison import compare_conditions, compare_secondary_metrics
 from vla.rollouts.evaluate import evaluate
 from vla.rollouts.motion import Motion, log_dimensionless_jerk, path_length
-from vla.rollouts.results import Report, compare_conditions, compare_secondary_metrics
+from vla.rollouts.results import Report
 from vla.runs.folder import read_run
 from vla.spec import FIRST_SEED, Array
 

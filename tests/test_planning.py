@@ -6,23 +6,23 @@ import itertools
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 from command_line import here
 from finished_runs import a_run
 from rich import get_console
 from scipy.stats import binom, multinomial
 
-from vla.rollouts import planning
 from vla.rollouts.comparison import fisher, mcnemar
 from vla.rollouts.planning import (
     MOST,
-    SIMULATIONS,
     episodes_needed,
     power_for_bar,
     power_of_pairs,
     power_of_samples,
     stopping,
 )
+from vla.rollouts.sequential import excludes
 from vla.rollouts.statistics import wilson_interval
 
 
@@ -76,14 +76,22 @@ def test_stopping_rarely_errs_and_is_early_where_the_difference_is_large() -> No
         stops, early = stopping(0.5, won, lost, 0.8, fixed), stopping(0.5, larger, lost, 0.8, fixed)
         assert stops is not None and early is not None
         assert stops.mean < 1.1 * fixed < stops.most < 2.5 * fixed and early.mean < 0.5 * fixed
-        assert 0.005 * SIMULATIONS < stops.wrong * SIMULATIONS < 0.05 * SIMULATIONS
+        assert 0.005 < stops.wrong < 0.05
     assert stopping(0.5, 0.11, 0.1, 0.99, 10) is None
 
 
-def test_bounds_of_stopping_are_the_same_in_parts(monkeypatch: pytest.MonkeyPatch) -> None:
-    whole = stopping(0.5, 0.6, 0.2, 0.8, 50)
-    monkeypatch.setattr(planning, "PART", 7)
-    assert whole is not None and stopping(0.5, 0.6, 0.2, 0.8, 50) == whole
+def test_stopping_is_as_late_as_in_simulated_evaluations() -> None:
+    random, (lost, won) = np.random.default_rng(0), (0.2, 0.6)
+    stops = stopping(0.5, won, lost, 0.8, 50)
+    assert stops is not None
+    ended = []
+    for _ in range(300):
+        drawn = random.random(stops.most)
+        counts = np.cumsum(drawn < won), np.cumsum(drawn > 1 - lost)
+        decided = [n for n, (ones, zeros) in enumerate(zip(*counts, strict=True), 1) if excludes(0.5, ones, zeros)]
+        ended.append(decided[0] if decided else np.inf)
+    assert np.mean(np.isfinite(ended)) == pytest.approx(0.8, abs=0.08)
+    assert np.minimum(ended, stops.most).mean() == pytest.approx(stops.mean, rel=0.08)
 
 
 def test_the_command_prints_a_row_per_design(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

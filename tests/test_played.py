@@ -15,7 +15,7 @@ import toy_recordable as toy
 from command_line import here
 
 from vla.io.documents import MAX_BYTES
-from vla.parallel.pool import LocalCluster
+from vla.parallel.pool import Cluster
 from vla.rollouts.evaluate import evaluate
 from vla.rollouts.results import Report, Result
 from vla.runs.played import PLAYED, Played
@@ -190,7 +190,7 @@ def test_known_episodes_are_not_played_again(workers: int) -> None:
     known = {result.seed: result for result in expected.results[::2]}
     kept = list[Result]()
     report = evaluate(
-        *(toy.make_environment, toy.make_agent, None, SEEDS, LocalCluster(workers, "beside")),
+        *(toy.make_environment, toy.make_agent, None, SEEDS, Cluster(workers, "beside")),
         known=known,
         keep=kept.append,
     )

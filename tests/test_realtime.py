@@ -1,7 +1,8 @@
-"""Chunks that arrive late: which action acts at which step, over simulated networks and a real one."""
+"""Chunks that arrive late: which action acts at which step, over simulated networks and in real time."""
 
 from __future__ import annotations
 
+import time
 from contextlib import closing
 from dataclasses import replace
 from functools import partial
@@ -13,12 +14,22 @@ import toy
 from fake_batch import as_policy, make_act
 
 from vla.rollouts.evaluate import evaluate
-from vla.rollouts.realtime import Network, OverNetwork, RealTime, Schedule, SimulatedLink, make_over_network
+from vla.rollouts.realtime import (
+    BackgroundLink,
+    Network,
+    OverNetwork,
+    RealTime,
+    SimulatedLink,
+    averaged,
+    make_over_network,
+)
 from vla.rollouts.rollout import rollout
+from vla.schedule import Schedule
 from vla.spec import FIRST_SEED, Array, Observation
 
 # A plain arm: one component that moves it, an absolute position, which is also in the state, and a gripper.
 SPEC = replace(toy.SPEC, action=("move", "east", "gripper"), low=(-9.0, -9.0, -9.0), high=(9.0, 9.0, 9.0))
+SEEN = SPEC.random_observation(np.random.default_rng(0))
 
 
 def network_of(latency: float, jitter: float = 0.0, loss: float = 0.0, ensemble: float | None = None) -> Network:
@@ -29,9 +40,10 @@ def network_of(latency: float, jitter: float = 0.0, loss: float = 0.0, ensemble:
 class Counting:
     """Plans chunks of `chunk` actions, whose components are the number of the call + the place in the chunk / 100."""
 
-    def __init__(self, chunk: int, execute: int) -> None:
+    def __init__(self, chunk: int, execute: int, seconds: float = 0.0) -> None:
         self.info: dict[str, Any] = {}
-        self.execute, self._chunk = execute, chunk
+        self.execute, self._chunk, self._seconds = execute, chunk, seconds
+        self.calls = 0
 
     def reset(self, instruction: str, seed: int) -> None:
         """Start counting."""
@@ -42,41 +54,65 @@ class Counting:
         raise NotImplementedError
 
     def plan(self, observation: Observation) -> Array:
-        """The next chunk."""
+        """The next chunk; all but the first one take some time."""
+        time.sleep(self._seconds if self.calls else 0)
         self.calls += 1
         return (self.calls + np.arange(self._chunk)[:, None] / 100 + np.zeros(3)).astype(np.float32)
 
 
-def acted(
-    network: Network, chunk: int, execute: int, steps: int, seed: int = 0, hz: float | None = None
-) -> list[float]:
-    """The moves of `steps` steps; with `hz` they follow the clock."""
-    spec = replace(SPEC, control_hz=hz or SPEC.control_hz)
-    observation = SPEC.random_observation(np.random.default_rng(0))
-    with closing(OverNetwork(Counting(chunk, execute), network, spec, by_clock=hz is not None)) as agent:
-        agent.reset("", seed)
-        actions = [agent.act(observation) for _ in range(steps)]
+def moves(actions: list[Array]) -> list[float]:
+    """The first components of actions, of which the others are held where it is zero."""
     assert all(action.shape == (3,) and action.dtype == np.float32 for action in actions)
     assert all(np.all(action[1:] == (action[0] or action[1])) and action[1] for action in actions)  # held, not zero
     return [round(float(action[0]), 2) for action in actions]
 
 
-def test_without_latency_the_first_actions_of_each_chunk_act() -> None:
-    assert acted(network_of(0.0), 4, 2, 5) == [1.00, 1.01, 2.00, 2.01, 3.00]
+def acted(network: Network, chunk: int, execute: int, steps: int, seed: int = 0) -> list[float]:
+    agent = OverNetwork(Counting(chunk, execute), network, SPEC)
+    agent.reset("", seed)
+    return moves([agent.act(SEEN) for _ in range(steps)])
 
 
-def test_a_chunk_goes_on_until_the_next_arrives_which_skips_what_is_past() -> None:
-    # 10 Hz: the second observation, at step 2, is answered at step 4, of which two actions are past by then.
-    assert acted(network_of(0.2), 5, 2, 7) == [1.00, 1.01, 1.02, 1.03, 2.02, 2.03, 3.02]
-    assert acted(network_of(0.11), 5, 2, 7) == acted(
-        network_of(0.2), 5, 2, 7
-    )  # an answer between steps is for the later
+def test_a_schedule_tells_whose_action_is_due() -> None:
+    schedule = Schedule[str](0.5)
+    assert schedule.wants_plan(7.0, 1) and schedule.at(7.0) == [] and schedule.end == -np.inf
+    schedule.add("abc", 1.0)
+    schedule.add("ABC", 2.0)  # of an observation at 2.0, whenever it arrives
+    due = {at: schedule.at(at) for at in (0.0, 1.0, 1.49, 1.5, 2.0, 2.5, 3.49, 3.5)}
+    assert due == {**{0.0: ["a", "A"], 1.0: ["a", "A"], 1.49: ["a", "A"]}, **{1.5: ["b", "A"], 2.0: ["c", "A"]}} | {
+        2.5: ["B"],
+        3.49: ["C"],
+        3.5: [],
+    }
+    assert schedule.end == 3.5 and not schedule.wants_plan(2.9, 2) and schedule.wants_plan(3.0, 2)
+    schedule.clear()
+    assert schedule.newest is None
 
 
-def test_an_arm_without_actions_holds_and_its_plan_does_not_age() -> None:
-    assert acted(network_of(0.2), 1, 1, 7) == [1.00, 0, 0, 2.00, 0, 0, 3.00]
-    # Asked at step 2, out of actions at step 3 with one executed in between, answered at step 5.
-    assert acted(network_of(0.3), 3, 2, 7) == [1.00, 1.01, 1.02, 0, 0, 2.01, 2.02]
+@pytest.mark.parametrize(
+    ("network", "chunk", "execute", "expected"),
+    [
+        (network_of(0.0), 4, 2, [1.00, 1.01, 2.00, 2.01, 3.00]),
+        # 10 Hz: the second observation, at step 2, is answered at step 4, of which two actions are past by then.
+        (network_of(0.2), 5, 2, [1.00, 1.01, 1.02, 1.03, 2.02, 2.03, 3.02]),
+        (
+            network_of(0.11),
+            5,
+            2,
+            [1.00, 1.01, 1.02, 1.03, 2.02, 2.03, 3.02],
+        ),  # an answer between steps is for the later
+        # An arm without actions holds, and its plan does not age.
+        (network_of(0.2), 1, 1, [1.00, 0, 0, 2.00, 0, 0, 3.00]),
+        # Asked at step 2, out of actions at step 3 with one executed in between, answered at step 5.
+        (network_of(0.3), 3, 2, [1.00, 1.01, 1.02, 0, 0, 2.01, 2.02]),
+        # A chunk a step: of the third step there are three.
+        (network_of(0.0, ensemble=0.0), 3, 3, [1.00, 1.5, 2.01]),
+    ],
+)
+def test_a_chunk_goes_on_until_the_next_arrives_which_skips_what_is_past(
+    network: Network, chunk: int, execute: int, expected: list[float]
+) -> None:
+    assert acted(network, chunk, execute, len(expected)) == expected
 
 
 def test_jitter_and_loss_are_drawn_from_the_seed() -> None:
@@ -89,43 +125,36 @@ def test_jitter_and_loss_are_drawn_from_the_seed() -> None:
 
 
 def test_chunks_for_the_same_step_are_averaged_with_the_oldest_first() -> None:
-    schedule = Schedule(ensemble=0.5)
-    for value in (1.0, 2.0):
-        schedule.add(np.full((3, 1), value, np.float32), schedule.step)
-        last = schedule.next()
     weights = np.exp([0.0, -0.5])
-    assert last is not None and last == pytest.approx((weights[0] * 1 + weights[1] * 2) / weights.sum())
-    steps = [schedule.next() for _ in range(3)]
-    assert steps[0] == pytest.approx(last) and steps[1] == pytest.approx(2.0) and steps[2] is None
-    # A chunk a step: of the third step there are three.
-    assert acted(network_of(0.0, ensemble=0.0), 3, 3, 3) == [1.00, 1.5, 2.01]
+    mean = averaged([np.full(1, 1.0), np.full(1, 2.0)], 0.5)
+    assert mean == pytest.approx((weights[0] * 1 + weights[1] * 2) / weights.sum()) and mean.dtype == np.float32
 
 
 def test_an_evaluation_without_latency_is_that_of_the_policy_and_with_latency_repeatable() -> None:
-    policy = as_policy(make_act(chunk=4, execute=2))
-    expected = rollout(toy.make_environment(), as_policy(policy.model), FIRST_SEED)
-    here = rollout(toy.make_environment(), OverNetwork(as_policy(policy.model), network_of(0.0), toy.SPEC), FIRST_SEED)
-    np.testing.assert_array_equal(here.executed, expected.executed)
-    late = [
-        rollout(
-            toy.make_environment(),
-            OverNetwork(as_policy(policy.model), network_of(0.2, 0.1, 0.1), toy.SPEC),
-            FIRST_SEED,
-        )
-        for _ in range(2)
-    ]
-    np.testing.assert_array_equal(late[0].executed, late[1].executed)
-    assert not np.array_equal(late[0].executed, expected.executed)
+    model = make_act(chunk=4, execute=2)
+
+    def executed(network: Network) -> Array:
+        agent = OverNetwork(as_policy(model), network, toy.SPEC)
+        return rollout(toy.make_environment(), agent, FIRST_SEED).executed
+
+    expected = rollout(toy.make_environment(), as_policy(model), FIRST_SEED).executed
+    np.testing.assert_array_equal(executed(network_of(0.0)), expected)
+    late = executed(network_of(0.2, 0.1, 0.1))
+    np.testing.assert_array_equal(late, executed(network_of(0.2, 0.1, 0.1)))
+    assert not np.array_equal(late, expected)
 
 
 def test_by_the_clock_a_chunk_goes_on_while_the_next_one_is_under_way() -> None:
-    assert acted(network_of(0.0), 3, 3, 1, hz=1000.0) == [1.0]
-    # The first answer is waited for; whatever is sent afterwards is lost, and the arm holds.
-    assert acted(network_of(0.001, loss=1.0), 3, 2, 40, hz=1000.0) == [1.0, 1.01, 1.02, *[0.0] * 37]
-    # An answer that takes longer than the episode.
-    assert acted(network_of(0.3), 3, 1, 5, hz=1000.0) == [1.0, 1.01, 1.02, 0.0, 0.0]
-    moves = acted(network_of(0.2), 40, 2, 120, hz=100.0)
-    assert moves[0] == 1.0 and max(moves) > 2 and not np.isin([2.0, 3.0], moves).any()  # what is past is skipped
+    """The first answer is waited for; the second takes longer than the chunk, and then the arm holds."""
+    agent = Counting(3, 1, seconds=0.3)
+    with closing(BackgroundLink(agent.plan, 1000.0)) as link:
+        acting = RealTime(SPEC, link, lambda: 1, None)
+        assert moves([acting.act(SEEN) for _ in range(5)]) == [1.0, 1.01, 1.02, 0.0, 0.0]
+    agent = Counting(40, 2, seconds=0.2)
+    with closing(BackgroundLink(agent.plan, 100.0)) as link:
+        acting = RealTime(SPEC, link, lambda: 2, None)
+        found = moves([acting.act(SEEN) for _ in range(120)])
+    assert found[0] == 1.0 and max(found) > 2 and not np.isin([2.0, 3.0], found).any()  # what is past is skipped
 
 
 def test_latency_costs_steps_and_then_success() -> None:
@@ -144,17 +173,7 @@ def test_an_arm_that_waits_stands_still_and_keeps_its_grip() -> None:
     """What carries the load is called otherwise in another world, and has no unit either."""
     spec = replace(SPEC, action=("x", "y", "suction"), low=(-0.05, -0.05, -1.0))
     acting = RealTime(spec, SimulatedLink(lambda _: np.full((1, 3), 0.03), network_of(0.2), 10.0), lambda: 1, None)
-    seen = spec.random_observation(np.random.default_rng(0))
-    np.testing.assert_allclose([acting.act(seen) for _ in range(2)], [[0.03] * 3, [0, 0, 0.03]])
-
-
-def test_an_error_of_the_policy_is_one_of_the_episode() -> None:
-    def fail(observation: Observation) -> Array:
-        raise ValueError("the policy server failed")
-
-    acting = RealTime(SPEC, SimulatedLink(fail, network_of(0.1), 10.0), lambda: 1, None)
-    with pytest.raises(ValueError, match="server failed"):
-        acting.act(SPEC.random_observation(np.random.default_rng(0)))
+    np.testing.assert_allclose([acting.act(SEEN) for _ in range(2)], [[0.03] * 3, [0, 0, 0.03]])
 
 
 def test_an_agent_with_a_history_sees_every_frame() -> None:
@@ -162,7 +181,6 @@ def test_an_agent_with_a_history_sees_every_frame() -> None:
     agent.history = 2  # type: ignore[attr-defined]
     distant = OverNetwork(agent, network_of(0.0), SPEC)
     distant.reset("", 0)
-    observation = SPEC.random_observation(np.random.default_rng(0))
     for _ in range(4):
-        distant.act(observation)
+        distant.act(SEEN)
     assert agent.calls == 4

@@ -38,33 +38,22 @@ def test_what_was_written_is_read(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("file", "content", "says"),
     [
-        ("report.json", "[1]", r"report\.json is damaged or of another kind"),
-        ("report.json", "{}", r"report\.json is damaged or of another kind: .*Field required"),
         ("report.json", "{", r"report\.json is damaged or of another kind: .*JSON"),
         ("report.json", "[" * 10**6, r"report\.json is damaged .*recursion limit"),
-        ("report.json", changed(latency_ms=0), r"latency_ms: Input should be greater than 0"),
         ("report.json", changed(latency_ms=float("nan")), r"latency_ms: Input should be a finite number"),
         ("report.json", changed(seeds=[1]), r"per_episode has other episodes than seeds"),
-        ("report.json", changed(per_episode=[{"seed": "x", "outcome": 1}]), r"per_episode\[0\]\.seed: "),
         ("report.json", changed(conditions={"dark": 3}), r"conditions\.dark: "),
         ("config.yaml", "- 1", r"config\.yaml is damaged or of another kind: Input should be an object"),
         ("config.yaml", BOMB, r"config\.yaml is nested deeper than \d+ levels, or has aliases"),
-        ("config.yaml", "a: [" * 10**5, r"config\.yaml is nested deeper"),
         ("config.yaml", "# " + "x" * (2 << 20), r"config\.yaml has \d+ bytes, more than"),
         ("config.yaml", "a: !!python/object/apply:os.getcwd []", r"config\.yaml is no plain YAML"),
-        ("changes.yaml", "key: 1", r"changes\.yaml is damaged or of another kind"),
         ("changes.yaml", "- {key: 1, here: 2}", r"\[0\]\.key: .*; \[0\]\.default: Field required"),
-        ("training.json", "[]", r"training\.json is damaged or of another kind"),
         ("training.json", "{}", r"parameters: Field required"),
         ("training.json", changed(checkpoint="../../other"), r"checkpoint: Unexpected keyword"),
         ("metrics.csv", "epoch,train/loss\n0,1\n", r"metrics\.csv is damaged in line 1: there is no column step"),
         ("metrics.csv", "step,train/loss\n9,1\nten,2\n", r"metrics\.csv is damaged in line 3: .*'ten'"),
-        ("metrics.csv", "step,train/loss\n9,low\n", r"line 2: could not convert"),
         ("metrics.csv", "step,train/loss\n9,1,2\n", r"line 2: .*longer"),
         ("metrics.csv", "step,train/loss\n" + "9" * 30 + ",1\n", r"line 2: step is no count, but 9{30}"),
-        ("metrics.csv", "step,train/loss\n-1,1\n", r"line 2: step is no count, but -1"),
-        ("metrics.csv", "step,train/loss\n,1\n", r"line 2: step is no count"),
-        ("metrics.csv", "step,step\n1,1\n", r"line 1: there is no column step, or a column twice"),
         ("metrics.csv", "step,train/loss\n9," + "1" * 10**6, r"line 2: field larger"),
     ],
     ids=count(),
@@ -83,43 +72,23 @@ def test_a_file_of_another_kind_is_refused_by_name_with_a_way_out(
     assert "\n" not in told and len(told) < 1000 and not (tmp_path / "new").exists()
 
 
-@pytest.mark.parametrize(
-    ("config", "says"),
-    [
-        ({}, ""),
-        ({"task": 3, "model": [1], "collect": None, "trainer": "x"}, "config.task is not a mapping of names to values"),
-    ],
-)
-def test_a_report_without_a_configuration_is_shown_and_one_with_another_thing_is_refused(
-    config: dict[str, Any], says: str, tmp_path: Path
-) -> None:
+def test_a_report_without_a_configuration_is_shown(tmp_path: Path) -> None:
     folder, other = a_run(tmp_path / "run"), a_run(tmp_path / "other")
-    (folder / "config.yaml").write_text(json.dumps(config))
+    (folder / "config.yaml").write_text("{}")
     report = folder / "report.json"
-    report.write_text(json.dumps({**json.loads(report.read_text()), "config": config}))
-    if says:
-        with pytest.raises(ValueError, match=rf"report\.json .*{says}.*; remove the file, or repeat the run$"):
-            compared([folder, other], tmp_path)
-    else:
-        page = compared([folder, other], tmp_path).read_text()
-        assert page.count("100.0") >= 2  # the success of both
+    report.write_text(json.dumps({**json.loads(report.read_text()), "config": {}}))
+    assert compared([folder, other], tmp_path).read_text().count("100.0") >= 2  # the success of both
 
 
-def test_a_row_that_a_killed_process_left_half_is_skipped(tmp_path: Path) -> None:
-    (tmp_path / "metrics.csv").write_text("epoch,step,train/loss\n0,9,2.5\n0,1")
-    steps, values = read_run(tmp_path).metrics["train/loss"]
-    assert (steps.tolist(), values.tolist()) == ([9], [2.5])
-    (tmp_path / "metrics.csv").write_text("")
-    assert read_run(tmp_path).metrics == {}
-
-
-def test_points_that_are_no_number_are_not_drawn(tmp_path: Path) -> None:
-    curves = "step,train/loss,val/loss\n9,2.5,nan\n19,inf,\n29,-1e400,nan\n39,1.5,\n"
+def test_what_a_killed_process_left_half_and_points_that_are_no_number_are_not_drawn(tmp_path: Path) -> None:
+    curves = "step,train/loss,val/loss\n9,2.5,nan\n19,inf,\n29,-1e400,nan\n39,1.5,\n49"
     run = read_run(a_run(tmp_path / "run", curves=curves))
     assert {name: (at.tolist(), of.tolist()) for name, (at, of) in run.metrics.items()} == {
         "train/loss": ([9, 39], [2.5, 1.5])
     }
     assert "<svg" in compared([run.folder], tmp_path).read_text()
+    (run.folder / "metrics.csv").write_text("")
+    assert read_run(run.folder).metrics == {}
 
 
 def test_a_damaged_description_of_the_training_costs_no_evaluation(

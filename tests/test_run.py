@@ -23,7 +23,7 @@ import pytest
 import torch
 import warm
 import yaml
-from clusters import until
+from collecting import until
 from command_line import SMALL, here, vla
 from PIL import Image
 from rerun.chunk import RrdReader

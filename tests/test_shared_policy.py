@@ -16,7 +16,7 @@ from toy_telling import Telling
 
 from vla.models.flow import Flow
 from vla.models.model import Model
-from vla.parallel.pool import LocalCluster
+from vla.parallel.pool import Cluster
 from vla.rollouts.evaluate import evaluate
 from vla.rollouts.rollout import rollout
 from vla.rollouts.shared_policy import shared_policy
@@ -34,7 +34,7 @@ def test_reports_are_the_same_with_any_number_of_workers() -> None:
     policy = as_policy(make_bc(chunk=2), lanes=2)
     beside = evaluate(Telling, lambda world: policy, None, SEEDS)
     with shared_policy(lambda: policy) as agent:
-        reports = [evaluate(Telling, agent, None, SEEDS, LocalCluster(workers, "beside")) for workers in (1, 2, 4)]
+        reports = [evaluate(Telling, agent, None, SEEDS, Cluster(workers, "beside")) for workers in (1, 2, 4)]
     assert not beside.errors and reports == [beside] * 3
 
 

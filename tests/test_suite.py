@@ -12,7 +12,8 @@ from PIL import Image
 from rich.console import Console
 
 from vla.reports.result_tables import conditions_table, plot_conditions
-from vla.rollouts.results import Report, Result, compare_conditions
+from vla.rollouts.comparison import Comparison, compare_conditions
+from vla.rollouts.results import Report, Result
 from vla.spec import FIRST_SEED
 
 
@@ -22,8 +23,12 @@ def a_report(outcomes: str) -> Report:
     return Report(tuple(Result(FIRST_SEED + index, names[outcome]) for index, outcome in enumerate(outcomes)))
 
 
+def compared(first: str, second: str) -> Comparison:
+    return compare_conditions({"seen": a_report(first), "dark": a_report(second)}, 0.02)["dark"]
+
+
 def p_value(first: str, second: str) -> float:
-    return a_report(first).compare(a_report(second)).p
+    return compared(first, second).p
 
 
 def test_only_pairs_that_differ_count() -> None:
@@ -33,13 +38,13 @@ def test_only_pairs_that_differ_count() -> None:
     assert p_value("1e00", "1000") == 1.0
     # ten lost, none won: 2 / 2^10
     assert p_value("1" * 10, "0" * 10) == pytest.approx(2 / 1024)
-    told = a_report("1100e").compare(a_report("10101"))
+    told = compared("1100e", "10101")
     assert (told.difference, told.episodes, told.only_first, told.only_second) == (0, 4, 1, 1)
 
 
 def test_reports_on_different_seeds_are_not_compared() -> None:
     with pytest.raises(ValueError, match="same seeds"):
-        a_report("11").compare(a_report("1"))
+        compared("11", "1")
 
 
 def test_the_table_and_the_picture_show_every_condition(tmp_path: Path, figures: list[Figure]) -> None:

@@ -80,14 +80,10 @@ def test_workers_are_numbered() -> None:
     assert {*results(Numbered, *range(6))} == {0, 1}
 
 
-def test_an_error_that_cannot_be_sent_is_told_in_words() -> None:
-    one, error = results(Doubling, 1, 8)
+def test_an_error_or_result_that_cannot_be_sent_is_told_in_words_and_no_crash() -> None:
+    one, error, other = results(Doubling, 1, 8, 9)
     assert one == 2 and type(error) is RuntimeError and str(error) == "Awkward: eight is 8"
-
-
-def test_a_result_that_cannot_be_sent_is_no_crash() -> None:
-    one, error = results(Doubling, 1, 9)
-    assert one == 2 and not isinstance(error, Crashed) and "pickle" in str(error)
+    assert not isinstance(other, Crashed) and "pickle" in str(other)
 
 
 def test_a_process_that_is_killed_while_it_starts_is_replaced(tmp_path: Path) -> None:

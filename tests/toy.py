@@ -10,13 +10,14 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from vla.data.episodes import EpisodeStore
-from vla.parallel.pool import LocalCluster
+from vla.parallel.pool import Cluster
 from vla.rollouts.collect import collect
 from vla.spec import Array, Environment, Observation, RobotModel, Spec
 
@@ -172,39 +173,17 @@ class ToyExpert:
         return np.array([*(way + self._random.normal(0, self._noise, 2)), 1.0], np.float32)
 
 
-def make_environment() -> ToyEnvironment:
-    """The plain world."""
-    return ToyEnvironment()
-
-
-def make_arm() -> ToyEnvironment:
-    """The same with a robot and depth."""
-    return ToyEnvironment(spec=ARM_SPEC)
-
-
-def make_in_turn() -> ToyInTurn:
-    """A world whose seeds take tasks in turn."""
-    return ToyInTurn()
+make_environment = ToyEnvironment
+make_arm = partial(ToyEnvironment, spec=ARM_SPEC)
+make_in_turn = ToyInTurn
+make_slow_environment = partial(ToyEnvironment, seconds_per_step=0.005)  # long enough to be interrupted
+make_deadly_environment = partial(ToyEnvironment, deadly_seed=7)
+make_forgetful_environment = partial(ToyEnvironment, forgetful=True)
 
 
 def make_expert(environment: Environment) -> ToyExpert:
     """The expert of the plain world."""
     return ToyExpert()
-
-
-def make_slow_environment() -> ToyEnvironment:
-    """A world whose episodes take long enough to be interrupted."""
-    return ToyEnvironment(seconds_per_step=0.005)
-
-
-def make_deadly_environment() -> ToyEnvironment:
-    """A world that takes its process down with it at seed 7."""
-    return ToyEnvironment(deadly_seed=7)
-
-
-def make_forgetful_environment() -> ToyEnvironment:
-    """A world in which no episode can be replayed."""
-    return ToyEnvironment(forgetful=True)
 
 
 def make_lost_expert(environment: Environment) -> ToyExpert:
@@ -215,7 +194,7 @@ def make_lost_expert(environment: Environment) -> ToyExpert:
 def make_store(folder: Path, make: Callable[[], ToyEnvironment] = make_environment) -> EpisodeStore:
     """A store of the expert's first episodes."""
     store = EpisodeStore.create_or_open(folder, make().spec, {})
-    collect(store, make, make_expert, EPISODES, LocalCluster(1, "beside"), seed=0)
+    collect(store, make, make_expert, EPISODES, Cluster(1, "beside"), seed=0)
     return store
 
 

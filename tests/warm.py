@@ -26,8 +26,7 @@ from tempfile import TemporaryDirectory, mkdtemp
 from typing import Any, TextIO
 from unittest.mock import patch
 
-from vla.parallel.fast_exit import fast_exit
-from vla.parallel.processes import raise_gc_thresholds, without_triton
+from vla.parallel.processes import ease_garbage_collection, without_triton
 from vla.tasks.gl import choose_backend
 
 CONF = str(Path(__file__).parents[1] / "conf")
@@ -216,7 +215,7 @@ def compose_faster() -> None:
 
 def load() -> None:
     """Import the heavy libraries."""
-    raise_gc_thresholds()
+    ease_garbage_collection()
     choose_backend()
     without_triton()
     compose_faster()
@@ -264,5 +263,4 @@ def main(server: socket) -> None:
 
 
 if __name__ == "__main__":
-    with fast_exit():
-        main(socket(fileno=int(sys.argv[1])))
+    main(socket(fileno=int(sys.argv[1])))

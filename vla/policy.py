@@ -19,6 +19,7 @@ from vla.io.errors import UserError
 from vla.io.types import Count
 from vla.models.compile_cache import set_compile_cache
 from vla.models.model import Batch, Model
+from vla.schedule import Schedule
 from vla.spec import LONGEST_INSTRUCTION, Array, Observation, Spec
 
 LONG_SENTENCE = " ".join(["sentence"] * 24)  # shorter instructions are padded to it for a constant shape
@@ -33,7 +34,8 @@ class Lane:
     text: Tensor  # (1, L) its tokens
     random: torch.Generator  # of the noise of the model
     frames: deque[dict[str, Tensor]]  # encoded frames of the history, (1, 1, …) each, the newest last
-    chunk: deque[tuple[Array, dict[str, Any]]] = field(default_factory=deque)  # actions to execute, with their `info`
+    schedule: Schedule[tuple[Array, dict[str, Any]]] = field(default_factory=Schedule)  # actions with their `info`
+    step: int = 0  # number of executed actions
     info: dict[str, Any] = field(default_factory=dict)  # about the last action
 
 
@@ -112,7 +114,10 @@ class Policy:
 
     def looking(self, lane: int) -> bool:
         """Return whether the next action of a lane is not chosen yet, or its observation is part of a history."""
-        return not self._lanes[lane].chunk or self.history > 1
+        return self._wants_plan(lane) or self.history > 1
+
+    def _wants_plan(self, lane: int) -> bool:
+        return self._lanes[lane].schedule.wants_plan(self._lanes[lane].step, self.execute)
 
     @overload
     def act(self, observations: Observation | Mapping[str, Any]) -> Array: ...
@@ -131,11 +136,12 @@ class Policy:
             return self.act([_as_observation(observations, self.spec)], [0])[0]
         seen = self._followed(observations, lanes)
         self._observe({lane: each for lane, each in seen.items() if self.looking(lane)})
-        for lane, (actions, infos) in self._predict([lane for lane in lanes if not self._lanes[lane].chunk]).items():
-            self._lanes[lane].chunk.extend(list(zip(actions, infos, strict=True))[: self.execute])
+        for lane, (actions, infos) in self._predict([lane for lane in lanes if self._wants_plan(lane)]).items():
+            self._lanes[lane].schedule.add(list(zip(actions, infos, strict=True)), self._lanes[lane].step)
         chosen = []
         for state in (self._lanes[lane] for lane in lanes):
-            action, state.info = state.chunk.popleft()
+            action, state.info = state.schedule.at(state.step)[-1]
+            state.step += 1
             chosen.append(action)
         return np.stack(chosen)
 

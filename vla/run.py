@@ -33,8 +33,7 @@ from vla.deploy import ros
 from vla.io.errors import UserError
 from vla.io.printable import printable
 from vla.io.suggestion import suggestion
-from vla.parallel.fast_exit import fast_exit
-from vla.parallel.processes import raise_gc_thresholds, require_ranks, spin_briefly, without_triton
+from vla.parallel.processes import ease_garbage_collection, spin_briefly, without_triton
 from vla.runs.cells import describe_failures, save_failure
 
 PACKAGE = Path(__file__).resolve().parent
@@ -263,7 +262,7 @@ def _require_no_pickle(arguments: list[str]) -> None:
 
 def main() -> None:
     """Run the command line; errors that the user can fix end in one sentence unless HYDRA_FULL_ERROR=1."""
-    raise_gc_thresholds()
+    ease_garbage_collection()
     spin_briefly()
     sys.excepthook = lambda _, bug, __: sys.stderr.write(printable("".join(traceback.format_exception(bug))))
     os.environ.setdefault(TRACEBACKS, os.environ.get("HYDRA_FULL_ERROR", "0"))
@@ -271,7 +270,6 @@ def main() -> None:
     sys.argv[1:], ros.arguments[:] = ros.split_arguments(sys.argv[1:])
     try:
         _require_no_pickle(sys.argv[1:])
-        require_ranks()
         if sys.argv[1:] in (["--help"], ["-h"]):  # with further arguments Hydra composes the help itself
             print(_menu())
             return
@@ -285,5 +283,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    with fast_exit():
-        main()
+    main()

@@ -283,22 +283,18 @@ class Environment(Protocol):
 
     def reset(self, seed: int) -> Observation:
         """Start the episode of `seed`: the same seed gives the same episode, bit for bit."""
-        ...
 
     def step(self, action: Array) -> Observation:
         """Apply one (D,) action for one control period and return the next observation."""
-        ...
 
     def blind(self) -> AbstractContextManager[None]:
         """Return a context in which observations carry no images, which makes steps cheap.
 
         Later images do not depend on whether the context was used.
         """
-        ...
 
     def close(self) -> None:
         """Free the resources of the environment."""
-        ...
 
 
 class SpecOnly:
@@ -315,11 +311,10 @@ class Multitask(Protocol):
 
     def task_of(self, seed: int) -> str:
         """Return the task of the episode of `seed`; every task in `tasks` recurs within a few consecutive seeds."""
-        ...
 
 
 @runtime_checkable
-class InARow(Protocol):
+class MultiInstruction(Protocol):
     """Environment that gives several instructions in an episode, each when the one before is completed.
 
     It succeeds when all are completed, and fails as soon as one does.
@@ -330,42 +325,38 @@ class InARow(Protocol):
 
 
 @runtime_checkable
-class Traceable(Protocol):
+class HasTool(Protocol):
     """Environment that exposes the tool position, so that reports contain path length and smoothness."""
 
     @property
     def tool(self) -> Array:
         """(3,) true position of the tool centre point, or another point of the tool, in a fixed frame [m]."""
-        ...
 
 
 @runtime_checkable
-class Drawable(Protocol):
+class HasScene(Protocol):
     """Environment that a recorder can draw in three dimensions."""
 
     viewpoint: tuple[Point, Point]  # position of the viewer and the point looked at [m]
 
     def shapes(self) -> list[Shape]:
         """Return the visible solids of the current episode."""
-        ...
 
     def poses(self) -> dict[str, Array]:
         """Return body name → (7,) position [m] and quaternion wxyz in the world."""
-        ...
 
 
 @runtime_checkable
-class Eventful(Protocol):
+class HasEvents(Protocol):
     """Environment with events that the agent does not cause, such as disturbances; recordings mark their steps."""
 
     @property
     def events(self) -> Sequence[tuple[int, str]]:
         """Return (step, description) of every event so far; step is the observation just before or just after it."""
-        ...
 
 
 @runtime_checkable
-class Drivable(Protocol):
+class TakesJointTargets(Protocol):
     """Environment whose arm also takes joint targets, independently of control periods, like a robot driver."""
 
     def drive(self, joints: Array, opening: float, seconds: float) -> None:
@@ -374,37 +365,31 @@ class Drivable(Protocol):
         Raises:
             UserError: physics cannot step for so long.
         """
-        ...
 
     def judge(self) -> None:
         """Update the outcome after one control period of driving; the episode may end."""
-        ...
 
     def look(self) -> Observation:
         """Return the current observation."""
-        ...
 
 
 class Agent(Protocol):
     """Source of actions: an expert, a policy, a person.
 
-    One that also has `looks`, whether its next action may depend on the images, gets no others rendered: false while a
-    planned chunk is executed and no new instruction discards it; always for experts on the truth.
+    One that also has `looks`, whether its next action may depend on the images, gets no others rendered: False while a
+    planned chunk is executed and no new instruction discards it; always False for experts that read the truth.
     """
 
     @property
     def info(self) -> dict[str, Any]:
         """What is known about the last action, for recorders: "clean" (D,), "probabilities" (D, K)."""
-        ...
 
     def reset(self, instruction: str, seed: int) -> None:
         """Start an episode, or a new instruction within it, without history; `seed` initialises the random generator of
         the agent, if it has one."""
-        ...
 
     def act(self, observation: Observation, /) -> Array:
         """Return the (D,) float32 action to execute now."""
-        ...
 
 
 @runtime_checkable
@@ -413,7 +398,6 @@ class Agents(Protocol):
 
     def reset(self, instruction: str, seed: int, lane: int) -> None:
         """Start an episode, or a new instruction within it, in a lane; as of `Agent`."""
-        ...
 
     def act(self, observations: Sequence[Observation], lanes: Sequence[int], /) -> Array:
         """Return the actions (n, D) float32 to execute now in n lanes, given what each of them sees.
@@ -421,15 +405,12 @@ class Agents(Protocol):
         Raises:
             UserError: an observation does not fit; no lane has acted then.
         """
-        ...
 
     def about(self, lane: int) -> dict[str, Any]:
         """Return what is known about the last action of a lane, as `Agent.info`."""
-        ...
 
     def looking(self, lane: int) -> bool:
         """Return whether the next action of a lane may depend on the images, as `looks` of an `Agent`."""
-        ...
 
 
 @runtime_checkable
@@ -444,15 +425,12 @@ class Recorder(Protocol):
 
     def start(self, environment: Environment) -> None:
         """Begin an episode; one that has not ended is discarded."""
-        ...
 
     def step(self, observation: Observation, action: Array, info: Mapping[str, Any]) -> None:
         """Record one step: the observation and the (D,) action chosen for it."""
-        ...
 
     def end(self, episode: Episode) -> None:
         """Finish the episode."""
-        ...
 
 
 class Exporter(Protocol):
@@ -463,7 +441,6 @@ class Exporter(Protocol):
 
         Returns the path of the export.
         """
-        ...
 
 
 class PolicyExporter(Protocol):
@@ -471,7 +448,6 @@ class PolicyExporter(Protocol):
 
     def export_policy(self, policy: Any) -> Any:
         """Write a `vla.policy.Policy`; returns the path of the export."""
-        ...
 
 
 class Deployment(Protocol):
@@ -484,7 +460,6 @@ class Deployment(Protocol):
 
     def run(self) -> Any:
         """Run until finished or interrupted; returns a `vla.rollouts.results.Report` if success was measured."""
-        ...
 
 
 def readable(unit: str) -> tuple[float, str]:

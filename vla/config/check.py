@@ -77,7 +77,6 @@ PLAIN: dict[str, Any] = {
         "without": Annotated[list[Literal["images", "instruction"]], Predicate(unique)],
         "nearest": Text | None,
         "networks": dict[str, object],
-        "by_clock": bool,
     },
 }
 

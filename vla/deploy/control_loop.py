@@ -63,10 +63,9 @@ class ControlLoop:
         self.state, self.reason = State.WAITING, "no joint state yet"
         self.instruction, self._instructed_at, self._said_at = "", 0.0, -np.inf
         self.late_plans, self.rejections, self.handed_over = 0, 0, False
-        self.motion = Motion(self.limits, self.tick, self.goals.workspace)
+        self.motion = Motion(self.limits, self.tick, 1 / self.spec.control_hz, self.goals.workspace)
         self._observer, self._tracking = Observer(self.spec), Tracking(self.safety, self._follows_positions)
         self._pending: _Pending | None = None
-        self._next_inference = -np.inf
         self.observed_at = -np.inf  # time stamp of the last observation
         self.resumed = True  # True if the last observation is the first since the loop started to run
         self._last_observed = -np.inf  # as `observed_at`, but reset whenever the loop stops running
@@ -160,10 +159,10 @@ class ControlLoop:
 
     def next_observation(self, now: float) -> Observation | None:
         """Return the observation for the policy if an inference is due; then call `set_plan` or `reject_plan`."""
-        observed = self._observer.due(self._last_observed, self._next_inference)
+        observed = self._observer.due(self._last_observed, self.motion.schedule.end)
         if self.state is not State.RUNNING or self._pending is not None or observed is None:
             return None
-        if self.motion.schedule and now > self.motion.schedule[-1][0] + 0.5 / self.spec.control_hz:
+        if self.motion.schedule.newest and now > self.motion.schedule.end + 0.5 / self.spec.control_hz:
             self.late_plans += 1
         # Anchor on the pose commanded at that time. The measured pose lags behind it; the last goal runs ahead of an
         # arm that its limits slow down, and the policy would overshoot.
@@ -187,7 +186,7 @@ class ControlLoop:
         except UserError as error:
             return self._count_rejection(str(error))
         if self.state is State.RUNNING and not pending.outdated:
-            self.rejections, self._next_inference = 0, waypoints[-1][0]
+            self.rejections = 0
             # An arm that does not follow its commands is where it is measured, not where it was commanded.
             measured = None if self._follows_positions else self._observer.newest
             self.motion.follow(waypoints, None if measured is None else measured.joints)
@@ -215,7 +214,7 @@ class ControlLoop:
     @property
     def acting(self) -> bool:
         """Whether the arm executes actions of the policy."""
-        return bool(self.motion.schedule)
+        return self.motion.schedule.newest is not None
 
     def _supervise(self, now: float) -> None:
         """Change the state if an input is missing, late or invalid, or fresh again."""
@@ -280,6 +279,5 @@ class ControlLoop:
     def _drop_plans(self) -> None:
         """Brake until the next plan, and ignore an inference under way: it answers an observation of before."""
         self.motion.follow([])
-        self._next_inference = -np.inf
         if self._pending is not None:
             self._pending.outdated = True

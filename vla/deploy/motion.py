@@ -19,6 +19,7 @@ from vla.io.errors import UserError
 from vla.io.types import Point
 from vla.robots.cartesian import CartesianController
 from vla.robots.controllers import controller_for, gripper_index
+from vla.schedule import Schedule
 from vla.spec import Array, Spec
 
 Waypoint = tuple[float, Array, float | None]  # when due, goal of the joints (J,) [rad], opening
@@ -123,11 +124,11 @@ class Goals:
 class Motion:
     """The commanded state of an arm: it moves along a schedule, and brakes without one."""
 
-    def __init__(self, limits: JointLimits, tick: float, workspace: _Workspace | None) -> None:
-        """Args: limits of the joints; time between commands [s]; box of the tool point, if there is one."""
+    def __init__(self, limits: JointLimits, tick: float, period: float, workspace: _Workspace | None) -> None:
+        """Args: limits of the joints; time between commands [s]; of an action [s]; box of the tool point, if any."""
         self.limiter, self.tick = JointLimiter(limits, tick), tick
-        self._workspace = workspace
-        self.schedule: list[Waypoint] = []  # without those that are past, but for the last one
+        self._workspace, self._period = workspace, period
+        self.schedule = Schedule[Waypoint](period)
         self._opening: float | None = 1.0
         self._commanded: deque[tuple[float, Array]] = deque()  # at, joints
         # Trajectory that an arm executes by itself: since when, its commands, and whether it is still to be followed.
@@ -151,11 +152,13 @@ class Motion:
         self.limiter.hold(measured)
         self._sent, self._sent_valid = None, False
 
-    def follow(self, schedule: list[Waypoint], position: Array | None = None) -> None:
-        """Replace the schedule; its first goal is approached from the commanded position, or from another (J,)."""
+    def follow(self, plan: list[Waypoint], position: Array | None = None) -> None:
+        """Replace what is planned; the first goal is approached from the commanded position, or from another (J,)."""
         if position is not None:
             self.limiter.position = np.array(position, float)
-        self.schedule, self._sent_valid = schedule, False
+        self.schedule, self._sent_valid = Schedule[Waypoint](self._period), False
+        if plan:
+            self.schedule.add(plan, plan[0][0] - self._period)
 
     def set_limits(self, limits: JointLimits) -> None:
         """Replace the limits."""
@@ -170,7 +173,7 @@ class Motion:
         if self._sent is not None:
             self._recall(*self._sent, now)
         if not self._sent_valid:
-            self._opening = self._step(self.limiter, self.schedule, now, self._opening)
+            self._opening = self._step(self.limiter, now, self._opening)
         self._record(now)
         return _command(self.limiter, self._opening)
 
@@ -181,11 +184,11 @@ class Motion:
             now: the time of this tick [s].
             longest: time [s] after which the arm brakes, if the schedule has not ended before.
         """
-        limiter, schedule, opening = copy.copy(self.limiter), list(self.schedule), self._opening
-        commands, until = [], min(now + longest, schedule[-1][0] if schedule else now)
+        limiter, opening = copy.copy(self.limiter), self._opening
+        commands, until = [], min(now + longest, self.schedule.end)
         while now < until:
             now += self.tick
-            opening = self._step(limiter, schedule, now, opening)
+            opening = self._step(limiter, now, opening)
             commands.append(_command(limiter, opening))
         while not limiter.resting or not commands:
             limiter.brake()
@@ -213,15 +216,14 @@ class Motion:
         self.limiter.position, self.limiter.velocity = planned.position.copy(), planned.velocity.copy()
         self._opening = planned.opening
 
-    def _step(self, limiter: JointLimiter, schedule: list[Waypoint], now: float, opening: float | None) -> float | None:
+    def _step(self, limiter: JointLimiter, now: float, opening: float | None) -> float | None:
         """Move towards the next goal within limits and workspace, or brake; returns the opening to command."""
-        if not schedule:
+        plan = self.schedule.newest
+        if plan is None:
             limiter.brake()
             return opening
-        # Goals that are already due are skipped, but the last one is held.
-        while len(schedule) > 1 and schedule[0][0] <= now:
-            schedule.pop(0)
-        end, goal, opening = schedule[0]
+        # Goals that are already due are skipped, but the last one is held until the next plan.
+        end, goal, opening = (self.schedule.at(now) or [plan.actions[-1]])[-1]
         if self._workspace is None:
             limiter.step(goal, end - now)
         else:

@@ -20,7 +20,7 @@ from vla.deploy.joint_limiter import JointLimits
 from vla.deploy.messages import SimulatedEpisode
 from vla.deploy.settings import Topics
 from vla.io.errors import UserError
-from vla.spec import LONGEST_INSTRUCTION, Array, Drivable, Environment, InARow
+from vla.spec import LONGEST_INSTRUCTION, Array, Environment, MultiInstruction, TakesJointTargets
 
 
 class SimulatorNode(Node):
@@ -38,17 +38,17 @@ class SimulatorNode(Node):
         command_timeout: float,
         seed: int,
     ) -> None:
-        """Args: a `Drivable` environment; its arm; topics; rates of joints and cameras [Hz]; time-out of commands [s];
-        seed of the first episode.
+        """Args: an environment that `TakesJointTargets`; its arm; topics; rates of joints and cameras [Hz]; time-out of
+        commands [s]; seed of the first episode.
 
         Raises:
-            UserError: the environment has no robot, is not `Drivable`, or gives several instructions in a row, or a
-                control step is not a whole number of ticks.
+            UserError: the environment has no robot, is not `TakesJointTargets`, or gives several instructions in a
+                row, or a control step is not a whole number of ticks.
         """
         self._model = environment.spec.require_robot("deploy=simulator")
-        if not isinstance(environment, Drivable):
+        if not isinstance(environment, TakesJointTargets):
             raise UserError(
-                f"deploy=simulator needs an environment that is Drivable, {type(environment).__name__} is not"
+                f"deploy=simulator needs an environment that is TakesJointTargets, {type(environment).__name__} is not"
             )
         control_hz = environment.spec.control_hz
         self._ticks_per_step = round(rates[0] / control_hz)
@@ -76,7 +76,7 @@ class SimulatorNode(Node):
         """Start the next episode."""
         self.seed += 1
         self.instruction = self.environment.reset(self.seed).instruction
-        if isinstance(self.environment, InARow) and self.environment.instructions > 1:
+        if isinstance(self.environment, MultiInstruction) and self.environment.instructions > 1:
             raise UserError("deploy=simulator waits for one instruction per episode: set task.goal.length=1")
         self._target = self._hold_command()
         self._commanded_at: float | None = None

@@ -16,18 +16,16 @@ from vla.spec import FIRST_SEED, Array, Environment, Observation
 class DmEnvironment(dm_env.Environment):
     """Adapter of an `Environment` to dm_env.
 
-    An observation is a dictionary: one image per camera, (H, W, 3) uint8, the `state` (P,) float32 and the
-    `instruction`, an array of one string. The reward is 1 for the step that succeeds, otherwise 0. The discount is 0
-    after success and 1 if an episode ends at its time limit.
+    An observation is that of `vla.envs.gym.GymEnvironment`, with the `instruction` as an array of one string. The
+    reward is 1 for the step that succeeds, otherwise 0. The discount is 0 after success and 1 if an episode ends at its
+    time limit.
     """
 
     def __init__(self, environment: Environment, random_state: int | np.random.RandomState | None = None) -> None:
-        """Args: the environment to wrap; source of the episodes' seeds, which are below those of evaluation."""
-        self.environment = environment
-        if not isinstance(random_state, np.random.RandomState):
-            random_state = np.random.RandomState(random_state)
-        self.random_state = random_state
-        self._over = True
+        """Wrap an environment; `random_state` draws the seeds of episodes, which are below those of evaluation."""
+        self.environment, self._over = environment, True
+        given = isinstance(random_state, np.random.RandomState)
+        self.random_state = random_state if given else np.random.RandomState(random_state)
 
     def reset(self, seed: int | None = None) -> TimeStep:
         """Start the episode of `seed`, or of a random seed."""
@@ -40,8 +38,8 @@ class DmEnvironment(dm_env.Environment):
         if self._over:
             return self.reset()
         observation = _arrays(self.environment.step(action))
-        success, self._over = self.environment.outcome == "success", self.environment.done
-        if success:
+        self._over = self.environment.done
+        if self.environment.outcome == "success":
             return dm_env.termination(1.0, observation)
         return dm_env.truncation(0.0, observation) if self._over else dm_env.transition(0.0, observation)
 
@@ -70,6 +68,5 @@ def load(task: str, random_state: int | np.random.RandomState | None = None, **o
     return DmEnvironment(make_environment(compose_task(task, **overrides)), random_state)
 
 
-def _arrays(observation: Observation) -> dict[str, Array]:
-    instruction = np.array(observation.instruction, dtype=object)
-    return {**observation.rgb, "state": observation.state, "instruction": instruction}
+def _arrays(seen: Observation) -> dict[str, Array]:
+    return {**seen.rgb, "state": seen.state, "instruction": np.array(seen.instruction, dtype=object)}

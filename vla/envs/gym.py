@@ -38,7 +38,7 @@ class GymEnvironment(gymnasium.Env[dict[str, Any], Array]):
     metadata = {"render_modes": ["rgb_array"]}  # noqa: RUF012
 
     def __init__(self, environment: Environment, render_mode: str | None = None) -> None:
-        """Args: the environment to wrap; with "rgb_array", `render` returns the images of all cameras side by side."""
+        """Wrap an environment; with "rgb_array", `render` returns the images of all cameras side by side."""
         self.environment, self.render_mode = environment, render_mode
         spec = environment.spec
         self.metadata = {**self.metadata, "render_fps": round(spec.control_hz)}
@@ -90,5 +90,5 @@ class Task(GymEnvironment):
     """A task of the config as a gymnasium environment."""
 
     def __init__(self, task: str, render_mode: str | None = None, **overrides: Any) -> None:
-        """Args: see `vla.config.compose.compose_task` and `GymEnvironment`."""
+        """Build an option of the group `task`; see `vla.config.compose.compose_task` and `GymEnvironment`."""
         super().__init__(make_environment(compose_task(task, **overrides)), render_mode)

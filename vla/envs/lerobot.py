@@ -11,7 +11,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import gymnasium
 import numpy as np
 from gymnasium.spaces import Box, Dict
 
@@ -24,25 +23,22 @@ TASK = "task"  # the instructions
 AGENT = {STATE: "agent_pos", RATES: "velocities"}  # what an environment calls them, before LeRobot renames them
 
 
-class LeRobotEnvironment(gymnasium.Wrapper[dict[str, Any], Array, dict[str, Any], Array]):
+class LeRobotEnvironment(Task):
     """A task of the config as the environments that LeRobot evaluates policies in.
 
     An observation has `pixels`, camera → (H, W, 3) uint8, `agent_pos`, the pose, and `velocities`, the rates of change,
     if the state has any, both float32. `info` has `is_success` only.
-
-    Args:
-        task: an option of the group `task`.
-        longest: number of steps after which LeRobot ends an episode that has not ended itself.
-        options: options and values of the task, see `vla.config.compose.compose_task`.
     """
 
     def __init__(self, task: str, longest: int, options: Mapping[str, Any]) -> None:
-        inner = Task(task, "rgb_array", **options)
-        super().__init__(inner)
-        self.vla_spec, self._world = inner.environment.spec, inner.environment
+        """Build an option of the group `task` with `options`, see `vla.config.compose.compose_task`.
+
+        LeRobot ends an episode that has not ended itself after `longest` steps.
+        """
+        super().__init__(task, "rgb_array", **options)
+        self.vla_spec = self.environment.spec
         self._max_episode_steps = longest
-        self.task_description = ""  # instruction of the episode
-        self.task = ""
+        self.task_description = self.task = ""  # instruction and task of the episode
         image = Box(0, 255, (*self.vla_spec.image_size, 3), np.uint8)
         vectors = {AGENT[key]: Box(-np.inf, np.inf, (len(part),)) for key, part in _parts(self.vla_spec).items()}
         self.observation_space = Dict({"pixels": Dict(dict.fromkeys(self.vla_spec.cameras, image)), **vectors})
@@ -54,20 +50,17 @@ class LeRobotEnvironment(gymnasium.Wrapper[dict[str, Any], Array, dict[str, Any]
 
         Without a seed one is drawn.
         """
-        asked = int(self.np_random.integers(FIRST_SEED)) if seed is None else seed
-        observation, info = self.env.reset(seed=asked + FIRST_SEED * (asked < FIRST_SEED), options=options)
-        return self._renamed(observation), _success(info)
+        given = int(self.np_random.integers(FIRST_SEED)) if seed is None else seed
+        return super().reset(seed=given + FIRST_SEED * (given < FIRST_SEED), options=options)
 
-    def step(self, action: Array) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
-        """Apply one (D,) action for one control period."""
-        observation, reward, terminated, truncated, info = self.env.step(action)
-        return self._renamed(observation), float(reward), terminated, truncated, _success(info)
+    def _arrays(self, observation: Observation) -> dict[str, Any]:
+        seen = super()._arrays(observation)
+        self.task_description, self.task = observation.instruction, self.environment.task
+        vectors = {AGENT[key]: seen["state"][part] for key, part in _parts(self.vla_spec).items()}
+        return {"pixels": {camera: seen[camera] for camera in self.vla_spec.cameras}, **vectors}
 
-    def _renamed(self, observation: dict[str, Any]) -> dict[str, Any]:
-        self.task_description = observation["instruction"]
-        self.task = self._world.task
-        vectors = {AGENT[key]: observation["state"][part] for key, part in _parts(self.vla_spec).items()}
-        return {"pixels": {camera: observation[camera] for camera in self.vla_spec.cameras}, **vectors}
+    def _info(self) -> dict[str, Any]:
+        return {"is_success": self.environment.outcome == "success"}
 
 
 def arrays(observation: Observation, spec: Spec) -> dict[str, Array]:
@@ -112,10 +105,6 @@ def observations(batch: Mapping[str, Any], spec: Spec) -> list[Observation]:
 def _parts(spec: Spec) -> dict[str, list[int]]:
     """Return key of a vector → indices of its components in the state."""
     return {STATE: spec.pose, **({RATES: spec.rates} if spec.rates else {})}
-
-
-def _success(info: dict[str, Any]) -> dict[str, Any]:
-    return {"is_success": info["is_success"]}
 
 
 def _pixels(images: Array) -> Array:

@@ -24,11 +24,12 @@ from vla.policy import costs
 from vla.reports.evaluation import plot_report, write_report
 from vla.reports.result_tables import SecondaryRows, conditions_table, plot_conditions, secondary_table
 from vla.reports.run_page import write_page
+from vla.rollouts.comparison import compare_conditions, compare_secondary_metrics
 from vla.rollouts.evaluate import RecorderFactory, evaluate
-from vla.rollouts.memory import make_nearest, make_without, open_memory
+from vla.rollouts.memorisation import make_nearest, make_without, open_memory
 from vla.rollouts.realtime import Network, make_over_network
 from vla.rollouts.recordings import clear, keep_recordings
-from vla.rollouts.results import Report, compare_conditions, compare_secondary_metrics
+from vla.rollouts.results import Report
 from vla.rollouts.rollout import AgentFactory
 from vla.rollouts.shared_policy import shared_policy
 from vla.rollouts.statements import AgainstBar, AgainstRun, Statement, differs_clearly
@@ -104,8 +105,6 @@ def require_possible(experiment: Experiment) -> None:
     _require_unseen(experiment)
     _statements(experiment)
     _networks(experiment)
-    if experiment["evaluate"]["by_clock"] and not experiment["evaluate"]["networks"]:
-        raise UserError("evaluate.by_clock is about evaluate.networks, and there are none: add evaluate=latency")
     if not experiment.playable and experiment["evaluate"]["conditions"]:
         raise UserError("evaluate.conditions change a world, and a recording has none: omit them")
     if (folder := experiment["evaluate"]["nearest"]) is not None:
@@ -258,7 +257,7 @@ def _play(
     """
     asked, task = experiment["evaluate"], experiment["task"]
     seeds: Sequence[int] = range(asked["seed"], asked["seed"] + asked["episodes"])
-    cluster, needs = experiment.cluster(), [checkpoint.resolve()] if checkpoint else []
+    cluster = experiment.cluster()
     named = (experiment["agent"] or {}).get("folder")
     here = experiment["cluster"].get("policy") == "here"  # then lanes are workers
     lanes = 1 if here else (experiment["policy"] or {}).get("lanes", 1)
@@ -270,13 +269,8 @@ def _play(
     recorder = experiment.make_recorder(recordings)
     if recorder:
         recordings.mkdir(exist_ok=True)
-        needs.append(recordings)
     if not len(kept):
         clear(recordings)
-    if asked["nearest"]:
-        needs.append(Path(asked["nearest"]).resolve())
-    if folder:
-        needs.append(folder)
 
     def played(
         name: str,
@@ -289,9 +283,7 @@ def _play(
         environment, wanted = experiment.make_environment(changes), asked["recordings"]
         until = until if asked["until"] else None
         known, keep = kept.of(name), partial(kept.add, name)
-        report = evaluate(
-            environment, agent, recorder, seeds, cluster, name, needs, until, wanted, turns, known, keep, lanes
-        )
+        report = evaluate(environment, agent, recorder, seeds, cluster, name, until, wanted, turns, known, keep, lanes)
         return replace(report, tiers=task.get("tiers") or {})  # of worlds that have them
 
     world = experiment.world() if asked["until"] else None
@@ -312,10 +304,7 @@ def _other_agents(experiment: Experiment, make_agent: AgentFactory) -> dict[str,
     the nearest demonstration."""
     asked = experiment["evaluate"]
     impaired = {f"without_{each}": partial(make_without, make_agent, each) for each in asked["without"]}
-    distant = {
-        name: partial(make_over_network, make_agent, network, by_clock=asked["by_clock"])
-        for name, network in _networks(experiment).items()
-    }
+    distant = {name: partial(make_over_network, make_agent, network) for name, network in _networks(experiment).items()}
     folder = asked["nearest"]
     replayed = {NEAREST: partial(make_nearest, Path(folder).resolve())} if folder else {}
     return {**impaired, **replayed, **distant}

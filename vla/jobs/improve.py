@@ -180,11 +180,10 @@ def _labelled(experiment: Experiment, checkpoint: Path, folder: Path, seed: int)
     world = environment()
     world.close()
     store = EpisodeStore.create_or_open(folder, world.spec, own, experiment.codec)
-    cluster, needs = experiment.cluster(), [checkpoint.resolve()]
     with policy_for_workers(experiment, checkpoint) as policy:
         assert policy is not None, "there is a checkpoint"
         agent = partial(make_supervised, policy, experiment.make_expert(), asked["beta"], asked["segment"])
-        collect(store, environment, agent, asked["episodes"], cluster, seed, keep_failures=True, needs=needs)
+        collect(store, environment, agent, asked["episodes"], experiment.cluster(), seed, keep_failures=True)
     return EpisodeStore(folder)
 
 

@@ -16,10 +16,9 @@ from vla.io.errors import UserError
 from vla.io.printable import show
 from vla.io.types import Share, Text
 from vla.reports.comparison import common_episodes, read_runs
-from vla.rollouts.comparison import compare_pairs
+from vla.rollouts.comparison import compare_pairs, pairs_of
 from vla.rollouts.planning import (
     MOST,
-    SIMULATIONS,
     Stopping,
     episodes_needed,
     power_for_bar,
@@ -27,7 +26,7 @@ from vla.rollouts.planning import (
     power_of_samples,
     stopping,
 )
-from vla.rollouts.results import Result, pairs_of
+from vla.rollouts.results import Result
 from vla.rollouts.sequential import decided_after
 from vla.spec import IN_DISTRIBUTION
 
@@ -56,9 +55,8 @@ def run(experiment: Experiment) -> None:
     share = sum(one.success != two.success for one, two in common) / len(common) if common else asked["discordant"]
     show(plan_table(one, other, asked["power"], share))
     show(
-        "Without early stopping the numbers are exact. With it, they and the false-positive rate come from "
-        f"{SIMULATIONS} simulated evaluations, at the same power. evaluate.until=decided "
-        "also stops when two policies differ by less than evaluate.margin: set that below the difference."
+        "All numbers are exact; those with early stopping are for the same power. evaluate.until=decided also stops "
+        "when two policies differ by less than evaluate.margin: set that below the difference."
     )
     if common:
         show(_replayed(common, experiment["evaluate"]["margin"]))

@@ -1,1 +1,1 @@
-"""Parallel work: in processes of this machine, or on the workers of a Dask cluster."""
+"""Parallel work in processes of this machine."""

@@ -1,7 +1,7 @@
-"""The worker pool of collection, evaluation and exports: its interface and its implementation on this machine.
+"""The worker pool of collection, evaluation and exports.
 
 Every process creates its own worker at its first item and keeps it. A result depends on its item alone, so it is the
-same on every machine.
+same with any number of workers.
 """
 
 from __future__ import annotations
@@ -11,12 +11,11 @@ import logging
 import pickle
 import signal
 import threading
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from concurrent import futures
-from contextlib import AbstractContextManager, closing, contextmanager
+from contextlib import closing, contextmanager
 from multiprocessing import resource_tracker
-from pathlib import Path
-from typing import Any, Literal, Protocol
+from typing import Any, Literal
 
 from vla.io.errors import UserError
 from vla.io.types import Count
@@ -27,100 +26,65 @@ log = logging.getLogger(__name__)
 
 
 class WorkersLost(UserError):
-    """Loss of workers that crashed, were killed or became unreachable; a retry with new ones may succeed."""
+    """Loss of workers that crashed or were killed; a retry with new ones may succeed."""
 
 
 class Crashed(WorkersLost):
     """Crash of every process that attempted one item; other items are not affected."""
 
 
-class Future(Protocol):
-    """Pending result of one item."""
-
-    def result(self) -> Any:
-        """Wait for the result; raises the error of the worker factory or of the attempt, or `WorkersLost`."""
-        ...
-
-    def cancel(self) -> object:
-        """Drop the item if nobody has begun with it."""
-        ...
-
-
-class Pool(Protocol):
-    """Workers that process items in parallel."""
-
-    @property
-    def size(self) -> int:
-        """Current number of workers, at least one."""
-        ...
-
-    def submit(self, item: Any) -> Future:
-        """Submit an item."""
-        ...
-
-    def as_completed(self, pending: Iterable[Any]) -> Iterator[Any]:
-        """Yield futures as they complete."""
-        ...
-
-
-class Cluster(Protocol):
-    """Machines that workers run on."""
-
-    def pool(self, make: WorkerFactory, needs: Sequence[Path] = ()) -> AbstractContextManager[Pool]:
-        """Run workers for the duration of the context.
-
-        Args:
-            make: factory of a worker, called once in every process.
-            needs: absolute paths of the files and folders that workers read or write.
-        """
-        ...
-
-
-class LocalCluster:
+class Cluster:
     """Spawned processes of this machine; a single worker runs in this process."""
 
     def __init__(self, workers: Count | None, policy: Literal["beside", "here"]) -> None:
-        """Args:
-        workers: their number; None: one per core.
-        policy: whether a policy runs beside each worker, or here, in this process, once for all of them.
+        """Describe the workers; they are started by `pool`.
+
+        Args:
+            workers: their number; None: one per core.
+            policy: whether a policy runs beside each worker, or here, in this process, once for all of them.
         """
         self.workers, self.policy = workers or cores(), policy
 
     @contextmanager
-    def pool(self, make: WorkerFactory, needs: Sequence[Path] = ()) -> Iterator[Pool]:
-        """See `Cluster`."""
+    def pool(self, make: WorkerFactory) -> Iterator[Pool]:
+        """Run workers for the duration of the context; `make` is called once in every process."""
         with one_thread_each():
             if self.workers == 1:
                 with closing(make()) as worker:
-                    yield _SerialPool(worker)
+                    yield SerialPool(worker)
             else:
                 with ProcessPool(make, self.workers) as pool:
                     yield pool
 
 
-THIS_PROCESS = LocalCluster(1, "beside")
+THIS_PROCESS = Cluster(1, "beside")
 
 
-class _SerialPool:
+class SerialPool:
+    """A pool of one worker in this process, whose futures compute their result when asked for it."""
+
     size = 1
 
     def __init__(self, worker: Worker) -> None:
         self._worker = worker
 
-    def submit(self, item: Any) -> Future:
-        return _LazyResult(self._worker, item)
+    def submit(self, item: Any) -> LazyFuture:
+        """Submit an item."""
+        return LazyFuture(self._worker, item)
 
     def as_completed(self, pending: Iterable[Any]) -> Iterator[Any]:
+        """Yield futures in their order."""
         return iter(pending)
 
 
-class _LazyResult:
+class LazyFuture:
     """Future that computes its result on demand."""
 
     def __init__(self, worker: Worker, item: Any) -> None:
         self._worker, self._item = worker, item
 
     def result(self) -> Any:
+        """Return the result; raises the error of the attempt."""
         return self._worker.attempt(self._item)
 
     def cancel(self) -> None:
@@ -152,7 +116,7 @@ class ProcessPool:
         return self._threads.submit(self._attempt, item)
 
     def as_completed(self, pending: Iterable[Any]) -> Iterator[Any]:
-        """See `Pool`."""
+        """Yield futures as they complete."""
         return futures.as_completed(pending)
 
     def __enter__(self) -> ProcessPool:
@@ -160,17 +124,20 @@ class ProcessPool:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        """End all processes: after their current item on normal exit, at once after an exception."""
-        with _interrupts_deferred(again=kind is None):
-            with self._lock:
-                self._closed = True
-            for process in self._processes if kind else ():
+        """End all processes: after their current item on normal exit, at once after an exception or Ctrl-C."""
+        with self._lock:
+            self._closed = True
+        try:
+            if kind is None:
+                self._threads.shutdown(cancel_futures=True)
+                for process in self._processes:
+                    process.dismiss()
+                for process in self._processes:
+                    process.join()
+        finally:
+            for process in self._processes:
                 process.kill()
             self._threads.shutdown(cancel_futures=True)
-            for process in self._processes:
-                process.dismiss()
-            for process in self._processes:
-                process.join()
 
     def _enter_thread(self) -> None:
         # Processes inherit the signal mask of the thread that starts them; starting the tracker would reset it.
@@ -211,17 +178,5 @@ class ProcessPool:
         return self._own.process
 
 
-@contextmanager
-def _interrupts_deferred(again: bool) -> Iterator[None]:
-    """Suppress Ctrl-C within the context; with `again` it is raised at the end."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    received: list[int] = []
-    before = signal.signal(signal.SIGINT, lambda number, frame: received.append(number))
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, before)
-    if received and again:
-        signal.raise_signal(signal.SIGINT)
+Pool = SerialPool | ProcessPool
+Future = LazyFuture | futures.Future[Any]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import gc
 import logging
 import os
@@ -17,17 +18,12 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any, Protocol
 
-from vla.io.errors import UserError
-
 GPUS = "nvidiactl", "dxg", "kfd"  # devices of NVIDIA, the same in WSL, and of AMD
-PATIENCE = 5.0  # [s] for an idle process to free its resources
+SECONDS_TO_END = 5.0  # [s] for an idle process to free its resources
 WORKER = "VLA_WORKER"  # environment variable: number of a worker process in its pool
 
 # LP_NUM_THREADS is of Mesa's renderer, which counts only threads beside the calling one.
 THREAD_SETTINGS = {"OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "LP_NUM_THREADS": "0"}
-
-RANKS = ("RANK", "LOCAL_RANK", "NODE_RANK", "WORLD_SIZE", "SLURM_PROCID", "SLURM_LOCALID", "SLURM_NODEID")
-RANKS += ("SLURM_NTASKS", "SLURM_STEP_NUM_TASKS", "JSM_NAMESPACE_RANK")
 
 
 class Worker(Protocol):
@@ -35,11 +31,9 @@ class Worker(Protocol):
 
     def attempt(self, item: Any, /) -> Any:
         """Return the result of one item."""
-        ...
 
     def close(self) -> None:
         """Free the resources of the worker."""
-        ...
 
 
 WorkerFactory = Callable[[], Worker]
@@ -79,7 +73,7 @@ class WorkerProcess:
         except (EOFError, OSError) as end:
             raise ProcessEnded(self._how_it_ended()) from end
         if error is not None:
-            raise error from _RemoteTraceback(remote)
+            raise error from _RemoteTraceback(f"\n{remote}")
         return result
 
     def _how_it_ended(self) -> str:
@@ -90,29 +84,22 @@ class WorkerProcess:
         memory = ", perhaps because memory ran out" if code == -signal.SIGKILL else ""
         return f"it was ended by signal {-code} ({signal.strsignal(-code)}{memory})"
 
-    def kill(self) -> None:
-        """Kill the process at once."""
-        self._process.kill()
-
     def dismiss(self) -> None:
         """Close the connection: the process ends as soon as it is idle."""
         self._connection.close()
 
     def join(self) -> None:
-        """Wait for the end of the process; kill it after `PATIENCE`."""
-        self._process.join(PATIENCE)
+        """Wait up to `SECONDS_TO_END` for the end of the process."""
+        self._process.join(SECONDS_TO_END)
+
+    def kill(self) -> None:
+        """End the process at once, if it has not ended."""
         self._process.kill()
         self._process.join()
 
 
 class _RemoteTraceback(Exception):
     """Traceback of another process, as text."""
-
-    def __init__(self, text: str) -> None:
-        self._text = text
-
-    def __str__(self) -> str:
-        return f"\n{self._text}"
 
 
 def _serve(connection: Connection, make: bytes, number: int) -> None:
@@ -161,16 +148,14 @@ def leave_with_parent() -> None:
     threading.Thread(target=wait, daemon=True).start()
 
 
-def one_thread() -> None:
-    """Limit numerical libraries to one thread: sums must not depend on the number of workers on the machine."""
-    os.environ.update(THREAD_SETTINGS)  # read when a library is loaded
-    if torch := sys.modules.get("torch"):  # already loaded if this process trained the policy
-        torch.set_num_threads(1)
+def ease_garbage_collection() -> None:
+    """Let the cyclic garbage collector run seldom, and not at the end of the program.
 
-
-def raise_gc_thresholds() -> None:
-    """Raise the thresholds of the cyclic garbage collector: its passes during imports take a second and free little."""
+    Its passes during imports take a second and free little; those at the end would take up to two seconds to free what
+    ends with the process anyway.
+    """
     gc.set_threshold(50_000, 20, 100)
+    atexit.register(gc.freeze)
 
 
 def spin_briefly() -> None:
@@ -180,17 +165,6 @@ def spin_briefly() -> None:
     they take these cores from the very threads that they wait for, in every operation.
     """
     os.environ.setdefault("GOMP_SPINCOUNT", "3000")  # about ten microseconds
-
-
-def require_ranks() -> None:
-    """Require numbers in the variables by which launchers number processes; libraries read them as they are imported.
-
-    Raises:
-        UserError: one is no number.
-    """
-    for name in RANKS:
-        if not (value := os.environ.get(name, "0")).isdecimal():
-            raise UserError(f"the environment variable {name} must be a number of a launcher, got {value!r}: unset it")
 
 
 def without_triton() -> None:
@@ -207,11 +181,16 @@ def without_triton() -> None:
 
 @contextmanager
 def one_thread_each() -> Iterator[None]:
-    """Apply `one_thread` to this process and its children within the context."""
+    """Limit numerical libraries of this process and its children to one thread within the context.
+
+    Sums must not depend on the number of workers on the machine.
+    """
     before = {name: os.environ.get(name) for name in THREAD_SETTINGS}
-    torch = sys.modules.get("torch")
+    torch = sys.modules.get("torch")  # already loaded if this process trained the policy
     threads = torch.get_num_threads() if torch else 0
-    one_thread()
+    os.environ.update(THREAD_SETTINGS)  # read when a library is loaded
+    if torch:
+        torch.set_num_threads(1)
     try:
         yield
     finally:

@@ -13,8 +13,16 @@ from vla.config.differences import at
 from vla.io.errors import UserError
 from vla.reports.result_tables import secondary_table
 from vla.reports.tables import DIFFERENCE, Table, difference
-from vla.rollouts.comparison import Comparison, compare_pairs, compare_samples, concluded
-from vla.rollouts.results import ERROR, Report, Result, concluded_secondary, pairs_of, secondary_of
+from vla.rollouts.comparison import (
+    Comparison,
+    compare_pairs,
+    compare_samples,
+    concluded,
+    concluded_secondary,
+    pairs_of,
+    secondary_of,
+)
+from vla.rollouts.results import ERROR, Report, Result
 from vla.rollouts.statistics import effective_episodes
 from vla.runs.folder import Run, require_run
 from vla.runs.sweep import SweepRow
@@ -170,8 +178,7 @@ def _by_seed(run: Run, condition: str) -> dict[int, tuple[Result, Any]]:
 def _scenes(run: Run, condition: str) -> tuple[Any, ...]:
     """Return the config values that determine the scenes: the task, and the changes of a condition."""
     config = run.report.config if run.report else {}
-    network = at(config, "evaluate.networks", {}).get(condition)
-    return at(config, "task"), _changes(run, condition), network and (network, at(config, "evaluate.by_clock", None))
+    return at(config, "task"), _changes(run, condition), at(config, "evaluate.networks", {}).get(condition)
 
 
 def _changes(run: Run, condition: str) -> dict[str, Any] | None:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import logging
 import time
-from collections import Counter, deque
+from collections import Counter, defaultdict, deque
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext, suppress
 from dataclasses import dataclass, replace
@@ -35,7 +35,7 @@ log = logging.getLogger(__name__)
 
 COLLECTION_TIME = "seconds.txt"  # file in a store: total duration of its collection [s]
 Seconds = Annotated[float, Ge(0), Le(1e9)]
-PATIENCE = 50  # consecutive failures at a task before collection is given up
+MAX_FAILURES = 50  # consecutive failures at a task before collection is given up
 LOOK_AHEAD = 4  # pending episodes per worker: a long one must not block the others
 NOT_REPEATABLE = "not_repeatable"  # outcome of a success that the replay of its actions does not reproduce
 
@@ -52,6 +52,15 @@ class Summary:
     tasks: dict[str, tuple[int, int]]  # task → successes, seeds tried
     seconds: float  # of this call
 
+    @classmethod
+    def of(cls, store: EpisodeStore, added: int, seconds: float) -> Summary:
+        """Summarise a store."""
+        tried = [entry for entry in store.tried if entry.outcome not in (DAMAGED, NOT_NEEDED)]
+        failures = Counter(entry.outcome for entry in tried if not entry.success)
+        solved, every = Counter(entry.task for entry in tried if entry.success), Counter(entry.task for entry in tried)
+        tasks = {task: (solved[task], every[task]) for task in sorted(every)}
+        return cls(len(store.episodes), solved.total(), added, len(tried), dict(failures), tasks, seconds)
+
     @property
     def success_rate(self) -> float:
         """Share of the tried seeds that the expert solved, 0…1."""
@@ -67,42 +76,31 @@ def collect(
     seed: int,
     multitask: Multitask | None = None,
     keep_failures: bool = False,
-    needs: Sequence[Path] = (),
 ) -> Summary:
     """Roll the expert out on `seed`, `seed` + 1, … until the store holds `episodes` successes.
 
     Existing episodes are kept. If another process is collecting into the same store, wait for it. Each process of
-    `cluster` calls the two factories once and accesses the paths `needs`. `multitask` tells the task of a seed; its
+    `cluster` calls the two factories once. `multitask` tells the task of a seed; its
     tasks get equal shares. With `keep_failures` every seed gives an episode: failures are stored and count too.
 
     Raises:
         UserError: the store starts at another seed or is derived, the expert fails persistently, workers died, or the
             disk is full.
     """
-    started = time.monotonic()
-    before = len(store.episodes)
+    started, before = time.monotonic(), len(store.episodes)
     store.require_first_seed(seed)
     if before < episodes:
         store.require_growable()
-        with store.writing():
-            before = len(store.episodes)  # another process may have added some meanwhile
+        with store.writing():  # once another process has finished, which may have added some
+            before, began = len(store.episodes), time.monotonic()
             store.require_first_seed(seed)
             if before < episodes:
-                began = time.monotonic()  # excludes the wait for another process
+                make = partial(DemonstrationWorker, make_environment, make_expert, keep_failures)
                 try:
-                    make = partial(DemonstrationWorker, make_environment, make_expert, keep_failures)
-                    fill = partial(_fill, store, episodes=episodes, seed=seed, multitask=multitask, keep=keep_failures)
-                    _fill_with(cluster, make, needs, store, fill)
+                    _fill_with(cluster, make, store, partial(_fill, store, episodes, seed, multitask, keep_failures))
                 finally:
                     _save_collection_time(store.folder, time.monotonic() - began)
-    stored = len(store.episodes)
-    tried = [entry for entry in store.tried if entry.outcome not in (DAMAGED, NOT_NEEDED)]
-    failures = Counter(entry.outcome for entry in tried if not entry.success)
-    successes = [entry for entry in tried if entry.success]
-    solved, asked = (Counter(entry.task for entry in entries) for entries in (successes, tried))
-    tasks = {task: (solved[task], asked[task]) for task in sorted(asked)}
-    seconds = time.monotonic() - started
-    return Summary(stored, len(successes), stored - before, len(tried), dict(failures), tasks, seconds)
+    return Summary.of(store, len(store.episodes) - before, time.monotonic() - started)
 
 
 def collection_time(store: EpisodeStore, episodes: int) -> float | None:
@@ -132,14 +130,12 @@ def _save_collection_time(folder: Path, seconds: float) -> None:
             write_text(file, f"{before + seconds:.1f}\n")
 
 
-def _fill_with(
-    cluster: Cluster, make: WorkerFactory, needs: Sequence[Path], store: EpisodeStore, fill: Callable[[Pool], None]
-) -> None:
+def _fill_with(cluster: Cluster, make: WorkerFactory, store: EpisodeStore, fill: Callable[[Pool], None]) -> None:
     """Fill the store, restarting workers that died: in long collections processes occasionally crash outside Python."""
     while True:
         tried = len(store.tried)
         try:
-            with cluster.pool(make, needs) as pool:
+            with cluster.pool(make) as pool:
                 return fill(pool)
         except WorkersLost as lost:
             if len(store.tried) == tried:
@@ -154,12 +150,7 @@ class Attempts:
     """
 
     def __init__(self, pool: Pool, multitask: Multitask | None, store: EpisodeStore, first: int) -> None:
-        """Args:
-        pool: of `DemonstrationWorker`s.
-        multitask: maps a seed to its task; None: all seeds are needed.
-        store: of the episodes so far.
-        first: seed of an empty store.
-        """
+        """Continue a store, or begin it at the seed `first`; without `multitask` all seeds are of one task."""
         self._pool = pool
         self._task_of = multitask.task_of if multitask else lambda seed: ""
         self._solved = dict.fromkeys(multitask.tasks if multitask else [""], 0)
@@ -175,64 +166,76 @@ class Attempts:
         """
         self._advance(most)
         seed, future = self._pending.popleft()
-        if not self._needed(seed, self._solved):
+        task = self._task_of(seed)
+        if not _needed(task, self._solved):
             none = np.empty((0, 0), np.float32)
-            return Episode(seed, self._task_of(seed), "", NOT_NEEDED, frozenset(), {}, [], none, none)
+            return Episode(
+                seed=seed,
+                task=task,
+                instruction="",
+                outcome=NOT_NEEDED,
+                milestones=frozenset(),
+                draws={},
+                observations=[],
+                actions=none,
+                executed=none,
+            )
         episode: Episode = (future or self._pool.submit(seed)).result()
-        self._solved[self._task_of(seed)] += episode.success
+        self._solved[task] += episode.success
         return episode
 
     def _advance(self, most: int) -> None:
         going = [seed for seed, future in self._pending if future is not None]
-        expected = dict(self._solved)
-        for seed in going:
-            expected[self._task_of(seed)] += 1
+        expected = Counter(self._solved) + Counter(self._task_of(seed) for seed in going)
+        expected = {task: expected[task] for task in self._solved}
         missing = most - len(going)
         while missing > 0:
             if self._next >= FIRST_SEED:
                 raise UserError(f"seeds from {FIRST_SEED} on are reserved for evaluation: lower collect.seed")
-            needed = self._needed(self._next, expected)
+            task = self._task_of(self._next)
+            needed = _needed(task, expected)
             self._pending.append((self._next, self._pool.submit(self._next) if needed else None))
-            expected[self._task_of(self._next)] += needed
+            expected[task] += needed
             missing -= needed
             self._next += 1
 
-    def _needed(self, seed: int, solved: Mapping[str, int]) -> bool:
-        return solved[self._task_of(seed)] == min(solved.values())
+
+def _needed(task: str, solved: Mapping[str, int]) -> bool:
+    return solved[task] == min(solved.values())
 
 
-def _fill(store: EpisodeStore, pool: Pool, episodes: int, seed: int, multitask: Multitask | None, keep: bool) -> None:
-    stored = before = len(store.episodes)
-    solved = sum(entry.success for entry in store.tried)
-    attempts = Attempts(pool, multitask, store, seed)
-    tried = sum(entry.outcome not in (DAMAGED, NOT_NEEDED) for entry in store.tried)
-    in_a_row: dict[str, list[str]] = {}  # task → outcomes of the failures since its last success
-    started = time.monotonic()
+def _fill(
+    store: EpisodeStore, episodes: int, seed: int, multitask: Multitask | None, keep_failures: bool, pool: Pool
+) -> None:
+    """Append episodes until there are so many, or the expert fails too often in a row."""
+    before, attempts, started = len(store.episodes), Attempts(pool, multitask, store, seed), time.monotonic()
+    outcomes = Counter(entry.success for entry in store.tried if entry.outcome not in (DAMAGED, NOT_NEEDED))
+    in_a_row = defaultdict[str, list[str]](list)  # task → outcomes of the failures since its last success
     columns = (TextColumn("collecting"), BarColumn(), MofNCompleteColumn(), TextColumn("{task.description}"))
     with Progress(*columns, TimeRemainingColumn()) as progress:
-        task = progress.add_task("", total=episodes, completed=stored)
-        while stored < episodes:
+        bar = progress.add_task("", total=episodes, completed=before)
+        while (stored := len(store.episodes)) < episodes:
             # No more pending than missing: without failures no episode is wasted.
             episode = attempts.next(min(LOOK_AHEAD * pool.size, episodes - stored))
             if episode.outcome == NOT_NEEDED:
                 store.fail(episode)
                 continue
-            tried, solved = tried + 1, solved + episode.success
-            if episode.success or keep:
+            outcomes[episode.success] += 1
+            if episode.success or keep_failures:
                 store.append(episode)
-                stored += 1
                 in_a_row[episode.task] = []
             else:
                 store.fail(episode)
-                failed = in_a_row.setdefault(episode.task, [])
-                failed.append(episode.outcome)
-                _give_up_after(episode.task, failed)
-            speed = (stored - before) / (time.monotonic() - started)
-            progress.update(task, completed=stored, description=f"{speed:.1f} episodes/s, success {solved / tried:.0%}")
+                in_a_row[episode.task].append(episode.outcome)
+                _give_up_after(episode.task, in_a_row[episode.task])
+            speed = (len(store.episodes) - before) / (time.monotonic() - started)
+            rate = outcomes[True] / outcomes.total()
+            description = f"{speed:.1f} episodes/s, success {rate:.0%}"
+            progress.update(bar, completed=len(store.episodes), description=description)
 
 
 def _give_up_after(task: str, failures: Sequence[str]) -> None:
-    if len(failures) >= PATIENCE:
+    if len(failures) >= MAX_FAILURES:
         raise UserError(
             f"the expert failed on {len(failures)} seeds of {task} in a row ({dict(Counter(failures))}): watch it with "
             "job=preview, or simplify the task"

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
-from bisect import bisect
-from collections.abc import Mapping, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from math import hypot, sqrt
+from operator import attrgetter
 from typing import NamedTuple, TypeVar
 
 import numpy as np
 
+from vla.io.errors import UserError
+from vla.rollouts.motion import AMOUNTS
+from vla.rollouts.results import ERROR, Report, Result
 from vla.rollouts.sequential import LEVEL, anytime_difference, anytime_p
-from vla.rollouts.statistics import wilson_interval
+from vla.rollouts.statistics import mcnemar, median_interval, wilson_interval
 from vla.spec import Array
 
 Key = TypeVar("Key")
@@ -34,7 +38,7 @@ class Comparison:
     difference: float  # a rate's is from -1 to 1
     ci_low: float  # of its 95 % confidence interval
     ci_high: float
-    p: float  # two-sided, for equal rates, or for an amount that is as often larger as smaller
+    p: float  # two-sided, for equal rates, or for a median difference of zero
     episodes: int  # number of pairs; without pairs, of all episodes
     only_first: int | None = None  # pairs in which only the first succeeded, or had more; None without pairs
     only_second: int | None = None
@@ -91,14 +95,8 @@ def compare_amounts(first: Amounts, second: Amounts, anytime: bool = False) -> C
     """Compare an amount in pairs of episodes: the median difference, its interval, and the exact sign test.
 
     The sign test is McNemar's with "had more" for "succeeded alone"; pairs without a difference do not count in it. It
-    assumes nothing about the distribution. With `anytime` it is valid whatever the reason to stop playing.
-
-    Args:
-        first: amounts of the first policy or condition.
-        second: those of the second one in the same episodes.
-
-    Returns:
-        None if there are too few pairs to find any difference.
+    assumes nothing about the distribution. With `anytime` it is valid whatever the reason to stop playing. Returns None
+    if there are too few pairs to find any difference.
     """
     differences = np.subtract(second, first)
     if (interval := median_interval(differences, anytime)) is None:
@@ -108,28 +106,13 @@ def compare_amounts(first: Amounts, second: Amounts, anytime: bool = False) -> C
     return Comparison(float(np.median(differences)), *interval, p, len(differences), less, more)
 
 
-def median_interval(values: Amounts, anytime: bool = False) -> tuple[float, float] | None:
-    """Return the 95 % confidence interval of the median, between two of the values; None with too few of them.
-
-    It contains the medians that the sign test does not exclude (W. R. Thompson, "On confidence ranges for the median
-    and other expectation distributions", Annals of Mathematical Statistics 7, 1936).
-    """
-    ordered, test = np.sort(values), anytime_p if anytime else mcnemar
-    count = len(ordered)
-    outside = bisect(range(count // 2 + 1), LEVEL, key=lambda below: test(below, count - below))
-    return (float(ordered[outside - 1]), float(ordered[-outside])) if outside else None
-
-
 def concluded(comparisons: Mapping[Key, Comparison], margin: float | None) -> dict[Key, Comparison]:
     """Return the comparisons with verdicts that together find a false difference with a probability of at most 5 %.
 
     S. Holm, "A simple sequentially rejective multiple test procedure", Scandinavian Journal of Statistics 6 (1979).
     Pairs that never differ cannot give a small p-value, so they do not count (R. E. Tarone, "A modified Bonferroni
-    method for discrete data", Biometrics 46, 1990).
-
-    Args:
-        comparisons: those made together.
-        margin: non-inferiority margin of the success rate, 0…1; None if it is not about success.
+    method for discrete data", Biometrics 46, 1990). The `margin` of non-inferiority, 0…1, is None if it is not about
+    success.
     """
     left = sum(
         each.only_first is None or each.only_first + (each.only_second or 0) > 0 for each in comparisons.values()
@@ -140,17 +123,6 @@ def concluded(comparisons: Mapping[Key, Comparison], margin: float | None) -> di
         found[key] = each.conclude(largest, margin)
         left -= 1
     return {key: found[key] for key in comparisons}
-
-
-def mcnemar(lost: int, won: int) -> float:
-    """Return the two-sided exact p-value for equal success rates, given the numbers of discordant pairs.
-
-    Under the null hypothesis both kinds of pairs are equally likely (Q. McNemar, "Note on the sampling error of
-    the difference between correlated proportions or percentages", Psychometrika 12, 1947).
-    """
-    from scipy.special import bdtr  # the binomial distribution; importing scipy.stats takes a second
-
-    return min(1.0, 2 * float(bdtr(min(lost, won), lost + won, 0.5)))
 
 
 def fisher(won_first: int, first: int, won_second: int, second: int) -> float:
@@ -193,3 +165,74 @@ def newcombe_paired(pairs: Pairs) -> tuple[float, float]:
         return sqrt(max(one**2 - 2 * correlation * one * two + two**2, 0.0))
 
     return two - one - reach(two - below, high - one), two - one + reach(above - two, one - low)
+
+
+def pairs_of(
+    together: Iterable[tuple[Result, Result]], happened: Callable[[Result], bool] = attrgetter("success")
+) -> Pairs:
+    """Count what happened in pairs of episodes, without those of which one was not completed."""
+    counts = Counter((happened(one), happened(two)) for one, two in together if ERROR not in (one.outcome, two.outcome))
+    return Pairs(counts[True, True], counts[True, False], counts[False, True], counts[False, False])
+
+
+def secondary_of(together: Sequence[tuple[Result, Result]], anytime: bool) -> dict[str, Comparison]:
+    """Compare, in pairs of episodes, motion where both succeeded, and how often each milestone was reached in the same
+    task.
+
+    Returns:
+        Field of `Motion` or milestone → comparison, without fields of which too few pairs are known.
+    """
+    found = {}
+    for name in AMOUNTS:
+        pairs = [
+            (getattr(one.motion, name), getattr(two.motion, name))
+            for one, two in together
+            if one.success and two.success and one.motion and two.motion
+        ]
+        known = np.array([pair for pair in pairs if None not in pair], float).reshape(-1, 2)
+        if compared := compare_amounts(known[:, 0], known[:, 1], anytime):
+            found[name] = compared
+    alike = [(one, two) for one, two in together if one.task == two.task]  # another task may not have the milestone
+    for name in sorted({name for pair in alike for result in pair for name in result.milestones}):
+        found[name] = compare_pairs(pairs_of(alike, lambda result, name=name: name in result.milestones), anytime)
+    return found
+
+
+def compare_conditions(reports: Mapping[str, Report], margin: float) -> dict[str, Comparison]:
+    """Return condition → comparison of its success with that of the first condition, which has none.
+
+    Pairs with an error do not count. Where episodes were played until it was clear, one report may be longer. The
+    `margin` of non-inferiority is a difference of rates, 0…1.
+
+    Raises:
+        UserError: the reports have different seeds.
+    """
+    paired = _paired(reports)
+    return concluded({name: compare_pairs(pairs_of(both), anytime) for name, (both, anytime) in paired.items()}, margin)
+
+
+def compare_secondary_metrics(reports: Mapping[str, Report]) -> dict[str, dict[str, Comparison]]:
+    """Return condition → comparisons of milestones and motion with those of the first condition, which has none.
+
+    Verdicts take all of them into account, but not the comparisons of success. Raises as `compare_conditions` does.
+    """
+    return concluded_secondary({name: secondary_of(*paired) for name, paired in _paired(reports).items()})
+
+
+def _paired(reports: Mapping[str, Report]) -> dict[str, tuple[list[tuple[Result, Result]], bool]]:
+    """Return condition → its episodes beside those of the first one, and whether statements are valid at any time."""
+    (_, first), *others = reports.items()
+    paired = {}
+    for name, other in others:
+        both, anytime = list(zip(first.results, other.results, strict=False)), first.anytime or other.anytime
+        if any(one.seed != two.seed for one, two in both) or (len(first.results) != len(other.results) and not anytime):
+            raise UserError("only reports on the same seeds can be compared")
+        paired[name] = both, anytime
+    return paired
+
+
+def concluded_secondary(secondary: Mapping[Key, Mapping[str, Comparison]]) -> dict[Key, dict[str, Comparison]]:
+    """Return what `secondary_of` found in several cases, with verdicts that take all of it into account."""
+    flat = {(case, name): compared for case, metrics in secondary.items() for name, compared in metrics.items()}
+    found = concluded(flat, None)
+    return {case: {name: found[case, name] for name in metrics} for case, metrics in secondary.items()}

@@ -9,7 +9,7 @@ import json
 import logging
 import traceback
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 
@@ -21,8 +21,7 @@ from vla.rollouts.motion import motion_of
 from vla.rollouts.recordings import Recordings, chosen
 from vla.rollouts.results import ERROR, Report, Result
 from vla.rollouts.rollout import AgentFactory, EnvironmentFactory, close_agent
-from vla.rollouts.worlds import Stage, WorldsHere, in_lanes
-from vla.rollouts.worlds import play as play_worlds
+from vla.rollouts.worlds import Stage, Worlds, in_lanes, play
 from vla.spec import FIRST_SEED, Agent, Agents, Environment, Episode, Recorder
 
 log = logging.getLogger(__name__)
@@ -39,7 +38,6 @@ def evaluate(
     seeds: Sequence[int],
     cluster: Cluster = THIS_PROCESS,
     name: str = "evaluating",
-    needs: Sequence[Path] = (),
     until: Callable[[Report], bool] | None = None,
     recordings: Recordings = "all",
     turns: int = 1,
@@ -52,7 +50,7 @@ def evaluate(
     `recordings` says which episodes are recorded. Unless that is all, it is known at the end only which they are: these
     are played once more and recorded.
 
-    Every process of the `cluster` calls the factories once and accesses the paths `needs`. Errors of a factory end the
+    Every process of the `cluster` calls the factories once. Errors of a factory end the
     evaluation; errors of an episode, or a crash of its process, are reported in its result.
 
     With `until` the evaluation stops as soon as `until(report on the first n seeds)` is true; n is a multiple of
@@ -70,45 +68,57 @@ def evaluate(
     if not seeds or min(seeds) < FIRST_SEED:
         raise UserError(f"evaluation needs seeds from {FIRST_SEED} on, which no policy is trained on; got {seeds}")
     make = partial(_RolloutWorker, make_environment, make_agent, None if recordings == 0 else make_recorder, lanes)
-    at_once = recordings == "all"
-    columns = (TextColumn(name), BarColumn(), MofNCompleteColumn(), TextColumn("{task.fields[note]}"))
-    results = {seed: known[seed] for seed in seeds if seed in known} if known else {}
-    counted = 0
-
-    def reported() -> Report:
-        return Report(tuple(results[seed] for seed in seeds[:counted]), anytime=until is not None)
-
-    def clear() -> bool:
-        """Count the results that no missing one precedes; return whether they suffice."""
-        nonlocal counted
-        while counted < len(seeds) and seeds[counted] in results:
-            counted += 1
-            if until is not None and counted % turns == 0 and until(reported()):
-                return True
-        return False
-
-    with cluster.pool(make, needs) as pool, Progress(*columns, TimeRemainingColumn()) as bar:
-        task = bar.add_task("", total=len(seeds), completed=len(results), note="")
-        missing = [] if clear() else [seed for seed in seeds if seed not in results]
+    at_once, score = recordings == "all", _Score(seeds, dict(known or {}), until, turns)
+    columns = (TextColumn(name), BarColumn(), MofNCompleteColumn(), TextColumn("{task.description}"))
+    with cluster.pool(make) as pool, Progress(*columns, TimeRemainingColumn()) as progress:
+        bar = progress.add_task("", total=len(seeds), completed=len(score.results))
+        missing = [] if score.clear() else [seed for seed in seeds if seed not in score.results]
         size = 1 if lanes == 1 else ROUNDS * lanes
         groups = [missing[first : first + size] for first in range(0, len(missing), size)]
         group_of = {pool.submit((group, at_once)): group for group in groups}
         for future in pool.as_completed(group_of):
             for result in _results(pool, future, group_of[future], at_once):
-                results[result.seed] = result
+                score.results[result.seed] = result
                 if keep is not None and result.outcome != ERROR:
                     keep(result)
-            so_far = Report(tuple(results.values()))
-            errors = f", {len(so_far.errors)} errors" if so_far.errors else ""
-            bar.update(task, completed=len(results), note=f"success {100 * so_far.success:.0f} %{errors}")
-            if clear():
+            progress.update(bar, completed=len(score.results), description=score.note())
+            if score.clear():
                 for later in group_of:
                     later.cancel()
                 break
-        report = reported()
+        report = score.report()
         if make_recorder is not None and not at_once:
             _record(pool, chosen(report, recordings))
     return report
+
+
+@dataclass
+class _Score:
+    """Results so far, in any order, of which those count that no missing one precedes."""
+
+    seeds: Sequence[int]
+    results: dict[int, Result]
+    until: Callable[[Report], bool] | None
+    turns: int
+    counted: int = 0
+
+    def report(self) -> Report:
+        """Report the results that count."""
+        return Report(tuple(self.results[seed] for seed in self.seeds[: self.counted]), anytime=self.until is not None)
+
+    def clear(self) -> bool:
+        """Count the results that no missing one precedes; return whether they suffice."""
+        while self.counted < len(self.seeds) and self.seeds[self.counted] in self.results:
+            self.counted += 1
+            if self.until is not None and self.counted % self.turns == 0 and self.until(self.report()):
+                return True
+        return False
+
+    def note(self) -> str:
+        """Format the success so far."""
+        so_far = Report(tuple(self.results.values()))
+        errors = f", {len(so_far.errors)} errors" if so_far.errors else ""
+        return f"success {100 * so_far.success:.0f} %{errors}"
 
 
 def _results(pool: Pool, future: Future, seeds: Sequence[int], recorded: bool) -> list[Result]:
@@ -139,43 +149,36 @@ def _record(pool: Pool, results: Sequence[Result]) -> None:
             log.warning(took, result.seed, again.steps, result.steps)
 
 
-def play(environment: Environment, agent: Agent, seed: int, recorder: Recorder | None = None) -> Result:
+def play_episode(environment: Environment, agent: Agent, seed: int) -> Result:
     """Play one episode; errors become results, so that one seed ends neither an evaluation nor a training."""
-    worlds = WorldsHere([Stage(environment, recorder)])
-    ((_, ended),) = play_worlds(worlds, in_lanes(agent), [seed], recorder is not None, recorder is not None)
+    ((_, ended),) = play(Worlds([Stage(environment)]), in_lanes(agent), [seed], all_images=False)
     return result_of(seed, ended, environment.spec.control_hz)
 
 
 def result_of(seed: int, ended: Episode | Exception, control_hz: float) -> Result:
-    """Summarise what `vla.rollouts.worlds.play` makes of a seed, at so many steps per second [Hz]."""
+    """Summarise what `play` makes of a seed, at so many steps per second [Hz]."""
     try:
         if isinstance(ended, Exception):
             raise ended
-        episode, motion = ended, motion_of(ended, control_hz)
         # Worlds may give arrays; plain values support comparison and JSON.
-        draws, completed, _ = json.loads(
-            json.dumps(
-                [episode.draws, episode.completed, asdict(motion)],
-                default=lambda value: value.tolist(),
-                allow_nan=False,
-            )
+        motion = motion_of(ended, control_hz)
+        facts = [ended.draws, ended.completed, asdict(motion)]
+        draws, completed, _ = json.loads(json.dumps(facts, default=lambda value: value.tolist(), allow_nan=False))
+        return Result(
+            seed,
+            ended.outcome,
+            ended.instruction,
+            len(ended.observations),
+            draws,
+            ended.task,
+            tuple(sorted(ended.milestones)),
+            completed=completed and tuple(completed),
+            motion=motion,
         )
-    except Exception as problem:
+    except Exception as problem:  # of any kind: worlds are what people write
         where = traceback.extract_tb(problem.__traceback__)[-1]
         what = f"{type(problem).__name__}: {problem} ({Path(where.filename).name}:{where.lineno})"
         return Result(seed, ERROR, error=what)
-    steps, milestones = len(episode.observations), tuple(sorted(episode.milestones))
-    return Result(
-        seed,
-        episode.outcome,
-        episode.instruction,
-        steps,
-        draws,
-        episode.task,
-        milestones,
-        completed=completed and tuple(completed),
-        motion=motion,
-    )
 
 
 class _LenientRecorder:
@@ -208,12 +211,12 @@ class _RolloutWorker:
         others = range(1, lanes if isinstance(self._agent, Agents) else 1)
         self._environments = [first, *(make_environment() for _ in others)]
         recorders = [None if make_recorder is None else _LenientRecorder(make_recorder()) for _ in self._environments]
-        self._worlds = WorldsHere([Stage(*each) for each in zip(self._environments, recorders, strict=True)])
+        self._worlds = Worlds([Stage(*each) for each in zip(self._environments, recorders, strict=True)])
 
     def attempt(self, item: tuple[Sequence[int], bool]) -> list[Result]:
         """Play the episodes of seeds, and record them if the second part of the item says so."""
         seeds, recorded = item
-        played = play_worlds(self._worlds, in_lanes(self._agent), seeds, recorded, recorded)
+        played = play(self._worlds, in_lanes(self._agent), seeds, recorded, recorded)
         return [result_of(seed, ended, self._worlds.spec.control_hz) for seed, ended in played]
 
     def close(self) -> None:

@@ -45,9 +45,7 @@ def log_dimensionless_jerk(positions: Array, hz: float) -> float | None:
     S. Balasubramanian et al., "On the analysis of movement smoothness", Journal of NeuroEngineering and Rehabilitation
     12 (2015). Derivatives are differences, so what happens between two positions does not count.
 
-    Args:
-        positions: (T, 3) [m], equidistant in time.
-        hz: number of positions per second.
+    Positions are (T, 3) [m], `hz` of them per second.
     """
     speed = float(np.linalg.norm(np.diff(positions, axis=0), axis=1).max(initial=0.0)) * hz
     if len(positions) < 4 or speed == 0:

@@ -1,4 +1,4 @@
-"""Number of episodes that an evaluation needs to tell two success rates apart."""
+"""Number of episodes that an evaluation needs to tell two success rates apart; all probabilities are exact."""
 
 from __future__ import annotations
 
@@ -8,15 +8,13 @@ from math import ceil, log, sqrt
 
 import numpy as np
 
-from vla.rollouts.sequential import LEVEL, log_capital
+from vla.rollouts.sequential import LEVEL
 from vla.rollouts.statistics import NORMAL_QUANTILE
 from vla.spec import Array
 
 MOST = 200_000  # episodes
 FAR = 9.0  # standard deviations beyond which outcomes are too rare to count
-SIMULATIONS = 10_000
-PART = 4096  # numbers of observations per batch, which limits memory
-HORIZON = 4  # length of a simulated evaluation, as a multiple of the fixed number of episodes
+HORIZON = 4  # length of an evaluation that stops when it is clear, as a multiple of the fixed number of episodes
 
 
 def episodes_needed(power: Callable[[int], float], enough: float) -> int | None:
@@ -69,10 +67,9 @@ def power_of_samples(episodes: int, one: float, other: float) -> float:
     from scipy.stats import binom
 
     one, other = sorted((one, other))
-    ways = (
-        gammaln(episodes + 1) - gammaln(np.arange(episodes + 1) + 1) - gammaln(episodes - np.arange(episodes + 1) + 1)
-    )
-    first, second = (binom.pmf(np.arange(episodes + 1), episodes, rate) for rate in (one, other))
+    every = np.arange(episodes + 1)
+    ways = gammaln(episodes + 1) - gammaln(every + 1) - gammaln(episodes - every + 1)
+    first, second = (binom.pmf(every, episodes, rate) for rate in (one, other))
     reach = FAR * sqrt(episodes * max(one * (1 - one), other * (1 - other))) + FAR
     low, high = max(0, int(episodes * one - reach)), min(episodes, int(episodes * other + reach))
     found = 0.0
@@ -86,7 +83,7 @@ def power_of_samples(episodes: int, one: float, other: float) -> float:
 
 @dataclass(frozen=True)
 class Stopping:
-    """Numbers of episodes of evaluations that stop when it is clear, by simulation."""
+    """Numbers of episodes of evaluations that stop when it is clear."""
 
     most: int  # number of episodes after which the share `enough` of the evaluations is decided
     mean: float  # mean number of episodes if evaluations end after `most`
@@ -94,7 +91,7 @@ class Stopping:
 
 
 def stopping(mean: float, one: float, zero: float, enough: float, fixed: int) -> Stopping | None:
-    """Simulate `SIMULATIONS` evaluations that stop as soon as observations of 0 and 1 exclude a mean.
+    """Return how long evaluations take that stop as soon as observations of 0 and 1 exclude a mean.
 
     Args:
         mean: the one to exclude: a bar, or 1/2 for pairs, of which those count that differ.
@@ -106,47 +103,57 @@ def stopping(mean: float, one: float, zero: float, enough: float, fixed: int) ->
     Returns:
         None if too few evaluations are decided after `HORIZON` times the fixed number.
     """
-    random, counting = np.random.default_rng(0), one + zero
-    horizon = ceil(HORIZON * fixed * counting) + 10
-    parts = np.array_split(np.arange(1, horizon + 1), 1 + horizon // PART)
-    lower, upper = (np.concatenate(ends) for ends in zip(*(_decisive(mean, part) for part in parts), strict=True))
-    bounds = lower, upper
-    ended = np.sort(_ends(random, bounds, one / counting, counting))
-    most = ended[ceil(enough * SIMULATIONS) - 1]
-    if not np.isfinite(most):
+    from scipy.stats import binom
+
+    counting = one + zero
+    counts = np.arange(1, ceil(HORIZON * fixed * counting) + 11)  # of observations
+    bounds = _largest_decisive(mean, counts), counts - _largest_decisive(1 - mean, counts)
+    ended, by_chance = _ends(bounds, one / counting), _ends(bounds, mean)
+
+    def decided(ended: Array, episodes: int) -> float:
+        """Return the share of evaluations that are decided after so many episodes: those that count suffice."""
+        return float(ended @ binom.sf(counts - 1, episodes, counting))
+
+    most = episodes_needed(lambda episodes: decided(ended, episodes), enough) if ended.sum() > enough else None
+    if most is None:
         return None
-    without = _ends(random, bounds, mean, counting)
-    return Stopping(int(most), float(np.minimum(ended, most).mean()), float((without <= most).mean()))
+    # Wald: of the episodes until the m-th observation, or `most`, the share `counting` are observations.
+    until = np.cumsum(binom.sf(counts - 1, most, counting)) / counting
+    return Stopping(most, float(ended @ until + (1 - ended.sum()) * most), decided(by_chance, most))
 
 
-def _decisive(mean: float, counts: Array) -> tuple[Array, Array]:
-    """Return the largest and the smallest numbers of ones among observations that exclude a mean, as real numbers."""
-    limit, found = log(1 / LEVEL), []
-    for end in (0 * counts - 1.0, counts + 1.0):
-        inside, outside = mean * counts, end
-        for _ in range(24):
-            middle = (inside + outside) / 2
-            ones = np.clip(middle, 0, counts)
-            beyond = (log_capital(mean, ones, counts - ones) >= limit) | (middle != ones)
-            inside, outside = np.where(beyond, inside, middle), np.where(beyond, middle, outside)
-        found.append(outside)
-    return found[0], found[1]
+def _largest_decisive(mean: float, counts: Array) -> Array:
+    """Return the largest numbers of ones among `counts` observations that show a smaller mean; -1 if none does.
+
+    The capital is that of `vla.rollouts.sequential.log_capital` in its closed form.
+    """
+    from scipy.special import betaln
+
+    low, high = np.full_like(counts, -1), np.floor(mean * counts).astype(counts.dtype)
+    while (high - low > 1).any():
+        middle = np.maximum((low + high) // 2, 0)
+        capital = betaln(middle + 0.5, counts - middle + 0.5) - betaln(0.5, 0.5)
+        beyond = capital - middle * log(mean) - (counts - middle) * log(1 - mean) >= log(1 / LEVEL)
+        open_ = high - low > 1
+        low, high = np.where(beyond & open_, middle, low), np.where(beyond | ~open_, high, middle)
+    return low
 
 
-def _ends(random: np.random.Generator, bounds: tuple[Array, Array], share: float, counting: float) -> Array:
-    """Return the numbers of episodes, infinite where nothing was decided, of simulated evaluations.
+def _ends(bounds: tuple[Array, Array], share: float) -> Array:
+    """Return the probabilities that the n-th observation decides, n = 1, 2, …
 
     Args:
-        random: source of the observations.
-        bounds: as `_decisive` returns them.
+        bounds: the largest and the smallest numbers of ones that decide, for every n.
         share: of ones among observations.
-        counting: share of the episodes that give an observation.
     """
-    ended = np.full(SIMULATIONS, np.inf)
-    for part in np.array_split(np.arange(SIMULATIONS), 100):  # for their memory
-        ones = np.cumsum(random.random((len(part), len(bounds[0]))) < share, axis=1)
-        decided = (ones <= bounds[0]) | (ones >= bounds[1])
-        first = decided.argmax(1) + 1
-        between = random.negative_binomial(first, counting) if counting < 1 else 0
-        ended[part] = np.where(decided.any(1), first + between, np.inf)
+    undecided, ended = np.zeros(len(bounds[0]) + 2), np.zeros(len(bounds[0]))  # undecided: by the number of ones
+    undecided[0], first, last = 1.0, 0, 0
+    for place, (low, high) in enumerate(zip(*bounds, strict=True)):
+        won = share * undecided[first : last + 1]
+        undecided[first : last + 1] -= won
+        undecided[first + 1 : last + 2] += won
+        for decisive in (slice(first, low + 1), slice(high, last + 2)):
+            ended[place] += undecided[decisive].sum()
+            undecided[decisive] = 0
+        first, last = max(low + 1, 0), min(last + 1, high - 1)
     return ended

@@ -20,15 +20,14 @@ from vla.io.errors import UserError
 from vla.io.files import atomic_path
 from vla.io.types import Natural, Point
 from vla.rollouts.moving_picture import save_moving_picture
-from vla.spec import Array, Drawable, Environment, Episode, Eventful, Observation, Shape, Spec
+from vla.spec import Array, Environment, Episode, HasEvents, HasScene, Observation, Shape, Spec
 
 # N steps, S series of a plot, D action components, K bins, V vertices, F faces
 
 VIEWER = str(Path(rerun_cli.__file__).with_name("rerun"))  # the binary: killing its wrapper script would orphan it
 CURVES = np.array([0xE5574CFF, 0x5ABE64FF, 0x508CF0FF, 0xF0AA3CFF, 0xB46EE6FF, 0x3CC8C8FF, 0xDCDCDCFF], np.uint32)
-HEAT = np.array([(10, 8, 24), (70, 18, 95), (160, 45, 95), (235, 105, 55), (252, 190, 75), (252, 253, 200)])
 EVENTS = "events"  # entity of the log
-TOKENS = (210, 256)  # height and width of the image of token probabilities [px]
+TOKENS = (49, 256)  # height and width of the image of token probabilities [px]
 
 
 def recording_name(seed: int, outcome: str) -> str:
@@ -39,15 +38,13 @@ def recording_name(seed: int, outcome: str) -> str:
 class RerunRecorder:
     """Recorder of one .rrd file per episode, with the timelines "step" and "time" [s].
 
-    It contains the scene if the environment is `Drawable`, and a log if it is `Eventful`.
+    It contains the scene if the environment is `HasScene`, and a log if it is `HasEvents`.
     """
 
     def __init__(self, folder: str | os.PathLike[str], pictures: Natural) -> None:
-        """Create the folder of the recordings; files are named by `recording_name`.
+        """Create the folder of the recordings, in which files are named by `recording_name`.
 
-        Args:
-            folder: of the recordings.
-            pictures: number of episodes of each outcome of which there is also a moving picture, the first ones.
+        Of the first episodes of each outcome, so many as `pictures`, there is also a moving picture.
         """
         self._folder, self._pictures = Path(folder), pictures
         self._folder.mkdir(parents=True, exist_ok=True)
@@ -56,8 +53,8 @@ class RerunRecorder:
     def start(self, environment: Environment) -> None:
         """Begin an episode; an unfinished one is discarded."""
         self._spec = environment.spec
-        self._world = environment if isinstance(environment, Drawable) else None
-        self._eventful = environment if isinstance(environment, Eventful) else None
+        self._world = environment if isinstance(environment, HasScene) else None
+        self._eventful = environment if isinstance(environment, HasEvents) else None
         self._steps, self._poses = 0, list[dict[str, Array]]()
         self._probabilities: dict[int, Array] = {}
 
@@ -115,13 +112,10 @@ class _Writer:
         end = f"{'✔' if episode.success else '✘'} **{episode.outcome}** after {steps} steps, seed {episode.seed}"
         draws = "\n".join(f"- **{axis}** {draw}" for axis, draw in episode.draws.items())
         said = [seen.instruction for seen in episode.observations]
-        changes = [step for step in range(steps) if step == 0 or said[step] != said[step - 1]]
-        if len(changes) > 1:
-            texts = [f"### {said[step]}\n\n{end}" for step in changes]
-            columns = rr.TextDocument.columns(text=texts, media_type=["text/markdown"] * len(texts))
-            self._columns("instruction", np.array(changes), columns)
-        else:
-            self._static("instruction", rr.TextDocument(f"### {said[0]}\n\n{end}", media_type="text/markdown"))
+        given = [step for step in range(steps) if step == 0 or said[step] != said[step - 1]]
+        texts = [f"### {said[step]}\n\n{end}" for step in given]
+        columns = rr.TextDocument.columns(text=texts, media_type=["text/markdown"] * len(texts))
+        self._columns("instruction", np.array(given), columns)
         self._static("draws", rr.TextDocument(draws, media_type="text/markdown"))
 
     def events(self, events: Sequence[tuple[int, str]]) -> None:
@@ -139,19 +133,17 @@ class _Writer:
             self._columns(_path("world", body), moved, columns)
 
     def cameras(self, observations: Sequence[Observation]) -> None:
-        """Write colour as JPEG, depth as lossless 16-bit PNG [mm]."""
+        """Write colour as JPEG; depth [mm] as it is, which Rerun compresses faster and better than PNG would."""
         steps = np.arange(len(observations))
         for camera in observations[0].rgb:
             blobs = [encoded(seen.rgb[camera], "JPEG", quality=90) for seen in observations]
             columns = rr.EncodedImage.columns(blob=blobs, media_type=["image/jpeg"] * len(blobs))
             self._columns(_path("camera", camera, "rgb"), steps, columns)
         for camera in observations[0].depth:
-            path, some = _path("camera", camera, "depth"), np.stack([seen.depth[camera] for seen in observations[::8]])
+            depth = np.stack([seen.depth[camera] for seen in observations])
+            some = depth[::8]
             shades = np.percentile(some[some > 0], (1, 90)) if some.any() else (0.0, 1.0)
-            self._static(path, rr.EncodedDepthImage.from_fields(meter=1000.0, depth_range=shades, colormap="turbo"))
-            blobs = [encoded(seen.depth[camera], "PNG", compress_level=1) for seen in observations]
-            columns = rr.EncodedDepthImage.columns(blob=blobs, media_type=["image/png"] * len(blobs))
-            self._columns(path, steps, columns)
+            self._shades(_path("camera", camera, "depth"), steps, depth, "turbo", shades, meter=1000.0)
 
     def curves(self, episode: Episode) -> None:
         """Write state and executed action by unit, and the clean action if it differs."""
@@ -166,23 +158,28 @@ class _Writer:
                 self._series(_path("action", unit, "clean"), episode.actions[:, which], names, width=0.75)
 
     def tokens(self, steps: Array, probabilities: Array) -> None:
-        """Write one image per step: a row per action component, with its lowest bin on the left.
-
-        Args: steps (N,) and their probabilities (N, D, K); each row is scaled by its maximum.
-        """
+        """Write the probabilities (N, D, K) of steps (N,) as images: a row per component, scaled by its maximum."""
         components, bins = probabilities.shape[1:]
-        row = TOKENS[0] // components  # [px]
-        pixel_row, pixel_bin = np.arange(row * components) // row, np.arange(TOKENS[1]) * bins // TOKENS[1]
+        row, columns = TOKENS[0] // components, np.arange(TOKENS[1]) * bins // TOKENS[1]  # [px]
         # The square root makes small probabilities visible.
         strength = np.sqrt(probabilities / probabilities.max(axis=2, keepdims=True))
-        levels = np.round(strength * 255).astype(np.uint8)[:, pixel_row][:, :, pixel_bin]
-        levels[:, ::row] = 0  # a line between rows
-        shades = np.linspace(0, 255, len(HEAT))
-        palette = np.stack([np.interp(np.arange(256), shades, channel) for channel in HEAT.T], axis=1).astype(np.uint8)
-        blobs = [encoded(picture, "PNG", palette=palette, compress_level=1) for picture in levels]
-        self._columns("tokens", steps, rr.EncodedImage.columns(blob=blobs, media_type=["image/png"] * len(blobs)))
+        pixels = np.round(strength * 255).astype(np.uint8)[:, :, columns].repeat(row, axis=1)
+        pixels[:, ::row] = 0  # a line between rows
+        self._shades("tokens", steps, pixels, "inferno", (0.0, 255.0))
         beside = [(-32.0, (index + 0.5) * row) for index in range(components)]
         self._static("tokens/names", rr.Points2D(beside, labels=self._spec.action, radii=0.0, show_labels=True))
+
+    def _shades(self, path: str, steps: Array, pixels: Array, colours: Any, ends: Any, **fields: float) -> None:
+        """Write images (N, H, W) of whole numbers, with the numbers that have the first and the last of the colours.
+
+        To Rerun they are depths: only those have colours of their own.
+        """
+        height, width = pixels.shape[1:]
+        kind = {1: "U8", 2: "U16"}[pixels.itemsize]
+        image = rr.components.ImageFormat(width=width, height=height, channel_datatype=kind)
+        self._static(path, rr.DepthImage.from_fields(colormap=colours, depth_range=ends, **fields))
+        buffers = np.ascontiguousarray(pixels).view(np.uint8).reshape(len(pixels), -1)
+        self._columns(path, steps, rr.DepthImage.columns(buffer=buffers, format=[image] * len(pixels)))
 
     def _series(self, path: str, values: Array, names: Sequence[str], width: float = 1.75) -> None:
         """Write a plot; values (N, S), S names, width of the curves [px]."""
@@ -228,12 +225,10 @@ def _xyzw(wxyz: Array) -> Any:
     return np.asarray(wxyz)[..., [1, 2, 3, 0]]
 
 
-def encoded(pixels: Array, kind: str, palette: Array | None = None, **options: int) -> bytes:
+def encoded(pixels: Array, kind: str, **options: int) -> bytes:
     """Encode an image file of `kind`, "PNG" or "JPEG", with Pillow's `options`."""
-    image, buffer = Image.fromarray(pixels), io.BytesIO()
-    if palette is not None:
-        image.putpalette(palette.tobytes())
-    image.save(buffer, kind, **options)
+    buffer = io.BytesIO()
+    Image.fromarray(pixels).save(buffer, kind, **options)
     return buffer.getvalue()
 
 

@@ -9,8 +9,8 @@ import asyncio
 import logging
 import threading
 import time
-from collections.abc import Coroutine, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from collections.abc import Coroutine, Mapping, Sequence
+from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
@@ -29,26 +29,6 @@ from vla.spec import Array, Observation, Spec
 log = logging.getLogger(__name__)
 
 Result = TypeVar("Result")
-
-# Units are wrong if more than this share of a chunk exceeds the bounds by more than this share of their range.
-MAX_OUTLIER_SHARE, OUTLIER_DISTANCE = 0.25, 0.5
-
-
-@contextmanager
-def event_loop() -> Iterator[asyncio.AbstractEventLoop]:
-    """Run an event loop in a thread of its own within the context.
-
-    The connection lives there, as Python's TLS socket loses messages when two threads read and write at a time.
-    """
-    with asyncio.Runner() as runner:
-        loop = runner.get_loop()
-        thread = threading.Thread(target=loop.run_forever, name="connection", daemon=True)
-        thread.start()
-        try:
-            yield loop
-        finally:
-            loop.call_soon_threadsafe(loop.stop)
-            thread.join()
 
 
 @dataclass(frozen=True)
@@ -76,7 +56,7 @@ class RemotePolicy:
         execute: actions of each chunk to execute; null: as many as the server says, or all.
         asynchronous: act at the spec's control rate by the clock, and go on with the chunk, or hold, while the server
             computes the next one; else wait for it.
-        ensemble: as of `vla.rollouts.realtime.Schedule`; null: only the newest chunk counts.
+        ensemble: as of `vla.rollouts.realtime.Network`; null: only the newest chunk counts.
         timeout: longest time to wait for an answer [s].
         api_key: sent to `url` alone, as Authorization: Api-Key …
         spec: of the environment.
@@ -100,39 +80,47 @@ class RemotePolicy:
     spec: Spec
 
     def __post_init__(self) -> None:
-        self._images = {camera: key for camera, key in self.images.items() if key and camera in self.spec.cameras}
+        """Check the mapping, and connect."""
+        cameras = self.spec.cameras
+        self._images = {camera: key for camera, key in self.images.items() if key and camera in cameras}
         if not self._images:
-            cameras = self.spec.cameras
             raise UserError(
                 f"agent.images has no key for the world's cameras, {', '.join(cameras)}: add "
                 f"+agent.images.{cameras[0]}=KEY"
             )
-        names = [name for names in self.state.values() for name in names or ()]
-        _require_known("agent.state", names, self.spec.state, "state components")
+        names = {name for names in self.state.values() for name in names or ()}
+        if unknown := sorted(names - {*self.spec.state}):
+            known = ", ".join(self.spec.state)
+            raise UserError(f"agent.state names {', '.join(unknown)}, the state components are {known}")
         if self.actions is not None and sorted(self.actions) != sorted(self.spec.action):
             raise UserError(f"agent.actions must map {', '.join(self.spec.action)}, got {', '.join(self.actions)}")
-        if self.image_size is not None and max(np.divide(self.image_size, self.spec.image_size)) > 1:
-            size = f"[{self.image_size[0]},{self.image_size[1]}]"
-            log.warning("agent.image_size=%s enlarges the images of the world: set task.image_size=%s", size, size)
         self.info: dict[str, Any] = {}
-        self._broken = self._warned = False
-        self._configured_execute = self.execute
+        self._broken, self._configured_execute = False, self.execute
         self._low, self._high = np.array(self.spec.low, np.float32), np.array(self.spec.high, np.float32)
         with ExitStack() as opened:
-            self._loop = opened.enter_context(event_loop())
-            self._connect(opened)
+            self._connection = opened.enter_context(closing(Connection(self.url, self.timeout, self.api_key)))
+            self._adopt_metadata()
             self._open = opened.pop_all()
         if self.asynchronous:
-            link = BackgroundLink(self.plan, self.spec.control_hz)
-            self._open.callback(link.close)
+            link = self._open.enter_context(closing(BackgroundLink(self.plan, self.spec.control_hz)))
         else:
             link = SimulatedLink(self.plan, IDEAL, self.spec.control_hz)
         self._real_time = RealTime(self.spec, link, lambda: self.execute or 1, self.ensemble)
 
-    def _connect(self, opened: ExitStack) -> None:
-        """Connect, and adopt the metadata of the server's policy. Raises as the class does."""
-        self._connection, self.metadata = self._connected(opened)
-        self._require_alike()
+    def _adopt_metadata(self) -> None:
+        """Compare what the server says of its policy, as `vla.deploy.server` does, with the spec.
+
+        Raises:
+            UserError: its actions have other names, and no mapping is given.
+        """
+        self.metadata = self._connection.metadata
+        action, rate = self.metadata.get("action"), self.metadata.get("control_hz")
+        names = action.get("names") if isinstance(action, dict) else None
+        if self.actions is None and isinstance(names, list) and names != list(self.spec.action):
+            theirs, ours = ", ".join(map(str, names)), ", ".join(self.spec.action)
+            raise self._connection.error(f"its actions are {theirs[:200]}, ours are {ours[:200]}: set agent.actions")
+        if isinstance(rate, int | float) and abs(rate - self.spec.control_hz) > 0.01 * self.spec.control_hz:
+            log.warning("%s acts at %g Hz, the world at %g Hz", self.url, rate, self.spec.control_hz)
         advertised, history = (
             number if isinstance(number := self.metadata.get(name), int) and number >= 1 else None
             for name in ("execute", "history")
@@ -140,25 +128,12 @@ class RemotePolicy:
         self.history = history or 1  # frames of a window; above 1 every observation is sent
         self._wanted = self._configured_execute or (1 if self.history > 1 else advertised)
 
-    def _require_alike(self) -> None:
-        """Compare the server's metadata of its actions, as `vla.deploy.server` sends it, with the spec.
-
-        Raises:
-            UserError: its actions have other names, and no mapping is given.
-        """
-        action, rate = self.metadata.get("action"), self.metadata.get("control_hz")
-        names = action.get("names") if isinstance(action, dict) else None
-        if self.actions is None and isinstance(names, list) and names != list(self.spec.action):
-            theirs, ours = ", ".join(map(str, names)), ", ".join(self.spec.action)
-            raise self._error(f"its actions are {theirs[:200]}, ours are {ours[:200]}: set agent.actions")
-        if isinstance(rate, int | float) and abs(rate - self.spec.control_hz) > 0.01 * self.spec.control_hz:
-            log.warning("%s acts at %g Hz, the world at %g Hz", self.url, rate, self.spec.control_hz)
-
     def reset(self, instruction: str, seed: int) -> None:
         """Start an episode: drop all chunks, connect again if that broke, and tell a server that has episodes."""
         self._real_time.reset(seed)
         if self._broken:
-            self._connect(self._open)
+            self._connection.connect()
+            self._adopt_metadata()
             self._broken = False
         if self.metadata.get("reset") is True:
             self._ask({"reset": True, "prompt": instruction, "seed": seed})
@@ -184,17 +159,23 @@ class RemotePolicy:
         """Return the server's answer to an observation. Raises as `act` does."""
         return self._ask(self.message(observation))
 
+    def _ask(self, message: Mapping[str, Any]) -> dict[str, Any]:
+        self._broken = True  # until it has answered: after an error, too, a server closes the connection
+        answer = self._connection.ask(message)
+        self._broken = False
+        return answer
+
     def close(self) -> None:
         """Close the connection."""
         self._open.close()
 
     def message(self, observation: Observation) -> dict[str, Any]:
         """Return the observation with the server's keys."""
-        state = {
+        sent: dict[str, Any] = {
             key: observation.state if names is None else observation.state[self.spec.indices(names)]
             for key, names in self.state.items()
         }
-        sent: dict[str, Any] = {**state, self.prompt: observation.instruction}
+        sent[self.prompt] = observation.instruction
         for camera, key in self._images.items():
             image = _resized(observation.rgb[camera], self.image_size)
             *outer, name = [key] if isinstance(key, str) else key
@@ -208,84 +189,114 @@ class RemotePolicy:
         """Convert the server's chunk to ours, (k, D)."""
         if not isinstance(actions, np.ndarray) or actions.ndim != 2 or 0 in actions.shape:
             shape = getattr(actions, "shape", type(actions).__name__)
-            raise self._error(f"actions are a chunk (k, D), not {shape}")
+            raise self._connection.error(f"actions are a chunk (k, D), not {shape}")
         wanted = self.actions or {name: Component(index, 1.0, 0.0) for index, name in enumerate(self.spec.action)}
-        fits = actions.shape[1] > max(each.index for each in wanted.values())
-        if not fits or (self.actions is None and actions.shape[1] != len(wanted)):
+        columns, width = [wanted[name] for name in self.spec.action], actions.shape[1]
+        if width <= max(each.index for each in columns) or (self.actions is None and width != len(columns)):
             names = ", ".join(self.spec.action)
-            raise self._error(f"its actions have {actions.shape[1]} components, ours are {names}: set agent.actions")
-        columns = [wanted[name] for name in self.spec.action]
+            raise self._connection.error(f"its actions have {width} components, ours are {names}: set agent.actions")
         mine = np.stack([each.scale * actions[:, each.index] + each.offset for each in columns], 1)
         if not np.isfinite(mine).all():
-            raise self._error("an action is not finite")
-        clipped = np.clip(mine.astype(np.float32), self._low, self._high)
-        outlying = np.abs(mine - clipped) > OUTLIER_DISTANCE * (self._high - self._low)
-        if not self._warned and outlying.mean() > MAX_OUTLIER_SHARE:
-            self._warned = True
-            where = f"actions of {self.url} are far beyond the bounds of the world"
-            log.warning("%s: set agent.actions to its units", where)
-        return clipped
+            raise self._connection.error("an action is not finite")
+        return np.clip(mine.astype(np.float32), self._low, self._high)
 
-    def _connected(self, opened: ExitStack) -> tuple[ClientConnection, dict[str, Any]]:
-        times = {"open_timeout": self.timeout, "close_timeout": self.timeout, "ping_timeout": self.timeout}
-        headers = {"Authorization": f"Api-Key {self.api_key}"} if self.api_key else None
 
-        async def connected() -> ClientConnection:
-            try:
-                # No proxy of the environment; and where host and port are given, redirections elsewhere are refused.
-                place = {"host": parse_uri(self.url).host, "port": parse_uri(self.url).port, "proxy": None}
-                options = {"compression": None, "max_size": 2**26, "additional_headers": headers}
-                return await connect(self.url, **place, **options, **times)
-            except (ValueError, InvalidURI) as error:
-                raise UserError(
-                    f"agent.url={self.url[:200]} leads to no policy server ({error}): it looks like ws://127.0.0.1:8000"
-                ) from error
+class Connection:
+    """A WebSocket to a policy server, in a thread with an event loop of its own.
 
+    Python's TLS socket would lose messages if two threads read and wrote at a time, and pings are answered meanwhile.
+    """
+
+    def __init__(self, url: str, timeout: float, api_key: str | None) -> None:
+        """Connect; `timeout` is the longest time to wait for an answer [s]. Raises as `RemotePolicy`."""
+        self.url, self.timeout = url, timeout
+        self._headers = {"Authorization": f"Api-Key {api_key}"} if api_key else None
+        self._socket: ClientConnection | None = None
+        self._loop = asyncio.new_event_loop()
+        self._thread = threading.Thread(target=self._loop.run_forever, name="connection", daemon=True)
+        self._thread.start()
         try:
-            connection = self._wait(connected())
-            opened.callback(lambda: self._wait(connection.close()))
-            metadata = self._wait(asyncio.wait_for(self._received(connection), self.timeout))
+            self.connect()
+        except BaseException:
+            self.close()
+            raise
+
+    def connect(self) -> None:
+        """Connect again; `metadata` is what the server then says of its policy."""
+        try:
+            self.metadata = self._wait(self._connect())
         except InvalidStatus as error:
             said = bytes(error.response.body or b"").decode(errors="replace").strip()[:200]
-            raise self._error(
-                f"{said}: set VLA_API_KEY" if "API key" in said else said or f"HTTP status {error.response.status_code}"
-            ) from error
+            said = f"{said}: set VLA_API_KEY" if "API key" in said else said
+            raise self.error(said or f"HTTP status {error.response.status_code}") from error
         except (OSError, WebSocketException) as error:  # a time-out is an OSError without a text
             reason = error if str(error) else f"no answer within {self.timeout:g} s"
             raise UserError(f"no policy server at {self.url} ({reason}): start it, or set agent.url") from error
-        return connection, metadata
 
-    def _ask(self, message: Mapping[str, Any]) -> dict[str, Any]:
-        async def answered() -> dict[str, Any]:
-            await self._connection.send(pack(message))
-            return await self._received(self._connection)
-
-        self._broken = True  # until it has answered: after an error, too, a server closes the connection
+    async def _connect(self) -> dict[str, Any]:
+        await self._disconnect()
         try:
-            answer = self._wait(asyncio.wait_for(answered(), self.timeout))
+            place = parse_uri(self.url)
+            self._socket = await connect(
+                self.url,
+                host=place.host,  # where host and port are given, redirections elsewhere are refused
+                port=place.port,
+                proxy=None,  # of the environment
+                compression=None,
+                max_size=2**26,
+                additional_headers=self._headers,
+                open_timeout=self.timeout,
+                close_timeout=self.timeout,
+                ping_timeout=self.timeout,
+            )
+        except (ValueError, InvalidURI) as error:
+            raise UserError(
+                f"agent.url={self.url[:200]} leads to no policy server ({error}): it looks like ws://127.0.0.1:8000"
+            ) from error
+        return await asyncio.wait_for(self._received(self._socket), self.timeout)
+
+    def ask(self, message: Mapping[str, Any]) -> dict[str, Any]:
+        """Return the answer to a message; a UserError if there is none."""
+        assert self._socket is not None
+        try:
+            return self._wait(asyncio.wait_for(self._asked(self._socket, pack(message)), self.timeout))
         except ConnectionClosed as error:
             reason = f" ({error.rcvd.reason})" if error.rcvd and error.rcvd.reason else ""
-            raise self._error(f"it closed the connection{reason}") from error
+            raise self.error(f"it closed the connection{reason}") from error
         except TimeoutError as error:
-            self._loop.call_soon_threadsafe(self._connection.transport.abort)  # a late answer would be the next one's
-            raise self._error(f"no answer within {self.timeout:g} s") from error
-        self._broken = False
+            self._loop.call_soon_threadsafe(self._socket.transport.abort)  # a late answer would be the next one's
+            raise self.error(f"no answer within {self.timeout:g} s") from error
+
+    async def _asked(self, socket: ClientConnection, message: bytes) -> dict[str, Any]:
+        await socket.send(message)
+        return await self._received(socket)
+
+    async def _received(self, socket: ClientConnection) -> dict[str, Any]:
+        data = await socket.recv()
+        if isinstance(data, str):
+            raise self.error(data.strip().splitlines()[-1][:500] if data.strip() else "an empty error")
+        answer = unpack(data)
+        if not isinstance(answer, dict):
+            raise self.error(f"an answer is a map, not {type(answer).__name__}")
         return answer
 
     def _wait(self, work: Coroutine[Any, Any, Result]) -> Result:
         return asyncio.run_coroutine_threadsafe(work, self._loop).result()
 
-    async def _received(self, connection: ClientConnection) -> dict[str, Any]:
-        data = await connection.recv()
-        if isinstance(data, str):
-            raise self._error(data.strip().splitlines()[-1][:500] if data.strip() else "an empty error")
-        answer = unpack(data)
-        if not isinstance(answer, dict):
-            raise self._error(f"an answer is a map, not {type(answer).__name__}")
-        return answer
+    async def _disconnect(self) -> None:
+        if self._socket is not None:
+            await self._socket.close()
 
-    def _error(self, what: str) -> UserError:
+    def error(self, what: str) -> UserError:
+        """Return the error that names the server."""
         return UserError(f"the policy server at {self.url} failed: {what}")
+
+    def close(self) -> None:
+        """Close the connection, and end its thread."""
+        self._wait(self._disconnect())
+        self._loop.call_soon_threadsafe(self._loop.stop)
+        self._thread.join()
+        self._loop.close()
 
 
 def _resized(image: Array, size: Sequence[int] | None) -> Array:
@@ -293,8 +304,3 @@ def _resized(image: Array, size: Sequence[int] | None) -> Array:
     if size is None or image.shape[:2] == tuple(size):
         return image
     return np.array(ImageOps.pad(Image.fromarray(image), (size[1], size[0]), Image.Resampling.BILINEAR))
-
-
-def _require_known(key: str, names: Any, known: Sequence[str], what: str) -> None:
-    if unknown := [str(name) for name in names if name not in known]:
-        raise UserError(f"{key} names {', '.join(unknown)}, the {what} are {', '.join(known)}")

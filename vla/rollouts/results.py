@@ -1,20 +1,19 @@
-"""Results of an evaluation: rates with intervals, by task and by tier, and comparisons of reports on the same seeds."""
+"""Results of an evaluation: rates with intervals, by task and by tier."""
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from operator import attrgetter
 from typing import Any
 
 import numpy as np
 
-from vla.io.errors import UserError
-from vla.rollouts.comparison import Comparison, Key, Pairs, compare_amounts, compare_pairs, concluded, median_interval
 from vla.rollouts.motion import AMOUNTS, Motion
 from vla.rollouts.sequential import anytime_interval
-from vla.rollouts.statistics import bounded_mean_interval, stratified_interval, wilson_interval
+from vla.rollouts.statistics import bounded_mean_interval, median_interval, stratified_interval, wilson_interval
+
+Rate = tuple[float, float, float]  # an estimate, and its 95 % confidence interval
 
 ERROR = "error"  # outcome of an episode that was not completed
 
@@ -76,6 +75,11 @@ class Report:
         return len(self.results) - len(self.errors)
 
     @property
+    def outcome_counts(self) -> dict[str, int]:
+        """Outcome → number of episodes, the most frequent first."""
+        return dict(Counter(result.outcome for result in self.results).most_common())
+
+    @property
     def successes(self) -> int:
         """Number of successes."""
         return self.outcome_counts.get("success", 0)
@@ -90,17 +94,12 @@ class Report:
         """95 % confidence interval of `success`; with tiers, the tasks are fixed strata."""
         if self.anytime or not self.tiers:
             return self.interval_of(self.successes)
-        played = [part for part in self.tasks.values() if part.episodes]
-        known = sum(part.episodes for part in played)  # an error in `seen` leaves other conditions without its task
-        return stratified_interval([part._stratum(known) for part in played])[1:]
+        # Known tasks only: an error in `seen` leaves other conditions without its task.
+        return self._stratified([self.tasks])[1:]
 
     def interval_of(self, count: float) -> tuple[float, float]:
         """Return the 95 % confidence interval of the rate of an event that `count` completed episodes had."""
         return anytime_interval(count, self.episodes - count) if self.anytime else wilson_interval(count, self.episodes)
-
-    def _stratum(self, episodes: float) -> tuple[int, int, float]:
-        """Return successes, completed episodes and weight, their share of `episodes`, as a stratum of an interval."""
-        return self.successes, self.episodes, self.episodes / episodes
 
     @property
     def milestones(self) -> dict[str, int]:
@@ -108,27 +107,15 @@ class Report:
         return dict(sorted(Counter(name for result in self.results for name in result.milestones).items()))
 
     @property
-    def amounts(self) -> dict[str, list[float]]:
-        """Field of `Motion` → its values in successful episodes, without fields that nobody measured."""
-        motions = [result.motion for result in self.results if result.success]
-        values = {name: [getattr(motion, name, None) for motion in motions] for name in AMOUNTS}
-        known = {name: [value for value in each if value is not None] for name, each in values.items()}
-        return {name: each for name, each in known.items() if each}
-
-    @property
     def medians(self) -> dict[str, Median]:
-        """Field of `Motion` → its median in successful episodes, see `amounts`."""
-        return {
-            name: Median(
-                float(np.median(values)), *(median_interval(values, self.anytime) or (None, None)), len(values)
-            )
-            for name, values in self.amounts.items()
-        }
-
-    @property
-    def _chains(self) -> list[tuple[int, int]]:
-        """Instructions completed, of how many, per episode with several."""
-        return [result.completed for result in self.results if result.completed]
+        """Field of `Motion` → its median in successful episodes, without fields that nobody measured."""
+        motions, found = [result.motion for result in self.results if result.success], dict[str, Median]()
+        for name in AMOUNTS:
+            measured = [getattr(motion, name, None) for motion in motions]
+            if values := [value for value in measured if value is not None]:
+                low, high = median_interval(values, self.anytime) or (None, None)
+                found[name] = Median(float(np.median(values)), low, high, len(values))
+        return found
 
     @property
     def in_a_row(self) -> dict[str, int]:
@@ -136,26 +123,23 @@ class Report:
 
         Empty if the episodes have only one instruction.
         """
-        length = max((length for _, length in self._chains), default=0)
-        return {f"{n}/{length}": sum(done >= n for done, _ in self._chains) for n in range(1, length + 1)}
+        chains = [result.completed for result in self.results if result.completed]
+        length = max((length for _, length in chains), default=0)
+        return {f"{n}/{length}": sum(done >= n for done, _ in chains) for n in range(1, length + 1)}
 
     @property
-    def mean_in_a_row(self) -> tuple[float, float, float] | None:
+    def mean_in_a_row(self) -> Rate | None:
         """Mean number of instructions completed, with its 95 % confidence interval; None if episodes have only one."""
-        if not self._chains:
+        chains = [result.completed for result in self.results if result.completed]
+        if not chains:
             return None
-        done, length = [done for done, _ in self._chains], max(length for _, length in self._chains)
+        done, length = [done for done, _ in chains], max(length for _, length in chains)
         if self.anytime:  # bets on shares of a success lose more than bets on the values would
             share = sum(done) / length
             low, high = (length * bound for bound in anytime_interval(share, len(done) - share))
         else:
             low, high = bounded_mean_interval(done, length)
         return sum(done) / len(done), low, high
-
-    @property
-    def outcome_counts(self) -> dict[str, int]:
-        """Outcome → number of episodes, the most frequent first."""
-        return dict(Counter(result.outcome for result in self.results).most_common())
 
     @property
     def tasks(self) -> dict[str, Report]:
@@ -175,25 +159,28 @@ class Report:
         return {tier: part for tier, part in parts.items() if part.episodes}
 
     def _part(self, tasks: Sequence[str], tiers: Mapping[str, Sequence[str]] | None = None) -> Report:
-        return replace(
-            self, results=tuple(result for result in self.results if result.task in tasks), tiers=tiers or {}
-        )
+        results = tuple(result for result in self.results if result.task in tasks)
+        return replace(self, results=results, tiers=tiers or {})
 
     @property
-    def mean_over_tiers(self) -> tuple[float, float, float] | None:
+    def mean_over_tiers(self) -> Rate | None:
         """Mean of the tiers' success rates, 0…1, with its 95 % confidence interval.
 
         None with fewer than two tiers, or if it must be valid whatever the reason to stop playing.
         """
         tiers = list(self.by_tier.values())
-        if len(tiers) < 2 or self.anytime:
-            return None
+        return None if len(tiers) < 2 or self.anytime else self._stratified([tier.tasks for tier in tiers])
+
+    @staticmethod
+    def _stratified(groups: Sequence[Mapping[str, Report]]) -> Rate:
+        """Return the mean rate over groups of tasks, in each of which episodes weigh alike."""
+        played = [[task for task in group.values() if task.episodes] for group in groups]
+        totals = [len(groups) * sum(task.episodes for task in tasks) for tasks in played]
         return stratified_interval(
             [
-                part._stratum(len(tiers) * tier.episodes)
-                for tier in tiers
-                for part in tier.tasks.values()
-                if part.episodes
+                (task.successes, task.episodes, task.episodes / total)
+                for tasks, total in zip(played, totals, strict=True)
+                for task in tasks
             ]
         )
 
@@ -204,116 +191,32 @@ class Report:
         known = sum(part.episodes > 0 for task, part in self.tasks.items() if task in listed)
         return "mean over tiers" if known == len(listed) else f"mean over tiers ({known} of {len(listed)} tasks)"
 
-    def compare(self, other: Report) -> Comparison:
-        """Compare the success of another report, as the second, with this one, the first, on the same seeds.
-
-        Pairs with an error do not count. Where episodes were played until it was clear, one report may be longer.
-
-        Raises:
-            UserError: the reports have different seeds.
-        """
-        return compare_pairs(pairs_of(self._together(other)), self.anytime or other.anytime)
-
-    def compare_secondary(self, other: Report) -> dict[str, Comparison]:
-        """Compare milestones and motion of another report with those of this one, see `compare` and `secondary_of`."""
-        return secondary_of(self._together(other), self.anytime or other.anytime)
-
-    def _together(self, other: Report) -> list[tuple[Result, Result]]:
-        together = list(zip(self.results, other.results, strict=False))
-        if any(one.seed != two.seed for one, two in together) or (
-            len(self.results) != len(other.results) and not (self.anytime or other.anytime)
-        ):
-            raise UserError("only reports on the same seeds can be compared")
-        return together
-
     def __str__(self) -> str:
         """Format failures, errors, milestones, motion, several instructions, several tasks, tiers and, last, the
         success rate with its interval."""
+        ci = "anytime-valid 95 % CI" if self.anytime else "95 % CI"
         lines = [f"{name} {count}" for name, count in self.outcome_counts.items() if name not in ("success", ERROR)]
         if self.errors:
             first = self.errors[0]
             lines.append(f"errors {len(self.errors)}, the first at seed {first.seed}: {first.error}")
-        lines += [f"{name} {self._rate(count)}" for name, count in self.milestones.items()]
+        lines += [f"{name} {self._rate(ci, count)}" for name, count in self.milestones.items()]
         if medians := [f"{AMOUNTS[name]} {median}" for name, median in self.medians.items()]:
-            lines.append(f"medians of the successes, {self._ci}: {', '.join(medians)}")
-        lines += [f"{name} completed in {self._rate(count)}" for name, count in self.in_a_row.items()]
+            lines.append(f"medians of the successes, {ci}: {', '.join(medians)}")
+        lines += [f"{name} completed in {self._rate(ci, count)}" for name, count in self.in_a_row.items()]
         if row := self.mean_in_a_row:
-            mean, low, high = (f"{value:.2f}" for value in row)
-            lines.append(f"completed in a row on average {mean} ({self._ci} {low}-{high})")
+            lines.append("completed in a row on average {:.2f} ({ci} {:.2f}-{:.2f})".format(*row, ci=ci))
         if len(self.tasks) > 1:
-            lines += [f"{task} {report._rate()}" for task, report in self.tasks.items()]
-        lines += [f"{tier.replace('_', ' ')} {report._rate()}" for tier, report in self.by_tier.items()]
+            lines += [f"{task} {report._rate(ci)}" for task, report in self.tasks.items()]
+        lines += [f"{tier.replace('_', ' ')} {report._rate(ci)}" for tier, report in self.by_tier.items()]
         if mean := self.mean_over_tiers:
-            rate, low, high = (f"{100 * value:.1f}" for value in mean)
-            lines.append(f"{self.mean_label} {rate} % (95 % CI {low}-{high})")
-        return "\n".join([*lines, f"success {self._rate()}"])
+            rate, low, high = (100 * value for value in mean)
+            lines.append(f"{self.mean_label} {rate:.1f} % ({ci} {low:.1f}-{high:.1f})")
+        return "\n".join([*lines, f"success {self._rate(ci)}"])
 
-    def _rate(self, count: int | None = None) -> str:
+    def _rate(self, ci: str, count: int | None = None) -> str:
         """Format the rate of an event that `count` completed episodes had, by default that of success."""
         if not self.episodes:
             return "0/0 (no episode was completed)"
         count, (low, high) = (self.successes, self.interval) if count is None else (count, self.interval_of(count))
         share = count / self.episodes
-        return f"{count}/{self.episodes} ({100 * share:.1f} %, {self._ci} {100 * low:.1f}-{100 * high:.1f})"
-
-    @property
-    def _ci(self) -> str:
-        return "anytime-valid 95 % CI" if self.anytime else "95 % CI"
-
-
-def pairs_of(
-    together: Iterable[tuple[Result, Result]], happened: Callable[[Result], bool] = attrgetter("success")
-) -> Pairs:
-    """Count what happened in pairs of episodes, without those of which one was not completed."""
-    counts = Counter((happened(one), happened(two)) for one, two in together if ERROR not in (one.outcome, two.outcome))
-    return Pairs(counts[True, True], counts[True, False], counts[False, True], counts[False, False])
-
-
-def secondary_of(together: Sequence[tuple[Result, Result]], anytime: bool) -> dict[str, Comparison]:
-    """Compare, in pairs of episodes, motion where both succeeded, and how often each milestone was reached in the same
-    task.
-
-    Returns:
-        Field of `Motion` or milestone → comparison, without fields of which too few pairs are known.
-    """
-    found = {}
-    for name in AMOUNTS:
-        pairs = [
-            (getattr(one.motion, name), getattr(two.motion, name))
-            for one, two in together
-            if one.success and two.success and one.motion and two.motion
-        ]
-        known = np.array([pair for pair in pairs if None not in pair], float).reshape(-1, 2)
-        if compared := compare_amounts(known[:, 0], known[:, 1], anytime):
-            found[name] = compared
-    alike = [(one, two) for one, two in together if one.task == two.task]  # another task may not have the milestone
-    for name in sorted({name for pair in alike for result in pair for name in result.milestones}):
-        found[name] = compare_pairs(pairs_of(alike, lambda result, name=name: name in result.milestones), anytime)
-    return found
-
-
-def compare_conditions(reports: Mapping[str, Report], margin: float) -> dict[str, Comparison]:
-    """Return condition → comparison of its success with that of the first condition, which has none.
-
-    Args:
-        reports: by condition.
-        margin: non-inferiority margin of the success rate, 0…1.
-    """
-    (_, first), *others = reports.items()
-    return concluded({name: first.compare(report) for name, report in others}, margin)
-
-
-def compare_secondary_metrics(reports: Mapping[str, Report]) -> dict[str, dict[str, Comparison]]:
-    """Return condition → comparisons of milestones and motion with those of the first condition, which has none.
-
-    Verdicts take all of them into account, but not the comparisons of success.
-    """
-    (_, first), *others = reports.items()
-    return concluded_secondary({name: first.compare_secondary(report) for name, report in others})
-
-
-def concluded_secondary(secondary: Mapping[Key, Mapping[str, Comparison]]) -> dict[Key, dict[str, Comparison]]:
-    """Return what `secondary_of` found in several cases, with verdicts that take all of it into account."""
-    flat = {(case, name): compared for case, metrics in secondary.items() for name, compared in metrics.items()}
-    found = concluded(flat, None)
-    return {case: {name: found[case, name] for name in metrics} for case, metrics in secondary.items()}
+        return f"{count}/{self.episodes} ({100 * share:.1f} %, {ci} {100 * low:.1f}-{100 * high:.1f})"

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vla.rollouts.worlds import Stage, WorldsHere, copied, in_lanes, play
+from vla.rollouts.worlds import Stage, Worlds, copied, in_lanes, play
 from vla.spec import Agent, Environment, Episode, Observation, Recorder
 
 EnvironmentFactory = Callable[[], Environment]
@@ -23,7 +23,7 @@ def rollout(
         UserError: the agent returned an action of the wrong shape, or one that is not finite, or the episode is over
             at its start.
     """
-    worlds = WorldsHere([Stage(environment, recorder)])
+    worlds = Worlds([Stage(environment, recorder)])
     ((_, ended),) = play(worlds, in_lanes(agent), [seed], recorder is not None, all_images)
     if isinstance(ended, Exception):
         raise ended

@@ -3,8 +3,8 @@
 The capital of bets at the odds of a hypothesis, 1 at first, is a test martingale. If the hypothesis is true, the
 capital ever reaches 20 with a probability of at most 1/20 (J. Ville, "Étude critique de la notion de collectif",
 1939). The hypotheses with a capital below 20 form a 95 % confidence sequence (I. Waudby-Smith, A. Ramdas, "Estimating
-means of bounded random variables by betting", Journal of the Royal Statistical Society B 86, 2024): the intervals after
-all numbers of episodes cover the truth together with a probability of 95 %.
+means of bounded random variables by betting", Journal of the Royal Statistical Society B 86, 2024): the intervals cover
+the truth simultaneously, for all n, with probability 95 %.
 
 The capital is spread evenly over `BETS` constant bets. For successes and failures it is that of the mixture with the
 density Beta(1/2, 1/2) (R. Krichevsky, V. Trofimov, "The performance of universal encoding", IEEE Transactions on
@@ -18,7 +18,6 @@ odds of the mean over tasks then lose.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import accumulate
 from math import log
 
 import numpy as np
@@ -48,6 +47,14 @@ def log_capital(mean: float, ones: Array | float, zeros: Array | float, halves: 
     return np.asarray(largest + np.log(np.exp(growth - largest[..., None]).mean(-1)))
 
 
+def excludes(mean: float, ones: int, zeros: int, halves: int = 0, comparisons: int = 1) -> bool:
+    """Return whether observations have shown that their mean is another one, which is between 0 and 1.
+
+    The number of `comparisons` is for the Bonferroni correction.
+    """
+    return bool(log_capital(mean, ones, zeros, halves) >= log(comparisons / LEVEL))
+
+
 def anytime_interval(ones: float, zeros: float, halves: int = 0) -> tuple[float, float]:
     """Return the confidence interval of the mean of observations of 0, 1/2 and 1; (0, 1) without observations.
 
@@ -73,14 +80,12 @@ def anytime_interval(ones: float, zeros: float, halves: int = 0) -> tuple[float,
     return 0.0 if ones + halves == 0 else bound(0.0), 1.0 if zeros + halves == 0 else bound(1.0)
 
 
-def anytime_difference(first: int, second: int, pairs: int) -> tuple[float, float]:
-    """Return the confidence interval of the second success rate minus the first.
+# Of pairs of episodes: those in which only the first succeeded, those in which only the second did, and all of them. A
+# pair is an observation of 1 if the second one did better, of 0 if the first did, else of 1/2.
 
-    Args:
-        first: pairs in which only the first succeeded.
-        second: pairs in which only the second succeeded.
-        pairs: all of them.
-    """
+
+def anytime_difference(first: int, second: int, pairs: int) -> tuple[float, float]:
+    """Return the confidence interval of the second success rate minus the first."""
     low, high = anytime_interval(second, first, pairs - first - second)
     return 2 * low - 1, 2 * high - 1
 
@@ -89,34 +94,20 @@ def anytime_p(first: int, second: int) -> float:
     """Return a p-value for equal success, valid at any time: one over the capital from bets on a fair coin.
 
     Of a pair that differs, it is as likely to favour either; the others do not change the capital.
-
-    Args:
-        first: pairs in which only the first succeeded.
-        second: pairs in which only the second succeeded.
     """
     return float(np.exp(-max(log_capital(0.5, second, first), 0.0)))
-
-
-def excludes(bar: float, successes: int, failures: int) -> bool:
-    """Return whether a success rate has been shown to be above or below a bar, which is between 0 and 1."""
-    return bool(log_capital(bar, successes, failures) >= log(1 / LEVEL))
 
 
 def is_decided(first: int, second: int, pairs: int, margin: float, comparisons: int = 1) -> bool:
     """Return whether two success rates are shown to be different, or equivalent within a margin, at any time.
 
-    Args:
-        first: pairs in which only the first succeeded.
-        second: pairs in which only the second succeeded.
-        pairs: all of them.
-        margin: of what counts as equal, between 0 and 1.
-        comparisons: number of comparisons, for the Bonferroni correction of the test for a difference.
+    The number of `comparisons` is for the Bonferroni correction of the test for a difference.
     """
-    if log_capital(0.5, second, first) >= log(comparisons / LEVEL):
+    if excludes(0.5, second, first, comparisons=comparisons):
         return True
     within = abs(second - first) < margin * pairs
     ends = ((1 - margin) / 2, (1 + margin) / 2)
-    return within and all(log_capital(end, second, first, pairs - first - second) >= log(1 / LEVEL) for end in ends)
+    return within and all(excludes(end, second, first, pairs - first - second) for end in ends)
 
 
 def decided_after(outcomes: Sequence[tuple[bool, bool]], margin: float, turns: int = 1) -> int | None:
@@ -127,7 +118,9 @@ def decided_after(outcomes: Sequence[tuple[bool, bool]], margin: float, turns: i
         margin: as in `is_decided`.
         turns: number of tasks that take turns; decisions are made after whole rounds.
     """
-    first = accumulate(one and not other for one, other in outcomes)
-    second = accumulate(other and not one for one, other in outcomes)
-    rounds = list(enumerate(zip(first, second, strict=True), start=1))[turns - 1 :: turns]
-    return next((pairs for pairs, (lost, won) in rounds if is_decided(lost, won, pairs, margin)), None)
+    first = second = 0
+    for pairs, (one, other) in enumerate(outcomes, start=1):
+        first, second = first + (one and not other), second + (other and not one)
+        if pairs % turns == 0 and is_decided(first, second, pairs, margin):
+            return pairs
+    return None

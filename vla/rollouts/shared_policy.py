@@ -40,7 +40,6 @@ class Planner(Agents, Protocol):
 
     def plan(self, observations: Sequence[Observation], lanes: Sequence[int], /) -> Array:
         """Return the chunks (n, k, D) of n lanes."""
-        ...
 
 
 @contextmanager
@@ -144,11 +143,7 @@ class DistantPolicy:
     """The agent of one world whose policy is in another process of this machine."""
 
     def __init__(self, address: str, key: bytes, spec: Spec) -> None:
-        """Args: where the policy is, and the spec of the environment.
-
-        Raises:
-            UserError: the policy has another spec.
-        """
+        """Connect to a policy; a UserError if it has another spec than the environment."""
         self._connection = Client(address, authkey=key)
         self._connection.send(True)
         name, self.spec, self.execute, self.history = self._connection.recv()

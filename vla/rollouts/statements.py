@@ -6,8 +6,8 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 from vla.io.errors import UserError
-from vla.rollouts.comparison import Comparison, compare_pairs
-from vla.rollouts.results import ERROR, Report, Result, pairs_of
+from vla.rollouts.comparison import compare_pairs, pairs_of
+from vla.rollouts.results import ERROR, Report, Result
 from vla.rollouts.sequential import excludes, is_decided
 
 
@@ -39,6 +39,14 @@ class AgainstRun:
     margin: float
     anytime: bool = False  # whether the other run stopped when something was clear
 
+    def require_common(self, seeds: Iterable[int]) -> None:
+        """Raise a UserError if the other run completed no episode with one of these seeds."""
+        if not any(seed in self.results and self.results[seed].outcome != ERROR for seed in seeds):
+            raise UserError(
+                f"evaluate.against={self.run} has no episode in common with this evaluation: it needs a run with the "
+                "same task, randomisation and evaluate.seed"
+            )
+
     def is_decided(self, report: Report) -> bool:
         """Return whether the episodes of a report decide the statement, or the other run has no later ones.
 
@@ -47,22 +55,15 @@ class AgainstRun:
         Raises:
             UserError: the other run has other episodes with the same seeds.
         """
-        found = self._compared(report)
-        if not found.episodes and self._completed(report):
-            raise self._apart()
-        assert found.only_first is not None and found.only_second is not None
-        if report.results and report.results[-1].seed >= max(self.results):
-            return True
-        return is_decided(found.only_first, found.only_second, found.episodes, self.margin)
-
-    def require_common(self, seeds: Iterable[int]) -> None:
-        """Raise a UserError if the other run completed no episode with one of these seeds."""
-        if not any(seed in self.results and self.results[seed].outcome != ERROR for seed in seeds):
-            raise self._apart()
+        pairs = pairs_of(self._common(report))
+        if not sum(pairs) and sum(pairs_of(self._paired(report))):
+            self.require_common(())
+        ended = bool(report.results) and report.results[-1].seed >= max(self.results)
+        return ended or is_decided(pairs.first, pairs.second, sum(pairs), self.margin)
 
     def say(self, report: Report) -> str:
         """Describe the verdict on a finished report in one sentence."""
-        found = self._compared(report)
+        found = compare_pairs(pairs_of(self._common(report)), self.anytime or report.anytime)
         if not found.episodes:
             return f"no episode in common with {self.run}"
         verdict = found.conclude(found.p, self.margin).verdict
@@ -72,25 +73,14 @@ class AgainstRun:
             f"({low} to {high}), p = {found.p:.2g}"
         )
 
-    def _completed(self, report: Report) -> list[tuple[Result, Result]]:
-        """Return results of the other run and of this one for the seeds that both completed."""
-        pairs = [(self.results[mine.seed], mine) for mine in report.results if mine.seed in self.results]
-        return [pair for pair in pairs if ERROR not in (pair[0].outcome, pair[1].outcome)]
+    def _paired(self, report: Report) -> list[tuple[Result, Result]]:
+        """Return results of the other run and of this one with the same seeds."""
+        return [(self.results[mine.seed], mine) for mine in report.results if mine.seed in self.results]
 
-    def _compared(self, report: Report) -> Comparison:
-        # The same seed gives another episode under another goal or level of randomisation.
-        same = [
-            (their, mine)
-            for their, mine in self._completed(report)
-            if (their.instruction, their.draws) == (mine.instruction, mine.draws)
-        ]
-        return compare_pairs(pairs_of(same), self.anytime or report.anytime)
-
-    def _apart(self) -> UserError:
-        return UserError(
-            f"evaluate.against={self.run} has no episode in common with this evaluation: it needs a run with the same "
-            "task, randomisation and evaluate.seed"
-        )
+    def _common(self, report: Report) -> list[tuple[Result, Result]]:
+        """Return those of the same episodes: another goal or level of randomisation gives a seed another one."""
+        pairs = self._paired(report)
+        return [(one, two) for one, two in pairs if (one.instruction, one.draws) == (two.instruction, two.draws)]
 
 
 Statement = AgainstBar | AgainstRun

@@ -1,11 +1,15 @@
-"""Confidence intervals of success rates and of means."""
+"""Confidence intervals of success rates, means and medians, and the exact test for pairs."""
 
 from __future__ import annotations
 
+from bisect import bisect
 from collections.abc import Mapping, Sequence
 from math import sqrt
 
 import numpy as np
+
+from vla.rollouts.sequential import LEVEL, anytime_p
+from vla.spec import Array
 
 NORMAL_QUANTILE = 1.959964  # of 0.975: an interval of 95 %
 
@@ -67,7 +71,30 @@ def bounded_mean_interval(values: Sequence[float], largest: float) -> tuple[floa
     return largest * low, largest * high
 
 
-def mean_interval(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def median_interval(values: Sequence[float] | Array, anytime: bool = False) -> tuple[float, float] | None:
+    """Return the 95 % confidence interval of the median, between two of the values; None with too few of them.
+
+    It contains the medians that the sign test does not exclude (W. R. Thompson, "On confidence ranges for the median
+    and other expectation distributions", Annals of Mathematical Statistics 7, 1936).
+    """
+    ordered, test = np.sort(values), anytime_p if anytime else mcnemar
+    count = len(ordered)
+    outside = bisect(range(count // 2 + 1), LEVEL, key=lambda below: test(below, count - below))
+    return (float(ordered[outside - 1]), float(ordered[-outside])) if outside else None
+
+
+def mcnemar(lost: int, won: int) -> float:
+    """Return the two-sided exact p-value for equal success rates, given the numbers of discordant pairs.
+
+    Under the null hypothesis both kinds of pairs are equally likely (Q. McNemar, "Note on the sampling error of
+    the difference between correlated proportions or percentages", Psychometrika 12, 1947).
+    """
+    from scipy.special import bdtr  # the binomial distribution; importing scipy.stats takes a second
+
+    return min(1.0, 2 * float(bdtr(min(lost, won), lost + won, 0.5)))
+
+
+def mean_interval(values: Array) -> tuple[Array, Array]:
     """Return the 95 % confidence intervals of the means of (E, D) non-negative values, as two arrays (D,).
 
     Student's t interval over the E rows; with a single row it is unbounded.
@@ -118,7 +145,7 @@ def effective_episodes(trainings: Sequence[Mapping[int, bool]]) -> tuple[float, 
     return rate * independent, independent
 
 
-def _squares(values: np.ndarray, groups: np.ndarray) -> float:
+def _squares(values: Array, groups: Array) -> float:
     """Σ_g (Σ_{i∈g} x_i)²."""
     _, place = np.unique(groups, return_inverse=True)
     return float(np.square(np.bincount(place, values)).sum())

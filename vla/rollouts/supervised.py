@@ -19,15 +19,7 @@ class Supervised:
     """
 
     def __init__(self, policy: Agent, expert: Agent, beta: float, segment: int) -> None:
-        """Args:
-        policy: agent that acts.
-        expert: agent that labels; memoryless, see `require_memoryless`.
-        beta: probability that the expert acts in a segment, 0…1; 0 lets the policy act throughout.
-        segment: length [steps].
-
-        Raises:
-            UserError: the expert is not memoryless, so that it cannot label states of another agent.
-        """
+        """Let an expert, see `require_memoryless`, act with the probability `beta` in every `segment` [steps]."""
         require_memoryless(expert)
         self._policy, self._expert, self._beta, self._segment = policy, expert, beta, segment
         self.info: dict[str, Any] = {}

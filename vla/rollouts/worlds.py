@@ -8,38 +8,15 @@ Shapes: n lanes, D action components, N steps of an episode.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
 from vla.io.errors import UserError
-from vla.spec import Agent, Agents, Array, Environment, Episode, InARow, Observation, Recorder, Spec, Traceable
-
-
-class Worlds(Protocol):
-    """Environments side by side, each in a lane; what is asked of one lane does not wait for the others."""
-
-    spec: Spec
-    lanes: int
-
-    def reset(self, lane: int, seed: int, recorded: bool) -> None:
-        """Start the episode of a seed in a lane."""
-        ...
-
-    def step(self, lane: int, action: Array, info: Mapping[str, Any], blind: bool) -> None:
-        """Apply an action (D,), about which `info` is known; the next observation has no images if it is `blind`."""
-        ...
-
-    def wait(self) -> Iterable[tuple[int, Any]]:
-        """Wait for at least one of the lanes that were asked.
-
-        Returns lane → its next observation; or, if its episode is over, what is made of it, or the exception that ended
-        it.
-        """
-        ...
+from vla.spec import Agent, Agents, Array, Environment, Episode, HasTool, MultiInstruction, Observation, Recorder
 
 
 class Stage:
@@ -61,7 +38,7 @@ class Stage:
         self._seed, self._seen, self._clean, self._executed = seed, list[Observation](), list[Array](), list[Array]()
         # Now, because the tool of a world may exist from its first episode on.
         world = self.environment
-        self._traced = world if isinstance(world, Traceable) else None
+        self._traced = world if isinstance(world, HasTool) else None
         self._tool = [self._traced.tool] if self._traced else []
         self._recording = self._recorder if recorded else None
         if self._recording is not None:
@@ -105,31 +82,31 @@ class Stage:
         return episode
 
 
-class WorldsHere:
-    """Worlds in this process: each does at once what it is asked, and makes an `Episode`."""
+class Worlds:
+    """Stages side by side, each in a lane; what is asked of one lane does not wait for the others."""
 
     def __init__(self, stages: Sequence[Stage]) -> None:
         self._stages, self.lanes, self.spec = stages, len(stages), stages[0].environment.spec
-        self._found: list[tuple[int, Any]] = []
+        self._answers: list[tuple[int, Any]] = []
 
     def reset(self, lane: int, seed: int, recorded: bool) -> None:
-        """See `Worlds`."""
+        """Start the episode of a seed in a lane."""
         self._ask(lane, self._stages[lane].reset, seed, recorded)
 
     def step(self, lane: int, action: Array, info: Mapping[str, Any], blind: bool) -> None:
-        """See `Worlds`."""
+        """Apply an action (D,), about which `info` is known; the next observation has no images if it is `blind`."""
         self._ask(lane, self._stages[lane].step, action, info, blind)
 
     def _ask(self, lane: int, call: Callable[..., Any], *arguments: Any) -> None:
         try:
-            self._found.append((lane, call(*arguments)))
+            self._answers.append((lane, call(*arguments)))
         except Exception as error:  # of any kind: worlds are what people write
-            self._found.append((lane, error))
+            self._answers.append((lane, error))
 
-    def wait(self) -> Iterable[tuple[int, Any]]:
-        """See `Worlds`."""
-        found, self._found = self._found, []
-        return found
+    def wait(self) -> list[tuple[int, Any]]:
+        """Return the answers of the lanes that were asked: the next observation, the ended episode, or an error."""
+        answers, self._answers = self._answers, []
+        return answers
 
 
 class Alone:
@@ -176,7 +153,7 @@ class _Episode:
 def play(
     worlds: Worlds, agents: Agents, seeds: Sequence[int], recorded: bool = False, all_images: bool = True
 ) -> Iterator[tuple[int, Any]]:
-    """Play the episodes of seeds side by side; yield seed → what the worlds make of it, or its error, as they end.
+    """Play the episodes of seeds side by side; yield seed → `Episode`, or its error, as they end.
 
     Without `all_images`, images are rendered only at steps where the agent reads them. If a new instruction makes the
     agent read an image that was not rendered, the episode is run again with all images. A new instruction resets the
@@ -256,5 +233,5 @@ def copied(seen: Observation) -> Observation:
 
 
 def _completed(environment: Environment) -> tuple[int, int] | None:
-    several = isinstance(environment, InARow) and environment.instructions > 1
+    several = isinstance(environment, MultiInstruction) and environment.instructions > 1
     return (environment.completed, environment.instructions) if several else None

@@ -18,7 +18,7 @@ from vla.models.model import Model
 from vla.models.policy_folder import BEST
 from vla.parallel.pool import Crashed, Future, ProcessPool
 from vla.parallel.processes import one_thread_each
-from vla.rollouts.evaluate import play
+from vla.rollouts.evaluate import play_episode
 from vla.rollouts.results import ERROR, Result
 from vla.rollouts.statistics import wilson_interval
 from vla.spec import Agent, Environment
@@ -42,7 +42,7 @@ class _Player:
         """Play the episodes of seeds with a model."""
         policy = self._make_policy(model)
         with closing(self._make_environment()) as environment:
-            return [play(environment, policy, seed) for seed in seeds]
+            return [play_episode(environment, policy, seed) for seed in seeds]
 
     def close(self) -> None:
         """Hold nothing."""

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from vla.io.types import Count
-from vla.rollouts.evaluate import play
+from vla.rollouts.evaluate import play_episode
 from vla.rollouts.results import Report
 from vla.spec import FIRST_SEED, Agent, Environment
 
@@ -30,4 +30,4 @@ class Rehearsal:
         """Play all episodes."""
         policy, environment = self.policy(), self.environment()
         seeds = range(FIRST_SEED, FIRST_SEED + self.episodes)
-        return Report(tuple(play(environment, policy, seed) for seed in seeds))
+        return Report(tuple(play_episode(environment, policy, seed) for seed in seeds))

@@ -53,7 +53,7 @@ class FolderExporter(ABC):
         self._folder.mkdir(parents=True, exist_ok=True)
         with staging_folder(self._folder) as place:
             missing = [number for number in range(len(store.episodes)) if not self._is_exported(store, number)]
-            for _ in map_episodes(partial(self._export, place), store, missing, cluster, place):
+            for _ in map_episodes(partial(self._export, place), store, missing, cluster):
                 pass
         return self._folder
 
@@ -169,18 +169,15 @@ def map_episodes(
     store: EpisodeStore,
     items: Sequence[Item],
     cluster: Cluster,
-    *needs: Path,
 ) -> Generator[Result]:
     """Yield the results of `work(store, item)` in the order of the items, computed on a cluster.
-
-    Workers also access the paths `needs`.
 
     Raises:
         UserError: raised by `work` or by the cluster.
     """
     folder = store.folder.resolve()
     make = partial(_ExportWorker, work, folder, len(store.episodes))
-    with cluster.pool(make, (folder, *needs)) as pool:
+    with cluster.pool(make) as pool:
         pending = deque(map(pool.submit, items))
         try:
             yield from track((pending.popleft().result() for _ in items), "exporting", len(items))

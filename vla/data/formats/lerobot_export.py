@@ -87,7 +87,7 @@ class LeRobotExporter:
         units = [(camera, file) for camera in store.spec.cameras for file in files]
         counts: dict[str, list[Array]] = {camera: [] for camera in store.spec.cameras}
         work = partial(self._write_video, draft)
-        for (camera, _), found in zip(units, map_episodes(work, store, units, cluster, draft), strict=True):
+        for (camera, _), found in zip(units, map_episodes(work, store, units, cluster), strict=True):
             counts[camera] += found
         columns, tasks = list(_columns(store)), list(_tasks(store))
         episodes = [_episode(store, number, one, counts) for number, one in enumerate(columns)]

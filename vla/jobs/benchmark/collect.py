@@ -11,7 +11,7 @@ from vla.config.substitutes import options
 from vla.data.episodes import EpisodeStore
 from vla.jobs.benchmark.measure import DURATION, HasMinimalStep, Measure, measure, peer, timed
 from vla.parallel.limits import cores
-from vla.parallel.pool import LocalCluster
+from vla.parallel.pool import Cluster
 from vla.parallel.processes import WorkerFactory
 from vla.rollouts.collect import DemonstrationWorker
 from vla.rollouts.rollout import replay, rollout
@@ -108,7 +108,7 @@ def _renderers(experiment: Experiment) -> dict[str, Measure]:
 
 def _verified(make: WorkerFactory, processes: int, episodes_each: int) -> float:
     """Return the rate of verified control steps [1/s] of concurrent processes after a warm-up."""
-    with LocalCluster(processes, "beside").pool(make) as pool:
+    with Cluster(processes, "beside").pool(make) as pool:
         play = lambda seeds: [attempt.result() for attempt in [pool.submit(seed) for seed in seeds]]  # noqa: E731
         play(range(2 * processes))
         episodes, seconds = timed(partial(play, range(processes * episodes_each)))

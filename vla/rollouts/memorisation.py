@@ -23,7 +23,7 @@ class WithoutModality:
     """An agent whose images are grey and without depth, or whose instruction is empty."""
 
     def __init__(self, agent: Agent, missing: Modality) -> None:
-        """Args: the agent, and the modality that it does without."""
+        """Take a modality from an agent."""
         self._agent, self._missing = agent, missing
         self.info: dict[str, Any] = {}
 
@@ -34,12 +34,12 @@ class WithoutModality:
     def act(self, observation: Observation) -> Array:
         """Return the (D,) action of the agent."""
         if self._missing == "instruction":
-            observation = replace(observation, instruction="")
+            seen = replace(observation, instruction="")
         else:
             rgb = {camera: np.full_like(image, GREY) for camera, image in observation.rgb.items()}
             depth = {camera: np.zeros_like(image) for camera, image in observation.depth.items()}
-            observation = replace(observation, rgb=rgb, depth=depth)
-        action = self._agent.act(observation)
+            seen = replace(observation, rgb=rgb, depth=depth)
+        action = self._agent.act(seen)
         self.info = self._agent.info
         return action
 
@@ -62,10 +62,7 @@ class NearestDemonstration:
     """
 
     def __init__(self, folder: Path, episodes: Count | None, *, spec: Spec) -> None:
-        """Args:
-        folder: of the episode store.
-        episodes: the first ones to know; None: all.
-        spec: of the environment.
+        """Read the first images of the demonstrations in a store: of the first `episodes`, or of all.
 
         Raises:
             UserError: as of `open_memory`.
@@ -74,10 +71,10 @@ class NearestDemonstration:
         self._entries, self._executed = store.episodes, store.rows("executed")
         self._instructions = np.array([entry.instruction for entry in self._entries])
         self._seeds = np.array([entry.seed for entry in self._entries])
-        first = [slice(entry.span.start, entry.span.start + 1) for entry in self._entries]
         rows = [store.rows(f"rgb_{camera}") for camera in spec.cameras]
-        images = [np.concatenate([_subsampled(each[span]) for span in first]) for each in rows]
-        self._cameras, self._images = spec.cameras, np.stack(images, axis=1)  # (E, cameras, h, w, 3)
+        starts = [entry.span.start for entry in self._entries]
+        images = [[_subsampled(each[start : start + 1])[0] for each in rows] for start in starts]
+        self._cameras, self._images = spec.cameras, np.array(images)  # (E, cameras, h, w, 3)
         self.info: dict[str, Any] = {}
         self.reset("", 0)
 

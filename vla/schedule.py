@@ -1,0 +1,63 @@
+"""The one schedule of planned actions: a plan is executed while the next one is computed.
+
+Policies, simulated networks and clients of a policy server count in executed actions, so that no action becomes
+obsolete while an arm holds for lack of one; a robot counts in seconds on its clock.
+"""
+
+from __future__ import annotations
+
+import math
+from bisect import bisect_right
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Generic, TypeVar
+
+Action = TypeVar("Action")
+
+
+@dataclass(frozen=True)
+class Plan(Generic[Action]):
+    """Actions that follow each other, with the times at which they end."""
+
+    start: float
+    actions: Sequence[Action]
+    ends: Sequence[float]
+
+
+class Schedule(Generic[Action]):
+    """Which action of which plan is due at which time; plans overlap where one begins before another has ended."""
+
+    def __init__(self, period: float = 1.0) -> None:
+        """Start without a plan; every action takes a `period`: one step, or [s] on a clock."""
+        self._period = period
+        self._plans: list[Plan[Action]] = []  # in the order in which they were added
+
+    @property
+    def newest(self) -> Plan[Action] | None:
+        """The plan that was added last."""
+        return self._plans[-1] if self._plans else None
+
+    @property
+    def end(self) -> float:
+        """Time at which the newest plan ends; -∞ without one."""
+        return self._plans[-1].ends[-1] if self._plans else -math.inf
+
+    def add(self, actions: Sequence[Action], start: float) -> None:
+        """Add a plan, at least one action, made from what was seen at `start`, where its first action begins.
+
+        It may arrive later: actions whose time has passed by then are never due.
+        """
+        ends = [start + self._period * (place + 1) for place in range(len(actions))]
+        self._plans = [*(plan for plan in self._plans if plan.ends[-1] > start), Plan(start, actions, ends)]
+
+    def clear(self) -> None:
+        """Drop all plans."""
+        self._plans = []
+
+    def wants_plan(self, time: float, execute: int) -> bool:
+        """Return whether `execute` actions of the newest plan are over, so that the next observation is due."""
+        return not self._plans or time >= self._plans[-1].start + self._period * execute
+
+    def at(self, time: float) -> list[Action]:
+        """Return the action of every plan that has one for a time, the newest last."""
+        return [plan.actions[bisect_right(plan.ends, time)] for plan in self._plans if time < plan.ends[-1]]
