@@ -15,8 +15,8 @@ import toy
 from reading import fit, windows
 
 from vla.data.datamodule import Prefetcher, held_out
+from vla.data.derivation import derive_store
 from vla.data.episodes import EpisodeStore, observations_of
-from vla.data.verification import derive_store
 from vla.data.window_batches import WindowBatcher, perturbed
 from vla.parallel.pool import LocalCluster
 from vla.rollouts.collect import collect

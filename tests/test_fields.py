@@ -19,12 +19,13 @@ from toy_episodes import CODECS, CONFIG, EPISODES, MORE, add, change, content
 from vla.config.check import check
 from vla.config.experiment import Experiment
 from vla.data.datamodule import digest_of
+from vla.data.derivation import derive_store
 from vla.data.episodes import EpisodeStore
 from vla.data.fields import END
 from vla.data.formats.imported_demonstrations import ImportedDemonstrations
 from vla.data.header import Codec
 from vla.data.image_codec import decode, encode
-from vla.data.verification import derive_store, episode_of, require_whole, verify_store
+from vla.data.verification import episode_of, require_whole, verify_store
 from vla.data.window_batches import WindowBatcher
 from vla.jobs.collect import JOB, complete_store
 from vla.parallel.pool import LocalCluster

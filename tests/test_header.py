@@ -60,7 +60,7 @@ SPECS: list[dict[str, Any]] = [
         {"config": {"task": "${oc.env:HOME}"}},
         {"config": {"size": NAN}},
         {"config": {"parts": None, "where": []}},
-        {"config": {"parts": [{"config": {}, "entries": 10**30}], "where": []}},
+        {"config": {"parts": [[{}, 10**30]], "where": []}},
         {"format": "2"},
     ],
     ids=lambda change: str(change)[-60:],

@@ -18,7 +18,7 @@ from rerun.chunk import RrdReader
 from toy import ARM_SPEC
 
 from vla.data.episodes import EpisodeStore
-from vla.data.formats.video import decode, encode
+from vla.data.formats.lerobot_images import decode, encode
 
 
 @pytest.fixture(scope="module")

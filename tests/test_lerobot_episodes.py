@@ -35,8 +35,8 @@ from toy_episodes import content
 
 from vla.data.datamodule import held_out
 from vla.data.episodes import EpisodeStore
+from vla.data.formats.lerobot_images import decode, encode, require_video
 from vla.data.formats.lerobot_import import LeRobotDemonstrations
-from vla.data.formats.video import decode, encode, require_video
 
 FRONT = "observation.images.front"
 

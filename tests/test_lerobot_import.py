@@ -36,7 +36,7 @@ from toy_episodes import content
 from vla.config.experiment import make_expert
 from vla.data.episodes import EpisodeStore
 from vla.data.formats import lerobot_tables as tables
-from vla.data.formats.video import encode
+from vla.data.formats.lerobot_images import encode
 from vla.spec import Spec
 
 OTHER = replace(ARM_SPEC, state=("north", "south"), state_units=("m", "m"), robot=None)
@@ -329,33 +329,21 @@ def test_nonsense_in_a_table_is_refused_by_name(
     assert "copy the dataset" not in str(caught.value)  # which would not help
 
 
-@pytest.mark.parametrize(
-    ("limit", "says"), [("MOST_ROWS", r"has \d+ rows, more than the 5"), ("MOST_BYTES", r"unpacks to .* GB, more than")]
-)
-def test_a_table_that_unpacks_without_end_is_not_read(
-    home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, limit: str, says: str
+def test_a_table_of_more_rows_than_recordings_have_is_not_read(
+    home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(f"vla.data.formats.lerobot_tables.{limit}", 5)
-    with pytest.raises(ValueError, match=rf"file-000\.parquet {says}"):
+    monkeypatch.setattr("vla.data.formats.lerobot_tables.MAX_ROWS", 5)
+    with pytest.raises(ValueError, match=r"file-000\.parquet has \d+ rows, more than the 5"):
         demonstrations(str(copied(home, tmp_path / "dataset")), ARM_SPEC)
 
 
-def test_the_size_of_a_column_does_not_depend_on_its_name(tmp_path: Path) -> None:
-    values = pa.array(np.ones((50, 6), np.float32).tolist())
-    pq.write_table(pa.table({"action": values, "observation.state": values}), tmp_path / "table.parquet")
-    sizes = [
-        tables._unpacked_size(tmp_path / "table.parquet", [name], False) for name in ("action", "observation.state")
-    ]
-    assert sizes[0] == sizes[1] >= 50 * 6 * 8
-
-
-def test_rows_of_different_lengths_are_no_matrix() -> None:
+def test_rows_of_different_lengths_are_no_array() -> None:
     ragged = pa.chunked_array([pa.array([[1.0] * 5, [2.0] * 7])])
-    assert tables.matrix(ragged, 6) is None
-    whole = tables.matrix(pa.chunked_array([pa.array([[1.0] * 6, [2.0] * 6])]), 6)
+    assert tables.array(ragged, 6) is None
+    whole = tables.array(pa.chunked_array([pa.array([[1.0] * 6, [2.0] * 6])]), 6)
     assert whole is not None and whole.tolist() == [[1.0] * 6, [2.0] * 6]
-    assert tables.lists_have(pa.chunked_array([pa.array([[[1, 2], [3, 4]]])]), 2, 2)
-    assert not tables.lists_have(pa.chunked_array([pa.array([[[1], [2, 3, 4]]])]), 2, 2)
+    assert tables.array(pa.chunked_array([pa.array([[[1, 2], [3, 4]]])]), 2, 2) is not None
+    assert tables.array(pa.chunked_array([pa.array([[[1], [2, 3, 4]]])]), 2, 2) is None
 
 
 def test_a_video_of_another_size_is_not_decoded(home: Path, tmp_path: Path) -> None:

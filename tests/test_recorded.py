@@ -25,10 +25,11 @@ from test_server import serving
 from vla.config.build import build
 from vla.config.experiment import plain
 from vla.data.datamodule import held_out
+from vla.data.derivation import derive_store
 from vla.data.episodes import EpisodeStore
 from vla.data.formats.imported_demonstrations import action_bounds
-from vla.data.formats.video import encode
-from vla.data.verification import derive_store, find_episode
+from vla.data.formats.lerobot_images import encode
+from vla.data.verification import find_episode
 from vla.deploy.client_observation import Keys
 from vla.deploy.control_loop import ControlLoop
 from vla.io.images import resize

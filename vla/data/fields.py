@@ -60,12 +60,11 @@ class ScatteredRows:
         places = self._places(rows)
 
         def unpack(number: int) -> None:
-            row = int(rows[number])
-            packed = self._packed(row, *places[number])
+            packed = self._packed(int(rows[number]), *places[number])
             try:
                 images[number] = decode(packed, self.codec, self.shape[1:], self.dtype)
-            except ValueError as error:
-                raise self._damaged(row) from error
+            except UserError as error:
+                raise self._damaged(int(rows[number])) from error
 
         if self._ends is not None:
             in_threads(unpack, len(rows))
@@ -106,15 +105,7 @@ Rows = Array | ScatteredRows
 
 
 class Field:
-    """Files of a field.
-
-    Args:
-        folder: of the store.
-        name: of the field.
-        shape: of a row.
-        dtype: of the rows.
-        codec: of the store.
-    """
+    """Files of a field of a store in `folder`, with rows of `shape` and `dtype`; `codec` is that of the store."""
 
     def __init__(self, folder: Path, name: str, shape: tuple[int, ...], dtype: np.dtype, codec: Codec) -> None:
         self.shape, self.dtype = shape, dtype

@@ -14,7 +14,7 @@ from matplotlib.figure import Figure, SubFigure
 from rich.markup import escape
 from rich.table import Table
 
-from vla.data.draws import flat
+from vla.data.episode_filter import flat
 from vla.data.index import NOT_NEEDED, Entry, listed
 from vla.data.verification import StoreReport, entries_by_config, episode_of
 from vla.io.files import write_text

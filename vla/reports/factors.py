@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from vla.data.draws import flat
+from vla.data.episode_filter import flat
 from vla.rollouts.results import Result
 
 BINS = 5  # quantile groups of a numeric factor

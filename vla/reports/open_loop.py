@@ -24,7 +24,7 @@ COLUMNS = 4  # panels of components per row
 def components(result: OpenLoop) -> list[ComponentError]:
     """Return the error of every action component."""
     spec, (low, high) = result.spec, result.interval
-    rows = zip(spec.action, spec.units, result.errors.mean(0), low, high, result.constant_errors, strict=True)
+    rows = zip(spec.action, spec.units, result.mean, low, high, result.constant_errors, strict=True)
     return [
         ComponentError(name, unit, float(error), float(least), float(most) if np.isfinite(most) else None, float(still))
         for name, unit, error, least, most, still in rows
@@ -94,7 +94,7 @@ def _plot_relative(axes: Axes, result: OpenLoop) -> None:
     """Plot the errors as fractions of those of the constant action."""
     names, places = list(result.spec.action)[::-1], np.arange(len(result.spec.action))
     scale = result.scale[::-1]
-    error = result.errors.mean(0)[::-1] / scale
+    error = result.mean[::-1] / scale
     low, high = (bound[::-1] / scale for bound in result.interval)
     axes.barh(places, error, color=GREEN, height=0.6)
     if np.isfinite(high).all():

@@ -11,7 +11,7 @@ from PIL import Image, ImageDraw
 from rich.markup import escape
 from rich.table import Table
 
-from vla.data.draws import flat, leaves
+from vla.data.episode_filter import flat, leaves
 from vla.reports.fonts import image_fonts
 from vla.spec import Array, Observation
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import shutil
 from abc import ABC, abstractmethod
@@ -23,7 +22,7 @@ from vla.data.episodes import EpisodeStore
 from vla.data.index import Entry
 from vla.io.documents import read_json
 from vla.io.errors import UserError
-from vla.io.files import writing
+from vla.io.files import write_json, writing
 from vla.io.types import Text
 from vla.parallel.pool import THIS_PROCESS, Cluster, WorkersLost
 from vla.spec import Array, Spec
@@ -35,11 +34,7 @@ Result = TypeVar("Result")
 
 
 class FolderExporter(ABC):
-    """Base class of exports with one folder per episode, whose `manifest.json` gives its provenance.
-
-    Args:
-        folder: of the export.
-    """
+    """Base class of exports to a `folder` with one folder per episode, whose `manifest.json` gives its provenance."""
 
     def __init__(self, folder: Text | Path) -> None:
         self._folder = Path(folder).resolve()
@@ -53,20 +48,16 @@ class FolderExporter(ABC):
         self._folder.mkdir(parents=True, exist_ok=True)
         with staging_folder(self._folder) as place:
             missing = [number for number in range(len(store.episodes)) if not self._is_exported(store, number)]
-            for _ in map_episodes(partial(self._export, place), store, missing, cluster, place):
-                pass
+            deque(map_episodes(partial(self._export, place), store, missing, cluster, place), 0)
         return self._folder
 
     def _is_exported(self, store: EpisodeStore, number: int) -> bool:
         folder = self._folder / f"episode_{number:05d}"
-        if not folder.exists():
-            return False
-        manifest = self._manifest(store, number)
-        if read_json(folder / "manifest.json", dict[str, Any]) != manifest:
+        if folder.exists() and read_json(folder / "manifest.json", dict[str, Any]) != self._manifest(store, number):
             raise UserError(
                 f"{folder} was exported from other episodes, or as other files: choose another export.folder"
             )
-        return True
+        return folder.exists()
 
     def _manifest(self, store: EpisodeStore, number: int) -> dict[str, Any]:
         entry, layout = store.episodes[number], {"layout": type(self).__name__, **self.settings()}
@@ -113,8 +104,9 @@ class Files(FolderExporter):
                     np.save(images / "depth_image.npy", rows[f"depth_{camera}"][step] * MILLIMETRE)
             state = dict(zip(spec.state, rows["state"][step].tolist(), strict=True))
             write_json(place / "robot_state.json", state)
-            action = {name: rows[name][step].tolist() for name in ("action", "executed")}
-            write_json(place / "expert_action.json", action)
+            write_json(
+                place / "expert_action.json", {name: rows[name][step].tolist() for name in ("action", "executed")}
+            )
 
 
 def provenance(entry: Entry) -> dict[str, Any]:
@@ -123,17 +115,8 @@ def provenance(entry: Entry) -> dict[str, Any]:
     return {name: value for name, value in fields.items() if name != "start"}
 
 
-def write_json(path: Path, value: Any) -> None:
-    """Write readable JSON."""
-    path.write_text(json.dumps(value, ensure_ascii=False, indent=1) + "\n", encoding="utf-8")
-
-
 def require_empty(folder: Path) -> None:
-    """Require a folder to be missing or empty.
-
-    Raises:
-        UserError: the folder has content, or is a file.
-    """
+    """Raise a UserError unless a folder is missing or empty."""
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise UserError(f"{folder} has content other than these episodes: choose another export.folder")
 
@@ -171,9 +154,7 @@ def map_episodes(
     cluster: Cluster,
     *needs: Path,
 ) -> Generator[Result]:
-    """Yield the results of `work(store, item)` in the order of the items, computed on a cluster.
-
-    Workers also access the paths `needs`.
+    """Yield the results of `work(store, item)` in the order of the items, computed on a cluster that reaches `needs`.
 
     Raises:
         UserError: raised by `work` or by the cluster.
