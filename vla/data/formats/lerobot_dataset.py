@@ -22,7 +22,7 @@ import pyarrow.parquet as pq
 from vla.data.formats import lerobot_layout as layout
 from vla.data.formats import lerobot_tables as tables
 from vla.data.formats.lerobot_images import decode, decode_file, require_video
-from vla.data.formats.lerobot_tables import COUNTS, MEND, NUMBERS, PICTURES, REMEDY, TIMES
+from vla.data.formats.lerobot_tables import COUNTS, DEPTHS, MEND, NUMBERS, PICTURES, REMEDY, TIMES
 from vla.data.index import listed
 from vla.io.documents import read_bounded, read_json
 from vla.io.errors import UserError
@@ -108,11 +108,7 @@ class LeRobotDataset:
         return dict(zip(names, places, strict=True))
 
     def read(self, keys: Sequence[str]) -> dict[str, Array]:
-        """Read the numbers of features, each (N, D) float32, in the order of the tables.
-
-        Raises:
-            UserError: rows are no vectors of finite numbers.
-        """
+        """Read features, each (N, D) float32, in the order of the tables; a UserError if one holds no such numbers."""
         rows = tables.read(tables.files(self.folder / "data"), dict.fromkeys(keys, NUMBERS) | {OWNER: COUNTS})
         found = dict[str, Array]()
         for key in keys:
@@ -127,50 +123,34 @@ class LeRobotDataset:
             found[key] = values
         return found
 
-    def open(self, cameras: Sequence[str], keys: Sequence[str], depth: Sequence[str]) -> None:
-        """Load the features `keys`, which `numbers` returns, and check images and the features `depth`.
-
-        Of images in tables and of frames of videos, this decodes the first one of each camera.
+    def require_images(self, cameras: Sequence[str], depth: Sequence[str]) -> None:
+        """Require images of cameras and the features `depth`; decodes the first image of each camera alone.
 
         Raises:
             UserError: a file is missing or damaged, or contradicts others.
         """
-        self._matrices = self.read(keys)
         images = [self.images[camera] for camera in cameras]
         self._require_videos([key for key in images if self._is_video(key)])
-        columns = {key: PICTURES for key in images if not self._is_video(key)}
+        columns = {key: PICTURES for key in images if not self._is_video(key)} | dict.fromkeys(depth, DEPTHS)
         for path in tables.files(self.folder / "data"):
-            tables.require(path, columns | dict.fromkeys(depth, tables.DEPTHS))
+            tables.require(path, columns)
         for key in images:
             next(self._decoded(self.parts[0], key, 1))
 
-    def numbers(self, key: str, part: Part) -> Array:
-        """Return a feature of the whole episode of a part, (N, D) float32."""
-        return self._matrices[key][part.rows]
-
     def frames(self, part: Part, camera: str, size: tuple[int, int], every: int) -> Array:
-        """Return every `every`-th image of a part, (N, H, W, 3) uint8, cropped at the centre and resized to `size`.
-
-        Raises:
-            UserError: images are missing or damaged.
-        """
+        """Return every `every`-th image of a part, (N, H, W, 3) uint8, cropped at the centre and resized to `size`."""
         images = self._decoded(part, self.images[camera], every)
         return np.stack([resize(image, size, "centre") for image in images])
 
     def depths(self, part: Part, key: str, size: tuple[int, int]) -> Array:
         """Return the depth images of a part, (N, H, W) uint16 [mm]; a UserError if they are of another `size`."""
-        values = tables.array(self._column(part, key, tables.DEPTHS), *size, dtype=np.uint16)
+        values = tables.array(self._column(part, key, DEPTHS), *size, dtype=np.uint16)
         if values is None:
             raise UserError(f"{self.folder} has {key} of another size in episode {part.episode}: {MEND}")
         return values
 
     def _read_parts(self, videos: Sequence[str]) -> list[Part]:
-        """Return the parts of all episodes, in order, with the places of the `videos`, keys of features.
-
-        Raises:
-            UserError: a table is missing or damaged, rows or episodes are missing, or time stamps do not follow the
-                rate.
-        """
+        """Return the parts of all episodes, in order, with the places of the `videos`, keys of features."""
         episodes, instructions = self._read_episodes(videos), _read_instructions(self.folder / layout.TASKS)
         paths = tables.files(self.folder / "data")
         rows = tables.read(paths, {OWNER: COUNTS, TASK: COUNTS, TIME: NUMBERS})
@@ -342,13 +322,13 @@ def _read_info(folder: Path) -> layout.Info:
         raise UserError(f"{error}: {REMEDY}") from error
     if version == layout.VERSION:
         return read_json(path, layout.Info)
-    ours, found = (re.fullmatch(r"v(\d{1,4})\.(\d{1,4})", text) for text in (layout.VERSION, version))
-    if found and ours and [*map(int, found.groups())] > [*map(int, ours.groups())]:
+    match = re.fullmatch(r"v(\d{1,4})\.(\d{1,4})", version)
+    if match and int(match[1]) >= 3:
         raise UserError(
             f"{path} has version {version}, newer than {layout.VERSION}, which is read here: look for a newer vla"
         )
-    remedy = f"has version {version}: convert" if found else f"has no version, but {version[:20]}: write or convert"
-    raise UserError(f"{path} {remedy} the dataset to {layout.VERSION} with lerobot")
+    has = f"has version {version}: convert" if match else f"has no version, but {version[:20]}: write or convert"
+    raise UserError(f"{path} {has} the dataset to {layout.VERSION} with lerobot")
 
 
 def _read_instructions(path: Path) -> dict[int, str]:

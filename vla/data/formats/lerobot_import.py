@@ -66,28 +66,34 @@ class LeRobotDemonstrations(ImportedDemonstrations):
     ) -> None:
         self.spec, self._every = spec.without_truth, every
         self._dataset = dataset = _opened(folder, images)
+        features, ours = dataset.info.features, layout.features(spec, depth=True)
         self._state = dataset.components(state, [spec.state[index] for index in spec.pose])
         self._action = dataset.components(action, spec.action)
-        features = dataset.info.features
         rates = [key for key in (layout.RATES,) if key in features and features[key].components]
         for name, place in dataset.components(rates).items():
             self._state.setdefault(name, place)
+
+        def has(*keys: str) -> bool:
+            return all(key in features and features[key].is_like(ours[key]) for key in keys)
+
+        depth, executed = [layout.depth_key(camera) for camera in spec.depth], has(layout.EXECUTED)
+        self._lacks = [] if has(*depth) else ["depth"]
+        self._lacks += [] if executed else [layout.EXECUTED]
+        self._lacks += [] if all(name in self._state for name in spec.state) else [layout.RATES]
         self._low, self._high = np.array(spec.low, np.float32), np.array(spec.high, np.float32)
-        self._require_fit(action)
+        differences = [*self._mismatches()]
+        if all(name in self._action for name in spec.action):
+            read = [*state, *action, *rates, *([layout.EXECUTED] if executed else [])]
+            self._numbers = dataset.read(list(dict.fromkeys(read)))
+            actions = self._columns(spec.action, self._action, slice(None))
+            differences += _out_of_bounds(actions, spec)
+            self._beyond = float(((actions < self._low) | (actions > self._high)).mean())
+        if differences:
+            raise UserError(f"{dataset.folder} does not match the task: {'; '.join(differences)}")
         for camera in spec.cameras:
             key = dataset.images[camera]
             spec.require_cut(camera, features[key].image_size, f"{key} of {dataset.folder}")
-        known = {key: layout.Feature(**feature) for key, feature in layout.features(spec, depth=True).items()}
-        depth = [layout.depth_key(camera) for camera in spec.depth]
-        has_depth, has_executed = (
-            all(key in features and features[key].alike(known[key]) for key in keys)
-            for keys in (depth, [layout.EXECUTED])
-        )
-        self._lacks = [] if has_depth else ["depth"]
-        self._lacks += [] if has_executed else [layout.EXECUTED]
-        self._lacks += [] if all(name in self._state for name in spec.state) else [layout.RATES]
-        read = [*state, *action, *rates, *([layout.EXECUTED] if has_executed else [])]
-        dataset.open(spec.cameras, list(dict.fromkeys(read)), depth if has_depth else [])
+        dataset.require_images(spec.cameras, depth if has(*depth) else [])
 
     @classmethod
     def recording(
@@ -115,7 +121,7 @@ class LeRobotDemonstrations(ImportedDemonstrations):
         spec, dataset, part = self.spec, self._dataset, self._dataset.parts[number]
         first = np.arange(part.steps.start, part.steps.stop, self._every)
         last = np.minimum(first + self._every - 1, part.steps.stop - 1)  # the target at the end of the period
-        actions = np.clip(self._columns(spec.action, self._action, part)[last], self._low, self._high)
+        actions = np.clip(self._columns(spec.action, self._action, part.rows[last]), self._low, self._high)
         images = {
             f"rgb_{camera}": dataset.frames(part, camera, spec.image_size, self._every) for camera in spec.cameras
         }
@@ -127,9 +133,9 @@ class LeRobotDemonstrations(ImportedDemonstrations):
             outcome="success",
             milestones=frozenset(),
             draws={"recorded": {"episode": part.episode, "first_step": part.steps.start, "lacks": self._lacks}},
-            observations=observations_of(spec, {**images, "state": self._states(part)[first]}, part.instruction),
+            observations=observations_of(spec, {**images, "state": self._states(part.rows)[first]}, part.instruction),
             actions=actions,
-            executed=actions if "executed" in self._lacks else dataset.numbers(layout.EXECUTED, part)[last],
+            executed=actions if layout.EXECUTED in self._lacks else self._numbers[layout.EXECUTED][part.rows[last]],
         )
 
     def fill(self, store: EpisodeStore, episodes: int) -> int:
@@ -144,18 +150,6 @@ class LeRobotDemonstrations(ImportedDemonstrations):
         if self._beyond:
             log.info("%.2g %% of the actions are clipped to the bounds of the task", 100 * self._beyond)
         return super().fill(store, episodes)
-
-    def _require_fit(self, keys: Keys) -> None:
-        """Raise a UserError unless metadata and action range, from the features `keys`, match the task."""
-        dataset, spec = self._dataset, self.spec
-        differences = [*self._mismatches()]
-        if all(name in self._action for name in spec.action):
-            values = dataset.read(keys)
-            actions = np.stack([values[key][:, at] for key, at in map(self._action.__getitem__, spec.action)], axis=1)
-            differences += _out_of_bounds(actions, spec)
-            self._beyond = float(((actions < self._low) | (actions > self._high)).mean())
-        if differences:
-            raise UserError(f"{dataset.folder} does not match the task: {'; '.join(differences)}")
 
     def _mismatches(self) -> Iterator[str]:
         """Yield the differences between the spec and the metadata of the dataset."""
@@ -174,21 +168,20 @@ class LeRobotDemonstrations(ImportedDemonstrations):
                 theirs = f"{kind} of {len(places)} numbers ({_shortened(places)})"
                 yield f"{theirs}, the task has {len(ours)} ({_shortened(ours)})"
 
-    def _states(self, part: Part) -> Array:
-        """Return (N, P) float32; joint velocities are differences of positions if the dataset has none."""
+    def _states(self, rows: Array) -> Array:
+        """Return the state in the rows of an episode, (N, P) float32; unknown velocities are differences."""
         spec, known = self.spec, dict[str, Array]()
         if layout.RATES in self._lacks and spec.robot:
-            joints = self._columns(spec.robot.joints, self._state, part)
+            joints = self._columns(spec.robot.joints, self._state, rows)
             rates = np.diff(joints, axis=0, prepend=joints[:1]) * np.float32(self._dataset.info.fps)
             known = dict(zip(spec.robot.velocities, rates.T, strict=True))
         names = [name for name in spec.state if name in self._state]
-        known |= dict(zip(names, self._columns(names, self._state, part).T, strict=True))
+        known |= dict(zip(names, self._columns(names, self._state, rows).T, strict=True))
         return np.stack([known[name] for name in spec.state], axis=1)
 
-    def _columns(self, names: Iterable[str], places: Places, part: Part) -> Array:
-        """Return components by name, (N, …) float32, of the whole episode of a part."""
-        found = [places[name] for name in names]
-        return np.stack([self._dataset.numbers(key, part)[:, at] for key, at in found], axis=1)
+    def _columns(self, names: Iterable[str], places: Places, rows: Array | slice) -> Array:
+        """Return components by name, (N, …) float32, in rows of the dataset."""
+        return np.stack([self._numbers[key][rows, at] for key, at in map(places.__getitem__, names)], axis=1)
 
     def _depth(self, part: Part, camera: str) -> Array:
         """Return the depth of the steps of a part, (N, H, W) uint16 [mm]."""

@@ -72,9 +72,9 @@ class Feature:
         known = isinstance(names, list) and all(isinstance(name, str) for name in names)
         return names if known and [len(names)] == list(self.shape) else []
 
-    def alike(self, other: Feature) -> bool:
-        """Return whether two features hold the same numbers."""
-        return (self.dtype, *self.shape, self.names) == (other.dtype, *other.shape, other.names)
+    def is_like(self, other: dict[str, Any]) -> bool:
+        """Return whether this is the feature that an export describes so, see `features`."""
+        return {"dtype": self.dtype, "shape": [*self.shape], "names": self.names} == other
 
     @property
     def image_size(self) -> tuple[int, int]:
