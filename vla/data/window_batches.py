@@ -160,7 +160,7 @@ class WindowBatcher:
         return batch
 
     def verify(self, episodes: Array | None = None) -> None:
-        """Raise a UserError if images of the episodes with numbers (N,), by default of all, differ from their checksums.
+        """Raise a UserError if images of the episodes with numbers (N,), by default all, differ from their checksums.
 
         Otherwise an episode is verified when its first window is read.
         """
