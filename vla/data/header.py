@@ -78,13 +78,6 @@ class Header:
     fields: Any  # field → shape and dtype of a row
     codec: Codec = RAW  # of the images; not written if they are raw
 
-    def text(self) -> str:
-        """Return the content of the file."""
-        content = asdict(self)
-        if self.codec == RAW:
-            del content["codec"]
-        return dumps(content)
-
 
 def fields_of(spec: Spec) -> dict[str, tuple[tuple[int, ...], np.dtype]]:
     """Return field name → shape and dtype of one row."""
@@ -142,7 +135,10 @@ def write_header(folder: Path, spec: Spec, config: dict[str, Any], codec: Codec)
     orphans = sorted(file.name for file in folder.iterdir() if file.suffix in (".bin", ".pack", ".jsonl"))
     if orphans:
         raise UserError(f"{folder} holds {orphans[0]} without {NAME}, which says what it means: {REMEDY}")
-    write_text(folder / NAME, Header(FORMAT, spec.to_dict(), config, _layouts(spec), codec).text())
+    content = asdict(Header(FORMAT, spec.to_dict(), config, _layouts(spec), codec))
+    if codec == RAW:
+        del content["codec"]
+    write_text(folder / NAME, dumps(content))
 
 
 def _layouts(spec: Spec) -> dict[str, dict[str, Any]]:

@@ -74,7 +74,8 @@ class LeRobotDataset:
         _require_unchanged(folder)
         self.info = _read_info(folder)
         keys = [key for key, feature in self.info.features.items() if feature.dtype in IMAGES and not feature.is_depth]
-        self.images = {_camera(key): key for key in keys} if images is None else dict(images)
+        cameras = [key.removeprefix("observation.").removeprefix("images.") for key in keys]
+        self.images = dict(zip(cameras, keys, strict=True) if images is None else images)
         if unknown := [key for key in self.images.values() if key not in keys]:
             raise UserError(f"expert.images: {folder} has no images {', '.join(unknown)}, it has {', '.join(keys)}")
         self.parts = self._read_parts([key for key in self.images.values() if self._is_video(key)])
@@ -169,7 +170,9 @@ class LeRobotDataset:
         for row, start, end in zip(episodes, first, stop, strict=True):
             steps, number = order[start:end], row[OWNER]
             times = stamps[steps, 0]
-            self._require_whole(row, len(steps))
+            if len(steps) != (count := row[TO] - row[FROM]) or not count:
+                found, remedy = f"{self.folder}/data holds {len(steps)}", REMEDY if len(steps) < count else MEND
+                raise UserError(f"{found} of the {count} steps that meta/episodes counts of episode {number}: {remedy}")
             self._require_even(number, times - times[0])
             files = tuple(paths[each] for each in np.unique(file[steps]))
             # What is done after a change of the task is no answer to the instruction before it.
@@ -271,17 +274,6 @@ class LeRobotDataset:
         for (path, key), count in frames.items():
             require_video(path, self.info.features[key].image_size, layout.fraction(self.info.fps), count)
 
-    def _require_whole(self, row: Mapping[str, Any], count: int) -> None:
-        """Require the rows of an episode, `count` of them, to be as many as its metadata, `row`, count."""
-        steps, number = row[TO] - row[FROM], row[OWNER]
-        if count < steps:
-            raise UserError(f"{self.folder}/data holds {count} of the {steps} steps of episode {number}: {REMEDY}")
-        if count > steps or not steps:
-            raise UserError(
-                f"{self.folder}/data holds {count} steps of episode {number}, for which meta/episodes counts {steps}: "
-                f"{MEND}"
-            )
-
     def _require_even(self, number: int, times: Array) -> None:
         """Require the times of an episode, those since its first step, to follow the rate, without gaps."""
         fps, steps = self.info.fps, np.arange(len(times))
@@ -305,11 +297,6 @@ class LeRobotDataset:
                 f"{self.folder}: {name} is {values[row, at]} at index {at} in episode {owner[row]}, step {step}{more}: "
                 "correct the numbers, or delete the episodes with lerobot-edit-dataset"
             )
-
-
-def _camera(key: str) -> str:
-    """Return the camera of a feature of images: its name without `observation.` and `images.`."""
-    return key.removeprefix("observation.").removeprefix("images.")
 
 
 def _read_info(folder: Path) -> layout.Info:
