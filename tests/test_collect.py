@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import os
-import resource
 import signal
 import subprocess
 import sys
@@ -18,6 +17,7 @@ import pytest
 import toy
 from collecting import EPISODES, TRIED, content, lines
 from composing import composed
+from toy_episodes import full_disk
 
 from vla.config.experiment import Experiment
 from vla.data.episodes import EpisodeStore
@@ -277,13 +277,9 @@ def same_images(one: Episode, other: Episode) -> bool:
 
 
 def test_a_disk_that_fills_up_costs_nothing_that_was_committed(tmp_path: Path, whole: Path) -> None:
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, ((whole / "rgb_eye.bin").stat().st_size // 2, hard))
-    try:
-        with pytest.raises(ValueError, match=r"cannot take seed \d+ \(.*\): the \d+ episodes before it are safe"):
-            gather(tmp_path)
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    safe = r"cannot take seed \d+ \(.*\): the \d+ episodes before it are safe"
+    with full_disk((whole / "rgb_eye.bin").stat().st_size // 2), pytest.raises(ValueError, match=safe):
+        gather(tmp_path)
     assert len(EpisodeStore(tmp_path).episodes) > 5
     gather(tmp_path)
     assert content(tmp_path) == content(whole)

@@ -90,23 +90,6 @@ def test_shapes_and_types_are_those_of_the_contract(folder: Path, arms: Path) ->
     assert next(iter(windows(folder, depth=True).train_dataloader()))["depth"] == {}
 
 
-def test_nothing_is_labelled_before_the_start_or_beyond_the_end(folder: Path) -> None:
-    store = EpisodeStore(folder)
-    off = perturbed(store.rows("action")[:], store.rows("executed")[:], store.spec)
-    entry = next(
-        entry
-        for entry in store.episodes
-        for last in [entry.start + entry.steps - 1]
-        if not off[[entry.start, last - 2, last - 1, last]].any()
-    )
-    batch = WindowBatcher(store, history=3, chunk=2)(np.array([entry.start, entry.start + entry.steps - 1]))
-    assert batch["present"].tolist() == [[False, False, True], [True, True, True]]
-    assert batch["valid"][0].tolist() == [[False, False], [False, False], [True, True]]
-    assert batch["valid"][1].tolist() == [[True, True], [True, True], [True, False]]
-    assert not batch["rgb"]["eye"][0, :2].any() and not batch["state"][0, :2].any()
-    assert torch.equal(batch["action"][1, 2, 0], batch["action"][1, 2, 1])
-
-
 def test_a_further_store_may_lack_the_truth(folder: Path, tmp_path: Path) -> None:
     source = EpisodeStore(folder)
     lacking = EpisodeStore.create_or_open(tmp_path / "lacking", source.spec.without_truth, {})

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-import resource
 import shutil
 from collections.abc import Callable
 from dataclasses import replace
@@ -13,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from toy import ARM_SPEC
-from toy_episodes import CODECS, CONFIG, EPISODES, add, content
+from toy_episodes import CODECS, CONFIG, EPISODES, add, content, full_disk
 
 from vla.data.episodes import EpisodeStore
 from vla.data.header import Codec
@@ -50,24 +49,15 @@ def test_the_files_can_be_read_without_this_package(tmp_path: Path) -> None:
     np.testing.assert_array_equal(frames[line["start"]], EPISODES[1].observations[0].rgb["front"])
 
 
-def test_statistics_are_those_of_all_stored_actions(tmp_path: Path) -> None:
-    statistics = add(tmp_path, EPISODES).statistics
-    actions = np.concatenate([episode.actions for episode in EPISODES if episode.success])
-    np.testing.assert_array_equal(statistics.actions, actions)
-    np.testing.assert_array_equal(statistics.low, actions.min(0))
-    np.testing.assert_array_equal(statistics.high, actions.max(0))
-
-
-def test_a_sample_of_chunks_stays_within_its_episodes_and_its_size(
+def test_statistics_and_samples_are_those_of_all_stored_actions(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    statistics = add(tmp_path, EPISODES).statistics
-    expected = [
-        episode.actions[np.minimum(np.arange(step, step + 4), len(episode.actions) - 1)]
-        for episode in EPISODES
-        if episode.success
-        for step in range(len(episode.actions))
-    ]
+    statistics, stored = add(tmp_path, EPISODES).statistics, [each.actions for each in EPISODES if each.success]
+    np.testing.assert_array_equal(statistics.actions, np.concatenate(stored))
+    np.testing.assert_array_equal(statistics.low, np.concatenate(stored).min(0))
+    np.testing.assert_array_equal(statistics.high, np.concatenate(stored).max(0))
+    padded = [np.concatenate([actions, actions[-1:].repeat(3, 0)]) for actions in stored]  # chunks stay within episodes
+    expected = [each[step : step + 4] for each in padded for step in range(len(each) - 3)]
     np.testing.assert_array_equal(statistics.chunks(4), expected)
     monkeypatch.setattr("vla.data.statistics.SAMPLE", 40)
     few = statistics.chunks(4)
@@ -119,14 +109,10 @@ def test_a_full_disk_takes_back_the_half_written_episode_only(tmp_path: Path, co
     add(whole, EPISODES, codec)
     store = add(full, EPISODES[:2], codec)
     before = content(full)
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     with store.writing():
-        resource.setrlimit(resource.RLIMIT_FSIZE, (max(map(len, before.values())) + 1000, hard))
-        try:
-            with pytest.raises(ValueError, match=r"cannot take seed 2 .*: the 2 episodes before it are safe"):
-                store.append(EPISODES[2])
-        finally:
-            resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+        safe, most = r"cannot take seed 2 .*: the 2 episodes before it are safe", max(map(len, before.values()))
+        with full_disk(most + 1000), pytest.raises(ValueError, match=safe):
+            store.append(EPISODES[2])
         assert content(full) == before
         store.append(EPISODES[2])
     add(full, EPISODES[3:], codec)
@@ -134,13 +120,8 @@ def test_a_full_disk_takes_back_the_half_written_episode_only(tmp_path: Path, co
 
 
 def test_a_full_disk_takes_no_store(tmp_path: Path) -> None:
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (100, hard))
-    try:
-        with pytest.raises(OSError, match=r"store\.json cannot be written \(.*\): make room there"):
-            add(tmp_path, [])
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    with full_disk(100), pytest.raises(OSError, match=r"store\.json cannot be written \(.*\): make room there"):
+        add(tmp_path, [])
     add(tmp_path, EPISODES)
     assert not list(tmp_path.glob(".*")) and "store.json" in content(tmp_path)
 

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 import torch
 from composing import composed
-from exporting import content as exported
 from exporting import exporter
 from toy import ARM_SPEC, make_arm, make_environment, make_expert
 from toy_episodes import CODECS, CONFIG, EPISODES, MORE, add, change, content
@@ -25,7 +24,7 @@ from vla.data.header import Codec
 from vla.data.image_codec import decode, encode
 from vla.data.verification import episode_of, require_whole, verify_store
 from vla.data.window_batches import WindowBatcher
-from vla.jobs.collect import JOB, complete_store
+from vla.jobs.collect import JOB
 from vla.parallel.pool import LocalCluster
 from vla.rollouts.collect import collect
 from vla.rollouts.memory import NearestDemonstration
@@ -135,18 +134,6 @@ def test_the_config_names_the_codec(options: tuple[str, ...], codec: Codec | Non
             check(composed("job=collect", option), JOB)
 
 
-def test_demonstrations_with_other_losses_do_not_complete_a_training(tmp_path: Path) -> None:
-    options = (f"collect.folder={tmp_path}", "collect.episodes=2")
-    source = Experiment.of(composed(*options)).source
-    store = EpisodeStore.create_or_open(tmp_path, ARM_SPEC, source, JPEG)
-    with store.writing():
-        for episode in EPISODES[:2]:
-            store.append(episode)
-    assert complete_store(Experiment.of(composed(*options))) is not None
-    with pytest.raises(ValueError, match=r"not lossless images: .* omit collect\.images"):
-        complete_store(Experiment.of(composed(*options, "collect.images=lossless")))
-
-
 @pytest.mark.parametrize("codec", CODECS[1:], ids=str)
 def test_a_damaged_image_is_named_by_episode_and_step(tmp_path: Path, codec: Codec) -> None:
     store = add(tmp_path / "store", EPISODES, codec)
@@ -230,15 +217,6 @@ def test_stores_with_different_codecs_are_merged_without_a_further_loss(tmp_path
         np.testing.assert_array_equal(images, others)
     derive_store(stores[:2], tmp_path / "exact")
     assert content(tmp_path / "exact") == content(add(tmp_path / "whole", MORE[:4], LOSSLESS).folder)
-
-
-@pytest.mark.parametrize("kind", ["files", "lerobot"])
-def test_exports_are_those_of_a_raw_store(tmp_path: Path, kind: str) -> None:
-    made = [
-        exporter(kind, tmp_path / f"{codec}-{kind}").export(add(tmp_path / str(codec), EPISODES[:2], codec))
-        for codec in (RAW, LOSSLESS)
-    ]
-    assert exported(made[0]) == exported(made[1]) != {}
 
 
 def test_a_video_of_jpeg_is_a_second_loss_and_that_is_said(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
