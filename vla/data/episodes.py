@@ -92,8 +92,7 @@ class EpisodeStore:
         Raises:
             UserError: the store has another spec or config, other losses than `codec`, or lacks its `store.json`.
         """
-        folder = Path(folder)
-        plain = json.loads(dumps(config))
+        folder, plain = Path(folder), json.loads(dumps(config))
         if not is_store(folder):
             folder.mkdir(parents=True, exist_ok=True)
             with FileLock(folder / "lock"):
@@ -186,7 +185,7 @@ class EpisodeStore:
         rows = {field: np.array(source[entry.span]) for field, source in sources.items()}
         for field, values in rows.items():
             if len(values) < entry.steps or _checksum(sources[field], entry.span, values) != entry.crc.get(field):
-                raise self._changed([entry.seed])
+                raise self._changed(entry.seed)
         return rows
 
     def verify(self, entries: Iterable[Entry], rows: Mapping[str, Rows]) -> None:
@@ -195,13 +194,13 @@ class EpisodeStore:
         for entry in entries:
             try:
                 if any(_checksum(source, entry.span) != entry.crc.get(field) for field, source in rows.items()):
-                    raise self._changed([entry.seed])
+                    raise self._changed(entry.seed)
             except DamageError as damage:  # also of a compressed image, which is named by its step
                 damages[entry.seed] = damage
         if damages:
-            raise self._changed([*damages]) if len(damages) > 1 else damages.popitem()[1]
+            raise self._changed(*damages) if len(damages) > 1 else damages.popitem()[1]
 
-    def _changed(self, seeds: Sequence[int]) -> DamageError:
+    def _changed(self, *seeds: int) -> DamageError:
         which = f"seed {seeds[0]}" if len(seeds) == 1 else f"the seeds {listed(seeds)}"
         return DamageError(f"the rows of {which} in {self.folder} were changed on disk")
 
@@ -257,21 +256,22 @@ class EpisodeStore:
         # JPEG by the bytes of its files: what a decoder makes of them depends on its rounding.
         jpeg = [name for name in rows if self.codec.of(name) == "jpeg"]
         crc = {name: zlib.crc32(pieces[name][0] if name in jpeg else rows[name].data) for name in rows}
-        self._commit(self._entry(episode, episode.instruction, len(episode.actions), crc), pieces)
+        self._commit(self._entry(episode, crc), pieces)
 
     def fail(self, episode: Episode) -> None:
         """Store the outcome of a failed seed, without rows. Raises as `append` does."""
-        self._commit(self._entry(episode, "", 0, {}), {})
+        self._commit(self._entry(episode, {}), {})
 
-    def _entry(self, episode: Episode, instruction: str, steps: int, crc: dict[str, int]) -> Entry:
+    def _entry(self, episode: Episode, crc: dict[str, int]) -> Entry:
+        """Return the index entry of an episode, of which rows are stored if they have checksums."""
         return Entry(
             seed=episode.seed,
             task=episode.task,
             outcome=episode.outcome,
             milestones=tuple(sorted(episode.milestones)),
-            instruction=instruction,
+            instruction=episode.instruction if crc else "",
             start=self._rows,
-            steps=steps,
+            steps=len(episode.actions) if crc else 0,
             draws=dict(episode.draws),
             crc=crc,
         )

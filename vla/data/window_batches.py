@@ -76,6 +76,8 @@ class BufferPool:
 class WindowBatcher:
     """Callable that copies windows of an episode store into batches; a window is identified by its newest row.
 
+    The numeric rows of the store are verified at once, a UserError if they differ from their checksums.
+
     Args:
         store: source of the rows.
         history: frames T in a window.
@@ -83,9 +85,6 @@ class WindowBatcher:
         depth: include depth.
         pin: allocate page-locked memory, from which copies to a GPU are asynchronous.
         truth_size: number S of truth scalars, NaN if the store has no truth; None: that of the store.
-
-    Raises:
-        UserError: numeric rows of the store differ from their checksums.
     """
 
     def __init__(
