@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from vla.data.episodes import EpisodeStore
-from vla.data.formats.files import FolderExporter
+from vla.data.formats.files import Files
 from vla.data.index import Entry
 from vla.deploy.bag import message_types
 from vla.deploy.joint_limiter import Robot
@@ -27,7 +27,7 @@ from vla.spec import Array, Spec
 SECOND = 1_000_000_000  # [ns]
 
 
-class Mcap(FolderExporter):
+class Mcap(Files):
     """One bag per episode, which `rerun`, Foxglove and `ros2 bag` open, and `python -m vla.deploy.bag play` plays.
 
         episode_00000/episode_00000.mcap   the messages
@@ -76,11 +76,11 @@ class Mcap(FolderExporter):
         self._require_fit(store.spec)
         return super().export(store, cluster)
 
-    def settings(self) -> dict[str, Any]:
-        """Return topics and joint names."""
+    def _manifest(self, store: EpisodeStore, number: int) -> dict[str, Any]:
         actions = {"action": self._action, "executed": self._executed}
+        topics = {**asdict(self._topics), "depths": self._depths, **actions}
         joints = {"joints": self._robot.joints, "fingers": self._robot.fingers}
-        return {"topics": {**asdict(self._topics), "depths": self._depths, **actions}, **joints}
+        return super()._manifest(store, number) | {"topics": topics, **joints}
 
     def write(self, folder: Path, spec: Spec, entry: Entry, rows: dict[str, Array]) -> None:
         """Write one bag."""

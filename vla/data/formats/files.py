@@ -1,10 +1,9 @@
-"""Exporters of an episode store: their common base, and the export to plain files."""
+"""Export of an episode store to plain files, and what all exports share."""
 
 from __future__ import annotations
 
 import os
 import shutil
-from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import contextmanager, suppress
@@ -33,8 +32,17 @@ Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 
-class FolderExporter(ABC):
-    """Base class of exports to a `folder` with one folder per episode, whose `manifest.json` gives its provenance."""
+class Files:
+    """Export to a `folder` with one folder per episode and one folder of plain files per step.
+
+        episode_00000/manifest.json                  spec and provenance of the episode
+        episode_00000/step_0000/rgb_image.png        (H, W, 3) uint8
+        episode_00000/step_0000/depth_image.npy      (H, W) float32 [m], 0: no return; of depth cameras
+        episode_00000/step_0000/robot_state.json     component of the state → value
+        episode_00000/step_0000/expert_action.json   the action to imitate and the executed one, each (D,)
+
+    With several cameras the images of each are in a folder of its name: `step_0000/front/rgb_image.png`.
+    """
 
     def __init__(self, folder: Text | Path) -> None:
         self._folder = Path(folder).resolve()
@@ -54,14 +62,11 @@ class FolderExporter(ABC):
     def _is_exported(self, store: EpisodeStore, number: int) -> bool:
         folder = self._folder / f"episode_{number:05d}"
         if folder.exists() and read_json(folder / "manifest.json", dict[str, Any]) != self._manifest(store, number):
-            raise UserError(
-                f"{folder} was exported from other episodes, or as other files: choose another export.folder"
-            )
+            raise UserError(f"{folder} holds other episodes, or as other files: choose another export.folder")
         return folder.exists()
 
     def _manifest(self, store: EpisodeStore, number: int) -> dict[str, Any]:
-        entry, layout = store.episodes[number], {"layout": type(self).__name__, **self.settings()}
-        return provenance(entry) | layout | {"spec": store.spec.to_dict()}
+        return provenance(store.episodes[number]) | {"spec": store.spec.to_dict()}
 
     def _export(self, place: Path, store: EpisodeStore, number: int) -> None:
         entry = store.episodes[number]
@@ -71,29 +76,8 @@ class FolderExporter(ABC):
         write_json(draft / "manifest.json", self._manifest(store, number))
         os.rename(draft, self._folder / draft.name)
 
-    def settings(self) -> dict[str, Any]:
-        """Return the settings that the files depend on, as JSON values."""
-        return {}
-
-    @abstractmethod
     def write(self, folder: Path, spec: Spec, entry: Entry, rows: dict[str, Array]) -> None:
         """Write the (steps, …) rows of an episode, by field, into the new folder `folder`."""
-
-
-class Files(FolderExporter):
-    """Export with one folder per episode and one folder of plain files per step.
-
-        episode_00000/manifest.json                  spec and provenance of the episode
-        episode_00000/step_0000/rgb_image.png        (H, W, 3) uint8
-        episode_00000/step_0000/depth_image.npy      (H, W) float32 [m], 0: no return; of depth cameras
-        episode_00000/step_0000/robot_state.json     component of the state → value
-        episode_00000/step_0000/expert_action.json   the action to imitate and the executed one, each (D,)
-
-    With several cameras the images of each are in a folder of its name: `step_0000/front/rgb_image.png`.
-    """
-
-    def write(self, folder: Path, spec: Spec, entry: Entry, rows: dict[str, Array]) -> None:
-        """Write one episode."""
         for step in range(entry.steps):
             place = folder / f"step_{step:04d}"
             for camera in spec.cameras:
@@ -104,21 +88,14 @@ class Files(FolderExporter):
                     np.save(images / "depth_image.npy", rows[f"depth_{camera}"][step] * MILLIMETRE)
             state = dict(zip(spec.state, rows["state"][step].tolist(), strict=True))
             write_json(place / "robot_state.json", state)
-            write_json(
-                place / "expert_action.json", {name: rows[name][step].tolist() for name in ("action", "executed")}
-            )
+            actions = {name: rows[name][step].tolist() for name in ("action", "executed")}
+            write_json(place / "expert_action.json", actions)
 
 
 def provenance(entry: Entry) -> dict[str, Any]:
     """Return an index entry as JSON values, without its place in the store."""
     fields = {**asdict(entry), "milestones": list(entry.milestones)}
     return {name: value for name, value in fields.items() if name != "start"}
-
-
-def require_empty(folder: Path) -> None:
-    """Raise a UserError unless a folder is missing or empty."""
-    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise UserError(f"{folder} has content other than these episodes: choose another export.folder")
 
 
 @contextmanager

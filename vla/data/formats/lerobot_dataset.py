@@ -321,7 +321,7 @@ def _read_info(folder: Path) -> layout.Info:
 def _read_instructions(path: Path) -> dict[int, str]:
     """Return task index → instruction; the name of the column of instructions depends on the writer."""
     schema = tables.schema_of(path)
-    texts = tables.texts_of(schema)
+    texts = [field.name for field in schema if tables.is_text(field.type)]
     known = [name for name in (UNNAMED, "task") if name in texts] or (texts if len(texts) == 1 else [])
     if not known:
         raise UserError(f"{path} has the columns {', '.join(schema.names)[:200]}, none of them task with texts: {MEND}")

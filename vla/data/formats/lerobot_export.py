@@ -21,10 +21,11 @@ from annotated_types import Ge, Le
 
 from vla.data.episodes import EpisodeStore
 from vla.data.formats import lerobot_layout as layout
-from vla.data.formats.files import map_episodes, provenance, require_empty, staging_folder
+from vla.data.formats.files import map_episodes, provenance, staging_folder
 from vla.data.formats.lerobot_images import encode
 from vla.data.formats.lerobot_tables import write_rows, write_tasks
 from vla.io.documents import read_json
+from vla.io.errors import UserError
 from vla.io.files import write_json
 from vla.io.types import Text
 from vla.parallel.pool import THIS_PROCESS, Cluster
@@ -70,7 +71,8 @@ class LeRobotExporter:
         with staging_folder(self._folder) as place:
             if _holds(self._folder, source):
                 return self._folder
-            require_empty(self._folder)
+            if self._folder.exists() and (not self._folder.is_dir() or any(self._folder.iterdir())):
+                raise UserError(f"{self._folder} has content other than these episodes: choose another export.folder")
             if store.codec.images == "jpeg":
                 log.warning("%s holds JPEG, of which videos lose more: export=files loses nothing", store.folder)
             draft = place / "dataset"
@@ -94,10 +96,10 @@ class LeRobotExporter:
         whole = {name: np.concatenate([one[name] for one in columns]) for name in columns[0]}
         statistics = {name: _moments(values) for name, values in whole.items()}
         for camera, counts in histograms.items():
-            statistics[layout.image_key(camera)] = _image_moments(np.sum(counts, 0), len(whole["index"]))
+            statistics[layout.IMAGES + camera] = _image_moments(np.sum(counts, 0), len(whole["index"]))
         depths = {camera: store.rows(f"depth_{camera}") for camera in store.spec.depth if self._depth}
         rows = (
-            numbers | {layout.depth_key(camera): values[entry.span] for camera, values in depths.items()}
+            numbers | {layout.DEPTH + camera: values[entry.span] for camera, values in depths.items()}
             for entry, numbers in zip(store.episodes, columns, strict=True)
         )
         write_rows(_made(draft / layout.place(layout.DATA)), rows)
@@ -121,7 +123,7 @@ class LeRobotExporter:
                 histograms.append(np.stack([np.bincount(values, minlength=256) for values in colours]))
                 yield images
 
-        path = _made(draft / layout.place(layout.VIDEOS, file, video_key=layout.image_key(camera)))
+        path = _made(draft / layout.place(layout.VIDEOS, file, video_key=layout.IMAGES + camera))
         if path.exists():
             deque(clips(), 0)  # the histograms are needed in any case
         else:
@@ -186,10 +188,10 @@ def _episode(
     chunk, file = divmod(file, layout.FILES_PER_CHUNK)
     statistics = {name: _moments(values) for name, values in columns.items()}
     for camera, counts in histograms.items():
-        video = f"videos/{layout.image_key(camera)}"
+        video = f"videos/{layout.IMAGES}{camera}"
         row |= {f"{video}/chunk_index": chunk, f"{video}/file_index": file}
         row |= {f"{video}/from_timestamp": float(before / fps), f"{video}/to_timestamp": float((before + steps) / fps)}
-        statistics[layout.image_key(camera)] = _image_moments(counts[number], steps)
+        statistics[layout.IMAGES + camera] = _image_moments(counts[number], steps)
     return row | {f"stats/{key}/{name}": value for key, of in statistics.items() for name, value in of.items()}
 
 

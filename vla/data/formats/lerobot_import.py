@@ -76,7 +76,7 @@ class LeRobotDemonstrations(ImportedDemonstrations):
         def has(*keys: str) -> bool:
             return all(key in features and features[key].is_like(ours[key]) for key in keys)
 
-        depth, executed = [layout.depth_key(camera) for camera in spec.depth], has(layout.EXECUTED)
+        depth, executed = [layout.DEPTH + camera for camera in spec.depth], has(layout.EXECUTED)
         self._lacks = [] if has(*depth) else ["depth"]
         self._lacks += [] if executed else [layout.EXECUTED]
         self._lacks += [] if all(name in self._state for name in spec.state) else [layout.RATES]
@@ -187,7 +187,7 @@ class LeRobotDemonstrations(ImportedDemonstrations):
         """Return the depth of the steps of a part, (N, H, W) uint16 [mm]."""
         if "depth" in self._lacks:
             return np.zeros((len(part), *self.spec.image_size), np.uint16)
-        return self._dataset.depths(part, layout.depth_key(camera), self.spec.image_size)
+        return self._dataset.depths(part, layout.DEPTH + camera, self.spec.image_size)
 
 
 def _out_of_bounds(actions: Array, spec: Spec) -> Iterator[str]:

@@ -40,6 +40,7 @@ RATE_TOLERANCE = 0.01  # relative; cameras of 29.97 Hz are said to have 30
 # LeRobot's policies use every feature "observation…" as an input, every "action…" as an output, and every image as a
 # colour image: other features have other names, and depth is an array.
 STATE, ACTION, EXECUTED, RATES = "observation.state", "action", "executed", "velocities"
+IMAGES, DEPTH = "observation.images.", "depth."  # and the name of a camera
 COUNTERS = {"timestamp": "float32", "frame_index": "int64", "episode_index": "int64"}
 COUNTERS |= {"index": "int64", "task_index": "int64"}
 
@@ -117,16 +118,6 @@ def checksums(folder: Path) -> Checksums:
     return found
 
 
-def image_key(camera: str) -> str:
-    """Return the feature name of the colour images of a camera."""
-    return f"observation.images.{camera}"
-
-
-def depth_key(camera: str) -> str:
-    """Return the feature name of the depth of a camera."""
-    return f"depth.{camera}"
-
-
 def place(pattern: str, file: int = 0, **names: str) -> str:
     """Return the path of file number `file` of a pattern."""
     chunk, file = divmod(file, FILES_PER_CHUNK)
@@ -158,8 +149,8 @@ def features(spec: Spec, depth: bool) -> dict[str, dict[str, Any]]:
     pixels = _feature("uint16", [height, width], ["height", "width"])
     return {
         **{name: _feature("float32", [len(components)], components) for name, components in names.items()},
-        **{image_key(camera): image for camera in spec.cameras},
-        **{depth_key(camera): pixels for camera in spec.depth if depth},
+        **{IMAGES + camera: image for camera in spec.cameras},
+        **{DEPTH + camera: pixels for camera in spec.depth if depth},
         **{name: _feature(dtype, [1], None) for name, dtype in COUNTERS.items()},
     }
 

@@ -36,7 +36,8 @@ def _within_lists(kind: pa.DataType) -> tuple[int, pa.DataType]:
     return depth, kind
 
 
-def _is_text(kind: pa.DataType) -> bool:
+def is_text(kind: pa.DataType) -> bool:
+    """Return whether a column of this type holds texts."""
     return pa.types.is_string(kind) or pa.types.is_large_string(kind)
 
 
@@ -56,7 +57,7 @@ def _within(column: Column, high: float) -> bool:
 
 COUNTS: Kind = "integers from 0 on", lambda column: pa.types.is_integer(column.type) and _within(column, 2**53)
 TIMES: Kind = "seconds", lambda column: pa.types.is_floating(column.type) and _within(column, LONGEST)
-TEXTS: Kind = "text", lambda column: _is_text(column.type) and not column.null_count
+TEXTS: Kind = "text", lambda column: is_text(column.type) and not column.null_count
 NUMBERS: Kind = "lists of numbers", _are_numbers
 DEPTHS: Kind = "lists of lists of 16-bit integers", lambda column: _within_lists(column.type) == (2, pa.uint16())
 PICTURES: Kind = "images, as the bytes of a file", _are_files
@@ -110,11 +111,6 @@ def schema_of(path: Path) -> pa.Schema:
     if rows > MAX_ROWS:
         raise UserError(f"{path} has {rows} rows, more than the {MAX_ROWS} that such a file can have")
     return schema
-
-
-def texts_of(schema: pa.Schema) -> list[str]:
-    """Return the names of the columns that hold texts."""
-    return [field.name for field in schema if _is_text(field.type)]
 
 
 def _require_kinds(path: Path, table: pa.Table, columns: Mapping[str, Kind]) -> None:
