@@ -70,7 +70,7 @@ def test_what_is_there_is_left_alone(tmp_path: Path) -> None:
         "episode_00001",
     }
     assert (folder / "episode_00000/manifest.json").stat().st_mtime_ns == untouched
-    with pytest.raises(ValueError, match=r"episode_00000 holds other episodes, or as other files: ch"):
+    with pytest.raises(ValueError, match=r"episode_00000 was exported from another store, or as other files"):
         Files(folder).export(stored(tmp_path / "second", seeds=range(1, 2))[0])
     with staging_folder(folder), pytest.raises(ValueError, match=r"another export to .*export is under way"):
         Files(folder).export(store)

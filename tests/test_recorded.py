@@ -301,20 +301,11 @@ def episode_at(folder: Path, seed: int) -> Episode:
     return find_episode(EpisodeStore(folder), seed)[1]
 
 
-@pytest.mark.parametrize("format", ["lerobot", "mcap"])
-def test_imported_episodes_are_exported_as_others_are(dataset: Path, tmp_path: Path, format: str) -> None:
+def test_imported_episodes_are_exported_as_others_are(dataset: Path, tmp_path: Path) -> None:
     recording = ("task=recorded", f"expert.folder={dataset}", "task.image_size=[24,32]", "collect.folder=store")
-    if format == "mcap":
-        topics = [f"+export.topics.images.{camera}=/{camera}" for camera in SPEC.cameras]
-        numbers = {"low": -3, "high": 3, "speed": 2, "acceleration": 9}
-        robot = [f"export.robot.{name}={[value] * 3}" for name, value in numbers.items()]
-        robot += ["export.robot.joints=[a,b,c]", "export.robot.fingers=[]"]
-        recording += ("task.joints=all", "task.units=deg", *topics, *robot)
-    here(tmp_path, "job=export", f"export={format}", *recording, "export.folder=new", "output=run", "cluster.workers=1")
-    assert any(file.is_file() for file in (tmp_path / "new").rglob("*"))
-    if format == "lerobot":
-        again = build(composed(tmp_path / "new", "task.image_size=[24,32]")["task"], "task").spec
-        assert (again.action, again.state, again.control_hz) == (NAMES, NAMES, 30.0)
+    here(tmp_path, "job=export", "export=lerobot", *recording, "export.folder=new", "output=run", "cluster.workers=1")
+    again = build(composed(tmp_path / "new", "task.image_size=[24,32]")["task"], "task").spec
+    assert (again.action, again.state, again.control_hz) == (NAMES, NAMES, 30.0)
 
 
 class Behind:
