@@ -59,7 +59,7 @@ def test_statistics_and_samples_are_those_of_all_stored_actions(
     padded = [np.concatenate([actions, actions[-1:].repeat(3, 0)]) for actions in stored]  # chunks stay within episodes
     expected = [each[step : step + 4] for each in padded for step in range(len(each) - 3)]
     np.testing.assert_array_equal(statistics.chunks(4), expected)
-    monkeypatch.setattr("vla.data.statistics.SAMPLE", 40)
+    monkeypatch.setattr("vla.data.statistics.MAX_SAMPLE", 40)
     few = statistics.chunks(4)
     np.testing.assert_array_equal(few[[0, -1]], [expected[0], expected[-1]])
     assert few.shape == (10, 4, 3)

@@ -30,12 +30,12 @@ from vla.spec import Array, Spec
 
 # Multiplying by the golden ratio spreads consecutive seeds evenly over the circle of 32-bit numbers (Knuth, The Art of
 # Computer Programming 3, section 6.4): every stretch of seeds gets its share of held-out episodes.
-GOLDEN = 2654435769
+GOLDEN_RATIO = 2654435769
 
 
 def held_out(recording: int, fraction: float) -> bool:
     """Return whether an episode is held out for validation, independently of others, by its `Entry.recording`."""
-    return recording * GOLDEN % 2**32 < fraction * 2**32
+    return recording * GOLDEN_RATIO % 2**32 < fraction * 2**32
 
 
 def digest_of(episodes: Sequence[Entry]) -> str:

@@ -19,7 +19,7 @@ from vla.io.errors import UserError
 from vla.spec import Array
 
 END = np.dtype([("end", "<u8"), ("crc", "<u4")])
-OVERHEAD = 4096  # largest number of bytes by which compression may enlarge an image
+MAX_OVERHEAD = 4096  # largest number of bytes by which compression may enlarge an image
 
 Damaged = Callable[[int], UserError]  # row → the error to raise
 
@@ -86,7 +86,7 @@ class ScatteredRows:
         else:
             starts = np.where(rows > 0, self._ends["end"][rows - 1], 0)
             sizes = self._ends["end"][rows] - starts  # unsigned: negative ones are large
-            if len(wrong := np.flatnonzero((sizes > self._size + OVERHEAD) | (starts > np.iinfo(np.int64).max))):
+            if len(wrong := np.flatnonzero((sizes > self._size + MAX_OVERHEAD) | (starts > np.iinfo(np.int64).max))):
                 raise self._damaged(int(rows[wrong[0]]))
             places = list(zip(starts.tolist(), sizes.tolist(), strict=True))
         for place in places:

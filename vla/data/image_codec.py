@@ -20,7 +20,7 @@ from vla.io.types import Images
 from vla.parallel.limits import cores
 from vla.spec import Array
 
-LEVEL = 1  # of Zstandard: 3 takes up to three times as long to save 5 %
+ZSTANDARD_LEVEL = 1  # of Zstandard: 3 takes up to three times as long to save 5 %
 
 
 def encode(image: Array, codec: Images, quality: int | None) -> bytes:
@@ -83,4 +83,4 @@ def _threads() -> tuple[int, ThreadPoolExecutor]:
 def _zstandard() -> Any:
     from pyarrow import Codec as Compression  # takes a fifth of a second
 
-    return Compression("zstd", compression_level=LEVEL)
+    return Compression("zstd", compression_level=ZSTANDARD_LEVEL)

@@ -24,7 +24,7 @@ LOST = "lost"  # outcome of a seed whose index line is unreadable
 NOT_NEEDED = "not_needed"  # outcome of a seed that was passed over, because its task had its share of episodes
 CHECK = b', "check": '  # precedes the CRC-32 of the line without it, at the end of every line
 MAX_INDEX_BYTES = 4 << 30  # millions of seeds
-LISTED = 8  # largest number of numbers in a message
+MAX_LISTED = 8  # largest number of numbers in a message
 
 
 def moderate(value: Any) -> bool:
@@ -131,8 +131,8 @@ def listed(numbers: Sequence[int]) -> str:
     ordered = sorted(set(numbers))
     if len(ordered) > 2 and ordered[-1] - ordered[0] == len(ordered) - 1:
         return f"{ordered[0]} to {ordered[-1]}"
-    more = f" and {len(ordered) - LISTED} others" if len(ordered) > LISTED else ""
-    return ", ".join(map(str, ordered[:LISTED])) + more
+    more = f" and {len(ordered) - MAX_LISTED} others" if len(ordered) > MAX_LISTED else ""
+    return ", ".join(map(str, ordered[:MAX_LISTED])) + more
 
 
 def read_index(path: Path, any_seed: bool, damaged: bool) -> tuple[list[Entry], int]:

@@ -13,7 +13,7 @@ import numpy as np
 from rich.progress import track
 
 from vla.data.episodes import DamageError, EpisodeStore, observations_of
-from vla.data.index import DAMAGED, LISTED, LOST, NOT_NEEDED, Entry, listed
+from vla.data.index import DAMAGED, LOST, MAX_LISTED, NOT_NEEDED, Entry, listed
 from vla.io.errors import UserError
 from vla.spec import Array, Episode
 
@@ -80,8 +80,8 @@ def require_whole(report: StoreReport) -> None:
     folder, count = report.store.folder, sum(map(len, report.damaged.values()))
     if report.damaged:
         problems = [f"seeds {listed(seeds)}: {problem}" for problem, seeds in report.damaged.items()]
-        more = [f"and {len(problems) - LISTED} others"] if len(problems) > LISTED else []
-        named = "; ".join([*problems[:LISTED], *more])
+        more = [f"and {len(problems) - MAX_LISTED} others"] if len(problems) > MAX_LISTED else []
+        named = "; ".join([*problems[:MAX_LISTED], *more])
         raise UserError(
             f"{folder} has {count} damaged episodes ({named}): inspect.repair=true leaves them out of a copy"
         )

@@ -27,8 +27,8 @@ Places = Mapping[str, tuple[str, int]]  # component → feature and index
 
 # Largest share of a component's actions beyond its bounds, and tolerance relative to its range. A larger share means
 # other units. Bounds from quantiles exclude 2 % of the actions.
-OUTSIDE, ROUNDING = 0.02, 1e-3
-LONGEST_NAMES = 200  # characters of names from a dataset in a message
+MAX_OUTSIDE, BOUNDS_TOLERANCE = 0.02, 1e-3
+MAX_NAMES = 200  # characters of names from a dataset in a message
 
 log = logging.getLogger(__name__)
 
@@ -193,8 +193,8 @@ class LeRobotDemonstrations(ImportedDemonstrations):
 def _out_of_bounds(actions: Array, spec: Spec) -> Iterator[str]:
     """Yield the components of which more than a few of the (N, D) actions exceed the bounds of the spec."""
     for index, (name, low, high) in enumerate(zip(spec.action, spec.low, spec.high, strict=True)):
-        values, slack = actions[:, index], ROUNDING * (high - low)
-        if (beyond := ((values < low - slack) | (values > high + slack)).mean()) > OUTSIDE:
+        values, slack = actions[:, index], BOUNDS_TOLERANCE * (high - low)
+        if (beyond := ((values < low - slack) | (values > high + slack)).mean()) > MAX_OUTSIDE:
             unit = "" if spec.units[index] == "1" else f" {spec.units[index]}"
             yield (
                 f"{name} in action from {values.min():.3g} to {values.max():.3g}, the task has {low:g} to "
@@ -204,7 +204,7 @@ def _out_of_bounds(actions: Array, spec: Spec) -> Iterator[str]:
 
 def _shortened(names: Iterable[str]) -> str:
     text = ", ".join(names)
-    return text if len(text) <= LONGEST_NAMES else f"{text[:LONGEST_NAMES]}…"
+    return text if len(text) <= MAX_NAMES else f"{text[:MAX_NAMES]}…"
 
 
 def _opened(folder: Path | str | None, images: dict[str, Text] | None) -> LeRobotDataset:

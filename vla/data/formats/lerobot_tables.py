@@ -22,7 +22,7 @@ from vla.spec import Array
 REMEDY = "copy the dataset again from where it is whole"  # where a copy may be damaged or incomplete
 MEND = "correct the dataset, or write it again"  # where a copy cannot help
 MAX_ROWS = 10_000_000  # of a file: 280 hours at 10 Hz
-LONGEST = 1e6  # video [s]
+MAX_SECONDS = 1e6  # video [s]
 
 Column = pa.ChunkedArray
 Kind = tuple[str, Callable[[Column], bool]]  # what a column must hold, and whether it does
@@ -56,7 +56,7 @@ def _within(column: Column, high: float) -> bool:
 
 
 COUNTS: Kind = "integers from 0 on", lambda column: pa.types.is_integer(column.type) and _within(column, 2**53)
-TIMES: Kind = "seconds", lambda column: pa.types.is_floating(column.type) and _within(column, LONGEST)
+TIMES: Kind = "seconds", lambda column: pa.types.is_floating(column.type) and _within(column, MAX_SECONDS)
 TEXTS: Kind = "text", lambda column: is_text(column.type) and not column.null_count
 NUMBERS: Kind = "lists of numbers", _are_numbers
 DEPTHS: Kind = "lists of lists of 16-bit integers", lambda column: _within_lists(column.type) == (2, pa.uint16())
