@@ -32,14 +32,9 @@ def derive_store(
     """Write a new store of the episodes in others of the same spec that match `where`, atomically.
 
     Seeds are in order, config by config. Of the same seed and config one undamaged episode is kept. If all seeds
-    between the first and the last of a single config exist, the new store equals a collected one, and can grow.
-    Returns the seeds that are damaged in every store.
-
-    Args:
-        stores: sources of the episodes; with `repair` they may be damaged.
-        folder: of the new store; it must not exist.
-        where: conditions, see `vla.data.episode_filter`.
-        repair: turn a damaged episode into a failed seed instead of raising.
+    between the first and the last of a single config exist, the new store equals a collected one, and can grow. With
+    `repair` the sources may be damaged, and an episode that is damaged in all of them becomes a failed seed. Returns
+    these seeds.
 
     Raises:
         UserError: the folder exists, specs differ, nothing matches, or an episode is damaged.

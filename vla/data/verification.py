@@ -97,19 +97,16 @@ def find_episode(store: EpisodeStore, seed: int) -> tuple[dict[str, Any], Episod
     tried = [(config, entry) for config, entries in entries_by_config(store) for entry in entries if entry.seed == seed]
     stored = [(config, entry) for config, entry in tried if entry.stored]
     if not tried:
-        seeds = [entry.seed for entry in store.tried]
-        raise UserError(f"{store.folder} has no seed {seed}: it holds {listed(seeds) or 'none yet'}")
+        seeds = listed([entry.seed for entry in store.tried]) or "none yet"
+        raise UserError(f"{store.folder} has no seed {seed}: it holds {seeds}")
     if not stored:
-        nearest = sorted({entry.seed for entry in store.episodes}, key=lambda other: abs(other - seed))[:2]
+        seeds, outcome = listed([entry.seed for entry in store.episodes]) or "none", tried[0][1].outcome
         raise UserError(
-            f"seed {seed} in {store.folder} ended as {tried[0][1].outcome}, and its steps were not kept: there is "
-            f"{' or '.join(map(str, nearest)) or 'none'}"
+            f"seed {seed} in {store.folder} ended as {outcome}, and its steps were not kept: there are {seeds}"
         )
     if len(stored) > 1:
-        raise UserError(
-            f"{store.folder} has {len(stored)} episodes of seed {seed}: inspect one of the stores that it was merged "
-            "from"
-        )
+        count = f"{store.folder} has {len(stored)} episodes of seed {seed}"
+        raise UserError(f"{count}: inspect one of the stores that it was merged from")
     config, entry = stored[0]
     return config, episode_of(store, entry)
 
