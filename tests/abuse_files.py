@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import io
-import json
 import os
 import random
 import shutil
 import struct
 import zlib
 from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -18,22 +15,20 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 from bags import write as write_bag
+from lerobot_files import EPISODES as OF_EPISODES
+from lerobot_files import FRONT, INFO, PICTURE, ROWS, TASKS, Change, column, info
+from lerobot_files import png as packed
 from PIL import Image
+from test_lerobot_import import REFUSED, told
 from trials import CHECKPOINT, SMALL, Trials, digest, last, run
 
 EPISODES = 4
-IMPORT: tuple[str, ...] = (
-    *SMALL[:2],
-    "job=collect",
-    "expert=lerobot",
-    "expert.folder=hurt",
-    f"collect.episodes={EPISODES}",
-)
-IMPORT = (*IMPORT, "collect.folder=imported", "output=wrong")
-INFO, TASKS = "meta/info.json", "meta/tasks.parquet"
-ROWS, OF_EPISODES = "data/chunk-000/file-000.parquet", "meta/episodes/chunk-000/file-000.parquet"
-IMAGES = "observation.images.front"
-VIDEO = f"videos/{IMAGES}/chunk-000/file-000.mp4"
+COLLECTED = (*SMALL[:2], f"collect.episodes={EPISODES}", "output=wrong")
+IMPORT = ("job=collect", "expert=lerobot", "expert.folder=hurt", "collect.folder=imported", *COLLECTED)
+VIDEO = f"videos/{FRONT}/chunk-000/file-000.mp4"
+PLAYED = ("/isaac/franka/joint_states", "/user/command")
+
+
 BAG = (
     *("task.joints=all", "task.units=rad", "task.image_size=[8,8]", "expert.robot.fingers=[left,right]"),
     *(
@@ -43,8 +38,6 @@ BAG = (
     ),
     *("expert.topics.images={front: /front, wrist: /wrist}", "collect.folder=lessons", "output=wrong"),
 )
-
-Change = Callable[[Path], object]  # does something to the copy in a folder
 
 
 def flipped(path: Path, chance: random.Random) -> None:
@@ -70,40 +63,23 @@ def garbled(path: Path, chance: random.Random) -> None:
 DAMAGES = (flipped, cut, garbled)
 
 
-def hurt(name: str, damage: Callable[[Path, random.Random], None], chance: random.Random, folder: Path) -> None:
-    """Damage a file of a folder."""
-    damage(folder / name, chance)
+def damages(name: str, times: int, chance: random.Random) -> dict[str, Change]:
+    """Damage a file of a folder in all ways, so many times each."""
+    return {
+        f"{damage.__name__} {name} {number}": lambda folder, damage=damage: damage(folder / name, chance)
+        for damage in DAMAGES
+        for number in range(times)
+    }
 
 
-def linked(name: str, target: str) -> Change:
-    """Put a link in the place of a file."""
-
-    def change(folder: Path) -> None:
-        (folder / name).unlink()
-        (folder / name).symlink_to(target)
-
-    return change
-
-
-def piped(name: str) -> Change:
-    """Put a pipe that nobody writes to in the place of a file."""
+def instead(name: str, put: Callable[[Path], object] = lambda path: None) -> Change:
+    """Put something, by default nothing, in the place of a file."""
 
     def change(folder: Path) -> None:
         (folder / name).unlink()
-        os.mkfifo(folder / name)
+        put(folder / name)
 
     return change
-
-
-def emptied(name: str, folder: Path) -> None:
-    """Put a folder in the place of a file."""
-    (folder / name).unlink()
-    (folder / name).mkdir()
-
-
-def removed(name: str, folder: Path) -> None:
-    """Remove a file."""
-    (folder / name).unlink()
 
 
 def written(name: str, data: bytes) -> Change:
@@ -111,42 +87,33 @@ def written(name: str, data: bytes) -> Change:
     return lambda folder: (folder / name).write_bytes(data)
 
 
-def told(**values: Any) -> Change:
-    """Change what `info.json` says; a key with __ goes into what stands there."""
-
-    def change(folder: Path) -> None:
-        info = json.loads((folder / INFO).read_text())
-        for key, value in values.items():
-            *parents, name = key.split("__")
-            holder = info
-            for parent in parents:
-                holder = holder[parent]
-            holder[name.replace("IMAGES", IMAGES)] = value
-        (folder / INFO).write_text(json.dumps(info))
-
-    return change
+def unreadable(name: str) -> dict[str, Change]:
+    """Put what nobody can read to its end in the place of a file."""
+    return {
+        f"endless {name}": instead(name, lambda path: path.symlink_to("/dev/zero")),
+        f"pipe {name}": instead(name, os.mkfifo),
+        f"a folder {name}": instead(name, Path.mkdir),
+    }
 
 
-def column(file: str, name: str, value: Any, rows: int | None = None) -> Change:
-    """Let every row of a column be one value; with `rows`, let there be so many, all alike."""
+def feature(key: str, **values: Any) -> Change:
+    """Change what `info.json` says of a feature."""
+    return info(lambda content: content["features"].update({key: values}))
+
+
+def repeated(file: str, name: str, value: Any, rows: int) -> Change:
+    """Let a table have so many rows, all alike, with one value in a column."""
 
     def change(folder: Path) -> None:
         table = pq.read_table(folder / file)
-        if rows is not None:
-            table = table.take(pa.array(np.zeros(rows, np.int64)))
-        values = pa.array([value], size=1) if not isinstance(value, pa.Array) else value
-        values = values.take(pa.array(np.zeros(len(table), np.int64)))
-        pq.write_table(table.set_column(table.column_names.index(name), name, values), folder / file)
+        pq.write_table(table.take(pa.array(np.zeros(rows, np.int64))), folder / file)
+        column(file, name, lambda table: pa.array([value]).take(pa.array(np.zeros(rows, np.int64))))(folder)
 
     return change
 
 
-def png(height: int, width: int, bomb: bool = False) -> bytes:
-    """A PNG of one colour; a `bomb` says so of its size and unpacks to a gigabyte."""
-    if not bomb:
-        file = io.BytesIO()
-        Image.new("RGB", (width, height)).save(file, "PNG")
-        return file.getvalue()
+def bomb(height: int, width: int) -> bytes:
+    """A PNG that says so of its size and unpacks to a gigabyte."""
 
     def chunk(kind: bytes, data: bytes) -> bytes:
         return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
@@ -158,99 +125,93 @@ def png(height: int, width: int, bomb: bool = False) -> bytes:
 
 
 def pictures(content: bytes | None, path: str = "../../../etc/passwd") -> Change:
-    """Let a camera's images be PNG in the table, all of them the same."""
+    """Let a camera's images be files in the table, all of them the same."""
 
     def change(folder: Path) -> None:
         table = pq.read_table(folder / ROWS)
-        kind = pa.struct({"bytes": pa.binary(), "path": pa.string()})
-        images = pa.array([{"bytes": content, "path": path}], kind).take(pa.array(np.zeros(len(table), np.int64)))
-        pq.write_table(table.append_column(IMAGES, images), folder / ROWS)
-        told(features__IMAGES={"dtype": "image", "shape": [32, 32, 3], "names": None})(folder)
+        images = pa.array([{"bytes": content, "path": path}] * len(table), PICTURE)
+        pq.write_table(table.append_column(FRONT, images), folder / ROWS)
+        feature(FRONT, dtype="image", shape=[32, 32, 3], names=None)(folder)
 
     return change
 
 
+def plain(height: int, width: int) -> bytes:
+    """A black PNG."""
+    return packed(Image.new("RGB", (width, height)))
+
+
 TRAILING = "an image bomb that says 32 x 32"
-LONG = pa.array([[0.0] * 300_000], pa.list_(pa.float32()))
-# What is done to a dataset; the large images take seconds to make, so not before they are wanted.
+# What is done to a dataset, beside what tests refuse; the large images take seconds to make, so not before they are
+# wanted.
 HOSTILE: dict[str, Change] = {
-    **{f"fps {value!r}": told(fps=value) for value in (20, 1e308, None, float("nan"))},
-    **{f"version {value!r}": told(codebase_version=value) for value in ("v2.1", None)},
-    **{f"features {value!r}": told(features=value) for value in (None, dict[str, Any]())},
-    **{f"image shape {value}": told(features__IMAGES={"dtype": "video", "shape": value}) for value in (
-        [32, 32], [10**12, 10**12, 3], ["32", 32, 3])},
-    **{f"action names {value}": told(features__action={"dtype": "float32", "shape": [7], "names": value})
+    **{f"{number}: {says}": change for number, (change, says) in enumerate(REFUSED)},
+    **{f"fps {value!r}": told(fps=value) for value in (20, 1e308, None)},
+    **{f"image shape {value}": feature(FRONT, dtype="video", shape=value)
+       for value in ([32, 32], [10**12, 10**12, 3], ["32", 32, 3])},
+    **{f"action names {value}": feature("action", dtype="float32", shape=[7], names=value)
        for value in (["a"] * 7, {"x": 1})},
-    "image dtype": told(features__IMAGES={"dtype": "object", "shape": [32, 32, 3]}),
-    "action dtype": told(features__action={"dtype": "string", "shape": [10**9]}),
+    "image dtype": feature(FRONT, dtype="object", shape=[32, 32, 3]),
+    "action dtype": feature("action", dtype="string", shape=[10**9]),
     "counts of totals": told(total_episodes=10**18, total_frames=-1, chunks_size=0),
     "paths in info": told(data_path="../../{chunk_index}.parquet", video_path="/etc/passwd"),
-    "info nested": written(INFO, b'{"codebase_version": "v3.0", "features": ' + b"[" * 10**5),
     "info large": written(INFO, b" " * (40 << 20) + b"{}"),
     "info not text": written(INFO, bytes(range(256))),
     "info twice": lambda folder: (folder / INFO).write_text((folder / INFO).read_text()[:-2] + ',"fps":20}'),
-    **{f"endless {name}": linked(name, "/dev/zero") for name in (INFO, TASKS, ROWS, OF_EPISODES, VIDEO)},
-    **{f"pipe {name}": piped(name) for name in (INFO, TASKS, ROWS, OF_EPISODES, VIDEO)},
+    **{name: change for file in (INFO, TASKS, ROWS, OF_EPISODES, VIDEO) for name, change in unreadable(file).items()},
     "endless checksums": lambda folder: (folder / "meta/checksums.json").symlink_to("/dev/zero"),
     "checksums elsewhere": written("meta/checksums.json", b'{"../../../../etc/passwd": 1}'),
     "folder in a circle": lambda folder: (folder / "data/chunk-001").symlink_to("..", True),
     "video of files": written(VIDEO, b"ffconcat version 1.0\nfile '/etc/passwd'\n"),
     "video of addresses": written(VIDEO, b"#EXTM3U\n#EXTINF:1,\nhttp://127.0.0.1:9/x.ts\n#EXT-X-ENDLIST\n"),
-    "video an image": written(VIDEO, png(32, 32)),
-    "video of another size": lambda folder: written(VIDEO, png(20_000, 20_000))(folder),
+    "video an image": written(VIDEO, plain(32, 32)),
+    "video of another size": lambda folder: written(VIDEO, plain(20_000, 20_000))(folder),
     "videos gone": lambda folder: shutil.rmtree(folder / "videos"),
-    "a video a folder": partial(emptied, VIDEO),
     **{f"{of.rpartition('/')[2]} {value!r}": column(OF_EPISODES, of, value) for of, value in (
-        (f"videos/{IMAGES}/chunk_index", "../../x"), (f"videos/{IMAGES}/chunk_index", 2**40),
-        (f"videos/{IMAGES}/file_index", -1), (f"videos/{IMAGES}/from_timestamp", float("nan")),
-        (f"videos/{IMAGES}/from_timestamp", -1e18), (f"videos/{IMAGES}/from_timestamp", 9e5),
-        ("dataset_to_index", 2**62), ("dataset_from_index", -5), ("dataset_to_index", 3), ("episode_index", 0),
-        ("data/file_index", None), ("episode_index", "0"))},
+        (f"videos/{FRONT}/chunk_index", 2**40), (f"videos/{FRONT}/from_timestamp", 9e5), ("dataset_from_index", -5),
+        ("dataset_to_index", 2**62), ("dataset_to_index", 3), ("data/file_index", None), ("episode_index", "0"))},
     **{f"{of} {str(value)[:20]}": column(ROWS, of, value) for of, value in (
-        ("action", "push"), ("action", [0.0]), ("action", [float("nan")] * 7), ("action", [1e30] * 7),
-        ("action", None), ("observation.state", [["a"]]), ("episode_index", 2), ("episode_index", None),
-        ("task_index", 77), ("task_index", 1.5))},
-    **{f"task {str(value)[:9]}": column(TASKS, "task", value) for value in (None, 3, "x" * 1001, "x" * 10**8)},
-    "many rows": column(ROWS, "episode_index", 0, 200_000),
-    "many episodes": column(OF_EPISODES, "episode_index", 0, 2_000),
-    "long rows": column(ROWS, "action", LONG),
-    "long texts": column(TASKS, "task", "x" * 10**4, 20_000),
+        ("action", [float("nan")] * 7), ("action", [1e30] * 7), ("action", None), ("observation.state", [["a"]]),
+        ("episode_index", 2), ("task_index", 1.5))},
+    **{f"task {str(value)[:9]}": column(TASKS, "task", value) for value in (3, "x" * 10**8)},
+    "many rows": repeated(ROWS, "episode_index", 0, 200_000),
+    "many episodes": repeated(OF_EPISODES, "episode_index", 0, 2_000),
+    "long rows": column(ROWS, "action", [0.0] * 300_000),
+    "long texts": repeated(TASKS, "task", "x" * 10**4, 20_000),
     "images of a path only": pictures(None),
     "images that are none": pictures(b"\x89PNG"),
-    "images of another size": pictures(png(64, 64)),
-    "an image bomb": lambda folder: pictures(png(30_000, 12_000, bomb=True))(folder),
-    TRAILING: lambda folder: pictures(png(32, 32, bomb=True))(folder),
+    "images of another size": pictures(plain(64, 64)),
+    "an image bomb": lambda folder: pictures(bomb(30_000, 12_000))(folder),
+    TRAILING: lambda folder: pictures(bomb(32, 32))(folder),
 }  # fmt: skip
+
+
+def exported(root: Path, kind: str, folder: str) -> None:
+    """Export the episodes of the store, once."""
+    if not (root / folder).exists():
+        made = ("job=export", f"export={kind}", f"export.folder={folder}", "collect.folder=store")
+        how, printed = run(root, *made, *COLLECTED)
+        assert how == "done", printed
 
 
 def datasets(root: Path) -> Trials:
     """LeRobot datasets: imported as they were, or refused in a sentence."""
-    if not (root / "dataset").exists():
-        made = ("job=export", "export=lerobot", "export.folder=dataset", "collect.folder=store", "output=wrong")
-        how, printed = run(root, *SMALL[:2], *made, f"collect.episodes={EPISODES}")
-        assert how == "done", printed
+    exported(root, "lerobot", "dataset")
     expected = imported(root, lambda folder: None, checksums=True)[2]
     assert expected and imported(root, lambda folder: None, checksums=False)[2] == expected
-    chance = random.Random(0)
-    files = [path for path in (root / "dataset").rglob("*") if path.is_file()]
-    names = sorted(str(path.relative_to(root / "dataset")) for path in files)
     # What follows the pixels of an image is not unpacked.
-    black = imported(root, pictures(png(32, 32)), checksums=False)[2]
+    black = imported(root, pictures(plain(32, 32)), checksums=False)[2]
     for attack, change in HOSTILE.items():
         how, printed, found = imported(root, change, checksums=False)
         right = black if attack == TRAILING else expected
         yield attack, how == "sentence" or (how == "done" and found == right), f"{how}: {last(printed)}"
-
-    for name in names:
-        for damage in DAMAGES:
-            checksums = name.endswith((".mp4", "checksums.json"))  # nothing but a checksum says what these held
-            how, printed, found = imported(root, partial(hurt, name, damage, chance), checksums)
+    files, chance = [path for path in (root / "dataset").rglob("*") if path.is_file()], random.Random(0)
+    for name in sorted(str(path.relative_to(root / "dataset")) for path in files):
+        checksums = name.endswith((".mp4", "checksums.json"))  # nothing but a checksum says what these held
+        for attack, change in damages(name, 1, chance).items():
+            how, printed, found = imported(root, change, checksums)
             held = how == "sentence" or (not checksums and how == "done" and found == expected)
-            yield (
-                f"{damage.__name__} {name}, {'with' if checksums else 'without'} checksums",
-                held,
-                f"{how}: {last(printed)}",
-            )
+            yield attack, held, f"{how}: {last(printed)}"
 
 
 def imported(root: Path, change: Change, checksums: bool) -> tuple[str, str, dict[str, str]]:
@@ -272,17 +233,10 @@ def bags(root: Path) -> Trials:
         write_bag(whole)
     how, printed = learned(root, whole)
     assert how == "done", printed
-    chance = random.Random(0)
-    changes: dict[str, Change] = {
-        f"{damage.__name__} {name} {number}": partial(hurt, name, damage, chance)
-        for name, times in (("bag_whole.mcap", 4), ("metadata.yaml", 2))
-        for damage in DAMAGES
-        for number in range(times)
-    }
-    for name in ("bag_whole.mcap", "metadata.yaml"):
-        changes |= {f"endless {name}": linked(name, "/dev/zero"), f"pipe {name}": piped(name)}
-        changes |= {f"no {name}": partial(removed, name)}
-        changes |= {f"empty {name}": written(name, b"")}
+    chance, changes = random.Random(0), dict[str, Change]()
+    for name, times in (("bag_whole.mcap", 4), ("metadata.yaml", 2)):
+        changes |= {**damages(name, times, chance), **unreadable(name)}
+        changes |= {f"no {name}": instead(name), f"empty {name}": written(name, b"")}
     changes["aliases"] = written("metadata.yaml", b"a: &a [x]\nb: [*a, *a]")
     changes["a file elsewhere"] = lambda folder: (folder / "metadata.yaml").write_text(
         (folder / "metadata.yaml").read_text().replace("bag_whole.mcap", "../../../../etc/passwd")
@@ -312,15 +266,10 @@ def runs(root: Path) -> Trials:
             if (root / "run" / name).exists():
                 shutil.copy(root / "run" / name, root / "evaluated")
     files = ("report.json", "config.yaml", "changes.yaml", "training.json", "metrics.csv", "rollouts.rrd")
-    there = [name for name in files if (root / "evaluated" / name).exists()]
-    chance = random.Random(0)
-    changes: dict[str, Change] = {}
-    for name in there:
-        for number in range(1):
-            changes |= {f"{damage.__name__} {name} {number}": partial(hurt, name, damage, chance) for damage in DAMAGES}
-        changes |= {f"endless {name}": linked(name, "/dev/zero"), f"pipe {name}": piped(name)}
+    chance, changes = random.Random(0), dict[str, Change]()
+    for name in (name for name in files if (root / "evaluated" / name).exists()):
+        changes |= {**damages(name, 1, chance), **unreadable(name)}
         changes |= {f"nested {name}": written(name, b"[" * 10**5), f"zeros {name}": written(name, bytes(4096))}
-        changes |= {f"a folder {name}": partial(emptied, name)}
     for attack, change in changes.items():
         for name in ("hurt_run", "wrong"):
             shutil.rmtree(root / name, ignore_errors=True)

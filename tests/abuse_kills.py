@@ -69,13 +69,11 @@ def killed(
 def weights(output: Path) -> dict[str, bytes]:
     """The bytes of all weights of the newest checkpoint, and of the optimiser's state."""
     content = torch.load(output / "checkpoints/last.ckpt", weights_only=True)
-    state = {str(key): value for of in content["optimizer_states"] for key, value in of["state"].items()}
-    flat = {
-        **content["state_dict"],
-        **{f"{key}.{name}": each for key, of in state.items() for name, each in of.items()},
-    }
-    found = {name: value.numpy().tobytes() for name, value in flat.items() if isinstance(value, torch.Tensor)}
-    return {**found, "steps": str(content["global_step"]).encode()}
+    found = dict(content["state_dict"])
+    for optimizer in content["optimizer_states"]:
+        found |= {f"{key}.{name}": value for key, of in optimizer["state"].items() for name, value in of.items()}
+    tensors = {name: value.numpy().tobytes() for name, value in found.items() if isinstance(value, torch.Tensor)}
+    return {**tensors, "steps": str(content["global_step"]).encode()}
 
 
 def reported(output: Path) -> Any:
@@ -95,14 +93,13 @@ def collections(root: Path, times: int = 10) -> Trials:
     arguments = ("job=collect", *SMALL, "collect.folder=killed", "output=wrong")
     expected = stored(root / "store")
     for trial in range(1, times + 1):
-        command = [sys.executable, "-m", "vla.run", *arguments]
-        quiet: Any = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
-        process = subprocess.Popen(command, cwd=root, start_new_session=True, **quiet)
+        command, quiet = [sys.executable, "-m", "vla.run", *arguments], subprocess.DEVNULL
+        process = subprocess.Popen(command, cwd=root, start_new_session=True, stdout=quiet, stderr=quiet)
         time.sleep(chance.uniform(2, 9))
         twice = trial % 4 == 0
-        for number in (signal.SIGINT, signal.SIGINT) if twice else (signal.SIGKILL,):
+        for _ in range(1 + twice):
             with suppress(ProcessLookupError):
-                os.killpg(process.pid, number) if not twice else process.send_signal(number)
+                process.send_signal(signal.SIGINT) if twice else os.killpg(process.pid, signal.SIGKILL)
             time.sleep(0.3)
         try:
             process.wait(15)

@@ -14,8 +14,9 @@ from matplotlib.figure import Figure
 from rich.console import Console
 from toy_episodes import EPISODES, add
 
+from vla.data.derivation import derive_store
 from vla.data.episodes import EpisodeStore
-from vla.data.verification import derive_store, verify_store
+from vla.data.verification import verify_store
 from vla.reports.dataset_card import store_table, write_card
 
 DRAWS: list[dict[str, Any]] = [

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import logging
 import os
-import resource
 import signal
 import subprocess
 import sys
 import time
 from collections import Counter
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +17,7 @@ import pytest
 import toy
 from collecting import EPISODES, TRIED, content, lines
 from composing import composed
+from toy_episodes import full_disk
 
 from vla.config.experiment import Experiment
 from vla.data.episodes import EpisodeStore
@@ -86,19 +87,13 @@ def start(folder: Path, until: int, workers: int = 2, episodes: int = EPISODES) 
     return process
 
 
-def test_the_summary_counts_what_was_tried(tmp_path: Path) -> None:
-    summary = gather(tmp_path)
-    assert (summary.episodes, summary.added, summary.tried) == (EPISODES, EPISODES, TRIED)
-    assert summary.failures == {"timeout": TRIED - EPISODES}
-    assert summary.success_rate == EPISODES / TRIED
-    store = EpisodeStore(tmp_path)
-    assert all(entry.seed % 5 != 3 for entry in store.episodes)
-    assert [entry.seed for entry in store.tried] == list(range(TRIED))
-
-
 def test_two_workers_leave_the_same_bytes_as_one(tmp_path: Path, whole: Path) -> None:
-    gather(tmp_path, workers=2)
+    summary, store = gather(tmp_path, workers=2), EpisodeStore(tmp_path)
     assert content(tmp_path) == content(whole)
+    assert (summary.episodes, summary.added, summary.tried) == (EPISODES, EPISODES, TRIED)
+    assert summary.failures == {"timeout": TRIED - EPISODES} and summary.success_rate == EPISODES / TRIED
+    assert [entry.seed for entry in store.tried] == list(range(TRIED))
+    assert all(entry.seed % 5 != 3 for entry in store.episodes)
 
 
 def test_a_larger_count_adds_only_what_is_missing(tmp_path: Path, whole: Path) -> None:
@@ -107,6 +102,10 @@ def test_a_larger_count_adds_only_what_is_missing(tmp_path: Path, whole: Path) -
     assert content(tmp_path) == content(whole)
     assert gather(tmp_path, episodes=5).added == 0
     assert content(tmp_path) == content(whole)
+    for episodes in (1, 60):
+        store = EpisodeStore(tmp_path)
+        with pytest.raises(ValueError, match=r"starts at seed 0, not 7: set collect\.seed=0"):
+            collect(store, toy.make_environment, toy.make_expert, episodes, Cluster(1, "beside"), seed=7)
 
 
 def in_turn(folder: Path, episodes: int, workers: int = 1) -> Summary:
@@ -137,7 +136,9 @@ def test_shares_depend_neither_on_workers_nor_on_interruptions(tmp_path: Path) -
     assert content(tmp_path / "parallel") == content(tmp_path / "grown") == content(tmp_path / "whole")
 
 
-def test_how_long_it_took_is_added_up_and_shared_out_among_the_episodes(tmp_path: Path) -> None:
+def test_how_long_it_took_is_shared_out_among_the_episodes_and_may_be_unknown(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     gather(tmp_path, episodes=4)
     (tmp_path / COLLECTION_TIME).write_text("1000.0\n")
     gather(tmp_path, episodes=8)
@@ -145,22 +146,16 @@ def test_how_long_it_took_is_added_up_and_shared_out_among_the_episodes(tmp_path
     whole = collection_time(store, 8)
     assert whole is not None and whole >= 1000
     assert collection_time(store, 2) == pytest.approx(whole / 4)
-    (tmp_path / COLLECTION_TIME).unlink()
+    file = tmp_path / COLLECTION_TIME
+    file.unlink()
     assert collection_time(store, 8) is None
-
-
-def test_a_damaged_duration_is_unknown_and_costs_no_collection(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    gather(tmp_path, episodes=2)
-    file, store = tmp_path / COLLECTION_TIME, EpisodeStore(tmp_path)
     for damage in ("", "soon", "nan", "1e400", "1e300", "-1", "[1]", "1" * 10**6):
         file.write_text(damage)
         assert collection_time(store, 2) is None
         assert f"the duration of the collection is unknown: {file}" in caplog.text
         caplog.clear()
-    assert gather(tmp_path, episodes=4).episodes == 4
-    assert collection_time(EpisodeStore(tmp_path), 4) is None and file.read_text() == damage
+    assert gather(tmp_path, episodes=10).episodes == 10
+    assert collection_time(EpisodeStore(tmp_path), 10) is None and file.read_text() == damage
 
 
 def test_killed_at_random_moments_it_loses_and_doubles_nothing(tmp_path: Path) -> None:
@@ -183,27 +178,23 @@ def test_killed_at_random_moments_it_loses_and_doubles_nothing(tmp_path: Path) -
     assert content(folder) == content(whole)
 
 
-def test_ctrl_c_ends_it_with_one_traceback(tmp_path: Path) -> None:
+@pytest.mark.parametrize("pause", [None, 0.0, 0.3])
+def test_ctrl_c_ends_it_with_one_traceback_and_twice_too(tmp_path: Path, pause: float | None) -> None:
     folder, whole = tmp_path / "episodes", tmp_path / "whole"
     process = start(folder, 3, episodes=10 * EPISODES)
     os.killpg(process.pid, signal.SIGINT)
+    if pause is not None:
+        time.sleep(pause)
+        with suppress(ProcessLookupError):
+            os.killpg(process.pid, signal.SIGINT)
     output = process.communicate(timeout=20)[0]  # its workers hold the same pipe
-    # Where it arrives while another exception is handled, that one's comes first.
-    assert output.count("Traceback") - output.count("During handling of the above exception") == 1
-    assert output.count("\nKeyboardInterrupt") == 1 and output.rstrip().endswith("KeyboardInterrupt")
+    if pause is None:
+        # Where it arrives while another exception is handled, that one's comes first.
+        assert output.count("Traceback") - output.count("During handling of the above exception") == 1
+        assert output.count("\nKeyboardInterrupt") == 1 and output.rstrip().endswith("KeyboardInterrupt")
     gather(folder, episodes=2 * EPISODES)
     gather(whole, episodes=2 * EPISODES)
     assert content(folder) == content(whole)
-
-
-@pytest.mark.parametrize("pause", [0.0, 0.02, 0.3])
-def test_ctrl_c_twice_ends_it_too(tmp_path: Path, pause: float) -> None:
-    process = start(tmp_path / "episodes", 2, episodes=10 * EPISODES)
-    for _ in range(2):
-        os.killpg(process.pid, signal.SIGINT)
-        time.sleep(pause)
-    process.communicate(timeout=20)  # its workers hold the same pipe
-    gather(tmp_path / "episodes", episodes=4)
 
 
 def test_a_second_job_waits_for_the_first_and_uses_its_episodes(
@@ -238,12 +229,9 @@ def test_an_expert_without_hope_is_given_up(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=words):
         gather(tmp_path, make_expert=toy.make_lost_expert)
     assert EpisodeStore(tmp_path).episodes == []
-
-
-def test_a_success_that_cannot_be_replayed_is_a_failure(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match=NOT_REPEATABLE):
-        gather(tmp_path, make_environment=toy.make_forgetful_environment)
-    assert EpisodeStore(tmp_path).episodes == []
+    with pytest.raises(ValueError, match=NOT_REPEATABLE):  # a success that cannot be replayed is a failure
+        gather(tmp_path / "forgetful", make_environment=toy.make_forgetful_environment)
+    assert EpisodeStore(tmp_path / "forgetful").episodes == []
 
 
 def test_an_expert_that_does_not_look_leaves_the_same_demonstrations_from_fewer_images() -> None:
@@ -288,22 +276,10 @@ def same_images(one: Episode, other: Episode) -> bool:
     )
 
 
-@pytest.mark.parametrize("episodes", [1, 3])
-def test_a_store_goes_on_from_its_own_first_seed(tmp_path: Path, episodes: int) -> None:
-    gather(tmp_path, episodes=2)
-    store = EpisodeStore(tmp_path)
-    with pytest.raises(ValueError, match=r"starts at seed 0, not 7: set collect\.seed=0"):
-        collect(store, toy.make_environment, toy.make_expert, episodes, Cluster(1, "beside"), seed=7)
-
-
 def test_a_disk_that_fills_up_costs_nothing_that_was_committed(tmp_path: Path, whole: Path) -> None:
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, ((whole / "rgb_eye.bin").stat().st_size // 2, hard))
-    try:
-        with pytest.raises(ValueError, match=r"cannot take seed \d+ \(.*\): the \d+ episodes before it are safe"):
-            gather(tmp_path)
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    safe = r"cannot take seed \d+ \(.*\): the \d+ episodes before it are safe"
+    with full_disk((whole / "rgb_eye.bin").stat().st_size // 2), pytest.raises(ValueError, match=safe):
+        gather(tmp_path)
     assert len(EpisodeStore(tmp_path).episodes) > 5
     gather(tmp_path)
     assert content(tmp_path) == content(whole)

@@ -16,11 +16,11 @@ from reading import fit, windows
 
 from vla.data.datamodule import Prefetcher, held_out
 from vla.data.episodes import EpisodeStore, observations_of
-from vla.data.verification import derive_store
+from vla.data.verification import episode_of
 from vla.data.window_batches import WindowBatcher, perturbed
 from vla.parallel.pool import Cluster
 from vla.rollouts.collect import collect
-from vla.spec import Array, Episode
+from vla.spec import Array
 
 EPISODES = toy.EPISODES
 
@@ -71,17 +71,6 @@ def test_a_batch_is_what_a_loop_over_the_episodes_gives(arms: Path, history: int
         assert batch["instruction"][place] == expected["text"]
 
 
-def test_chosen_episodes_give_the_windows_that_they_gave(folder: Path, tmp_path: Path) -> None:
-    whole = EpisodeStore(folder)
-    derive_store([whole], tmp_path / "chosen", {"colour": "red", "seed": [4, None]})
-    module, entry = windows(tmp_path / "chosen"), EpisodeStore(tmp_path / "chosen").episodes[0]
-    same = next(other for other in whole.episodes if other.seed == entry.seed)
-    one, other = module.make_batch(np.array([entry.start])), WindowBatcher(whole, 3, 2)(np.array([same.start]))
-    assert same.start > entry.start == 0
-    torch.testing.assert_close(one["action"], other["action"], rtol=0, atol=0)
-    torch.testing.assert_close(one["rgb"]["eye"], other["rgb"]["eye"], rtol=0, atol=0)
-
-
 def test_shapes_and_types_are_those_of_the_contract(folder: Path, arms: Path) -> None:
     batch = next(iter(windows(arms, spec=toy.ARM_SPEC, depth=True).train_dataloader()))
     assert {name: (tuple(image.shape), image.dtype) for name, image in batch["rgb"].items()} == {
@@ -101,32 +90,14 @@ def test_shapes_and_types_are_those_of_the_contract(folder: Path, arms: Path) ->
     assert next(iter(windows(folder, depth=True).train_dataloader()))["depth"] == {}
 
 
-def test_nothing_is_labelled_before_the_start_or_beyond_the_end(folder: Path) -> None:
-    store = EpisodeStore(folder)
-    off = perturbed(store.rows("action")[:], store.rows("executed")[:], store.spec)
-    entry = next(
-        entry
-        for entry in store.episodes
-        for last in [entry.start + entry.steps - 1]
-        if not off[[entry.start, last - 2, last - 1, last]].any()
-    )
-    batch = WindowBatcher(store, history=3, chunk=2)(np.array([entry.start, entry.start + entry.steps - 1]))
-    assert batch["present"].tolist() == [[False, False, True], [True, True, True]]
-    assert batch["valid"][0].tolist() == [[False, False], [False, False], [True, True]]
-    assert batch["valid"][1].tolist() == [[True, True], [True, True], [True, False]]
-    assert not batch["rgb"]["eye"][0, :2].any() and not batch["state"][0, :2].any()
-    assert torch.equal(batch["action"][1, 2, 0], batch["action"][1, 2, 1])
-
-
 def test_a_further_store_may_lack_the_truth(folder: Path, tmp_path: Path) -> None:
     source = EpisodeStore(folder)
     lacking = EpisodeStore.create_or_open(tmp_path / "lacking", source.spec.without_truth, {})
     with lacking.writing():
         for seed, entry in enumerate(source.episodes[:4]):
-            rows = source.read(entry)
-            seen = observations_of(lacking.spec, rows, entry.instruction)
-            what = (seed, "recorded", entry.instruction, "unverified", frozenset[str](), {})
-            lacking.append(Episode(*what, seen, rows["action"], rows["executed"]))
+            seen = observations_of(lacking.spec, source.read(entry), entry.instruction)
+            given = replace(episode_of(source, entry), seed=seed, outcome="unverified", draws={}, observations=seen)
+            lacking.append(given)
     module, twice = (windows(folder, more=[lacking.folder] * number) for number in (1, 2))
     added = len(module.training_windows) - len(windows(folder).training_windows)
     assert len(twice.training_windows) == len(module.training_windows) + added and added > 0
@@ -146,14 +117,9 @@ def test_every_window_comes_once_per_shuffle(folder: Path) -> None:
     assert not np.array_equal(windows(folder, seed=2).order(0), module.order(0))
     larger = windows(folder, batch_size=2 * count + 5)
     assert np.bincount(larger.order(0))[module.training_windows].min() == 2
-
-
-def test_ranks_share_the_windows_out(folder: Path) -> None:
-    module = windows(folder)
-    steps = len(module.training_windows) // (8 * 2)
-    drawn = [np.concatenate([module.order(step, rank, 2) for step in range(steps)]) for rank in (0, 1)]
-    assert not set(drawn[0]) & set(drawn[1])
-    assert len(set(drawn[0]) | set(drawn[1])) == steps * 8 * 2
+    steps = count // (8 * 2)  # two processes share the windows out
+    ranks = [np.concatenate([module.order(step, rank, 2) for step in range(steps)]) for rank in (0, 1)]
+    assert len({*ranks[0], *ranks[1]}) == steps * 8 * 2
 
 
 def test_the_split_is_by_episode_and_does_not_move_when_episodes_are_added(folder: Path) -> None:
@@ -163,14 +129,10 @@ def test_the_split_is_by_episode_and_does_not_move_when_episodes_are_added(folde
     for entry in EpisodeStore(folder).episodes:
         side = many.held_out_windows if held_out(entry.seed, 0.2) else many.training_windows
         assert np.isin(np.arange(entry.start, entry.start + entry.steps), side).all()
-
-
-@pytest.mark.parametrize("fraction", [0.05, 0.1, 0.5])
-def test_every_stretch_of_seeds_holds_out_its_share(fraction: float) -> None:
-    held = np.array([held_out(seed, fraction) for seed in range(10_000)])
-    assert abs(held.mean() - fraction) < 0.001
-    length = round(2 / fraction)
-    assert all(held[first : first + length].any() for first in range(0, 10_000 - length))
+    for fraction in (0.05, 0.1, 0.5):  # every stretch of seeds holds out its share
+        held, length = np.array([held_out(seed, fraction) for seed in range(10_000)]), round(2 / fraction)
+        assert abs(held.mean() - fraction) < 0.001
+        assert all(held[first : first + length].any() for first in range(0, 10_000 - length))
 
 
 def test_validation_is_the_same_pass_in_whole_batches(folder: Path) -> None:
@@ -194,6 +156,12 @@ def test_the_stream_is_made_ahead_but_not_without_bound(folder: Path) -> None:
     stream.close()  # type: ignore[attr-defined]
     assert len(made) <= 4 + 2
 
+    def fail(rows: Array) -> dict[str, Any]:
+        raise ValueError(f"row {rows[0]} is gone")
+
+    with pytest.raises(ValueError, match="row 7 is gone"):  # where the batch is waited for
+        next(iter(Prefetcher(fail, lambda: [np.array([7])], 2)))
+
 
 def test_what_is_kept_of_a_batch_does_not_change(folder: Path) -> None:
     module = windows(folder)
@@ -204,14 +172,6 @@ def test_what_is_kept_of_a_batch_does_not_change(folder: Path) -> None:
     for step, images in enumerate(kept):
         expected = WindowBatcher(EpisodeStore(folder), 3, 2)(module.order(step))["rgb"]["eye"][1:4, 0]
         np.testing.assert_array_equal(images, expected)
-
-
-def test_an_error_in_the_thread_is_raised_where_the_batch_is_waited_for() -> None:
-    def fail(rows: Array) -> dict[str, Any]:
-        raise ValueError(f"row {rows[0]} is gone")
-
-    with pytest.raises(ValueError, match="row 7 is gone"):
-        next(iter(Prefetcher(fail, lambda: [np.array([7])], 2)))
 
 
 @pytest.mark.parametrize("accumulate", [1, 2])
@@ -231,15 +191,13 @@ def test_training_leaves_the_store_as_it_is(folder: Path, tmp_path: Path) -> Non
     shutil.copytree(folder, store)
     for path in (*store.iterdir(), store):
         path.chmod(0o555 if path.is_dir() else 0o444)
-    before = {path.name: path.stat() for path in store.iterdir()} | {".": store.stat()}
+    before = {path: path.stat().st_mtime_ns for path in (store, *store.iterdir())}
     # What job=train does: it looks whether there are episodes enough, and trains on them.
-    complete = EpisodeStore.create_or_open(store, toy.SPEC, {})
-    assert collect(complete, toy.make_environment, toy.make_expert, EPISODES, Cluster(1, "beside"), seed=0).added == 0
+    complete, cluster = EpisodeStore.create_or_open(store, toy.SPEC, {}), Cluster(1, "beside")
+    assert collect(complete, toy.make_environment, toy.make_expert, EPISODES, cluster, seed=0).added == 0
     seen = fit(store, 5).seen
     assert all(torch.equal(one, two) for one, two in zip(seen, fit(folder, 5).seen, strict=True))
-    after = {path.name: path.stat() for path in store.iterdir()} | {".": store.stat()}
-    assert before.keys() == after.keys()
-    assert all(after[name].st_mtime_ns == stat.st_mtime_ns for name, stat in before.items())
+    assert {path: path.stat().st_mtime_ns for path in (store, *store.iterdir())} == before
     opened = EpisodeStore(store)
     assert all(isinstance(rows, np.ndarray) and not rows.flags.writeable for rows in map(opened.rows, opened.fields))
     store.chmod(0o755)  # so that it can be tidied away

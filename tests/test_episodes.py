@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-import resource
 import shutil
 from collections.abc import Callable
 from dataclasses import replace
@@ -13,10 +12,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 from toy import ARM_SPEC
-from toy_episodes import CODECS, CONFIG, EPISODES, add, content
+from toy_episodes import CODECS, CONFIG, EPISODES, add, content, full_disk
 
 from vla.data.episodes import EpisodeStore
 from vla.data.header import Codec
+from vla.data.verification import episode_of
 
 
 def test_what_was_stored_is_read_back(tmp_path: Path) -> None:
@@ -27,20 +27,17 @@ def test_what_was_stored_is_read_back(tmp_path: Path) -> None:
     assert store.tried[3].outcome == "timeout" and store.tried[3].steps == 0
     assert store.next_seed == 5
     assert store.tried[0].draws["colour"] in ("red", "blue") and store.tried[0].draws["limit"] == 40
-    for entry in store.episodes:
-        episode, rows = EPISODES[entry.seed], store.read(entry)
-        assert entry.instruction == episode.instruction and entry.task in episode.instruction
-        assert entry.milestones == ("near",)
-        np.testing.assert_array_equal(rows["action"], episode.actions)
-        np.testing.assert_array_equal(rows["executed"], episode.executed)
-        for step, seen in enumerate(episode.observations):
-            for camera in ARM_SPEC.cameras:
-                np.testing.assert_array_equal(rows[f"rgb_{camera}"][step], seen.rgb[camera])
-                np.testing.assert_array_equal(rows[f"depth_{camera}"][step], seen.depth[camera])
-            np.testing.assert_array_equal(rows["state"][step], seen.state)
-            assert seen.truth is not None
-            np.testing.assert_array_equal(rows["truth"][step], [*seen.truth["target"], *seen.truth["point"]])
     assert len(store.rows("state")) == sum(entry.steps for entry in store.episodes)
+    for entry in store.episodes:
+        came, went = episode_of(store, entry), EPISODES[entry.seed]
+        for name in ("seed", "task", "instruction", "outcome", "milestones"):
+            assert getattr(came, name) == getattr(went, name)
+        np.testing.assert_array_equal([came.actions, came.executed], [went.actions, went.executed])
+        for seen, was in zip(came.observations, went.observations, strict=True):
+            for kind in ("rgb", "depth", "truth"):
+                one, other = getattr(seen, kind), getattr(was, kind)
+                assert one.keys() == other.keys() and all(np.array_equal(one[name], other[name]) for name in other)
+            np.testing.assert_array_equal(seen.state, was.state)
 
 
 def test_the_files_can_be_read_without_this_package(tmp_path: Path) -> None:
@@ -52,26 +49,17 @@ def test_the_files_can_be_read_without_this_package(tmp_path: Path) -> None:
     np.testing.assert_array_equal(frames[line["start"]], EPISODES[1].observations[0].rgb["front"])
 
 
-def test_statistics_are_those_of_all_stored_actions(tmp_path: Path) -> None:
-    statistics = add(tmp_path, EPISODES).statistics
-    actions = np.concatenate([episode.actions for episode in EPISODES if episode.success])
-    np.testing.assert_array_equal(statistics.actions, actions)
-    np.testing.assert_array_equal(statistics.low, actions.min(0))
-    np.testing.assert_array_equal(statistics.high, actions.max(0))
-
-
-def test_a_sample_of_chunks_stays_within_its_episodes_and_its_size(
+def test_statistics_and_samples_are_those_of_all_stored_actions(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    statistics = add(tmp_path, EPISODES).statistics
-    expected = [
-        episode.actions[np.minimum(np.arange(step, step + 4), len(episode.actions) - 1)]
-        for episode in EPISODES
-        if episode.success
-        for step in range(len(episode.actions))
-    ]
+    statistics, stored = add(tmp_path, EPISODES).statistics, [each.actions for each in EPISODES if each.success]
+    np.testing.assert_array_equal(statistics.actions, np.concatenate(stored))
+    np.testing.assert_array_equal(statistics.low, np.concatenate(stored).min(0))
+    np.testing.assert_array_equal(statistics.high, np.concatenate(stored).max(0))
+    padded = [np.concatenate([actions, actions[-1:].repeat(3, 0)]) for actions in stored]  # chunks stay within episodes
+    expected = [each[step : step + 4] for each in padded for step in range(len(each) - 3)]
     np.testing.assert_array_equal(statistics.chunks(4), expected)
-    monkeypatch.setattr("vla.data.statistics.SAMPLE", 40)
+    monkeypatch.setattr("vla.data.statistics.MAX_SAMPLE", 40)
     few = statistics.chunks(4)
     np.testing.assert_array_equal(few[[0, -1]], [expected[0], expected[-1]])
     assert few.shape == (10, 4, 3)
@@ -83,13 +71,10 @@ def test_a_reader_can_keep_to_the_first_episodes(tmp_path: Path) -> None:
     assert len(EpisodeStore(tmp_path, episodes=2).statistics.actions) == sum(len(each.actions) for each in EPISODES[:2])
     with pytest.raises(ValueError, match="holds 4 of 9 episodes"):
         EpisodeStore(tmp_path, episodes=9)
-
-
-def test_an_empty_store_has_no_rows_and_no_statistics(tmp_path: Path) -> None:
-    store = add(tmp_path, [])
-    assert store.episodes == [] and store.next_seed is None and store.rows("rgb_front").shape == (0, 16, 16, 3)
+    empty = add(tmp_path / "empty", [])
+    assert empty.episodes == [] and empty.next_seed is None and empty.rows("rgb_front").shape == (0, 16, 16, 3)
     with pytest.raises(ValueError, match="no episodes yet"):
-        _ = store.statistics
+        _ = empty.statistics
 
 
 TEARS: dict[str, tuple[float, float, float]] = {  # share of the last episode in one file, in the others, in the index
@@ -124,14 +109,10 @@ def test_a_full_disk_takes_back_the_half_written_episode_only(tmp_path: Path, co
     add(whole, EPISODES, codec)
     store = add(full, EPISODES[:2], codec)
     before = content(full)
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     with store.writing():
-        resource.setrlimit(resource.RLIMIT_FSIZE, (max(map(len, before.values())) + 1000, hard))
-        try:
-            with pytest.raises(ValueError, match=r"cannot take seed 2 .*: the 2 episodes before it are safe"):
-                store.append(EPISODES[2])
-        finally:
-            resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+        safe, most = r"cannot take seed 2 .*: the 2 episodes before it are safe", max(map(len, before.values()))
+        with full_disk(most + 1000), pytest.raises(ValueError, match=safe):
+            store.append(EPISODES[2])
         assert content(full) == before
         store.append(EPISODES[2])
     add(full, EPISODES[3:], codec)
@@ -139,13 +120,8 @@ def test_a_full_disk_takes_back_the_half_written_episode_only(tmp_path: Path, co
 
 
 def test_a_full_disk_takes_no_store(tmp_path: Path) -> None:
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (100, hard))
-    try:
-        with pytest.raises(OSError, match=r"store\.json cannot be written \(.*\): make room there"):
-            add(tmp_path, [])
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    with full_disk(100), pytest.raises(OSError, match=r"store\.json cannot be written \(.*\): make room there"):
+        add(tmp_path, [])
     add(tmp_path, EPISODES)
     assert not list(tmp_path.glob(".*")) and "store.json" in content(tmp_path)
 
@@ -171,18 +147,20 @@ def test_a_store_of_another_task_is_refused(tmp_path: Path) -> None:
         EpisodeStore.create_or_open(tmp_path, ARM_SPEC, {**CONFIG, "task": {"size": 2.0}})
 
 
-def test_seeds_come_in_order(tmp_path: Path) -> None:
-    store = add(tmp_path, EPISODES[:2])
+def test_an_episode_that_does_not_fit_is_refused(tmp_path: Path) -> None:
+    store, seen = add(tmp_path, []), EPISODES[0].observations
+    small, blind = [replace(each, state=each.state[:6]) for each in seen], [replace(each, rgb={}) for each in seen]
+    for says, episode in {
+        r"state must be \(12, 15\) float32, got \(12, 6\)": replace(EPISODES[0], observations=small),
+        "an observation lacks 'front', which the spec names": replace(EPISODES[0], observations=blind),
+    }.items():
+        with store.writing(), pytest.raises(ValueError, match=says):
+            store.append(episode)
+    assert EpisodeStore(tmp_path).tried == []
+    add(tmp_path, EPISODES[:2])
+    store = EpisodeStore(tmp_path)
     with store.writing(), pytest.raises(ValueError, match="expects seed 2 next, got seed 4"):
         store.append(EPISODES[4])
-
-
-def test_an_episode_that_does_not_fit_the_spec_is_refused(tmp_path: Path) -> None:
-    store = add(tmp_path, [])
-    small = [replace(seen, state=seen.state[:6]) for seen in EPISODES[0].observations]
-    with store.writing(), pytest.raises(ValueError, match=r"state must be \(12, 15\) float32, got \(12, 6\)"):
-        store.append(replace(EPISODES[0], observations=small))
-    assert EpisodeStore(tmp_path).tried == []
 
 
 def test_what_cannot_be_read_is_named(tmp_path: Path) -> None:
@@ -196,8 +174,6 @@ def test_what_cannot_be_read_is_named(tmp_path: Path) -> None:
         (folder / name).write_bytes(change((whole / name).read_bytes()))
         return folder
 
-    with pytest.raises(ValueError, match="has format 9, this version reads 3: collect again"):
-        EpisodeStore(damaged("store.json", lambda data: data.replace(b'"format": 3', b'"format": 9')))
     with pytest.raises(ValueError, match=r"depth_wrist\.bin is shorter than its index says"):
         EpisodeStore(damaged("depth_wrist.bin", lambda data: data[:-1]))
     with pytest.raises(ValueError, match=r"line 2 of .*index\.jsonl is damaged: it does not fit its checksum: keep"):
@@ -209,14 +185,6 @@ def test_what_cannot_be_read_is_named(tmp_path: Path) -> None:
         store.read(store.episodes[0])
     with pytest.raises(ValueError, match="has no field 'rgb'"):
         store.rows("rgb")
-
-
-@pytest.mark.parametrize("content", [b"{", b'{"format": 3}', b"[]", b"\xff\xfe"])
-def test_a_garbled_description_is_named_with_the_way_out(tmp_path: Path, content: bytes) -> None:
-    store = EpisodeStore.create_or_open(tmp_path, ARM_SPEC, {})
-    (store.folder / "store.json").write_bytes(content)
-    with pytest.raises(ValueError, match=r"store\.json is damaged or of another kind: .*collect again"):
-        EpisodeStore(store.folder)
 
 
 @pytest.mark.parametrize("name", ["index.jsonl", "executed.bin", "rgb_front.bin"])

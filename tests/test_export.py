@@ -51,66 +51,40 @@ def test_the_files_say_what_the_episode_was(tmp_path: Path) -> None:
             np.testing.assert_array_equal(np.float32(action["executed"]), episode.executed[step])
 
 
-def test_one_camera_needs_no_folder_of_its_own(tmp_path: Path) -> None:
+def test_a_step_of_one_camera_is_four_files(tmp_path: Path) -> None:
     store, _ = stored(tmp_path / "store", replace(ARM_SPEC, cameras=("front",), depth=("front",)), range(1))
     folder = Files(tmp_path / "export").export(store)
-    assert sorted(path.name for path in (folder / "episode_00000" / "step_0000").iterdir()) == [
-        "depth_image.npy",
-        "expert_action.json",
-        "rgb_image.png",
-        "robot_state.json",
-    ]
+    names = ["depth_image.npy", "expert_action.json", "rgb_image.png", "robot_state.json"]
+    assert sorted(path.name for path in (folder / "episode_00000/step_0000").iterdir()) == names
 
 
 def test_what_is_there_is_left_alone(tmp_path: Path) -> None:
-    store, _ = stored(tmp_path / "store")
+    stored(tmp_path / "store", seeds=range(3))
+    store = EpisodeStore(tmp_path / "store", episodes=2)  # only as many as the store shows are exported
     folder = Files(tmp_path / "export").export(store)
-    untouched = (folder / "episode_00000/manifest.json").stat().st_mtime_ns
+    untouched, whole = (folder / "episode_00000/manifest.json").stat().st_mtime_ns, content(folder)
     shutil.rmtree(folder / "episode_00001")
     Files(folder).export(store)
-    assert (folder / "episode_00001/step_0003/front/rgb_image.png").exists()
+    assert content(folder) == whole and {path.parts[0] for path in map(Path, whole)} == {
+        "episode_00000",
+        "episode_00001",
+    }
     assert (folder / "episode_00000/manifest.json").stat().st_mtime_ns == untouched
+    with pytest.raises(ValueError, match=r"episode_00000 was exported from another store, or as other files"):
+        Files(folder).export(stored(tmp_path / "second", seeds=range(1, 2))[0])
+    with staging_folder(folder), pytest.raises(ValueError, match=r"another export to .*export is under way"):
+        Files(folder).export(store)
 
 
 @pytest.mark.parametrize("kind", ["files", "lerobot"])
 def test_what_a_killed_export_left_beside_the_whole_one_is_removed(kind: str, tmp_path: Path) -> None:
     store, _ = stored(tmp_path / "store")
     folder = exporter(kind, tmp_path / "export").export(store)
-    left = folder.with_name(".export.unfinished")
+    left, before = folder.with_name(".export.unfinished"), content(folder)
     left.mkdir()
     (left / "lock").touch()
-    before = content(folder)
     exporter(kind, folder).export(store)
     assert not left.exists() and content(folder) == before
-
-
-def test_a_folder_with_other_episodes_is_refused(tmp_path: Path) -> None:
-    folder = Files(tmp_path / "export").export(stored(tmp_path / "first")[0])
-    with pytest.raises(
-        ValueError, match=r"episode_00000 was exported from other episodes, .*: choose another export\.folder"
-    ):
-        Files(folder).export(stored(tmp_path / "second", seeds=range(1, 2))[0])
-
-
-def test_only_as_many_episodes_as_the_store_shows_are_exported(tmp_path: Path) -> None:
-    stored(tmp_path / "store", seeds=range(3))
-    folder = Files(tmp_path / "export").export(EpisodeStore(tmp_path / "store", episodes=2))
-    assert sorted(path.name for path in folder.iterdir()) == ["episode_00000", "episode_00001"]
-
-
-def test_two_exports_at_once_do_not_disturb_each_other(tmp_path: Path) -> None:
-    store, _ = stored(tmp_path / "store")
-    with (
-        staging_folder(tmp_path / "export"),
-        pytest.raises(ValueError, match=r"another export to .*export is under way"),
-    ):
-        Files(tmp_path / "export").export(store)
-
-
-@pytest.fixture(scope="module")
-def store(tmp_path_factory: pytest.TempPathFactory) -> EpisodeStore:
-    """Enough episodes to be interrupted among them."""
-    return stored(tmp_path_factory.mktemp("many") / "store", seeds=range(75))[0]
 
 
 def written(folder: Path) -> int:
@@ -126,8 +100,7 @@ if __name__ == "__main__":  # worker processes import this file
     from vla.config.build import build
     from vla.data.episodes import EpisodeStore
     from vla.parallel.pool import Cluster
-    cluster = Cluster(int(sys.argv[1]), "beside")
-    build({config}, "export").export(EpisodeStore(Path({store!r}), {episodes}), cluster)
+    build({config}, "export").export(EpisodeStore(Path({store!r})), Cluster(int(sys.argv[1]), "beside"))
 """
 
 
@@ -151,20 +124,19 @@ def test_compressed_data_do_not_depend_on_what_was_rendered_before() -> None:
     assert len(printed) == 1
 
 
-@pytest.mark.parametrize(("name", "episodes"), [("lerobot", 60), ("files", 12)])
-def test_killed_twice_at_random_an_export_goes_on_and_ends_up_the_same(
-    name: str, episodes: int, store: EpisodeStore, tmp_path: Path
-) -> None:
-    store = EpisodeStore(store.folder, episodes)
+@pytest.mark.parametrize("name", ["lerobot", "mcap"])
+def test_killed_twice_at_random_an_export_goes_on_and_ends_up_the_same(name: str, tmp_path: Path) -> None:
+    store = stored(tmp_path / "store", seeds=range(75))[0]  # 60 episodes, more than one video per camera
     whole = exporter(name, tmp_path / "whole").export(store)
     killed, script = tmp_path / "killed", tmp_path / "export.py"
-    config = composed(name, killed)
-    script.write_text(EXPORT.format(config=config, store=str(store.folder), episodes=episodes))
+    script.write_text(EXPORT.format(config=composed(name, killed), store=str(store.folder)))
     files = written(whole)
-    for workers, share in zip("21", sorted(np.random.default_rng(episodes).uniform(0, 0.8, 2)), strict=True):
-        environment = {**os.environ, "PYTHONPATH": TESTS}
+    for workers, share in zip("21", sorted(np.random.default_rng(60).uniform(0, 0.8, 2)), strict=True):
         process = subprocess.Popen(
-            [sys.executable, str(script), workers], env=environment, stdout=subprocess.DEVNULL, start_new_session=True
+            [sys.executable, str(script), workers],
+            env={**os.environ, "PYTHONPATH": TESTS},
+            stdout=subprocess.DEVNULL,
+            start_new_session=True,
         )
         while process.poll() is None and written(killed) < share * files:
             time.sleep(0.01)
@@ -173,4 +145,4 @@ def test_killed_twice_at_random_an_export_goes_on_and_ends_up_the_same(
         assert process.wait() <= 0  # killed, or faster
     exporter(name, killed).export(store)
     assert content(killed) == content(whole)
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["export.py", "killed", "whole"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["export.py", "killed", "store", "whole"]

@@ -17,9 +17,10 @@ from composing import check, composed
 
 from vla.config.adopt import resume
 from vla.config.experiment import Experiment, plain
+from vla.data.derivation import derive_store
 from vla.data.episodes import EpisodeStore
 from vla.data.header import Codec
-from vla.data.verification import derive_store, episode_of, verify_store
+from vla.data.verification import episode_of, verify_store
 from vla.data.window_batches import WindowBatcher
 from vla.jobs import improve
 from vla.models.policy_folder import read_policy

@@ -18,7 +18,7 @@ from rerun.chunk import RrdReader
 from toy import ARM_SPEC
 
 from vla.data.episodes import EpisodeStore
-from vla.data.formats.video import decode, encode
+from vla.data.formats.lerobot_images import decode, encode
 
 
 @pytest.fixture(scope="module")
@@ -79,20 +79,18 @@ def test_every_image_is_close_to_that_of_the_store(home: Path) -> None:
 def test_statistics_are_those_of_all_rows_and_pixels(home: Path) -> None:
     store = EpisodeStore(home / "store")
     statistics = json.loads((home / "dataset/meta/stats.json").read_text())
-    action = store.rows("action")[:].astype(float)
+    action, pixels = store.rows("action")[:].astype(float), store.rows("rgb_wrist")[:].reshape(-1, 3) / 255
+    found, image = statistics["action"], statistics["observation.images.wrist"]
     for name in ("min", "max", "mean", "std"):
-        np.testing.assert_allclose(statistics["action"][name], getattr(action, name)(0), atol=1e-12)
-    np.testing.assert_allclose(statistics["action"]["q10"], np.quantile(action, 0.1, axis=0), atol=1e-12)
-    assert statistics["action"]["count"] == [len(action)]
-    pixels = store.rows("rgb_wrist")[:].reshape(-1, 3) / 255
-    image = statistics["observation.images.wrist"]
-    for name in ("min", "max", "mean", "std"):
+        np.testing.assert_allclose(found[name], getattr(action, name)(0), atol=1e-12)
         np.testing.assert_allclose(np.reshape(image[name], 3), getattr(pixels, name)(0), atol=1e-6)
+    np.testing.assert_allclose(found["q10"], np.quantile(action, 0.1, axis=0), atol=1e-12)
     np.testing.assert_allclose(np.reshape(image["q90"], 3), np.quantile(pixels, 0.9, axis=0), atol=1 / 255)
+    assert found["count"] == image["count"] == [len(action)]
     first = pq.read_table(home / "dataset/meta/episodes/chunk-000/file-000.parquet").to_pylist()[0]
     np.testing.assert_allclose(first["stats/action/max"], store.read(store.episodes[0])["action"].max(0))
     assert np.shape(first["stats/observation.images.front/mean"]) == (3, 1, 1)
-    assert image["count"] == [len(action)] and first["stats/observation.images.front/count"] == [first["length"]]
+    assert first["stats/observation.images.front/count"] == [first["length"]]
 
 
 def test_rerun_opens_it(home: Path, tmp_path: Path) -> None:

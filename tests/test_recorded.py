@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Callable
 from dataclasses import replace
-from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
@@ -25,10 +23,10 @@ from test_server import serving
 from vla.config.build import build
 from vla.config.experiment import plain
 from vla.data.datamodule import held_out
+from vla.data.derivation import derive_store
 from vla.data.episodes import EpisodeStore
 from vla.data.formats.imported_demonstrations import action_bounds
-from vla.data.formats.video import encode
-from vla.data.verification import derive_store, find_episode
+from vla.data.verification import find_episode
 from vla.deploy.client_observation import Keys
 from vla.deploy.control_loop import ControlLoop
 from vla.io.images import resize
@@ -129,15 +127,10 @@ def renamed(dataset: Path, folder: Path, names: Any) -> Path:
     return copy
 
 
-def test_components_of_one_name_are_told_apart(dataset: Path, tmp_path: Path) -> None:
-    copy = renamed(dataset, tmp_path / "dataset", ["joint", "joint", "gripper"])
-    spec = build(composed(copy)["task"], "task").spec
-    assert spec.action == ("action.joint_0", "action.joint_1", "action.gripper_2")
-
-
 @pytest.mark.parametrize(
     ("names", "expected"),
     [
+        (["joint", "joint", "gripper"], ("action.joint_0", "action.joint_1", "action.gripper_2")),
         ({"motors": ["a", "b", "c"]}, ("a", "b", "c")),
         ({"left": ["a", "b"], "right": ["c"]}, ("a", "b", "c")),
         ({"left": ["waist", "elbow"], "right": ["waist"]}, ("left_waist", "left_elbow", "right_waist")),
@@ -145,7 +138,7 @@ def test_components_of_one_name_are_told_apart(dataset: Path, tmp_path: Path) ->
         ({"left": [2], "right": [1]}, ("action_0", "action_1", "action_2")),
     ],
 )
-def test_names_may_be_grouped(dataset: Path, tmp_path: Path, names: Any, expected: tuple[str, ...]) -> None:
+def test_names_may_be_grouped_or_repeated(dataset: Path, tmp_path: Path, names: Any, expected: tuple[str, ...]) -> None:
     copy = renamed(dataset, tmp_path / "dataset", names)
     assert build(composed(copy)["task"], "task").spec.action == expected
 
@@ -195,46 +188,6 @@ def test_outliers_do_not_widen_the_bounds_and_rare_events_do() -> None:
     assert action_bounds(np.append(np.zeros(1000), 1.0)) == (0.0, 1.0)  # a gripper that closes once
     low, high = action_bounds(np.full(10, 5.0))
     assert low < 5 < high
-
-
-def without(name: str) -> Callable[[Path], None]:
-    return lambda dataset: (dataset / name).unlink()
-
-
-def slower(dataset: Path) -> None:
-    path = dataset / "data/chunk-000/file-000.parquet"
-    rows = pq.read_table(path)
-    stamps = np.array(rows["timestamp"]) * np.where(np.array(rows["episode_index"]) == 3, 2, 1)
-    place = rows.column_names.index("timestamp")
-    pq.write_table(rows.set_column(place, "timestamp", pa.array(stamps, pa.float32())), path)
-
-
-@pytest.mark.parametrize(
-    ("damage", "says"),
-    [
-        (without("videos/observation.images.top/chunk-000/file-000.mp4"), r"lacks videos/observation\.images\.top/chu"),
-        (without("data/chunk-000/file-000.parquet"), r"data holds no tables: copy the dataset again"),
-        (slower, r"step 1 of episode 3 comes 0\.06667 s after its first one, but at 30 Hz, the rate in meta/info\.js"),
-    ],
-    ids=["video", "table", "rates"],
-)
-def test_what_is_missing_is_named_before_anything_is_imported(
-    dataset: Path, tmp_path: Path, damage: Callable[[Path], None], says: str
-) -> None:
-    spec = build(composed(dataset)["task"], "task").spec
-    copy = Path(shutil.copytree(dataset, tmp_path / "dataset"))
-    damage(copy)
-    with pytest.raises(ValueError, match=says):
-        build(composed(dataset)["expert"] | {"folder": str(copy)}, "expert", spec=spec)
-
-
-def test_cameras_of_another_rate_are_named(dataset: Path, tmp_path: Path) -> None:
-    copy = Path(shutil.copytree(dataset, tmp_path / "dataset"))
-    path = copy / "videos/observation.images.hand/chunk-000/file-000.mp4"
-    encode(path, [np.zeros((2 * STEPS * EPISODES, 24, 32, 3), np.uint8)], (24, 32), Fraction(60), 60)
-    config = composed(copy)
-    with pytest.raises(ValueError, match=r"images\.hand.*mp4 has 60 images per second, the dataset 30: encode the vid"):
-        build(config["expert"], "expert", spec=build(config["task"], "task").spec)
 
 
 @pytest.mark.parametrize(
@@ -370,7 +323,7 @@ class Behind:
         return observation.state + 1 - (1 + self._seed)
 
 
-def test_errors_are_means_over_episodes_with_an_interval() -> None:
+def test_errors_are_means_over_recordings_with_an_interval() -> None:
     result = open_loop(Behind(), SPEC, [episode(0), episode(1)], np.zeros(3))
     np.testing.assert_allclose(result.errors, [[1] * 3, [2] * 3], rtol=1e-5)
     # 1.5 +- t(0.975, 1) * 0.7071 / sqrt(2), with t(0.975, 1) = 12.7062; no error is below zero
@@ -379,6 +332,12 @@ def test_errors_are_means_over_episodes_with_an_interval() -> None:
     assert components(open_loop(Behind(), SPEC, [episode(0)], np.zeros(3)))[0].ci_high is None
     low, high = mean_interval(np.array([[1.0], [2.0], [3.0]]))  # 2 +- t(0.975, 2) / sqrt(3), t = 4.3027
     np.testing.assert_allclose([low[0], high[0]], [0.0, 2 + 4.3027 / np.sqrt(3)], rtol=1e-4)
+    # Three episodes of one recording, with errors of 1, 2 and 3, and one of another, with 4: two means, 2 and 4.
+    parts = [replace(episode(seed), draws={"recorded": {"episode": seed // 3}}) for seed in range(4)]
+    split = open_loop(Behind(), SPEC, parts, np.zeros(3))
+    np.testing.assert_allclose(split.mean, [3] * 3, rtol=1e-5)
+    np.testing.assert_allclose(split.interval[1], [3 + 12.7062] * 3, rtol=1e-4)
+    assert split.relative == pytest.approx(float((split.mean / split.constant_errors).mean()))
 
 
 JOINTS = replace(ROBOT, joints=["a", "b", "c"], low=[-1.5] * 3, high=[1.5] * 3, speed=[2.0] * 3,

@@ -25,7 +25,6 @@ class RecordableEnvironment(ToyEnvironment):
         self._broken = broken
 
     def reset(self, seed: int) -> Observation:
-        """As the toy does."""
         if self._broken and seed == BROKEN_SEED:
             raise ValueError("the block fell off the table")
         return super().reset(seed)
@@ -49,7 +48,6 @@ class ThinkingAgent(ToyExpert):
     """The toy expert, with a made-up distribution over bins for what it does."""
 
     def act(self, observation: Observation) -> Array:
-        """As the toy expert does."""
         action = super().act(observation)
         share = (action - SPEC.low) / (np.array(SPEC.high) - SPEC.low)
         peaks = np.exp(-((np.arange(BINS) - BINS * share[:, None]) ** 2))
@@ -80,7 +78,6 @@ class OnceDeadlyEnvironment(RecordableEnvironment):
         self._marker = marker
 
     def reset(self, seed: int) -> Observation:
-        """As the toy does, after a note that death is near."""
         if seed == DEADLY_SEED:
             self._marker.touch()
         return super().reset(seed)

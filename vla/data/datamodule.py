@@ -14,7 +14,6 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 
@@ -31,15 +30,12 @@ from vla.spec import Array, Spec
 
 # Multiplying by the golden ratio spreads consecutive seeds evenly over the circle of 32-bit numbers (Knuth, The Art of
 # Computer Programming 3, section 6.4): every stretch of seeds gets its share of held-out episodes.
-GOLDEN = 2654435769
+GOLDEN_RATIO = 2654435769
 
 
 def held_out(recording: int, fraction: float) -> bool:
-    """Return whether an episode is held out for validation, independently of others, by its `Entry.recording`.
-
-    Parts of one recorded episode, which show the same scene, are thus held out together.
-    """
-    return recording * GOLDEN % 2**32 < fraction * 2**32
+    """Return whether an episode is held out for validation, independently of others, by its `Entry.recording`."""
+    return recording * GOLDEN_RATIO % 2**32 < fraction * 2**32
 
 
 def digest_of(episodes: Sequence[Entry]) -> str:
@@ -85,14 +81,10 @@ class Prefetcher:
 
 
 class SizedPrefetcher(Prefetcher):
-    """Prefetcher of a known number of batches."""
-
-    def __init__(self, make_batch: Callable[[Array], Batch], batches: list[Array], ahead: int) -> None:
-        super().__init__(make_batch, lambda: batches, ahead)
-        self._length = len(batches)
+    """Prefetcher of a known number of batches; the trainer takes one without a length for endless."""
 
     def __len__(self) -> int:
-        return self._length
+        return len(list(self._plan()))
 
 
 class WindowDataModule(LightningDataModule):
@@ -141,17 +133,14 @@ class WindowDataModule(LightningDataModule):
         self._fraction, self._validation_windows = validation_fraction, validation_windows
 
     def setup(self, stage: str | None = None) -> None:
-        """Open the stores and split their episodes.
-
-        Raises:
-            UserError: a store cannot be read or has another spec, or there are too few episodes to split.
-        """
+        """Open the stores and split their episodes; a UserError if they do not fit, or are too few to split."""
         stores = [EpisodeStore(self._folder, self._episodes), *map(EpisodeStore, self._more)]
         rows = [max((entry.end for entry in store.episodes), default=0) for store in stores]
         trained, unseen = list[Array](), list[Array]()
         for store, first in zip(stores, np.cumsum([0, *rows]), strict=False):
-            there = store.spec if store.spec.truth else replace(store.spec, truth=self._spec.truth)
-            self._spec.require(there, "the model", f"the episode store {store.folder}")
+            # A further store may lack the truth, which becomes NaN.
+            expected = self._spec if store.spec.truth else self._spec.without_truth
+            expected.require(store.spec, "the model", f"the episode store {store.folder}")
             for entry in store.episodes:
                 side = unseen if held_out(entry.recording, self._fraction) else trained
                 side.append(first + np.arange(entry.start, entry.end))
@@ -172,11 +161,7 @@ class WindowDataModule(LightningDataModule):
         return {"windows": self._digest}
 
     def load_state_dict(self, state: dict[str, str]) -> None:
-        """Compare the demonstrations with those of the resumed training.
-
-        Raises:
-            UserError: they differ.
-        """
+        """Raise a UserError unless the demonstrations are those of the resumed training."""
         if state["windows"] != self._digest:
             raise UserError(
                 f"the resumed training was started with other demonstrations than those in {self._folder}: "
@@ -197,7 +182,7 @@ class WindowDataModule(LightningDataModule):
         # Whole batches: one shape for a compiled model, and the same number of steps in all processes.
         spread = np.linspace(0, len(self.held_out_windows) - 1, batches * share).round().astype(np.int64)
         windows = self.held_out_windows[spread].reshape(batches, self.batch_size, processes)
-        return SizedPrefetcher(self._make_batch, list(windows[:, :, rank]), self._ahead)
+        return SizedPrefetcher(self._make_batch, lambda: windows[:, :, rank], self._ahead)
 
     def order(self, step: int, rank: int = 0, processes: int = 1) -> Array:
         """Return the windows (B,) of training step `step` in process `rank`, as row numbers.

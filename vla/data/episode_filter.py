@@ -11,7 +11,8 @@ from collections.abc import Callable, Iterable, Mapping
 from fnmatch import fnmatchcase
 from typing import Any
 
-from vla.data.draws import flat, leaves
+import numpy as np
+
 from vla.data.index import Entry
 from vla.io.errors import UserError
 from vla.io.suggestion import suggestion
@@ -19,15 +20,25 @@ from vla.io.suggestion import suggestion
 FACTS = ("seed", "task", "instruction", "outcome", "steps")
 
 
-def facts(entry: Entry) -> dict[str, Any]:
-    """Return name → value of an index entry; draws have dotted names."""
-    return {**{name: getattr(entry, name) for name in FACTS}, **flat(entry.draws)}
+def flat(draws: Mapping[str, Any]) -> dict[str, Any]:
+    """Return dotted name → value of all draws of an episode."""
+    values: dict[str, Any] = {}
+    for name, draw in draws.items():
+        if isinstance(draw, Mapping):
+            values |= {f"{name}.{key}": value for key, value in flat(draw).items()}
+        else:
+            values[str(name)] = draw
+    return values
+
+
+def leaves(value: Any) -> list[Any]:
+    """Return the scalars in a draw, at any depth of nested lists."""
+    plain = value.tolist() if isinstance(value, (np.ndarray, np.generic)) else value
+    return [leaf for item in plain for leaf in leaves(item)] if isinstance(plain, (list, tuple)) else [plain]
 
 
 def episode_filter(where: Mapping[str, Any], entries: Iterable[Entry]) -> Callable[[Entry], bool]:
-    """Return the predicate of index entries that all conditions match.
-
-    An entry matches a condition if it has values of that name, and all of them match.
+    """Return the predicate of index entries that have a value of every name in `where`, and whose values all match.
 
     Args:
         where: name of a fact → condition.
@@ -36,46 +47,42 @@ def episode_filter(where: Mapping[str, Any], entries: Iterable[Entry]) -> Callab
     Raises:
         UserError: a name occurs in no entry, or a condition is of another kind.
     """
-    known = dict.fromkeys(name for entry in entries for name in facts(entry))
-    for name, condition in where.items():
+    known = dict.fromkeys(name for entry in entries for name in _facts(entry))
+    for name in where:
         if name not in known:
             hint = suggestion(name, known) or f": there are {', '.join(known)}"
             raise UserError(f"inspect.where: no episode has {name}{hint}")
-        if not (isinstance(condition, (str, bool, int, float)) or _is_range(condition) or _is_texts(condition)):
-            raise UserError(
-                f"inspect.where: {name} must be a text, in which * stands for anything, a number, a range "
-                f"[low, high] or a list of texts, not {condition!r}"
-            )
+    conditions = {name: _condition(name, value) for name, value in where.items()}
 
     def matches(entry: Entry) -> bool:
-        values = {name: leaves(value) for name, value in facts(entry).items() if name in where}
+        facts = _facts(entry)
         return all(
-            values.get(name) and all(_matches(value, condition) for value in values[name])
-            for name, condition in where.items()
+            bool(values := leaves(facts.get(name, []))) and all(map(holds, values))
+            for name, holds in conditions.items()
         )
 
     return matches
 
 
-def _is_range(condition: Any) -> bool:
-    ends = isinstance(condition, list) and len(condition) == 2
-    return ends and all(end is None or _is_number(end) for end in condition) and condition != [None, None]
+def _facts(entry: Entry) -> dict[str, Any]:
+    return {**{name: getattr(entry, name) for name in FACTS}, **flat(entry.draws)}
 
 
-def _is_texts(condition: Any) -> bool:
-    return isinstance(condition, list) and bool(condition) and all(isinstance(item, str) for item in condition)
+def _condition(name: str, wanted: Any) -> Callable[[Any], bool]:
+    """Return the predicate of a scalar; a UserError if `wanted` is no condition."""
+    texts = wanted if isinstance(wanted, list) else [wanted]
+    if texts and all(isinstance(text, str) for text in texts):
+        return lambda value: isinstance(value, str) and any(fnmatchcase(value, text) for text in texts)
+    if isinstance(wanted, (bool, int, float)):
+        return lambda value: isinstance(value, bool) is isinstance(wanted, bool) and bool(value == wanted)
+    if isinstance(wanted, list) and len(wanted) == 2 and all(end is None or _is_number(end) for end in wanted):
+        low, high = (bound if end is None else end for end, bound in zip(wanted, (-np.inf, np.inf), strict=True))
+        return lambda value: _is_number(value) and low <= value <= high
+    raise UserError(
+        f"inspect.where: {name} must be a text, in which * stands for anything, a number, a range [low, high] or a "
+        f"list of texts, not {wanted!r}"
+    )
 
 
 def _is_number(value: Any) -> bool:
     return isinstance(value, (int, float)) and not isinstance(value, bool)
-
-
-def _matches(value: Any, condition: Any) -> bool:
-    if isinstance(condition, list) and not _is_texts(condition):
-        low, high = condition
-        return _is_number(value) and (low is None or low <= value) and (high is None or value <= high)
-    if isinstance(value, str):
-        return any(
-            fnmatchcase(value, str(word)) for word in (condition if isinstance(condition, list) else [condition])
-        )
-    return isinstance(value, bool) is isinstance(condition, bool) and bool(value == condition)

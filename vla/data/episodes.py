@@ -92,8 +92,7 @@ class EpisodeStore:
         Raises:
             UserError: the store has another spec or config, other losses than `codec`, or lacks its `store.json`.
         """
-        folder = Path(folder)
-        plain = json.loads(dumps(config))
+        folder, plain = Path(folder), json.loads(dumps(config))
         if not is_store(folder):
             folder.mkdir(parents=True, exist_ok=True)
             with FileLock(folder / "lock"):
@@ -105,10 +104,7 @@ class EpisodeStore:
         return store
 
     def require(self, config: Mapping[str, Any]) -> None:
-        """Raise a UserError if the episodes have another config.
-
-        A derived store may differ: its episodes were chosen explicitly.
-        """
+        """Raise a UserError if the episodes have another config, unless they were chosen explicitly."""
         if self.derived:
             return
         asked, there = canonical(json.loads(dumps(config))), canonical(self.config)
@@ -117,7 +113,7 @@ class EpisodeStore:
             raise UserError(f"{self.folder} was collected with another config for {different}: choose another folder")
 
     def require_codec(self, codec: Codec | None) -> None:
-        """Raise a UserError if the images have other losses than those of `codec`; with None they may have any."""
+        """Raise a UserError if the images have other losses than those of `codec`; None: whatever they have."""
         if codec is not None and codec.loss != self.codec.loss:
             raise UserError(
                 f"{self.folder} holds {self.codec}, not {codec}: choose another folder, or omit collect.images"
@@ -162,20 +158,19 @@ class EpisodeStore:
     def rows(self, field: str, scattered: bool = False) -> Rows:
         """Return all committed rows of `field`, (N, …), which are read when they are indexed.
 
-        Of a large store, `scattered` rows, to be taken in random order, are read one by one.
-
-        They are a memory-mapped array, or `ScatteredRows`, which raise a DamageError error for a damaged image.
+        They are a memory-mapped array, or `ScatteredRows`, which raise a DamageError for a damaged image: those of
+        compressed images, and of a large store all that are `scattered`, to be taken in random order.
         """
         if field not in self.fields:
             raise UserError(f"{self.folder} has no field {field!r}: it has {sorted(self.fields)}")
         shape, dtype = self.fields[field]
-        if self._rows == 0:
+        if self._rows == 0:  # an empty file cannot be mapped
             return np.empty((0, *shape), dtype)
         large = self._rows * sum(column.size for column in self._columns.values()) > IN_MEMORY * memory()
         return self._columns[field].rows(self._rows, partial(self._image_changed, field), scattered and large)
 
     def packed(self, entry: Entry) -> dict[str, list[bytes]]:
-        """Return the images of an episode as they are compressed, by field; a DamageError error if one is damaged."""
+        """Return the images of an episode as they are compressed, by field; a DamageError if one is damaged."""
         sources = {field: self.rows(field) for field in self.fields}
         return {field: rows.packed(entry.span) for field, rows in sources.items() if isinstance(rows, ScatteredRows)}
 
@@ -185,33 +180,27 @@ class EpisodeStore:
         return sum(after) - sum(before)
 
     def read(self, entry: Entry) -> dict[str, Array]:
-        """Read one episode as field → (steps, …) rows; a DamageError error if a checksum differs."""
+        """Read one episode as field → (steps, …) rows; a DamageError if a checksum differs."""
         sources = {field: self.rows(field) for field in self.fields}
         rows = {field: np.array(source[entry.span]) for field, source in sources.items()}
         for field, values in rows.items():
             if len(values) < entry.steps or _checksum(sources[field], entry.span, values) != entry.crc.get(field):
-                raise self._changed([entry.seed])
+                raise self._changed(entry.seed)
         return rows
 
     def verify(self, entries: Iterable[Entry], rows: Mapping[str, Rows]) -> None:
-        """Compare the `rows` of episodes, by field, with their checksums.
+        """Compare the `rows` of episodes, by field, with their checksums; a DamageError names the seeds that differ."""
+        damages = dict[int, DamageError]()
+        for entry in entries:
+            try:
+                if any(_checksum(source, entry.span) != entry.crc.get(field) for field, source in rows.items()):
+                    raise self._changed(entry.seed)
+            except DamageError as damage:  # also of a compressed image, which is named by its step
+                damages[entry.seed] = damage
+        if damages:
+            raise self._changed(*damages) if len(damages) > 1 else damages.popitem()[1]
 
-        Raises:
-            DamageError: some differ; the message names their seeds.
-        """
-        found = {entry.seed: damage for entry in entries if (damage := self._damage(entry, rows))}
-        if found:
-            raise self._changed([*found]) if len(found) > 1 else found.popitem()[1]
-
-    def _damage(self, entry: Entry, rows: Mapping[str, Rows]) -> DamageError | None:
-        try:
-            if all(_checksum(source, entry.span) == entry.crc.get(field) for field, source in rows.items()):
-                return None
-        except DamageError as damage:
-            return damage
-        return self._changed([entry.seed])
-
-    def _changed(self, seeds: Sequence[int]) -> DamageError:
+    def _changed(self, *seeds: int) -> DamageError:
         which = f"seed {seeds[0]}" if len(seeds) == 1 else f"the seeds {listed(seeds)}"
         return DamageError(f"the rows of {which} in {self.folder} were changed on disk")
 
@@ -235,8 +224,10 @@ class EpisodeStore:
             stack.callback(lock.release)
             self._refresh()
             paths = (self._index, *(path for column in self._columns.values() for path in column.files))
-            _require_own_files(paths)
-            for path in paths:
+            for path in paths:  # an archive keeps links: what is behind them would be overwritten
+                require_file(path)
+                if path.is_symlink():
+                    raise UserError(f"{path} is a link, and nothing is added behind one: copy the file to this place")
                 self._files[path] = stack.enter_context(path.open("ab", buffering=0))
             stack.callback(self._files.clear)
             self._cut()
@@ -260,30 +251,39 @@ class EpisodeStore:
                 f"seed {episode.seed} has several instructions, and a store keeps one per episode: give episodes below "
                 f"seed {FIRST_SEED} one each"
             )
-        try:
-            rows = self._rows_of(episode)
-        except KeyError as error:
-            raise UserError(f"seed {episode.seed}: an observation lacks {error}, which the spec names") from error
+        rows = rows_of(self.spec, episode)
         pieces = {name: self._columns[name].pieces(self._rows, rows[name], (packed or {}).get(name)) for name in rows}
+        # JPEG by the bytes of its files: what a decoder makes of them depends on its rounding.
         jpeg = [name for name in rows if self.codec.of(name) == "jpeg"]
         crc = {name: zlib.crc32(pieces[name][0] if name in jpeg else rows[name].data) for name in rows}
-        self._commit(self._entry(episode, episode.instruction, len(episode.actions), crc), pieces)
+        self._commit(self._entry(episode, crc), pieces)
 
     def fail(self, episode: Episode) -> None:
         """Store the outcome of a failed seed, without rows. Raises as `append` does."""
-        self._commit(self._entry(episode, "", 0, {}), {})
+        self._commit(self._entry(episode, {}), {})
 
-    def _entry(self, episode: Episode, instruction: str, steps: int, crc: dict[str, int]) -> Entry:
-        milestones = tuple(sorted(episode.milestones))
-        what = (episode.seed, episode.task, episode.outcome, milestones, instruction)
-        return Entry(*what, self._rows, steps, dict(episode.draws), crc)
+    def _entry(self, episode: Episode, crc: dict[str, int]) -> Entry:
+        """Return the index entry of an episode, of which rows are stored if they have checksums."""
+        return Entry(
+            seed=episode.seed,
+            task=episode.task,
+            outcome=episode.outcome,
+            milestones=tuple(sorted(episode.milestones)),
+            instruction=episode.instruction if crc else "",
+            start=self._rows,
+            steps=len(episode.actions) if crc else 0,
+            draws=dict(episode.draws),
+            crc=crc,
+        )
 
     def _commit(self, entry: Entry, pieces: Mapping[str, Sequence[bytes | memoryview]]) -> None:
+        """Write an episode: its rows, then its index line, which makes them count."""
         assert self._files, "append and fail work inside `with store.writing()`"
         if self.next_seed not in (None, entry.seed):
             raise UserError(f"{self.folder} expects seed {self.next_seed} next, got seed {entry.seed}")
         line = index_line(entry)
-        entry = parse_line(line[:-1], f"{self.folder}: the entry of seed {entry.seed}")  # validated as a reader does
+        # Validated as a reader does: nothing is stored that could not be read back.
+        entry = parse_line(line[:-1], f"{self.folder}: the entry of seed {entry.seed}")
         try:
             for name, contents in pieces.items():
                 for path, content in zip(self._columns[name].files, contents, strict=True):
@@ -298,9 +298,10 @@ class EpisodeStore:
             safe = f"the {len(self.episodes)} episodes before it are safe, make room and run again to continue"
             raise UserError(f"{self.folder} cannot take seed {entry.seed} ({error.strerror}): {safe}") from error
         finally:
-            self._cut()
+            self._cut()  # nothing to do after a success; after an error, or Ctrl-C, what was half written
 
     def _cut(self) -> None:
+        """Truncate all files to what is committed."""
         # The index first: no line may refer to truncated rows at any moment.
         self._files[self._index].truncate(self._index_size)
         for column in self._columns.values():
@@ -308,6 +309,7 @@ class EpisodeStore:
                 self._files[path].truncate(size)
 
     def _refresh(self) -> None:
+        """Read the index: what counts is what it names, whatever else the files of the fields hold."""
         files = [column.files[0] for column in self._columns.values()]
         if not self._index.exists() and (there := [path for path in files if path.exists()]):
             raise UserError(f"{self._index} is missing, which {there[0].name} beside it needs: {REMEDY}")
@@ -320,25 +322,26 @@ class EpisodeStore:
                 raise UserError(f"{column.files[0]} is shorter than its index says: {SALVAGE}")
             self._rows = whole
 
-    def _rows_of(self, episode: Episode) -> dict[str, Array]:
-        observations = episode.observations
-        columns: dict[str, Any] = {"action": episode.actions, "executed": episode.executed}
-        columns["state"] = [observation.state for observation in observations]
-        for name in (name for name in self.fields if "_" in name):
-            kind, _, camera = name.partition("_")
-            columns[name] = [getattr(observation, kind)[camera] for observation in observations]
-        if self.spec.truth:
-            columns["truth"] = [
-                np.hstack([np.ravel((one.truth or {})[key]) for key, _ in self.spec.truth]) for one in observations
-            ]
-        return {name: self._column(name, columns[name], len(observations)) for name in self.fields}
 
-    def _column(self, name: str, values: Any, steps: int) -> Array:
-        shape, dtype = self.fields[name]
-        column = np.asarray(values)
-        if column.shape != (steps, *shape) or not np.can_cast(column.dtype, dtype, "same_kind"):
-            raise UserError(f"{name} must be {(steps, *shape)} {dtype}, got {column.shape} {column.dtype}")
-        return np.ascontiguousarray(column, dtype)
+def rows_of(spec: Spec, episode: Episode) -> dict[str, Array]:
+    """Return the rows of an episode, field → (steps, …), see `fields_of`; a UserError if it does not fit the spec."""
+    seen = episode.observations
+    columns: dict[str, Any] = {"action": episode.actions, "executed": episode.executed}
+    try:
+        columns["state"] = [each.state for each in seen]
+        columns |= {f"rgb_{camera}": [each.rgb[camera] for each in seen] for camera in spec.cameras}
+        columns |= {f"depth_{camera}": [each.depth[camera] for each in seen] for camera in spec.depth}
+        names = [name for name, _ in spec.truth]
+        columns["truth"] = [np.hstack([np.ravel((each.truth or {})[name]) for name in names]) for each in seen if names]
+    except KeyError as error:
+        raise UserError(f"seed {episode.seed}: an observation lacks {error}, which the spec names") from error
+    rows = dict[str, Array]()
+    for name, (shape, dtype) in fields_of(spec).items():
+        column = np.asarray(columns[name])
+        if column.shape != (len(seen), *shape) or not np.can_cast(column.dtype, dtype, "same_kind"):
+            raise UserError(f"{name} must be {(len(seen), *shape)} {dtype}, got {column.shape} {column.dtype}")
+        rows[name] = np.ascontiguousarray(column, dtype)
+    return rows
 
 
 def observations_of(spec: Spec, rows: Mapping[str, Array], instruction: str) -> list[Observation]:
@@ -356,16 +359,8 @@ def observations_of(spec: Spec, rows: Mapping[str, Array], instruction: str) -> 
     ]
 
 
-def _require_own_files(paths: Iterable[Path]) -> None:
-    """Refuse links, which an archive keeps: what is behind them would be overwritten. Raises a UserError."""
-    for path in paths:
-        require_file(path)
-        if path.is_symlink():
-            raise UserError(f"{path} is a link, and nothing is added behind a link: copy the file to this place")
-
-
 def _checksum(rows: Rows, span: slice, values: Array | None = None) -> int:
-    """Return the CRC-32 of the rows in `span`, which are `values`; decoders of JPEG round differently: of its bytes."""
+    """Return the CRC-32 of the rows in `span`, which are `values`, or of the files of JPEG."""
     if isinstance(rows, ScatteredRows) and rows.codec == "jpeg":
         return zlib.crc32(b"".join(rows.packed(span)))
     return zlib.crc32((rows[span] if values is None else values).data)

@@ -19,7 +19,7 @@ from vla.io.errors import UserError
 from vla.spec import Array
 
 END = np.dtype([("end", "<u8"), ("crc", "<u4")])
-OVERHEAD = 4096  # largest number of bytes by which compression may enlarge an image
+MAX_OVERHEAD = 4096  # largest number of bytes by which compression may enlarge an image
 
 Damaged = Callable[[int], UserError]  # row → the error to raise
 
@@ -60,12 +60,11 @@ class ScatteredRows:
         places = self._places(rows)
 
         def unpack(number: int) -> None:
-            row = int(rows[number])
-            packed = self._packed(row, *places[number])
+            packed = self._packed(int(rows[number]), *places[number])
             try:
                 images[number] = decode(packed, self.codec, self.shape[1:], self.dtype)
-            except ValueError as error:
-                raise self._damaged(row) from error
+            except UserError as error:
+                raise self._damaged(int(rows[number])) from error
 
         if self._ends is not None:
             in_threads(unpack, len(rows))
@@ -87,7 +86,7 @@ class ScatteredRows:
         else:
             starts = np.where(rows > 0, self._ends["end"][rows - 1], 0)
             sizes = self._ends["end"][rows] - starts  # unsigned: negative ones are large
-            if len(wrong := np.flatnonzero((sizes > self._size + OVERHEAD) | (starts > np.iinfo(np.int64).max))):
+            if len(wrong := np.flatnonzero((sizes > self._size + MAX_OVERHEAD) | (starts > np.iinfo(np.int64).max))):
                 raise self._damaged(int(rows[wrong[0]]))
             places = list(zip(starts.tolist(), sizes.tolist(), strict=True))
         for place in places:
@@ -106,15 +105,7 @@ Rows = Array | ScatteredRows
 
 
 class Field:
-    """Files of a field.
-
-    Args:
-        folder: of the store.
-        name: of the field.
-        shape: of a row.
-        dtype: of the rows.
-        codec: of the store.
-    """
+    """Files of a field of a store in `folder`, with rows of `shape` and `dtype`; `codec` is that of the store."""
 
     def __init__(self, folder: Path, name: str, shape: tuple[int, ...], dtype: np.dtype, codec: Codec) -> None:
         self.shape, self.dtype = shape, dtype

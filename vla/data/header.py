@@ -18,7 +18,7 @@ from vla.spec import Spec
 
 FORMAT = 3
 NAME = "store.json"
-LARGEST = 16 << 20  # [bytes]; a derived store of a thousand others has 5 MB
+MAX_HEADER_BYTES = 16 << 20  # a derived store of a thousand others has 5 MB
 LARGEST_RAW = 128  # height and width of the images that are stored raw unless asked otherwise [px]
 
 
@@ -57,32 +57,12 @@ RAW = Codec()
 
 
 @dataclass(frozen=True)
-class Layout:
-    """Layout of one row of a field."""
-
-    __pydantic_config__ = STRICT
-
-    shape: tuple[int, ...]
-    dtype: str
-
-
-@dataclass(frozen=True)
-class Part:
-    """Consecutive entries of one config."""
-
-    __pydantic_config__ = STRICT
-
-    config: Plain
-    entries: Annotated[int, Ge(1), Le(2**53)]
-
-
-@dataclass(frozen=True)
 class Derived:
     """Config of a store that was derived from others."""
 
     __pydantic_config__ = STRICT
 
-    parts: list[Part]
+    parts: list[tuple[Plain, Annotated[int, Ge(1), Le(2**53)]]]  # a config, and how many entries in a row have it
     where: list[Plain]  # the filters that were applied, in order
 
 
@@ -95,15 +75,8 @@ class Header:
     format: int
     spec: Any
     config: Plain  # of task and expert, or `Derived`
-    fields: dict[str, Layout]
+    fields: Any  # field → shape and dtype of a row
     codec: Codec = RAW  # of the images; not written if they are raw
-
-    def text(self) -> str:
-        """Return the content of the file."""
-        content = asdict(self)
-        if self.codec == RAW:
-            del content["codec"]
-        return dumps(content)
 
 
 def fields_of(spec: Spec) -> dict[str, tuple[tuple[int, ...], np.dtype]]:
@@ -124,22 +97,18 @@ def is_store(folder: Path) -> bool:
 
 
 def read_header(folder: Path) -> tuple[Header, Spec]:
-    """Read the description of the store in a folder.
-
-    Raises:
-        UserError: it is missing, damaged or of another kind.
-    """
+    """Read the description of the store in a folder; a UserError if it is missing, damaged or of another kind."""
     path = folder / NAME
     if not is_store(folder):
         raise UserError(f"there is no episode store in {folder} (no {NAME}): collect one first, with job=collect")
     try:
-        content = read_bounded(path, LARGEST)
-        found = parse_json(content, dict[str, Any], str(path)).get("format")
-        if found == FORMAT:
+        content = read_bounded(path, MAX_HEADER_BYTES)
+        version = parse_json(content, dict[str, Any], str(path)).get("format")
+        if version == FORMAT:
             return _parsed(content, path)
-    except ValueError as error:
+    except UserError as error:
         raise UserError(f"{error}: {REMEDY}") from error
-    raise UserError(f"{path} has format {str(found)[:20]}, this version reads {FORMAT}: collect again")
+    raise UserError(f"{path} has format {str(version)[:20]}, this version reads {FORMAT}: collect again")
 
 
 def _parsed(content: bytes, path: Path) -> tuple[Header, Spec]:
@@ -161,14 +130,16 @@ def write_header(folder: Path, spec: Spec, config: dict[str, Any], codec: Codec)
         UserError: the folder holds episodes without a description.
         OSError: it cannot be written.
     """
-    path = folder / NAME
     if is_store(folder):
         return
     orphans = sorted(file.name for file in folder.iterdir() if file.suffix in (".bin", ".pack", ".jsonl"))
     if orphans:
         raise UserError(f"{folder} holds {orphans[0]} without {NAME}, which says what it means: {REMEDY}")
-    write_text(path, Header(FORMAT, spec.to_dict(), config, _layouts(spec), codec).text())
+    content = asdict(Header(FORMAT, spec.to_dict(), config, _layouts(spec), codec))
+    if codec == RAW:
+        del content["codec"]
+    write_text(folder / NAME, dumps(content))
 
 
-def _layouts(spec: Spec) -> dict[str, Layout]:
-    return {name: Layout(shape, dtype.name) for name, (shape, dtype) in fields_of(spec).items()}
+def _layouts(spec: Spec) -> dict[str, dict[str, Any]]:
+    return {name: {"shape": [*shape], "dtype": dtype.name} for name, (shape, dtype) in fields_of(spec).items()}

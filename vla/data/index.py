@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import zlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -23,8 +23,8 @@ DAMAGED = "damaged"  # outcome of a seed whose episode a repair could not save
 LOST = "lost"  # outcome of a seed whose index line is unreadable
 NOT_NEEDED = "not_needed"  # outcome of a seed that was passed over, because its task had its share of episodes
 CHECK = b', "check": '  # precedes the CRC-32 of the line without it, at the end of every line
-LARGEST = 4 << 30  # [bytes], millions of seeds
-LISTED = 8  # largest number of numbers in a message
+MAX_INDEX_BYTES = 4 << 30  # millions of seeds
+MAX_LISTED = 8  # largest number of numbers in a message
 
 
 def moderate(value: Any) -> bool:
@@ -72,15 +72,23 @@ class Entry:
 
     @property
     def recording(self) -> int:
-        """Number of the recorded episode that it was or is a part of; its seed if it was not recorded."""
-        recorded = self.draws.get("recorded")
-        number = recorded.get("episode") if isinstance(recorded, dict) else None
-        return number if isinstance(number, int) else self.seed
+        """Number of the recorded episode that it is a part of, see `recording_of`."""
+        return recording_of(self.seed, self.draws)
 
     @property
     def span(self) -> slice:
         """The rows of the episode in every field file."""
         return slice(self.start, self.end)
+
+
+def recording_of(seed: int, draws: Mapping[str, Any]) -> int:
+    """Return the number of the recorded episode that an episode was or is a part of; its seed if it was not recorded.
+
+    Parts of one recording show the same scene: they are held out together, and count as one in statistics.
+    """
+    recorded = draws.get("recorded")
+    number = recorded.get("episode") if isinstance(recorded, dict) else None
+    return number if isinstance(number, int) else seed
 
 
 def index_line(entry: Entry) -> bytes:
@@ -123,8 +131,8 @@ def listed(numbers: Sequence[int]) -> str:
     ordered = sorted(set(numbers))
     if len(ordered) > 2 and ordered[-1] - ordered[0] == len(ordered) - 1:
         return f"{ordered[0]} to {ordered[-1]}"
-    more = f" and {len(ordered) - LISTED} others" if len(ordered) > LISTED else ""
-    return ", ".join(map(str, ordered[:LISTED])) + more
+    more = f" and {len(ordered) - MAX_LISTED} others" if len(ordered) > MAX_LISTED else ""
+    return ", ".join(map(str, ordered[:MAX_LISTED])) + more
 
 
 def read_index(path: Path, any_seed: bool, damaged: bool) -> tuple[list[Entry], int]:
@@ -141,16 +149,15 @@ def read_index(path: Path, any_seed: bool, damaged: bool) -> tuple[list[Entry], 
     for number, line in enumerate(lines, start=1):
         try:
             entries[number] = parse_line(line, f"line {number} of {path}")
-        except ValueError as error:
+        except UserError as error:
             problems[number] = str(error)
-    salvaged = damaged and not any_seed and bool(entries)
     remedy = REMEDY if any_seed or not entries else SALVAGE
-    if problems and not salvaged:
+    if damaged and remedy == SALVAGE:
+        return _with_lost(entries, len(lines)), 0
+    if problems:
         first, *others = problems
         more = f"; so are the lines {listed(others)}" if others else ""
         raise UserError(f"{problems[first]}{more}: {remedy}")
-    if salvaged:
-        return _with_lost(entries, len(lines)), 0
     rows, seed = 0, None
     for number, entry in entries.items():
         if entry.start != rows or (entry.seed != seed and seed is not None and not any_seed):
@@ -161,25 +168,21 @@ def read_index(path: Path, any_seed: bool, damaged: bool) -> tuple[list[Entry], 
 
 def _lines(path: Path) -> list[bytes]:
     """Return every complete line, without its line end."""
-    *lines, rest = read_bounded(path, LARGEST).split(b"\n") if path.exists() else [b""]
+    *lines, rest = read_bounded(path, MAX_INDEX_BYTES).split(b"\n") if path.exists() else [b""]
     # A process killed within a line leaves a shorter one: here only the line end is damaged.
     whole = _sealed(rest[:-1].rpartition(CHECK)[0] + b"}") == rest[:-1]
     return [*lines, rest] if whole else lines
 
 
 def _with_lost(entries: dict[int, Entry], lines: int) -> list[Entry]:
-    """Insert a `LOST` entry for every missing seed before, between and after the readable ones."""
-    found: list[Entry] = []
-    rows = last = 0
-    for number, entry in entries.items():
-        before = found[-1].seed if found else entry.seed - number
-        if not 1 <= entry.seed - before <= number - last + 1:  # a damaged line end joins two lines
-            continue
-        found += [_lost(seed, rows) for seed in range(max(before + 1, 0), entry.seed)]
-        found.append(entry)
-        rows, last = entry.end, number
-    return found + [_lost(found[-1].seed + 1 + number, rows) for number in range(lines - last)]
-
-
-def _lost(seed: int, row: int) -> Entry:
-    return Entry(seed, "", LOST, (), "", row, 0, {}, {})
+    """Return the readable entries with a `LOST` one for every seed between, before and after them that has none."""
+    (first, oldest), *_, (last, newest) = [*entries.items(), *entries.items()]
+    seeds = range(max(oldest.seed - first + 1, 0), newest.seed + lines - last + 1)
+    if len(seeds) > 2 * lines:  # a damaged line end joins two lines, so there are at most two seeds to a line
+        raise UserError(f"the readable seeds, {oldest.seed} to {newest.seed}, are too far apart: {REMEDY}")
+    known = {entry.seed: entry for entry in entries.values()}
+    found, row = list[Entry](), 0
+    for seed in seeds:
+        found.append(known.get(seed, Entry(seed, "", LOST, (), "", row, 0, {}, {})))
+        row = found[-1].end
+    return found

@@ -11,7 +11,7 @@ import numpy as np
 
 from vla.spec import Array
 
-SAMPLE = 2**18  # largest number of actions in a sample
+MAX_SAMPLE = 2**18  # largest number of actions in a sample
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,7 @@ class Statistics:
 
         Beyond the end of an episode its last action is repeated, as in training windows.
         """
-        count = min(len(self.actions), max(SAMPLE // length, 1))
+        count = min(len(self.actions), max(MAX_SAMPLE // length, 1))
         rows = np.linspace(0, len(self.actions) - 1, count).round().astype(np.int64)
         last = self.ends[self.ends.searchsorted(rows, side="right")] - 1
         return self.actions[np.minimum(rows[:, None] + np.arange(length), last[:, None])]

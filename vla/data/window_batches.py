@@ -42,9 +42,9 @@ def perturbed(action: Array, executed: Array, spec: Spec) -> Array:
 
 
 def aligned_empty(shape: tuple[int, ...], dtype: DTypeLike) -> Array:
-    """Return an array with arbitrary content that starts at a multiple of 64 bytes.
+    """Return an array with arbitrary content that starts at a cache line, to which some processors copy twice as fast.
 
-    Some processors copy to other addresses at half the speed; NumPy's own arrays start 16 bytes after such a multiple.
+    NumPy's own arrays start 16 bytes after one.
     """
     size = prod(shape) * np.dtype(dtype).itemsize
     memory = bytearray(size + CACHE_LINE)  # no array, so that views refer to the result
@@ -76,6 +76,8 @@ class BufferPool:
 class WindowBatcher:
     """Callable that copies windows of an episode store into batches; a window is identified by its newest row.
 
+    The numeric rows of the store are verified at once, a UserError if they differ from their checksums.
+
     Args:
         store: source of the rows.
         history: frames T in a window.
@@ -83,9 +85,6 @@ class WindowBatcher:
         depth: include depth.
         pin: allocate page-locked memory, from which copies to a GPU are asynchronous.
         truth_size: number S of truth scalars, NaN if the store has no truth; None: that of the store.
-
-    Raises:
-        UserError: numeric rows of the store differ from their checksums.
     """
 
     def __init__(
@@ -107,6 +106,7 @@ class WindowBatcher:
         store.verify(store.episodes, numbers)
         self._truth_size = store.spec.truth_size if truth_size is None else truth_size
         known = [numbers[name][:] for name in names]
+        # Truth that this store lacks, and others beside it have.
         unknown = np.full((len(known[0]), self._truth_size - store.spec.truth_size), np.nan, np.float32)
         self._numbers = np.concatenate([*known, unknown], axis=1)
         self._action = numbers["action"]
@@ -159,12 +159,9 @@ class WindowBatcher:
         return batch
 
     def verify(self, episodes: Array | None = None) -> None:
-        """Compare the images of the episodes with numbers (N,), by default of all, with their checksums.
+        """Raise a UserError if images of the episodes with numbers (N,), by default all, differ from their checksums.
 
         Otherwise an episode is verified when its first window is read.
-
-        Raises:
-            UserError: they differ.
         """
         episodes = np.arange(len(self._entries)) if episodes is None else episodes
         entries = [self._entries[number] for number in episodes.tolist()]
@@ -193,10 +190,10 @@ class WindowBatcher:
 
 
 class JoinedBatcher:
-    """Callable that copies windows of several stores into batches, as `WindowBatcher` does of one.
+    """Callable that copies windows of several stores into batches; rows are numbered store by store.
 
     Args:
-        batchers: one per store; rows are numbered store by store.
+        batchers: one per store.
         rows: number of rows of every store.
     """
 
@@ -211,11 +208,7 @@ class JoinedBatcher:
         return parts[0] if len(parts) == 1 else _joined(parts)
 
     def verify(self) -> None:
-        """Compare the images of all episodes with their checksums.
-
-        Raises:
-            UserError: they differ.
-        """
+        """Raise a UserError if images differ from their checksums."""
         for batcher in self._batchers:
             batcher.verify()
 

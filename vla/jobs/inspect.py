@@ -12,9 +12,10 @@ from annotated_types import MinLen
 from vla.config.build import require_no_paths
 from vla.config.check import Job
 from vla.config.experiment import Experiment, make_environment
+from vla.data.derivation import derive_store
 from vla.data.episodes import EpisodeStore
 from vla.data.index import listed
-from vla.data.verification import derive_store, find_episode, require_whole, verify_store
+from vla.data.verification import find_episode, require_whole, verify_store
 from vla.io.errors import UserError
 from vla.io.files import warn_on_error
 from vla.io.printable import show

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 
-from vla.data.draws import flat, leaves
+from vla.data.episode_filter import flat, leaves
 from vla.data.index import NOT_NEEDED, Entry, listed
 from vla.data.verification import StoreReport, entries_by_config, episode_of
 from vla.io.files import write_text

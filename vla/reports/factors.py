@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 
-from vla.data.draws import flat
+from vla.data.episode_filter import flat
 from vla.reports.pictures import GREEN, GREY, RED, Interval, Panels, error_bars, plot_counts, rate_limits
 from vla.reports.tables import in_words
 from vla.rollouts.results import ERROR, Report, Result

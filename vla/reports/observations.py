@@ -11,7 +11,7 @@ import numpy as np
 from matplotlib import colormaps
 from matplotlib.axes import Axes
 
-from vla.data.draws import flat, leaves
+from vla.data.episode_filter import flat, leaves
 from vla.reports.pictures import GREEN, MIDDLE, Panels, plot_image, save
 from vla.reports.tables import Table
 from vla.spec import Array, Observation, Spec, readable

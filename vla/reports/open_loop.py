@@ -22,7 +22,7 @@ from vla.spec import in_brackets
 def components(result: OpenLoop) -> list[ComponentError]:
     """Return the error of every action component."""
     spec, (low, high) = result.spec, result.interval
-    rows = zip(spec.action, spec.units, result.errors.mean(0), low, high, result.constant_errors, strict=True)
+    rows = zip(spec.action, spec.units, result.mean, low, high, result.constant_errors, strict=True)
     return [
         ComponentError(name, unit, float(error), float(least), float(most) if np.isfinite(most) else None, float(still))
         for name, unit, error, least, most, still in rows
@@ -70,7 +70,7 @@ def plot_errors(result: OpenLoop, path: Path) -> None:
 
 def _plot_relative(axes: Axes, result: OpenLoop) -> None:
     places, scale = np.arange(len(result.spec.action)), result.scale
-    error, low, high = (each / scale for each in (result.errors.mean(0), *result.interval))
+    error, low, high = (each / scale for each in (result.mean, *result.interval))
     axes.barh(places, error, color=GREEN, height=0.6)
     if np.isfinite(high).all():
         axes.errorbar(error, places, xerr=[error - low, high - error], fmt="none", ecolor=GREY, capsize=3)

@@ -1,11 +1,9 @@
-"""Exporters of an episode store: their common base, and the export to plain files."""
+"""Export of an episode store to plain files, and what all exports share."""
 
 from __future__ import annotations
 
-import json
 import os
 import shutil
-from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import contextmanager, suppress
@@ -23,7 +21,7 @@ from vla.data.episodes import EpisodeStore
 from vla.data.index import Entry
 from vla.io.documents import read_json
 from vla.io.errors import UserError
-from vla.io.files import writing
+from vla.io.files import write_json, writing
 from vla.io.types import Text
 from vla.parallel.pool import THIS_PROCESS, Cluster, WorkersLost
 from vla.spec import Array, Spec
@@ -34,11 +32,16 @@ Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 
-class FolderExporter(ABC):
-    """Base class of exports with one folder per episode, whose `manifest.json` gives its provenance.
+class Files:
+    """Export to a `folder` with one folder per episode and one folder of plain files per step.
 
-    Args:
-        folder: of the export.
+        episode_00000/manifest.json                  spec and provenance of the episode
+        episode_00000/step_0000/rgb_image.png        (H, W, 3) uint8
+        episode_00000/step_0000/depth_image.npy      (H, W) float32 [m], 0: no return; of depth cameras
+        episode_00000/step_0000/robot_state.json     component of the state → value
+        episode_00000/step_0000/expert_action.json   the action to imitate and the executed one, each (D,)
+
+    With several cameras the images of each are in a folder of its name: `step_0000/front/rgb_image.png`.
     """
 
     def __init__(self, folder: Text | Path) -> None:
@@ -53,24 +56,19 @@ class FolderExporter(ABC):
         self._folder.mkdir(parents=True, exist_ok=True)
         with staging_folder(self._folder) as place:
             missing = [number for number in range(len(store.episodes)) if not self._is_exported(store, number)]
-            for _ in map_episodes(partial(self._export, place), store, missing, cluster):
-                pass
+            deque(map_episodes(partial(self._export, place), store, missing, cluster), 0)
         return self._folder
 
     def _is_exported(self, store: EpisodeStore, number: int) -> bool:
         folder = self._folder / f"episode_{number:05d}"
-        if not folder.exists():
-            return False
-        manifest = self._manifest(store, number)
-        if read_json(folder / "manifest.json", dict[str, Any]) != manifest:
+        if folder.exists() and read_json(folder / "manifest.json", dict[str, Any]) != self._manifest(store, number):
             raise UserError(
-                f"{folder} was exported from other episodes, or as other files: choose another export.folder"
+                f"{folder} was exported from another store, or as other files: choose another export.folder"
             )
-        return True
+        return folder.exists()
 
     def _manifest(self, store: EpisodeStore, number: int) -> dict[str, Any]:
-        entry, layout = store.episodes[number], {"layout": type(self).__name__, **self.settings()}
-        return provenance(entry) | layout | {"spec": store.spec.to_dict()}
+        return provenance(store.episodes[number]) | {"spec": store.spec.to_dict()}
 
     def _export(self, place: Path, store: EpisodeStore, number: int) -> None:
         entry = store.episodes[number]
@@ -80,29 +78,8 @@ class FolderExporter(ABC):
         write_json(draft / "manifest.json", self._manifest(store, number))
         os.rename(draft, self._folder / draft.name)
 
-    def settings(self) -> dict[str, Any]:
-        """Return the settings that the files depend on, as JSON values."""
-        return {}
-
-    @abstractmethod
     def write(self, folder: Path, spec: Spec, entry: Entry, rows: dict[str, Array]) -> None:
         """Write the (steps, …) rows of an episode, by field, into the new folder `folder`."""
-
-
-class Files(FolderExporter):
-    """Export with one folder per episode and one folder of plain files per step.
-
-        episode_00000/manifest.json                  spec and provenance of the episode
-        episode_00000/step_0000/rgb_image.png        (H, W, 3) uint8
-        episode_00000/step_0000/depth_image.npy      (H, W) float32 [m], 0: no return; of depth cameras
-        episode_00000/step_0000/robot_state.json     component of the state → value
-        episode_00000/step_0000/expert_action.json   the action to imitate and the executed one, each (D,)
-
-    With several cameras the images of each are in a folder of its name: `step_0000/front/rgb_image.png`.
-    """
-
-    def write(self, folder: Path, spec: Spec, entry: Entry, rows: dict[str, Array]) -> None:
-        """Write one episode."""
         for step in range(entry.steps):
             place = folder / f"step_{step:04d}"
             for camera in spec.cameras:
@@ -113,29 +90,14 @@ class Files(FolderExporter):
                     np.save(images / "depth_image.npy", rows[f"depth_{camera}"][step] * MILLIMETRE)
             state = dict(zip(spec.state, rows["state"][step].tolist(), strict=True))
             write_json(place / "robot_state.json", state)
-            action = {name: rows[name][step].tolist() for name in ("action", "executed")}
-            write_json(place / "expert_action.json", action)
+            actions = {name: rows[name][step].tolist() for name in ("action", "executed")}
+            write_json(place / "expert_action.json", actions)
 
 
 def provenance(entry: Entry) -> dict[str, Any]:
     """Return an index entry as JSON values, without its place in the store."""
     fields = {**asdict(entry), "milestones": list(entry.milestones)}
     return {name: value for name, value in fields.items() if name != "start"}
-
-
-def write_json(path: Path, value: Any) -> None:
-    """Write readable JSON."""
-    path.write_text(json.dumps(value, ensure_ascii=False, indent=1) + "\n", encoding="utf-8")
-
-
-def require_empty(folder: Path) -> None:
-    """Require a folder to be missing or empty.
-
-    Raises:
-        UserError: the folder has content, or is a file.
-    """
-    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise UserError(f"{folder} has content other than these episodes: choose another export.folder")
 
 
 @contextmanager

@@ -20,9 +20,10 @@ from vla.spec import Array, Episode, Spec
 
 log = logging.getLogger(__name__)
 
-QUANTILES = (0.01, 0.99)
-MARGIN = 0.5  # by which bounds exceed the quantiles, as a fraction of the distance between these
-STILL = 0.02  # distance between the quantiles, as a fraction of the range, below which rare values are no outliers
+OUTLIER_QUANTILES = (0.01, 0.99)
+OUTLIER_MARGIN = 0.5  # by which bounds exceed the quantiles, as a fraction of the distance between these
+# Distance between the quantiles, as a fraction of the range, below which rare values are no outliers.
+RARE_EVENT_SPREAD = 0.02
 
 
 @dataclass(frozen=True)
@@ -92,12 +93,13 @@ class ImportedDemonstrations(ABC):
 def action_bounds(values: Array) -> tuple[float, float]:
     """Return bounds for a component of the actions, given its values (N,).
 
-    They are the smallest and the largest value, unless one is an outlier: further from the quantiles than `MARGIN`
-    times the distance between these. A component that hardly moves, such as a gripper that closes once, has none.
+    They are the smallest and the largest value, unless one is an outlier: further from the quantiles than
+    `OUTLIER_MARGIN` times the distance between these. A component that hardly moves, such as a gripper that closes
+    once, has none.
     """
     least, most = float(values.min()), float(values.max())
-    low, high = (float(quantile) for quantile in np.quantile(values, QUANTILES))
-    if high - low > STILL * (most - least):
-        least, most = max(least, low - MARGIN * (high - low)), min(most, high + MARGIN * (high - low))
+    low, high = (float(quantile) for quantile in np.quantile(values, OUTLIER_QUANTILES))
+    if high - low > RARE_EVENT_SPREAD * (most - least):
+        least, most = max(least, low - OUTLIER_MARGIN * (high - low)), min(most, high + OUTLIER_MARGIN * (high - low))
     apart = 1e-3 * max(1.0, abs(least)) if least == most else 0.0
     return least - apart, most + apart

@@ -1,4 +1,7 @@
-"""A LeRobot dataset on disk, checked as a whole when it is opened.
+"""A LeRobot dataset on disk, checked as a whole when it is opened: metadata, episodes, numbers and images.
+
+The rows of an episode are those with its number, in whichever file. Files that metadata name, and numbers of rows, may
+be out of date after episodes were merged or deleted.
 
 Shapes: N steps, D components, H by W pixels.
 """
@@ -8,26 +11,44 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyarrow as pa
+import pyarrow.parquet as pq
 
 from vla.data.formats import lerobot_layout as layout
 from vla.data.formats import lerobot_tables as tables
-from vla.data.formats.lerobot_episodes import OWNER, Part, read_parts, require_finite
-from vla.data.formats.lerobot_tables import MEND, REMEDY, counts, numbers
-from vla.data.formats.video import decode, require_video
-from vla.data.image_codec import decode_image
+from vla.data.formats.lerobot_images import decode, decode_file, require_video
+from vla.data.formats.lerobot_tables import COUNTS, DEPTHS, MEND, NUMBERS, PICTURES, REMEDY, TIMES
+from vla.data.index import listed
 from vla.io.documents import read_bounded, read_json
 from vla.io.errors import UserError
 from vla.io.images import resize
-from vla.spec import Array
+from vla.spec import LONGEST_INSTRUCTION, Array
 
 IMAGES = ("video", "image")
-PICTURES = ("PNG", "JPEG", "WEBP")  # formats of images in tables
-MOST_COMPONENTS = 10_000  # of a feature; a damaged or hostile file may name any number
+MAX_COMPONENTS = 10_000  # of a feature; a damaged or hostile file may name any number
+OWNER, TASK, TIME, FROM, TO = "episode_index", "task_index", "timestamp", "dataset_from_index", "dataset_to_index"
+UNNAMED = "__index_level_0__"  # column of an index that pandas writes without a name
+
+
+@dataclass(frozen=True)
+class Part:
+    """Consecutive steps of an episode that have one instruction: all of them, unless its task changes."""
+
+    episode: int  # its number in the dataset
+    rows: Array  # (N,) those of the whole episode in the tables
+    files: tuple[Path, ...]  # that hold these rows
+    steps: slice  # of the part, among those of the episode
+    instruction: str  # of the part
+    time: float  # stamp of the first step of the episode [s]
+    place: Mapping[str, Any]  # files and times of the episode's videos, a row of `meta/episodes`
+
+    def __len__(self) -> int:
+        return self.steps.stop - self.steps.start
 
 
 class LeRobotDataset:
@@ -50,13 +71,14 @@ class LeRobotDataset:
 
     def __init__(self, folder: Path, images: Mapping[str, str] | None) -> None:
         self.folder = folder
-        self._require_unchanged()
-        self.info = self._read_info()
-        there = [key for key, feature in self.info.features.items() if feature.dtype in IMAGES and not feature.is_depth]
-        self.images = {camera_of(key): key for key in there} if images is None else dict(images)
-        if unknown := [key for key in self.images.values() if key not in there]:
-            raise UserError(f"expert.images: {folder} has no images {', '.join(unknown)}, it has {', '.join(there)}")
-        self.parts = read_parts(folder, self.info, [key for key in self.images.values() if self._is_video(key)])
+        _require_unchanged(folder)
+        self.info = _read_info(folder)
+        keys = [key for key, feature in self.info.features.items() if feature.dtype in IMAGES and not feature.is_depth]
+        cameras = [key.removeprefix("observation.").removeprefix("images.") for key in keys]
+        self.images = dict(zip(cameras, keys, strict=True) if images is None else images)
+        if unknown := [key for key in self.images.values() if key not in keys]:
+            raise UserError(f"expert.images: {folder} has no images {', '.join(unknown)}, it has {', '.join(keys)}")
+        self.parts = self._read_parts([key for key in self.images.values() if self._is_video(key)])
 
     def components(self, keys: Sequence[str], anonymous: Sequence[str] = ()) -> dict[str, tuple[str, int]]:
         """Return component → its feature and index, of several features in order.
@@ -66,18 +88,20 @@ class LeRobotDataset:
         Raises:
             UserError: there is no such feature, or it is no vector of a reasonable size.
         """
+        features = self.info.features
+        vectors = [key for key, feature in features.items() if len(feature.shape) == 1]
         for key in keys:
-            if key not in self.info.features or len(self.info.features[key].shape) != 1:
-                vectors = [name for name, feature in self.info.features.items() if len(feature.shape) == 1]
+            if key not in vectors:
                 raise UserError(f"{self.folder} has no vector {key}, it has {', '.join(vectors)[:500]}")
-            if (size := self.info.features[key].shape[0]) > MOST_COMPONENTS:
-                raise UserError(f"{self.folder} has {size} components in {key}, the limit is {MOST_COMPONENTS}")
-        named = {key: dict(enumerate(self.info.features[key].components or ())) for key in keys}
-        places = [(key, index) for key in keys for index in range(self.info.features[key].shape[0])]
-        numbered = {f"{key.rpartition('.')[2]}_{index}" for key, index in places}
-        if not any(named.values()) and len(places) == len(anonymous) and not numbered >= {*anonymous}:
-            return dict(zip(anonymous, places, strict=True))
-        names = [named[key].get(index, f"{key.rpartition('.')[2]}_{index}") for key, index in places]
+            if (size := features[key].shape[0]) > MAX_COMPONENTS:
+                raise UserError(f"{self.folder} has {size} components in {key}, the limit is {MAX_COMPONENTS}")
+        places = [(key, index) for key in keys for index in range(features[key].shape[0])]
+        numbered = [f"{key.rpartition('.')[2]}_{index}" for key, index in places]
+        if not any(features[key].components for key in keys):
+            by_number = len(places) != len(anonymous) or {*numbered} >= {*anonymous}
+            return dict(zip(numbered if by_number else anonymous, places, strict=True))
+        named = {(key, index): name for key in keys for index, name in enumerate(features[key].components)}
+        names = [named.get(place, number) for place, number in zip(places, numbered, strict=True)]
         if len(set(names)) < len(names):
             names = [f"{key}.{name}" for (key, _), name in zip(places, names, strict=True)]
         if len(set(names)) < len(names):  # within a feature, such as those of two arms
@@ -85,74 +109,124 @@ class LeRobotDataset:
         return dict(zip(names, places, strict=True))
 
     def read(self, keys: Sequence[str]) -> dict[str, Array]:
-        """Read the numbers of features, each (N, D) float32, in the order of the tables.
+        """Read features, each (N, D) float32, in the order of the tables; a UserError if one holds no such numbers."""
+        rows = tables.read(tables.files(self.folder / "data"), dict.fromkeys(keys, NUMBERS) | {OWNER: COUNTS})
+        found = dict[str, Array]()
+        for key in keys:
+            size = self.info.features[key].shape[0]
+            values = tables.array(rows[key], size)
+            if values is None or not len(values):
+                raise UserError(
+                    f"{self.folder}/data has rows of {key} without the {size} numbers that meta/info.json states: "
+                    f"{MEND}"
+                )
+            self._require_finite(key, values, rows[OWNER].to_numpy())
+            found[key] = values
+        return found
 
-        Raises:
-            UserError: rows are no vectors of finite numbers.
-        """
-        rows = tables.read(tables.files(self.folder / "data"), dict.fromkeys(keys, numbers) | {OWNER: counts})
-        return {key: self._matrix(rows, key) for key in keys}
-
-    def open(self, cameras: Sequence[str], keys: Sequence[str], depth: Sequence[str]) -> None:
-        """Load the features `keys`, which `numbers` returns, and check images and the features `depth`.
-
-        Of images in tables and of frames of videos, this decodes the first one of each camera.
+    def require_images(self, cameras: Sequence[str], depth: Sequence[str]) -> None:
+        """Require images of cameras and the features `depth`; decodes the first image of each camera alone.
 
         Raises:
             UserError: a file is missing or damaged, or contradicts others.
         """
-        self._matrices = self.read(keys)
         images = [self.images[camera] for camera in cameras]
         self._require_videos([key for key in images if self._is_video(key)])
-        columns = {key: tables.pictures for key in images if not self._is_video(key)}
+        columns = {key: PICTURES for key in images if not self._is_video(key)} | dict.fromkeys(depth, DEPTHS)
         for path in tables.files(self.folder / "data"):
-            tables.require(path, columns | dict.fromkeys(depth, tables.pixels))
+            tables.require(path, columns)
         for key in images:
             next(self._decoded(self.parts[0], key, 1))
 
-    def numbers(self, key: str, part: Part) -> Array:
-        """Return a feature of the whole episode of a part, (N, D) float32."""
-        return self._matrices[key][part.rows]
-
     def frames(self, part: Part, camera: str, size: tuple[int, int], every: int) -> Array:
-        """Return every `every`-th image of a part, (N, H, W, 3) uint8, cropped at the centre and resized to `size`.
-
-        Raises:
-            UserError: images are missing or damaged.
-        """
+        """Return every `every`-th image of a part, (N, H, W, 3) uint8, cropped at the centre and resized to `size`."""
         images = self._decoded(part, self.images[camera], every)
         return np.stack([resize(image, size, "centre") for image in images])
 
-    def column(self, part: Part, key: str, kind: tables.Kind) -> pa.ChunkedArray:
-        """Return the rows of a part in a column that is too large for memory."""
-        column = tables.read(part.files, {key: kind}, [(OWNER, "=", part.episode)])[key]
-        return column[part.steps]
-
-    def _matrix(self, rows: pa.Table, name: str) -> Array:
-        """Return a column of lists as (N, D) float32."""
-        size = self.info.features[name].shape[0]
-        values = tables.matrix(rows[name], size)
-        if values is None or not len(values):
-            raise UserError(
-                f"{self.folder}/data has rows of {name} without the {size} numbers that meta/info.json states: {MEND}"
-            )
-        require_finite(self.folder, name, values, rows[OWNER].to_numpy())
+    def depths(self, part: Part, key: str, size: tuple[int, int]) -> Array:
+        """Return the depth images of a part, (N, H, W) uint16 [mm]; a UserError if they are of another `size`."""
+        values = tables.array(self._column(part, key, DEPTHS), *size, dtype=np.uint16)
+        if values is None:
+            raise UserError(f"{self.folder} has {key} of another size in episode {part.episode}: {MEND}")
         return values
+
+    def _read_parts(self, videos: Sequence[str]) -> list[Part]:
+        """Return the parts of all episodes, in order, with the places of the `videos`, keys of features."""
+        episodes, instructions = self._read_episodes(videos), _read_instructions(self.folder / layout.TASKS)
+        paths = tables.files(self.folder / "data")
+        rows = tables.read(paths, {OWNER: COUNTS, TASK: COUNTS, TIME: NUMBERS})
+        file = np.repeat(np.arange(len(paths)), [pq.read_metadata(path).num_rows for path in paths])
+        owner, tasks, stamps = (
+            rows[OWNER].to_numpy(),
+            rows[TASK].to_numpy(),
+            tables.array(rows[TIME], 1, dtype=np.float64),
+        )
+        if stamps is None:
+            raise UserError(f"{self.folder}/data has rows of {TIME} that are not one number: {MEND}")
+        self._require_finite(TIME, stamps, owner)
+        order, numbers = np.argsort(owner, kind="stable"), [row[OWNER] for row in episodes]
+        first, stop = (np.searchsorted(owner[order], numbers, side) for side in ("left", "right"))
+        parts = list[Part]()
+        for row, start, end in zip(episodes, first, stop, strict=True):
+            steps, number = order[start:end], row[OWNER]
+            times = stamps[steps, 0]
+            if len(steps) != (count := row[TO] - row[FROM]) or not count:
+                found, remedy = f"{self.folder}/data holds {len(steps)}", REMEDY if len(steps) < count else MEND
+                raise UserError(f"{found} of the {count} steps that meta/episodes counts of episode {number}: {remedy}")
+            self._require_even(number, times - times[0])
+            files = tuple(paths[each] for each in np.unique(file[steps]))
+            # What is done after a change of the task is no answer to the instruction before it.
+            changes = np.flatnonzero(np.diff(tasks[steps])) + 1
+            for begin, last in pairwise([0, *changes.tolist(), len(steps)]):
+                if (task := int(tasks[steps[begin]])) not in instructions:
+                    path = self.folder / layout.TASKS
+                    raise UserError(f"{path} lacks task {task}, which episode {number} has: {MEND}")
+                span = slice(begin, last)
+                parts.append(Part(number, steps, files, span, instructions[task], float(times[0]), row))
+        return parts
+
+    def _read_episodes(self, videos: Sequence[str]) -> list[dict[str, Any]]:
+        """Return the rows of `meta/episodes`, in the order of the episodes."""
+        folder, columns = self.folder / "meta/episodes", dict.fromkeys((OWNER, FROM, TO), COUNTS)
+        for video in (f"videos/{key}" for key in videos):
+            columns |= {f"{video}/chunk_index": COUNTS, f"{video}/file_index": COUNTS}
+            columns |= {f"{video}/from_timestamp": TIMES, f"{video}/to_timestamp": TIMES}
+        rows = tables.read(tables.files(folder), columns).sort_by(OWNER).to_pylist()
+        if twice := [row[OWNER] for row, other in pairwise(rows) if row[OWNER] == other[OWNER]]:
+            raise UserError(f"{folder} lists episode {twice[0]} more than once: {MEND}")
+        # Of half a copy the totals are those of the whole; more episodes than they say are no damage.
+        counts = (
+            ("episodes", len(rows), self.info.total_episodes),
+            ("frames", sum(row[TO] - row[FROM] for row in rows), self.info.total_frames),
+        )
+        for what, count, total in counts:
+            if count < total:
+                raise UserError(
+                    f"{folder} lists {count} of the {total} {what} that meta/info.json counts: {REMEDY}, or correct "
+                    f"total_{what} there if the others were left out on purpose"
+                )
+        if not rows:
+            raise UserError(f"{self.folder} has no episodes: record some first")
+        return rows
+
+    def _column(self, part: Part, key: str, kind: tables.Kind) -> tables.Column:
+        """Return the rows of a part in a column that is too large for memory."""
+        return tables.read(part.files, {key: kind}, [(OWNER, "=", part.episode)])[key][part.steps]
 
     def _is_video(self, key: str) -> bool:
         return self.info.features[key].dtype == "video"
 
     def _decoded(self, part: Part, key: str, every: int) -> Iterator[Array]:
-        size, count = self.info.features[key].image_size, part.steps.stop - part.steps.start
+        size = self.info.features[key].image_size
         if self._is_video(key):
-            start = self._begin(part, key) + part.steps.start / self.info.fps
-            yield from decode(self._video(part, key), start, count, layout.fraction(self.info.fps), size, every)
+            start, fps = self._begin(part, key) + part.steps.start / self.info.fps, layout.fraction(self.info.fps)
+            yield from decode(self._video(part, key), start, len(part), fps, size, every)
             return
-        column = self.column(part, key, tables.pictures)
-        for step in range(0, count, every):
+        column = self._column(part, key, PICTURES)
+        for step in range(0, len(part), every):
             try:
-                yield decode_image(self._content(column[step].as_py() or {}), PICTURES, (*size, 3))
-            except ValueError as error:
+                yield decode_file(self._content(column[step].as_py() or {}), size)
+            except UserError as error:
                 step += part.steps.start
                 raise UserError(f"{self.folder}: {key} of episode {part.episode}, step {step}: {error}") from error
 
@@ -186,39 +260,6 @@ class LeRobotDataset:
         chunk, file = (part.place[f"videos/{key}/{name}_index"] for name in ("chunk", "file"))
         return self.folder / layout.VIDEOS.format(video_key=key, chunk_index=chunk, file_index=file)
 
-    def _read_info(self) -> layout.Info:
-        path = self.folder / "meta/info.json"
-        if not path.exists():
-            raise UserError(f"there is no LeRobot dataset in {self.folder} (no meta/info.json)")
-        try:
-            version = str(read_json(path, dict[str, Any]).get("codebase_version"))
-        except ValueError as error:
-            raise UserError(f"{error}: {REMEDY}") from error
-        if version == layout.VERSION:
-            return read_json(path, layout.Info)
-        known, found = (re.fullmatch(r"v(\d{1,4})\.(\d{1,4})", text) for text in (layout.VERSION, version))
-        if found and known and [*map(int, found.groups())] > [*map(int, known.groups())]:
-            raise UserError(
-                f"{path} has version {version}, newer than {layout.VERSION}, which is read here: look for a newer vla"
-            )
-        what = f"has version {version}: convert" if found else f"has no version, but {version[:20]}: write or convert"
-        raise UserError(f"{path} {what} the dataset to {layout.VERSION} with lerobot")
-
-    def _require_unchanged(self) -> None:
-        """Compare the files with their checksums, if the dataset has any."""
-        path = self.folder / layout.CHECKSUMS
-        if not path.exists():
-            return
-        try:
-            expected, found = read_json(path, layout.Checksums), layout.checksums(self.folder)
-        except ValueError as error:
-            raise UserError(f"{error}: {REMEDY}") from error
-        if changed := [name for name in expected if expected[name] != found.get(name)]:
-            raise UserError(
-                f"{self.folder} has changed since it was exported, in {', '.join(changed)[:200]}: {REMEDY}, or delete "
-                f"{layout.CHECKSUMS} if this was intended"
-            )
-
     def _require_videos(self, keys: Sequence[str]) -> None:
         """Require the videos of all episodes to be there, with the size, the rate and the images that these need."""
         frames: dict[tuple[Path, str], int] = {}
@@ -233,7 +274,75 @@ class LeRobotDataset:
         for (path, key), count in frames.items():
             require_video(path, self.info.features[key].image_size, layout.fraction(self.info.fps), count)
 
+    def _require_even(self, number: int, times: Array) -> None:
+        """Require the times of an episode, those since its first step, to follow the rate, without gaps."""
+        fps, steps = self.info.fps, np.arange(len(times))
+        off = np.abs(times - steps / fps) > (0.5 + layout.RATE_TOLERANCE * steps) / fps
+        off |= np.abs(np.diff(times, prepend=-1 / fps) - 1 / fps) > 0.5 / fps  # a step that was left out
+        if off.any():
+            step = int(np.argmax(off))
+            raise UserError(
+                f"{self.folder}: step {step} of episode {number} comes {times[step]:.4g} s after its first one, but at "
+                f"{fps:g} Hz, the rate in meta/info.json, it is {step / fps:.4g} s: correct fps there, or record all "
+                "episodes at one rate without gaps"
+            )
 
-def camera_of(key: str) -> str:
-    """Return the camera of a feature of images: its name without `observation.` and `images.`."""
-    return key.removeprefix("observation.").removeprefix("images.")
+    def _require_finite(self, name: str, values: Array, owner: Array) -> None:
+        """Require the rows (N, D) of a feature to be finite; `owner` (N,) are their episodes."""
+        if len(wrong := np.argwhere(~np.isfinite(values))):
+            row, at = wrong[0]
+            step, others = (owner[:row] == owner[row]).sum(), len(set(wrong[:, 0])) - 1
+            more = f", as in {others} other steps" if others else ""
+            raise UserError(
+                f"{self.folder}: {name} is {values[row, at]} at index {at} in episode {owner[row]}, step {step}{more}: "
+                "correct the numbers, or delete the episodes with lerobot-edit-dataset"
+            )
+
+
+def _read_info(folder: Path) -> layout.Info:
+    path = folder / "meta/info.json"
+    if not path.exists():
+        raise UserError(f"there is no LeRobot dataset in {folder} (no meta/info.json)")
+    try:
+        version = str(read_json(path, dict[str, Any]).get("codebase_version"))
+    except UserError as error:
+        raise UserError(f"{error}: {REMEDY}") from error
+    if version == layout.VERSION:
+        return read_json(path, layout.Info)
+    match = re.fullmatch(r"v(\d{1,4})\.(\d{1,4})", version)
+    if match and int(match[1]) >= 3:
+        raise UserError(
+            f"{path} has version {version}, newer than {layout.VERSION}, which is read here: look for a newer vla"
+        )
+    has = f"has version {version}: convert" if match else f"has no version, but {version[:20]}: write or convert"
+    raise UserError(f"{path} {has} the dataset to {layout.VERSION} with lerobot")
+
+
+def _read_instructions(path: Path) -> dict[int, str]:
+    """Return task index → instruction; the name of the column of instructions depends on the writer."""
+    schema = tables.schema_of(path)
+    texts = [field.name for field in schema if tables.is_text(field.type)]
+    known = [name for name in (UNNAMED, "task") if name in texts] or (texts if len(texts) == 1 else [])
+    if not known:
+        raise UserError(f"{path} has the columns {', '.join(schema.names)[:200]}, none of them task with texts: {MEND}")
+    table = tables.read([path], {TASK: COUNTS, known[0]: tables.TEXTS})
+    tasks = dict(zip(table[TASK].to_pylist(), table[known[0]].to_pylist(), strict=True))
+    if longer := [index for index, text in tasks.items() if len(text) > LONGEST_INSTRUCTION]:
+        raise UserError(f"{path} has tasks of more than {LONGEST_INSTRUCTION} characters: {listed(longer)}")
+    return tasks
+
+
+def _require_unchanged(folder: Path) -> None:
+    """Compare the files with their checksums, if the dataset has any."""
+    path = folder / layout.CHECKSUMS
+    if not path.exists():
+        return
+    try:
+        expected, found = read_json(path, layout.Checksums), layout.checksums(folder)
+    except UserError as error:
+        raise UserError(f"{error}: {REMEDY}") from error
+    if changed := [name for name in expected if expected[name] != found.get(name)]:
+        raise UserError(
+            f"{folder} has changed since it was exported, in {', '.join(changed)[:200]}: {REMEDY}, or delete "
+            f"{layout.CHECKSUMS} if this was intended"
+        )

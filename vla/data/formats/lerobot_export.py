@@ -9,7 +9,7 @@ import logging
 import os
 import shutil
 from collections import deque
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
@@ -21,10 +21,12 @@ from annotated_types import Ge, Le
 
 from vla.data.episodes import EpisodeStore
 from vla.data.formats import lerobot_layout as layout
-from vla.data.formats.files import map_episodes, provenance, require_empty, staging_folder, write_json
-from vla.data.formats.lerobot_statistics import image_moments, moments
-from vla.data.formats.video import encode
+from vla.data.formats.files import map_episodes, provenance, staging_folder
+from vla.data.formats.lerobot_images import encode
+from vla.data.formats.lerobot_tables import write_rows, write_tasks
 from vla.io.documents import read_json
+from vla.io.errors import UserError
+from vla.io.files import write_json
 from vla.io.types import Text
 from vla.parallel.pool import THIS_PROCESS, Cluster
 from vla.spec import Array
@@ -34,9 +36,11 @@ log = logging.getLogger(__name__)
 # Compromise: readers keep every file open, and find frames by 32-bit seconds, which are inexact in long files.
 EPISODES_PER_VIDEO = 50
 
-MAX_BYTES = 1 << 30  # [bytes] of `meta/vla.json`, which contains the draws of every episode
+MAX_SOURCE_BYTES = 1 << 30  # of `meta/vla.json`, which contains the draws of every episode
+QUANTILES = {"q01": 0.01, "q10": 0.10, "q50": 0.50, "q90": 0.90, "q99": 0.99}
 
 Columns = dict[str, Array]
+Statistics = dict[str, Any]
 
 
 class LeRobotExporter:
@@ -62,86 +66,76 @@ class LeRobotExporter:
             UserError: the folder has other content, or the store is damaged or empty.
         """
         store.require_episodes()
-        source = self._source(store)
+        episodes = [provenance(entry) for entry in store.episodes]
+        source = {"spec": store.spec.to_dict(), "crf": self._crf, "depth": self._depth, "episodes": episodes}
         with staging_folder(self._folder) as place:
             if _holds(self._folder, source):
                 return self._folder
-            require_empty(self._folder)
+            if self._folder.exists() and (not self._folder.is_dir() or any(self._folder.iterdir())):
+                raise UserError(f"{self._folder} has content other than these episodes: choose another export.folder")
             if store.codec.images == "jpeg":
                 log.warning("%s holds JPEG, of which videos lose more: export=files loses nothing", store.folder)
             draft = place / "dataset"
             if not _holds(draft, source):
                 shutil.rmtree(draft, ignore_errors=True)
-                (draft / "meta").mkdir(parents=True)
                 write_json(draft / "meta/vla.json", source)
             self._write(draft, store, cluster)
             os.rename(draft, self._folder)
         return self._folder
 
-    def _source(self, store: EpisodeStore) -> dict[str, Any]:
-        episodes = [provenance(entry) for entry in store.episodes]
-        return {"spec": store.spec.to_dict(), "crf": self._crf, "depth": self._depth, "episodes": episodes}
-
     def _write(self, draft: Path, store: EpisodeStore, cluster: Cluster) -> None:
         files = range(-(-len(store.episodes) // EPISODES_PER_VIDEO))
         units = [(camera, file) for camera in store.spec.cameras for file in files]
-        counts: dict[str, list[Array]] = {camera: [] for camera in store.spec.cameras}
+        histograms: dict[str, list[Array]] = {camera: [] for camera in store.spec.cameras}
         work = partial(self._write_video, draft)
-        for (camera, _), found in zip(units, map_episodes(work, store, units, cluster), strict=True):
-            counts[camera] += found
-        columns, tasks = list(_columns(store)), list(_tasks(store))
-        episodes = [_episode(store, number, one, counts) for number, one in enumerate(columns)]
+        for (camera, _), counts in zip(units, map_episodes(work, store, units, cluster), strict=True):
+            histograms[camera] += counts
+        tasks = [*dict.fromkeys(entry.instruction for entry in store.episodes)]
+        columns = list(_columns(store, tasks))
+        episodes = [_episode(store, number, one, histograms) for number, one in enumerate(columns)]
         whole = {name: np.concatenate([one[name] for one in columns]) for name in columns[0]}
-        statistics = {name: moments(values) for name, values in whole.items()}
-        for camera, found in counts.items():
-            statistics[layout.image_key(camera)] = image_moments(np.sum(found, 0), len(whole["index"]))
-        layout.write_rows(_made(draft / layout.place(layout.DATA)), self._rows(store, columns))
+        statistics = {name: _moments(values) for name, values in whole.items()}
+        for camera, counts in histograms.items():
+            statistics[layout.IMAGES + camera] = _image_moments(np.sum(counts, 0), len(whole["index"]))
+        depths = {camera: store.rows(f"depth_{camera}") for camera in store.spec.depth if self._depth}
+        rows = (
+            numbers | {layout.DEPTH + camera: values[entry.span] for camera, values in depths.items()}
+            for entry, numbers in zip(store.episodes, columns, strict=True)
+        )
+        write_rows(_made(draft / layout.place(layout.DATA)), rows)
         table = pa.Table.from_pylist(episodes)
         pq.write_table(table, _made(draft / layout.place(layout.EPISODES)), write_page_checksum=True)
-        layout.write_tasks(draft / layout.TASKS, tasks)
+        write_tasks(draft / layout.TASKS, tasks)
         write_json(draft / "meta/stats.json", statistics)
         info = layout.info(store.spec, self._depth, len(episodes), len(whole["index"]), len(tasks))
         write_json(draft / "meta/info.json", info)
         write_json(draft / layout.CHECKSUMS, layout.checksums(draft))
 
-    def _rows(self, store: EpisodeStore, columns: Sequence[Columns]) -> Iterator[Columns]:
-        """Yield the columns of every episode, with depth if requested."""
-        depths = {camera: store.rows(f"depth_{camera}") for camera in store.spec.depth if self._depth}
-        for entry, numbers in zip(store.episodes, columns, strict=True):
-            yield numbers | {layout.depth_key(camera): values[entry.span] for camera, values in depths.items()}
-
     def _write_video(self, draft: Path, store: EpisodeStore, unit: tuple[str, int]) -> list[Array]:
         """Write one file of a camera unless it exists; returns histograms of colour values, (3, 256) per episode."""
         camera, file = unit
-        counts: list[Array] = []
+        histograms: list[Array] = []
 
         def clips() -> Iterator[Array]:
             for entry in store.episodes[file * EPISODES_PER_VIDEO :][:EPISODES_PER_VIDEO]:
                 images = store.read(entry)[f"rgb_{camera}"]
-                counts.append(
-                    np.stack([np.bincount(images[..., colour].ravel(), minlength=256) for colour in range(3)])
-                )
+                colours = (images[..., colour].ravel() for colour in range(3))
+                histograms.append(np.stack([np.bincount(values, minlength=256) for values in colours]))
                 yield images
 
-        path = _made(draft / layout.place(layout.VIDEOS, file, video_key=layout.image_key(camera)))
+        path = _made(draft / layout.place(layout.VIDEOS, file, video_key=layout.IMAGES + camera))
         if path.exists():
             deque(clips(), 0)  # the histograms are needed in any case
         else:
-            encode(
-                path.with_suffix(".draft"),
-                clips(),
-                store.spec.image_size,
-                layout.fraction(store.spec.control_hz),
-                self._crf,
-            )
-            os.replace(path.with_suffix(".draft"), path)
-        return counts
+            unfinished, fps = path.with_suffix(".draft"), layout.fraction(store.spec.control_hz)
+            encode(unfinished, clips(), store.spec.image_size, fps, self._crf)
+            os.replace(unfinished, path)
+        return histograms
 
 
 def _holds(folder: Path, source: Mapping[str, Any]) -> bool:
-    path = folder / "meta/vla.json"
     try:
-        return read_json(path, dict[str, Any], MAX_BYTES) == source
+        return read_json(folder / "meta/vla.json", dict[str, Any], MAX_SOURCE_BYTES) == source
     except (OSError, ValueError):  # missing or incomplete
         return False
 
@@ -151,36 +145,32 @@ def _made(path: Path) -> Path:
     return path
 
 
-def _tasks(store: EpisodeStore) -> dict[str, int]:
-    """Return instruction → index, in the order of first occurrence."""
-    return {task: index for index, task in enumerate(dict.fromkeys(entry.instruction for entry in store.episodes))}
-
-
-def _columns(store: EpisodeStore) -> Iterator[Columns]:
+def _columns(store: EpisodeStore, tasks: list[str]) -> Iterator[Columns]:
     """Yield the columns of the `data/` table of every episode."""
     fields = {name: store.rows(name) for name in ("state", "action", "executed")}
-    tasks, index = _tasks(store), 0
+    index = 0
     for number, entry in enumerate(store.episodes):
-        rows = {name: values[entry.span] for name, values in fields.items()}
+        rows = {name: np.array(values[entry.span]) for name, values in fields.items()}
         frames = np.arange(entry.steps)
-        rates = {layout.RATES: np.array(rows["state"][:, store.spec.rates])} if store.spec.rates else {}
         yield {
-            layout.STATE: np.array(rows["state"][:, store.spec.pose]),
-            layout.ACTION: np.array(rows["action"]),
-            layout.EXECUTED: np.array(rows["executed"]),
-            **rates,
+            layout.STATE: rows["state"][:, store.spec.pose],
+            layout.ACTION: rows["action"],
+            layout.EXECUTED: rows["executed"],
+            **({layout.RATES: rows["state"][:, store.spec.rates]} if store.spec.rates else {}),
             "timestamp": (frames / store.spec.control_hz).astype(np.float32),
             "frame_index": frames,
             "episode_index": np.full_like(frames, number),
             "index": frames + index,
-            "task_index": np.full_like(frames, tasks[entry.instruction]),
+            "task_index": np.full_like(frames, tasks.index(entry.instruction)),
         }
         index += entry.steps
 
 
-def _episode(store: EpisodeStore, number: int, columns: Columns, counts: Mapping[str, list[Array]]) -> dict[str, Any]:
+def _episode(
+    store: EpisodeStore, number: int, columns: Columns, histograms: Mapping[str, list[Array]]
+) -> dict[str, Any]:
     """Return the row of an episode in `meta/episodes/`."""
-    entries = store.episodes
+    entries, fps = store.episodes, layout.fraction(store.spec.control_hz)
     file, place = divmod(number, EPISODES_PER_VIDEO)
     before = sum(entry.steps for entry in entries[number - place : number])  # in the same video
     begin, steps = int(columns["index"][0]), entries[number].steps
@@ -196,11 +186,33 @@ def _episode(store: EpisodeStore, number: int, columns: Columns, counts: Mapping
         "meta/episodes/file_index": 0,
     }
     chunk, file = divmod(file, layout.FILES_PER_CHUNK)
-    statistics = {name: moments(values) for name, values in columns.items()}
-    for camera, found in counts.items():
-        video = f"videos/{layout.image_key(camera)}"
+    statistics = {name: _moments(values) for name, values in columns.items()}
+    for camera, counts in histograms.items():
+        video = f"videos/{layout.IMAGES}{camera}"
         row |= {f"{video}/chunk_index": chunk, f"{video}/file_index": file}
-        row |= {f"{video}/from_timestamp": float(before / layout.fraction(store.spec.control_hz))}
-        row |= {f"{video}/to_timestamp": float((before + steps) / layout.fraction(store.spec.control_hz))}
-        statistics[layout.image_key(camera)] = image_moments(found[number], steps)
+        row |= {f"{video}/from_timestamp": float(before / fps), f"{video}/to_timestamp": float((before + steps) / fps)}
+        statistics[layout.IMAGES + camera] = _image_moments(counts[number], steps)
     return row | {f"stats/{key}/{name}": value for key, of in statistics.items() for name, value in of.items()}
+
+
+def _moments(values: Array) -> Statistics:
+    """Compute moments and quantiles of (N,) or (N, D) values over the steps, one number per component."""
+    values = values.reshape(len(values), -1).astype(np.float64)
+    found = {"min": values.min(0), "max": values.max(0), "mean": values.mean(0), "std": values.std(0)}
+    found |= zip(QUANTILES, np.quantile(values, [*QUANTILES.values()], axis=0), strict=True)
+    return {name: value.tolist() for name, value in found.items()} | {"count": [len(values)]}
+
+
+def _image_moments(counts: Array, images: int) -> Statistics:
+    """Compute the same of images in the range 0…1 from their histograms, `counts` (3, 256); shape (3, 1, 1)."""
+    levels, total = np.arange(256) / 255, counts.sum(1)
+    mean = counts @ levels / total
+    rising = counts.cumsum(1) / total[:, None]
+    found = {
+        "min": levels[(counts > 0).argmax(1)],
+        "max": levels[255 - (counts[:, ::-1] > 0).argmax(1)],
+        "mean": mean,
+        "std": np.sqrt(np.maximum(counts @ levels**2 / total - mean**2, 0)),
+        **{name: levels[(rising >= share).argmax(1)] for name, share in QUANTILES.items()},
+    }
+    return {name: value.reshape(3, 1, 1).tolist() for name, value in found.items()} | {"count": [images]}

@@ -8,28 +8,23 @@
     videos/observation.images.CAMERA/chunk-000/file-000.mp4     several episodes in sequence
     meta/checksums.json                       file → CRC-32; only `vla` writes it
 
-Shapes: N steps, D components, H by W pixels.
+Shapes: D components, H by W pixels.
 """
 
 from __future__ import annotations
 
-import json
 import zlib
-from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
 from typing import Annotated, Any
 
-import numpy as np
-import pyarrow as pa
-import pyarrow.parquet as pq
 from annotated_types import Ge, MaxLen
 
-from vla.data.formats.video import PIXELS
+from vla.data.formats.lerobot_images import PIXELS
 from vla.io.documents import LENIENT
 from vla.io.types import Count, Natural, Positive
-from vla.spec import Array, Spec
+from vla.spec import Spec
 
 VERSION = "v3.0"
 FILE = "chunk-{chunk_index:03d}/file-{file_index:03d}"
@@ -45,6 +40,7 @@ RATE_TOLERANCE = 0.01  # relative; cameras of 29.97 Hz are said to have 30
 # LeRobot's policies use every feature "observation…" as an input, every "action…" as an output, and every image as a
 # colour image: other features have other names, and depth is an array.
 STATE, ACTION, EXECUTED, RATES = "observation.state", "action", "executed", "velocities"
+IMAGES, DEPTH = "observation.images.", "depth."  # and the name of a camera
 COUNTERS = {"timestamp": "float32", "frame_index": "int64", "episode_index": "int64"}
 COUNTERS |= {"index": "int64", "task_index": "int64"}
 
@@ -62,26 +58,30 @@ class Feature:
     video_info: Any = None  # the same in older datasets
 
     @property
-    def components(self) -> list[str] | None:
+    def components(self) -> list[str]:
         """Names from a list, lists within a dictionary, one after the other, or a dictionary of indices.
 
-        None if unknown. Where several lists share a name, names begin with the key of their list.
+        Empty if unknown. Where several lists share a name, names begin with the key of their list.
         """
         names = self.names
         if isinstance(names, dict) and all(isinstance(index, int) for index in names.values()):
             names = sorted(names, key=names.__getitem__)
         elif isinstance(names, dict) and all(isinstance(part, list) for part in names.values()):
-            parts = [(key, name) for key, part in names.items() for name in part]
-            apart = len({str(name) for _, name in parts}) == len(parts)
-            names = [name if apart or not isinstance(name, str) else f"{key}_{name}" for key, name in parts]
+            parts = [(key, str(name)) for key, part in names.items() for name in part]
+            apart = len({name for _, name in parts}) == len(parts)
+            names = [name if apart else f"{key}_{name}" for key, name in parts]
         known = isinstance(names, list) and all(isinstance(name, str) for name in names)
-        return names if names and known and [len(names)] == list(self.shape) else None
+        return names if known and [len(names)] == list(self.shape) else []
+
+    def is_like(self, other: dict[str, Any]) -> bool:
+        """Return whether this is the feature that an export describes so, see `features`."""
+        return {"dtype": self.dtype, "shape": [*self.shape], "names": self.names} == other
 
     @property
     def image_size(self) -> tuple[int, int]:
         """Height and width [px], for channels first or last."""
-        first = len(self.shape) == 3 and self.shape[0] in CHANNELS and self.shape[-1] not in CHANNELS
-        height, width = (*self.shape[1:], 1, 1)[:2] if first else (*self.shape, 1, 1)[:2]
+        channels_first = len(self.shape) == 3 and self.shape[0] in CHANNELS and self.shape[-1] not in CHANNELS
+        height, width, *_ = (*self.shape[1:], 1, 1) if channels_first else (*self.shape, 1, 1)
         return height, width
 
     @property
@@ -108,26 +108,14 @@ Checksums = dict[str, Annotated[int, Ge(0)]]  # path in the dataset → CRC-32
 
 def checksums(folder: Path) -> Checksums:
     """Compute the checksums of all files of a dataset but `CHECKSUMS`."""
-    files = sorted(path for path in folder.rglob("*") if path.is_file() and path != folder / CHECKSUMS)
-    return {path.relative_to(folder).as_posix(): _crc(path) for path in files}
-
-
-def _crc(path: Path) -> int:
-    crc = 0
-    with path.open("rb") as file:
-        while block := file.read(1 << 20):
-            crc = zlib.crc32(block, crc)
-    return crc
-
-
-def image_key(camera: str) -> str:
-    """Return the feature name of the colour images of a camera."""
-    return f"observation.images.{camera}"
-
-
-def depth_key(camera: str) -> str:
-    """Return the feature name of the depth of a camera."""
-    return f"depth.{camera}"
+    found: Checksums = {}
+    for path in sorted(path for path in folder.rglob("*") if path.is_file() and path != folder / CHECKSUMS):
+        crc = 0
+        with path.open("rb") as file:
+            while block := file.read(1 << 20):
+                crc = zlib.crc32(block, crc)
+        found[path.relative_to(folder).as_posix()] = crc
+    return found
 
 
 def place(pattern: str, file: int = 0, **names: str) -> str:
@@ -146,9 +134,6 @@ def features(spec: Spec, depth: bool) -> dict[str, dict[str, Any]]:
     names = {STATE: [spec.state[index] for index in spec.pose], ACTION: [*spec.action], EXECUTED: [*spec.action]}
     if spec.rates:
         names[RATES] = [spec.state[index] for index in spec.rates]
-    found: dict[str, dict[str, Any]] = {
-        name: {"dtype": "float32", "shape": [len(of)], "names": of} for name, of in names.items()
-    }
     height, width = spec.image_size
     video = {
         "video.height": height,
@@ -160,12 +145,18 @@ def features(spec: Spec, depth: bool) -> dict[str, dict[str, Any]]:
         "video.fps": _fps(spec),
         "has_audio": False,
     }
-    image = {"dtype": "video", "shape": [height, width, 3], "names": ["height", "width", "channels"], "info": video}
-    found |= {image_key(camera): image for camera in spec.cameras}
-    if depth:
-        pixels = {"dtype": "uint16", "shape": [height, width], "names": ["height", "width"]}
-        found |= {depth_key(camera): pixels for camera in spec.depth}
-    return found | {name: {"dtype": dtype, "shape": [1], "names": None} for name, dtype in COUNTERS.items()}
+    image = _feature("video", [height, width, 3], ["height", "width", "channels"]) | {"info": video}
+    pixels = _feature("uint16", [height, width], ["height", "width"])
+    return {
+        **{name: _feature("float32", [len(components)], components) for name, components in names.items()},
+        **{IMAGES + camera: image for camera in spec.cameras},
+        **{DEPTH + camera: pixels for camera in spec.depth if depth},
+        **{name: _feature(dtype, [1], None) for name, dtype in COUNTERS.items()},
+    }
+
+
+def _feature(dtype: str, shape: list[int], names: list[str] | None) -> dict[str, Any]:
+    return {"dtype": dtype, "shape": shape, "names": names}
 
 
 def info(spec: Spec, depth: bool, episodes: int, frames: int, tasks: int) -> dict[str, Any]:
@@ -185,66 +176,6 @@ def info(spec: Spec, depth: bool, episodes: int, frames: int, tasks: int) -> dic
         "video_path": VIDEOS,
         "features": features(spec, depth),
     }
-
-
-def write_tasks(path: Path, tasks: Sequence[str]) -> None:
-    """Write the table of tasks with pandas metadata that make the task its index, as LeRobot expects."""
-    table = pa.table({"task_index": pa.array(range(len(tasks)), pa.int64()), "task": pa.array(tasks, pa.string())})
-    names = {"task_index": ("int64", "int64"), "task": ("unicode", "object")}
-    columns = [
-        {"name": name, "field_name": name, "pandas_type": kind, "numpy_type": numpy, "metadata": None}
-        for name, (kind, numpy) in names.items()
-    ]
-    index = {"name": None, "field_name": None, "pandas_type": "unicode", "numpy_type": "object"}
-    pandas = {
-        "index_columns": ["task"],
-        "column_indexes": [index | {"metadata": {"encoding": "UTF-8"}}],
-        "columns": columns,
-        "creator": {"library": "pyarrow", "version": pa.__version__},
-        "pandas_version": "2.2.0",
-    }
-    pq.write_table(table.replace_schema_metadata({"pandas": json.dumps(pandas)}), path, write_page_checksum=True)
-
-
-def write_rows(path: Path, episodes: Iterable[dict[str, Array]]) -> None:
-    """Write columns, each (N,), (N, D) or (N, H, W), with a row group per episode.
-
-    The schema metadata has the types that the package `datasets` needs.
-    """
-    writer: pq.ParquetWriter | None = None
-    metadata: dict[str, str] = {}
-    try:
-        for columns in episodes:
-            table = pa.table({name: _arrow(values) for name, values in columns.items()})
-            if writer is None:
-                kinds = {name: _kind(values) for name, values in columns.items()}
-                metadata = {"huggingface": json.dumps({"info": {"features": kinds}})}
-                schema = table.schema.with_metadata(metadata)
-                writer = pq.ParquetWriter(path, schema, compression="zstd", write_page_checksum=True)
-            writer.write_table(table.replace_schema_metadata(metadata))
-    finally:
-        if writer is not None:
-            writer.close()
-
-
-def _kind(values: Array) -> dict[str, Any]:
-    value = {"dtype": values.dtype.name, "_type": "Value"}
-    if values.ndim == 1:
-        return value
-    if values.ndim == 2:
-        return {"feature": value, "length": values.shape[1], "_type": "List"}
-    return {"dtype": values.dtype.name, "shape": values.shape[1:], "_type": "Array2D"}
-
-
-def _arrow(values: Array) -> pa.Array:
-    flat = pa.array(values.ravel())
-    if values.ndim == 1:
-        return flat
-    if values.ndim == 2:
-        return pa.FixedSizeListArray.from_arrays(flat, values.shape[1])
-    for size in (values.shape[2], values.shape[1]):
-        flat = pa.ListArray.from_arrays(pa.array(np.arange(0, len(flat) + 1, size, dtype=np.int32)), flat)
-    return flat
 
 
 def _fps(spec: Spec) -> float | int:

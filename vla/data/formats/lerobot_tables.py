@@ -1,8 +1,12 @@
-"""Reader of untrusted tables of a LeRobot dataset: bounded in rows, and of the expected types."""
+"""Tables of a LeRobot dataset: untrusted ones are bounded in rows and of the expected types, and new ones.
+
+Shapes: N steps, D components, H by W pixels.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+import json
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,54 +21,50 @@ from vla.spec import Array
 
 REMEDY = "copy the dataset again from where it is whole"  # where a copy may be damaged or incomplete
 MEND = "correct the dataset, or write it again"  # where a copy cannot help
-MOST_ROWS = 10_000_000  # of a file: 280 hours at 10 Hz
-MOST_BYTES = 2**33  # to unpack at once
-LONGEST = 1e6  # video [s]
+MAX_ROWS = 10_000_000  # of a file: 280 hours at 10 Hz
+MAX_SECONDS = 1e6  # video [s]
 
-Kind = Callable[[pa.ChunkedArray], bool]  # predicate of a column; its docstring is the expected type
-
-
-def counts(column: pa.ChunkedArray) -> bool:
-    """integers from 0 on"""
-    return pa.types.is_integer(column.type) and _within(column, 0, 2**53)
+Column = pa.ChunkedArray
+Kind = tuple[str, Callable[[Column], bool]]  # what a column must hold, and whether it does
 
 
-def times(column: pa.ChunkedArray) -> bool:
-    """seconds"""
-    return pa.types.is_floating(column.type) and _within(column, 0, LONGEST)
+def _within_lists(kind: pa.DataType) -> tuple[int, pa.DataType]:
+    """Return how deep lists are nested, and the type of what they hold."""
+    depth = 0
+    while pa.types.is_list(kind) or pa.types.is_fixed_size_list(kind) or pa.types.is_large_list(kind):
+        depth, kind = depth + 1, kind.value_type
+    return depth, kind
 
 
-def texts(column: pa.ChunkedArray) -> bool:
-    """text"""
-    return (pa.types.is_string(column.type) or pa.types.is_large_string(column.type)) and not column.null_count
+def is_text(kind: pa.DataType) -> bool:
+    """Return whether a column of this type holds texts."""
+    return pa.types.is_string(kind) or pa.types.is_large_string(kind)
 
 
-def numbers(column: pa.ChunkedArray) -> bool:
-    """lists of numbers"""
-    of = column.type.value_type if _is_list(column.type) else column.type
-    return pa.types.is_floating(of) or pa.types.is_integer(of)
+def _are_numbers(column: Column) -> bool:
+    depth, kind = _within_lists(column.type)
+    return depth <= 1 and (pa.types.is_floating(kind) or pa.types.is_integer(kind))
 
 
-def pixels(column: pa.ChunkedArray) -> bool:
-    """lists of lists of unsigned 16-bit integers"""
-    nested = _is_list(column.type) and _is_list(column.type.value_type)
-    return nested and bool(pa.types.is_uint16(column.type.value_type.value_type))
+def _are_files(column: Column) -> bool:
+    return pa.types.is_struct(column.type) and column.type.get_field_index("bytes") >= 0
 
 
-def pictures(column: pa.ChunkedArray) -> bool:
-    """images, as the bytes of a file"""
-    if not pa.types.is_struct(column.type) or column.type.get_field_index("bytes") < 0:
-        return False
-    content = column.type.field("bytes").type
-    return pa.types.is_binary(content) or pa.types.is_large_binary(content)
+def _within(column: Column, high: float) -> bool:
+    values = column.to_numpy()  # nulls become NaN
+    return not column.null_count and bool(((values >= 0) & (values <= high)).all())
+
+
+COUNTS: Kind = "integers from 0 on", lambda column: pa.types.is_integer(column.type) and _within(column, 2**53)
+TIMES: Kind = "seconds", lambda column: pa.types.is_floating(column.type) and _within(column, MAX_SECONDS)
+TEXTS: Kind = "text", lambda column: is_text(column.type) and not column.null_count
+NUMBERS: Kind = "lists of numbers", _are_numbers
+DEPTHS: Kind = "lists of lists of 16-bit integers", lambda column: _within_lists(column.type) == (2, pa.uint16())
+PICTURES: Kind = "images, as the bytes of a file", _are_files
 
 
 def files(folder: Path) -> list[Path]:
-    """Return the files of a table, in their order.
-
-    Raises:
-        UserError: there are none.
-    """
+    """Return the files of a table, in their order; a UserError if there are none."""
     if found := sorted(folder.glob("chunk-*/file-*.parquet")):
         return found
     raise UserError(f"{folder} holds no tables: {REMEDY}")
@@ -74,98 +74,117 @@ def read(paths: Sequence[Path], columns: Mapping[str, Kind], only: Any = None) -
     """Read the named columns of Parquet files, concatenated; `only` filters rows.
 
     Raises:
-        UserError: a file is damaged, too large, or lacks a column of the expected type.
+        UserError: a file is damaged, has too many rows, or lacks a column of the expected type.
     """
-    found = [_read(path, columns, only) for path in paths]
+    tables = list[pa.Table]()
+    for path in paths:
+        require(path, columns)
+        try:
+            table = pq.read_table(path, columns=[*columns], filters=only, page_checksum_verification=True)
+            table.validate(full=True)
+        except (pa.ArrowException, OSError) as error:
+            raise UserError(f"{path} cannot be read ({str(error)[:200]}): {REMEDY}") from error
+        _require_kinds(path, table, columns)
+        tables.append(table)
     try:
-        return pa.concat_tables(found, promote_options="permissive")
+        return pa.concat_tables(tables, promote_options="permissive")
     except pa.ArrowException as error:
         raise UserError(f"{paths[0]} and others beside it differ ({str(error)[:200]}): {MEND}") from error
 
 
-def schema_of(path: Path) -> pa.Schema:
-    """Return the columns of a Parquet file.
-
-    Raises:
-        UserError: it is damaged, no ordinary file, or has too many rows.
-    """
-    require_file(path)
-    try:
-        with pq.ParquetFile(path) as file:
-            rows, schema = file.metadata.num_rows, file.schema_arrow
-    except (pa.ArrowException, OSError, UnicodeDecodeError) as error:
-        raise UserError(f"{path} cannot be read ({str(error)[:200]}): {REMEDY}") from error
-    if rows > MOST_ROWS:
-        raise UserError(f"{path} has {rows} rows, more than the {MOST_ROWS} that such a file can have")
-    return schema
-
-
 def require(path: Path, columns: Mapping[str, Kind]) -> None:
-    """Require a Parquet file to have columns of the expected types; their values are not read.
-
-    Raises:
-        UserError: it has not, or cannot be read.
-    """
+    """Raise a UserError unless a file has columns of the expected types; their values are not read."""
     empty = schema_of(path).empty_table()
     if missing := [name for name in columns if name not in empty.column_names]:
         raise UserError(f"{path} lacks the columns {', '.join(missing)}: {MEND}")
     _require_kinds(path, empty, columns)
 
 
-def _require_kinds(path: Path, table: pa.Table, columns: Mapping[str, Kind]) -> None:
-    for name, is_kind in columns.items():
-        if not is_kind(table[name]):
-            raise UserError(f"{path}: {name} does not hold {is_kind.__doc__}: {MEND}")
-
-
-def _read(path: Path, columns: Mapping[str, Kind], only: Any) -> pa.Table:
-    require(path, columns)
-    if (unpacked := _unpacked_size(path, columns, only is not None)) > MOST_BYTES:
-        raise UserError(f"{path} unpacks to {unpacked / 1e9:.0f} GB, more than the {MOST_BYTES / 1e9:.0f} GB it may")
+def schema_of(path: Path) -> pa.Schema:
+    """Return the columns of a Parquet file; a UserError if it is damaged, no ordinary file, or has too many rows."""
+    require_file(path)
     try:
-        table = pq.read_table(path, columns=[*columns], filters=only, page_checksum_verification=True)
-        table.validate(full=True)
-    except (pa.ArrowException, OSError) as error:
+        with pq.ParquetFile(path) as file:
+            rows, schema = file.metadata.num_rows, file.schema_arrow
+    except (pa.ArrowException, OSError, UnicodeDecodeError) as error:
         raise UserError(f"{path} cannot be read ({str(error)[:200]}): {REMEDY}") from error
-    _require_kinds(path, table, columns)
-    return table
+    if rows > MAX_ROWS:
+        raise UserError(f"{path} has {rows} rows, more than the {MAX_ROWS} that such a file can have")
+    return schema
 
 
-def _unpacked_size(path: Path, columns: Collection[str], filtered: bool) -> int:
-    """Estimate the decoded size of columns [bytes], summed over row groups or, if filtered, of the largest one.
-
-    The estimate uses the metadata of the file; dictionary-encoded texts can take more memory.
-    """
-    metadata, sizes = pq.read_metadata(path), []
-    for group in (metadata.row_group(number) for number in range(metadata.num_row_groups)):
-        of = [group.column(number) for number in range(group.num_columns)]
-        chosen = [each for each in of if any(f"{each.path_in_schema}.".startswith(f"{name}.") for name in columns)]
-        sizes.append(sum(max(column.total_uncompressed_size, 8 * column.num_values) for column in chosen))
-    return (max if filtered else sum)([0, *sizes])
+def _require_kinds(path: Path, table: pa.Table, columns: Mapping[str, Kind]) -> None:
+    for name, (kind, holds) in columns.items():
+        if not holds(table[name]):
+            raise UserError(f"{path}: {name} does not hold {kind}: {MEND}")
 
 
-def matrix(column: pa.ChunkedArray, size: int, dtype: type[np.floating] = np.float32) -> Array | None:
-    """Return a column of `numbers` as (N, size); None if rows have another size. Missing numbers become NaN."""
-    if _is_list(column.type) and not lists_have(column, size):
-        return None
-    flat = pc.list_flatten(column) if _is_list(column.type) else column
-    values = np.asarray(flat.combine_chunks(), dtype)
-    return values.reshape(-1, size) if len(values) == len(column) * size else None
-
-
-def lists_have(column: pa.ChunkedArray, *sizes: int) -> bool:
-    """Return whether all lists of a column have the first of the sizes, the lists in these the next, and so on."""
-    for size in sizes:
+def array(column: Column, *shape: int, dtype: type[np.generic] = np.float32) -> Array | None:
+    """Return numbers, or nested lists of them, as (N, *shape), NaN if missing; None if rows have another shape."""
+    rows = len(column)
+    for size in shape[: _within_lists(column.type)[0]]:
         if not pc.all(pc.equal(pc.list_value_length(column), size)).as_py():
-            return False
+            return None
         column = pc.list_flatten(column)
-    return True
+    if column.null_count and not issubclass(dtype, np.floating):
+        return None
+    values = np.asarray(column.combine_chunks(), dtype)
+    return values.reshape(rows, *shape) if values.size == rows * np.prod(shape) else None
 
 
-def _is_list(kind: pa.DataType) -> bool:
-    return pa.types.is_list(kind) or pa.types.is_fixed_size_list(kind) or pa.types.is_large_list(kind)
+def write_tasks(path: Path, tasks: Sequence[str]) -> None:
+    """Write the table of tasks with pandas metadata that make the task its index, as LeRobot expects."""
+    table = pa.table({"task_index": pa.array(range(len(tasks)), pa.int64()), "task": pa.array(tasks, pa.string())})
+    kinds = {"task_index": ("int64", "int64"), "task": ("unicode", "object"), None: ("unicode", "object")}
+    *columns, index = (
+        {"name": name, "field_name": name, "pandas_type": kind, "numpy_type": numpy, "metadata": None}
+        for name, (kind, numpy) in kinds.items()
+    )
+    pandas = {
+        "index_columns": ["task"],
+        "column_indexes": [index | {"metadata": {"encoding": "UTF-8"}}],
+        "columns": columns,
+        "creator": {"library": "pyarrow", "version": pa.__version__},
+        "pandas_version": "2.2.0",
+    }
+    pq.write_table(table.replace_schema_metadata({"pandas": json.dumps(pandas)}), path, write_page_checksum=True)
 
 
-def _within(column: pa.ChunkedArray, low: float, high: float) -> bool:
-    values = column.to_numpy()  # nulls become NaN
-    return not column.null_count and bool(((values >= low) & (values <= high)).all())
+def write_rows(path: Path, episodes: Iterable[Mapping[str, Array]]) -> None:
+    """Write columns, each (N,), (N, D) or (N, H, W), with a row group per episode.
+
+    The schema metadata has the types that the package `datasets` needs.
+    """
+    writer: pq.ParquetWriter | None = None
+    try:
+        for columns in episodes:
+            features = {name: _feature(values) for name, values in columns.items()}
+            metadata = {"huggingface": json.dumps({"info": {"features": features}})}
+            table = pa.table({name: _arrow(values) for name, values in columns.items()})
+            table = table.replace_schema_metadata(metadata)
+            if writer is None:
+                writer = pq.ParquetWriter(path, table.schema, compression="zstd", write_page_checksum=True)
+            writer.write_table(table)
+    finally:
+        if writer is not None:
+            writer.close()
+
+
+def _feature(values: Array) -> dict[str, Any]:
+    """Return the type of a column for `datasets`."""
+    value = {"dtype": values.dtype.name, "_type": "Value"}
+    if values.ndim == 1:
+        return value
+    if values.ndim == 2:
+        return {"feature": value, "length": values.shape[1], "_type": "List"}
+    return {"dtype": values.dtype.name, "shape": values.shape[1:], "_type": "Array2D"}
+
+
+def _arrow(values: Array) -> pa.Array:
+    """Return a column with lists of fixed size of vectors, and lists of lists of images."""
+    flat = pa.array(values.ravel())
+    if values.ndim == 2:
+        return pa.FixedSizeListArray.from_arrays(flat, values.shape[1])
+    for size in reversed(values.shape[1:]):
+        flat = pa.ListArray.from_arrays(pa.array(np.arange(0, len(flat) + 1, size, dtype=np.int32)), flat)
+    return flat

@@ -1,0 +1,104 @@
+"""New episode stores from others, by repair, filtering and merging.
+
+Nothing is changed in place: a new store is written to a temporary folder and renamed when it is complete.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from rich.progress import track
+
+from vla.data.episode_filter import episode_filter
+from vla.data.episodes import DamageError, EpisodeStore
+from vla.data.header import Codec
+from vla.data.index import DAMAGED, LOST, Entry
+from vla.data.verification import entries_by_config, episode_of, without_rows
+from vla.io.errors import UserError
+
+Copies = Sequence[tuple[EpisodeStore, Entry]]  # of one seed and config
+Chosen = dict[str, dict[int, list[tuple[EpisodeStore, Entry]]]]  # config as JSON → seed → its copies
+
+
+def derive_store(
+    stores: Sequence[EpisodeStore], folder: Path, where: Mapping[str, Any] | None = None, repair: bool = False
+) -> list[int]:
+    """Write a new store of the episodes in others of the same spec that match `where`, atomically.
+
+    Seeds are in order, config by config. Of the same seed and config one undamaged episode is kept. If all seeds
+    between the first and the last of a single config exist, the new store equals a collected one, and can grow. With
+    `repair` the sources may be damaged, and an episode that is damaged in all of them becomes a failed seed. Returns
+    these seeds.
+
+    Raises:
+        UserError: the folder exists, specs differ, nothing matches, or an episode is damaged.
+    """
+    if folder.exists():
+        raise UserError(f"{folder} exists already and is left alone: choose another inspect.into")
+    for store in stores[1:]:
+        store.spec.require(stores[0].spec, f"the episode store {store.folder}", f"{stores[0].folder}")
+    chosen = _choose(stores, where or {})
+    if not any(entry.stored for seeds in chosen.values() for copies in seeds.values() for _, entry in copies):
+        fitting = f" that fit inspect.where={dict(where)}" if where else ""
+        raise UserError(f"{', '.join(str(store.folder) for store in stores)}: there are no episodes{fitting}")
+    draft = folder.with_name(f".{folder.name}.draft")
+    shutil.rmtree(draft, ignore_errors=True)  # left by a process that was killed
+    try:
+        codecs = {store.codec for store in stores}
+        codec = Codec("lossless") if len(codecs) > 1 else codecs.pop()  # nothing more is lost
+        new = EpisodeStore.create_or_open(draft, stores[0].spec, _config(chosen, stores, where), codec)
+        with new.writing():
+            seeds = [(seed, copies) for part in chosen.values() for seed, copies in sorted(part.items())]
+            damaged = [seed for seed, copies in track(seeds, "writing") if not _write(new, copies, repair)]
+        os.rename(draft, folder)
+    except BaseException as error:
+        shutil.rmtree(draft, ignore_errors=True)
+        if isinstance(error.__cause__, OSError):  # whose message, of a store that grows, does not apply here
+            reason = f"{folder} cannot be written ({error.__cause__.strerror}), nothing of it is kept"
+            raise UserError(f"{reason}: make room there, or choose another inspect.into") from error
+        raise
+    return damaged
+
+
+def _choose(stores: Sequence[EpisodeStore], where: Mapping[str, Any]) -> Chosen:
+    matches = episode_filter(where, [entry for store in stores for entry in store.tried])
+    chosen: Chosen = {}
+    for store in stores:
+        for config, entries in entries_by_config(store):
+            for entry in filter(matches, entries):
+                chosen.setdefault(json.dumps(config), {}).setdefault(entry.seed, []).append((store, entry))
+    return chosen
+
+
+def _config(chosen: Chosen, stores: Sequence[EpisodeStore], where: Mapping[str, Any] | None) -> dict[str, Any]:
+    """Return the config that the episodes were collected with, if one collection could have; else `Derived`."""
+    conditions = [condition for store in stores if store.derived for condition in store.config["where"]]
+    conditions += [dict(where)] if where else []
+    (config, seeds), *others = chosen.items()
+    alike = len({store.codec.loss for store in stores}) == 1
+    if not others and not conditions and alike and max(seeds) - min(seeds) == len(seeds) - 1:
+        return json.loads(config)
+    return {"parts": [(json.loads(config), len(seeds)) for config, seeds in chosen.items()], "where": conditions}
+
+
+def _write(new: EpisodeStore, copies: Copies, repair: bool) -> bool:
+    """Add a seed to a store from its first undamaged copy; returns whether there was one."""
+    known = [(source, entry) for source, entry in copies if entry.outcome != LOST]
+    for source, entry in sorted(known, key=lambda copy: not copy[1].stored):  # an episode rather than a failure
+        if not entry.stored:
+            new.fail(without_rows(entry))
+            return True
+        try:
+            new.append(episode_of(source, entry), source.packed(entry) if source.codec == new.codec else None)
+            return True
+        except DamageError:
+            if not repair:
+                raise
+    new.fail(replace(without_rows((known or copies)[0][1]), outcome=DAMAGED))
+    return False
