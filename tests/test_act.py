@@ -35,7 +35,7 @@ def test_the_latent_is_drawn_in_training_only() -> None:
 
 def test_the_latent_does_not_know_what_is_not_valid() -> None:
     model = make_act()
-    encoder, standing, action = model.cvae_encoder, [torch.randn(4, model.robot_state_width)], torch.randn(4, 4, 3)
+    encoder, standing, action = model.cvae_encoder, torch.randn(4, model.context.state_width), torch.randn(4, 4, 3)
     valid = torch.arange(4) < torch.tensor([[1], [2], [4], [0]])
     mean, log_variance = encoder(standing, action, valid)
     other = encoder(standing, action + 3.0 * ~valid.unsqueeze(-1), valid)

@@ -16,7 +16,7 @@ from fake_batch import Motions
 from saved_policies import save_policy
 from toy import SPEC
 
-from vla.models.model import mean_where
+from vla.models.layers import mean_where
 from vla.models.policy_folder import read_policy
 from vla.models.tokenizers.fast import Fast
 from vla.models.tokenizers.quantile import Quantile

@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 
 import pytest
 import torch
-from fake_batch import make_batch, make_bc, make_rt1, overfit, with_text
+from fake_batch import make_act, make_batch, make_bc, make_decoder, make_rt1, overfit, with_text
 from toy import SPEC
 
-from vla.models.model import Model, RunningNormalizer
+from vla.models.layers import RunningNormalizer
+from vla.models.model import Model
+from vla.models.tokenizers.tokenizer import Uniform
 
-MODELS: dict[str, Callable[[], Model]] = {
+MODELS: dict[str, Callable[..., Model]] = {
     "bc": make_bc,
-    "bc chunk": lambda: make_bc(chunk=3),
+    "bc chunk": partial(make_bc, chunk=3),
     "rt1": make_rt1,
-    "rt1 chunk": lambda: make_rt1(chunk=2, proprioception=True),
+    "rt1 chunk": partial(make_rt1, chunk=2, proprioception=True),
 }
 every_model = pytest.mark.parametrize("make", MODELS.values(), ids=MODELS.keys())
 
@@ -61,6 +64,25 @@ def test_the_instruction_matters(make: Callable[[], Model]) -> None:
     batch = with_text(model, make_batch(model.history, model.chunk))
     other = {**batch, "text": model.text.tokenize(["push the button"] * 4)}
     assert not torch.allclose(model(batch)["logits"], model(other)["logits"])
+
+
+@pytest.mark.parametrize("make", [*MODELS.values(), partial(make_decoder, chunk=2)], ids=[*MODELS, "decoder"])
+def test_log_probabilities_of_actions_are_those_of_the_cross_entropy(make: Callable[..., Model]) -> None:
+    """With targets of one bin; and each of a decoder is given those before it, as in its training."""
+    model = make(auxiliary=0.0).eval()
+    model.tokenizer = Uniform(64, 0.05, 0.0, 0, spec=SPEC)
+    batch = with_text(model, make_batch(model.history, model.chunk))
+    batch["valid"][:, :-1] = False
+    found = model.log_probabilities(batch, batch["action"][:, -1])
+    assert found.shape == (4, model.chunk) and (found < 0).all()
+    assert -found.mean().item() / 3 == pytest.approx(model.loss(batch)["action_loss"].item(), rel=1e-5)
+
+
+def test_numbers_have_no_log_probabilities() -> None:
+    model = make_act()
+    batch = with_text(model, make_batch(1, 4))
+    with pytest.raises(ValueError, match="ACT with Uniform gives actions no probabilities"):
+        model.log_probabilities(batch, batch["action"][:, -1])
 
 
 def test_without_weight_there_is_no_auxiliary_head() -> None:

@@ -22,13 +22,13 @@ from fake_batch import (
 from observing import observations
 from toy import SPEC, ToyEnvironment
 
-from vla.models.chunk_policy import ChunkModel
+from vla.models.bc import BC
 from vla.models.diffusion import Diffusion
 from vla.models.flow import Flow
-from vla.models.one_frame import OneFrameModel
+from vla.models.model import ContextModel, Model
 from vla.rollouts.rollout import rollout
 
-MODELS: dict[str, Callable[..., ChunkModel]] = {
+MODELS: dict[str, Callable[..., ContextModel]] = {
     "act": make_act,
     "diffusion": partial(make_denoising, Diffusion),
     "flow": partial(make_denoising, Flow),
@@ -36,12 +36,12 @@ MODELS: dict[str, Callable[..., ChunkModel]] = {
 every_model = pytest.mark.parametrize("make", MODELS.values(), ids=MODELS.keys())
 
 
-def batch_for(model: ChunkModel) -> dict[str, Any]:
+def batch_for(model: ContextModel) -> dict[str, Any]:
     return with_text(model, make_batch(1, model.chunk))
 
 
 @every_model
-def test_shapes(make: Callable[..., ChunkModel]) -> None:
+def test_shapes(make: Callable[..., ContextModel]) -> None:
     model = make()
     batch = batch_for(model)
     assert model(batch)["truth"].shape == (4, 1, SPEC.truth_size)
@@ -52,14 +52,14 @@ def test_shapes(make: Callable[..., ChunkModel]) -> None:
 
 
 @every_model
-def test_overfits_one_batch(make: Callable[..., ChunkModel]) -> None:
+def test_overfits_one_batch(make: Callable[..., ContextModel]) -> None:
     torch.manual_seed(0)
     model = make(chunk=2)
     assert overfit(model, batch_for(model), steps=200) < 0.08
 
 
 @every_model
-def test_saves_and_loads_equal(make: Callable[..., ChunkModel]) -> None:
+def test_saves_and_loads_equal(make: Callable[..., ContextModel]) -> None:
     torch.manual_seed(0)
     model, other = make(), make()
     batch = batch_for(model)
@@ -69,7 +69,7 @@ def test_saves_and_loads_equal(make: Callable[..., ChunkModel]) -> None:
 
 
 @every_model
-def test_predictions_ignore_truth_and_labels(make: Callable[..., ChunkModel]) -> None:
+def test_predictions_ignore_truth_and_labels(make: Callable[..., ContextModel]) -> None:
     model = make().eval()
     batch = batch_for(model)
     seen = {name: value for name, value in batch.items() if name not in ("truth", "action", "valid", "instruction")}
@@ -77,7 +77,7 @@ def test_predictions_ignore_truth_and_labels(make: Callable[..., ChunkModel]) ->
 
 
 @every_model
-def test_the_instruction_matters(make: Callable[..., ChunkModel]) -> None:
+def test_the_instruction_matters(make: Callable[..., ContextModel]) -> None:
     model = make().eval()
     batch = batch_for(model)
     other = {**batch, "text": model.text.tokenize(["push the button"] * 4)}
@@ -85,14 +85,14 @@ def test_the_instruction_matters(make: Callable[..., ChunkModel]) -> None:
 
 
 @every_model
-def test_without_weight_there_is_no_auxiliary_head(make: Callable[..., ChunkModel]) -> None:
+def test_without_weight_there_is_no_auxiliary_head(make: Callable[..., ContextModel]) -> None:
     model = make(auxiliary=0.0)
     losses = model.loss(batch_for(model))
     assert losses["loss"] == losses["action_loss"] and "truth_loss" not in losses
 
 
 @pytest.mark.parametrize("make", [make_bc, *MODELS.values()], ids=["bc", *MODELS])
-def test_without_proprioception_the_robot_state_does_not_matter(make: Callable[..., OneFrameModel]) -> None:
+def test_without_proprioception_the_robot_state_does_not_matter(make: Callable[..., Model]) -> None:
     seeing = make()
     batch = with_text(seeing, make_batch(1, seeing.chunk))
     other = {**batch, "state": batch["state"].flip(0)}
@@ -105,7 +105,7 @@ def test_without_proprioception_the_robot_state_does_not_matter(make: Callable[.
 
 
 @every_model
-def test_labels_that_are_not_valid_count_for_nothing(make: Callable[..., ChunkModel]) -> None:
+def test_labels_that_are_not_valid_count_for_nothing(make: Callable[..., ContextModel]) -> None:
     model = make()
     batch = batch_for(model)
     batch["valid"][:, :, 2:] = False
@@ -120,7 +120,7 @@ def test_labels_that_are_not_valid_count_for_nothing(make: Callable[..., ChunkMo
 
 
 @every_model
-def test_actions_are_scaled_between_the_bounds_of_the_tokenizer(make: Callable[..., ChunkModel]) -> None:
+def test_actions_are_scaled_between_the_bounds_of_the_tokenizer(make: Callable[..., ContextModel]) -> None:
     model = make()
     low, high = model.tokenizer.low, model.tokenizer.high
     assert torch.allclose(model.scaled(torch.stack([low, (low + high) / 2, high])).T, torch.tensor([-1.0, 0.0, 1.0]))
@@ -129,7 +129,7 @@ def test_actions_are_scaled_between_the_bounds_of_the_tokenizer(make: Callable[.
 
 
 @every_model
-def test_validation_leaves_the_random_numbers_of_training_alone(make: Callable[..., ChunkModel]) -> None:
+def test_validation_leaves_the_random_numbers_of_training_alone(make: Callable[..., ContextModel]) -> None:
     model = make().eval()
     batch = batch_for(model)
     before = torch.get_rng_state()
@@ -139,7 +139,7 @@ def test_validation_leaves_the_random_numbers_of_training_alone(make: Callable[.
 
 
 @every_model
-def test_plays_an_episode_that_follows_from_the_seed(make: Callable[..., ChunkModel]) -> None:
+def test_plays_an_episode_that_follows_from_the_seed(make: Callable[..., ContextModel]) -> None:
     policy = as_policy(make())
     first, other, again = (rollout(ToyEnvironment(), policy, seed).actions for seed in (3, 8, 3))
     assert first.shape == (40, 3) and first.dtype == np.float32
@@ -147,12 +147,13 @@ def test_plays_an_episode_that_follows_from_the_seed(make: Callable[..., ChunkMo
 
 
 @pytest.mark.parametrize("make", [*MODELS.values(), make_bc], ids=[*MODELS, "bc"])
-def test_looks_again_after_the_actions_that_are_executed(make: Callable[..., OneFrameModel]) -> None:
+def test_looks_again_after_the_actions_that_are_executed(make: Callable[..., Model]) -> None:
     model = make(chunk=4, execute=2)
     policy = as_policy(model)
     looks: list[int] = []
     acted: list[np.ndarray] = []
-    model.images[0].register_forward_pre_hook(lambda module, inputs: looks.append(len(acted)))
+    encoder: Any = model.get_submodule("features.images.0" if isinstance(model, BC) else "context.features.images.0")
+    encoder.register_forward_pre_hook(lambda module, inputs: looks.append(len(acted)))
     seen = observations(6)
     policy.reset(seen[0].instruction, 0)
     for observation in seen:
@@ -181,7 +182,7 @@ def test_more_cannot_be_executed_than_is_predicted() -> None:
 
 
 @every_model
-def test_images_that_it_does_not_look_at_make_no_difference(make: Callable[..., ChunkModel]) -> None:
+def test_images_that_it_does_not_look_at_make_no_difference(make: Callable[..., ContextModel]) -> None:
     policy = as_policy(make(chunk=4, execute=2))
     everything, sparse = (rollout(ToyEnvironment(), policy, 3, all_images=every) for every in (True, False))
     assert np.array_equal(everything.executed, sparse.executed) and len(sparse.executed) == 40

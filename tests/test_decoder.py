@@ -99,11 +99,11 @@ def test_writing_with_a_cache_is_decoding_the_growing_sequence_again_and_again(m
     batch = batch_for(model)
     batch["present"][:2, :-1] = False
     with torch.inference_mode():
-        memory, absent = model.memory(batch)
-        logits, tokens = model.generate(memory, absent)
+        context = model.encoded(batch)
+        logits, tokens = model.generate(context)
         written = tokens[:, :0]
         for place in range(tokens.shape[1]):
-            again = model.head(model.decode(written, memory, absent))
+            again = model.head(model.decode(written, context))
             assert torch.allclose(again, logits[:, : place + 1], atol=1e-4, rtol=1e-4)
             written = torch.cat([written, again[:, -1:].argmax(-1)], 1)
         assert torch.equal(written, tokens)
@@ -112,7 +112,7 @@ def test_writing_with_a_cache_is_decoding_the_growing_sequence_again_and_again(m
 
 def test_a_token_depends_on_those_before_it_and_on_no_later_one() -> None:
     model = make_decoder(chunk=2).eval()
-    memory, absent = model.memory(batch_for(model))
+    context = model.encoded(batch_for(model))
     tokens = torch.randint(64, (4, 5))
     embedded: list[torch.Tensor] = []
 
@@ -121,7 +121,7 @@ def test_a_token_depends_on_those_before_it_and_on_no_later_one() -> None:
         return embedded[-1]
 
     model.embedding.register_forward_hook(keep)
-    hidden = model.decode(tokens, memory, absent)
+    hidden = model.decode(tokens, context)
     for place in range(6):
         (gradient,) = torch.autograd.grad(hidden[:, place].square().sum(), embedded[0], retain_graph=True)
         assert (gradient[:, place:] == 0).all()
@@ -163,7 +163,7 @@ def test_writing_ends_when_all_have_ended() -> None:
     torch.nn.init.zeros_(model.head.weight)
     with torch.no_grad():
         model.head.bias.copy_(torch.eye(256)[model.tokenizer.end])
-    _, tokens = model.generate(*model.memory(batch_for(model)))
+    _, tokens = model.generate(model.encoded(batch_for(model)))
     assert tokens.tolist() == [[model.tokenizer.end]] * 4
 
 

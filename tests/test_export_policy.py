@@ -79,7 +79,7 @@ def test_a_program_that_differs_is_not_written(
         if type(whole).__name__ != program:
             return capture(whole, inputs)
         changed = type(whole)(deepcopy(whole.model))
-        bias = changed.model.image_tokens.bias if program == "Encode" else changed.model.head.bias  # type: ignore[union-attr]
+        bias = changed.model.context.image_tokens.bias if program == "Encode" else changed.model.head.bias  # type: ignore[union-attr]
         with torch.no_grad():
             bias[0] += 1000 * wrong  # type: ignore[index,operator]
         return capture(changed, inputs)

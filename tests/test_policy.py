@@ -21,7 +21,8 @@ from toy import SPEC, ToyEnvironment
 from vla.io.types import Inherited
 from vla.models.compile_cache import set_compile_cache
 from vla.models.flow import Flow
-from vla.models.model import Batch, Model, TokenModel, pixels
+from vla.models.layers import Batch, pixels
+from vla.models.model import Model, TokenModel
 from vla.models.tokenizers.tokenizer import Uniform
 from vla.policy import Policy
 from vla.rollouts.rollout import rollout
@@ -73,7 +74,7 @@ def test_only_the_newest_frame_is_encoded(make: Callable[..., Any]) -> None:
     model = make(history=3)
     policy = as_policy(model)
     frames = []
-    model.image.register_forward_pre_hook(lambda module, inputs: frames.append(len(inputs[0])))
+    model.context.image.register_forward_pre_hook(lambda module, inputs: frames.append(len(inputs[0])))
     act(policy, observations(5))
     assert frames == [1] * (5 * len(SPEC.cameras))
 
@@ -136,7 +137,7 @@ class Linear(TokenModel):
 
     def __init__(self, **inherited: Inherited) -> None:
         super().__init__(**inherited)
-        inputs = len(self.spec.cameras) + self.robot_state_width + self.text.width
+        inputs = len(self.spec.cameras) + self.robot_state.width + self.text.width
         self.head = nn.Linear(inputs, int(np.prod(self.logits_shape)))
 
     def forward(self, batch: Batch) -> dict[str, Tensor]:
@@ -249,9 +250,10 @@ def test_predictions_ignore_truth() -> None:
     "rgb",
     [
         {"front": np.zeros((16, 16, 3), np.uint8)},
-        {"eye": np.zeros((8, 16, 3), np.uint8)},
+        {"eye": np.zeros((8, 16, 4), np.uint8)},
+        {"eye": np.zeros((8, 16, 3), np.float32)},
     ],
-    ids=["camera", "size"],
+    ids=["camera", "channels", "numbers"],
 )
 def test_observations_of_another_kind_are_refused(rgb: dict[str, np.ndarray]) -> None:
     policy = as_policy(make_bc())

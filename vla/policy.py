@@ -18,7 +18,8 @@ from torch import Tensor
 from vla.io.errors import UserError
 from vla.io.types import Count
 from vla.models.compile_cache import set_compile_cache
-from vla.models.model import Batch, Model
+from vla.models.layers import Batch
+from vla.models.model import Model
 from vla.spec import LONGEST_INSTRUCTION, Array, Observation, Spec
 
 LONG_SENTENCE = " ".join(["sentence"] * 24)  # shorter instructions are padded to it for a constant shape
@@ -231,25 +232,29 @@ class Policy:
         return {**joined, "rgb": rgb, "text": state.text}
 
     def frame(self, observation: Observation, lane: int = 0) -> Batch:
-        """Convert an observation of a lane to a batch of one frame.
+        """Convert an observation of a lane, with images of any size, to a batch of one frame that the model sees.
 
         Raises:
             UserError: the observation does not match the spec.
         """
-        shape = (*self.spec.image_size, 3)
-        shapes = {camera: image.shape for camera, image in observation.rgb.items()}
-        if any(shapes.get(camera) != shape for camera in self.spec.cameras):
-            raise UserError(f"the policy needs cameras {self.spec.cameras} of {shape}, the observation has {shapes}")
-        if other := [camera for camera in self.spec.cameras if observation.rgb[camera].dtype != np.uint8]:
-            raise UserError(f"images must be uint8, 0 to 255, that of {other[0]} is {observation.rgb[other[0]].dtype}")
-        if observation.state.shape != (len(self.spec.state),):
-            raise UserError(f"the policy's state is {self.spec.state}, the observation's {observation.state.shape}")
-        return {
-            "rgb": {camera: self._tensor(observation.rgb[camera]) for camera in self.spec.cameras},
+        spec, rgb = self.spec, observation.rgb
+        for camera in spec.cameras:
+            if camera not in rgb:
+                raise UserError(f"the policy needs cameras {spec.cameras}, the observation has {tuple(rgb)}")
+            image = rgb[camera]
+            if image.ndim != 3 or image.shape[2] != 3 or not image.size or image.dtype != np.uint8:
+                kind = f"{image.dtype} of {image.shape}"
+                raise UserError(f"the image of {camera} must be (H, W, 3) uint8, 0 to 255, and is {kind}")
+            spec.require_cut(camera, image.shape, f"the image of {camera}")
+        if observation.state.shape != (len(spec.state),):
+            raise UserError(f"the policy's state is {spec.state}, the observation's {observation.state.shape}")
+        frame = {
+            "rgb": {camera: self._tensor(rgb[camera]) for camera in spec.cameras},
             "state": self._tensor(np.asarray(observation.state, np.float32)),
             "present": torch.ones(1, 1, dtype=torch.bool, device=self.device),
             "text": self._lanes[lane].text,
         }
+        return self.model.transforms(frame)
 
     @torch.inference_mode()
     def _encoded(self, frame: Batch) -> dict[str, Tensor]:

@@ -22,7 +22,8 @@ from vla.io.documents import lines_of
 from vla.io.errors import UserError
 from vla.io.files import atomic_path
 from vla.io.types import Text
-from vla.models.model import Batch, Model
+from vla.models.layers import Batch
+from vla.models.model import Model
 from vla.policy import Policy
 
 log = logging.getLogger(__name__)

@@ -9,7 +9,7 @@ from collections.abc import Collection
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import asdict, replace
 from functools import partial
-from typing import Any, cast, get_args
+from typing import Any
 
 import numpy as np
 from builtin_interfaces.msg import Duration
@@ -35,7 +35,6 @@ from vla.deploy.lifecycle_node import GuardedLifecycleNode
 from vla.deploy.observer import age_of
 from vla.deploy.ros import action_class
 from vla.deploy.settings import COMPRESSED, FOLLOW, TRAJECTORY_ACTION, PolicySettings
-from vla.io import images
 from vla.io.errors import UserError
 from vla.policy import Policy
 from vla.robots.controllers import acts_on_joints
@@ -73,7 +72,6 @@ class PolicyNode(GuardedLifecycleNode):
         self._timers: list[Any] = []
         self._latencies: dict[str, deque[float]] = {}
         self._stamps: dict[str, tuple[int, int]] = {}
-        self._sizes: dict[str, tuple[int, ...]] = {}  # camera → shape of its last image
         self._inference: tuple[Future[Array], float] | None = None
         self._pool = ThreadPoolExecutor(1, thread_name_prefix="policy")
         self._last_tick: float | None = None
@@ -98,7 +96,6 @@ class PolicyNode(GuardedLifecycleNode):
             self.declare_parameter(name, value, ParameterDescriptor(floating_point_range=limits))
         self.declare_parameter("command", self.settings.command)
         self.declare_parameter("image_reliability", self.settings.image_reliability)
-        self.declare_parameter("image_crop", self.settings.image_crop)
         self.declare_parameter("dry_run", self.settings.dry_run)
         rate = FloatingPointRange(from_value=1.0, to_value=1000.0)
         self.declare_parameter(
@@ -138,7 +135,6 @@ class PolicyNode(GuardedLifecycleNode):
         robot = Robot(**{name: self.get_parameter(name).value for name in asdict(self.settings.robot)})
         self._command_type = self._choice("command", COMMANDS)
         self.settings.require_messages(self._command_type)
-        self._crop = cast("images.Crop", self._choice("image_crop", get_args(images.Crop)))
         reliability = self._choice("image_reliability", ("best_effort", "reliable"))
         self._dry_run = dry_run = self.get_parameter("dry_run").value
         twist = self._command_type == "twist"
@@ -172,7 +168,7 @@ class PolicyNode(GuardedLifecycleNode):
         self.add_service(Trigger, "~/resume", self._on_resume)
         self.add_service(SetBool, "~/hand_over", self._on_hand_over)
         self._connect_actions()
-        self._latencies, self._stamps, self._sizes, self._dropped = {}, {}, {}, 0
+        self._latencies, self._stamps, self._dropped = {}, {}, 0
         self.loop = loop
 
     def _topics_of_commands(self) -> tuple[str, str | None]:
@@ -293,10 +289,6 @@ class PolicyNode(GuardedLifecycleNode):
             image = messages.image_from(message)
         except ValueError as error:
             return self._drop(f"camera {camera}: {error}")
-        if self._sizes.get(camera) != image.shape:
-            self._sizes[camera] = image.shape
-            if resizing := images.describe_resize(image.shape, self.policy.spec.image_size, self._crop):
-                self.get_logger().info(f"camera {camera}: {resizing}")
         self._record("image age", age)
         self.loop.on_image(camera, image, now - age)
         return self._advance()
@@ -402,9 +394,7 @@ class PolicyNode(GuardedLifecycleNode):
     def _infer(self, observation: Observation, reset: bool) -> Array:
         if reset:
             self.policy.reset(observation.instruction, 0)
-        size = self.policy.spec.image_size
-        rgb = {camera: images.resize(image, size, self._crop) for camera, image in observation.rgb.items()}
-        plan = self.policy.plan(replace(observation, rgb=rgb))
+        plan = self.policy.plan(observation)
         # In training the frames of a history have no gaps either.
         return plan[: 1 if getattr(self.policy, "history", 1) > 1 else self.policy.execute]
 

@@ -10,7 +10,6 @@ from vla.deploy.control_loop import Safety
 from vla.deploy.joint_limiter import Robot
 from vla.deploy.ros import action_class
 from vla.io.errors import UserError
-from vla.io.images import Crop
 from vla.io.types import NonNegative, Positive, Text
 
 FOLLOW = "follow_joint_trajectory"  # the command that is an action
@@ -91,7 +90,6 @@ class PolicySettings:
         gripper: action of the gripper; None: it takes positions on a topic.
         command_hz: commands per second.
         image_reliability: QoS of the images; "reliable" helps with large images on a lossy network.
-        image_crop: for images with another aspect ratio than in training: crop the centre, or distort the whole.
         dry_run: publish the commands below ~/dry_run, where nothing obeys them.
     """
 
@@ -103,7 +101,6 @@ class PolicySettings:
     gripper: GripperCommand | FrankaGripper | None
     command_hz: Positive
     image_reliability: Literal["best_effort", "reliable"]
-    image_crop: Crop
     dry_run: bool
 
     def require_messages(self, command: str) -> None:

@@ -14,7 +14,8 @@ from typing import Any
 import torch
 from torch.utils.flop_counter import FlopCounterMode, conv_flop_count
 
-from vla.models.model import Batch, Model
+from vla.models.layers import Batch
+from vla.models.model import Model
 
 WINDOWS = 2  # counted; batch normalisation needs more than one value
 SIZES = (128, 256, 512, 1024, 2048, 4096, 8192)  # of matrices whose products are timed

@@ -58,7 +58,6 @@ def _serving(experiment: Experiment, policy: Policy) -> Iterator[RemotePolicy]:
         host="127.0.0.1",
         port=0,
         keys=keys,
-        image_crop="centre",
         connections=1,
         largest_message=2**26,
         api_key=None,
