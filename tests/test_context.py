@@ -15,7 +15,8 @@ from toy import SPEC
 
 from vla.config.build import build
 from vla.config.experiment import plain
-from vla.models.context import Context
+from vla.io.types import Inherited
+from vla.models.context import Context, Encoded
 from vla.models.flow import Flow
 from vla.models.model import ContextModel
 from vla.models.tokenizers.tokenizer import Uniform
@@ -75,17 +76,17 @@ class Trunk(Context):
 
     length = 5
 
-    def __init__(self, *, image: object, text_width: int, width: int, spec: Any) -> None:
-        super().__init__(spec)
-        self.trunk = torch.nn.Linear(3, width)
+    def __init__(self, **inherited: Inherited) -> None:
+        super().__init__(**inherited)
+        self.trunk = torch.nn.Linear(3, self.width)
 
     def encode(self, batch: Any, text: torch.Tensor) -> torch.Tensor:
-        colours = torch.stack([batch["rgb"][camera].float().mean((2, 3)) for camera in self.cameras], 2)  # (B, 1, n, 3)
+        colours = torch.stack(
+            [batch["rgb"][camera].float().mean((2, 3)) for camera in self.spec.cameras], 2
+        )  # (B, 1, n, 3)
         return self.trunk(colours / 255)
 
     def forward(self, batch: Any, text: torch.Tensor) -> Any:
-        from vla.models.context import Encoded
-
         prefix = batch["tokens"] if "tokens" in batch else self.encode(batch, text)
         tokens = prefix.flatten(1, 2).expand(-1, 5, -1)
         return Encoded(tokens, tokens[:, 0], torch.arange(5).expand(len(tokens), -1) > 1)

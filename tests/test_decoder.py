@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 from defaults import defaults_of
-from fake_batch import Motions, as_policy, make_batch, make_decoder, make_rt1, overfit, with_text
+from fake_batch import Motions, as_policy, make_batch, make_decoder, make_rt1, with_text
 from small_training import loader, make_learner, make_trainer
 from toy import SPEC, ToyEnvironment
 
@@ -48,45 +48,6 @@ def batch_for(model: Decoder, size: int = 4) -> dict[str, Any]:
     chunks = MOTIONS.chunks(model.chunk)
     rows = np.random.default_rng(0).integers(len(chunks), size=(size, model.history))
     return {**batch, "action": torch.from_numpy(chunks[rows])}
-
-
-@every_model
-def test_shapes(make: Callable[[], Decoder]) -> None:
-    model = make()
-    output = model(batch_for(model))
-    assert output["logits"].shape == (4, output["tokens"].shape[1], model.tokenizer.bins)
-    assert 1 <= output["tokens"].shape[1] <= model.length
-    assert output["truth"].shape == (4, 1, SPEC.truth_size)
-    prediction = model.eval().predict(batch_for(model))
-    assert prediction.actions.shape == (4, model.chunk, 3)
-    if prediction.probabilities is not None:
-        assert prediction.probabilities.shape == (4, model.chunk, 3, model.tokenizer.bins)
-
-
-@pytest.mark.parametrize("name", ["chunk", "quantile", "fast"])  # even bins: see test_action_tokenizer
-def test_overfits_one_batch(name: str) -> None:
-    torch.manual_seed(0)
-    model = MODELS[name]()
-    assert overfit(model, batch_for(model)) < 0.02
-
-
-@every_model
-def test_saves_and_loads_equal(make: Callable[[], Decoder], tmp_path: Path) -> None:
-    model, other = make(), make()
-    batch = batch_for(model)
-    model.loss(batch)  # gathers statistics, which must travel too
-    torch.save(model.state_dict(), tmp_path / "model.ckpt")
-    other.load_state_dict(torch.load(tmp_path / "model.ckpt", weights_only=True))
-    assert torch.equal(model.eval()(batch)["logits"], other.eval()(batch)["logits"])
-    assert torch.equal(model.predict(batch).actions, other.predict(batch).actions)
-
-
-@every_model
-def test_predictions_ignore_truth_and_labels(make: Callable[[], Decoder]) -> None:
-    model = make().eval()
-    batch = batch_for(model)
-    seen = {name: value for name, value in batch.items() if name not in ("truth", "action", "valid", "instruction")}
-    assert torch.equal(model.predict(batch).actions, model.predict(seen).actions)
 
 
 @every_model
@@ -147,15 +108,6 @@ def test_frames_that_are_missing_are_as_frames_that_are_padding() -> None:
     rgb = {camera: images[:, 2:] for camera, images in batch["rgb"].items()}
     prediction = model.predict({**alone, "rgb": rgb, "text": batch["text"]})
     assert torch.allclose(prediction.actions, model.predict(batch).actions, atol=1e-6)
-
-
-def test_labels_that_are_not_valid_do_not_count() -> None:
-    model = make_decoder(chunk=3, auxiliary=0.0).eval()
-    batch = batch_for(model)
-    batch["valid"][:, -1, 1:] = False
-    other = {**batch, "action": batch["action"].clone()}
-    other["action"][:, -1, 1:] = 0.0
-    assert model.loss(batch)["loss"].item() == pytest.approx(model.loss(other)["loss"].item(), rel=1e-6)
 
 
 def test_writing_ends_when_all_have_ended() -> None:

@@ -239,10 +239,6 @@ HOSTILE: dict[str, tuple[Callable[[Path], object], str]] = {
         lambda folder: torch.save({"a": 1}, folder / "model.safetensors") or _sign(folder),
         r"model\.safetensors is damaged: ",
     ),
-    "half precision": (
-        weights(lambda state: {name: value.half() for name, value in state.items()}),
-        r"does not fit the model .* numbers of torch\.float16, not torch\.float32",
-    ),
     "names of folders": (
         weights(lambda state: {f"../{name}": value for name, value in state.items()}),
         r"model\.safetensors is damaged: ",

@@ -6,6 +6,7 @@ Shapes: B batch, k action chunk, D action components, K bins, S truth scalars.
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 
 import torch
 from torch import Tensor, nn
@@ -30,7 +31,8 @@ class BC(TokenModel):
         self, image: Callable[..., ImageEncoder], keypoints: Width, proprioception: bool, **inherited: Inherited
     ) -> None:
         super().__init__(**inherited)
-        self.features = KeypointFeatures(keypoints, proprioception, image, self.text.width, self.spec)
+        make_encoder = partial(image, text_width=self.text.width)
+        self.features = KeypointFeatures(keypoints, proprioception, make_encoder, self.spec)
         self.mlp = mlp(sum([*self.features.image_widths, *self.features.state_widths, self.text.width]), self.width)
         self.head = nn.Linear(self.width, self.chunk * len(self.spec.action) * self.tokenizer.bins)
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 import torch
@@ -14,7 +15,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from vla.io.errors import UserError
-from vla.io.types import Natural, Steps, Width
+from vla.io.types import Inherited, Natural, Steps, Width
 from vla.models.kinematics import RobotState
 from vla.models.layers import Batch, RunningNormalizer, mlp, newest, pixels
 from vla.models.vision.image_tokenizer import ImageEncoder, Keypoints, TokenLearner
@@ -38,17 +39,21 @@ class Context(nn.Module, ABC):
     last hidden states and their padding, ignores `image`, reads the instruction as token ids from a text encoder whose
     `forward` returns its argument, and is frozen or trained at a rate of its own under its name, `context`.
 
-    Subclasses take their own options, and from the model, by keyword: `image`, a factory of image encoders, called with
-    `text_width`; `text_width`, the length of the instruction vector; `width`, E; and `spec`.
+    Args:
+        image: factory of image encoders, called with `text_width`.
+        text_width: length of the instruction vector.
+        width: E.
+        spec: observation and action spaces.
     """
 
     history = 1  # T
     length: int  # N
     state_width = 0  # R; 0: the robot state is not given to the head
 
-    def __init__(self, spec: Spec) -> None:
+    def __init__(self, *, image: Callable[..., ImageEncoder], text_width: int, width: int, spec: Spec) -> None:
         super().__init__()
-        self.cameras = spec.cameras
+        self.make_encoder = partial(image, text_width=text_width)
+        self.text_width, self.width, self.spec = text_width, width, spec
 
     def encode(self, batch: Batch, text: Tensor) -> Tensor | None:
         """Return tokens of each frame, (B, T, n, E), that depend on the frame and the instruction alone.
@@ -72,20 +77,16 @@ class KeypointFeatures(nn.Module):
     Args:
         keypoints: per camera.
         proprioception: use the robot state.
-        image, text_width, spec: as of `Context`.
+        make_encoder: returns an image encoder.
+        spec: observation and action spaces.
     """
 
     def __init__(
-        self,
-        keypoints: int,
-        proprioception: bool,
-        image: Callable[..., ImageEncoder],
-        text_width: int,
-        spec: Spec,
+        self, keypoints: int, proprioception: bool, make_encoder: Callable[[], ImageEncoder], spec: Spec
     ) -> None:
         super().__init__()
         self.cameras = spec.cameras
-        encoders = [image(text_width=text_width) for _ in spec.cameras]
+        encoders = [make_encoder() for _ in spec.cameras]
         self.images = nn.ModuleList(encoders)
         heads = [Keypoints(encoder.channels, keypoints) for encoder in encoders]
         self.keypoints = nn.ModuleList(heads)
@@ -123,19 +124,10 @@ class KeypointContext(Context):
         proprioception: use the robot state.
     """
 
-    def __init__(
-        self,
-        keypoints: Width,
-        proprioception: bool,
-        *,
-        image: Callable[..., ImageEncoder],
-        text_width: int,
-        width: int,
-        spec: Spec,
-    ) -> None:
-        super().__init__(spec)
-        self.features = KeypointFeatures(keypoints, proprioception, image, text_width, spec)
-        widths = [*self.features.image_widths, *self.features.state_widths, text_width]
+    def __init__(self, keypoints: Width, proprioception: bool, **inherited: Inherited) -> None:
+        super().__init__(**inherited)
+        self.features = KeypointFeatures(keypoints, proprioception, self.make_encoder, self.spec)
+        width, widths = self.width, [*self.features.image_widths, *self.features.state_widths, self.text_width]
         self.length, self.state_width = 1 + len(widths), sum(self.features.state_widths)
         self.tokens = nn.ModuleList(nn.Linear(features, width) for features in widths)
         self.fuse = nn.Sequential(mlp(sum(widths), 2 * width), nn.Linear(2 * width, width))
@@ -170,29 +162,26 @@ class TokenContext(Context):
         keypoints: Natural,
         proprioception: bool,
         *,
-        image: Callable[..., ImageEncoder],
-        text_width: int,
-        width: int,
-        spec: Spec,
         frames_alone: bool = False,
+        **inherited: Inherited,
     ) -> None:
-        super().__init__(spec)
-        self.history, cameras = history, len(spec.cameras)
-        self.per_frame = cameras * (learned_tokens + (keypoints > 0)) + proprioception  # n
+        super().__init__(**inherited)
+        self.history, cameras, width = history, self.spec.cameras, self.width
+        self.per_frame = len(cameras) * (learned_tokens + (keypoints > 0)) + proprioception  # n
         if not self.per_frame:
             raise UserError(
                 "a frame needs a token: raise model.context.learned_tokens or model.context.keypoints, or set "
                 "model.context.proprioception=true"
             )
-        self.image = image(text_width=text_width)  # the cameras share it
-        self.token_learners = nn.ModuleList(TokenLearner(self.image.channels, learned_tokens) for _ in spec.cameras)
+        self.image = self.make_encoder()  # the cameras share it
+        self.token_learners = nn.ModuleList(TokenLearner(self.image.channels, learned_tokens) for _ in cameras)
         self.image_tokens = nn.Linear(self.image.channels, width)
         self.keypoints: nn.ModuleList | None = None
         if keypoints:
-            heads = [Keypoints(self.image.channels, keypoints) for _ in spec.cameras]
+            heads = [Keypoints(self.image.channels, keypoints) for _ in cameras]
             self.keypoints = nn.ModuleList(heads)
             self.keypoint_tokens = nn.ModuleList(nn.Linear(keypoints * head.width, width) for head in heads)
-        self.proprioception = Proprioception(spec) if proprioception else None
+        self.proprioception = Proprioception(self.spec) if proprioception else None
         if self.proprioception:
             self.proprioception_token = nn.Linear(self.proprioception.width, width)
         self.length = history * self.per_frame
@@ -201,7 +190,7 @@ class TokenContext(Context):
             self.length += 2
             self.positions = nn.Embedding(history * self.per_frame, width)
             nn.init.normal_(self.positions.weight, std=0.05)
-            self.instruction_token = nn.Linear(text_width, width)
+            self.instruction_token = nn.Linear(self.text_width, width)
             first = [nn.Linear((self.per_frame + 1) * width, 2 * width), nn.ReLU()]
             second = [nn.Linear(2 * width, 2 * width), nn.ReLU(), nn.Linear(2 * width, width)]
             self.fuse = nn.Sequential(*first, *second)
@@ -209,9 +198,9 @@ class TokenContext(Context):
 
     def encode(self, batch: Batch, text: Tensor) -> Tensor:
         """Return (B, T, n, E) tokens of the frames."""
-        cameras, frames = len(self.cameras), batch["present"].shape[1]
+        cameras, frames = len(self.spec.cameras), batch["present"].shape[1]
         # One pass of the encoder for all cameras.
-        images = pixels(torch.cat([batch["rgb"][camera] for camera in self.cameras]))
+        images = pixels(torch.cat([batch["rgb"][camera] for camera in self.spec.cameras]))
         every = self.image(images, text.repeat(cameras, 1).repeat_interleave(frames, 0))  # (cameras·B·T, C, h, w)
         tokens = []
         for index, features in enumerate(every.chunk(cameras)):  # (B·T, C, h, w) each
