@@ -341,7 +341,7 @@ def _model(node: Node, spec: Spec, tokenizer: ActionTokenizer, saved: SavedPolic
 
 def _without_pretraining(model: Node) -> Node:
     """Remove pretrained weights from a model node whose weights all come from a policy."""
-    nowhere = {"image": "pretrained", "text": "name"}
+    nowhere = {"image": "pretrained", "context": "pretrained", "text": "name"}
     parts = {part: _emptied(model[part], key) for part, key in nowhere.items() if isinstance(model.get(part), dict)}
     return {**model, **parts}
 
