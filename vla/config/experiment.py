@@ -175,7 +175,7 @@ class Experiment:
         node = self["model"]
         saved = read_policy(origin) if origin else None
         if saved:
-            saved.require_layout(spec, "the demonstrations")
+            saved.spec.require_input(spec, f"the policy {origin}", "the demonstrations")
             layout = {"robot": saved.spec.robot, "image_size": saved.spec.image_size}
             spec, node = replace(spec, **layout), _without_pretraining(node)
         model = _model(node, spec, build(self["tokenizer"], "tokenizer", spec=spec), saved)
@@ -302,7 +302,7 @@ def make_policy(policy: Node, checkpoint: Path, environment: Environment | None 
 
     saved = read_policy(checkpoint)
     if environment is not None:
-        saved.require_layout(environment.spec, "the task")
+        saved.spec.require_input(environment.spec, f"the policy {checkpoint}", "the task")
     nodes = {"tokenizer": saved.config["tokenizer"], "model": _without_pretraining(saved.config["model"])}
     if not own:
         require_no_paths(nodes, nodes, checkpoint)

@@ -10,7 +10,7 @@ import hashlib
 import re
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cache, cached_property
 from pathlib import Path
 from typing import Annotated, Any
@@ -78,12 +78,6 @@ class SavedPolicy:
         with _opened(path) as weights:
             names: list[str] = weights.keys()  # it is no mapping
             return _joined(weights.metadata() or {}, {name: weights.get_tensor(name) for name in names})
-
-    def require_layout(self, spec: Spec, what: str) -> None:
-        """Raise a UserError unless the policy fits a `spec`, called `what`; only cut images need their size."""
-        own = self.spec.without_truth
-        size = self.spec.image_size if own.cut else spec.image_size
-        replace(own, image_size=size).require(spec.without_truth, f"the policy {self.folder}", what)
 
     def initialize(self, model: Model) -> None:
         """Load the weights for fine-tuning, as `restore`; the truth head keeps its own if the truth differs."""
