@@ -113,3 +113,11 @@ def test_one_raw_observation_is_the_same_input_everywhere(
     assert inputs[0][0].shape == (1, 3, 20, 20) and inputs[0][0].std() > 0.01
     for others in inputs[1:]:  # validation computes loss and prediction, each of which looks once
         assert all(torch.equal(*pair) for pair in zip(inputs[0][:2], others, strict=True))
+
+
+def test_a_world_with_another_size_of_images_fits_unless_they_are_cut_out() -> None:
+    TRAINED.require_input(replace(RAW, truth=()), "the policy", "the task")
+    with pytest.raises(ValueError, match="the policy has image_size"):
+        replace(TRAINED, cut=("eye",)).require_input(RAW, "the policy", "the task")
+    with pytest.raises(ValueError, match="the policy has control_hz"):
+        TRAINED.require_input(replace(RAW, control_hz=5.0), "the policy", "the task")

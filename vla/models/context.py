@@ -169,10 +169,7 @@ class TokenContext(Context):
         self.history, cameras, width = history, self.spec.cameras, self.width
         self.per_frame = len(cameras) * (learned_tokens + (keypoints > 0)) + proprioception  # n
         if not self.per_frame:
-            raise UserError(
-                "a frame needs a token: raise model.context.learned_tokens or model.context.keypoints, or set "
-                "model.context.proprioception=true"
-            )
+            raise UserError("a frame needs a token: raise model.context.learned_tokens, or model.context.keypoints")
         self.image = self.make_encoder()  # the cameras share it
         self.token_learners = nn.ModuleList(TokenLearner(self.image.channels, learned_tokens) for _ in cameras)
         self.image_tokens = nn.Linear(self.image.channels, width)
@@ -184,17 +181,8 @@ class TokenContext(Context):
         self.proprioception = Proprioception(self.spec) if proprioception else None
         if self.proprioception:
             self.proprioception_token = nn.Linear(self.proprioception.width, width)
-        self.length = history * self.per_frame
-        self.fuse: nn.Sequential | None = None
-        if not frames_alone:
-            self.length += 2
-            self.positions = nn.Embedding(history * self.per_frame, width)
-            nn.init.normal_(self.positions.weight, std=0.05)
-            self.instruction_token = nn.Linear(self.text_width, width)
-            first = [nn.Linear((self.per_frame + 1) * width, 2 * width), nn.ReLU()]
-            second = [nn.Linear(2 * width, 2 * width), nn.ReLU(), nn.Linear(2 * width, width)]
-            self.fuse = nn.Sequential(*first, *second)
-            self.norm = nn.LayerNorm(width)
+        self.fusion = None if frames_alone else Fusion(history, self.per_frame, self.text_width, width)
+        self.length = history * self.per_frame + (0 if frames_alone else 2)
 
     def encode(self, batch: Batch, text: Tensor) -> Tensor:
         """Return (B, T, n, E) tokens of the frames."""
@@ -217,14 +205,39 @@ class TokenContext(Context):
         """Return the context of up to `history` frames; positions are aligned at the newest one, which comes last."""
         frames = batch["tokens"] if "tokens" in batch else self.encode(batch, text)
         frames, present = newest_last(frames, batch["present"])
-        visual, padding = frames.flatten(1, 2), ~present.repeat_interleave(self.per_frame, 1)
-        if self.fuse is None:
-            return Encoded(visual, frames[:, -1].mean(1), padding)
-        visual = visual + self.positions.weight[-visual.shape[1] :]
-        instruction = self.instruction_token(text).unsqueeze(1)
-        fused = self.fuse(torch.cat([frames[:, -1], instruction], 1).flatten(1)).unsqueeze(1)
-        tokens = self.norm(torch.cat([visual, instruction, fused], 1))
+        padding = ~present.repeat_interleave(self.per_frame, 1)
+        if self.fusion is None:
+            return Encoded(frames.flatten(1, 2), frames[:, -1].mean(1), padding)
+        tokens = self.fusion(frames, text)
         return Encoded(tokens, tokens[:, -1], F.pad(padding, (0, 2)))
+
+
+class Fusion(nn.Module):
+    """Tokens of frames → the same with positions, the instruction, and an MLP of the newest frame and the instruction.
+
+    Args:
+        history, per_frame: T and n.
+        text_width: length of the instruction vector.
+        width: E.
+    """
+
+    def __init__(self, history: int, per_frame: int, text_width: int, width: int) -> None:
+        super().__init__()
+        self.positions = nn.Embedding(history * per_frame, width)
+        nn.init.normal_(self.positions.weight, std=0.05)
+        self.instruction = nn.Linear(text_width, width)
+        first = [nn.Linear((per_frame + 1) * width, 2 * width), nn.ReLU()]
+        second = [nn.Linear(2 * width, 2 * width), nn.ReLU(), nn.Linear(2 * width, width)]
+        self.mlp = nn.Sequential(*first, *second)
+        self.norm = nn.LayerNorm(width)
+
+    def forward(self, frames: Tensor, text: Tensor) -> Tensor:
+        """Map (B, T, n, E) frames, the newest last, and (B, text_width) text to (B, T·n + 2, E)."""
+        visual = frames.flatten(1, 2)
+        visual = visual + self.positions.weight[-visual.shape[1] :]
+        instruction = self.instruction(text).unsqueeze(1)
+        fused = self.mlp(torch.cat([frames[:, -1], instruction], 1).flatten(1)).unsqueeze(1)
+        return self.norm(torch.cat([visual, instruction, fused], 1))
 
 
 def newest_last(frames: Tensor, present: Tensor) -> tuple[Tensor, Tensor]:

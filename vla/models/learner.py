@@ -39,6 +39,9 @@ class Learner(LightningModule):
         model: the model to train.
         spec: observation and action spaces; saved with every checkpoint.
         config: the resolved configuration as plain dicts and lists; saved with every checkpoint.
+
+    Raises:
+        UserError: `rates` or `frozen` name no part of the model, or nothing is left to train.
     """
 
     def __init__(

@@ -181,12 +181,11 @@ class Model(nn.Module, ABC):
             UserError: a name is that of no part, or nothing is left to train.
         """
         parameters = dict(self.named_parameters())
-        for key, part in (*(("rates", name) for name in rates), *(("frozen", name) for name in frozen)):
-            if not any(_is_within(name, part) for name in parameters):
-                parts = ", ".join(dict.fromkeys(name.partition(".")[0] for name in parameters))
-                raise UserError(f"learner.{key} names {part}, which no parameter of the model is in: it has {parts}")
+        _require_parts(parameters, "rates", rates)
+        _require_parts(parameters, "frozen", frozen)
         for name, parameter in parameters.items():
-            parameter.requires_grad_(parameter.requires_grad and not any(_is_within(name, part) for part in frozen))
+            if any(_is_within(name, part) for part in frozen):
+                parameter.requires_grad_(False)
         trained = {name: parameter for name, parameter in parameters.items() if parameter.requires_grad}
         if not trained:
             raise UserError("learner.frozen leaves nothing to train")
@@ -199,6 +198,13 @@ class Model(nn.Module, ABC):
             {"params": group, "lr": learning_rate * factor, "weight_decay": weight_decay if decays else 0.0}
             for (factor, decays), group in sorted(groups.items(), key=lambda item: item[0], reverse=True)
         ]
+
+
+def _require_parts(parameters: Collection[str], key: str, parts: Collection[str]) -> None:
+    for part in parts:
+        if not any(_is_within(name, part) for name in parameters):
+            known = ", ".join(dict.fromkeys(name.partition(".")[0] for name in parameters))
+            raise UserError(f"learner.{key} names {part}, which no parameter of the model is in: it has {known}")
 
 
 def _is_within(name: str, part: str) -> bool:
