@@ -29,5 +29,11 @@ def defaults_of(option: str, **changes: Any) -> dict[str, Any]:
     return {**plain, **changes}
 
 
+def part_of(option: str, part: str, **changes: Any) -> dict[str, Any]:
+    """The plain arguments of an object in an option, such as the context of "model/rt1", with some changes."""
+    named = _arguments(option)[part].items()
+    return {**{name: value for name, value in named if not name.startswith("_")}, **changes}
+
+
 def _is_object(value: Any) -> bool:
     return isinstance(value, dict) and "_target_" in value

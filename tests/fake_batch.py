@@ -8,11 +8,12 @@ from typing import Any
 
 import numpy as np
 import torch
-from defaults import defaults_of
+from defaults import defaults_of, part_of
 from toy import SPEC
 
 from vla.models.act import ACT
 from vla.models.bc import BC
+from vla.models.context import KeypointContext, TokenContext
 from vla.models.decoder import Decoder
 from vla.models.denoiser import DenoisingModel
 from vla.models.model import Model
@@ -24,6 +25,7 @@ from vla.policy import Policy
 from vla.spec import Spec
 
 TINY_IMAGE = partial(FilmConv, [8, 8], [5, 3], [2, 1], chroma=True, positions=False)
+OF_CONTEXT = ("history", "learned_tokens", "keypoints", "proprioception")
 TINY_TEXT = partial(NGrams, **defaults_of("model/text/ngrams", vocabulary=64, dropout=0.0))
 
 
@@ -63,29 +65,38 @@ def with_text(model: Model, batch: dict[str, Any]) -> dict[str, Any]:
     return {**batch, "text": model.text.tokenize(batch["instruction"])}
 
 
+def context_of(option: str, **changes: Any) -> Callable[..., Any]:
+    """The context of a model, with some changes."""
+    options = part_of(option, "context", **changes)
+    return partial(TokenContext if "history" in options else KeypointContext, **options)
+
+
 def _small(kind: Callable[..., Any], option: str, small: dict[str, Any], options: dict[str, Any]) -> Any:
-    """A model of an option, smaller and without random shifts."""
-    sizes = {"keypoints": 8, "text_width": 16, "width": 32, "auxiliary": 1.0, "shift": (0, 0)}
+    """A model of an option, smaller and without random shifts; some of `options` are those of its context."""
+    sizes = {"text_width": 16, "width": 32, "auxiliary": 1.0, "shift": (0, 0)}
     spec = options.get("spec", SPEC)
     tokenizer = Uniform(spec=spec, **defaults_of("tokenizer/uniform", bins=64))
-    parts = {"image": TINY_IMAGE, "text": TINY_TEXT, "spec": spec, "tokenizer": tokenizer}
+    parts: dict[str, Any] = {"image": TINY_IMAGE, "text": TINY_TEXT, "spec": spec, "tokenizer": tokenizer}
+    own = {name: options.pop(name) for name in OF_CONTEXT if name in options and kind is not BC}
+    if kind is not BC and "context" not in options:
+        parts["context"] = context_of(option, **{"keypoints": 8, **own})
     return kind(**{**parts, **defaults_of(option, **{**sizes, **small, **options})})
 
 
 def make_bc(**options: Any) -> BC:
     """A small BC."""
-    return _small(BC, "model/bc", {"width": 64}, options)
+    return _small(BC, "model/bc", {"width": 64, "keypoints": 8}, options)
 
 
 def make_rt1(**options: Any) -> RT1:
     """A small RT-1 without dropout."""
-    small = {"history": 3, "image_size": None, "learned_tokens": 2, "layers": 2, "heads": 2, "key_width": 16}
-    return _small(RT1, "model/rt1", {**small, "dropout": 0.0}, options)
+    small = {"image_size": None, "layers": 2, "heads": 2, "key_width": 16, "dropout": 0.0}
+    return _small(RT1, "model/rt1", small, {"history": 3, "learned_tokens": 2, **options})
 
 
 def make_decoder(**options: Any) -> Decoder:
     """A small decoder."""
-    return _small(Decoder, "model/decoder", {"learned_tokens": 2, "heads": 2, "feedforward": 64}, options)
+    return _small(Decoder, "model/decoder", {"heads": 2, "feedforward": 64}, {"learned_tokens": 2, **options})
 
 
 def make_act(**options: Any) -> ACT:

@@ -27,31 +27,11 @@ def node(target: str, **arguments: Any) -> dict[str, Any]:
 def hostile(mark: Path) -> dict[str, tuple[str, Any]]:
     """Attack → the key of a configuration, and what it holds; each of them once acted, mostly by leaving `mark`."""
     created = "${oc.select:model.text,${oc.create:{_target_:%s}}}"
-    files = {"file_name": str(mark), "log_dir": str(mark), "f": str(mark), "name": str(mark), "filename": str(mark)}
     return {
         **{f"a command as {key}": (key, command(mark)) for key in ("model.image", "model.text", "task.goal")},
         "a command as an axis": ("task.randomize.mass", command(mark)),
         "a command as a plugin": ("trainer.plugins", [command(mark)]),
-        "a library": ("model.image", node("torch._inductor.codecache.DLLWrapper", lib_path=files["f"])),
-        "an allocator": (
-            "model.image",
-            node(
-                "torch.cuda.memory.CUDAPluggableAllocator",
-                path_to_so_file=str(mark),
-                alloc_fn_name="a",
-                free_fn_name="b",
-            ),
-        ),
         "a file emptied": ("model.image", node("torch.serialization._open_file", name=str(mark), mode="w")),
-        "an archive": ("model.image", node("torch.package.PackageExporter", f=str(mark))),
-        "a folder": (
-            "model.image",
-            node("lightning.fabric.loggers.csv_logs._ExperimentWriter", log_dir=str(mark)),
-        ),
-        "an event file": ("model.image", node("torch.utils.tensorboard.SummaryWriter", log_dir=str(mark))),
-        "a process": ("model.image", node("torch._inductor.autotune_process.TuningProcess")),
-        "a pool": ("model.image", node("torch._inductor.compile_worker.subproc_pool.SubprocPool", nprocs=1)),
-        "a server": ("model.image", node("torch.distributed.debug._frontend.FrontendServer", port=0)),
         "code behind a reference": (
             "model.image",
             created % f"torch._inductor.codecache.PyCodeCache.load,_args_:[\"open({str(mark)!r},'w')\"]",

@@ -17,7 +17,7 @@ from saved_policies import save_policy
 from toy import SPEC
 
 from vla.io.errors import UserError
-from vla.models.model import mean_where
+from vla.models.layers import mean_where
 from vla.models.policy_folder import read_policy
 from vla.models.tokenizers.fast import Fast
 from vla.models.tokenizers.quantile import Quantile

@@ -203,7 +203,7 @@ def test_build_gives_plain_containers_runtime_arguments_and_nested_factories() -
 def test_a_class_takes_the_arguments_of_its_base_classes_too() -> None:
     node = plain(composed("model=act").model)
     for changes, message in (
-        ({"keypoint": 3}, "model.keypoint is unknown, did you mean keypoints? ACT takes text, "),
+        ({"width_": 3}, "model.width_ is unknown, did you mean width? ACT takes text, "),
         ({"chunk": 0}, "model.chunk must be a whole number, at least 1"),
         ({"inherited": 3}, "model.inherited is unknown"),
     ):

@@ -16,19 +16,18 @@ from fake_batch import (
     make_bc,
     make_decoder,
     make_denoising,
-    overfit,
     with_text,
 )
 from observing import observations
-from toy import SPEC, ToyEnvironment
+from toy import ToyEnvironment
 
-from vla.models.chunk_policy import ChunkModel
+from vla.models.bc import BC
 from vla.models.diffusion import Diffusion
 from vla.models.flow import Flow
-from vla.models.one_frame import OneFrameModel
+from vla.models.model import ContextModel, Model
 from vla.rollouts.rollout import rollout
 
-MODELS: dict[str, Callable[..., ChunkModel]] = {
+MODELS: dict[str, Callable[..., ContextModel]] = {
     "act": make_act,
     "diffusion": partial(make_denoising, Diffusion),
     "flow": partial(make_denoising, Flow),
@@ -36,63 +35,12 @@ MODELS: dict[str, Callable[..., ChunkModel]] = {
 every_model = pytest.mark.parametrize("make", MODELS.values(), ids=MODELS.keys())
 
 
-def batch_for(model: ChunkModel) -> dict[str, Any]:
+def batch_for(model: ContextModel) -> dict[str, Any]:
     return with_text(model, make_batch(1, model.chunk))
 
 
-@every_model
-def test_shapes(make: Callable[..., ChunkModel]) -> None:
-    model = make()
-    batch = batch_for(model)
-    assert model(batch)["truth"].shape == (4, 1, SPEC.truth_size)
-    assert model.loss(batch)["loss"].shape == ()
-    prediction = model.eval().predict(batch)
-    assert prediction.actions.shape == (4, 4, 3) and prediction.actions.dtype == torch.float32
-    assert prediction.probabilities is None
-
-
-@every_model
-def test_overfits_one_batch(make: Callable[..., ChunkModel]) -> None:
-    torch.manual_seed(0)
-    model = make(chunk=2)
-    assert overfit(model, batch_for(model), steps=200) < 0.08
-
-
-@every_model
-def test_saves_and_loads_equal(make: Callable[..., ChunkModel]) -> None:
-    torch.manual_seed(0)
-    model, other = make(), make()
-    batch = batch_for(model)
-    model.loss(batch)  # gathers statistics, which must travel too
-    other.load_state_dict(model.state_dict())
-    assert torch.equal(model.eval().predict(batch).actions, other.eval().predict(batch).actions)
-
-
-@every_model
-def test_predictions_ignore_truth_and_labels(make: Callable[..., ChunkModel]) -> None:
-    model = make().eval()
-    batch = batch_for(model)
-    seen = {name: value for name, value in batch.items() if name not in ("truth", "action", "valid", "instruction")}
-    assert torch.equal(model.predict(batch).actions, model.predict(seen).actions)
-
-
-@every_model
-def test_the_instruction_matters(make: Callable[..., ChunkModel]) -> None:
-    model = make().eval()
-    batch = batch_for(model)
-    other = {**batch, "text": model.text.tokenize(["push the button"] * 4)}
-    assert not torch.allclose(model.predict(batch).actions, model.predict(other).actions)
-
-
-@every_model
-def test_without_weight_there_is_no_auxiliary_head(make: Callable[..., ChunkModel]) -> None:
-    model = make(auxiliary=0.0)
-    losses = model.loss(batch_for(model))
-    assert losses["loss"] == losses["action_loss"] and "truth_loss" not in losses
-
-
 @pytest.mark.parametrize("make", [make_bc, *MODELS.values()], ids=["bc", *MODELS])
-def test_without_proprioception_the_robot_state_does_not_matter(make: Callable[..., OneFrameModel]) -> None:
+def test_without_proprioception_the_robot_state_does_not_matter(make: Callable[..., Model]) -> None:
     seeing = make()
     batch = with_text(seeing, make_batch(1, seeing.chunk))
     other = {**batch, "state": batch["state"].flip(0)}
@@ -105,22 +53,7 @@ def test_without_proprioception_the_robot_state_does_not_matter(make: Callable[.
 
 
 @every_model
-def test_labels_that_are_not_valid_count_for_nothing(make: Callable[..., ChunkModel]) -> None:
-    model = make()
-    batch = batch_for(model)
-    batch["valid"][:, :, 2:] = False
-    batch["valid"][0] = False
-    other = {**batch, "action": batch["action"].clone()}
-    other["action"][~batch["valid"]] = 7.0
-    losses = []
-    for labels in (batch, other):
-        torch.manual_seed(0)
-        losses.append(model.loss(labels)["loss"])
-    assert torch.isfinite(losses[0]) and losses[0].item() == pytest.approx(losses[1].item(), rel=1e-6)
-
-
-@every_model
-def test_actions_are_scaled_between_the_bounds_of_the_tokenizer(make: Callable[..., ChunkModel]) -> None:
+def test_actions_are_scaled_between_the_bounds_of_the_tokenizer(make: Callable[..., ContextModel]) -> None:
     model = make()
     low, high = model.tokenizer.low, model.tokenizer.high
     assert torch.allclose(model.scaled(torch.stack([low, (low + high) / 2, high])).T, torch.tensor([-1.0, 0.0, 1.0]))
@@ -129,17 +62,7 @@ def test_actions_are_scaled_between_the_bounds_of_the_tokenizer(make: Callable[.
 
 
 @every_model
-def test_validation_leaves_the_random_numbers_of_training_alone(make: Callable[..., ChunkModel]) -> None:
-    model = make().eval()
-    batch = batch_for(model)
-    before = torch.get_rng_state()
-    first, second = model.loss(batch)["loss"], model.loss(batch)["loss"]
-    model.predict(batch)
-    assert torch.equal(torch.get_rng_state(), before) and first == second
-
-
-@every_model
-def test_plays_an_episode_that_follows_from_the_seed(make: Callable[..., ChunkModel]) -> None:
+def test_plays_an_episode_that_follows_from_the_seed(make: Callable[..., ContextModel]) -> None:
     policy = as_policy(make())
     first, other, again = (rollout(ToyEnvironment(), policy, seed).actions for seed in (3, 8, 3))
     assert first.shape == (40, 3) and first.dtype == np.float32
@@ -147,12 +70,13 @@ def test_plays_an_episode_that_follows_from_the_seed(make: Callable[..., ChunkMo
 
 
 @pytest.mark.parametrize("make", [*MODELS.values(), make_bc], ids=[*MODELS, "bc"])
-def test_looks_again_after_the_actions_that_are_executed(make: Callable[..., OneFrameModel]) -> None:
+def test_looks_again_after_the_actions_that_are_executed(make: Callable[..., Model]) -> None:
     model = make(chunk=4, execute=2)
     policy = as_policy(model)
     looks: list[int] = []
     acted: list[np.ndarray] = []
-    model.images[0].register_forward_pre_hook(lambda module, inputs: looks.append(len(acted)))
+    encoder: Any = model.get_submodule("features.images.0" if isinstance(model, BC) else "context.features.images.0")
+    encoder.register_forward_pre_hook(lambda module, inputs: looks.append(len(acted)))
     seen = observations(6)
     policy.reset(seen[0].instruction, 0)
     for observation in seen:
@@ -181,9 +105,46 @@ def test_more_cannot_be_executed_than_is_predicted() -> None:
 
 
 @every_model
-def test_images_that_it_does_not_look_at_make_no_difference(make: Callable[..., ChunkModel]) -> None:
+def test_images_that_it_does_not_look_at_make_no_difference(make: Callable[..., ContextModel]) -> None:
     policy = as_policy(make(chunk=4, execute=2))
     everything, sparse = (rollout(ToyEnvironment(), policy, 3, all_images=every) for every in (True, False))
     assert np.array_equal(everything.executed, sparse.executed) and len(sparse.executed) == 40
     assert [bool(observation.rgb) for observation in sparse.observations] == [True, False] * 20
     assert all(observation.rgb for observation in everything.observations)
+
+
+def test_without_weight_there_is_no_latent() -> None:
+    model = make_act(kl_weight=0.0)
+    losses = model.loss(with_text(model, make_batch(1, 4)))
+    assert "divergence" not in losses and not hasattr(model, "cvae_encoder")
+
+
+def test_the_divergence_is_that_of_two_normal_distributions() -> None:
+    model = make_act(kl_weight=10.0)
+    batch = with_text(model, make_batch(1, 4))
+    mean, log_variance = torch.tensor([[1.0, 0.0]] * 4), torch.tensor([[0.0, 0.5]] * 4)
+    actions = model.scaled(batch["action"][:, -1])
+    losses = model.action_loss({"actions": actions + 0.25, "mean": mean, "log_variance": log_variance}, batch)
+    normal = torch.distributions.Normal
+    posterior, prior = normal(mean, (log_variance / 2).exp()), normal(0.0, 1.0)
+    expected = torch.distributions.kl_divergence(posterior, prior).sum(-1).mean()
+    assert torch.isclose(losses["divergence"], expected)
+    assert torch.isclose(losses["action_loss"], 0.25 + 10 * expected)
+
+
+def test_the_latent_is_drawn_in_training_only() -> None:
+    model = make_act()
+    batch = with_text(model, make_batch(1, 4))
+    assert not torch.equal(model(batch)["actions"], model(batch)["actions"])
+    assert "mean" not in model.eval()(batch)
+    assert torch.equal(model(batch)["actions"], model(batch)["actions"])
+
+
+def test_the_latent_does_not_know_what_is_not_valid() -> None:
+    model = make_act()
+    encoder, standing, action = model.cvae_encoder, torch.randn(4, model.context.state_width), torch.randn(4, 4, 3)
+    valid = torch.arange(4) < torch.tensor([[1], [2], [4], [0]])
+    mean, log_variance = encoder(standing, action, valid)
+    other = encoder(standing, action + 3.0 * ~valid.unsqueeze(-1), valid)
+    assert torch.allclose(mean, other[0], atol=1e-6) and torch.allclose(log_variance, other[1], atol=1e-6)
+    assert not torch.allclose(mean, encoder(standing, action + 3.0, valid)[0], atol=1e-3)

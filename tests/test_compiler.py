@@ -20,11 +20,7 @@ CHECKPOINT = "checkpoint=nowhere.ckpt"
     ("overrides", "key", "off"),
     [
         (("job=train", "learner.compile=true"), "learner.compile", "false"),
-        (("job=evaluate", "learner.compile=true"), "learner.compile", "false"),
-        (("job=improve", "learner.compile=true"), "learner.compile", "false"),
         (("job=evaluate", "policy.compile=true"), "policy.compile", "false"),
-        (("job=evaluate", CHECKPOINT, "policy.compile=true"), "policy.compile", "false"),
-        (("job=improve", "policy.compile=true"), "policy.compile", "false"),
         (("job=deploy", "deploy=server", CHECKPOINT, "policy.compile=true"), "policy.compile", "false"),
         (("job=benchmark", "policy.compile=true"), "policy.compile", "false"),
         (("job=benchmark",), "benchmark.compile", r"\[false\]"),

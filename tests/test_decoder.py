@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 from defaults import defaults_of
-from fake_batch import Motions, as_policy, make_batch, make_decoder, make_rt1, overfit, with_text
+from fake_batch import Motions, as_policy, make_batch, make_decoder, make_rt1, with_text
 from small_training import loader, make_learner, make_trainer
 from toy import SPEC, ToyEnvironment
 
@@ -51,45 +51,6 @@ def batch_for(model: Decoder, size: int = 4) -> dict[str, Any]:
 
 
 @every_model
-def test_shapes(make: Callable[[], Decoder]) -> None:
-    model = make()
-    output = model(batch_for(model))
-    assert output["logits"].shape == (4, output["tokens"].shape[1], model.tokenizer.bins)
-    assert 1 <= output["tokens"].shape[1] <= model.length
-    assert output["truth"].shape == (4, 1, SPEC.truth_size)
-    prediction = model.eval().predict(batch_for(model))
-    assert prediction.actions.shape == (4, model.chunk, 3)
-    if prediction.probabilities is not None:
-        assert prediction.probabilities.shape == (4, model.chunk, 3, model.tokenizer.bins)
-
-
-@pytest.mark.parametrize("name", ["chunk", "quantile", "fast"])  # even bins: see test_action_tokenizer
-def test_overfits_one_batch(name: str) -> None:
-    torch.manual_seed(0)
-    model = MODELS[name]()
-    assert overfit(model, batch_for(model)) < 0.02
-
-
-@every_model
-def test_saves_and_loads_equal(make: Callable[[], Decoder], tmp_path: Path) -> None:
-    model, other = make(), make()
-    batch = batch_for(model)
-    model.loss(batch)  # gathers statistics, which must travel too
-    torch.save(model.state_dict(), tmp_path / "model.ckpt")
-    other.load_state_dict(torch.load(tmp_path / "model.ckpt", weights_only=True))
-    assert torch.equal(model.eval()(batch)["logits"], other.eval()(batch)["logits"])
-    assert torch.equal(model.predict(batch).actions, other.predict(batch).actions)
-
-
-@every_model
-def test_predictions_ignore_truth_and_labels(make: Callable[[], Decoder]) -> None:
-    model = make().eval()
-    batch = batch_for(model)
-    seen = {name: value for name, value in batch.items() if name not in ("truth", "action", "valid", "instruction")}
-    assert torch.equal(model.predict(batch).actions, model.predict(seen).actions)
-
-
-@every_model
 def test_writing_with_a_cache_is_decoding_the_growing_sequence_again_and_again(make: Callable[[], Decoder]) -> None:
     model = make()
     with torch.no_grad():
@@ -99,11 +60,11 @@ def test_writing_with_a_cache_is_decoding_the_growing_sequence_again_and_again(m
     batch = batch_for(model)
     batch["present"][:2, :-1] = False
     with torch.inference_mode():
-        memory, absent = model.memory(batch)
-        logits, tokens = model.generate(memory, absent)
+        context = model.encoded(batch)
+        logits, tokens = model.generate(context)
         written = tokens[:, :0]
         for place in range(tokens.shape[1]):
-            again = model.head(model.decode(written, memory, absent))
+            again = model.head(model.decode(written, context))
             assert torch.allclose(again, logits[:, : place + 1], atol=1e-4, rtol=1e-4)
             written = torch.cat([written, again[:, -1:].argmax(-1)], 1)
         assert torch.equal(written, tokens)
@@ -112,7 +73,7 @@ def test_writing_with_a_cache_is_decoding_the_growing_sequence_again_and_again(m
 
 def test_a_token_depends_on_those_before_it_and_on_no_later_one() -> None:
     model = make_decoder(chunk=2).eval()
-    memory, absent = model.memory(batch_for(model))
+    context = model.encoded(batch_for(model))
     tokens = torch.randint(64, (4, 5))
     embedded: list[torch.Tensor] = []
 
@@ -121,7 +82,7 @@ def test_a_token_depends_on_those_before_it_and_on_no_later_one() -> None:
         return embedded[-1]
 
     model.embedding.register_forward_hook(keep)
-    hidden = model.decode(tokens, memory, absent)
+    hidden = model.decode(tokens, context)
     for place in range(6):
         (gradient,) = torch.autograd.grad(hidden[:, place].square().sum(), embedded[0], retain_graph=True)
         assert (gradient[:, place:] == 0).all()
@@ -149,21 +110,12 @@ def test_frames_that_are_missing_are_as_frames_that_are_padding() -> None:
     assert torch.allclose(prediction.actions, model.predict(batch).actions, atol=1e-6)
 
 
-def test_labels_that_are_not_valid_do_not_count() -> None:
-    model = make_decoder(chunk=3, auxiliary=0.0).eval()
-    batch = batch_for(model)
-    batch["valid"][:, -1, 1:] = False
-    other = {**batch, "action": batch["action"].clone()}
-    other["action"][:, -1, 1:] = 0.0
-    assert model.loss(batch)["loss"].item() == pytest.approx(model.loss(other)["loss"].item(), rel=1e-6)
-
-
 def test_writing_ends_when_all_have_ended() -> None:
     model = make_fast().eval()
     torch.nn.init.zeros_(model.head.weight)
     with torch.no_grad():
         model.head.bias.copy_(torch.eye(256)[model.tokenizer.end])
-    _, tokens = model.generate(*model.memory(batch_for(model)))
+    _, tokens = model.generate(model.encoded(batch_for(model)))
     assert tokens.tolist() == [[model.tokenizer.end]] * 4
 
 

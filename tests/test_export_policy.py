@@ -68,7 +68,7 @@ def test_a_program_that_differs_is_not_written(
         if whole.part != program:
             return capture(whole, inputs)
         changed = Program(deepcopy(whole.model), whole.part)
-        bias = changed.model.image_tokens.bias if program == "encode" else changed.model.head.bias  # type: ignore[union-attr]
+        bias = changed.model.context.image_tokens.bias if program == "encode" else changed.model.head.bias  # type: ignore[union-attr]
         with torch.no_grad():
             bias[0] += 1000 * wrong  # type: ignore[index,operator]
         return capture(changed, inputs)

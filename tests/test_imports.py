@@ -199,7 +199,7 @@ def test_a_policy_acts_without_compiler_and_trainer() -> None:
         "import sys, vla.jobs.evaluate, vla.models.rt1; from pathlib import Path\n"
         "from fake_batch import make_bc; from toy import ARM_SPEC; from vla.models.policy_folder import TensorBudget\n"
         "with TensorBudget(Path(), 2**30):\n"
-        "    assert make_bc(spec=ARM_SPEC).kinematics is not None\n"
+        "    assert make_bc(spec=ARM_SPEC).robot_state.kinematics is not None\n"
         "print(*sys.modules)"
     )
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT / "tests", capture_output=True, text=True, timeout=60)

@@ -10,7 +10,7 @@ from typing import Any
 import lightning
 import pytest
 import torch
-from fake_batch import make_batch, make_bc, make_decoder, make_rt1, with_text
+from fake_batch import make_act, make_batch, make_bc, make_decoder, make_rt1, with_text
 from small_training import fit, loader, make_learner, make_trainer
 
 from vla.models.model import Model
@@ -124,8 +124,36 @@ def test_weight_decay_spares_the_embeddings_of_a_network_of_timm() -> None:
     decayed, spared = (
         set(map(id, group["params"])) for group in learner.configure_optimizers()["optimizer"].param_groups
     )
-    encoder: Any = model.images[0]
+    encoder: Any = model.features.images[0]
     assert id(encoder.backbone.pos_embed) in spared and id(encoder.backbone.patch_embed.proj.weight) in decayed
+
+
+def test_parts_have_rates_of_their_own_and_frozen_ones_stay() -> None:
+    model = make_act()
+    learner = make_learner(model, rates={"context": 0.1, "context.features.images": 0.5}, frozen=["text"], ema=0.0)
+    before = {name: value.clone() for name, value in model.named_parameters()}
+    trainer = fit(learner, make_batch(1, 4), 2)
+    rates = {id(each): group["lr"] for group in trainer.optimizers[0].param_groups for each in group["params"]}
+    found = {name: rates.get(id(value)) for name, value in model.named_parameters()}
+    assert found["text.norm.weight"] is None
+    whole = found["head.weight"]
+    assert whole and found["context.fuse.1.weight"] == pytest.approx(whole / 10)
+    assert found["context.features.images.0.convs.0.weight"] == pytest.approx(whole / 2)
+    changed = [name for name, value in model.named_parameters() if not torch.equal(value, before[name])]
+    assert not any(name.startswith("text.") for name in changed) and "context.fuse.1.weight" in changed
+
+
+@pytest.mark.parametrize(
+    ("options", "says"),
+    [
+        ({"frozen": ["contxt"]}, r"learner\.frozen names contxt, .* it has text, truth_head, features, mlp, head"),
+        ({"rates": {"features.image": 0.1}}, r"learner\.rates names features\.image, which no parameter"),
+        ({"frozen": ["text", "truth_head", "features", "mlp", "head"]}, "leaves nothing to train"),
+    ],
+)
+def test_a_part_that_is_not_there_is_refused(options: dict[str, Any], says: str) -> None:
+    with pytest.raises(ValueError, match=says):
+        make_learner(make_bc(), **options)
 
 
 def test_compiling_keeps_the_names_in_the_checkpoint() -> None:

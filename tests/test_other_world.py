@@ -44,7 +44,7 @@ TINY = {
         "model.heads=2",
         "model.layers=1",
         "model.text_width=8",
-        "model.proprioception=true",
+        "model.context.proprioception=true",
     ),
     "decoder": ("model.width=16", "model.heads=2", "model.layers=1", "model.text_width=8"),
     "act": ("model.width=16", "model.heads=2", "model.text_width=8"),

@@ -176,30 +176,22 @@ HOSTILE: dict[str, tuple[Callable[[Path], object], str]] = {
         lambda folder: (folder / "config.json").unlink() or (folder / "config.json").mkdir(),
         "has no",
     ),
-    "a pipe": (lambda folder: (folder / "config.json").unlink() or os.mkfifo(folder / "config.json"), "has no config"),
     "a link to the outside": (link("config.json", "/etc/passwd"), "is a link that leaves the folder"),
-    "a link upwards": (link("model.safetensors", "../outside"), "is a link that leaves the folder"),
-    "a link to a device": (link("model.safetensors", "/dev/zero"), "is a link that leaves the folder"),
     "a link to nothing": (link("training.json", "nothing"), r"has no training\.json"),
     "a list": (text("config.json", "[]"), r"config\.json is damaged or of another kind"),
     "no JSON": (text("config.json", "{"), r"config\.json is damaged or of another kind"),
-    "no text": (lambda folder: (folder / "config.json").write_bytes(b"\xff\xfe\x00"), r"config\.json is damaged"),
     "deep JSON": (text("config.json", DEEP), r"config\.json is damaged or of another kind: .*recursion"),
     "an endless number": (text("config.json", '{"task": {"a": ' + "9" * 5000 + "}}"), r"config\.json is damaged"),
-    "a huge file": (lambda folder: os.truncate(folder / "config.json", 10**12), "has 1000000000000 bytes, more than"),
     "a reference": (
         key("config.json", model={"width": "${oc.env:HOME}"}),
         "holds the reference .*only resolved values",
     ),
-    "a reference in a key": (key("config.json", model={"${oc.env:HOME}": 1}), "holds the reference"),
     "a node that is a list": (key("config.json", model=[]), "is of no policy of this project"),
     "a spec of another kind": (key("spec.json", cameras=5), r"spec\.json"),
-    "cameras in other folders": (key("spec.json", cameras=["../../front"]), r"spec\.json"),
     "a training of another kind": (
         key("training.json", steps=-1),
         r"training\.json is damaged or of another kind: steps",
     ),
-    "a further key": (key("training.json", more=1), r"training\.json is damaged or of another kind: more"),
     "a hash that is a path": (key("training.json", weights="../weights"), r"training\.json is damaged .*weights"),
     "other weights": (key("training.json", weights="0" * 64), r"model\.safetensors is damaged, or not the file"),
     "a flipped bit": (
@@ -212,7 +204,6 @@ HOSTILE: dict[str, tuple[Callable[[Path], object], str]] = {
         lambda folder: os.truncate(folder / "model.safetensors", 1000) or _sign(folder),
         r"model\.safetensors is damaged: ",
     ),
-    "empty": (lambda folder: os.truncate(folder / "model.safetensors", 0) or _sign(folder), "is damaged: "),
     "a header beyond the file": (
         lambda folder: (folder / "model.safetensors").write_bytes(b"\xff" * 8 + bytes(99)) and _sign(folder),
         r"model\.safetensors is damaged: ",
@@ -228,10 +219,6 @@ HOSTILE: dict[str, tuple[Callable[[Path], object], str]] = {
     "a pickle": (
         lambda folder: torch.save({"a": 1}, folder / "model.safetensors") or _sign(folder),
         r"model\.safetensors is damaged: ",
-    ),
-    "half precision": (
-        weights(lambda state: {name: value.half() for name, value in state.items()}),
-        r"does not fit the model .* numbers of torch\.float16, not torch\.float32",
     ),
     "names of folders": (
         weights(lambda state: {f"../{name}": value for name, value in state.items()}),

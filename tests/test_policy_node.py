@@ -21,7 +21,6 @@ from std_srvs.srv import SetBool, Trigger
 from test_server import remote, serving
 from world import KINDS, World, positions
 
-from vla.deploy import messages
 from vla.deploy.client_observation import Keys
 from vla.deploy.safety import State
 from vla.robots.panda import HOME, forward
@@ -209,24 +208,6 @@ def test_an_instruction_too_long_is_dropped_and_the_former_one_followed(
     world.live(5.0, until=lambda: world.policy.seen[-1].instruction.startswith("push"))
     status = {pair.key: pair.value for pair in world.statuses[-1].values}
     assert len(world.policy.seen[-1].instruction) == 999 and len(status["instruction"]) <= 80
-
-
-def test_images_of_another_size_are_resized_and_that_is_logged_once(
-    world: World, capfd: pytest.CaptureFixture[str]
-) -> None:
-    pixels = np.zeros((30, 40, 3), np.uint8)
-    pixels[:, 5:35] = 200  # the centre
-
-    def enlarge(image: Image) -> None:
-        messages.fill_image(image, pixels, "camera")
-
-    world.changed = enlarge
-    world.live(0.8)
-    assert world.becomes(State.RUNNING)
-    assert {image.shape for image in world.policy.seen[-1].rgb.values()} == {(8, 8, 3)}
-    assert all((image == 200).all() for image in world.policy.seen[-1].rgb.values())
-    said = "images of 40 by 30 pixels are cropped at the centre to 30 by 30 and resized to 8 by 8"
-    assert capfd.readouterr().err.count(said) == 2  # cameras
 
 
 def test_another_node_that_commands_the_arm_is_a_fault_and_one_that_sends_images_holds_it(world: World) -> None:

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 import torch
 from defaults import defaults_of
-from fake_batch import TINY_IMAGE, TINY_TEXT, make_batch, make_rt1, with_text
+from fake_batch import TINY_IMAGE, TINY_TEXT, context_of, make_batch, make_rt1, with_text
 from toy import SPEC
 
 from vla.models.rt1 import RT1, attention_mask
@@ -57,10 +57,10 @@ def test_one_pass_equals_a_loop_over_the_action_tokens() -> None:
 
 def test_no_prediction_depends_on_another_one_of_its_frame_nor_on_what_was_done() -> None:
     model = make_rt1(history=2, chunk=2).eval()
-    frame = model.tokens + model.slots
+    frame = model.context.per_frame + model.slots
     sequence = torch.randn(1, 2 * frame, 32, requires_grad=True)  # whatever slots may hold
     hidden = model.transform(sequence)
-    for slots in (range(model.tokens, frame), range(frame + model.tokens, 2 * frame)):
+    for slots in (range(model.context.per_frame, frame), range(frame + model.context.per_frame, 2 * frame)):
         for place in slots:
             (gradient,) = torch.autograd.grad(hidden[0, place].sum(), sequence, retain_graph=True)
             assert [other for other in slots if gradient[0, other].abs().sum() > 0] == [place]
@@ -109,7 +109,8 @@ def test_the_tokens_of_the_cameras_stand_side_by_side(cameras: tuple[str, ...]) 
         text=TINY_TEXT,
         spec=spec,
         tokenizer=tokenizer,
-        **defaults_of("model/rt1", history=2, image_size=64, width=32, text_width=8, layers=1, heads=1),
+        context=context_of("model/rt1", history=2),
+        **defaults_of("model/rt1", image_size=(64, 64), width=32, text_width=8, layers=1, heads=1),
     ).eval()
     batch = with_text(model, make_batch(2, spec=spec))
     assert model.encode(batch).shape == (4, 2, 8 * len(cameras), 32)
@@ -136,39 +137,34 @@ def test_the_paper_network_has_its_size_and_its_81_positions() -> None:
         text=partial(NGrams, **defaults_of("model/text/ngrams")),
         spec=spec,
         tokenizer=RT1Bins(spec=spec, **defaults_of("tokenizer/rt1")),
+        context=context_of("model/rt1"),
         **defaults_of("model/rt1"),
     ).eval()
     language = parameters_of(model.text)  # a frozen encoder in the paper
-    transformer = [model.image_tokens, model.positions, model.layers, model.head]
-    parts = parameters_of(model.image), parameters_of(model.token_learners), sum(map(parameters_of, transformer))
+    transformer = [model.context.image_tokens, model.positions, model.layers, model.head]
+    images = parameters_of(model.context.image), parameters_of(model.context.token_learners)
+    parts = (*images, sum(map(parameters_of, transformer)))
     assert parts == (15_709_784, 34_376, 19_375_872)
     assert parameters_of(model) == sum(parts) + language
     # The published code embeds the actions of the past too, and multiplies what comes of it by zero.
     unused = 256 * 512
     assert sum(parts) + unused == pytest.approx(35.25e6, abs=0.005e6)
-    assert len(model.image.films) + 1 == 27
+    assert len(model.context.image.films) + 1 == 27
     assert model.mask.shape == (114, 114)
     positions = []
-    model.token_learners[0].register_forward_pre_hook(lambda module, inputs: positions.append(inputs[0].shape))
+    model.context.token_learners[0].register_forward_pre_hook(lambda module, inputs: positions.append(inputs[0].shape))
     with torch.inference_mode():
-        tokens = model.encode(with_text(model, make_batch(1, size=1, spec=spec)))
+        tokens = model.encode(model.transforms(make_batch(1, size=1, spec=spec)))
     assert positions == [(1, 512, 9, 9)]
     assert tokens.shape == (1, 1, 8, 512)
 
 
 @pytest.mark.parametrize("option", ["model/rt1", "model/rt1_small"])
 def test_rt1_sees_images_and_the_instruction_only(option: str) -> None:
-    small = {
-        "image_size": None,
-        "width": 32,
-        "text_width": 16,
-        "layers": 1,
-        "heads": 2,
-        "key_width": 16,
-        "shift": (0, 0),
-    }
+    small = {"image_size": None, "width": 32, "text_width": 16, "layers": 1, "heads": 2, "key_width": 16}
     tokenizer = Uniform(spec=SPEC, **defaults_of("tokenizer/uniform"))
-    parts = {"image": TINY_IMAGE, "text": TINY_TEXT, "spec": SPEC, "tokenizer": tokenizer}
+    parts: dict[str, Any] = {"image": TINY_IMAGE, "text": TINY_TEXT, "spec": SPEC, "tokenizer": tokenizer}
+    parts["context"] = context_of(option)
     model = RT1(**parts, **defaults_of(option, **small)).eval()
     batch = with_text(model, make_batch(model.history))
     logits = model(batch)["logits"]

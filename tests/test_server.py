@@ -56,7 +56,6 @@ def settings(policy: Policy, **changes: Any) -> PolicyServer:
         "host": "127.0.0.1",
         "port": 0,
         "keys": KEYS,
-        "image_crop": "centre",
         "connections": 4,
         "largest_message": 1_000_000,
         "api_key": None,
@@ -211,19 +210,19 @@ def test_a_reset_begins_another_episode() -> None:
 def test_images_of_other_sizes_kinds_and_places_are_taken() -> None:
     observation = observations(1)[0]
     image = observation.rgb["eye"]
-    plain = KEYS.observation(message(observation), SPEC, "centre")
+    plain = KEYS.observation(message(observation), SPEC)
     np.testing.assert_array_equal(plain.rgb["eye"], image)
     nested = {
         "observation": {"image": image.transpose(2, 0, 1) / np.float32(255), "state": list(map(float, plain.state))}
     }
-    other = KEYS.observation({**nested, "prompt": "go"}, SPEC, "centre")
+    other = KEYS.observation({**nested, "prompt": "go"}, SPEC)
     np.testing.assert_array_equal(other.rgb["eye"], image)
     np.testing.assert_array_equal(other.state, plain.state)
     large = {**message(observation), "observation/image": image.repeat(4, 0).repeat(6, 1)}
-    assert KEYS.observation(large, SPEC, "centre").rgb["eye"].shape == (16, 16, 3)
+    assert KEYS.observation(large, SPEC).rgb["eye"].shape == (64, 96, 3)
     parts = Keys(KEYS.images, ["east", "north"], "prompt")
     split = {"observation/image": image, "east": np.float32(1), "north": [2.0], "prompt": "go"}
-    np.testing.assert_array_equal(parts.observation(split, SPEC, "none").state, [1, 2])
+    np.testing.assert_array_equal(parts.observation(split, SPEC).state, [1, 2])
 
 
 def test_the_encoding_is_documented() -> None:

@@ -82,7 +82,7 @@ def test_at_the_start_a_feature_map_is_that_of_the_network(name: str, size: int 
 def test_a_frozen_backbone_is_unchanged_while_the_rest_of_the_model_learns() -> None:
     torch.manual_seed(0)
     model = make_bc(image=partial(FilmBackbone, "test_resnet", False, frozen=True, size=32, channels=8))
-    encoder: Any = model.images[0]
+    encoder: Any = model.features.images[0]
     trunk = encoder.backbone
     before = {name: value.clone() for name, value in trunk.state_dict().items()}
     encoder(torch.rand(2, 3, 32, 32), torch.randn(2, encoder.film.gamma.in_features))  # in the mode of the beginning

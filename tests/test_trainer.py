@@ -128,8 +128,11 @@ def test_out_of_memory_errors_name_the_options_to_lower() -> None:
     """Images larger than all addresses, none of which is there before the model wants to compute with them."""
     batch = make_batch(3)
     batch["rgb"] = {name: image[:, :, :1, :1].expand(-1, -1, 10**8, 10**8, -1) for name, image in batch["rgb"].items()}
-    sizes = OmegaConf.create({"data": {"batch_size": 4}, "model": {"history": 3, "image_size": None, "width": 32}})
-    wanted = r"lower data\.batch_size \(now 4\), model\.history \(now 3\), model\.width .*trainer\.precision=bf16"
+    model = {"context": {"history": 3}, "image_size": None, "width": 32}
+    sizes = OmegaConf.create({"data": {"batch_size": 4}, "model": model})
+    wanted = (
+        r"lower data\.batch_size \(now 4\), model\.context\.history \(now 3\), model\.width .*trainer\.precision=bf16"
+    )
     with pytest.raises(UserError, match=wanted), explain_memory_errors(sizes):
         fit(make_learner(make_rt1()), batch, 1)
     for error in (torch.OutOfMemoryError("CUDA out of memory"), MemoryError()):

@@ -36,7 +36,7 @@ SMALL = (
     "learner.schedule=constant",  # or a longer training would begin otherwise
     "model.text.dropout=0",  # processes would not drop the same
     "model.shift=[0,0]",
-    "model.history=1",  # padding would count per process
+    "model.context.history=1",  # padding would count per process
     "tokenizer.smoothing=0",  # or a decoder would draw what it is told
 )
 

@@ -116,7 +116,9 @@ class ToyEnvironment:
         rgb: dict[str, Array] = {}
         depth: dict[str, Array] = {}
         for number, camera in enumerate(() if self._blind else self.spec.cameras):
-            grid = np.hypot(*(np.mgrid[:16, :16] / 16 - self._point[:, None, None]))
+            height, width = self.spec.image_size
+            rows, columns = np.mgrid[:height, :width]
+            grid = np.hypot(rows / height - self._point[0], columns / width - self._point[1])
             rgb[camera] = np.stack([255 * (grid % 1), grid * 0 + self._steps, grid * 0 + number], -1).astype(np.uint8)
             if camera in self.spec.depth:
                 depth[camera] = (500 + 40000 * (grid % 1) + number).astype(np.uint16)

@@ -6,10 +6,11 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from itertools import chain
-from typing import Any, Literal, overload
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -18,10 +19,12 @@ from torch import Tensor
 from vla.io.errors import UserError
 from vla.io.types import Count
 from vla.models.compile_cache import set_compile_cache
-from vla.models.model import Batch, Model
+from vla.models.layers import Batch
+from vla.models.model import Model
 from vla.schedule import Schedule
 from vla.spec import LONGEST_INSTRUCTION, Array, Observation, Spec
 
+Seen = Observation | Mapping[str, Any] | Sequence[Observation]  # by one lane, or by several
 LONG_SENTENCE = " ".join(["sentence"] * 24)  # shorter instructions are padded to it for a constant shape
 
 
@@ -86,7 +89,7 @@ class Policy:
             self._encode = torch.compile(self.model.encode, mode=mode)
             self._predict_chunk = torch.compile(self.model.predict, mode=mode)
         self._low, self._high = np.array(spec.low, np.float32), np.array(spec.high, np.float32)
-        self._lanes: dict[int, Lane] = {}
+        self._lanes = dict[int, Lane]()
         self.reset("", 0)
 
     def reset(self, instruction: str, seed: int, lane: int = 0) -> None:
@@ -119,11 +122,7 @@ class Policy:
     def _wants_plan(self, lane: int) -> bool:
         return self._lanes[lane].schedule.wants_plan(self._lanes[lane].step, self.execute)
 
-    @overload
-    def act(self, observations: Observation | Mapping[str, Any]) -> Array: ...
-    @overload
-    def act(self, observations: Sequence[Observation], lanes: Sequence[int]) -> Array: ...
-    def act(self, observations: Any, lanes: Sequence[int] | None = None) -> Array:
+    def act(self, observations: Seen, lanes: Sequence[int] | None = None) -> Array:
         """Return the actions to execute, (n, D) float32, clipped to the spec, of n lanes, given what each of them sees.
 
         Without `lanes`, return the action (D,) for the one observation of lane 0, which may also be that of
@@ -133,11 +132,11 @@ class Policy:
             UserError: an observation does not match the spec; no lane has acted then.
         """
         if lanes is None:
-            return self.act([_as_observation(observations, self.spec)], [0])[0]
+            return self.act([self._one(observations)], [0])[0]
         seen = self._followed(observations, lanes)
         self._observe({lane: each for lane, each in seen.items() if self.looking(lane)})
-        for lane, (actions, infos) in self._predict([lane for lane in lanes if self._wants_plan(lane)]).items():
-            self._lanes[lane].schedule.add(list(zip(actions, infos, strict=True)), self._lanes[lane].step)
+        for lane, chunk in self._predict([lane for lane in lanes if self._wants_plan(lane)]).items():
+            self._lanes[lane].schedule.add(chunk, self._lanes[lane].step)
         chosen = []
         for state in (self._lanes[lane] for lane in lanes):
             action, state.info = state.schedule.at(state.step)[-1]
@@ -145,26 +144,21 @@ class Policy:
             chosen.append(action)
         return np.stack(chosen)
 
-    @overload
-    def plan(self, observations: Observation) -> Array: ...
-    @overload
-    def plan(self, observations: Sequence[Observation], lanes: Sequence[int]) -> Array: ...
-    def plan(self, observations: Any, lanes: Sequence[int] | None = None) -> Array:
-        """Return chunks of actions, (n, k, D) float32, clipped to the spec, of n lanes, given what each of them sees.
+    def plan(self, observations: Seen, lanes: Sequence[int] | None = None) -> Array:
+        """Return chunks of actions, (n, k, D) float32, clipped to the spec, of which a caller executes the first.
 
-        The caller executes the first `execute` actions of each. Without `lanes`, return the chunk (k, D) for the one
-        observation of lane 0.
-
-        Raises:
-            UserError: an observation does not match the spec; no lane has seen its own then.
+        Without `lanes`, return the chunk (k, D) for the one observation of lane 0. Raises as `act`.
         """
         if lanes is None:
-            return self.plan([observations], [0])[0]
+            return self.plan([self._one(observations)], [0])[0]
         self._observe(self._followed(observations, lanes))
         planned = self._predict(lanes)
-        return np.stack([planned[lane][0] for lane in lanes])
+        return np.stack([[action for action, _ in planned[lane]] for lane in lanes])
 
-    def _followed(self, observations: Sequence[Observation], lanes: Sequence[int]) -> dict[int, Observation]:
+    def _one(self, seen: Any) -> Observation:
+        return seen if isinstance(seen, Observation) else Observation.from_mapping(seen, self.spec)
+
+    def _followed(self, observations: Any, lanes: Sequence[int]) -> dict[int, Observation]:
         """Return lane → its observation; a lane with another instruction begins an episode."""
         seen = dict(zip(lanes, observations, strict=True))
         for lane, observation in seen.items():
@@ -173,59 +167,59 @@ class Policy:
                 self.reset(observation.instruction, lane if state is None else state.seed, lane)
         return seen
 
-    def _passes(self, lanes: Iterable[int]) -> Iterator[dict[int, int]]:
-        """Divide lanes into passes through the model, row → lane, each with instructions of one length."""
+    def _observe(self, seen: Mapping[int, Observation]) -> None:
+        """Encode the observations of lanes, and add them to the histories; all, or none if one does not fit."""
+        for rows, frames in self._passes({lane: self.frame(observation, lane) for lane, observation in seen.items()}):
+            with self._computing():
+                tokens = self._encode(frames)
+            kept = {"present": frames["present"]}
+            if tokens is None:
+                kept |= {**frames["rgb"], "state": frames["state"]}
+            else:
+                kept["tokens"] = tokens.clone()  # a CUDA graph overwrites its output in the next call
+            for row, lane in rows.items():
+                self._lanes[lane].frames.append({name: values[row : row + 1] for name, values in kept.items()})
+
+    def _predict(self, lanes: Sequence[int]) -> dict[int, list[tuple[Array, dict[str, Any]]]]:
+        """Return lane → its chunk of clipped actions, (D,) each, with what is known about them."""
+        chunks = {}
+        for rows, windows in self._passes({lane: self._inputs(lane) for lane in lanes}):
+            with self._computing():
+                predicted, probabilities = self._predict_chunk(windows)
+            actions = np.clip(predicted.float().cpu().numpy(), self._low, self._high)
+            infos: list[list[dict[str, Any]]] = [[{} for _ in chunk] for chunk in actions]
+            if probabilities is not None:
+                infos = [[{"probabilities": each} for each in of] for of in probabilities.float().cpu().numpy()]
+            chunks |= {lane: list(zip(actions[row], infos[row], strict=True)) for row, lane in rows.items()}
+        return chunks
+
+    def _passes(self, inputs: Mapping[int, Batch]) -> Iterator[tuple[dict[int, int], Batch]]:
+        """Divide the inputs of lanes, batches of one, into passes with instructions of one length.
+
+        Yields row → lane, and the batch of all rows, in which any of the inputs stands for those of no lane.
+        """
         passes: dict[int, list[dict[int, int]]] = {}  # length of the instruction → passes
-        for lane in lanes:
+        for lane in inputs:
             state = self._lanes[lane]
             row, alike = state.seed % self.lanes, passes.setdefault(state.text.shape[1], [])
             free = next((each for each in alike if row not in each), None)
             if free is None:
                 alike.append(free := {})
             free[row] = lane
-        yield from chain.from_iterable(passes.values())
+        for rows in chain.from_iterable(passes.values()):
+            some = next(iter(rows.values()))
+            every = [inputs[rows.get(row, some)] for row in range(self.lanes)]
+            yield rows, every[0] if self.lanes == 1 else _joined(every)
 
-    def _observe(self, seen: Mapping[int, Observation]) -> None:
-        """Encode the observations of lanes, and add them to the histories."""
-        frames = {lane: self.frame(observation, lane) for lane, observation in seen.items()}  # all, or none is added
-        for lanes in self._passes(frames):
-            encoded = self._encoded(self._batch({row: frames[lane] for row, lane in lanes.items()}))
-            for row, lane in lanes.items():
-                self._lanes[lane].frames.append({name: values[row : row + 1] for name, values in encoded.items()})
-
-    def _predict(self, lanes: Iterable[int]) -> dict[int, tuple[Array, list[dict[str, Any]]]]:
-        """Return lane → clipped actions, (k, D), and what is known about each."""
-        predicted = {}
-        for together in self._passes(lanes):
-            inputs = {row: self._inputs(lane) for row, lane in together.items()}
-            actions, probabilities = self._predicted(self._batch(inputs))
-            for row, lane in together.items():
-                known = [{}] * len(actions[row])
-                if probabilities is not None:
-                    known = [{"probabilities": each} for each in probabilities[row]]
-                predicted[lane] = actions[row], known
-        return predicted
-
-    def _batch(self, inputs: Mapping[int, Batch]) -> Batch:
-        """Return the batch of all rows, of which some are given as batches of one; the others are any of these."""
-        some = next(iter(inputs.values()))
-        return some if self.lanes == 1 else _joined([inputs.get(row, some) for row in range(self.lanes)])
+    @contextmanager
+    def _computing(self) -> Iterator[None]:
+        with torch.inference_mode(), torch.autocast(self.device.type, torch.bfloat16, enabled=self._bf16):
+            yield
 
     def _inputs(self, lane: int) -> Batch:
         """Return the input of one prediction, with the next noise if the model needs any."""
         noise = self.model.sample_noise(self._lanes[lane].random)
         return self.window(lane) if noise is None else {**self.window(lane), "noise": noise.to(self.device)}
-
-    @torch.inference_mode()
-    def _predicted(self, inputs: Batch) -> tuple[Array, Array | None]:
-        """Return clipped actions, (B, k, D), and token probabilities, (B, k, D, K), if the model has them."""
-        with self._autocast():
-            actions, probabilities = self._predict_chunk(inputs)
-        array = None if probabilities is None else probabilities.float().cpu().numpy()
-        return np.clip(actions.float().cpu().numpy(), self._low, self._high), array
-
-    def _autocast(self) -> torch.autocast:
-        return torch.autocast(self.device.type, torch.bfloat16, enabled=self._bf16)
 
     def window(self, lane: int = 0) -> Batch:
         """Return the model input of a lane, a batch of one: the frames so far, padded to the history of the model."""
@@ -237,42 +231,32 @@ class Policy:
         return {**joined, "rgb": rgb, "text": state.text}
 
     def frame(self, observation: Observation, lane: int = 0) -> Batch:
-        """Convert an observation of a lane to a batch of one frame.
+        """Convert an observation of a lane, with images of any size, to a batch of one frame that the model sees.
 
         Raises:
             UserError: the observation does not match the spec.
         """
-        shape = (*self.spec.image_size, 3)
-        shapes = {camera: image.shape for camera, image in observation.rgb.items()}
-        if any(shapes.get(camera) != shape for camera in self.spec.cameras):
-            raise UserError(f"the policy needs cameras {self.spec.cameras} of {shape}, the observation has {shapes}")
-        if other := [camera for camera in self.spec.cameras if observation.rgb[camera].dtype != np.uint8]:
-            raise UserError(f"images must be uint8, 0 to 255, that of {other[0]} is {observation.rgb[other[0]].dtype}")
-        if observation.state.shape != (len(self.spec.state),):
-            raise UserError(f"the policy's state is {self.spec.state}, the observation's {observation.state.shape}")
-        return {
-            "rgb": {camera: self._tensor(observation.rgb[camera]) for camera in self.spec.cameras},
+        spec, rgb = self.spec, observation.rgb
+        if missing := [camera for camera in spec.cameras if camera not in rgb]:
+            raise UserError(f"the policy needs cameras {spec.cameras}, the observation lacks {', '.join(missing)}")
+        for camera in spec.cameras:
+            image = rgb[camera]
+            if image.ndim != 3 or image.shape[2] != 3 or not image.size or image.dtype != np.uint8:
+                kind = f"{image.dtype} of {image.shape}"
+                raise UserError(f"the image of {camera} must be (H, W, 3) uint8, 0 to 255, and is {kind}")
+            spec.require_cut(camera, image.shape, f"the image of {camera}")
+        if observation.state.shape != (len(spec.state),):
+            raise UserError(f"the policy's state is {spec.state}, the observation's {observation.state.shape}")
+        frame = {
+            "rgb": {camera: self._tensor(rgb[camera]) for camera in spec.cameras},
             "state": self._tensor(np.asarray(observation.state, np.float32)),
             "present": torch.ones(1, 1, dtype=torch.bool, device=self.device),
             "text": self._lanes[lane].text,
         }
-
-    @torch.inference_mode()
-    def _encoded(self, frame: Batch) -> dict[str, Tensor]:
-        """Return the part of B frames to cache, (B, 1, …): their tokens if the model encodes frames, else all of it."""
-        with self._autocast():
-            tokens = self._encode(frame)
-        if tokens is None:
-            return {**frame["rgb"], "state": frame["state"], "present": frame["present"]}
-        # A CUDA graph overwrites its output in the next call.
-        return {"tokens": tokens.clone(), "present": frame["present"]}
+        return self.model.transforms(frame)
 
     def _tensor(self, values: Array) -> Tensor:
         return torch.from_numpy(values.copy())[None, None].to(self.device)
-
-
-def _as_observation(seen: Observation | Mapping[str, Any], spec: Spec) -> Observation:
-    return seen if isinstance(seen, Observation) else Observation.from_mapping(seen, spec)
 
 
 def _joined(batches: Sequence[Batch]) -> Batch:

@@ -166,6 +166,11 @@ class Spec:
                     f"{what} has {name} = {str(value)[:200]}, but {against} has {str(theirs.get(name))[:200]}"
                 )
 
+    def require_input(self, other: Spec, what: str, against: str) -> None:
+        """Do as `require` for what a policy sees and does: images that are not cut may have another size."""
+        mine, theirs = self.without_truth, other.without_truth
+        (mine if self.cut else replace(mine, image_size=theirs.image_size)).require(theirs, what, against)
+
 
 def _fields(spec: Spec) -> dict[str, Any]:
     """Return field → value, with the fields of the robot under dotted names."""

@@ -175,8 +175,9 @@ class Experiment:
         node = self["model"]
         saved = read_policy(origin) if origin else None
         if saved:
-            saved.spec.without_truth.require(spec.without_truth, f"the policy {origin}", "the demonstrations")
-            spec, node = replace(spec, robot=saved.spec.robot), _without_pretraining(node)
+            saved.spec.require_input(spec, f"the policy {origin}", "the demonstrations")
+            layout = {"robot": saved.spec.robot, "image_size": saved.spec.image_size}
+            spec, node = replace(spec, **layout), _without_pretraining(node)
         model = _model(node, spec, build(self["tokenizer"], "tokenizer", spec=spec), saved)
         if saved:
             saved.initialize(model)
@@ -187,7 +188,8 @@ class Experiment:
         from vla.models.checkpoint import read_content, weights_of
 
         content = read_content(checkpoint)
-        spec = replace(spec, robot=Spec.from_dict(content["spec"], str(checkpoint)).robot)
+        begun = Spec.from_dict(content["spec"], str(checkpoint))  # perhaps as that of `pretrained`
+        spec = replace(spec, robot=begun.robot, image_size=begun.image_size)
         tokenizer = build(self["tokenizer"], "tokenizer", spec=spec)
         model = _model(_without_pretraining(self["model"]), spec, tokenizer, None)
         # Before Lightning does, because a sharded model cannot load what modules keep besides their weights.
@@ -300,7 +302,7 @@ def make_policy(policy: Node, checkpoint: Path, environment: Environment | None 
 
     saved = read_policy(checkpoint)
     if environment is not None:
-        saved.spec.without_truth.require(environment.spec.without_truth, f"the policy {checkpoint}", "the task")
+        saved.spec.require_input(environment.spec, f"the policy {checkpoint}", "the task")
     nodes = {"tokenizer": saved.config["tokenizer"], "model": _without_pretraining(saved.config["model"])}
     if not own:
         require_no_paths(nodes, nodes, checkpoint)
@@ -338,7 +340,13 @@ def _model(node: Node, spec: Spec, tokenizer: ActionTokenizer, saved: SavedPolic
 
 
 def _without_pretraining(model: Node) -> Node:
-    """Return a model node without the initial weights of its image encoder, which lie in the policy."""
-    if not isinstance(image := model.get("image"), dict) or "pretrained" not in image:
-        return model
-    return {**model, "image": {**image, "pretrained": False}}
+    """Return a model node without the initial weights of its image encoders, which lie in the policy."""
+    parts = {
+        part: {**node, "pretrained": False}
+        for part in ("image", "context")
+        if isinstance(node := model.get(part), dict) and "pretrained" in node
+    }
+    context = model.get("context")
+    if isinstance(context, dict) and isinstance(image := context.get("image"), dict) and "pretrained" in image:
+        parts["context"] = {**parts.get("context", context), "image": {**image, "pretrained": False}}
+    return {**model, **parts}

@@ -59,7 +59,7 @@ class BagDemonstrations(ImportedDemonstrations):
         topics: in the bag.
         status: topic of the policy node's status, which tells who moves the arm; without it, a person always does.
         robot: names of the joints, and travel of the fingers.
-        image_crop: as in the policy node.
+        image_crop: of images with another aspect ratio than the task's, crop the centre or distort the whole.
         spec: of the task.
 
     Raises:

@@ -10,7 +10,6 @@ import numpy as np
 from annotated_types import MinLen
 
 from vla.io.errors import UserError
-from vla.io.images import Crop, resize
 from vla.io.types import Text
 from vla.spec import LONGEST_INSTRUCTION, Array, Observation, Spec
 
@@ -25,8 +24,8 @@ class Keys:
     state: Annotated[list[Text], MinLen(1)]  # vectors to concatenate
     prompt: Text  # instruction
 
-    def observation(self, message: Any, spec: Spec, crop: Crop) -> Observation:
-        """Convert a client's observation, with images resized; raise a UserError if it does not match the spec."""
+    def observation(self, message: Any, spec: Spec) -> Observation:
+        """Convert a client's observation, whose images may have any size; a UserError if it does not match the spec."""
         if not isinstance(message, Mapping):
             raise UserError(f"an observation is a map, not {type(message).__name__}")
         wanted = [*(self.images[camera] for camera in spec.cameras), *self.state, self.prompt]
@@ -37,14 +36,13 @@ class Keys:
         images = {camera: _image(self.images[camera], found[self.images[camera]]) for camera in spec.cameras}
         for camera, image in images.items():
             spec.require_cut(camera, image.shape, self.images[camera])
-        rgb = {camera: resize(image, spec.image_size, crop) for camera, image in images.items()}
         state = np.concatenate([_vector(key, found[key]) for key in self.state])
         if len(state) != len(spec.state):
             raise UserError(
                 f"the state in {' and '.join(self.state)} has {len(state)} numbers, "
                 f"the policy needs {len(spec.state)}: {', '.join(spec.state)}"
             )
-        return Observation(rgb, state, instruction(self.prompt, found[self.prompt]))
+        return Observation(images, state, instruction(self.prompt, found[self.prompt]))
 
 
 def _find(message: Mapping[Any, Any], key: str) -> Any:

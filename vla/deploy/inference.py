@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import time
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import replace
 
 import numpy as np
 
-from vla.io.images import Crop, resize
 from vla.policy import Policy
 from vla.spec import Array, Observation
 
@@ -16,9 +14,8 @@ from vla.spec import Array, Observation
 class Inference:
     """One inference at a time, always in the same thread: compiled programs are kept per thread."""
 
-    def __init__(self, policy: Policy, crop: Crop) -> None:
-        """Args: the policy; how to fit images with another aspect ratio than in training."""
-        self._policy, self._crop = policy, crop
+    def __init__(self, policy: Policy) -> None:
+        self._policy = policy
         self._pool = ThreadPoolExecutor(1, thread_name_prefix="policy")
         self._running: Future[Array] | None = None
         self._since = 0.0
@@ -57,12 +54,6 @@ class Inference:
     def _plan(self, observation: Observation, first: bool) -> Array:
         if first:
             self._policy.reset(observation.instruction, 0)
-        plan = self._policy.plan(self._resized(observation))
+        plan = self._policy.plan(observation)
         # In training the frames of a history have no gaps either.
         return plan[: 1 if getattr(self._policy, "history", 1) > 1 else self._policy.execute]
-
-    def _resized(self, observation: Observation) -> Observation:
-        size = self._policy.spec.image_size
-        return replace(
-            observation, rgb={camera: resize(image, size, self._crop) for camera, image in observation.rgb.items()}
-        )

@@ -17,7 +17,6 @@ from vla.deploy.diagnostics import Diagnostics
 from vla.deploy.lifecycle_node import GuardedLifecycleNode
 from vla.deploy.observer import age_of
 from vla.deploy.settings import COMPRESSED, PolicySettings
-from vla.io import images
 from vla.io.errors import UserError
 from vla.spec import LONGEST_INSTRUCTION
 
@@ -35,9 +34,8 @@ class Inputs:
     ) -> None:
         """Args: the node; its loop, settings and diagnostics; `advance` is called after an image."""
         self._node, self._loop, self._diagnostics, self._advance = node, loop, diagnostics, advance
-        self._joint_states, self._crop = messages.JointStates(loop.limits), settings.image_crop
+        self._joint_states = messages.JointStates(loop.limits)
         self._stamps: dict[str, tuple[int, int]] = {}  # camera → time stamp of its last image
-        self._shapes: dict[str, tuple[int, ...]] = {}  # camera → shape of its last image
         topics, reliability = settings.topics, settings.image_reliability.upper()
         image_qos = QoSProfile(depth=1, reliability=ReliabilityPolicy[reliability])
         for camera in loop.spec.cameras:
@@ -61,17 +59,9 @@ class Inputs:
             image = messages.image_from(message)
         except UserError as error:
             return self._diagnostics.drop(f"camera {camera}: {error}")
-        self._tell_shape(camera, image.shape)
         self._diagnostics.record("image age", age)
         self._loop.on_image(camera, image, now - age)
         self._advance()
-
-    def _tell_shape(self, camera: str, shape: tuple[int, ...]) -> None:
-        """Log once how images of another size are used."""
-        if self._shapes.get(camera) != shape:
-            self._shapes[camera] = shape
-            if how := images.describe_resize(shape, self._loop.spec.image_size, self._crop):
-                self._node.get_logger().info(f"camera {camera}: {how}")
 
     def _on_joint_state(self, message: JointState) -> None:
         now = time.monotonic()

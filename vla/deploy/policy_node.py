@@ -92,7 +92,7 @@ class PolicyNode(GuardedLifecycleNode):
             raise UserError("deploy/gripper needs a policy that moves a gripper")
         if settings.gripper is not None and topics.gripper is None:
             raise UserError("deploy/gripper needs its action server in deploy.topics.gripper")
-        self._inference = Inference(self.policy, settings.image_crop)
+        self._inference = Inference(self.policy)
         self._inference.warm_up()
         self.diagnostics = Diagnostics(self, loop, settings.dry_run)
         Inputs(self, loop, settings, self.diagnostics, self._advance)

@@ -35,7 +35,6 @@ from websockets.http11 import Request, Response
 from vla.deploy.client_observation import Keys, instruction
 from vla.io.array_messages import pack, unpack
 from vla.io.errors import UserError
-from vla.io.images import Crop
 from vla.io.types import Count, Text
 from vla.spec import Array, Environment, Observation
 
@@ -57,7 +56,6 @@ class PolicyServer:
     Attributes:
         host, port: address to listen at.
         keys: where an observation has its images, state and instruction.
-        image_crop: for images with another aspect ratio than in training: crop the centre, or distort the whole.
         connections: largest number of clients at a time.
         largest_message: of a client [bytes].
         api_key: what clients must send; needed to listen beyond this machine.
@@ -72,7 +70,6 @@ class PolicyServer:
     host: Text
     port: Port
     keys: Keys
-    image_crop: Crop
     connections: Count
     largest_message: Count
     api_key: Text | None
@@ -208,7 +205,7 @@ class Service:
                 raise UserError(f"seed is {repr(seed)[:50]}, expected an integer from 0 to 2**32 - 1")
             self._policy.reset(instruction("prompt", message.get("prompt")), seed, lane)
             return {"reset": True}
-        observation = self._settings.keys.observation(message, self._policy.spec, self._settings.image_crop)
+        observation = self._settings.keys.observation(message, self._policy.spec)
         began, result = time.perf_counter(), asyncio.get_running_loop().create_future()
         self._waiting.put_nowait((lane, observation, result))
         return {"actions": await result, "server_timing": {"infer_ms": 1000 * (time.perf_counter() - began)}}

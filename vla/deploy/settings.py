@@ -11,7 +11,6 @@ from vla.deploy.joint_limiter import JointLimits
 from vla.deploy.ros import action_class
 from vla.deploy.safety import Safety
 from vla.io.errors import UserError
-from vla.io.images import Crop
 from vla.io.types import NonNegative, Positive, Text
 
 COMPRESSED = "/compressed"  # end of the topics of sensor_msgs/CompressedImage, as of image_transport
@@ -109,7 +108,6 @@ class PolicySettings:
         gripper: action of the gripper; None: it takes positions on a topic.
         command_hz: commands per second.
         image_reliability: QoS of the images; "reliable" helps with large images on a lossy network.
-        image_crop: for images with another aspect ratio than in training: crop the centre, or distort the whole.
         dry_run: publish the commands below ~/dry_run, where nothing obeys them.
     """
 
@@ -121,5 +119,4 @@ class PolicySettings:
     gripper: GripperCommand | FrankaGripper | None
     command_hz: Positive
     image_reliability: Literal["best_effort", "reliable"]
-    image_crop: Crop
     dry_run: bool

@@ -9,11 +9,12 @@ Shapes: B batch, k action chunk, D action components, M context tokens, E width 
 from __future__ import annotations
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor, nn
 
 from vla.io.types import Inherited, Layers, NonNegative, Width
-from vla.models.chunk_policy import ChunkModel, transformer_decoder
-from vla.models.model import Batch, Prediction, mean_where, require_heads
+from vla.models.layers import Batch, mean_where, transformer_decoder, transformer_encoder
+from vla.models.model import ContextModel, Prediction
 
 
 class CVAEEncoder(nn.Module):
@@ -40,15 +41,15 @@ class CVAEEncoder(nn.Module):
         self.encoder = transformer_encoder(width, layers, heads)
         self.head = nn.Linear(width, 2 * latent)
 
-    def forward(self, robot_state: list[Tensor], action: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
+    def forward(self, robot_state: Tensor | None, action: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
         """Return mean and log variance, (B, Z) each, of the latent.
 
         The inputs are the (B, robot_state_width) state, if it is used, (B, k, D) scaled actions and their (B, k) bool
         mask.
         """
-        start = self.start.weight.expand(len(action), 1, -1)
-        states = [self.robot_state(each).unsqueeze(1) for each in robot_state]
-        before = torch.cat([start, *states], 1)
+        before = self.start.weight.expand(len(action), 1, -1)
+        if robot_state is not None:
+            before = torch.cat([before, self.robot_state(robot_state).unsqueeze(1)], 1)
         tokens = torch.cat([before, self.action(action)], 1)
         padding = torch.cat([valid.new_zeros(before.shape[:2]), ~valid], 1)
         hidden = self.encoder(tokens + self.positions.weight, src_key_padding_mask=padding)[:, 0]
@@ -56,7 +57,7 @@ class CVAEEncoder(nn.Module):
         return mean, log_variance
 
 
-class ACT(ChunkModel):
+class ACT(ContextModel):
     """Action chunking with transformers: k learned queries attend to the context and become k actions.
 
     In training a latent variable encodes the style of a demonstration. Outside training it is 0, the mean of its prior.
@@ -71,19 +72,19 @@ class ACT(ChunkModel):
         UserError: `width` is not a multiple of `heads`.
     """
 
+    uses_tokens = False
+
     def __init__(
         self, layers: Layers, heads: Layers, latent: Width, kl_weight: NonNegative, **inherited: Inherited
     ) -> None:
         super().__init__(**inherited)
         width, components = self.width, len(self.spec.action)
-        require_heads(width, heads)
         self.kl_weight, self.latent = kl_weight, latent
         if kl_weight > 0:
-            self.cvae_encoder = CVAEEncoder(
-                sum(self.state_widths), components, self.chunk, width, layers, heads, latent
-            )
+            state = self.context.state_width
+            self.cvae_encoder = CVAEEncoder(state, components, self.chunk, width, layers, heads, latent)
             self.latent_token = nn.Linear(latent, width)
-        self.token_types = nn.Embedding(1 + len(self.tokens) + (kl_weight > 0), width)  # type embeddings
+        self.token_types = nn.Embedding(self.context.length + (kl_weight > 0), width)  # type embeddings
         self.encoder = transformer_encoder(width, layers, heads)
         self.queries = nn.Embedding(self.chunk, width)
         self.decoder = transformer_decoder(width, layers, heads)
@@ -94,20 +95,21 @@ class ACT(ChunkModel):
 
         In training also mean and log_variance: (B, Z) each; with an auxiliary head truth: (B, 1, S), normalised.
         """
-        robot_state = self.state_features(batch)
-        output = self.encode_context(batch, robot_state)
-        context = output.pop("context")
+        encoded = self.encoded(batch)
+        context, padding = encoded.tokens, encoded.padding
+        output = self.predict_truth(encoded.summary.unsqueeze(1))
         if self.kl_weight > 0:
             latent = context.new_zeros(len(context), self.latent)
             if self.training:
                 action, valid = batch["action"][:, -1], batch["valid"][:, -1]
-                mean, log_variance = self.cvae_encoder(robot_state, self.scaled(action), valid)
+                mean, log_variance = self.cvae_encoder(encoded.state, self.scaled(action), valid)
                 latent = mean + (log_variance / 2).exp() * torch.randn_like(mean)
                 output |= {"mean": mean, "log_variance": log_variance}
             context = torch.cat([context, self.latent_token(latent).unsqueeze(1)], 1)
-        memory = self.encoder(context + self.token_types.weight)
+            padding = None if padding is None else F.pad(padding, (0, 1))
+        memory = self.encoder(context + self.token_types.weight, src_key_padding_mask=padding)
         queries = self.queries.weight.expand(len(context), -1, -1)
-        return output | {"actions": self.head(self.decoder(queries, memory))}
+        return output | {"actions": self.head(self.decoder(queries, memory, memory_key_padding_mask=padding))}
 
     def action_loss(self, output: dict[str, Tensor], batch: Batch) -> dict[str, Tensor]:
         """Return the L1 error of the scaled actions plus, in training, the weighted KL divergence of the latent."""
@@ -123,9 +125,3 @@ class ACT(ChunkModel):
     def predict(self, batch: Batch) -> Prediction:
         """Predict with the latent at the mean of its prior, 0."""
         return Prediction(self.unscaled(self(batch)["actions"]))
-
-
-def transformer_encoder(width: int, layers: int, heads: int) -> nn.Module:
-    """Build a pre-norm transformer encoder without dropout."""
-    layer = nn.TransformerEncoderLayer(width, heads, 4 * width, 0.0, "gelu", batch_first=True, norm_first=True)
-    return nn.TransformerEncoder(layer, layers, nn.LayerNorm(width), enable_nested_tensor=False)

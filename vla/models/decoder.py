@@ -1,6 +1,6 @@
 """An autoregressive transformer decoder of action tokens, conditioned on images, robot state and instruction.
 
-Shapes: B batch, T frames, N tokens per frame, M = T·N + 2 tokens of memory, k action chunk, L action tokens, K bins,
+Shapes: B batch, T frames, M tokens of the context, k action chunk, L action tokens, K bins,
 E width of a token.
 """
 
@@ -13,8 +13,9 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from vla.io.types import Inherited, Layers, Rate, Width
-from vla.models.frame_tokens import FrameModel
-from vla.models.model import Batch, Prediction, mean_where, newest, require_heads
+from vla.models.context import Encoded
+from vla.models.layers import Batch, mean_where, require_heads
+from vla.models.model import ContextModel, Prediction, log_probabilities
 from vla.models.tokenizers.tokenizer import PerComponent
 
 
@@ -23,12 +24,12 @@ class CachedLayer:
 
     Args:
         layer: pre-norm, batch first, outside training.
-        memory: (B, M, E).
-        padding: (B, M) bool, true for masked positions of the memory.
+        context: of M tokens.
     """
 
-    def __init__(self, layer: nn.TransformerDecoderLayer, memory: Tensor, padding: Tensor) -> None:
-        self._layer, self._present = layer, ~padding[:, None, None]  # (B, 1, 1, M)
+    def __init__(self, layer: nn.TransformerDecoderLayer, context: Encoded) -> None:
+        memory, padding = context.tokens, context.padding
+        self._layer, self._present = layer, None if padding is None else ~padding[:, None, None]  # (B, 1, 1, M)
         self._memory_key, self._memory_value = _project(layer.multihead_attn, memory, 1, 3)
         self._key, self._value = _project(layer.self_attn, memory[:, :0], 1, 3)
 
@@ -58,22 +59,12 @@ def _attend(
     return attention.out_proj(attended.transpose(1, 2).flatten(2))
 
 
-def newest_last(frames: Tensor, present: Tensor) -> tuple[Tensor, Tensor]:
-    """Roll (B, T, N, E) frames and their (B, T) mask until the newest present frame is last: 1, 2, - → -, 1, 2."""
-    length = present.shape[1]
-    places = (torch.arange(length, device=present.device) + newest(present)[:, None] + 1) % length  # (B, T)
-    return frames.gather(1, places[:, :, None, None].expand_as(frames)), present.gather(1, places)
+class Decoder(ContextModel):
+    """`nn.TransformerDecoder` over action tokens, with causal self-attention and cross-attention to the context.
 
-
-class Decoder(FrameModel):
-    """`nn.TransformerDecoder` over action tokens, with causal self-attention and cross-attention to the frames.
-
-    The start token is an MLP of the newest frame and the instruction. Without it, with attention alone, training takes
-    several times as long.
-
-    Training is on the newest frame of a window, with teacher forcing, or with inputs drawn near the labels if the
-    tokenizer has some (`sampled`). Decoding is greedy: each most likely token is fed
-    back, and the tokenizer turns the logits into an action.
+    The start token is the summary of the context. Training is on the newest frame of a window, with teacher forcing, or
+    with inputs drawn near the labels if the tokenizer has some (`sampled`). Decoding is greedy: each most likely token
+    is fed back, and the tokenizer turns the logits into an action.
 
     Args:
         layers, heads, feedforward: of the decoder; feedforward is the hidden width of its MLPs.
@@ -89,19 +80,9 @@ class Decoder(FrameModel):
         width, bins = self.width, self.tokenizer.bins
         require_heads(width, heads)
         self.length = self.tokenizer.length(self.chunk)  # L
-        self.instruction_token = nn.Linear(self.text.width, width)
-        self.memory_norm = nn.LayerNorm(width)
-        self.fuse = nn.Sequential(
-            nn.Linear((self.tokens + 1) * width, 2 * width),
-            nn.ReLU(),
-            nn.Linear(2 * width, 2 * width),
-            nn.ReLU(),
-            nn.Linear(2 * width, width),
-        )
         self.embedding = nn.Embedding(bins, width)
-        self.memory_positions = nn.Embedding(self.history * self.tokens, width)
         self.positions = nn.Embedding(self.length, width)
-        for embedding in (self.embedding, self.memory_positions, self.positions):
+        for embedding in (self.embedding, self.positions):
             nn.init.normal_(embedding.weight, std=0.05)
         layer = nn.TransformerDecoderLayer(width, heads, feedforward, dropout, batch_first=True, norm_first=True)
         self.decoder = nn.TransformerDecoder(layer, layers)
@@ -121,9 +102,9 @@ class Decoder(FrameModel):
         """
         tokens = self.tokenizer.tokenize(batch["action"][:, -1])
         inputs = self.tokenizer.sampled(tokens, batch["action"][:, -1]) if self.training else tokens
-        memory, padding = self.memory(batch)
-        logits = self.head(self.decode(inputs[:, :-1], memory, padding))
-        return {"logits": logits, "tokens": tokens, **self.predict_truth(memory[:, -1:])}
+        context = self.encoded(batch)
+        logits = self.head(self.decode(inputs[:, :-1], context))
+        return {"logits": logits, "tokens": tokens, **self.predict_truth(context.summary.unsqueeze(1))}
 
     def action_loss(self, output: dict[str, Tensor], batch: Batch) -> dict[str, Tensor]:
         """Return the tokenizer's loss over unmasked tokens and, outside training, their accuracy."""
@@ -137,50 +118,41 @@ class Decoder(FrameModel):
 
     def predict(self, batch: Batch) -> Prediction:
         """Decode the actions for the newest frame token by token."""
-        logits, tokens = self.generate(*self.memory(batch))
+        logits, tokens = self.generate(self.encoded(batch))
         actions = self.tokenizer.actions(logits, tokens)
         if not isinstance(self.tokenizer, PerComponent):
             return Prediction(actions)
         return Prediction(actions, logits.unflatten(1, (self.chunk, -1)).softmax(-1))
 
-    def memory(self, batch: Batch) -> tuple[Tensor, Tensor]:
-        """Return the memory of cross-attention, (B, M, E), and its (B, M) bool padding mask, true for padding.
+    def log_probabilities(self, batch: Batch, actions: Tensor) -> Tensor:
+        """Return the log-probabilities, (B, k), of the tokens of (B, k, D) actions, each given those before it."""
+        if not isinstance(self.tokenizer, PerComponent):
+            return super().log_probabilities(batch, actions)
+        tokens = self.tokenizer.tokenize(actions)
+        logits = self.head(self.decode(tokens[:, :-1], self.encoded(batch))).float()
+        return log_probabilities(logits, tokens).unflatten(1, (self.chunk, -1)).sum(-1)
 
-        The last token is the fused one. There may be fewer frames than `history`: positions are aligned at the newest
-        frame.
-        """
-        frames = batch["tokens"] if "tokens" in batch else self.encode(batch)
-        frames, present = newest_last(frames, batch["present"])
-        visual = frames.flatten(1, 2)  # (B, T·N, E)
-        visual = visual + self.memory_positions.weight[-visual.shape[1] :]
-        instruction = self.instruction_token(self.text(batch["text"])).unsqueeze(1)
-        fused = self.fuse(torch.cat([frames[:, -1], instruction], 1).flatten(1)).unsqueeze(1)
-        padding = ~present.repeat_interleave(self.tokens, 1)
-        return self.memory_norm(torch.cat([visual, instruction, fused], 1)), F.pad(padding, (0, 2))
-
-    def decode(self, tokens: Tensor, memory: Tensor, padding: Tensor) -> Tensor:
+    def decode(self, tokens: Tensor, context: Encoded) -> Tensor:
         """Map the first n tokens, (B, n), to the hidden states that predict the first n + 1 tokens, (B, n + 1, E)."""
-        inputs = torch.cat([memory[:, -1:], self.embedding(tokens)], 1)
+        inputs = torch.cat([context.summary.unsqueeze(1), self.embedding(tokens)], 1)
         length = inputs.shape[1]
         hidden = self.decoder(
             inputs + self.positions.weight[:length],
-            memory,
+            context.tokens,
             tgt_mask=self.mask[:length, :length],
-            memory_key_padding_mask=padding,
+            memory_key_padding_mask=context.padding,
             tgt_is_causal=True,
         )
         return self.norm(hidden)
 
-    def generate(self, memory: Tensor, padding: Tensor) -> tuple[Tensor, Tensor]:
+    def generate(self, context: Encoded) -> tuple[Tensor, Tensor]:
         """Decode greedily; returns (B, n, K) float32 logits and (B, n) tokens.
 
         n is L, or less if all sequences of the batch have ended.
         """
-        layers = [
-            CachedLayer(cast("nn.TransformerDecoderLayer", layer), memory, padding) for layer in self.decoder.layers
-        ]
-        token_vector = memory[:, -1:]
-        ended = torch.zeros(len(memory), 1, dtype=torch.bool, device=memory.device)
+        layers = [CachedLayer(cast("nn.TransformerDecoderLayer", layer), context) for layer in self.decoder.layers]
+        token_vector = context.summary.unsqueeze(1)
+        ended = torch.zeros(len(token_vector), 1, dtype=torch.bool, device=token_vector.device)
         logits, tokens = [], []
         for place in range(self.length):
             x = token_vector + self.positions.weight[place]

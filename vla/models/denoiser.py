@@ -8,15 +8,18 @@ from __future__ import annotations
 
 import math
 from abc import abstractmethod
+from collections.abc import Callable
+from functools import partial
 
 import torch
 from torch import Tensor, nn
 
 from vla.io.errors import UserError
 from vla.io.types import Inherited, Layers, NonNegative, Steps
-from vla.models.chunk_policy import ChunkModel, transformer_decoder
-from vla.models.model import Batch, Prediction, mean_where, require_heads
+from vla.models.layers import Batch, mean_where, transformer_decoder
+from vla.models.model import ContextModel, Prediction
 
+Denoise = Callable[[Tensor, Tensor], Tensor]  # noisy actions (B, k, D) and times (B,) → (B, k, D), with a context
 MAX_FREQUENCY, MIN_FREQUENCY = 100.0, 1.0  # of the time embedding [rad]; time runs from 0 to 1
 
 
@@ -44,11 +47,15 @@ class Denoiser(nn.Module):
         self.head = nn.Linear(width, components)
         self.register_buffer("mask", torch.ones(chunk, chunk, dtype=torch.bool).triu(1), persistent=False)
 
-    def forward(self, noisy: Tensor, time: Tensor, context: Tensor) -> Tensor:
-        """Map (B, k, D) noisy actions at (B,) times in 0 … 1 with a (B, M, E) context to (B, k, D)."""
+    def forward(self, noisy: Tensor, time: Tensor, context: Tensor, padding: Tensor | None = None) -> Tensor:
+        """Map (B, k, D) noisy actions at (B,) times in 0 … 1 to (B, k, D).
+
+        The (B, M, E) context has a (B, M) bool mask, true for padding; None: there is none.
+        """
         time_token = self.time(sinusoidal_embedding(time, self.width)).unsqueeze(1)  # (B, 1, E)
         tokens = self.action(noisy) + self.positions.weight + time_token
-        return self.head(self.transformer(tokens, context, self.mask, tgt_is_causal=True))
+        hidden = self.transformer(tokens, context, self.mask, memory_key_padding_mask=padding, tgt_is_causal=True)
+        return self.head(hidden)
 
 
 def sinusoidal_embedding(time: Tensor, width: int) -> Tensor:
@@ -58,7 +65,7 @@ def sinusoidal_embedding(time: Tensor, width: int) -> Tensor:
     return torch.cat([angle.sin(), angle.cos()], -1)
 
 
-class DenoisingModel(ChunkModel):
+class DenoisingModel(ContextModel):
     """A model that denoises a chunk in a few steps, conditioned on a context that is computed once.
 
     Predictions are samples determined by "noise" in the batch; without it a fixed noise is used. Outside training
@@ -74,6 +81,8 @@ class DenoisingModel(ChunkModel):
         UserError: `width` is odd or not a multiple of `heads`.
     """
 
+    uses_tokens = False
+
     noise: Tensor
 
     def __init__(
@@ -86,7 +95,6 @@ class DenoisingModel(ChunkModel):
         **inherited: Inherited,
     ) -> None:
         super().__init__(**inherited)
-        require_heads(self.width, heads)
         if self.width % 2:
             raise UserError(f"model.width={self.width} must be even, for pairs of a sine and a cosine")
         self.copies, self.steps, self.temperature = copies, steps, temperature
@@ -103,30 +111,34 @@ class DenoisingModel(ChunkModel):
         """
 
     @abstractmethod
-    def sample(self, noise: Tensor, context: Tensor) -> Tensor:
-        """Denoise (B, k, D) noise to scaled actions, (B, k, D), given the (B, M, E) context."""
+    def sample(self, noise: Tensor, denoise: Denoise) -> Tensor:
+        """Denoise (B, k, D) noise to scaled actions, (B, k, D), in several steps."""
 
     def sample_noise(self, random: torch.Generator) -> Tensor:
         """Sample standard normal noise, (1, k, D)."""
         return torch.randn(1, *self.noise.shape, generator=random)
 
     def forward(self, batch: Batch) -> dict[str, Tensor]:
-        """Return context: (B, M, E); with an auxiliary head, truth: (B, 1, S), normalised."""
-        return self.encode_context(batch, self.state_features(batch))
+        """Return context: (B, M, E), padding: (B, M) unless there is none, and the result of `predict_truth`."""
+        encoded = self.encoded(batch)
+        padding = {} if encoded.padding is None else {"padding": encoded.padding}
+        return {"context": encoded.tokens, **padding, **self.predict_truth(encoded.summary.unsqueeze(1))}
 
     def action_loss(self, output: dict[str, Tensor], batch: Batch) -> dict[str, Tensor]:
         """Return the mean squared error of the denoiser on noisy copies of the chunks."""
         action = self.scaled(batch["action"][:, -1]).repeat(self.copies, 1, 1)  # (R·B, k, D)
         context = output["context"].repeat(self.copies, 1, 1)
+        padding = output["padding"].repeat(self.copies, 1) if "padding" in output else None
         generator = None if self.training else torch.Generator().manual_seed(0)
         noise = torch.randn(action.shape, generator=generator).to(action)
         uniform = torch.rand(len(action), generator=generator).to(action)
         noisy, time, target = self.corrupt(action, noise, uniform)
-        error = (self.denoiser(noisy, time, context).float() - target).square()
+        error = (self.denoiser(noisy, time, context, padding).float() - target).square()
         return {"action_loss": mean_where(error.mean(-1), batch["valid"][:, -1].repeat(self.copies, 1))}
 
     def predict(self, batch: Batch) -> Prediction:
         """Denoise the "noise" of the batch, or else a fixed noise."""
-        context = self(batch)["context"]
-        noise = batch["noise"] if "noise" in batch else self.noise.expand(len(context), -1, -1)
-        return Prediction(self.unscaled(self.sample(self.temperature * noise, context)))
+        encoded = self.encoded(batch)
+        noise = batch["noise"] if "noise" in batch else self.noise.expand(len(encoded.tokens), -1, -1)
+        denoise = partial(self.denoiser, context=encoded.tokens, padding=encoded.padding)
+        return Prediction(self.unscaled(self.sample(self.temperature * noise, denoise)))

@@ -3,7 +3,7 @@
 C. Chi et al., "Diffusion Policy: Visuomotor Policy Learning via Action Diffusion", arXiv 2303.04137; DDIM: J. Song, C.
 Meng, S. Ermon, arXiv 2010.02502; the schedule: A. Nichol, P. Dhariwal, arXiv 2102.09672.
 
-Shapes: B batch, k action chunk, D action components, M context tokens, E width of a token.
+Shapes: B batch, k action chunk, D action components.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import math
 import torch
 from torch import Tensor
 
-from vla.models.denoiser import DenoisingModel
+from vla.models.denoiser import Denoise, DenoisingModel
 
 LEVELS = 100  # noise levels of training
 START = 90  # first level of sampling: 2 % of the variance is signal; higher levels carry no information
@@ -30,13 +30,13 @@ class Diffusion(DenoisingModel):
         signal = alpha_bar(level)[:, None, None]
         return signal.sqrt() * action + (1 - signal).sqrt() * noise, level / LEVELS, noise
 
-    def sample(self, noise: Tensor, context: Tensor) -> Tensor:
+    def sample(self, noise: Tensor, denoise: Denoise) -> Tensor:
         """Run DDIM with eta = 0 over evenly spaced levels from START to 0."""
         levels = torch.linspace(START, 0, self.steps, device=noise.device).round()
         signals = [*alpha_bar(levels), torch.ones((), device=noise.device)]
         x = noise
         for level, signal, next_signal in zip(levels, signals[:-1], signals[1:], strict=True):
-            noise = self.denoiser(x, (level / LEVELS).expand(len(x)), context).float()
+            noise = denoise(x, (level / LEVELS).expand(len(x))).float()
             action = ((x - (1 - signal).sqrt() * noise) / signal.sqrt()).clamp(-1, 1)
             noise = (x - signal.sqrt() * action) / (1 - signal).sqrt()  # consistent with the clipped estimate
             x = next_signal.sqrt() * action + (1 - next_signal).sqrt() * noise

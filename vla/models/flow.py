@@ -3,14 +3,14 @@
 The paths are straight, as in rectified flow (X. Liu, C. Gong, Q. Liu, arXiv 2209.03003), with the time distribution of
 K. Black et al., "π0: A Vision-Language-Action Flow Model for General Robot Control", arXiv 2410.24164.
 
-Shapes: B batch, k action chunk, D action components, M context tokens, E width of a token.
+Shapes: B batch, k action chunk, D action components.
 """
 
 from __future__ import annotations
 
 from torch import Tensor
 
-from vla.models.denoiser import DenoisingModel
+from vla.models.denoiser import Denoise, DenoisingModel
 
 MAX_TIME = 0.999  # of training
 SHAPE = 1.5  # first parameter of the beta distribution of times; the second is 1
@@ -29,9 +29,9 @@ class Flow(DenoisingModel):
         part = time[:, None, None]
         return part * action + (1 - part) * noise, time, action - noise
 
-    def sample(self, noise: Tensor, context: Tensor) -> Tensor:
+    def sample(self, noise: Tensor, denoise: Denoise) -> Tensor:
         """Integrate the velocity from `noise` at time 0 to time 1."""
         x = noise
         for step in range(self.steps):
-            x = x + self.denoiser(x, x.new_full((len(x),), step / self.steps), context) / self.steps
+            x = x + denoise(x, x.new_full((len(x),), step / self.steps)) / self.steps
         return x

@@ -1,9 +1,41 @@
-"""Forward kinematics of a serial arm."""
+"""The state of a robot as models use it, and forward kinematics of a serial arm."""
 
 from __future__ import annotations
 
 import torch
 from torch import Tensor, nn
+
+from vla.models.layers import Batch
+from vla.spec import Spec
+
+
+class RobotState(nn.Module):
+    """The state of a batch without rates, and the pose of the tool if the kinematics are known.
+
+    Velocities are left out because a policy that observes them learns that an arm at rest stays at rest.
+
+    Args:
+        spec: observation and action spaces.
+    """
+
+    pose: Tensor  # indices of the state components that are not rates
+    joints: Tensor  # indices of the joint positions in the state
+
+    def __init__(self, spec: Spec) -> None:
+        super().__init__()
+        robot = spec.robot
+        self.kinematics = ForwardKinematics(robot.chain) if robot and robot.chain else None
+        joints = spec.indices(robot.joints) if robot else []
+        for name, indices in (("pose", spec.pose), ("joints", joints)):
+            self.register_buffer(name, torch.tensor(indices, dtype=torch.long), persistent=False)
+        self.width = len(spec.pose) + (ForwardKinematics.WIDTH if self.kinematics else 0)
+
+    def forward(self, batch: Batch) -> Tensor:
+        """Return (B, T, width), given (B, T, P) "state"."""
+        pose = batch["state"].index_select(-1, self.pose)
+        if self.kinematics is None:
+            return pose
+        return torch.cat([pose, self.kinematics(batch["state"].index_select(-1, self.joints))], -1)
 
 
 class ForwardKinematics(nn.Module):

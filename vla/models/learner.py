@@ -16,7 +16,8 @@ from vla.io.errors import UserError
 from vla.io.types import Natural, NonNegative, Positive, Rate
 from vla.models.compile_cache import set_compile_cache
 from vla.models.fsdp import local_shard, shard, unsharded
-from vla.models.model import Batch, Model
+from vla.models.layers import Batch
+from vla.models.model import Model
 from vla.spec import Spec, readable
 
 CHECK_FINITE_EVERY = 50  # steps
@@ -33,9 +34,14 @@ class Learner(LightningModule):
         schedule: "cosine" decays to 0 at the last step of the trainer; "constant" does not decay.
         compile: compile the model with torch.compile.
         ema: decay per step of the EMA weights, which are the ones evaluated and saved; 0 disables EMA.
+        rates: part of the model, such as context or context.image, → factor of its learning rate.
+        frozen: parts that are not trained.
         model: the model to train.
         spec: observation and action spaces; saved with every checkpoint.
         config: the resolved configuration as plain dicts and lists; saved with every checkpoint.
+
+    Raises:
+        UserError: `rates` or `frozen` name no part of the model, or nothing is left to train.
     """
 
     def __init__(
@@ -46,6 +52,8 @@ class Learner(LightningModule):
         schedule: Literal["cosine", "constant"],
         compile: bool,
         ema: Rate,
+        rates: dict[str, Positive] | None,
+        frozen: list[str],
         *,
         model: Model,
         spec: Spec,
@@ -54,10 +62,14 @@ class Learner(LightningModule):
         super().__init__()
         self.model, self._spec, self._config = model, spec, config
         self._lr, self._weight_decay, self._warmup, self._schedule = lr, weight_decay, warmup_steps, schedule
-        self._compile = compile
+        self._compile, self._rates, self._frozen = compile, rates or {}, frozen
         self._before: tuple[bool, str] | None = None  # flash attention and precision outside training
         self._non_finite_step: Tensor | None = None  # () on the device of the loss
         self.errors = nn.ModuleList(MeanMetric() for _ in spec.action)
+        self._groups()  # names of unknown parts are refused now, and frozen ones are frozen before they are distributed
+
+    def _groups(self) -> list[dict[str, Any]]:
+        return self.model.parameter_groups(self._lr, self._weight_decay, self._rates, self._frozen)
 
     def configure_model(self) -> None:
         """Compile the model in place, so that names in checkpoints stay; shard it if the strategy has a device mesh."""
@@ -107,20 +119,8 @@ class Learner(LightningModule):
                         state[name] = torch.empty_like(weight).copy_(value)
 
     def configure_optimizers(self) -> Any:
-        """Create AdamW, with weight decay on parameters of more than one dimension except embeddings.
-
-        A network of timm tells which parameters are embeddings, such as those of positions.
-        """
-        embeddings = {id(m.weight) for m in self.model.modules() if isinstance(m, nn.Embedding)}
-        for module in self.model.modules():
-            if callable(excluded := getattr(module, "no_weight_decay", None)):
-                own = dict(module.named_parameters())
-                embeddings |= {id(own[name]) for name in excluded() if name in own}
-        trained = [p for p in self.model.parameters() if p.requires_grad]
-        decayed = [p for p in trained if p.dim() > 1 and id(p) not in embeddings]
-        others = [p for p in trained if p.dim() <= 1 or id(p) in embeddings]
-        groups = [{"params": decayed, "weight_decay": self._weight_decay}, {"params": others, "weight_decay": 0.0}]
-        optimizer = torch.optim.AdamW(groups, lr=self._lr, fused=True)
+        """Create AdamW on the model's parameter groups, with the schedule."""
+        optimizer = torch.optim.AdamW(self._groups(), lr=self._lr, fused=True)
         # If this flag is set, Lightning assumes scaled gradients and never clips them.
         optimizer._step_supports_amp_scaling = False
         scheduler = torch.optim.lr_scheduler.LambdaLR(optimizer, self._lr_factor)
@@ -143,6 +143,10 @@ class Learner(LightningModule):
         tensors = {name: value for name, value in batch.items() if name != "instruction"}
         moved: Batch = super().transfer_batch_to_device(tensors, device, dataloader_idx)
         return {**moved, "instruction": batch["instruction"]}
+
+    def on_after_batch_transfer(self, batch: Batch, dataloader_idx: int) -> Batch:
+        """Apply the transforms of the model to a batch on its device."""
+        return self.model.transforms(batch)
 
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
         """Return the loss of a batch, augmented here, after `StepSeeding` and outside the compiled part.

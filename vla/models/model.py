@@ -1,4 +1,4 @@
-"""Base classes of models, which map a batch of windows to actions, and layers that they share.
+"""Base classes of models, which map a batch of windows to actions.
 
 Shapes: B batch, T history frames, k action chunk, D action components, K bins, S truth scalars, P state components.
 """
@@ -6,81 +6,22 @@ Shapes: B batch, T history frames, k action chunk, D action components, K bins, 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Collection, Mapping
 from typing import Any, NamedTuple
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor, nn
 
 from vla.io.errors import UserError
-from vla.io.types import Inherited, NonNegative, Steps, Width
-from vla.models.kinematics import ForwardKinematics
+from vla.io.types import ImageSize, Inherited, NonNegative, Shift, Steps, Width
+from vla.models.context import Context, Encoded
+from vla.models.kinematics import RobotState
+from vla.models.layers import Batch, RunningNormalizer, mean_where, newest
 from vla.models.text.ngrams import TextEncoder
 from vla.models.tokenizers.tokenizer import ActionTokenizer, PerComponent
+from vla.models.transforms import Fit, Resize, Transforms
+from vla.models.vision.image_tokenizer import ImageEncoder, RandomShift
 from vla.spec import Spec
-
-Batch = dict[str, Any]
-
-
-class RunningNormalizer(nn.Module):
-    """Normalisation to zero mean and unit variance by running statistics, which are saved in checkpoints.
-
-    Unlike batch normalisation it never uses the statistics of the current batch alone. Statistics are reduced over all
-    processes of a training.
-
-    Args:
-        width: number of components.
-    """
-
-    count: Tensor
-    mean: Tensor
-    variance: Tensor
-
-    MIN_STD = 1e-3  # a component that is constant in the data must not explode when it moves
-    LIMIT = 5.0  # standard deviations; values are clipped to it
-
-    def __init__(self, width: int) -> None:
-        super().__init__()
-        self.register_buffer("count", torch.zeros(()))
-        self.register_buffer("mean", torch.zeros(width))
-        self.register_buffer("variance", torch.zeros(width))
-
-    @property
-    def std(self) -> Tensor:
-        """Return the standard deviations, (width,)."""
-        return self.variance.sqrt().clamp(min=self.MIN_STD)
-
-    def forward(self, values: Tensor, present: Tensor) -> Tensor:
-        """Normalise (B, T, width) values where the (B, T) bool `present` is true; the others become 0."""
-        if self.training:
-            self._update(values.detach(), present.unsqueeze(-1).to(values.dtype))
-        normalized = ((values - self.mean) / self.std).clamp(-self.LIMIT, self.LIMIT)
-        return normalized * present.unsqueeze(-1)
-
-    def _update(self, values: Tensor, weight: Tensor) -> None:
-        added = _sum_over_processes(weight.sum())
-        total = (self.count + added).clamp(min=1)
-        mean = _sum_over_processes((values * weight).sum((0, 1))) / added.clamp(min=1)
-        squares = _sum_over_processes(((values - mean).square() * weight).sum((0, 1)))
-        # Parallel variance algorithm (Chan et al. 1979).
-        shift = mean - self.mean
-        between = shift.square() * self.count * added / total
-        self.variance.copy_((self.variance * self.count + squares + between) / total)
-        self.mean.add_(shift * added / total)
-        self.count.add_(added)
-
-
-def mean_where(values: Tensor, mask: Tensor) -> Tensor:
-    """Return the mean of values where the bool mask of the same shape is true; 0 if it is so nowhere."""
-    return (values * mask).sum() / mask.sum().clamp(min=1)
-
-
-def _sum_over_processes(tensor: Tensor) -> Tensor:
-    """Sum a tensor in place over all processes of a training."""
-    if torch.distributed.is_available() and torch.distributed.is_initialized():
-        torch.distributed.all_reduce(tensor)
-    return tensor
 
 
 class Prediction(NamedTuple):
@@ -93,9 +34,9 @@ class Prediction(NamedTuple):
 class Model(nn.Module, ABC):
     """A policy network: batch of windows → actions.
 
-    A batch is a dict:
-        rgb: camera → (B, T, H, W, 3) uint8; state: (B, T, P) float32; present: (B, T) bool, false for padding;
-        text: from `model.text.tokenize`. For training also action: (B, T, k, D) float32; valid: (B, T, k) bool, the
+    A batch is a dict, which `transforms` has made of observations:
+        rgb: camera → (B, T, H, W, 3) uint8 of `image_size`; state: (B, T, P) float32; present: (B, T) bool, false for
+        padding; text: from `text.tokenize`. For training also action: (B, T, k, D) float32; valid: (B, T, k) bool, the
         loss mask, true for a prefix of each chunk; unperturbed: (B, T) bool, false where a perturbation falls in the
         chunk; truth: (B, T, S) float32. For generative models optionally noise: (B, k, D) float32, standard normal.
 
@@ -108,6 +49,10 @@ class Model(nn.Module, ABC):
         width: hidden width; in a transformer that of a token.
         auxiliary: loss weight of the head that predicts the simulator state, used in training only; 0 omits it.
         execute: number of the k actions that a policy executes before it predicts again; None: all.
+        shift: largest random shift of the training images, vertical and horizontal [1/256 of the image height]; one
+            offset for all frames of a window.
+        image_size: height and width of the images that the model sees [px]; None: those of the demonstrations.
+        fit: of images with another aspect ratio: crop the centre, pad with black borders, or stretch.
         spec: observation and action spaces.
         tokenizer: converts between actions and tokens, and gives the action bounds.
 
@@ -117,10 +62,6 @@ class Model(nn.Module, ABC):
 
     history = 1  # T, number of frames in the input
     uses_tokens = True  # whether actions are predicted as tokens; else as numbers, scaled by the tokenizer's bounds
-    TRUTH_INPUT = 1  # length of the features that the auxiliary head reads [width]
-
-    pose: Tensor  # indices of the state components that are not rates
-    joints: Tensor  # indices of the joint positions in the state
 
     def __init__(
         self,
@@ -130,6 +71,9 @@ class Model(nn.Module, ABC):
         width: Width,
         auxiliary: NonNegative,
         execute: Steps | None = None,
+        shift: Shift = (0, 0),
+        image_size: ImageSize | None = None,
+        fit: Fit = "crop",
         *,
         spec: Spec,
         tokenizer: ActionTokenizer,
@@ -140,30 +84,19 @@ class Model(nn.Module, ABC):
             raise UserError(f"model.execute={execute} is more than the model.chunk={chunk} actions that are predicted")
         self.width, self.auxiliary, self.spec, self.tokenizer = width, auxiliary, spec, tokenizer
         self.text = text(width=text_width)
-        chain = spec.robot.chain if spec.robot else ()
-        self.kinematics = ForwardKinematics(chain) if chain else None
-        self.register_buffer("pose", torch.tensor(spec.pose, dtype=torch.long), persistent=False)
-        joints = spec.indices(spec.robot.joints) if spec.robot else []
-        self.register_buffer("joints", torch.tensor(joints, dtype=torch.long), persistent=False)
-        self.robot_state_width = len(spec.pose) + (ForwardKinematics.WIDTH if chain else 0)
+        sizes = [spec.image_size, *([image_size] if image_size else [])]
+        self.image_size = sizes[-1]
+        self.transforms = Transforms(tuple(Resize((size[0], size[1]), fit) for size in sizes), self.text.tokenize)
+        self.shift = RandomShift(*shift)
+        self.robot_state = RobotState(spec)
         self.truth_head: nn.Linear | None = None
         if auxiliary > 0 and spec.truth_size > 0:
-            self.truth_head = nn.Linear(self.TRUTH_INPUT * width, spec.truth_size)
+            self.truth_head = nn.Linear(width, spec.truth_size)
             self.truth_scale = RunningNormalizer(spec.truth_size)
 
-    def robot_state(self, batch: Batch) -> Tensor:
-        """Return (B, T, robot_state_width): the state without rates, and the pose of the tool if kinematics are known.
-
-        Velocities are left out because a policy that observes them learns that an arm at rest stays at rest.
-        """
-        pose = batch["state"].index_select(-1, self.pose)
-        if self.kinematics is None:
-            return pose
-        return torch.cat([pose, self.kinematics(batch["state"].index_select(-1, self.joints))], -1)
-
     def augment(self, batch: Batch) -> Batch:
-        """Return a training batch with random changes to its images; this part is not compiled."""
-        return batch
+        """Return a training batch with randomly shifted images; this part is not compiled."""
+        return {**batch, "rgb": self.shift(batch["rgb"])}
 
     def encode(self, batch: Batch) -> Tensor | None:
         """Return tokens of each frame, (B, T, N, E), to cache and pass to `forward` as "tokens" instead of images.
@@ -177,7 +110,7 @@ class Model(nn.Module, ABC):
         return None
 
     def predict_truth(self, features: Tensor) -> dict[str, Tensor]:
-        """Return truth: (B, T', S), normalised, given (B, T', …) features; nothing without an auxiliary head."""
+        """Return truth: (B, T', S), normalised, given (B, T', width) features; nothing without an auxiliary head."""
         return {} if self.truth_head is None else {"truth": self.truth_head(features)}
 
     def scaled(self, action: Tensor) -> Tensor:
@@ -208,6 +141,14 @@ class Model(nn.Module, ABC):
         Requires "present", "text", and the images and states or the "tokens" of all frames.
         """
 
+    def log_probabilities(self, batch: Batch, actions: Tensor) -> Tensor:
+        """Return the log-probabilities, (B, k), of the tokens of (B, k, D) actions after the newest frame.
+
+        Raises:
+            UserError: the model has none, because it predicts numbers, or its tokens are of no single action.
+        """
+        raise UserError(f"{type(self).__name__} with {type(self.tokenizer).__name__} gives actions no probabilities")
+
     def loss(self, batch: Batch) -> dict[str, Tensor]:
         """Return the scalar `loss` to minimise, and its parts by name."""
         output = self(batch)
@@ -222,6 +163,86 @@ class Model(nn.Module, ABC):
             losses["truth_loss"] = mean_where(error, known)
             losses["loss"] = losses["loss"] + self.auxiliary * losses["truth_loss"]
         return losses
+
+    def parameter_groups(
+        self, learning_rate: float, weight_decay: float, rates: Mapping[str, float], frozen: Collection[str]
+    ) -> list[dict[str, Any]]:
+        """Return groups of trained parameters for AdamW; matrices and filters decay, but no embeddings.
+
+        A network of timm tells which parameters are embeddings, such as those of positions.
+
+        Args:
+            learning_rate: of parts that `rates` does not name.
+            weight_decay: of what decays.
+            rates: part, such as "context" or "context.image", → factor of its learning rate; the longest name counts.
+            frozen: parts that are not trained.
+
+        Raises:
+            UserError: a name is that of no part, or nothing is left to train.
+        """
+        parameters = dict(self.named_parameters())
+        _require_parts(parameters, "rates", rates)
+        _require_parts(parameters, "frozen", frozen)
+        for name, parameter in parameters.items():
+            if any(_is_within(name, part) for part in frozen):
+                parameter.requires_grad_(False)
+        trained = {name: parameter for name, parameter in parameters.items() if parameter.requires_grad}
+        if not trained:
+            raise UserError("learner.frozen leaves nothing to train")
+        spared, groups = _embeddings(self), dict[tuple[float, bool], list[Tensor]]()
+        for name, parameter in trained.items():
+            factor = rates[max(within, key=len)] if (within := [r for r in rates if _is_within(name, r)]) else 1.0
+            decays = parameter.dim() > 1 and id(parameter) not in spared
+            groups.setdefault((factor, decays), []).append(parameter)
+        return [
+            {"params": group, "lr": learning_rate * factor, "weight_decay": weight_decay if decays else 0.0}
+            for (factor, decays), group in sorted(groups.items(), key=lambda item: item[0], reverse=True)
+        ]
+
+
+def _require_parts(parameters: Collection[str], key: str, parts: Collection[str]) -> None:
+    for part in parts:
+        if not any(_is_within(name, part) for name in parameters):
+            known = ", ".join(dict.fromkeys(name.partition(".")[0] for name in parameters))
+            raise UserError(f"learner.{key} names {part}, which no parameter of the model is in: it has {known}")
+
+
+def _is_within(name: str, part: str) -> bool:
+    return f"{name}.".startswith(f"{part}.")
+
+
+def _embeddings(model: nn.Module) -> set[int]:
+    """Return the ids of the parameters that are embeddings."""
+    found = {id(module.weight) for module in model.modules() if isinstance(module, nn.Embedding)}
+    for module in model.modules():
+        if callable(excluded := getattr(module, "no_weight_decay", None)):
+            own = dict(module.named_parameters())
+            found |= {id(own[name]) for name in excluded() if name in own}
+    return found
+
+
+class ContextModel(Model):
+    """A model that is the head of a context.
+
+    Args:
+        context: factory of the context, called with what `Context` needs.
+        image: factory of the image encoders of the context.
+    """
+
+    def __init__(
+        self, context: Callable[..., Context], image: Callable[..., ImageEncoder], **inherited: Inherited
+    ) -> None:
+        super().__init__(**inherited)
+        self.context = context(image=image, text_width=self.text.width, width=self.width, spec=self.spec)
+        self.history = self.context.history
+
+    def encode(self, batch: Batch) -> Tensor | None:
+        """Return tokens of each frame, as `Context.encode`."""
+        return self.context.encode(batch, self.text(batch["text"]))
+
+    def encoded(self, batch: Batch) -> Encoded:
+        """Return the context of a batch, in which "tokens" may take the place of images and states."""
+        return self.context(batch, self.text(batch["text"]))
 
 
 class TokenModel(Model):
@@ -253,35 +274,22 @@ class TokenModel(Model):
 
     def predict(self, batch: Batch) -> Prediction:
         """Decode the logits of the newest frame."""
+        logits = self._newest_logits(batch)
+        return Prediction(self.tokenizer.decode_logits(logits), logits.softmax(-1))
+
+    def log_probabilities(self, batch: Batch, actions: Tensor) -> Tensor:
+        """Return the log-probabilities, (B, k), of the tokens of (B, k, D) actions after the newest frame."""
+        return log_probabilities(self._newest_logits(batch), self.tokenizer.encode(actions)).sum(-1)
+
+    def _newest_logits(self, batch: Batch) -> Tensor:
+        """Return the logits of the newest frame, (B, k, D, K) float32."""
         frame = newest(batch["present"])
         logits = self(batch)["logits"]
         if logits.shape[1] != batch["present"].shape[1]:
             raise UserError(f"{type(self).__name__}.forward must return logits for every frame of its history")
-        logits = logits[torch.arange(len(frame)), frame].float()  # (B, k, D, K)
-        return Prediction(self.tokenizer.decode_logits(logits), logits.softmax(-1))
+        return logits[torch.arange(len(frame)), frame].float()
 
 
-def mlp(inputs: int, width: int) -> nn.Sequential:
-    """Build an MLP of three layers from `inputs` to `width` features, with layer normalisation and GELU."""
-    first = [nn.Linear(inputs, width), nn.LayerNorm(width), nn.GELU()]
-    second = [nn.Linear(width, width), nn.LayerNorm(width), nn.GELU()]
-    return nn.Sequential(*first, *second, nn.Linear(width, width), nn.GELU())
-
-
-def require_heads(width: int, heads: int) -> None:
-    """Raise a UserError unless `width` is a multiple of `heads`."""
-    if width % heads:
-        raise UserError(f"model.width={width} must be a multiple of model.heads={heads}")
-
-
-def newest(present: Tensor) -> Tensor:
-    """Return the (B,) index of the last of the (B, T) frames that is present."""
-    return (present * torch.arange(1, present.shape[1] + 1, device=present.device)).argmax(1)
-
-
-def pixels(images: Tensor, size: int | None = None) -> Tensor:
-    """Convert (B, T, H, W, 3) uint8 to (B·T, 3, H, W) float32 in 0 … 1, resized to a square of `size` [px] if given."""
-    x = images.flatten(0, 1).permute(0, 3, 1, 2).float().div_(255)
-    if size is not None and x.shape[-2:] != (size, size):
-        x = F.interpolate(x, (size, size), mode="bilinear")
-    return x
+def log_probabilities(logits: Tensor, tokens: Tensor) -> Tensor:
+    """Return the log-probabilities of tokens (…) under logits (…, K)."""
+    return logits.log_softmax(-1).gather(-1, tokens.unsqueeze(-1)).squeeze(-1)

@@ -6,13 +6,17 @@ E width of a token.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
+
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
 from vla.io.types import Inherited, Layers, Positive, Rate, Width
-from vla.models.frame_tokens import FrameModel
-from vla.models.model import Batch, TokenModel
+from vla.models.context import TokenContext
+from vla.models.layers import Batch
+from vla.models.model import ContextModel, TokenModel
 
 
 class Layer(nn.Module):
@@ -44,7 +48,7 @@ class Layer(nn.Module):
         return x + F.dropout(self.linear(self.linear_norm(x)), self.dropout, self.training)
 
 
-class RT1(FrameModel, TokenModel):
+class RT1(ContextModel, TokenModel):
     """A causal transformer over the image tokens of T frames, without action inputs, that predicts for every frame.
 
     Per frame, the sequence has the tokens of every camera, the optional proprioception token, and A = k·D action slots
@@ -53,6 +57,7 @@ class RT1(FrameModel, TokenModel):
     The paper has no keypoints and no proprioception token.
 
     Args:
+        context: factory of the tokens of frames; no more of the context is used.
         layers, heads, key_width: of the transformer.
         dropout: of attention weights and feed-forward outputs.
         position_std: standard deviation of the initial position embeddings. If it is small compared with the
@@ -60,10 +65,12 @@ class RT1(FrameModel, TokenModel):
             different ones.
     """
 
+    context: TokenContext
     mask: Tensor
 
     def __init__(
         self,
+        context: Callable[..., TokenContext],
         layers: Layers,
         heads: Layers,
         key_width: Width,
@@ -71,14 +78,18 @@ class RT1(FrameModel, TokenModel):
         position_std: Positive,
         **inherited: Inherited,
     ) -> None:
-        super().__init__(**inherited)
-        width = self.width
+        super().__init__(context=partial(context, frames_alone=True), **inherited)
+        width, tokens = self.width, self.context.per_frame
         self.slots = self.chunk * len(self.spec.action)  # A
-        self.positions = nn.Embedding(self.history * (self.tokens + self.slots), width)
+        self.positions = nn.Embedding(self.history * (tokens + self.slots), width)
         nn.init.normal_(self.positions.weight, std=position_std)
         self.layers = nn.ModuleList(Layer(width, heads, key_width, dropout) for _ in range(layers))
         self.head = nn.Linear(width, self.tokenizer.bins)
-        self.register_buffer("mask", attention_mask(self.history, self.tokens, self.slots), persistent=False)
+        self.register_buffer("mask", attention_mask(self.history, tokens, self.slots), persistent=False)
+
+    def encode(self, batch: Batch) -> Tensor:
+        """Return (B, T, N, E) tokens of the frames."""
+        return self.context.encode(batch, self.text(batch["text"]))
 
     def forward(self, batch: Batch) -> dict[str, Tensor]:
         """Return logits: (B, T, k, D, K) for every frame; with an auxiliary head, truth: (B, T, S), normalised.
@@ -89,7 +100,7 @@ class RT1(FrameModel, TokenModel):
         empty = tokens.new_zeros(*tokens.shape[:2], self.slots, tokens.shape[-1])
         hidden = self.transform(torch.cat([tokens, empty], 2).flatten(1, 2))
         hidden = hidden.unflatten(1, (tokens.shape[1], -1))  # (B, T, N + A, E)
-        before_slots = hidden[:, :, self.tokens - 1 : -1]  # (B, T, A, E)
+        before_slots = hidden[:, :, self.context.per_frame - 1 : -1]  # (B, T, A, E)
         logits = self.head(before_slots).unflatten(2, self.logits_shape[:2])
         return {"logits": logits, **self.predict_truth(before_slots[:, :, 0])}
 

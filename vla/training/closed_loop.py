@@ -94,9 +94,9 @@ class ClosedLoop(Callback):
         assert isinstance(pl_module, Learner)
         self._plays = pl_module.device_mesh is None and trainer.enable_validation
         if self._plays:
-            environment, spec = self._make_environment(), pl_module.model.spec.without_truth
+            environment = self._make_environment()
             environment.close()
-            spec.require(environment.spec.without_truth, "the demonstrations", "the task")
+            pl_module.model.spec.require_input(environment.spec, "the demonstrations", "the task")
 
     def on_validation_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Play the episodes; later callbacks restore the weights in training."""

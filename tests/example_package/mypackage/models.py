@@ -6,7 +6,8 @@ import torch
 from torch import Tensor, nn
 
 from vla.io.types import Inherited
-from vla.models.model import Batch, Model, Prediction, TokenModel, mean_where, mlp, pixels
+from vla.models.layers import Batch, mean_where, mlp, pixels
+from vla.models.model import Model, Prediction, TokenModel
 
 
 class Mine(TokenModel):
@@ -14,9 +15,9 @@ class Mine(TokenModel):
 
     def __init__(self, **inherited: Inherited) -> None:
         super().__init__(**inherited)
-        height, breadth = self.spec.image_size
+        height, breadth = self.image_size
         inputs = 3 * height * breadth * len(self.spec.cameras)
-        self.mlp = mlp(inputs + self.robot_state_width + self.text.width, self.width)
+        self.mlp = mlp(inputs + self.robot_state.width + self.text.width, self.width)
         self.head = nn.Linear(self.width, self.chunk * len(self.spec.action) * self.tokenizer.bins)
 
     def forward(self, batch: Batch) -> dict[str, Tensor]:
@@ -34,7 +35,7 @@ class Regression(Model):
 
     def __init__(self, **inherited: Inherited) -> None:
         super().__init__(**inherited)
-        self.mlp = mlp(self.robot_state_width + self.text.width, self.width)
+        self.mlp = mlp(self.robot_state.width + self.text.width, self.width)
         self.head = nn.Linear(self.width, self.chunk * len(self.spec.action))
 
     def forward(self, batch: Batch) -> dict[str, Tensor]:

@@ -1,0 +1,179 @@
+"""What holds for every model."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from defaults import defaults_of
+from fake_batch import (
+    Motions,
+    make_act,
+    make_batch,
+    make_bc,
+    make_decoder,
+    make_denoising,
+    make_rt1,
+    overfit,
+    with_text,
+)
+from toy import SPEC
+
+from vla.models.diffusion import Diffusion
+from vla.models.flow import Flow
+from vla.models.layers import RunningNormalizer
+from vla.models.model import Model
+from vla.models.tokenizers.fast import Fast
+from vla.models.tokenizers.quantile import Quantile
+from vla.models.tokenizers.tokenizer import RT1Bins, Uniform
+
+MOTIONS = Motions()
+MODELS: dict[str, Callable[..., Model]] = {
+    "bc": make_bc,
+    "bc chunk": partial(make_bc, chunk=3),
+    "rt1": make_rt1,
+    "rt1 chunk": partial(make_rt1, chunk=2, proprioception=True),
+    "decoder": make_decoder,
+    "decoder chunk": partial(make_decoder, history=3, chunk=3),
+    "decoder rt1": lambda **options: make_decoder(tokenizer=RT1Bins(spec=SPEC, **defaults_of("tokenizer/rt1"))),
+    "decoder quantile": lambda **options: make_decoder(tokenizer=Quantile(bins=64, spec=SPEC, statistics=MOTIONS)),
+    "decoder fast": lambda **options: make_decoder(
+        chunk=4, tokenizer=Fast(bins=256, chunk=4, spec=SPEC, statistics=MOTIONS, scale=10.0), **options
+    ),
+    "act": make_act,
+    "diffusion": partial(make_denoising, Diffusion),
+    "flow": partial(make_denoising, Flow),
+}
+NUMBERS = ("act", "diffusion", "flow")  # those that predict numbers instead of tokens
+every_model = pytest.mark.parametrize("name", MODELS)
+
+
+def made(name: str, **options: Any) -> tuple[Any, dict[str, Any]]:
+    """The same model every time, and a batch of noise with motions as labels."""
+    torch.manual_seed(0)
+    model = MODELS[name](**options)
+    batch = with_text(model, make_batch(model.history, model.chunk))
+    chunks = MOTIONS.chunks(model.chunk)
+    rows = np.random.default_rng(0).integers(len(chunks), size=(4, model.history))
+    return model, {**batch, "action": torch.from_numpy(chunks[rows])}
+
+
+@every_model
+def test_shapes(name: str) -> None:
+    model, batch = made(name)
+    frames = model.history if name.startswith("rt1") else 1
+    assert model(batch)["truth"].shape == (4, frames, SPEC.truth_size)
+    assert model.loss(batch)["loss"].shape == ()
+    prediction = model.eval().predict(batch)
+    assert prediction.actions.shape == (4, model.chunk, 3) and prediction.actions.dtype == torch.float32
+    if name in (*NUMBERS, "decoder fast"):
+        assert prediction.probabilities is None
+    else:
+        assert prediction.probabilities.shape == (4, model.chunk, 3, model.tokenizer.bins)
+        assert torch.allclose(prediction.probabilities.sum(-1), torch.ones(4, model.chunk, 3), atol=1e-4)
+
+
+@pytest.mark.parametrize("name", ["bc chunk", "rt1 chunk", "decoder quantile", "decoder fast", *NUMBERS])
+def test_overfits_one_batch(name: str) -> None:
+    model, batch = made(name, chunk=2) if name in NUMBERS else made(name)
+    assert overfit(model, batch, steps=200) < (0.08 if name in NUMBERS else 0.02)
+
+
+@every_model
+def test_saves_and_loads_equal_and_ignores_truth_and_labels(name: str) -> None:
+    model, batch = made(name)
+    other, _ = made(name)
+    model.loss(batch)  # gathers statistics, which must travel too
+    other.load_state_dict(model.state_dict())
+    seen = {name: value for name, value in batch.items() if name not in ("truth", "action", "valid", "instruction")}
+    assert torch.equal(model.eval().predict(batch).actions, other.eval().predict(seen).actions)
+
+
+@every_model
+def test_the_instruction_matters(name: str) -> None:
+    model, batch = made(name)
+    output = "context" if name in ("diffusion", "flow") else "actions" if name == "act" else "logits"
+    other = {**batch, "text": model.text.tokenize(["push the button"] * 4)}
+    assert not torch.allclose(model.eval()(batch)[output], model(other)[output])
+
+
+@every_model
+def test_labels_that_are_not_valid_count_for_nothing(name: str) -> None:
+    model, batch = made(name)
+    model.auxiliary = 0.0
+    batch["valid"][:, :, 1:], batch["valid"][0] = False, False
+    other = {**batch, "action": batch["action"].clone()}
+    other["action"][~batch["valid"]] = 0.01
+    losses = []
+    for labels in (batch, other) if name != "decoder fast" else (batch, batch):  # whose tokens are of whole chunks
+        torch.manual_seed(0)
+        losses.append(model.loss(labels)["action_loss"])
+    assert torch.isfinite(losses[0]) and losses[0].item() == pytest.approx(losses[1].item(), rel=1e-5)
+
+
+@every_model
+def test_validation_leaves_the_random_numbers_of_training_alone(name: str) -> None:
+    model, batch = made(name)
+    model.eval()
+    before = torch.get_rng_state()
+    first, second = model.loss(batch)["loss"], model.loss(batch)["loss"]
+    model.predict(batch)
+    assert torch.equal(torch.get_rng_state(), before) and first == second
+
+
+@pytest.mark.parametrize("name", ["bc", "rt1", "decoder", *NUMBERS])
+def test_without_weight_there_is_no_auxiliary_head(name: str) -> None:
+    model, batch = made(name, auxiliary=0.0)
+    losses = model.loss(batch)
+    assert losses["loss"] == losses["action_loss"] and "truth_loss" not in losses
+
+
+@pytest.mark.parametrize("name", ["bc", "bc chunk", "rt1", "rt1 chunk", "decoder", "decoder chunk"])
+def test_log_probabilities_of_actions_are_those_of_the_cross_entropy(name: str) -> None:
+    """With targets of one bin; and each of a decoder is given those before it, as in its training."""
+    model, batch = made(name, auxiliary=0.0)
+    model.eval().tokenizer = Uniform(64, 0.05, 0.0, 0, spec=SPEC)
+    batch["valid"][:, :-1] = False
+    found = model.log_probabilities(batch, batch["action"][:, -1])
+    assert found.shape == (4, model.chunk) and (found < 0).all()
+    assert -found.mean().item() / 3 == pytest.approx(model.loss(batch)["action_loss"].item(), rel=1e-5)
+
+
+@pytest.mark.parametrize(("name", "kinds"), [("act", "ACT with Uniform"), ("decoder fast", "Decoder with Fast")])
+def test_what_is_no_token_of_an_action_has_no_log_probability(name: str, kinds: str) -> None:
+    model, batch = made(name)
+    with pytest.raises(ValueError, match=f"{kinds} gives actions no probabilities"):
+        model.log_probabilities(batch, batch["action"][:, -1])
+
+
+def test_frames_that_are_padding_or_of_unknown_truth_do_not_count_in_the_auxiliary_loss() -> None:
+    model, batch = made("rt1")
+    model.eval()
+    batch["present"][:, 0] = False
+    unknown = {**batch, "truth": batch["truth"].clone()}
+    unknown["truth"][:, 0], unknown["truth"][:2] = 99.0, torch.nan
+    losses = model.loss(unknown)
+    standard = model.truth_scale(batch["truth"], batch["present"])
+    error = (model(batch)["truth"].float() - standard).square().mean(-1)
+    torch.testing.assert_close(losses["truth_loss"], error[2:, 1:].mean())
+    assert torch.isfinite(losses["loss"])
+
+
+def test_running_normalizer_accumulates_statistics_of_present_frames() -> None:
+    torch.manual_seed(0)
+    normalizer = RunningNormalizer(3)
+    values = torch.randn(50, 2, 3) * torch.tensor([0.1, 2.0, 0.0]) + torch.tensor([1.0, -3.0, 7.0])
+    present = torch.rand(50, 2) > 0.3
+    for part, there in zip(values.split(7), present.split(7), strict=True):
+        normalizer(part, there)
+    assert torch.allclose(normalizer.mean, values[present].mean(0), atol=1e-5)
+    assert torch.allclose(normalizer.std[:2], values[present].std(0, correction=0)[:2], rtol=1e-4)
+    standard = normalizer.eval()(values, present)
+    assert (standard[~present] == 0).all() and torch.isfinite(standard).all()
+    assert torch.allclose((standard * normalizer.std + normalizer.mean)[present], values[present], atol=1e-4)
+    normalizer(torch.ones(1, 1, 3), torch.ones(1, 1, dtype=torch.bool))
+    assert normalizer.count == present.sum()  # outside training nothing is added

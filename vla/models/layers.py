@@ -1,0 +1,112 @@
+"""Layers and functions that models share.
+
+Shapes: B batch, T frames, E width of a token.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from vla.io.errors import UserError
+
+Batch = dict[str, Any]
+
+
+class RunningNormalizer(nn.Module):
+    """Normalisation to zero mean and unit variance by running statistics, which are saved with the weights.
+
+    Unlike batch normalisation it never uses the statistics of the current batch alone. Statistics are reduced over all
+    processes of a training.
+
+    Args:
+        width: number of components.
+    """
+
+    count: Tensor
+    mean: Tensor
+    variance: Tensor
+
+    MIN_STD = 1e-3  # a component that is constant in the data must not explode when it moves
+    LIMIT = 5.0  # standard deviations; values are clipped to it
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.register_buffer("count", torch.zeros(()))
+        self.register_buffer("mean", torch.zeros(width))
+        self.register_buffer("variance", torch.zeros(width))
+
+    @property
+    def std(self) -> Tensor:
+        """Return the standard deviations, (width,)."""
+        return self.variance.sqrt().clamp(min=self.MIN_STD)
+
+    def forward(self, values: Tensor, present: Tensor) -> Tensor:
+        """Normalise (B, T, width) values where the (B, T) bool `present` is true; the others become 0."""
+        if self.training:
+            self._update(values.detach(), present.unsqueeze(-1).to(values.dtype))
+        normalized = ((values - self.mean) / self.std).clamp(-self.LIMIT, self.LIMIT)
+        return normalized * present.unsqueeze(-1)
+
+    def _update(self, values: Tensor, weight: Tensor) -> None:
+        added = _sum_over_processes(weight.sum())
+        total = (self.count + added).clamp(min=1)
+        mean = _sum_over_processes((values * weight).sum((0, 1))) / added.clamp(min=1)
+        squares = _sum_over_processes(((values - mean).square() * weight).sum((0, 1)))
+        # Parallel variance algorithm (Chan et al. 1979).
+        shift = mean - self.mean
+        between = shift.square() * self.count * added / total
+        self.variance.copy_((self.variance * self.count + squares + between) / total)
+        self.mean.add_(shift * added / total)
+        self.count.add_(added)
+
+
+def _sum_over_processes(tensor: Tensor) -> Tensor:
+    """Sum a tensor in place over all processes of a training."""
+    if torch.distributed.is_available() and torch.distributed.is_initialized():
+        torch.distributed.all_reduce(tensor)
+    return tensor
+
+
+def mean_where(values: Tensor, mask: Tensor) -> Tensor:
+    """Return the mean of values where the bool mask of the same shape is true; 0 if it is so nowhere."""
+    return (values * mask).sum() / mask.sum().clamp(min=1)
+
+
+def newest(present: Tensor) -> Tensor:
+    """Return the (B,) index of the last of the (B, T) frames that is present."""
+    return (present * torch.arange(1, present.shape[1] + 1, device=present.device)).argmax(1)
+
+
+def pixels(images: Tensor) -> Tensor:
+    """Convert (B, T, H, W, 3) uint8 to (B·T, 3, H, W) float32 in 0 … 1."""
+    return images.flatten(0, 1).permute(0, 3, 1, 2).float().div_(255)
+
+
+def mlp(inputs: int, width: int) -> nn.Sequential:
+    """Build an MLP of three layers from `inputs` to `width` features, with layer normalisation and GELU."""
+    first = [nn.Linear(inputs, width), nn.LayerNorm(width), nn.GELU()]
+    second = [nn.Linear(width, width), nn.LayerNorm(width), nn.GELU()]
+    return nn.Sequential(*first, *second, nn.Linear(width, width), nn.GELU())
+
+
+def transformer_encoder(width: int, layers: int, heads: int) -> nn.Module:
+    """Build a pre-norm transformer encoder without dropout; a UserError unless `heads` divide `width`."""
+    require_heads(width, heads)
+    layer = nn.TransformerEncoderLayer(width, heads, 4 * width, 0.0, "gelu", batch_first=True, norm_first=True)
+    return nn.TransformerEncoder(layer, layers, nn.LayerNorm(width), enable_nested_tensor=False)
+
+
+def transformer_decoder(width: int, layers: int, heads: int) -> nn.Module:
+    """Build a pre-norm transformer decoder without dropout; a UserError unless `heads` divide `width`."""
+    require_heads(width, heads)
+    layer = nn.TransformerDecoderLayer(width, heads, 4 * width, 0.0, "gelu", batch_first=True, norm_first=True)
+    return nn.TransformerDecoder(layer, layers, nn.LayerNorm(width))
+
+
+def require_heads(width: int, heads: int) -> None:
+    """Raise a UserError unless `width` is a multiple of `heads`."""
+    if width % heads:
+        raise UserError(f"model.width={width} must be a multiple of model.heads={heads}")
