@@ -20,7 +20,7 @@ from vla.data.episodes import EpisodeStore
 from vla.data.window_batches import WindowBatcher
 from vla.deploy import messages
 from vla.deploy.client_observation import Keys
-from vla.deploy.policy_node import PolicyNode
+from vla.deploy.inference import Inference
 from vla.io.images import resize
 from vla.models.model import Model
 from vla.models.transforms import Fit, Resize
@@ -84,8 +84,10 @@ def at_the_server(model: Model, seen: Any) -> object:
 def in_the_node(model: Model, seen: Any) -> object:
     message = messages.fill_image(SimpleNamespace(header=SimpleNamespace()), seen.rgb["eye"], "eye")
     observation = replace(seen, rgb={"eye": messages.image_from(message)})
-    node: Any = SimpleNamespace(policy=as_policy(model, spec=TRAINED))
-    return PolicyNode._infer(node, observation, reset=True)
+    inference = Inference(as_policy(model, spec=TRAINED))
+    inference.start(observation, first=True)
+    inference.close()
+    return inference.take()
 
 
 @pytest.mark.parametrize("fit", FITS)
