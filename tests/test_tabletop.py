@@ -120,6 +120,8 @@ def test_shapes_and_poses_describe_the_scene(tabletop: Tabletop) -> None:
     shapes, poses = tabletop.shapes(), tabletop.poses()
     assert {shape.body for shape in shapes} <= set(poses)
     assert {"mesh", "box", "cylinder"} == {shape.kind for shape in shapes}
+    names = [*poses, *(shape.name for shape in shapes)]
+    assert not any(name.endswith("/") or "//" in name for name in names)  # nothing is of PyMJCF's own
     block = next(shape for shape in shapes if shape.name == "block0")
     assert block.size[0] == pytest.approx(tabletop.draws["size"]["half_size"][0], abs=1e-4)
 

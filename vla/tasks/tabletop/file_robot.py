@@ -67,8 +67,8 @@ class FileRobot(TabletopRobot):
         if meshes == "light":
             robot_spec.use_convex_hulls(spec)
 
-    def attach(self, scene: mujoco.MjSpec) -> None:
-        """Add the robot to a scene."""
+    def complete(self, scene: mujoco.MjSpec) -> None:
+        """Add the robot to an exported scene: written as MJCF, for PyMJCF, its numbers would have six digits."""
         turn = (np.cos(self._file.yaw / 2), 0.0, 0.0, np.sin(self._file.yaw / 2))
         place = scene.worldbody.add_frame(pos=self._file.place, quat=turn)
         scene.attach(self._spec.copy(), frame=place, prefix=PREFIX)
@@ -122,7 +122,7 @@ class FileRobot(TabletopRobot):
         ascending order, (N, 3) [m].
         """
         alone = mujoco.MjSpec.from_string(f"<mujoco><option {attributes(**PHYSICS)}/></mujoco>")
-        self.attach(alone)
+        self.complete(alone)
         self._model = model = compiled(alone)
         self._data = data = mujoco.MjData(model)
         self.fingertips, self.tool = [[PREFIX + tip for tip in side] for side in sides], PREFIX + robot_spec.TOOL

@@ -8,6 +8,7 @@ from typing import Literal
 
 import mujoco
 import numpy as np
+from dm_control import mjcf
 
 from vla.robots import panda
 from vla.spec import Array, RobotModel
@@ -93,10 +94,9 @@ class Panda(TabletopRobot):
         """Choose the visual meshes, "light" (1 200 faces) or "full" (134 000). Collision meshes are the same."""
         self._meshes = meshes
 
-    def attach(self, scene: mujoco.MjSpec) -> None:
-        """Add the robot to a scene."""
-        robot = mujoco.MjSpec.from_string(_mjcf(self._meshes))
-        scene.attach(robot, frame=scene.worldbody.add_frame(), prefix=self.prefix)
+    def attach(self, scene: mjcf.RootElement) -> None:
+        """Attach the robot to a scene; the name of its model becomes the prefix of its names."""
+        scene.attach(mjcf.from_xml_string(_mjcf(self._meshes)))
 
     def grip(self, opening: float) -> tuple[float, float]:
         """Return half the opening, for both fingers and their common servo."""

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import mujoco
 import numpy as np
+from dm_control import mjcf
 from numpy.typing import ArrayLike
 
 from vla.robots.cartesian import Kinematics
@@ -99,9 +100,11 @@ class TabletopRobot:
     tip: Sequence[float]
     tool: str  # site
 
-    def attach(self, scene: mujoco.MjSpec) -> None:
-        """Add the robot to a scene."""
-        raise NotImplementedError
+    def attach(self, scene: mjcf.RootElement) -> None:
+        """Attach the robot to a scene, unless `complete` adds it."""
+
+    def complete(self, scene: mujoco.MjSpec) -> None:
+        """Add a robot that PyMJCF cannot read to the exported scene."""
 
     def grip(self, opening: float) -> tuple[Array | float, float]:
         """Return the positions of the finger joints and the gripper command for an opening [m]."""

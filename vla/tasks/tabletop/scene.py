@@ -1,9 +1,12 @@
-"""The tabletop scene in MJCF: table, lights, cameras, pads, blocks and robot."""
+"""The tabletop scene, composed with PyMJCF: table, lights, cameras, pads, blocks and robot."""
 
 from __future__ import annotations
 
+from xml.etree import ElementTree
+
 import mujoco
 import numpy as np
+from dm_control import mjcf
 
 from vla.tasks.tabletop.robot import PHYSICS, VISIBLE, CameraPose, TabletopRobot, attributes
 from vla.tasks.tabletop.robot_file import compiled
@@ -35,14 +38,28 @@ FRONT = CameraPose(position=(1.02, 0.0, 0.52), target=(0.5, 0.0, 0.05), fovy=45.
 def compile_scene(robot: TabletopRobot, blocks: int, shadows: bool) -> mujoco.MjModel:
     """Compile the scene with a robot and a number of blocks, cubes before randomisation (UserError: the robot's model
     does not compile)."""
-    spec = mujoco.MjSpec.from_string(_surroundings(shadows))
-    robot.attach(spec)
+    scene = mjcf.from_xml_string(_surroundings(shadows))
+    robot.attach(scene)
+    material = {"density": BLOCK_DENSITY, "condim": 4, "friction": FRICTION, "contype": 1, "conaffinity": 3}
     for name in (f"block{index}" for index in range(blocks)):
-        body = spec.worldbody.add_body(name=name)
-        body.add_freejoint()
-        block = body.add_geom(name=name, type=mujoco.mjtGeom.mjGEOM_BOX, size=(BLOCK_HALF_SIZE,) * 3, group=VISIBLE)
-        block.density, block.condim, block.friction, block.contype, block.conaffinity = BLOCK_DENSITY, 4, FRICTION, 1, 3
+        body = scene.worldbody.add("body", name=name)
+        body.add("freejoint")
+        body.add("geom", name=name, type="box", size=(BLOCK_HALF_SIZE,) * 3, group=VISIBLE, **material)
+    spec = _exported(scene)
+    robot.complete(spec)
     return compiled(spec)
+
+
+def _exported(scene: mjcf.RootElement) -> mujoco.MjSpec:
+    """Return a scene for MuJoCo, without the bodies around attached models and the names that PyMJCF adds to it."""
+    tree = ElementTree.fromstring(scene.to_xml_string())
+    for element in tree.iter():
+        name = element.get("name", "")
+        if "//unnamed" in name:
+            del element.attrib["name"]
+        elif element.tag == "body" and name.endswith("/"):
+            element.tag = "frame"
+    return mujoco.MjSpec.from_string(ElementTree.tostring(tree, encoding="unicode"), assets=scene.get_assets())
 
 
 def _surroundings(shadows: bool) -> str:
