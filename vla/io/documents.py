@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 from collections.abc import Iterator
 from functools import cache
@@ -18,6 +19,7 @@ T = TypeVar("T")
 
 MAX_BYTES = 64 << 20  # [bytes] of a file
 MAX_YAML_BYTES = 1 << 20  # [bytes] of a YAML file, which is slow to parse
+MAX_VALUES = 100_000  # values in a configuration
 MAX_DEPTH = 64  # nesting levels in YAML; pydantic's JSON parser stops at 200 by itself
 
 # `__pydantic_config__` of the dataclasses and typed dictionaries that describe a file; LENIENT: which may hold further
@@ -90,20 +92,27 @@ def resolved(value: Any, name: str) -> Any:
     """Return a copy of a configuration from a file, called `name`: dicts with texts as keys, lists, and plain values.
 
     Raises:
-        UserError: a value is no mapping, list, text, number or null; a key is no text; or a text contains `${`, which
-            would be resolved later.
+        UserError: a value is no mapping, list, text, number or null; a key is no text; a text contains `${`, which
+            would be resolved later; or there are more than `MAX_VALUES` values or `MAX_DEPTH` levels.
     """
-    if isinstance(value, list | tuple):
-        return [resolved(part, name) for part in value]
-    if isinstance(value, dict):
-        if other := [key for key in value if not isinstance(key, str)]:
-            raise UserError(f"{name} holds the key {str(other[0])[:200]}, which is no text")
-        return {resolved(key, name): resolved(part, name) for key, part in value.items()}
-    if isinstance(value, str) and "${" in value:
-        raise UserError(f"{name} holds the reference {value[:200]!r}: only resolved values are read from files")
-    if value is not None and not isinstance(value, bool | int | float | str):
-        raise UserError(f"{name} holds a {type(value).__name__}, which is no plain data")
-    return value
+    count = itertools.count(1)
+
+    def copied(item: Any, depth: int) -> Any:
+        if next(count) > MAX_VALUES or depth > MAX_DEPTH:  # a file can refer to a list many times, or to itself
+            raise UserError(f"{name} holds more than {MAX_VALUES} values, or more than {MAX_DEPTH} levels of them")
+        if type(item) in (list, tuple):
+            return [copied(part, depth + 1) for part in item]
+        if type(item) is dict:
+            if other := [key for key in item if type(key) is not str]:
+                raise UserError(f"{name} holds the key {str(other[0])[:200]}, which is no text")
+            return {copied(key, depth + 1): copied(part, depth + 1) for key, part in item.items()}
+        if type(item) is str and "${" in item:
+            raise UserError(f"{name} holds the reference {item[:200]!r}: only resolved values are read from files")
+        if item is not None and type(item) not in (bool, int, float, str):
+            raise UserError(f"{name} holds a {type(item).__name__}, which is no plain data")
+        return item
+
+    return copied(value, 0)
 
 
 def read_resolved(path: Path) -> Any:
