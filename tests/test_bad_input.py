@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -37,7 +38,7 @@ BAD_INPUT = {
         ("job=deploy", "deploy=server", "deploy.host=0.0.0.0"),
         "set the environment variable",
     ),
-    "another world's key": (("checkpoint=x", "task.hand_size=0.3"), "task is set by +task.hand_size=VALUE"),
+    "another world's key": (("checkpoint=x", "task.hand_size=0.3"), "+task.hand_size=VALUE adds it"),
     "another world's expert": (("job=preview", "expert=metaworld"), "expert=metaworld acts in task=metaworld only"),
     "another world's goal": (("task=metaworld", "task/goal=lift"), "the option chosen for task has no goal"),
     "no environment": (("job=preview", "task=gymnasium"), "task.package is missing: the options chosen need"),
@@ -132,9 +133,9 @@ NONSENSE = {
 
 @pytest.mark.parametrize(("job", "override"), [(job, override) for job in NONSENSE for override in NONSENSE[job]])
 def test_nonsense_is_refused_by_the_name_of_its_key(job: str, override: str) -> None:
-    with pytest.raises(ValueError) as caught:
+    key = override.partition("=")[0].lstrip("+")
+    with pytest.raises(ValueError, match=rf"^{re.escape(key)}(\[\d\])? must "):
         check(composed(f"job={job}", override))
-    assert str(caught.value).startswith(f"{override.partition('=')[0].lstrip('+')} must be ")
 
 
 @pytest.mark.parametrize(

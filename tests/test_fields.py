@@ -17,7 +17,7 @@ from toy import ARM_SPEC, make_arm, make_environment, make_expert
 from toy_episodes import CODECS, CONFIG, EPISODES, MORE, add, change, content
 
 from vla.config.check import check
-from vla.config.experiment import Experiment
+from vla.config.experiment import Experiment, plain
 from vla.data.datamodule import digest_of
 from vla.data.episodes import EpisodeStore
 from vla.data.fields import END
@@ -26,7 +26,8 @@ from vla.data.header import Codec
 from vla.data.image_codec import decode, encode
 from vla.data.verification import derive_store, episode_of, require_whole, verify_store
 from vla.data.window_batches import WindowBatcher
-from vla.jobs.collect import JOB, complete_store
+from vla.jobs import find
+from vla.jobs.collect import complete_store
 from vla.parallel.pool import LocalCluster
 from vla.rollouts.collect import collect
 from vla.rollouts.memory import NearestDemonstration
@@ -135,13 +136,13 @@ def test_a_store_keeps_its_codec_and_other_losses_are_refused(tmp_path: Path) ->
     ],
 )
 def test_the_config_names_the_codec(options: tuple[str, ...], codec: Codec | None) -> None:
-    assert Experiment.of(composed(*options)).codec == codec
+    assert Experiment.of(composed(*options)).collect.codec == codec
 
 
 @pytest.mark.parametrize("option", ["collect.images=png", "collect.images=auto", "collect.quality=96"])
 def test_a_config_of_another_codec_is_refused_by_name(option: str) -> None:
     with pytest.raises(ValueError, match=option.partition("=")[0].replace(".", r"\.")):
-        check(composed("job=collect", option), JOB)
+        check(plain(composed("job=collect", option)), find("collect"))
 
 
 def test_demonstrations_with_other_losses_do_not_complete_a_training(tmp_path: Path) -> None:

@@ -147,9 +147,10 @@ main()
 from vla.config.adopt import adopt
 from vla.config.check import check
 from vla.config.compose import compose
-from vla.jobs import deploy
+from vla.config.experiment import plain
+from vla.jobs import find
 robot = ["job=deploy", "deploy=server", "output=served", "checkpoint=without"]
-check(adopt(compose(*robot), robot), deploy.JOB)
+check(plain(adopt(compose(*robot), robot)), find("deploy"))
 sys.argv[1:] += ["output=further", "collect.episodes=13"]
 main()
 """

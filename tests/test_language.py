@@ -14,9 +14,8 @@ from hydra.errors import InstantiationException
 from hydra.utils import instantiate
 from matplotlib.colors import XKCD_COLORS, rgb_to_hsv, to_rgb
 
-from vla.config.check import conditions
 from vla.config.compose import axes
-from vla.config.experiment import plain
+from vla.config.experiment import Experiment
 from vla.io.documents import read_yaml
 from vla.spec import FIRST_SEED
 from vla.tasks.tabletop.language import Grammar, HeldOut, Silence
@@ -107,7 +106,7 @@ def test_every_unseen_name_means_one_thing_of_the_scene() -> None:
 
 
 def test_an_instruction_with_unseen_names_is_the_plain_one_with_other_names() -> None:
-    node = conditions(plain(composed("evaluate=unseen_names").evaluate))["unseen_names"]["randomize"]["phrasing"]
+    node = Experiment.of(composed("evaluate=unseen_names")).evaluate.changes["unseen_names"]["randomize"]["phrasing"]
     environment = make_tabletop("task/goal=mixed", "task/randomize=none")
     task = environment.simulation
     axes = {"plain": task.randomize, "renamed": {**task.randomize, "phrasing": instantiate(node)}}

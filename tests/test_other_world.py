@@ -19,8 +19,8 @@ from lightning import Trainer
 from omegaconf import DictConfig
 from rerun.chunk import RrdReader
 
-from vla.config.check import with_changes
 from vla.config.experiment import Experiment
+from vla.config.nodes import with_changes
 from vla.data.episodes import EpisodeStore
 from vla.data.formats.lerobot_import import LeRobotDemonstrations
 from vla.data.verification import require_whole, verify_store

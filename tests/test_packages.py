@@ -125,9 +125,9 @@ def test_a_job_with_a_group_of_its_own_is_two_options_and_a_module(home: Path, i
     away = [np.linalg.norm(start.truth["target"] - start.state) for start in starts]
     assert here(home, *asked, "output=surveyed").stdout == f"mean {1000 * np.mean(away):.3f}\n"
     for wrong, words in (
-        ("metric.unit=0", "metric.unit must be a number, more than 0, got 0"),
-        ("survey.episodes=0", "survey.episodes must be a whole number, at least 1, got 0"),
-        ("+survey.length=3", "survey.length is unknown: survey takes episodes, seed"),
+        ("metric.unit=0", "metric.unit must be greater than 0, got 0"),
+        ("survey.episodes=0", "survey.episodes must be greater than or equal to 1, got 0"),
+        ("+survey.length=3", "survey.length is unknown: Survey takes episodes, seed"),
         ("~metric", "job=mypackage.survey needs metric=OPTION"),
     ):
         assert words in here(home, *asked, wrong, ok=False).stderr

@@ -87,7 +87,7 @@ def test_a_file_of_another_kind_is_refused_by_name_with_a_way_out(
     ("config", "says"),
     [
         ({}, ""),
-        ({"task": 3, "model": [1], "collect": None, "trainer": "x"}, "config.task is not a mapping of names to values"),
+        ({"task": 3, "model": [1], "collect": None, "trainer": "x"}, "config.task must be an object, got 3"),
     ],
 )
 def test_a_report_without_a_configuration_is_shown_and_one_with_another_thing_is_refused(

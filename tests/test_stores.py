@@ -10,13 +10,15 @@ import pytest
 from command_line import here
 from toy_episodes import EPISODES, MORE, add, change, content, flip
 
+from vla.config.nodes import Inspection
 from vla.data.episodes import EpisodeStore
 from vla.jobs.inspect import inspect_store, replay_episode
 
 
 def inspect(folder: Path, **arguments: Any) -> None:
-    defaults: dict[str, Any] = {"stores": None, "where": None, "repair": False, "into": None}
-    inspect_store(str(folder), **defaults | arguments)
+    nothing: dict[str, Any] = {"stores": None, "where": None, "repair": False, "into": None, "episode": None}
+    wanted: dict[str, Any] = {**nothing, "folder": str(folder), **arguments}
+    inspect_store(Inspection(**wanted))
 
 
 def stored(folder: Path) -> dict[str, bytes]:

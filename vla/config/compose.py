@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import json
+import logging
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from functools import cache
-from pathlib import Path
 from typing import Any
 
 import hydra
@@ -16,14 +16,16 @@ from hydra.core.global_hydra import GlobalHydra
 from hydra.version import VersionBase
 from omegaconf import DictConfig, OmegaConf, open_dict
 
-import vla.config.check
-import vla.config.recorded  # noqa: F401  these two register the resolvers
+import vla.config.resolvers  # noqa: F401  registers them
+from vla.config.annotations import is_node, locate
 from vla.config.build import check_value
 from vla.config.experiment import Node, plain
-from vla.config.packages import CONF, config_folders, offer_options
+from vla.config.packages import CONF, offer_options
 from vla.io.documents import read_yaml
 from vla.io.errors import UserError
 from vla.io.suggestion import suggestion
+
+log = logging.getLogger(__name__)
 
 
 def compose(*overrides: str) -> DictConfig:
@@ -127,15 +129,18 @@ def _hydra() -> Iterator[ConfigLoader]:
         GlobalHydra.instance().hydra, VersionBase.instance().version_base = before
 
 
-def describe_jobs() -> str:
-    """Resolve `${jobs:}`: a line per option of the group `job`, with the first comment of its file."""
-    files = {file.stem: file for folder in reversed(config_folders()) for file in (folder / "job").glob("*.yaml")}
-    return "\n".join(f"  {name:11} {_comment(file)}" for name, file in sorted(files.items()))
+def substitutes(task: Node, overrides: Sequence[str]) -> list[str]:
+    """Return an override for every part of a task that this machine cannot use, which its class names; log a warning.
 
-
-def _comment(file: Path) -> str:
-    lines = (line.removeprefix("# ") for line in file.read_text(encoding="utf-8").splitlines() if line.startswith("# "))
-    return next((line for line in lines if not line.startswith("@")), "")
-
-
-OmegaConf.register_new_resolver("jobs", describe_jobs, replace=True)
+    None is for an option that the command line names: that fails, in a sentence.
+    """
+    found = []
+    for name, node in task.items():
+        if not is_node(node) or any(override.startswith(f"task/{name}=") for override in overrides):
+            continue
+        kind: Any = locate(f"task.{name}._target_", node["_target_"])
+        if substitute := getattr(kind, "substitute", lambda: None)():
+            reason, option = substitute
+            log.warning("%s: task/%s=%s instead", reason, name, option)
+            found.append(f"task/{name}={option}")
+    return found

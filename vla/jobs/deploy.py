@@ -6,7 +6,6 @@ from functools import partial
 from typing import Any
 
 from vla.config.build import build
-from vla.config.check import Job
 from vla.config.differences import at
 from vla.config.experiment import Experiment
 from vla.io.errors import UserError
@@ -14,8 +13,6 @@ from vla.io.printable import printable
 from vla.models.policy_folder import require_unseen
 from vla.reports.evaluation import plot_report, write_report
 from vla.runs.folder import PLOT, REPORT
-
-JOB = Job(("tokenizer", "model", "policy", "agent", "deploy"), adopts=True)
 
 
 def run(experiment: Experiment) -> None:
@@ -31,7 +28,7 @@ def run(experiment: Experiment) -> None:
     report = deployment(experiment).run()
     if report is not None:
         output = experiment.output
-        write_report(report, output / REPORT, experiment["checkpoint"], experiment.config)
+        write_report(report, output / REPORT, experiment.settings.checkpoint, experiment.config)
         plot_report(report, output / PLOT)
         print(printable(str(report)))
         if report.errors:

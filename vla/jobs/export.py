@@ -5,13 +5,10 @@ from __future__ import annotations
 import logging
 
 from vla.config.build import build
-from vla.config.check import Job
 from vla.config.experiment import Experiment
 from vla.jobs.collect import demonstrations
 
 log = logging.getLogger(__name__)
-
-JOB = Job(("task", "expert", "cluster", "tokenizer", "model", "policy", "export"), adopts=True)
 
 
 def run(experiment: Experiment) -> None:

@@ -43,7 +43,7 @@ def evaluate_open_loop(experiment: Experiment, checkpoint: Path | None) -> float
         UserError: the checkpoint was trained on other episodes, or on all of them.
     """
     started, output = time.monotonic(), experiment.output
-    facts = {**experiment["chosen"], "origin": asdict(experiment.origin)}
+    facts = {**experiment.settings.chosen, "origin": asdict(experiment.origin)}
     fraction = experiment["data"]["validation_fraction"]
     if checkpoint is not None:  # before an import
         saved = read_policy(checkpoint)
@@ -64,7 +64,7 @@ def evaluate_open_loop(experiment: Experiment, checkpoint: Path | None) -> float
     else:
         policy = experiment.make_policy(checkpoint)()
         policy.spec.without_truth.require(store.spec.without_truth, f"the checkpoint {checkpoint}", f"{store.folder}")
-        unseen = _unseen(store, [Path(folder) for folder in experiment["collect"]["more"] or ()], checkpoint)
+        unseen = _unseen(store, [Path(folder) for folder in experiment.collect.more or ()], checkpoint)
         facts |= costs(policy)
     try:
         result = _measure(experiment, store, unseen, policy)
@@ -92,7 +92,7 @@ def evaluate_open_loop(experiment: Experiment, checkpoint: Path | None) -> float
 
 def _store(experiment: Experiment) -> EpisodeStore:
     """Return the episodes, imported if there is no store of them."""
-    folder, episodes = Path(experiment["collect"]["folder"]), experiment["collect"]["episodes"]
+    folder, episodes = Path(experiment.collect.folder), experiment.collect.episodes
     if is_store(folder):
         return EpisodeStore(folder, episodes)
     return demonstrations(experiment)
@@ -137,6 +137,6 @@ def _measure(experiment: Experiment, store: EpisodeStore, unseen: list[Entry], p
             f"all {len(unseen)} episodes in {store.folder} are held out, so there is no constant action to compare "
             "with: record more, or raise collect.episodes"
         )
-    shown = unseen[: experiment["evaluate"]["episodes"]]
+    shown = unseen[: experiment.evaluate.episodes]
     episodes = (episode_of(store, entry) for entry in track(shown, "evaluating"))
     return open_loop(policy, store.spec, episodes, np.concatenate(seen).mean(0))

@@ -13,7 +13,6 @@ import lightning
 import torch
 from lightning import Callback, LightningModule, Trainer
 
-from vla.config.check import TRAINING, Job
 from vla.config.experiment import Experiment, training_policy
 from vla.config.origin import Origin
 from vla.config.packages import remember_trust
@@ -47,8 +46,6 @@ from vla.training.closed_loop import ClosedLoop
 from vla.training.trainer import explain_memory_errors, make_trainer, quiet_lightning, restore_metrics
 
 log = logging.getLogger(__name__)
-
-JOB = Job(TRAINING, stored=("task", "expert"))
 
 
 def run(experiment: Experiment) -> None:
@@ -93,9 +90,9 @@ def train(experiment: Experiment) -> Path | None:
 
 def _fit(experiment: Experiment, state: TrainingProgress, trainer: Trainer, graceful_stop: GracefulStop) -> None:
     """Collect missing demonstrations, train on them, and write the policy."""
-    more = [EpisodeStore(folder) for folder in experiment["collect"]["more"] or ()]
+    more = [EpisodeStore(folder) for folder in experiment.collect.more or ()]
     output, origin = experiment.output, None if state.resume_from else experiment.pretrained
-    lightning.seed_everything(experiment["seed"], verbose=False)
+    lightning.seed_everything(experiment.settings.seed, verbose=False)
     with explain_memory_errors(experiment.config), graceful_stop.explaining_restore(state.resume_from):
         spec, last = demonstration_spec(experiment), state.resume_from
         learner = experiment.resumed_learner(spec, last) if last else experiment.learner(spec, origin)
@@ -116,7 +113,7 @@ def _fit(experiment: Experiment, state: TrainingProgress, trainer: Trainer, grac
         )
     if not len(data.held_out_windows):
         trainer.limit_val_batches = 0  # else callbacks wait for a validation that never runs
-        if experiment["validate"]["episodes"]:
+        if experiment.validate.episodes:
             log.warning(
                 "data.validation_fraction=0: no validation, so no episodes are played, and the last weights are used"
             )
@@ -124,7 +121,7 @@ def _fit(experiment: Experiment, state: TrainingProgress, trainer: Trainer, grac
         draw_samples(data.make_batch(data.order(0)[:SHOWN]), store.spec, output / SAMPLES)
     if state.resume_from:
         restore_metrics(trainer, state.resume_from)
-    collection_s = collection_time(store, experiment["collect"]["episodes"])
+    collection_s = collection_time(store, experiment.collect.episodes)
     if not state.resume_from:
         save_config(output, experiment.config, experiment.changes)  # also of a training that fails at its start
     origins = _origins(experiment, state)
@@ -194,11 +191,10 @@ def _warn_of_clipped(model: Model, store: EpisodeStore, chunks: Array) -> None:
 
 def _closed_loop(experiment: Experiment) -> ClosedLoop | None:
     """Return the callback that plays episodes in every validation, or None without episodes."""
-    asked = experiment["validate"]
-    seeds = range(asked["seed"], asked["seed"] + asked["episodes"])
+    seeds = experiment.validate.seeds
     if seeds and not experiment.playable:
         raise UserError(f"validate.episodes={len(seeds)}: nothing can be played in a recording: set it to 0")
-    make_environment = experiment.make_environment(asked["changes"])
+    make_environment = experiment.make_environment(experiment.validate.changes)
     make_policy = partial(training_policy, experiment["policy"].get("precision", "fp32"))
     workers = experiment["cluster"].get("workers") or cores()
     return ClosedLoop(make_environment, make_policy, seeds, experiment.output, workers) if seeds else None
@@ -223,7 +219,7 @@ def _reported(
     """Write the report page and the log summary however training ends, including the runs it resumed from."""
     output = experiment.output
     parameters = sum(parameter.numel() for parameter in learner.model.parameters())
-    start = f", starting from {experiment['pretrained']}" if experiment["pretrained"] else ""
+    start = f", starting from {experiment['pretrained']}" if experiment.settings.pretrained else ""
     log.info("training %s with %.2f M parameters%s", type(learner.model).__name__, parameters / 1e6, start)
     ended = "done"
     try:

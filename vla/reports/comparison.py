@@ -10,8 +10,8 @@ from typing import Any
 
 from rich.table import Table
 
-from vla.config.check import conditions, with_changes
 from vla.config.differences import at
+from vla.config.nodes import conditions, with_changes
 from vla.io.errors import UserError
 from vla.reports.conditions import COMPARED, NARROW, SecondaryRows, short_texts
 from vla.rollouts.comparison import Comparison, compare_pairs, compare_samples, concluded
@@ -216,6 +216,5 @@ def _scenes(run: Run, condition: str) -> tuple[Any, ...]:
 
 def _changes(run: Run, condition: str) -> dict[str, Any] | None:
     """Return what a condition changes in the task; None if it is another agent's, or unknown."""
-    asked = at(run.report.config if run.report else {}, "evaluate", {})
-    absent = {"conditions": {}, "one_by_one": {}, "without": [], "nearest": None, "networks": {}}
-    return conditions({**absent, **asked}).get(condition)
+    evaluate = at(run.report.config if run.report else {}, "evaluate", {})
+    return conditions(evaluate.get("conditions", {}), evaluate.get("one_by_one", {})).get(condition)

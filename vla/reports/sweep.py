@@ -20,9 +20,8 @@ from vla.reports.style import markdown_table
 from vla.reports.sweep_plot import plot
 from vla.reports.training_curves import colours, draw_runs
 from vla.rollouts.statistics import effective_episodes
-from vla.runs.cells import failures
 from vla.runs.folder import PAGE
-from vla.runs.sweep import SweepRow, conditions_of, read_rows
+from vla.runs.sweep import SweepRow, conditions_of, failures, read_rows
 from vla.spec import IN_DISTRIBUTION
 
 SWEEP, OVERVIEW = "sweep.html", "sweep.png"

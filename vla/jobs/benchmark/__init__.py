@@ -8,36 +8,17 @@ from __future__ import annotations
 
 import logging
 from importlib import import_module
-from typing import Annotated, Literal
 
-from annotated_types import MinLen
 from rich import print as show
 from rich.table import Table
 
-from vla.config.check import TRAINING, Job
 from vla.config.experiment import Experiment
+from vla.config.nodes import Benchmark
 from vla.io.files import write_json
-from vla.io.types import Count
 from vla.jobs.benchmark.machine import OtherLoad, is_unreliable, machine
 from vla.jobs.benchmark.measure import Measure
 
 log = logging.getLogger(__name__)
-
-JOB = Job(
-    (*TRAINING, "policy"),
-    {
-        "names": Annotated[list[Literal["collect", "loader", "train", "policy", "deploy", "serve"]], MinLen(1)],
-        "episodes": Count,
-        "batches": Count,
-        "steps": Count,
-        "rounds": Count,
-        "precisions": list[Literal["fp32", "bf16"]] | None,
-        "compile": list[bool],
-        "robosuite": str | None,
-        "lerobot": str | None,
-    },
-    adopts=True,
-)
 
 
 def run(experiment: Experiment) -> dict[str, Measure]:
@@ -49,7 +30,7 @@ def run(experiment: Experiment) -> dict[str, Measure]:
     show(f"{here['processor']}, {here['cores']} cores, {' '.join(here['instructions'])}")
     measures: dict[str, Measure] = {}
     busy: dict[str, float] = {}
-    for name in experiment["benchmark"]["names"]:
+    for name in experiment.options(Benchmark).names:
         others = OtherLoad()
         found = import_module(f"vla.jobs.benchmark.{name}").measures(experiment)
         used = others.cores()

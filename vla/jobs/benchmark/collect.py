@@ -7,6 +7,7 @@ from functools import partial
 from tempfile import TemporaryDirectory
 
 from vla.config.experiment import Experiment
+from vla.config.nodes import Benchmark
 from vla.data.episodes import EpisodeStore
 from vla.jobs.benchmark.baselines.peer import DURATION, peer
 from vla.jobs.benchmark.measure import HasMinimalStep, Measure, measure, timed
@@ -28,13 +29,13 @@ def measures(experiment: Experiment) -> dict[str, Measure]:
     - all processes, including verification; the floor is that of one process times their number.
     - robosuite on the same work as the floor, if `benchmark.robosuite` names a Python interpreter.
     """
-    asked = experiment["benchmark"]
+    asked = experiment.options(Benchmark)
     makers = experiment.make_environment(), experiment.make_expert()
     environment = makers[0]()
     expert = makers[1](environment)
     rollout(environment, expert, 0)  # warm-up: compiles shaders
     calls = environment.minimal_step() if isinstance(environment, HasMinimalStep) else {}
-    episodes, taken = _timed_parts(environment, expert, calls, asked["episodes"])
+    episodes, taken = _timed_parts(environment, expert, calls, asked.episodes)
     steps = sum(len(episode.actions) for episode in episodes)
     floor, full, blind = {name: taken[name] for name in calls}, taken["full"], taken["blind"]
     with TemporaryDirectory() as folder:
@@ -57,12 +58,12 @@ def measures(experiment: Experiment) -> dict[str, Measure]:
         found[f"collect: {name}"] = measure(1000 * seconds / steps, "ms/step", steps, whole)
     found |= renderings(experiment)
     work = partial(DemonstrationWorker, *makers)
-    alone, together = (_attempts(work, count, asked["episodes"]) for count in (1, cores()))
+    alone, together = (_attempts(work, count, asked.episodes) for count in (1, cores()))
     found[f"collect: {cores()} processes"] = measure(*together, cores() * alone[0])
-    if asked["robosuite"] is not None:
+    if asked.robosuite is not None:
         arguments = (*environment.spec.image_size, DURATION)
         for count, (rate, unit, n) in ((1, alone), (cores(), together)):
-            rival = peer("robosuite", asked["robosuite"], "robosuite_lift.py", arguments, count)
+            rival = peer("robosuite", asked.robosuite, "robosuite_lift.py", arguments, count)
             if count == 1:  # robosuite verifies nothing: the same work is a rollout without verification
                 found["collect, against robosuite"] = measure(steps / full, unit, steps, rival)
             found[f"collect: verified, against {count} of robosuite"] = measure(rate, unit, n, rival)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from vla.config.experiment import Experiment
+from vla.config.nodes import Benchmark
 from vla.io.documents import parse_json
 from vla.io.errors import UserError
 from vla.jobs.benchmark.measure import Measure, measure
@@ -28,7 +29,7 @@ def measures(experiment: Experiment) -> dict[str, Measure]:
         for _ in range(loop.episodes):
             operator.play()
         operator.begin_episode()
-        delays = [1000 * operator.watchdog_delay() for _ in range(experiment["benchmark"]["episodes"])]
+        delays = [1000 * operator.watchdog_delay() for _ in range(experiment.options(Benchmark).episodes)]
         keys = ("image to command p50 [ms]", "inference p50 [ms]", "tick p99 [ms]")
         image, inference, tick = (
             parse_json(operator.status.get(key, ""), float, f"{key} of /vla_agent/status") for key in keys

@@ -13,6 +13,7 @@ import numpy as np
 from vla.config.build import build
 from vla.config.compose import compose
 from vla.config.experiment import Experiment, plain
+from vla.config.nodes import Benchmark
 from vla.data.episodes import EpisodeStore
 from vla.data.header import Codec
 from vla.data.window_batches import aligned_empty
@@ -39,24 +40,24 @@ def measures(experiment: Experiment) -> dict[str, Measure]:
     episodes take on the disk is what they take raw. If `benchmark.lerobot` names a Python interpreter, the floor of two
     further measures is LeRobot's loader on the same episodes.
     """
-    asked = experiment["benchmark"]
+    asked = experiment.options(Benchmark)
     store = demonstrations(experiment)
     model = experiment.fitted_learner(store).model
     alone = experiment.with_values({"collect.more": None})  # the floor reads one store
     names = {1: "loader: 1 frame", 6: "loader: 6 frames"}
     found = {
-        name: _loading(alone.data(store, frames, model.chunk), store, frames, asked["batches"])
+        name: _loading(alone.data(store, frames, model.chunk), store, frames, asked.batches)
         for frames, name in [(model.history, "loader"), *names.items()]
     }
     if "image_size" in experiment["task"]:
         found |= _of_large_images(alone.with_values({"task.image_size": [LARGE, LARGE]}), model.chunk)
-    if asked["lerobot"] is not None:
-        some = EpisodeStore(store.folder, min(experiment["collect"]["episodes"], PEER_EPISODES))
+    if asked.lerobot is not None:
+        some = EpisodeStore(store.folder, min(experiment.collect.episodes, PEER_EPISODES))
         with TemporaryDirectory() as folder:
             export = plain(compose("export=lerobot", f"output={folder}").export)
             dataset = build(export, "export").export(some, experiment.cluster())
             for frames, name in names.items():
-                rival = peer("lerobot", asked["lerobot"], "lerobot_windows.py", (dataset, frames, DURATION))
+                rival = peer("lerobot", asked.lerobot, "lerobot_windows.py", (dataset, frames, DURATION))
                 own = found[name]
                 found[f"{name}, against LeRobot"] = measure(own["value"], own["unit"], own["n"], rival)
     return found
@@ -65,19 +66,19 @@ def measures(experiment: Experiment) -> dict[str, Measure]:
 def _of_large_images(experiment: Experiment, chunk: int) -> dict[str, Measure]:
     environment, found = experiment.make_environment()(), dict[str, Measure]()
     expert = experiment.make_expert()(environment)
-    seeds = range(experiment["benchmark"]["episodes"])
+    seeds = range(experiment.options(Benchmark).episodes)
     episodes = [_from_three_cameras(rollout(environment, expert, seed)) for seed in seeds]
     environment.close()
     spec = replace(environment.spec, cameras=tuple(episodes[0].observations[0].rgb), depth=(), cut=())
-    every = experiment.with_values({"collect.episodes": None, "data.validation_fraction": 0})
-    for codec in (Codec.suited(spec), Codec("jpeg", experiment["collect"]["quality"])):
+    every = experiment.with_values({"collect.episodes": len(seeds), "data.validation_fraction": 0})
+    for codec in (Codec.suited(spec), Codec("jpeg", experiment.collect.quality)):
         with TemporaryDirectory() as folder:
             store = EpisodeStore.create_or_open(folder, spec, {}, codec)
             with store.writing():
                 for episode in episodes:
                     store.append(episode)
             name, steps = f"loader: 3 x {LARGE} px, {codec.images}", store.episodes[-1].end
-            found[name] = _loading(every.data(store, 1, chunk), store, 1, experiment["benchmark"]["batches"])
+            found[name] = _loading(every.data(store, 1, chunk), store, 1, experiment.options(Benchmark).batches)
             size = sum(store.size(field, entry) for field in store.fields for entry in store.episodes) / steps
             raw = sum(prod(shape) * dtype.itemsize for shape, dtype in store.fields.values())
             of_many = measure(EPISODES * STEPS * size / 1e9, "GB", steps, EPISODES * STEPS * raw / 1e9)

@@ -9,6 +9,7 @@ import torch
 
 from vla.config.build import build
 from vla.config.experiment import Experiment
+from vla.config.nodes import Benchmark
 from vla.jobs.benchmark.measure import Measure, measure, timed
 from vla.jobs.collect import demonstrations
 
@@ -30,7 +31,7 @@ def measures(experiment: Experiment) -> dict[str, Measure]:
     rgb = {camera: images.expand(1, model.history, -1, -1, -1) for camera, images in frame["rgb"].items()}
     frames = {name: frame[name].expand(1, model.history, *frame[name].shape[2:]) for name in ("state", "present")}
     whole = {"rgb": rgb, "text": frame["text"], **frames}
-    steps = experiment["benchmark"]["steps"]
+    steps = experiment.options(Benchmark).steps
     acting = _median(lambda: agent.plan(observation), steps)
     with torch.inference_mode():
         kept = agent.window()

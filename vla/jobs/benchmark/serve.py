@@ -10,6 +10,7 @@ from threading import Thread
 import numpy as np
 
 from vla.config.experiment import Experiment
+from vla.config.nodes import Benchmark
 from vla.deploy.client_observation import Keys
 from vla.deploy.server import PolicyServer, Service
 from vla.io.array_messages import pack
@@ -28,7 +29,7 @@ def measures(experiment: Experiment) -> dict[str, Measure]:
     Raises:
         UserError: no checkpoint is given.
     """
-    policy, steps = experiment.make_policy()(), experiment["benchmark"]["steps"]
+    policy, steps = experiment.make_policy()(), experiment.options(Benchmark).steps
     random = np.random.default_rng(0)
     observations = [policy.spec.random_observation(random) for _ in range(steps)]
     with _serving(experiment, policy) as agent, _echo() as echo:

@@ -17,6 +17,7 @@ from lightning.pytorch.profilers import SimpleProfiler
 from torch import Tensor
 
 from vla.config.experiment import Experiment
+from vla.config.nodes import Benchmark
 from vla.data.datamodule import WindowDataModule
 from vla.data.episodes import EpisodeStore
 from vla.io.errors import UserError
@@ -52,18 +53,18 @@ def measures(experiment: Experiment) -> dict[str, Measure]:
     Raises:
         UserError: there is nothing to measure, or not enough memory.
     """
-    asked = experiment["benchmark"]
+    asked = experiment.options(Benchmark)
     on_processor = computes_on_cpu(experiment["trainer"]["accelerator"])
-    precisions = _precisions(asked["precisions"], on_processor)
-    if not precisions or not asked["compile"]:
+    precisions = _precisions(asked.precisions, on_processor)
+    if not precisions or not asked.compile:
         raise UserError("training is timed in each of benchmark.precisions and benchmark.compile: both need an entry")
     quiet_lightning()
     logging.getLogger("lightning.pytorch.profilers").setLevel(logging.WARNING)
     store = demonstrations(experiment)
-    kinds = product(precisions, sorted(set(asked["compile"])))
+    kinds = product(precisions, sorted(set(asked.compile)))
     trials = [Trial(experiment, store, precision, compiled) for precision, compiled in kinds]
     loading = []
-    for _ in range(asked["rounds"]):
+    for _ in range(asked.rounds):
         for trial in trials:
             with explain_memory_errors(experiment.config):
                 trial.play()
@@ -107,7 +108,7 @@ class Trial(lightning.Callback):
 
     def __init__(self, experiment: Experiment, store: EpisodeStore, precision: str, compiled: bool) -> None:
         self.precision, self.name = precision, f"{precision} compile" if compiled else precision
-        self.steps = experiment["benchmark"]["steps"]
+        self.steps = experiment.options(Benchmark).steps
         self.samples = self.steps * experiment["data"]["batch_size"]
         self.loss = self.peak = self._flops = 0.0
         self._store = store
@@ -120,7 +121,7 @@ class Trial(lightning.Callback):
             "trainer.profiler": "simple",
         }
         self._experiment = experiment.with_values(changes)
-        lightning.seed_everything(experiment["seed"], verbose=False)
+        lightning.seed_everything(experiment.settings.seed, verbose=False)
         self._learner = self._experiment.fitted_learner(store)
         self._start = copy.deepcopy(self._learner.state_dict())
         self._rounds: list[Timing] = []
@@ -139,7 +140,7 @@ class Trial(lightning.Callback):
         """Play one round: the training, then as many steps of the model alone."""
         self._marks: list[float] = []
         self._losses: list[Tensor] = []
-        lightning.seed_everything(self._experiment["seed"], verbose=False)
+        lightning.seed_everything(self._experiment.settings.seed, verbose=False)
         self._learner.load_state_dict(self._start)
         data = self._data()
         with TemporaryDirectory() as folder:
