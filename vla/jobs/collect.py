@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 from pathlib import Path
 
-from vla.config.build import build
 from vla.config.experiment import Experiment
 from vla.data.episodes import EpisodeStore
 from vla.data.formats.imported_demonstrations import ImportedDemonstrations
@@ -68,7 +67,7 @@ def _source(experiment: Experiment) -> tuple[Environment | SpecOnly, Spec, Impor
     """Return the world, closed, the spec of the demonstrations, and the recordings to import, or None for an acting
     expert."""
     world = experiment.world()
-    expert = build(experiment["expert"], "expert", spec=world.spec)
+    expert = experiment.build("expert", spec=world.spec)
     recorded = expert if isinstance(expert, ImportedDemonstrations) else None
     return world, recorded.spec if recorded else world.spec, recorded
 
@@ -92,11 +91,6 @@ def _fill(experiment: Experiment) -> EpisodeStore:
     failures = ", ".join(f"{count} {cause}" for cause, count in summary.failures.items()) or "none"
     log.info(
         "%s: %d episodes, %d of them new in %.0f s; expert success %.1f %%, failures: %s",
-        store.folder,
-        summary.episodes,
-        summary.added,
-        summary.seconds,
-        100 * summary.success_rate,
-        failures,
+        *(store.folder, summary.episodes, summary.added, summary.seconds, 100 * summary.success_rate, failures),
     )
     return store

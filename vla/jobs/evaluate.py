@@ -242,8 +242,7 @@ def require_possible(experiment: Experiment) -> None:
     if settings.job != "improve" and any(output.glob(f"round_*/{CHECKPOINTS}")):
         raise UserError(f"{output} has the rounds of a job=improve, whose report this would replace: add output=DIR")
     if experiment.playable:
-        # A world takes a while to compile: of conditions that change the same arguments of it, one stands for all. Every
-        # node of the others has been checked.
+        # Worlds take time to compile: of conditions that change the same arguments one is built; all nodes are checked.
         kinds = {frozenset(changes): (name, changes) for name, changes in reversed(wanted.changes.items())}
         for name, changes in kinds.values():
             _require_world(experiment, name, changes)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 
-from vla.config.build import build
 from vla.config.experiment import Experiment
 from vla.jobs.collect import demonstrations
 
@@ -17,7 +16,7 @@ def run(experiment: Experiment) -> None:
     Raises:
         UserError: the exporter needs a policy, and no checkpoint is given.
     """
-    exporter = build(experiment["export"], "export")
+    exporter = experiment.build("export")
     if hasattr(exporter, "export_policy"):
         log.info("wrote %s", exporter.export_policy(experiment.make_policy()()))
     else:

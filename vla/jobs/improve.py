@@ -9,11 +9,10 @@ acts; in the others the policy does, or both in turns (`improve.beta`). Every ro
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import closing
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 from vla.config.adopt import require_identity
 from vla.config.check import devices
@@ -78,38 +77,26 @@ def _improved(experiment: Experiment, seeds: range) -> float:
 
 
 def _save_config(experiment: Experiment) -> None:
-    """Save the config for `resume=`.
-
-    Raises:
-        UserError: the folder has rounds of another training, or they begin where this one would not end.
-    """
+    """Save the config for `resume=`; a UserError if the folder has rounds of another training, or of another length."""
     saved = read_run(experiment.output).config
     if saved.get("job") == "improve":
         require_identity(saved, experiment.config, experiment.output)
-        if is_store(experiment.output / "round_1" / EPISODES):
-            _require_same_length(saved, experiment)
+        # Later trainings continue the earlier ones, which must not get another length.
+        begun = is_store(experiment.output / "round_1" / EPISODES)
+        lengths = [f"trainer.{name}" for name in LENGTHS] if experiment.pretrained is None else []
+        for key in (*lengths, "improve.steps") if begun else ():
+            before, now = at(saved, key, None), at(experiment.config, key, None)
+            if before != now:
+                raise UserError(
+                    f"{key}={now}: the rounds in {experiment.output} were trained with {before}: leave it at that, or "
+                    "choose another output=DIR"
+                )
     if saved != experiment.config:  # else its date would tell that the rounds began again
         save_config(experiment.output, experiment.config, experiment.changes)
 
 
-def _require_same_length(saved: Mapping[str, Any], experiment: Experiment) -> None:
-    """Raise a UserError if a training that later ones continue would get another length."""
-    lengths = [f"trainer.{name}" for name in LENGTHS] if experiment.pretrained is None else []
-    for key in (*lengths, "improve.steps"):
-        before, now = at(saved, key, None), at(experiment.config, key, None)
-        if before != now:
-            raise UserError(
-                f"{key}={now}: the rounds in {experiment.output} were trained with {before}: leave it at that, or "
-                "choose another output=DIR"
-            )
-
-
 def _require_possible(experiment: Experiment) -> range:
-    """Check the config, and return the seeds of all rounds.
-
-    Raises:
-        UserError: seeds are of evaluation, training is to use several devices, or the expert cannot label.
-    """
+    """Return the seeds of all rounds; a UserError if they are of evaluation, or the rounds cannot be played."""
     require_possible(experiment)
     asked = experiment.options(Rounds)
     seeds = asked.seeds
