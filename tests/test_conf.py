@@ -188,17 +188,6 @@ def test_the_suite_has_every_axis_by_itself_at_each_level() -> None:
     assert len(suite) == 4 + 2 * len(axes) + 4  # intensity and colour of the light
 
 
-def test_a_misspelt_word_in_a_condition_is_found_before_anything_is_done() -> None:
-    wrong = composed("+evaluate.conditions.dark={randomize: {lihgt: {brightnes: [0, 0]}}}")
-    with pytest.raises(ValueError, match=r"evaluate\.conditions\.dark\)\.randomize"):
-        check(wrong)
-    light = OmegaConf.to_container(composed().task.randomize.light)
-    assert isinstance(light, dict)
-    wrong.evaluate.conditions = {"dark": {"randomize": {"light": {**light, "brightnes": [0, 0]}}}}
-    with pytest.raises(ValueError, match="brightnes is unknown, did you mean brightness"):
-        check(wrong)
-
-
 @pytest.mark.parametrize("model", MODELS)
 def test_every_model_says_by_how_much_it_shifts_images(model: str) -> None:
     assert composed(f"model={model}").model.shift == ([20, 50] if model == "rt1" else [12, 12])

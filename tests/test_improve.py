@@ -185,24 +185,16 @@ def test_rounds_resume_with_their_own_config(tmp_path: Path) -> None:
     assert (resumed.improve.rounds, resumed.improve.steps, resumed.trainer.max_steps) == (5, 7, 9)
 
 
-def test_a_folder_with_other_rounds_is_left_alone(tmp_path: Path) -> None:
-    there = (f"output={tmp_path}", "job=improve")
-    save_config(tmp_path, plain(composed(*there)), [])
-    before = (tmp_path / "config.yaml").read_bytes()
-    with pytest.raises(ValueError, match=rf"holds a training that differs in data.seed, seed: .* resume={tmp_path}$"):
-        improve.run(Experiment.of(composed(*there, "seed=1")))
-    assert (tmp_path / "config.yaml").read_bytes() == before
-
-
-@pytest.mark.parametrize("longer", ["trainer.max_steps=5", "+trainer.max_time={hours: 1}", "improve.steps=5"])
-def test_the_trainings_of_rounds_do_not_get_longer(tmp_path: Path, longer: str) -> None:
+@pytest.mark.parametrize("change", ["seed=1", "trainer.max_steps=5", "+trainer.max_time={hours: 1}", "improve.steps=5"])
+def test_a_folder_with_other_rounds_or_longer_trainings_is_left_alone(tmp_path: Path, change: str) -> None:
     there = (f"output={tmp_path}", "job=improve")
     save_config(tmp_path, plain(composed(*there)), [])
     (tmp_path / "round_1/episodes").mkdir(parents=True)
     (tmp_path / "round_1/episodes/store.json").write_text("{}")
     before = (tmp_path / "config.yaml").read_bytes()
-    with pytest.raises(ValueError, match=f"the rounds in {tmp_path} were trained with"):
-        improve.run(Experiment.of(composed(*there, longer)))
+    other = "holds a training that differs in data.seed, seed: " if change == "seed=1" else "were trained with"
+    with pytest.raises(ValueError, match=rf"{tmp_path} {other}"):
+        improve.run(Experiment.of(composed(*there, change)))
     assert (tmp_path / "config.yaml").read_bytes() == before
 
 
@@ -217,13 +209,6 @@ def test_the_last_interrupted_run_may_be_one_in_rounds(tmp_path: Path, file: str
     (tmp_path / "run/report.json").touch()
     with pytest.raises(ValueError, match="no run in"):
         interrupted_run(tmp_path)
-
-
-def test_seeds_of_demonstrations_are_not_played_again(folder: Path) -> None:
-    store = EpisodeStore(folder)
-    with pytest.raises(ValueError, match=r"have 5 to 9: set improve\.seed=10, or higher"):
-        improve.require_new(range(5, 10), store)
-    improve.require_new(range(100, 110), store)
 
 
 def result(folder: Path) -> tuple[dict[str, bytes], dict[str, float]]:

@@ -21,9 +21,8 @@ from clusters import PLACES, address_in, dask
 from collecting import content
 from command_line import here
 from command_line import vla as vla_process
-from composing import CONF, check, composed
+from composing import composed
 from conftest import made_once
-from hydra.errors import ConfigCompositionException
 from saved_policies import save_run
 
 from vla import jobs
@@ -133,30 +132,6 @@ def test_a_job_with_a_group_of_its_own_is_two_options_and_a_module(home: Path, i
         assert words in here(home, *asked, wrong, ok=False).stderr
     with pytest.raises(ValueError, match=r"job names mypackage\.survey, which is not trusted: add trust=\[mypackage\]"):
         jobs.find("mypackage.survey")
-
-
-# Options that name a part of a world of this project: they are for this world only.
-OF_ONE_WORLD = {
-    *("ablation", "few", "images_alone", "learning_curve", "multitask", "recipe", "standard"),
-    *("generalisation", "language", "levels", "paper", "suite", "tabletop"),
-    *("unseen_names", "renderer", "lerobot", "metaworld", "metaworld_perturbed", "metaworld_improved", "few_improved"),
-    *("multitask_improved", "standard_improved"),
-}
-
-
-@pytest.mark.parametrize("group", ["experiment", "evaluate", "validate"])
-def test_options_go_with_any_world_or_are_refused_for_it(
-    group: str, importable: None, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv(packages.TRUSTED, "mypackage")
-    options = {path.stem for path in (CONF / group).glob("*.yaml")}
-    for option in sorted(options - OF_ONE_WORLD):
-        check(composed("task=mine", "expert=mine", f"{group}={option}"))
-    for option in sorted(options & OF_ONE_WORLD):
-        with pytest.raises(
-            (ValueError, ConfigCompositionException), match=r"randomize|perturb|task/goal|renderer|window|image_size"
-        ):
-            check(composed("task=mine", "expert=mine", f"{group}={option}"))
 
 
 @pytest.mark.parametrize("name", ["nothing", "os.path", "vla.io.files", "sweep", ""])

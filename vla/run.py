@@ -109,7 +109,7 @@ def _require_sweepable(experiment: Experiment, job: Job) -> None:
     if HydraConfig.get().mode != RunMode.MULTIRUN:
         return
     slurm = HydraConfig.get().runtime.choices["hydra/launcher"] == "submitit_slurm"
-    if not slurm and "trainer" in job.needs(experiment.nodes) and devices(experiment["trainer"]) > 1:
+    if not slurm and "trainer" in job.needs(experiment.nodes) and devices(experiment.trainer) > 1:
         raise UserError(
             "-m cannot train on several devices in this launcher: add trainer.devices=1, "
             "or hydra/launcher=submitit_slurm, which starts every process of a cell itself"
@@ -161,7 +161,7 @@ def _do(cfg: DictConfig) -> float | None:
     job = jobs.find(experiment.settings.job)
     check(experiment.nodes, job)
     _require_sweepable(experiment, job)  # with the trainer that a run brings
-    if jobs.builds_world(experiment) and (others := substitutes(experiment["task"], overrides)):
+    if jobs.builds_world(experiment) and (others := substitutes(experiment.task, overrides)):
         overrides += others
         experiment = Experiment.of(_adopted(compose_again(*overrides), overrides), default)
     return jobs.run(experiment)

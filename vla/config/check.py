@@ -31,9 +31,8 @@ class Job:
 
     def needs(self, config: Mapping[str, Any]) -> dict[str, Group]:
         """Return name → group of everything that it builds from with a config."""
-        further = () if config["agent"] is not None else self.without_agent
-        if config["agent"] is config["checkpoint"] is None:
-            further += self.without_checkpoint
+        agent, checkpoint = (config[name] is not None for name in ("agent", "checkpoint"))
+        further = () if agent else self.without_agent if checkpoint else (*self.without_agent, *self.without_checkpoint)
         groups = (GROUPS[name] if isinstance(name, str) else name for name in (*self.groups, *further))
         return {group.name: group for group in groups}
 
@@ -44,49 +43,50 @@ def check(config: Mapping[str, Any], job: Job) -> None:
     Raises:
         UserError: an unknown, missing or ill-typed key, with its dotted name and the allowed values.
     """
-    settings = {each.name: config[each.name] for each in fields(Settings)}
+    values = {each.name: config[each.name] for each in fields(Settings)}
     groups = {name: GROUPS[name] for name in OF_EVERY_JOB} | job.needs(config)
     files = (file for folder in config_folders() for file in (folder / "job").glob("*.yaml"))
     of_jobs = {file.stem for file in files}  # an experiment may have options of another job
     for name in (name for name in config if name not in of_jobs):
-        require_known("", name, {**settings, **GROUPS, **groups}, "the config")
-    check_arguments("", settings, Settings)
-    if config["agent"] is not None and "agent" not in groups:
-        raise UserError(f"job={config['job']} takes no agent: agent=OPTION goes with job=evaluate and deploy")
-    if config["agent"] is not None and config["checkpoint"] is not None:
-        raise UserError("agent=OPTION and checkpoint=RUN are two policies: omit one of them")
+        require_known("", name, {**values, **GROUPS, **groups}, "the config")
+    check_arguments("", values, Settings)
+    settings = Settings(**values)
+    if config["agent"] is not None:
+        if "agent" not in groups:
+            raise UserError(f"job={settings.job} takes no agent: agent=OPTION goes with job=evaluate and deploy")
+        if settings.checkpoint is not None:
+            raise UserError("agent=OPTION and checkpoint=RUN are two policies: omit one of them")
     for name, group in groups.items():
-        _check_group(config, group, may_lack=name in job.stored)
+        if config.get(name) is not None:
+            _check_group(config[name], group, may_lack=name in job.stored)
+        elif not group.optional:
+            raise UserError(f"job={settings.job} needs {name}=OPTION; --help lists the options")
     if "model" in groups:
         _require_together(*(locate(f"{group}._target_", config[group]["_target_"]) for group in ("tokenizer", "model")))
-    _check_contents(config, groups)
+    _check_contents(config, settings, groups)
 
 
-def _check_group(config: Mapping[str, Any], group: Group, may_lack: bool) -> None:
-    """Check the node of a group, whose library the machine `may_lack`."""
-    name, node = group.name, config.get(group.name)
-    if node is None:
-        if not group.optional:
-            raise UserError(f"job={config['job']} needs {name}=OPTION; --help lists the options")
-        return
-    for key, each in {f"{name}.{key}": part for key, part in node.items()}.items() if group.several else [(name, node)]:
+def _check_group(node: Any, group: Group, may_lack: bool) -> None:
+    """Check the node of a group, whose library this machine `may_lack`."""
+    nodes = {f"{group.name}.{key}": part for key, part in node.items()} if group.several else {group.name: node}
+    for key, each in nodes.items():
         with suppress(MissingLibrary) if may_lack else nullcontext():
             check_node(key, each, makes(group), group.runtime)
 
 
-def _check_contents(config: Mapping[str, Any], groups: Mapping[str, Group]) -> None:
+def _check_contents(config: Mapping[str, Any], settings: Settings, groups: Mapping[str, Group]) -> None:
     """Check that values go together, and the task under every condition and with all other changes."""
     collect, validate, evaluate = (build(config[name], name) for name in OF_EVERY_JOB)
-    if config["checkpoint"] is None:  # else the seeds of its own training count
+    if settings.checkpoint is None:  # else the seeds of its own training count
         _require_apart(validate, evaluate)
     _require_different_stores(collect)
     changed = {}
-    if {"evaluate", "improve"} & {config["job"]}:
+    if settings.job in ("evaluate", "improve"):
         changed = {f"evaluate.conditions.{name}": changes for name, changes in evaluate.changes.items()}
     if "learner" in groups and validate.episodes:
         changed["validate.changes"] = validate.changes
-    if config["job"] == "improve":
-        changed["improve.changes"] = config["improve"]["changes"]
+    if "improve" in groups:
+        changed["improve.changes"] = build(config["improve"], groups["improve"]).changes
     for name, changes in changed.items():
         if changes:
             check_node(f"task ({name})", with_changes(config["task"], changes), makes(GROUPS["task"]))

@@ -92,6 +92,21 @@ class Experiment:
         """Episodes and conditions of an evaluation."""
         return self.build("evaluate")
 
+    @property
+    def task(self) -> Node:
+        """The plain node of the world."""
+        return self.nodes["task"]
+
+    @property
+    def trainer(self) -> Node:
+        """The plain node of Lightning's trainer."""
+        return self.nodes["trainer"]
+
+    @property
+    def held_out(self) -> float:
+        """Share of the episodes that training holds out."""
+        return self.nodes["data"]["validation_fraction"]
+
     def options(self, kind: type[T]) -> T:
         """Build the node of the job itself, of class `kind`."""
         name = self.settings.job.rpartition(".")[2]
@@ -100,6 +115,10 @@ class Experiment:
     def build(self, group: str, **runtime: Any) -> Any:
         """Build the node of a group, see `vla.config.build.build`."""
         return build(self.nodes[group], group, **runtime)
+
+    def kind(self, group: str) -> type:
+        """Return the class of the node of a group."""
+        return locate(f"{group}._target_", self.nodes[group]["_target_"])
 
     def __getitem__(self, key: str) -> Any:
         """Return a plain node of a group."""
@@ -129,7 +148,7 @@ class Experiment:
     @property
     def playable(self) -> bool:
         """True if agents can act in the world of the task; else it is known from recordings only."""
-        return not issubclass(locate("task._target_", self.nodes["task"]["_target_"]), SpecOnly)
+        return not issubclass(self.kind("task"), SpecOnly)
 
     def world(self) -> Environment | SpecOnly:
         """Build the world of the task and close it: only its description is used, such as spec and tasks."""
@@ -143,7 +162,7 @@ class Experiment:
 
     def make_environment(self, changes: Mapping[str, Any] | None = None) -> Callable[[], Environment]:
         """Return the factory of the environment, with the `changes` of a condition."""
-        return _with_trust(make_environment, with_changes(self.nodes["task"], changes or {}))
+        return _with_trust(make_environment, with_changes(self.task, changes or {}))
 
     def make_expert(self) -> Callable[[Environment], Agent]:
         """Return the factory of the expert for an environment."""
@@ -151,8 +170,16 @@ class Experiment:
 
     def make_agent(self) -> Callable[[Environment], Agent] | None:
         """Return the factory of the agent that acts in place of a policy, or None."""
-        node = self.nodes["agent"]
-        return _with_trust(make_agent, node, "agent") if node else None
+        if not (node := self.nodes["agent"]):
+            return None
+        # Workers may be in another folder.
+        place = {"folder": str(Path(folder).resolve())} if (folder := self.agent_folder) else {}
+        return _with_trust(make_agent, {**node, **place}, "agent")
+
+    @property
+    def agent_folder(self) -> str | None:
+        """Folder that the agent reads, if any."""
+        return (self.nodes["agent"] or {}).get("folder")
 
     def make_policy(self, checkpoint: Path | None = None) -> Callable[..., Policy]:
         """Return the factory of the policy in a folder, by default `checkpoint`; a UserError if there is none."""

@@ -9,7 +9,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from vla.config.annotations import locate, require_trusted
+from vla.config.annotations import require_trusted
 from vla.config.build import Group
 from vla.config.check import TRAINING, Job
 from vla.config.packages import is_trusted
@@ -71,7 +71,7 @@ def builds_world(experiment: Experiment) -> bool:
     if settings.resume is not None or (settings.job == "train" and Path(experiment.collect.folder).exists()):
         return False
     if "deploy" in groups:
-        return getattr(locate("deploy._target_", experiment["deploy"]["_target_"]), "needs_environment", False)
+        return getattr(experiment.kind("deploy"), "needs_environment", False)
     return "task" in groups
 
 

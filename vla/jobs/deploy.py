@@ -5,7 +5,6 @@ from __future__ import annotations
 from functools import partial
 from typing import Any
 
-from vla.config.build import build
 from vla.config.differences import at
 from vla.config.experiment import Experiment
 from vla.io.errors import UserError
@@ -19,8 +18,7 @@ def run(experiment: Experiment) -> None:
     """Run the deployment until done or interrupted; report a measured success rate like an evaluation.
 
     Raises:
-        UserError: an episode ended in an error; the report is written and contains it. Or, before anything is started,
-            an episode that is to be played selected the weights.
+        UserError: an episode to be played selected the weights; or one ended in an error, which the report contains.
     """
     seed, episodes = (at(experiment["deploy"], key, None) for key in ("simulator.seed", "episodes"))
     if experiment.checkpoint is not None and seed is not None and episodes is not None:
@@ -36,19 +34,10 @@ def run(experiment: Experiment) -> None:
 
 
 def deployment(experiment: Experiment) -> Any:
-    """Build the deployment of an experiment.
-
-    Raises:
-        UserError: it needs a policy, and there is none.
-    """
-    built = build(
-        experiment["deploy"],
-        "deploy",
-        policy=partial(_policy, experiment),
-        environment=experiment.make_environment(),
-        output=experiment.output,
-    )
-    if getattr(built, "needs_policy", True) and experiment.checkpoint is None and not experiment["agent"]:
+    """Build the deployment of an experiment; a UserError if it needs a policy, and there is none."""
+    policy, environment = partial(_policy, experiment), experiment.make_environment()
+    built = experiment.build("deploy", policy=policy, environment=environment, output=experiment.output)
+    if getattr(built, "needs_policy", True) and experiment.checkpoint is experiment.make_agent() is None:
         raise UserError("this deployment needs a trained policy: checkpoint=RUN")
     return built
 

@@ -61,8 +61,9 @@ def run(experiment: Experiment) -> float | None:
     The result is None in all but the first process of a training, and if no episodes are left to evaluate on.
     """
     require_possible(experiment)
-    checkpoint = None if experiment["agent"] else experiment.checkpoint or _trained(experiment)
-    if checkpoint is None and not experiment["agent"]:
+    agent = experiment.make_agent()
+    checkpoint = None if agent else experiment.checkpoint or _trained(experiment)
+    if checkpoint is agent is None:
         return None
     if experiment.playable:
         return evaluated(experiment, checkpoint)
@@ -76,7 +77,7 @@ def _trained(experiment: Experiment) -> Path | None:
     """Train; return None in all but the first process, or if no episodes are left to evaluate on."""
     from vla.jobs.train import train
 
-    if experiment.playable or experiment["data"]["validation_fraction"]:
+    if experiment.playable or experiment.held_out:
         return train(experiment)
     log.warning("data.validation_fraction=0 trains on all episodes and leaves none to evaluate the policy on")
     train(experiment.with_values({"job": "train"}))  # else resume=last would wait for an evaluation
@@ -94,7 +95,7 @@ def evaluated(experiment: Experiment, checkpoint: Path | None, rounds: Sequence[
         return known
     statements, conclusions = _statements(experiment), list[str]()
     _ = experiment.origin  # of the code that is evaluated, not of later changes
-    sources = [checkpoint, (experiment["agent"] or {}).get("folder"), wanted.nearest]
+    sources = [checkpoint, experiment.agent_folder, wanted.nearest]
     paths = [Path(each) for each in sources if each is not None]
     try:
         with (
@@ -153,7 +154,7 @@ def _play(
     Episodes in `played` are not played again; others are added to it. With `evaluate.until` the first condition stops
     when all statements are clear; every other one has the seeds of the first, and stops when its difference is clear.
     """
-    wanted, task = experiment.evaluate, experiment["task"]
+    wanted, task = experiment.evaluate, experiment.task
     recordings = experiment.output.resolve() / RECORDINGS
     make_recorder = experiment.make_recorder(recordings)
     if make_recorder:
@@ -161,7 +162,7 @@ def _play(
         needs = [*needs, recordings]
     if not len(played):
         clear(recordings)
-    make_agent = _absolute(experiment).make_agent() or make_policy
+    make_agent = experiment.make_agent() or make_policy
     assert make_agent is not None, "there is a checkpoint"
     world = experiment.world() if wanted.until else None
     play = partial(
@@ -196,12 +197,6 @@ def _play(
     for name in wanted.changes:  # one that changes nothing is the first
         reports[name] = report(name, make_agent, until, changed[name], seeds) if name in changed else first
     return reports | {name: report(name, agent, until, seeds=seeds) for name, agent in agents.items()}
-
-
-def _absolute(experiment: Experiment) -> Experiment:
-    """Return the experiment with the folder of its agent made absolute: workers may be in another one."""
-    folder = (experiment["agent"] or {}).get("folder")
-    return experiment.with_values({"agent.folder": str(Path(folder).resolve())}) if folder else experiment
 
 
 def _other_agents(experiment: Experiment, make_agent: AgentFactory) -> dict[str, AgentFactory]:
@@ -291,7 +286,7 @@ def _against(experiment: Experiment, run: str) -> AgainstRun:
     if report is None:
         raise UserError(f"evaluate.against={run} has no report.json to compare with: evaluate that run first")
     theirs = {result.seed: result for result in report.per_episode}
-    if not any(result.draws for result in report.per_episode) and report.config.get("task") != experiment["task"]:
+    if not any(result.draws for result in report.per_episode) and report.config.get("task") != experiment.task:
         theirs = {}  # without draws to compare, equal seeds are the same episodes in the same task only
     statement = AgainstRun(run, theirs, experiment.evaluate.margin, report.anytime)
     statement.require_common(experiment.evaluate.seeds)

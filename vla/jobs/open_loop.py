@@ -44,7 +44,7 @@ def evaluate_open_loop(experiment: Experiment, checkpoint: Path | None) -> float
     """
     started, output = time.monotonic(), experiment.output
     facts = {**experiment.settings.chosen, "origin": asdict(experiment.origin)}
-    fraction = experiment["data"]["validation_fraction"]
+    fraction = experiment.held_out
     if checkpoint is not None:  # before an import
         saved = read_policy(checkpoint)
         trained, world = saved.spec.without_truth, experiment.world().spec.without_truth

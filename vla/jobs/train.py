@@ -164,7 +164,7 @@ class _Begun(Callback):
 
 
 def _warn_of_endless(experiment: Experiment) -> None:
-    trainer = experiment["trainer"]
+    trainer = experiment.trainer
     if all(trainer.get(name) in (None, -1) for name in LENGTHS):
         log.info("trainer.max_steps=-1: training runs until interrupted; Ctrl-C saves and stops")
     if trainer["max_steps"] in (None, -1) and experiment["learner"]["schedule"] == "cosine":

@@ -22,7 +22,8 @@ def measures(experiment: Experiment) -> dict[str, Measure]:
     Raises:
         UserError: no loop or no checkpoint is chosen.
     """
-    if not experiment["deploy"] or experiment["deploy"]["_target_"] != "vla.deploy.loop.Loop":
+    node = experiment["deploy"]
+    if not node or node["_target_"] != "vla.deploy.loop.Loop":
         raise UserError("benchmark.names=[deploy] needs deploy=loop checkpoint=RUN")
     loop = deployment(experiment)
     with loop.running() as operator:
@@ -34,7 +35,7 @@ def measures(experiment: Experiment) -> dict[str, Measure]:
         image, inference, tick = (
             parse_json(operator.status.get(key, ""), float, f"{key} of /vla_agent/status") for key in keys
         )
-    agent = experiment["deploy"]["agent"]
+    agent = node["agent"]
     return {
         "deploy: image to command": measure(image, "ms", loop.episodes, inference),
         "deploy: tick p99": measure(tick, "ms", loop.episodes, 1000 / agent["command_hz"]),

@@ -49,7 +49,7 @@ def measures(experiment: Experiment) -> dict[str, Measure]:
         name: _loading(alone.data(store, frames, model.chunk), store, frames, asked.batches)
         for frames, name in [(model.history, "loader"), *names.items()]
     }
-    if "image_size" in experiment["task"]:
+    if "image_size" in experiment.task:
         found |= _of_large_images(alone.with_values({"task.image_size": [LARGE, LARGE]}), model.chunk)
     if asked.lerobot is not None:
         some = EpisodeStore(store.folder, min(experiment.collect.episodes, PEER_EPISODES))

@@ -7,7 +7,6 @@ from collections.abc import Callable
 import numpy as np
 import torch
 
-from vla.config.build import build
 from vla.config.experiment import Experiment
 from vla.config.nodes import Benchmark
 from vla.jobs.benchmark.measure import Measure, measure, timed
@@ -24,7 +23,7 @@ def measures(experiment: Experiment) -> dict[str, Measure]:
     observation = environment.reset(0)
     environment.close()
     model = experiment.fitted_learner(demonstrations(experiment)).model
-    agent = build(experiment["policy"], "policy", model=model, spec=environment.spec)
+    agent = experiment.build("policy", model=model, spec=environment.spec)
     for _ in range(model.history + 1):  # warm-up: compiles and allocates
         agent.act(observation)
     frame = agent.frame(observation)

@@ -23,7 +23,7 @@ def renderings(experiment: Experiment) -> dict[str, Measure]:
     The floor is the fastest one. A renderer with settings of the user's is "chosen", beside the others. Nothing is
     measured of a world without `minimal_step` or such a renderer.
     """
-    own, choice = experiment["task"].get("renderer"), _options()
+    own, choice = experiment.task.get("renderer"), _options()
     if own is None or own["_target_"] not in [node["_target_"] for node in choice.values()]:
         return {}
     nodes = choice if own in choice.values() else {**choice, "chosen": own}

@@ -54,7 +54,7 @@ def measures(experiment: Experiment) -> dict[str, Measure]:
         UserError: there is nothing to measure, or not enough memory.
     """
     asked = experiment.options(Benchmark)
-    on_processor = computes_on_cpu(experiment["trainer"]["accelerator"])
+    on_processor = computes_on_cpu(experiment.trainer["accelerator"])
     precisions = _precisions(asked.precisions, on_processor)
     if not precisions or not asked.compile:
         raise UserError("training is timed in each of benchmark.precisions and benchmark.compile: both need an entry")
