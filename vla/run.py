@@ -7,7 +7,7 @@ import re
 import shutil
 import sys
 import traceback
-from collections.abc import Iterator, Sequence
+from collections.abc import Container, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NoReturn
@@ -23,7 +23,7 @@ from yaml import YAMLError
 
 from vla import jobs
 from vla.config.annotations import packages, targets
-from vla.config.check import Job, check, devices
+from vla.config.check import check, devices
 from vla.config.compose import CONF, offer_axes, substitutes, with_variant
 from vla.config.compose import compose as compose_again
 from vla.config.experiment import Experiment
@@ -104,29 +104,26 @@ def _is_mendable(error: Exception) -> bool:
     return isinstance(error, MENDABLE) or lightning or of_list
 
 
-def _require_sweepable(experiment: Experiment, job: Job) -> None:
-    """Refuse -m with several devices: processes that a trainer starts repeat the command line, here the whole sweep."""
-    if HydraConfig.get().mode != RunMode.MULTIRUN:
+def _require_sweepable(experiment: Experiment, groups: Container[str]) -> None:
+    """Refuse grids of which only one cell would run, cells that share a folder, and cells on several devices."""
+    config = HydraConfig.get()
+    given = {key: value for key, _, value in (override.partition("=") for override in config.overrides.task)}
+    name, params = config.runtime.choices["experiment"], config.sweeper.params or {}
+    if config.mode != RunMode.MULTIRUN:
+        if params:
+            raise UserError(f"experiment={name} is a grid of runs: add -m")
         return
-    slurm = HydraConfig.get().runtime.choices["hydra/launcher"] == "submitit_slurm"
-    if not slurm and "trainer" in job.needs(experiment.nodes) and devices(experiment.trainer) > 1:
+    if not given.keys() >= params.keys():
+        raise UserError(f"experiment={name} is a grid of its own: name no other one beside it")
+    if "${" not in given.get("output", "${"):
+        raise UserError("with -m every cell has a folder of its own: name that of the sweep, hydra.sweep.dir=DIR")
+    slurm = config.runtime.choices["hydra/launcher"] == "submitit_slurm"
+    if "trainer" in groups and not slurm and devices(experiment.trainer) > 1:
+        # Processes that a trainer starts repeat the command line, here the whole sweep.
         raise UserError(
             "-m cannot train on several devices in this launcher: add trainer.devices=1, "
             "or hydra/launcher=submitit_slurm, which starts every process of a cell itself"
         )
-
-
-def _require_swept() -> None:
-    """Refuse grids of which only one cell would run, and cells that share a folder."""
-    hydra_config = HydraConfig.get()
-    given = {key: value for key, _, value in (each.partition("=") for each in hydra_config.overrides.task)}
-    name, swept = hydra_config.runtime.choices["experiment"], hydra_config.mode == RunMode.MULTIRUN
-    if not swept and hydra_config.sweeper.params:
-        raise UserError(f"experiment={name} is a grid of runs: add -m")
-    if not given.keys() >= (hydra_config.sweeper.params or {}).keys():
-        raise UserError(f"experiment={name} is a grid of its own: name no other one beside it")
-    if swept and "${" not in given.get("output", "${"):
-        raise UserError("with -m every cell has a folder of its own: name that of the sweep, hydra.sweep.dir=DIR")
 
 
 @contextmanager
@@ -149,7 +146,6 @@ def _without_empty_folders(cfg: DictConfig) -> Iterator[None]:
 
 
 def _do(cfg: DictConfig) -> float | None:
-    _require_swept()
     without_triton()
     overrides = list(HydraConfig.get().overrides.task)
     cfg = with_variant(cfg, overrides)
@@ -160,7 +156,7 @@ def _do(cfg: DictConfig) -> float | None:
     experiment = Experiment.of(_adopted(cfg, overrides), default)
     job = jobs.find(experiment.settings.job)
     check(experiment.nodes, job)
-    _require_sweepable(experiment, job)  # with the trainer that a run brings
+    _require_sweepable(experiment, job.needs(experiment.nodes))
     if jobs.builds_world(experiment) and (others := substitutes(experiment.task, overrides)):
         overrides += others
         experiment = Experiment.of(_adopted(compose_again(*overrides), overrides), default)
@@ -168,11 +164,7 @@ def _do(cfg: DictConfig) -> float | None:
 
 
 def _adopted(cfg: DictConfig, overrides: list[str]) -> DictConfig:
-    """Return `cfg` merged with the run, policy or pretrained weights that it names.
-
-    Raises:
-        UserError: a value is no path, or the named file cannot be used.
-    """
+    """Return `cfg` merged with the run, policy or pretrained weights that it names; a UserError if it cannot be."""
     for key in ("resume", "checkpoint", "pretrained", "output"):
         if not isinstance(cfg[key], str | None) or (key == "output" and not cfg[key]):
             raise UserError(f"{key}={cfg[key]} is not a path: give a folder or file; a number is quoted, {key}=\\'3\\'")

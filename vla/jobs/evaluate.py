@@ -42,6 +42,7 @@ from vla.runs.folder import (
     RECORDINGS,
     REPORT,
     SUITE,
+    described,
     require_run,
     save_config,
     wall_time,
@@ -324,8 +325,7 @@ def _write(experiment: Experiment, checkpoint: Path | None, reports: dict[str, R
     page = None
     with warn_on_error(output / PAGE):
         page = write_page(output)
-    written = [path for path in (page, output / REPORT, output / PLOT, recording) if path and path.is_file()]
-    log.info("wrote %s", ", ".join([str(written[0]), *(path.name for path in written[1:])]))
+    log.info("wrote %s", described([page, output / REPORT, output / PLOT, recording]))
 
 
 def _errors(reports: Mapping[str, Report]) -> int:

@@ -7,7 +7,7 @@ import io
 import json
 import logging
 import shutil
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
@@ -135,6 +135,12 @@ def save_config(folder: Path, config: Mapping[str, Any], changes: list[Node]) ->
     """Save the resolved config and its differences from the default."""
     for name, content in ((CONFIG, config), (CHANGES, changes)):
         write_text(folder / name, yaml.safe_dump(content, sort_keys=False, allow_unicode=True, width=120))
+
+
+def described(files: Sequence[Path | None]) -> str:
+    """List those files of a folder that are there."""
+    first, *others = [file for file in files if file and file.is_file()]
+    return ", ".join([str(first), *(file.name for file in others)])
 
 
 def save_training(folder: Path, training: Training) -> None:
