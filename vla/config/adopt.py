@@ -40,10 +40,8 @@ IDENTITY = (
 def adopt(cfg: DictConfig, overrides: Sequence[str]) -> DictConfig:
     """Return `cfg` with task, tokenizer and model of `cfg.checkpoint`; for job=evaluate also its training settings.
 
-    A path or address in these nodes is an error; in the training settings, which are only shown, it becomes null.
-
-    Raises:
-        UserError: there is no such policy, or an override contradicts its weights.
+    A path or address in these nodes is an error; in the training settings, which are only shown, it becomes null. There
+    is a UserError if there is no such policy, or an override contradicts its weights.
     """
     parsed = _parsed(overrides, ("tokenizer", "model", "experiment"))
     saved = read_policy(cfg.checkpoint).config
@@ -120,11 +118,7 @@ def resume(cfg: DictConfig, run: Path, overrides: Sequence[str]) -> DictConfig:
 
 
 def _saved(run: Path) -> tuple[Path, Mapping[str, Any]]:
-    """Return the config of a run and the file that has it: its last checkpoint, or config.yaml of one in rounds.
-
-    Raises:
-        UserError: there is neither.
-    """
+    """Return the config of a run and the file that has it: its last checkpoint, or config.yaml of one in rounds."""
     if (run / LAST).is_file():
         return run / LAST, read_header(run / LAST).config
     file = run / "config.yaml"

@@ -51,12 +51,7 @@ class MissingLibrary(UserError):
 
 
 def locate(key: str, target: Any) -> type:
-    """Import the class that the `_target_` at `key` names.
-
-    Raises:
-        MissingLibrary: a library is not installed.
-        UserError: the class is not allowed or does not exist.
-    """
+    """Import the class that the `_target_` at `key` names; a UserError if it is not allowed or does not exist."""
     require_trusted(key, target)
     if not isinstance(target, str) or not (target.startswith(OWN) or target in LIBRARY or is_trusted(target)):
         raise UserError(

@@ -114,15 +114,10 @@ NARROWER: dict[str, dict[str, Any]] = {
 
 
 def build(node: Mapping[str, Any], group: str | Group, **runtime: Any) -> Any:
-    """Build the object that a plain `node` of a group such as "model" describes.
+    """Build the object that a plain `node` of a group, or of its name in `GROUPS`, describes.
 
-    Nested nodes are built first; those with `_partial_: true` become factories. Unresolved references such as `${seed}`
-    are refused, so the checked mapping is the one that is built.
-
-    Args:
-        node: class in `_target_`, and its arguments.
-        group: config group, or its name in `GROUPS`, which determines the base class.
-        runtime: arguments from the program.
+    Nested nodes are built first; those with `_partial_: true` become factories; `runtime` is from the program.
+    Unresolved references such as `${seed}` are refused, so the checked mapping is the one that is built.
 
     Raises:
         UserError: a class that is not allowed or of another kind, wrong arguments, or an error of the constructor.
@@ -211,15 +206,12 @@ def require_trust(config: Mapping[str, Any], names: Iterable[Any], source: objec
 def require_no_paths(
     config: Mapping[str, Any], names: Collection[str], source: object, given: Collection[str] | None = None
 ) -> None:
-    """Refuse nodes out of a file in which a class is given a file or folder, or an address or key of a connection.
+    """Raise a UserError if a node of the file `source` names a file, a folder, or an address or key of a connection.
 
     Args:
-        config: plain, with the nodes `names`, as far as there are any.
-        source: where it comes from, for the error.
+        config: plain, with the nodes `names`, as far as there are any, whose classes must be trusted.
+        source: for the error.
         given: dotted names of nodes that the command line gives in place of the file's; None: it cannot.
-
-    Raises:
-        UserError: with the dotted name of the first such argument, or a class that may not be built.
     """
     require_trust(config, names, source)
     for key in (f"{path}.{argument}" for name in names for _, path, argument in _paths_in(config.get(name), name)):

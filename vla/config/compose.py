@@ -29,12 +29,9 @@ log = logging.getLogger(__name__)
 
 
 def compose(*overrides: str) -> DictConfig:
-    """Compose the config that `python -m vla.run` composes from the same overrides.
+    """Compose the config that `python -m vla.run` composes from the same overrides, see `with_variant`.
 
     Add `output=DIR`: only the command line creates a folder per run.
-
-    Raises:
-        UserError: see `with_variant`.
     """
     with _hydra():
         config = hydra.compose("config", list(overrides), return_hydra_config=True)
@@ -47,12 +44,7 @@ def compose(*overrides: str) -> DictConfig:
 def with_variant(config: DictConfig, overrides: Sequence[str]) -> DictConfig:
     """Return a config without its `variants`, composed again with the overrides of the one that `variant` names.
 
-    Args:
-        config: as composed from the overrides.
-        overrides: of the command line.
-
-    Raises:
-        UserError: the config has no such variant, or an override contradicts it.
+    `config` is as composed from `overrides`; a UserError if it has no such variant, or one of these contradicts it.
     """
     with open_dict(config):
         name, variants = config.pop("variant"), config.pop("variants")
@@ -79,9 +71,7 @@ def compose_task(task: str, **overrides: Any) -> Node:
             KEY=VALUE for an argument, such as image_size=(64, 64) or **{"goal.radius": 0.03}. As on the command line, a
             mapping is merged, and an optional argument that the task's files do not list begins with a plus.
 
-    Raises:
-        hydra.errors.HydraException: an option does not exist.
-        omegaconf.errors.OmegaConfBaseException: a key does not exist.
+    An option or key that does not exist raises an exception of Hydra or OmegaConf.
     """
     with _hydra() as loader:
         groups = {name: option for name, option in overrides.items() if loader.get_group_options(f"task/{name}")}

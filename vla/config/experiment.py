@@ -207,36 +207,32 @@ class Experiment:
         """Folder of the policy with the initial weights of a training, if given; a UserError if there is none."""
         return _policy_folder(self.settings.pretrained)
 
-    def learner(self, spec: Spec, origin: Path | None = None) -> Learner:
-        """Build the learner; without `origin`, fit its tokenizer afterwards with `fit_tokenizer`.
+    def learner(self, spec: Spec, origin: Path | None = None, last: Path | None = None) -> Learner:
+        """Build the learner with initial weights; without any, fit its tokenizer afterwards with `fit_tokenizer`.
 
         Args:
             spec: of the demonstrations.
-            origin: folder of the policy with the initial weights.
+            origin: folder of the policy that has the weights.
+            last: Lightning's checkpoint of this training, which is to continue.
 
         Raises:
-            UserError: `origin` is no policy, or has another spec.
+            UserError: one of them is damaged, or the policy has another spec.
         """
+        from vla.models.checkpoint import read_content, weights_of
         from vla.models.policy_folder import read_policy
 
-        saved = read_policy(origin) if origin else None
+        saved, content = read_policy(origin) if origin else None, read_content(last) if last else None
         if saved:
             saved.spec.without_truth.require(spec.without_truth, f"the policy {origin}", "the demonstrations")
             spec = replace(spec, robot=saved.spec.robot)
-        model = _model(self.nodes, spec, saved, weights=saved is not None)
+        if content:
+            spec = replace(spec, robot=Spec.from_dict(content["spec"], str(last)).robot)
+        model = _model(self.nodes, spec, saved, weights=bool(origin or last))
         if saved:
             saved.initialize(model)
-        return self.build("learner", model=model, spec=spec, config=self.config)
-
-    def resumed_learner(self, spec: Spec, checkpoint: Path) -> Learner:
-        """Build the learner that Lightning's checkpoint of this training continues; a UserError if it is damaged."""
-        from vla.models.checkpoint import read_content, weights_of
-
-        content = read_content(checkpoint)
-        spec = replace(spec, robot=Spec.from_dict(content["spec"], str(checkpoint)).robot)
-        model = _model(self.nodes, spec, weights=True)
-        # Before Lightning does, because a sharded model cannot load what modules keep besides their weights.
-        model.load_state_dict(weights_of(content))
+        if content:
+            # Before Lightning does, because a sharded model cannot load what modules keep besides their weights.
+            model.load_state_dict(weights_of(content))
         return self.build("learner", model=model, spec=spec, config=self.config)
 
     def fit_tokenizer(self, tokenizer: ActionTokenizer, store: EpisodeStore) -> None:
@@ -350,13 +346,9 @@ def _policy_folder(name: str | None) -> Path | None:
 
 
 def _model(nodes: Node, spec: Spec, saved: SavedPolicy | None = None, weights: bool = False) -> Model:
-    """Build the model of a config, and its tokenizer.
+    """Build the model of a config, and its tokenizer; if it gets `weights`, without loading pretrained ones.
 
-    Args:
-        nodes: the config.
-        spec: of its inputs and outputs.
-        saved: the policy whose weights it gets; a larger model is refused.
-        weights: it gets some, so that no pretrained ones are loaded.
+    A model that is larger than the weights of the `saved` policy is refused.
     """
     node, tokenizer = nodes["model"], build(nodes["tokenizer"], "tokenizer", spec=spec)
     with saved.budget() if saved else nullcontext():

@@ -6,9 +6,9 @@ In a world of recordings there is no success to measure, only errors of actions:
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -25,12 +25,12 @@ from vla.policy import costs
 from vla.reports.conditions import SecondaryRows, conditions_table, plot_conditions, secondary_table
 from vla.reports.evaluation import plot_report, write_report
 from vla.reports.run_page import write_page
-from vla.rollouts.evaluate import RecorderFactory, evaluate
+from vla.rollouts.evaluate import evaluate
 from vla.rollouts.memory import make_nearest, make_without, open_memory
 from vla.rollouts.realtime import make_over_network
 from vla.rollouts.recordings import clear, keep_recordings
 from vla.rollouts.results import Report, compare_conditions, compare_secondary_metrics
-from vla.rollouts.rollout import AgentFactory
+from vla.rollouts.rollout import AgentFactory, EnvironmentFactory
 from vla.rollouts.shared_policy import shared_policy
 from vla.rollouts.statements import AgainstBar, AgainstRun, Statement, differs_clearly
 from vla.runs.files import Round
@@ -143,6 +143,39 @@ def _is_shared(experiment: Experiment) -> bool:
     return experiment["cluster"].get("policy") == "here"
 
 
+@dataclass(frozen=True)
+class _Condition:
+    """A world and an agent that plays in it on the seeds of the evaluation."""
+
+    name: str
+    make_environment: EnvironmentFactory
+    make_agent: AgentFactory
+
+
+def _conditions(experiment: Experiment, make_agent: AgentFactory) -> list[_Condition]:
+    """Return the training condition, then those that change its world or its agent.
+
+    Other agents are the same one without a modality or at the other end of a network, and the nearest demonstration.
+    """
+    wanted, task, world = experiment.evaluate, experiment.task, experiment.make_environment()
+    agents: dict[str, AgentFactory] = {
+        f"without_{each}": partial(make_without, make_agent, each) for each in wanted.without
+    }
+    if wanted.nearest:
+        agents[NEAREST] = partial(make_nearest, Path(wanted.nearest).resolve())
+    for name, node in wanted.networks.items():
+        agents[name] = partial(make_over_network, make_agent, build(node, NETWORK), by_clock=wanted.by_clock)
+    return [
+        _Condition(IN_DISTRIBUTION, world, make_agent),
+        *(
+            _Condition(name, experiment.make_environment(changes), make_agent)
+            for name, changes in wanted.changes.items()
+            if with_changes(task, changes) != task
+        ),
+        *(_Condition(name, world, agent) for name, agent in agents.items()),
+    ]
+
+
 def _play(
     experiment: Experiment,
     make_policy: AgentFactory | None,
@@ -155,63 +188,37 @@ def _play(
     Episodes in `played` are not played again; others are added to it. With `evaluate.until` the first condition stops
     when all statements are clear; every other one has the seeds of the first, and stops when its difference is clear.
     """
-    wanted, task = experiment.evaluate, experiment.task
-    recordings = experiment.output.resolve() / RECORDINGS
-    make_recorder = experiment.make_recorder(recordings)
+    wanted, recordings = experiment.evaluate, experiment.output.resolve() / RECORDINGS
+    make_agent, make_recorder = experiment.make_agent() or make_policy, experiment.make_recorder(recordings)
+    assert make_agent is not None, "there is a checkpoint"
     if make_recorder:
         recordings.mkdir(exist_ok=True)
         needs = [*needs, recordings]
     if not len(played):
         clear(recordings)
-    make_agent = experiment.make_agent() or make_policy
-    assert make_agent is not None, "there is a checkpoint"
     world = experiment.world() if wanted.until else None
-    play = partial(
-        evaluate,
-        cluster=experiment.cluster(),
-        needs=needs,
-        recordings=wanted.recordings,
-        turns=len(world.tasks) if isinstance(world, Multitask) else 1,
-        lanes=1 if _is_shared(experiment) else (experiment["policy"] or {}).get("lanes", 1),  # else lanes are workers
-    )
-
-    def report(
-        name: str,
-        make_agent: AgentFactory,
-        until: Callable[[Report], bool] | None,
-        changes: Mapping[str, Any] | None = None,
-        seeds: Sequence[int] = wanted.seeds,
-        make_recorder: RecorderFactory | None = None,
-    ) -> Report:
-        makers, kept = (experiment.make_environment(changes), make_agent, make_recorder), partial(played.add, name)
-        until = until if wanted.until else None
-        label = "as configured" if name == IN_DISTRIBUTION else name
-        found = play(*makers, seeds, name=label, until=until, known=played.of(name), keep=kept)
-        return replace(found, tiers=task.get("tiers") or {})  # of worlds that have them
-
-    decided = (lambda so_far: all(each.is_decided(so_far) for each in statements)) if statements else None
-    first = report(IN_DISTRIBUTION, make_agent, decided, make_recorder=make_recorder)
-    seeds, reports = [result.seed for result in first.results], {IN_DISTRIBUTION: first}
-    changed = {name: changes for name, changes in wanted.changes.items() if with_changes(task, changes) != task}
-    agents = _other_agents(experiment, make_agent)
-    until = partial(differs_clearly, first, wanted.margin, len(changed) + len(agents))
-    for name in wanted.changes:  # one that changes nothing is the first
-        reports[name] = report(name, make_agent, until, changed[name], seeds) if name in changed else first
-    return reports | {name: report(name, agent, until, seeds=seeds) for name, agent in agents.items()}
-
-
-def _other_agents(experiment: Experiment, make_agent: AgentFactory) -> dict[str, AgentFactory]:
-    """Return condition → factory of another agent: the same one without a modality or at the other end of a network, or
-    the nearest demonstration."""
-    wanted = experiment.evaluate
-    impaired = {f"without_{each}": partial(make_without, make_agent, each) for each in wanted.without}
-    replayed = {NEAREST: partial(make_nearest, Path(wanted.nearest).resolve())} if wanted.nearest else {}
-    networks = {name: build(node, NETWORK) for name, node in wanted.networks.items()}
-    distant = {
-        name: partial(make_over_network, make_agent, network, by_clock=wanted.by_clock)
-        for name, network in networks.items()
-    }
-    return {**impaired, **replayed, **distant}
+    turns = len(world.tasks) if isinstance(world, Multitask) else 1
+    lanes = 1 if _is_shared(experiment) else (experiment["policy"] or {}).get("lanes", 1)  # else lanes are workers
+    play = partial(evaluate, cluster=experiment.cluster(), needs=needs, turns=turns, lanes=lanes)
+    tiers = experiment.task.get("tiers") or {}  # of worlds that have them
+    conditions, reports, seeds = _conditions(experiment, make_agent), dict[str, Report](), list(wanted.seeds)
+    until = (lambda so_far: all(each.is_decided(so_far) for each in statements)) if statements else None
+    for each in conditions:
+        first = each is conditions[0]
+        report = play(
+            *(each.make_environment, each.make_agent, make_recorder if first else None, seeds),
+            name="as configured" if first else each.name,
+            until=until if wanted.until else None,
+            recordings=wanted.recordings,
+            known=played.of(each.name),
+            keep=partial(played.add, each.name),
+        )
+        reports[each.name] = replace(report, tiers=tiers)
+        if first:
+            seeds = [result.seed for result in report.results]
+            until = partial(differs_clearly, report, wanted.margin, len(conditions) - 1)
+    # A condition that changes nothing is the first one.
+    return {name: reports.get(name, reports[IN_DISTRIBUTION]) for name in (IN_DISTRIBUTION, *wanted.changes, *reports)}
 
 
 def require_possible(experiment: Experiment) -> None:

@@ -89,7 +89,7 @@ def _fit(experiment: Experiment, last: Path | None, trainer: Trainer, graceful_s
     lightning.seed_everything(experiment.settings.seed, verbose=False)
     with explain_memory_errors(experiment.config), graceful_stop.explaining_restore(last):
         spec = demonstration_spec(experiment)
-        learner = experiment.resumed_learner(spec, last) if last else experiment.learner(spec, origin)
+        learner = experiment.learner(spec, origin, last)
     store, model = demonstrations(experiment), learner.model
     if origin is last is None:
         experiment.fit_tokenizer(model.tokenizer, store)
