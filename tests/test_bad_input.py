@@ -21,7 +21,7 @@ BAD_INPUT = {
     "colect.episodes=3": "there is no colect, did you mean collect?",
     "model=rt2": "model has no option 'rt2', did you mean rt1?",
     "trainer.max_steps=many": "trainer.max_steps must be ",
-    "checkpoint=nowhere": "there is no policy",
+    "checkpoint=nowhere": "there is no policy 'nowhere': name a run",
     "checkpoint=nowhere.ckpt": "only resumes its own training: a policy is a folder",
     "checkpoint=.": ". is neither a policy nor a run with one",
     "job=deploy deploy=loop": "this deployment needs a trained policy",

@@ -136,7 +136,7 @@ def test_a_job_with_a_group_of_its_own_is_two_options_and_a_module(home: Path, i
 
 @pytest.mark.parametrize("name", ["nothing", "os.path", "vla.io.files", "sweep", ""])
 def test_what_is_no_job_is_none(name: str) -> None:
-    with pytest.raises(ValueError, match=f"there is no job={name}; --help lists the jobs"):
+    with pytest.raises(ValueError, match=f"there is no job '{name}'; --help lists the jobs"):
         jobs.find(name)
 
 

@@ -153,8 +153,8 @@ def _do(cfg: DictConfig) -> float | None:
     # Before anything is read from a file.
     trust(composed.get("trust"), [composed["job"], *targets(composed)], packages(composed))
     default = compose("config", [f"job={HydraConfig.get().runtime.choices['job']}"])
-    experiment = Experiment.of(_adopted(cfg, overrides), default)
-    job = jobs.find(experiment.settings.job)
+    cfg = _adopted(cfg, overrides)
+    experiment, job = Experiment.of(cfg, default), jobs.find(cfg.job)
     check(experiment.nodes, job)
     _require_sweepable(experiment, job.needs(experiment.nodes))
     if jobs.builds_world(experiment) and (others := substitutes(experiment.task, overrides)):

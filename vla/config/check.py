@@ -31,7 +31,7 @@ class Job:
 
     def needs(self, config: Mapping[str, Any]) -> dict[str, Group]:
         """Return name → group of everything that it builds from with a config."""
-        agent, checkpoint = (config[name] is not None for name in ("agent", "checkpoint"))
+        agent, checkpoint = (config.get(name) is not None for name in ("agent", "checkpoint"))
         further = () if agent else self.without_agent if checkpoint else (*self.without_agent, *self.without_checkpoint)
         groups = (GROUPS[name] if isinstance(name, str) else name for name in (*self.groups, *further))
         return {group.name: group for group in groups}
@@ -43,7 +43,7 @@ def check(config: Mapping[str, Any], job: Job) -> None:
     Raises:
         UserError: an unknown, missing or ill-typed key, with its dotted name and the allowed values.
     """
-    values = {each.name: config[each.name] for each in fields(Settings)}
+    values = {each.name: config[each.name] for each in fields(Settings) if each.name in config}
     groups = {name: GROUPS[name] for name in OF_EVERY_JOB} | job.needs(config)
     files = (file for folder in config_folders() for file in (folder / "job").glob("*.yaml"))
     of_jobs = {file.stem for file in files}  # an experiment may have options of another job
@@ -51,7 +51,7 @@ def check(config: Mapping[str, Any], job: Job) -> None:
         require_known("", name, {**values, **GROUPS, **groups}, "the config")
     check_arguments("", values, Settings)
     settings = Settings(**values)
-    if config["agent"] is not None:
+    if config.get("agent") is not None:
         if "agent" not in groups:
             raise UserError(f"job={settings.job} takes no agent: agent=OPTION goes with job=evaluate and deploy")
         if settings.checkpoint is not None:

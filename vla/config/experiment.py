@@ -170,7 +170,7 @@ class Experiment:
 
     def make_agent(self) -> Callable[[Environment], Agent] | None:
         """Return the factory of the agent that acts in place of a policy, or None."""
-        if not (node := self.nodes["agent"]):
+        if not (node := self.nodes.get("agent")):
             return None
         # Workers may be in another folder.
         place = {"folder": str(Path(folder).resolve())} if (folder := self.agent_folder) else {}
@@ -179,7 +179,7 @@ class Experiment:
     @property
     def agent_folder(self) -> str | None:
         """Folder that the agent reads, if any."""
-        return (self.nodes["agent"] or {}).get("folder")
+        return (self.nodes.get("agent") or {}).get("folder")
 
     def make_policy(self, checkpoint: Path | None = None) -> Callable[..., Policy]:
         """Return the factory of the policy in a folder, by default `checkpoint`; a UserError if there is none."""
@@ -190,7 +190,7 @@ class Experiment:
 
     def make_recorder(self, folder: Path) -> Callable[[], Recorder] | None:
         """Return the factory of the recorder that writes into a folder, or None without a recorder."""
-        node = self.nodes["recorder"]
+        node = self.nodes.get("recorder")
         return _with_trust(build, node, "recorder", folder=folder) if node else None
 
     def cluster(self) -> Cluster:

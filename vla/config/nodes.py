@@ -146,7 +146,7 @@ class Preview:
 
 
 @dataclass(frozen=True)
-class Comparison:
+class ReportedRuns:
     """Runs that `job=report` compares."""
 
     runs: list[Text]

@@ -39,7 +39,7 @@ JOBS = {
     "export": Job(("task", "expert", "cluster", "tokenizer", "model", "policy", "export"), adopts=True),
     "inspect": Job((_own("inspect", "Inspection"),)),
     "preview": Job(("task", "expert", "recorder", _own("preview", "Preview"))),
-    "report": Job((_own("report", "Comparison"),)),
+    "report": Job((_own("report", "ReportedRuns"),)),
     "plan": Job((_own("plan", "Power"),)),
     "benchmark": Job((*TRAINING, "policy", _own("benchmark", "Benchmark")), adopts=True),
 }
@@ -61,7 +61,7 @@ def find(name: str) -> Job:
             raise
         found = None
     if not hasattr(found, "JOB"):
-        raise UserError(f"there is no job={name}; --help lists the jobs")
+        raise UserError(f"there is no job '{name}'; --help lists the jobs")
     return found.JOB
 
 
