@@ -15,7 +15,7 @@ from vla.config import check as checking
 from vla.config.annotations import packages as packages_in
 from vla.config.compose import CONF as CONF
 from vla.config.compose import compose, offer_axes
-from vla.config.experiment import plain
+from vla.config.experiment import Experiment, plain
 from vla.config.packages import TRUSTED, trusted
 
 offer_axes()
@@ -38,7 +38,7 @@ def check(config: DictConfig) -> None:
     nodes = plain(config)
     used = packages_in(nodes)
     with patch.dict(os.environ, {TRUSTED: ",".join([*trusted(), *used])}):
-        checking.check(nodes, jobs.find(config.job))
+        checking.check(Experiment(nodes), jobs.find(config.job))
 
 
 def _is_value(override: str) -> bool:

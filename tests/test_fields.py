@@ -17,7 +17,7 @@ from toy import ARM_SPEC, make_arm, make_environment, make_expert
 from toy_episodes import CODECS, CONFIG, EPISODES, MORE, add, change, content
 
 from vla.config.check import check
-from vla.config.experiment import Experiment, plain
+from vla.config.experiment import Experiment
 from vla.data.datamodule import digest_of
 from vla.data.episodes import EpisodeStore
 from vla.data.fields import END
@@ -142,7 +142,7 @@ def test_the_config_names_the_codec(options: tuple[str, ...], codec: Codec | Non
 @pytest.mark.parametrize("option", ["collect.images=png", "collect.images=auto", "collect.quality=96"])
 def test_a_config_of_another_codec_is_refused_by_name(option: str) -> None:
     with pytest.raises(ValueError, match=option.partition("=")[0].replace(".", r"\.")):
-        check(plain(composed("job=collect", option)), find("collect"))
+        check(Experiment.of(composed("job=collect", option)), find("collect"))
 
 
 def test_demonstrations_with_other_losses_do_not_complete_a_training(tmp_path: Path) -> None:

@@ -158,10 +158,10 @@ main()
 from vla.config.adopt import adopt
 from vla.config.check import check
 from vla.config.compose import compose
-from vla.config.experiment import plain
+from vla.config.experiment import Experiment
 from vla.jobs import find
 robot = ["job=deploy", "deploy=server", "output=served", "checkpoint=without"]
-check(plain(adopt(compose(*robot), robot)), find("deploy"))
+check(Experiment.of(adopt(compose(*robot), robot)), find("deploy"))
 sys.argv[1:] += ["output=further", "collect.episodes=13"]
 main()
 """

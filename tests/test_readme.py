@@ -24,6 +24,7 @@ from saved_policies import change_json
 
 from vla import jobs
 from vla.deploy import ros
+from vla.io.errors import UserError
 from vla.jobs.machine import has_bfloat16
 from vla.parallel.limits import cores
 
@@ -104,7 +105,7 @@ def test_a_tool_for_the_robot_takes_the_arguments(tool: str, command: str, monke
     module = importlib.import_module(f"vla.deploy.{tool}")
 
     def unplugged(*_: Any, **__: Any) -> None:
-        raise ValueError("no network")
+        raise UserError("no network")
 
     monkeypatch.setattr(ros, "ros", unplugged)
     monkeypatch.setattr(sys, "argv", [tool, *shlex.split(command)])

@@ -155,7 +155,7 @@ def _do(cfg: DictConfig) -> float | None:
     default = compose("config", [f"job={HydraConfig.get().runtime.choices['job']}"])
     cfg = _adopted(cfg, overrides)
     experiment, job = Experiment.of(cfg, default), jobs.find(cfg.job)
-    check(experiment.nodes, job)
+    check(experiment, job)
     _require_sweepable(experiment, job.needs(experiment.nodes))
     if jobs.builds_world(experiment) and (others := substitutes(experiment.task, overrides)):
         overrides += others

@@ -10,8 +10,9 @@ from pathlib import Path
 from typing import Any
 
 from vla.config.annotations import MissingLibrary, fits, locate
-from vla.config.build import GROUPS, Group, arguments, build, check_arguments, check_node, makes, require_known
-from vla.config.nodes import Collection, Evaluation, Settings, Validation, with_changes
+from vla.config.build import GROUPS, Group, arguments, check_arguments, check_node, makes, require_known
+from vla.config.experiment import Experiment
+from vla.config.nodes import Collection, Evaluation, Rounds, Settings, Validation, with_changes
 from vla.config.packages import config_folders
 from vla.io.errors import UserError
 
@@ -37,12 +38,13 @@ class Job:
         return {group.name: group for group in groups}
 
 
-def check(config: Mapping[str, Any], job: Job) -> None:
-    """Check every node of a plain, resolved config that its `job` will build against the signature of its class.
+def check(experiment: Experiment, job: Job) -> None:
+    """Check every node of an experiment that its `job` will build against the signature of its class.
 
     Raises:
         UserError: an unknown, missing or ill-typed key, with its dotted name and the allowed values.
     """
+    config = experiment.nodes
     values = {each.name: config[each.name] for each in fields(Settings) if each.name in config}
     groups = {name: GROUPS[name] for name in OF_EVERY_JOB} | job.needs(config)
     files = (file for folder in config_folders() for file in (folder / "job").glob("*.yaml"))
@@ -50,7 +52,7 @@ def check(config: Mapping[str, Any], job: Job) -> None:
     for name in (name for name in config if name not in of_jobs):
         require_known("", name, {**values, **GROUPS, **groups}, "the config")
     check_arguments("", values, Settings)
-    settings = Settings(**values)
+    settings = experiment.settings
     if config.get("agent") is not None:
         if "agent" not in groups:
             raise UserError(f"job={settings.job} takes no agent: agent=OPTION goes with job=evaluate and deploy")
@@ -63,7 +65,7 @@ def check(config: Mapping[str, Any], job: Job) -> None:
             raise UserError(f"job={settings.job} needs {name}=OPTION; --help lists the options")
     if "model" in groups:
         _require_together(*(locate(f"{group}._target_", config[group]["_target_"]) for group in ("tokenizer", "model")))
-    _check_contents(config, settings, groups)
+    _check_contents(experiment, groups)
 
 
 def _check_group(node: Any, group: Group, may_lack: bool) -> None:
@@ -74,22 +76,22 @@ def _check_group(node: Any, group: Group, may_lack: bool) -> None:
             check_node(key, each, makes(group), group.runtime)
 
 
-def _check_contents(config: Mapping[str, Any], settings: Settings, groups: Mapping[str, Group]) -> None:
+def _check_contents(experiment: Experiment, groups: Mapping[str, Group]) -> None:
     """Check that values go together, and the task under every condition and with all other changes."""
-    collect, validate, evaluate = (build(config[name], name) for name in OF_EVERY_JOB)
+    settings, validate, evaluate = experiment.settings, experiment.validate, experiment.evaluate
     if settings.checkpoint is None:  # else the seeds of its own training count
         _require_apart(validate, evaluate)
-    _require_different_stores(collect)
+    _require_different_stores(experiment.collect)
     changed = {}
     if settings.job in ("evaluate", "improve"):
         changed = {f"evaluate.conditions.{name}": changes for name, changes in evaluate.changes.items()}
     if "learner" in groups and validate.episodes:
         changed["validate.changes"] = validate.changes
     if "improve" in groups:
-        changed["improve.changes"] = build(config["improve"], groups["improve"]).changes
+        changed["improve.changes"] = experiment.options(Rounds).changes
     for name, changes in changed.items():
         if changes:
-            check_node(f"task ({name})", with_changes(config["task"], changes), makes(GROUPS["task"]))
+            check_node(f"task ({name})", with_changes(experiment.task, changes), makes(GROUPS["task"]))
 
 
 def devices(trainer: Mapping[str, Any]) -> int:

@@ -45,9 +45,9 @@ class Settings:
 class Collection:
     """Number and seeds of demonstrations, and the store that holds them."""
 
-    episodes: Count
-    seed: Seed
-    folder: Text
+    episodes: Count  # successful ones
+    seed: Seed  # of the first episode; the others follow it
+    folder: Text  # of the store
     more: list[Text] | None  # further stores to train on
     images: Images | None  # codec of a new store; None: the one that suits the size of the images
     quality: Quality  # of JPEG
@@ -64,9 +64,9 @@ class Collection:
 class Validation:
     """Episodes that a policy in training plays in every validation."""
 
-    episodes: Natural
-    seed: UnseenSeed
-    changes: Changes
+    episodes: Natural  # 0: none
+    seed: UnseenSeed  # of the first episode
+    changes: Changes  # to the task
 
     @property
     def seeds(self) -> range:
@@ -82,19 +82,19 @@ class Evaluation:
         UserError: two conditions have one name.
     """
 
-    episodes: Count
-    seed: UnseenSeed
-    until: Literal["decided"] | None
-    bar: Between | None
-    against: Text | None
-    margin: Between
-    recordings: Literal["all", "failures"] | Natural
-    conditions: dict[str, Changes]
-    one_by_one: dict[str, dict[str, Changes]]
-    without: Annotated[list[Literal["images", "instruction"]], Predicate(unique)]
-    nearest: Text | None
+    episodes: Count  # with `until`, at most
+    seed: UnseenSeed  # of the first episode
+    until: Literal["decided"] | None  # stop as soon as `bar`, `against` and the differences of conditions are decided
+    bar: Between | None  # success rate to compare with
+    against: Text | None  # run to compare with on the same episodes
+    margin: Between  # loss of success that counts as not worse
+    recordings: Literal["all", "failures"] | Natural  # episodes to record; failures: and ten successes
+    conditions: dict[str, Changes]  # name → overrides of the task
+    one_by_one: dict[str, dict[str, Changes]]  # level → overrides of the task, each part of which is a condition
+    without: Annotated[list[Literal["images", "instruction"]], Predicate(unique)]  # what the policy lacks in conditions
+    nearest: Text | None  # store of demonstrations, the most similar one of which is replayed in a condition
     networks: dict[str, Changes]  # nodes of `vla.rollouts.realtime.Network`
-    by_clock: bool
+    by_clock: bool  # in these the time passes by the clock
 
     def __post_init__(self) -> None:
         """Require names of their own."""
@@ -124,12 +124,12 @@ class Rounds:
     """Rounds of `job=improve`, in which the expert labels what the policy sees."""
 
     rounds: Count
-    episodes: Count
-    seed: Seed
-    steps: Count
-    beta: Share
-    segment: Count
-    changes: Changes
+    episodes: Count  # in every round
+    seed: Seed  # of the first episode; the others follow it, round by round
+    steps: Count  # of training after every round
+    beta: Share  # probability that the expert acts in a segment of an episode
+    segment: Count  # [steps]
+    changes: Changes  # to the task in these episodes
 
     @property
     def seeds(self) -> range:
@@ -157,9 +157,9 @@ class Power:
     """Success rates that `job=plan` is to tell apart, and with which probability."""
 
     rates: tuple[Between, Between]
-    power: Between
-    discordant: Share | None
-    runs: tuple[Text, Text] | None
+    power: Between  # the probability
+    discordant: Share | None  # share of episodes in which only one of two policies succeeds
+    runs: tuple[Text, Text] | None  # from which to take that share
 
 
 @dataclass(frozen=True)
@@ -167,11 +167,11 @@ class Inspection:
     """Stores that `job=inspect` verifies and describes, and what it makes of them."""
 
     folder: Text
-    stores: Annotated[list[Text], MinLen(1)] | None
-    where: dict[str, Any] | None
-    repair: bool
-    into: Text | None
-    episode: Natural | None
+    stores: Annotated[list[Text], MinLen(1)] | None  # to merge, instead of `folder`
+    where: dict[str, Any] | None  # filter of the episodes of a new store
+    repair: bool  # write a store without the damaged episodes
+    into: Text | None  # folder of the new store
+    episode: Natural | None  # seed of an episode to replay
 
 
 @dataclass(frozen=True)
@@ -179,14 +179,14 @@ class Benchmark:
     """Stages that `job=benchmark` measures, and how often."""
 
     names: Annotated[list[Literal["collect", "loader", "train", "policy", "deploy", "serve"]], MinLen(1)]
-    episodes: Count
-    batches: Count
-    steps: Count
-    rounds: Count
-    precisions: list[Literal["fp32", "bf16"]] | None
+    episodes: Count  # of the expert
+    batches: Count  # of windows
+    steps: Count  # of training and of the policy
+    rounds: Count  # of training, interleaved
+    precisions: list[Literal["fp32", "bf16"]] | None  # None: those that are fast here
     compile: list[bool]
-    robosuite: str | None
-    lerobot: str | None
+    robosuite: str | None  # Python interpreter with robosuite
+    lerobot: str | None  # Python interpreter with lerobot
 
 
 def conditions(together: Mapping[str, Changes], one_by_one: Mapping[str, Any]) -> dict[str, dict[str, Any]]:

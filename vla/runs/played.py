@@ -7,13 +7,13 @@ import logging
 import time
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 from types import TracebackType
-from typing import Any
+from typing import Any, cast
 
 from vla.config.differences import differences
-from vla.io.documents import STRICT, parse_json, read_bounded
+from vla.io.documents import parse_json, read_bounded
 from vla.io.files import write_text, writing
 from vla.rollouts.results import Result
 
@@ -22,16 +22,7 @@ LARGEST = 4 << 30  # of that file [bytes], millions of episodes
 
 log = logging.getLogger(__name__)
 
-
-@dataclass(frozen=True)
-class _Episode:
-    """A line of the file."""
-
-    __pydantic_config__ = STRICT
-
-    condition: str
-    seconds: float  # of the evaluation so far [s]
-    result: Result
+Episode = tuple[str, float, Result]  # condition, duration of the evaluation so far [s], result
 
 
 class Played:
@@ -55,26 +46,27 @@ class Played:
         # First line of the file: what determines the episodes.
         head = {"changed_ns": {str(path): _changed_ns(path) for path in sources}, "versions": versions}
         episodes = self._read(head, config)
-        self._started = time.monotonic() - max((each.seconds for each in episodes), default=0.0)
+        self._started = time.monotonic() - max((seconds for _, seconds, _ in episodes), default=0.0)
         self._results = defaultdict[str, dict[int, Result]](dict)
-        for each in episodes:
-            self._results[each.condition][each.result.seed] = each.result
+        for condition, _, result in episodes:
+            self._results[condition][result.seed] = result
         if episodes:
             log.info("%s: already played, %d in all", self._path, len(self))
-        write_text(self._path, "".join(map(_line, ({**head, "config": config}, *map(asdict, episodes)))))
+        lines = [(condition, seconds, asdict(result)) for condition, seconds, result in episodes]
+        write_text(self._path, "".join(map(_line, ({**head, "config": config}, *lines))))
 
-    def _read(self, head: Mapping[str, Any], config: Mapping[str, Any]) -> list[_Episode]:
+    def _read(self, head: Mapping[str, Any], config: Mapping[str, Any]) -> list[Episode]:
         """Return the episodes in the file, up to the first damaged line, if they are of this evaluation."""
         if not self._path.is_file():
             return []
         first, *lines = read_bounded(self._path, LARGEST).splitlines() or [b""]
-        found = list[_Episode]()
+        found = list[Episode]()
         try:
             saved = parse_json(first, dict[str, Any], str(self._path))
             if differences(saved.pop("config", {}), config) or saved != head:
                 log.info("%s is of another evaluation, which this one replaces", self._path)
                 return []
-            found.extend(parse_json(line, _Episode, str(self._path)) for line in lines)
+            found.extend(parse_json(line, cast(type[Episode], Episode), str(self._path)) for line in lines)
         except ValueError as error:  # a process that was killed while it wrote
             log.warning("%s; the episodes from there on are played again", error)
         return found
@@ -109,7 +101,7 @@ class Played:
     def add(self, condition: str, result: Result) -> None:
         """Write the result of another episode; an OSError if the file cannot be written."""
         with writing(self._path), self._path.open("a", encoding="utf-8") as file:
-            file.write(_line(asdict(_Episode(condition, self.seconds, result))))
+            file.write(_line((condition, self.seconds, asdict(result))))
         self._results[condition][result.seed] = result
 
 
@@ -119,5 +111,5 @@ def _changed_ns(path: Path) -> int | None:
     return max((file.stat().st_mtime_ns for file in files if file.exists()), default=None)
 
 
-def _line(content: Mapping[str, Any]) -> str:
+def _line(content: Any) -> str:
     return json.dumps(content, allow_nan=False, ensure_ascii=False) + "\n"
