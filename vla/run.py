@@ -93,7 +93,10 @@ def _unknown_key(error: OmegaConfBaseException) -> str:
     known = [str(key) for key in parent if key != "hydra"] if isinstance(parent, DictConfig) else []
     if not known:
         return f"there is no {key}"
-    return f"there is no {key}{_among(name, known)}; +{key}=VALUE adds it where it is not listed"
+    among = _among(name, known)
+    # The task of a checkpoint may have other keys than that of the command.
+    hint = "" if among.startswith(",") and not key.startswith("task.") else f"; +{key}=VALUE adds it"
+    return f"there is no {key}{among}{hint}"
 
 
 def _is_mendable(error: Exception) -> bool:
