@@ -15,6 +15,7 @@ from vla.config import check as checking
 from vla.config.annotations import packages as packages_in
 from vla.config.compose import CONF as CONF
 from vla.config.compose import compose, offer_axes
+from vla.config.experiment import Experiment, plain
 from vla.config.packages import TRUSTED, trusted
 
 offer_axes()
@@ -34,9 +35,10 @@ def composed(*overrides: str) -> DictConfig:
 
 def check(config: DictConfig) -> None:
     """Check a configuration as the command line does, for its job, with trust in the packages that it uses."""
-    used = packages_in(OmegaConf.to_container(config, resolve=False))
+    nodes = plain(config)
+    used = packages_in(nodes)
     with patch.dict(os.environ, {TRUSTED: ",".join([*trusted(), *used])}):
-        checking.check(config, jobs.find(config.job).JOB)
+        checking.check(Experiment(nodes), jobs.find(config.job))
 
 
 def _is_value(override: str) -> bool:

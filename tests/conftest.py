@@ -109,7 +109,7 @@ def recording(monkeypatch: pytest.MonkeyPatch) -> None:
     joints = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll", "gripper")
     names = tuple(f"{joint}.pos" for joint in joints)
     found = Recording(("front", "wrist"), 30.0, names, names, dict.fromkeys(names, (-90.0, 90.0)), 50)
-    monkeypatch.setattr("vla.config.recorded._recording", lambda expert: found)
+    monkeypatch.setattr("vla.config.resolvers._recording", lambda expert: found)
 
 
 def made_once(factory: pytest.TempPathFactory, name: str, make: Callable[[Path], object]) -> Path:

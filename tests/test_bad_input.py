@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -15,126 +16,99 @@ from vla.config.build import build
 from vla.config.experiment import plain
 from vla.tasks.gl import WORKING_BACKEND
 
+# Line → what its sentence says.
 BAD_INPUT = {
-    "misspelt key": (("colect.episodes=3",), "collect"),
-    "misspelt option": (("model=rt2",), "rt1"),
-    "wrong type": (("trainer.max_steps=many",), "trainer.max_steps must be "),
-    "missing policy": (("checkpoint=nowhere",), "there is no policy"),
-    "a file for a policy": (("checkpoint=nowhere.ckpt",), "only resumes its own training: a policy is a folder"),
-    "a folder without a policy": (("checkpoint=.",), ". is neither a policy nor a run with one"),
-    "a deployment without a policy": (("job=deploy", "deploy=loop"), "this deployment needs a trained policy"),
-    "a run that is no path": (("resume=true",), "resume=True is not a path"),
-    "a checkpoint that is no path": (("checkpoint=3",), "checkpoint=3 is not a path"),
-    "nothing interrupted": (
-        ("resume=last", "output=nowhere/now"),
-        "no run in nowhere was interrupted",
-    ),
-    "no room on the table": (("job=preview", "task.blocks=4", "task.randomize.placement.x=[0.5,0.5]"), "no room"),
-    "no dataset": (("job=collect", "expert=lerobot", "expert.folder=nowhere"), "no LeRobot dataset in nowhere"),
-    "nothing to compare": (("job=report",), "report.runs=[RUN,RUN]"),
-    "more processes than cores": (("job=train", *SMALL, "trainer.devices=999"), "than this machine has cores"),
-    "no key for other machines": (
-        ("job=deploy", "deploy=server", "deploy.host=0.0.0.0"),
-        "set the environment variable",
-    ),
-    "another world's key": (("checkpoint=x", "task.hand_size=0.3"), "task is set by +task.hand_size=VALUE"),
-    "another world's expert": (("job=preview", "expert=metaworld"), "expert=metaworld acts in task=metaworld only"),
-    "another world's goal": (("task=metaworld", "task/goal=lift"), "the option chosen for task has no goal"),
-    "no environment": (("job=preview", "task=gymnasium"), "task.package is missing: the options chosen need"),
-    "a config out of a pickle": (
-        ("--experimental-rerun", "x.pickle"),
-        "--experimental-rerun runs whatever a file says",
-    ),
-    "the same, abbreviated": (("--exp=x.pickle",), "--experimental-rerun runs whatever a file says"),
-    "the store of all twice": (("job=train", "collect.folder=s", "collect.more=[a,./s]"), "name the same store, "),
-    "no cells": (("-m", "seed=range(0,0)"), "the sweep has no cells: one of its ranges or choices is empty"),
-    "brackets": ((f"seed={'[' * 200}{']' * 200}",), "nested too deep"),
-    "no GPU": (("trainer=gpu", *(item for item in SMALL if "accelerator" not in item)), "gpu"),
+    "colect.episodes=3": "there is no colect, did you mean collect?",
+    "model=rt2": "model has no option 'rt2', did you mean rt1?",
+    "trainer.max_steps=many": "trainer.max_steps must be ",
+    "checkpoint=nowhere": "there is no policy 'nowhere': name a run",
+    "checkpoint=nowhere.ckpt": "only resumes its own training: a policy is a folder",
+    "checkpoint=.": ". is neither a policy nor a run with one",
+    "job=deploy deploy=loop": "this deployment needs a trained policy",
+    "resume=true": "resume=True is not a path",
+    "checkpoint=3": "checkpoint=3 is not a path",
+    "checkpoint=x output=2": "output=2 is not a path",
+    "job=train checkpoint=x": "job=train takes no checkpoint: resume=RUN continues a run, pretrained=x starts",
+    "resume=last output=nowhere/now": "no run in nowhere was interrupted",
+    "job=preview task.blocks=4 task.randomize.placement.x=[0.5,0.5]": "no room",
+    "job=collect expert=lerobot expert.folder=nowhere": "no LeRobot dataset in nowhere",
+    "job=train collect.more=[lessons] collect.folder=store": "lessons",
+    "job=report": "report.runs=[RUN,RUN]",
+    f"job=train {' '.join(SMALL)} trainer.devices=999": "than this machine has cores",
+    "job=deploy deploy=server deploy.host=0.0.0.0": "set the environment variable",
+    "checkpoint=x task.hand_size=0.3": "+task.hand_size=VALUE adds it",
+    "job=preview expert=metaworld": "expert=metaworld acts in task=metaworld only",
+    "task=metaworld task/goal=lift": "the option chosen for task has no goal",
+    "experiment=standard task=metaworld": "the option chosen for task has no randomize: choose another task",
+    "job=preview task=gymnasium": "task.package",
+    "task.image_size.height=64": "height",
+    "--experimental-rerun x.pickle": "--experimental-rerun runs whatever a file says",
+    "--exp=x.pickle": "--experimental-rerun runs whatever a file says",
+    "job=train collect.folder=s collect.more=[a,./s]": "name the same store, ",
+    "-m seed=range(0,0)": "the sweep has no cells: one of its ranges or choices is empty",
+    "-m trainer=ddp trainer.accelerator=cpu trainer.devices=2 seed=0": "add trainer.devices=1, or hydra/launcher=sub",
+    "-m experiment=ablation,recipe": "experiment=ablation is a grid of its own: name no other one beside it",
+    "-m seed=0,1 output=there": "every cell has a folder of its own: name that of the sweep, hydra.sweep.dir=DIR",
+    "-m experiment=ablation variant=no_transformer model=rt1_small seed=0": "is model=bc: omit model=rt1_small",
+    "experiment=recipe": "experiment=recipe is a grid of runs: add -m",
+    f"seed={'[' * 200}{']' * 200}": "nested too deep",
+    f"trainer=gpu {' '.join(item for item in SMALL if 'accelerator' not in item)}": "gpu",
 }
 
 
-@pytest.mark.parametrize("name", BAD_INPUT)
-def test_bad_input_ends_in_one_clear_sentence(tmp_path: Path, name: str) -> None:
-    arguments, says = BAD_INPUT[name]
-    done = here(tmp_path, *arguments, ok=False)
-    errors = [line for line in done.stderr.splitlines() if line.startswith("error: ")]
-    assert len(errors) == 1 and says in errors[0], done.stderr
-    assert "Traceback" not in done.stderr
+@pytest.mark.parametrize("line", BAD_INPUT)
+def test_bad_input_ends_in_one_clear_sentence(tmp_path: Path, line: str) -> None:
+    done = here(tmp_path, *line.split(), ok=False)
+    assert done.stderr.count("error: ") == 1 and BAD_INPUT[line] in done.stderr and "Traceback" not in done.stderr
     assert all([*run.iterdir()] for run in tmp_path.glob("outputs/runs/*"))  # none is left empty
 
 
 # Job → values that no experiment can have, each of which is refused by the name of its key before any work.
 NONSENSE = {
-    "collect": (
-        *(
-            "task.time_limit=nan",
-            "task.time_limit=inf",
-            "task.time_limit=1e300",
-            "task.goal.radius=nan",
-            "task.image_size=[1,1]",
-        ),
-        *("task.image_size=[4096,4096]", "task.cameras=[front,front]", "task.randomize.mass.factor=[nan,nan]"),
-        *("task.randomize.mass.factor=[0,0]", "task.randomize.mass.factor=[2,1]", "task.randomize.camera.fovy=500"),
-        *("task.randomize.size.half_size=[0,0]", "task.randomize.size.half_size=[10,10]"),
-        *("task.randomize.arm.x=[5,5]", "task.goal.language.phrasings=[]", "expert.perturb.rate=nan"),
-        *("expert.perturb.rate=-1", "expert.perturb.noise=1e9", "expert.perturb.steps=[5,2]", "collect.folder="),
-        *("collect.seed=-1", "cluster.workers=0", "collect.episodes=99999999999"),
-    ),
-    "train": (
-        *("seed=99999999999999999999", "data.seed=-1", "data.validation_fraction=1.5", "model.chunk=0"),
-        *("model.chunk=-1", "model.width=-1", "model.width=0", "model.width=10000000", "model.keypoints=0"),
-        *("model.text_width=0", "model.shift=[-1,-1]", "model.auxiliary=nan", "model.auxiliary=-1"),
-        *("model.image.strides=[0,1,1]", "model.image.kernels=[0,0,0]", "model.image.kernels=[99,99,99]"),
-        *("model.text.vocabulary=1", "model.text.words=0", "model.text.word_dropout=1", "model.text.dropout=1"),
-        *(
-            "model.image.channels=[]",
-            "tokenizer.bins=1",
-            "tokenizer.smoothing=-1",
-            "tokenizer.margin=-5",
-            "tokenizer.bins=1000000",
-        ),
-        *(
-            "learner.lr=0",
-            "learner.weight_decay=-1",
-            "learner.ema=1",
-            "learner.ema=nan",
-            "learner.warmup_steps=-1",
-            "trainer.max_steps=0",
-            "data.batch_size=0",
-        ),
-        *("trainer.val_check_interval=0", "trainer.accumulate_grad_batches=0", "trainer.devices=-7"),
-        *(
-            "trainer.val_check_interval=0.5",
-            "trainer.val_check_interval=null",
-            "trainer.max_epochs=3",
-            "trainer.max_epochs=null",
-        ),
-        *("trainer.devices=abc", "trainer.devices='1,x'"),
-        *(
-            "trainer.gradient_clip_val=-1",
-            "trainer.limit_val_batches=-1",
-            "+trainer.limit_train_batches=0",
-            "trainer.precision=17",
-        ),
-    ),
-    "evaluate": ("evaluate.episodes=0", "evaluate.seed=3", "policy.precision=16"),
-    "benchmark": (
-        "benchmark.names=[]",
-        "benchmark.names=[training]",
-        "benchmark.precisions=[fp16]",
-        "benchmark.rounds=0",
-    ),
-    "inspect": ("inspect.stores=[]", "inspect.folder="),
-    "export": ("export.folder=",),
-    "report": ("report.runs=['']",),
+    "collect": """
+        task.time_limit=nan task.time_limit=inf task.time_limit=1e300 task.goal.radius=nan task.image_size=[1,1]
+        task.image_size=[4096,4096] task.cameras=[front,front] task.randomize.mass.factor=[nan,nan]
+        task.randomize.mass.factor=[0,0] task.randomize.mass.factor=[2,1] task.randomize.camera.fovy=500
+        task.randomize.size.half_size=[0,0] task.randomize.size.half_size=[10,10] task.randomize.arm.x=[5,5]
+        task.goal.language.phrasings=[] expert.perturb.rate=nan expert.perturb.rate=-1 expert.perturb.noise=1e9
+        expert.perturb.steps=[5,2] collect.folder= collect.seed=-1 cluster.workers=0 collect.episodes=99999999999
+    """,
+    "train": """
+        seed=99999999999999999999 data.seed=-1 data.validation_fraction=1.5 model.chunk=0 model.chunk=-1
+        model.width=-1 model.width=0 model.width=10000000 model.keypoints=0 model.text_width=0 model.shift=[-1,-1]
+        model.auxiliary=nan model.auxiliary=-1 model.image.strides=[0,1,1] model.image.kernels=[0,0,0]
+        model.image.kernels=[99,99,99] model.text.vocabulary=1 model.text.words=0 model.text.word_dropout=1
+        model.text.dropout=1 model.image.channels=[] tokenizer.bins=1 tokenizer.smoothing=-1 tokenizer.margin=-5
+        tokenizer.bins=1000000 learner.lr=0 learner.weight_decay=-1 learner.ema=1 learner.ema=nan
+        learner.warmup_steps=-1 trainer.max_steps=0 data.batch_size=0 trainer.val_check_interval=0
+        trainer.accumulate_grad_batches=0 trainer.devices=-7 trainer.val_check_interval=0.5
+        trainer.val_check_interval=null trainer.max_epochs=3 trainer.max_epochs=null trainer.devices=abc
+        trainer.devices='1,x' trainer.gradient_clip_val=-1 trainer.limit_val_batches=-1 +trainer.limit_train_batches=0
+        trainer.precision=17
+    """,
+    "evaluate": """
+        evaluate.episodes=0 evaluate.seed=3 policy.precision=16
+    """,
+    "benchmark": """
+        benchmark.names=[] benchmark.names=[training] benchmark.precisions=[fp16] benchmark.rounds=0
+    """,
+    "inspect": """
+        inspect.stores=[] inspect.folder=
+    """,
+    "export": """
+        export.folder=
+    """,
+    "report": """
+        report.runs=['']
+    """,
 }
 
 
-@pytest.mark.parametrize(("job", "override"), [(job, override) for job in NONSENSE for override in NONSENSE[job]])
+@pytest.mark.parametrize(("job", "override"), [(job, each) for job, line in NONSENSE.items() for each in line.split()])
 def test_nonsense_is_refused_by_the_name_of_its_key(job: str, override: str) -> None:
-    with pytest.raises(ValueError) as caught:
+    key = override.partition("=")[0].lstrip("+")
+    with pytest.raises(ValueError, match=rf"^{re.escape(key)}(\[\d\])? must "):
         check(composed(f"job={job}", override))
-    assert str(caught.value).startswith(f"{override.partition('=')[0].lstrip('+')} must be ")
 
 
 @pytest.mark.parametrize(
@@ -145,37 +119,6 @@ def test_a_phrasing_that_is_no_phrasing_is_refused(phrasing: str) -> None:
     cfg.task.goal.language.phrasings = [phrasing]
     with pytest.raises(ValueError, match=r"^task\.goal\.language"):
         build(plain(cfg.task), "task")
-
-
-def test_a_grid_whose_cells_want_several_processes_is_refused(tmp_path: Path) -> None:
-    several = ("trainer=ddp", "trainer.accelerator=cpu", "trainer.devices=2", "seed=0")
-    done = here(tmp_path, "-m", *several, ok=False)
-    assert "trainer.devices=1" in done.stderr and "submitit_slurm" in done.stderr and "Traceback" not in done.stderr
-
-
-def test_a_job_that_takes_no_checkpoint_says_which_word_does(tmp_path: Path) -> None:
-    done = here(tmp_path, "job=train", "checkpoint=x", ok=False)
-    assert "job=train takes no checkpoint: resume=RUN continues a run, pretrained=x starts" in done.stderr
-
-
-@pytest.mark.parametrize(
-    ("line", "sentence"),
-    [
-        ("experiment=recipe", "experiment=recipe is a grid of runs: add -m"),
-        ("-m experiment=ablation,recipe", "experiment=ablation is a grid of its own: name no other one beside it"),
-        ("-m seed=0,1 output=there", "every cell has a folder of its own: name that of the sweep, hydra.sweep.dir=DIR"),
-        (
-            "-m experiment=ablation variant=no_transformer model=rt1_small seed=0",
-            "variant=no_transformer is model=bc: omit model=rt1_small",
-        ),
-        ("experiment=standard task=metaworld", "the option chosen for task has no randomize: choose another task"),
-        ("task.image_size.height=64", "height"),
-        ("checkpoint=x output=2", "output=2 is not a path"),
-    ],
-)
-def test_a_line_that_would_not_do_what_it_says_is_refused(tmp_path: Path, line: str, sentence: str) -> None:
-    done = here(tmp_path, *line.split(), ok=False)
-    assert sentence in done.stderr and "Traceback" not in done.stderr
 
 
 def test_an_experiment_may_have_options_of_another_job() -> None:

@@ -11,15 +11,14 @@ import pytest
 import toy
 from composing import check, composed
 from defaults import defaults_of
-from hydra.errors import MissingConfigException
 from omegaconf import DictConfig, OmegaConf
 from saved_policies import save_policy
 
 from vla import jobs
 from vla.config.adopt import adopt
 from vla.config.build import build
-from vla.config.check import digest
 from vla.config.experiment import Experiment, plain
+from vla.config.resolvers import digest
 from vla.io.suggestion import suggestion
 from vla.models.policy_folder import require_unseen
 from vla.run import sentence
@@ -57,24 +56,26 @@ def problem(**changes: Any) -> str:
     return str(caught.value)
 
 
-def test_a_right_config_passes() -> None:
-    check(config())
-    check(config(**{"task.time_limit": 10, "task.image_size": [64, 128], "task.randomize.size": None}))
-
-
 def test_fields_that_a_dataclass_inherits_from_another_module_are_checked() -> None:
-    with pytest.raises(
-        ValueError, match="one of joint_state, trajectory, forward, twist, follow_joint_trajectory, got 'fly'"
-    ):
+    with pytest.raises(ValueError, match=r"must be 'joint_state', .* or 'follow_joint_trajectory', got 'fly'"):
         check(composed("job=deploy", "deploy=ros2", "deploy.command=fly"))
 
 
 def test_an_unknown_key_is_named_with_what_was_probably_meant() -> None:
-    assert problem(**{"task.bloks": 2}).startswith("task.bloks is unknown, did you mean blocks? Tabletop takes goal,")
-    assert problem(**{"task.goal.hight": 0.2}).startswith("task.goal.hight is unknown, did you mean height?")
-    assert problem(**{"task.randomize.mass.faktor": 1}).startswith("task.randomize.mass.faktor is unknown")
-    assert problem(**{"collect.episode": 2}).startswith("collect.episode is unknown, did you mean episodes?")
-    assert problem(sed=1).startswith("sed is unknown, did you mean seed?")
+    assert problem(**{"task.bloks": 2}) == "task.bloks is unknown, did you mean blocks?"
+    assert problem(**{"task.goal.hight": 0.2}) == "task.goal.hight is unknown, did you mean height?"
+    assert problem(**{"task.randomize.mass.xyz": 1}) == "task.randomize.mass.xyz is unknown: Masses takes factor"
+    assert problem(**{"collect.episode": 2}) == "collect.episode is unknown, did you mean episodes?"
+    assert problem(sed=1) == "sed is unknown, did you mean seed?"
+    assert problem(**{"expert.spec": 1}).startswith("expert.spec is unknown")  # which comes from the program
+
+
+def test_a_missing_key_is_named_unless_the_program_gives_it() -> None:
+    cfg = config(expert={"_target_": "vla.tasks.tabletop.expert.Waypoint"})
+    check(cfg)
+    del cfg.task.goal
+    with pytest.raises(ValueError, match=r"task\.goal is missing: Tabletop needs it"):
+        check(cfg)
 
 
 def test_a_list_of_what_there_is_names_nothing_twice() -> None:
@@ -90,54 +91,30 @@ def test_a_list_of_what_there_is_names_nothing_twice() -> None:
 @pytest.mark.parametrize(
     ("key", "value", "expected"),
     [
-        ("task.blocks", "three", "task.blocks must be a whole number, at least 1, got 'three'"),
-        ("task.blocks", True, "task.blocks must be a whole number, at least 1, got true"),
-        ("task.blocks", 2.5, "task.blocks must be a whole number, at least 1, got 2.5"),
-        ("task.shadows", 1, "task.shadows must be true or false, got 1"),
-        (
-            "task.image_size",
-            [96],
-            "task.image_size must be a list of 2 whole numbers, each at least 8, at most 1024, got [96]",
-        ),
-        ("task.image_size", [96, "x"], "task.image_size must be a list of 2 whole numbers, each at least 8"),
-        ("task.image_size", [1, 1], "task.image_size must be a list of 2 whole numbers, each at least 8"),
-        (
-            "task.cameras",
-            ["front", "front"],
-            "task.cameras must be a list of texts, each not empty, not empty, without",
-        ),
-        ("task.time_limit", float("nan"), "task.time_limit must be a number, more than 0, at most 3600, got nan"),
-        ("task.randomize.mass.factor", [2.0, 1.0], "task.randomize.mass.factor must be a list of 2 numbers, each more"),
-        (
-            "expert.perturb.steps",
-            [5, 2],
-            "expert.perturb.steps must be a list of 2 whole numbers, each at least 1, in ascending",
-        ),
-        ("collect.folder", "", "collect.folder must be text, not empty, got ''"),
+        ("task.blocks", "three", "task.blocks must be a valid integer, got 'three'"),
+        ("task.blocks", True, "task.blocks must be a valid integer, got true"),
+        ("task.shadows", 1, "task.shadows must be a valid boolean, got 1"),
+        ("task.image_size", [96], "task.image_size must be"),
+        ("task.image_size", [96, "x"], "task.image_size[1] must be a valid integer, got 'x'"),
+        ("task.image_size", [96, 1], "task.image_size[1] must be greater than or equal to 8, got 1"),
+        ("task.cameras", ["front", "front"], "task.cameras must be without repetitions, got ['front', 'front']"),
+        ("task.time_limit", float("nan"), "task.time_limit must be a finite number, got nan"),
+        ("task.randomize.mass.factor", [2.0, 1.0], "task.randomize.mass.factor must be in ascending order, got [2"),
+        ("collect.folder", "", "collect.folder must have at least 1 character, got ''"),
+        ("collect.images", "gif", "collect.images must be 'raw', 'lossless' or 'jpeg', got 'gif'"),
         ("task.goal", "lift", "task.goal must be Goal or Mixed or Chain, got 'lift'"),
-        (
-            "task.randomize.mass.factor",
-            [0.5, "a"],
-            "task.randomize.mass.factor must be a list of 2 numbers, each more than 0, in",
-        ),
-        ("expert.perturb.start", None, "expert.perturb.start must be a number, at least 0, at most 1, got null"),
-        ("cluster.workers", "all", "cluster.workers must be a whole number, at least 1, or null, got 'all'"),
-        ("seed", "first", "seed must be a whole number, at least 0, at most 4294967295, got 'first'"),
-        ("task.meshes", "lite", "task.meshes must be one of light, full, got 'lite', did you mean light?"),
-        ("evaluate.episodes", 0, "evaluate.episodes must be a whole number, at least 1, got 0"),
+        ("task.goal", MASSES, "task.goal must be Goal or Mixed or Chain, got {'_target_': 'vla.tasks.tabletop.random"),
+        ("task.randomize.mass", GRAMMAR, "task.randomize.mass must be Randomizer, got {'_target_': 'vla"),
+        ("expert.perturb.start", None, "expert.perturb.start must be a valid number, got null"),
+        ("cluster.workers", "all", "cluster.workers must be a valid integer, got 'all'"),
+        ("seed", "first", "seed must be a valid integer, got 'first'"),
+        ("task.meshes", "lite", "task.meshes must be 'light' or 'full', got 'lite', did you mean light?"),
+        ("evaluate.recordings", "x", "evaluate.recordings must be 'all' or 'failures' or a valid integer, got 'x'"),
+        ("evaluate.episodes", 0, "evaluate.episodes must be greater than or equal to 1, got 0"),
     ],
 )
 def test_a_wrong_value_is_named_with_what_is_allowed(key: str, value: Any, expected: str) -> None:
     assert problem(**{key: value}).startswith(expected)
-
-
-def test_a_missing_name_is_named_unless_the_program_gives_it() -> None:
-    cfg = config()
-    del cfg.task.goal
-    with pytest.raises(ValueError, match=r"task\.goal is missing: Tabletop needs it"):
-        check(cfg)
-    check(config(expert={"_target_": "vla.tasks.tabletop.expert.Waypoint"}))  # spec comes from the task
-    assert problem(**{"expert.spec": 1}).startswith("expert.spec is unknown")
 
 
 def test_a_job_needs_its_groups_and_looks_at_no_others() -> None:
@@ -147,12 +124,6 @@ def test_a_job_needs_its_groups_and_looks_at_no_others() -> None:
     cfg.deploy._target_ = "vla.nowhere.Nothing"
     with pytest.raises(ValueError, match=r"deploy\._target_ is vla\.nowhere\.Nothing, which cannot be imported"):
         check(cfg)
-
-
-def test_a_misspelt_job_is_answered_with_what_was_probably_meant() -> None:
-    with pytest.raises(MissingConfigException) as caught:
-        composed("job=evalute")
-    assert sentence(caught.value).startswith("job has no option evalute, did you mean evaluate?")
 
 
 @pytest.mark.parametrize(
@@ -182,9 +153,6 @@ def test_a_class_stands_only_where_its_kind_is_asked_for() -> None:
     with pytest.raises(ValueError, match=rf"expert\._target_ must name {kind}, got .*Masses"):
         build(MASSES, "expert")
     assert problem(task=MASSES).startswith("task._target_ must name a class of kind Environment")
-    assert problem(**{"task.randomize.mass": GRAMMAR}).startswith(
-        "task.randomize must be a mapping of names to values, each Randomizer or"
-    )
 
 
 def test_build_gives_plain_containers_runtime_arguments_and_nested_factories() -> None:
@@ -203,8 +171,8 @@ def test_build_gives_plain_containers_runtime_arguments_and_nested_factories() -
 def test_a_class_takes_the_arguments_of_its_base_classes_too() -> None:
     node = plain(composed("model=act").model)
     for changes, message in (
-        ({"width_": 3}, "model.width_ is unknown, did you mean width? ACT takes text, "),
-        ({"chunk": 0}, "model.chunk must be a whole number, at least 1"),
+        ({"width_": 3}, "model.width_ is unknown, did you mean width?"),
+        ({"chunk": 0}, "model.chunk must be greater than or equal to 1, got 0"),
         ({"inherited": 3}, "model.inherited is unknown"),
     ):
         with pytest.raises(ValueError, match=re.escape(message)):
@@ -273,11 +241,6 @@ def test_the_digest_is_stable_and_changes_with_the_episodes_only() -> None:
     assert digest("task", _root_=OmegaConf.create({"task": {"a": 1, "b": [2.0, "x"]}})) == by_hand
 
 
-def test_the_digest_resolves_references_and_is_a_resolver() -> None:
-    cfg = OmegaConf.create({"a": {"x": "${b}"}, "b": 1, "folder": "episodes/${digest:a,b}"})
-    assert cfg.folder == "episodes/" + digest("a", "b", _root_=OmegaConf.create({"a": {"x": 1}, "b": 1}))
-
-
 def test_a_suggestion_is_made_only_where_something_is_close() -> None:
     assert suggestion("precison", ["precision", "devices"]) == ", did you mean precision?"
     assert suggestion("xyz", ["precision", "devices"]) == ""
@@ -319,7 +282,7 @@ def test_a_checkpoint_brings_its_task_tokenizer_and_model_and_task_overrides_app
     harder = adopt(cfg, ["task/randomize=wide", "~task.goal"])
     assert OmegaConf.to_container(harder.task.randomize) == {"mass": {"a": 1}}
     assert harder.task.blocks == 4
-    assert untouched.chosen == SAVED["chosen"]
+    assert untouched.chosen == {**SAVED["chosen"], "randomize": "default"}
     assert "light" not in adopt(cfg, ["~task.randomize.light"]).task.randomize
     merged = adopt(cfg, ["task.randomize={size: {b: 2}}"])
     assert OmegaConf.to_container(merged.task.randomize) == {**SAVED["task"]["randomize"], "size": {"b": 2}}
@@ -351,7 +314,8 @@ def test_a_factory_is_refused_where_an_object_belongs(partial: Any) -> None:
     assert problem(**{"task._partial_": partial}).startswith("task._partial_ must be omitted here")
     assert problem(**{"expert": {**WAYPOINT, "_partial_": partial}}).startswith("expert._partial_ must be omitted")
     axis = problem(**{"task.randomize.mass": {**MASSES, "_partial_": partial}})
-    assert axis.startswith("task.randomize must be " if partial is True else "task.randomize.mass._partial_ must be ")
+    wrong = " must be Randomizer, got" if partial is True else "._partial_ must be "
+    assert axis.startswith(f"task.randomize.mass{wrong}")
 
 
 def test_an_object_is_refused_where_a_factory_belongs() -> None:
@@ -374,16 +338,9 @@ def test_a_report_says_what_the_training_of_its_checkpoint_was(checkpoint: Path)
     assert adopt(cfg, []).collect.episodes != 50
 
 
-@pytest.mark.parametrize(
-    ("override", "says"),
-    [
-        ({"evaluate.seed": 0}, r"evaluate\.seed must be .*1000000"),
-        ({"validate.seed": 1_000_004, "validate.episodes": 1}, "share episodes"),
-    ],
-)
-def test_evaluation_seeds_used_for_training_or_selection_are_refused(override: dict[str, Any], says: str) -> None:
-    with pytest.raises(ValueError, match=says):
-        check(config(**override))
+def test_evaluation_seeds_used_for_training_or_selection_are_refused() -> None:
+    assert problem(**{"evaluate.seed": 0}) == "evaluate.seed must be greater than or equal to 1000000, got 0"
+    assert "share episodes" in problem(**{"validate.seed": 1_000_004, "validate.episodes": 1})
 
 
 @pytest.mark.parametrize(

@@ -57,7 +57,7 @@ def test_a_job_that_compiles_nothing_needs_no_compiler(
 ) -> None:
     monkeypatch.setenv("CXX", "no-such-compiler")
     config = plain(composed(*overrides, "trainer.accelerator=cpu", "policy.device=cpu"))
-    require_compiler(config, jobs.find(config["job"]).JOB.needs(config))
+    require_compiler(config, jobs.find(config["job"]).needs(config))
 
 
 def test_a_compiler_may_have_arguments_and_needs_the_headers_of_python(

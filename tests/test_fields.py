@@ -24,7 +24,7 @@ from vla.data.header import Codec
 from vla.data.image_codec import decode, encode
 from vla.data.verification import episode_of, require_whole, verify_store
 from vla.data.window_batches import WindowBatcher
-from vla.jobs.collect import JOB
+from vla.jobs import find
 from vla.parallel.pool import Cluster
 from vla.rollouts.collect import collect
 from vla.rollouts.memorisation import NearestDemonstration
@@ -128,10 +128,10 @@ def test_a_store_keeps_its_codec_and_other_losses_are_refused(tmp_path: Path) ->
     ],
 )
 def test_the_config_names_the_codec(options: tuple[str, ...], codec: Codec | None) -> None:
-    assert Experiment.of(composed(*options)).codec == codec
+    assert Experiment.of(composed(*options)).collect.codec == codec
     for option in ("collect.images=png", "collect.quality=96"):
         with pytest.raises(ValueError, match=option.partition("=")[0].replace(".", r"\.")):
-            check(composed("job=collect", option), JOB)
+            check(Experiment.of(composed("job=collect", option)), find("collect"))
 
 
 @pytest.mark.parametrize("codec", CODECS[1:], ids=str)

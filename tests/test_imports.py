@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import os
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -128,11 +129,21 @@ def test_parts_import_only_what_they_may(module: str) -> None:
             assert [name for name in names if within(name, (library,))] == []
 
 
-def test_the_entry_dispatches_with_few_modules() -> None:
-    code = "import sys, vla.run; print(*(name for name in sys.modules if name.split('.')[0] == 'vla'))"
-    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, timeout=60)
-    modules = [name for name in done.stdout.split() if MODULES.get(name, ROOT / "__init__.py").name != "__init__.py"]
-    assert "vla.config.check" in modules and len(modules) <= 26, sorted(modules)
+def test_the_default_config_is_checked_before_its_job_is_imported(tmp_path: Path) -> None:
+    code = """
+import sys
+import vla.run
+def told(*_):
+    print(*(name for name in sys.modules if name.split(".")[0] == "vla"))
+    sys.exit()
+vla.run.check = told
+sys.argv = ["vla"]
+vla.run.main()
+"""
+    here = {**os.environ, "PYTHONPATH": str(ROOT)}
+    done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, env=here, capture_output=True, text=True)
+    modules = [name for name in done.stdout.split() if MODULES[name].read_bytes().count(b"\n") > 1]
+    assert "vla.config.check" in modules and len(modules) <= 35, sorted(modules)
 
 
 def test_training_and_deployment_need_no_simulator(home: Path) -> None:
@@ -146,9 +157,10 @@ main()
 from vla.config.adopt import adopt
 from vla.config.check import check
 from vla.config.compose import compose
-from vla.jobs import deploy
+from vla.config.experiment import Experiment
+from vla.jobs import find
 robot = ["job=deploy", "deploy=server", "output=served", "checkpoint=without"]
-check(adopt(compose(*robot), robot), deploy.JOB)
+check(Experiment.of(adopt(compose(*robot), robot)), find("deploy"))
 sys.argv[1:] += ["output=further", "collect.episodes=13"]
 main()
 """

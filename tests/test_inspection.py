@@ -17,6 +17,7 @@ from command_line import here
 from toy import ARM_SPEC, make_arm, make_environment, make_expert
 from toy_episodes import CODECS, CONFIG, EPISODES, MORE, add, change, content, flip
 
+from vla.config.nodes import Inspection
 from vla.data.derivation import derive_store
 from vla.data.episodes import EpisodeStore
 from vla.data.header import Codec
@@ -230,8 +231,8 @@ def test_a_seed_that_is_not_there_is_named(tmp_path: Path) -> None:
 
 
 def inspect(folder: Path, **arguments: Any) -> None:
-    defaults: dict[str, Any] = {"stores": None, "where": None, "repair": False, "into": None}
-    inspect_store(str(folder), **defaults | arguments)
+    defaults: dict[str, Any] = {"stores": None, "where": None, "repair": False, "into": None, "episode": None}
+    inspect_store(Inspection(str(folder), **defaults | arguments))
 
 
 def test_the_job_describes_what_is_damaged_and_repairs_it_beside_it(

@@ -13,9 +13,8 @@ from conftest import CONF, make_tabletop
 from hydra.errors import InstantiationException
 from hydra.utils import instantiate
 
-from vla.config.check import conditions
 from vla.config.compose import axes
-from vla.config.experiment import plain
+from vla.config.experiment import Experiment
 from vla.io.documents import read_yaml
 from vla.spec import FIRST_SEED
 from vla.tasks.tabletop.language import Grammar, HeldOut, Silence
@@ -88,7 +87,7 @@ def test_no_word_that_names_something_unseen_is_in_any_training_instruction() ->
 
 
 def test_an_instruction_with_unseen_names_is_the_plain_one_with_other_names() -> None:
-    node = conditions(plain(composed("evaluate=unseen_names").evaluate))["unseen_names"]["randomize"]["phrasing"]
+    node = Experiment.of(composed("evaluate=unseen_names")).evaluate.changes["unseen_names"]["randomize"]["phrasing"]
     environment = make_tabletop("task/goal=mixed", "task/randomize=none")
     task = environment.simulation
     axes = {"plain": task.randomize, "renamed": {**task.randomize, "phrasing": instantiate(node)}}

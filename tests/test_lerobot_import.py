@@ -40,7 +40,7 @@ from PIL import Image
 from toy import ARM, ARM_SPEC, make_arm
 from toy_episodes import content
 
-from vla.config.experiment import make_expert
+from vla.config.experiment import make_agent
 from vla.data.datamodule import held_out
 from vla.data.episodes import EpisodeStore
 from vla.data.formats import lerobot_tables as tables
@@ -342,7 +342,7 @@ def test_a_recording_does_not_act(home: Path) -> None:
     options = defaults_of("expert/lerobot", folder=str(home / "dataset"))
     node = {"_target_": "vla.data.formats.lerobot_import.LeRobotDemonstrations", **options}
     with pytest.raises(ValueError, match="cannot act: this job needs the expert of a world that can be played"):
-        make_expert(node, make_arm())
+        make_agent(node, "expert", make_arm())
 
 
 def drop(info: dict[str, Any]) -> None:

@@ -20,8 +20,8 @@ from omegaconf import DictConfig
 from PIL import Image
 from rerun.chunk import RrdReader
 
-from vla.config.check import with_changes
 from vla.config.experiment import Experiment
+from vla.config.nodes import with_changes
 from vla.data.episodes import EpisodeStore
 from vla.data.formats.lerobot_import import LeRobotDemonstrations
 from vla.data.verification import require_whole, verify_store

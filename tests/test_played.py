@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import json
-import resource
 import shutil
-from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +12,6 @@ import pytest
 import toy_recordable as toy
 from command_line import here
 
-from vla.io.documents import MAX_BYTES
 from vla.parallel.pool import Cluster
 from vla.rollouts.evaluate import evaluate
 from vla.rollouts.results import Report, Result
@@ -24,6 +21,7 @@ from vla.tasks.perturb import Perturbed
 
 SEEDS = range(FIRST_SEED, FIRST_SEED + 6)
 EPISODES = 4
+LATER = ("evaluate.seed=1000001",)
 COMMAND = (
     "agent=expert",
     "task.time_limit=2",
@@ -32,17 +30,6 @@ COMMAND = (
     "+evaluate.conditions.short.time_limit=1",
     "cluster.workers=1",
 )
-
-
-@contextmanager
-def files_of_at_most(size: int) -> Iterator[None]:
-    """What a full disk looks like to this process: no file can grow beyond `size` bytes."""
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
 
 
 def reported(folder: Path) -> dict[str, Any]:
@@ -60,44 +47,26 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     return reported(folder / "run")
 
 
-@pytest.fixture(scope="module")
-def played_once(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("played")
+def test_a_report_without_room_costs_no_episode_unless_another_evaluation_follows(
+    tmp_path: Path, whole: dict[str, Any]
+) -> None:
+    def full(*arguments: object, **named: object) -> None:
+        raise OSError(28, "No space left on device")
+
     with pytest.MonkeyPatch.context() as patch:
-
-        def full(*arguments: object, **named: object) -> None:
-            raise OSError(28, "No space left on device")
-
         patch.setattr("vla.jobs.evaluate.write_report", full)
-        failed = here(folder, *COMMAND, "output=run", ok=False)
+        failed = here(tmp_path, *COMMAND, "output=run", ok=False)
     assert "report.json cannot be written (No space left on device): make room there" in failed.stderr
-    assert f"/{EPISODES} (" in failed.stdout and not (folder / "run/report.json").exists()
-    return folder
-
-
-@pytest.fixture
-def played(played_once: Path, tmp_path: Path) -> Path:
-    """A folder with all episodes of an evaluation, whose report found no room."""
-    return shutil.copytree(played_once, tmp_path, dirs_exist_ok=True)
-
-
-def test_a_report_without_room_costs_no_episode(played: Path, whole: dict[str, Any]) -> None:
-    done = here(played, *COMMAND, "output=run")
-    assert f"already played, {2 * EPISODES} in all" in done.stdout + done.stderr
-    assert reported(played / "run") == whole
-    assert not (played / "run" / PLAYED).exists()
-
-
-def test_a_disk_that_fills_up_costs_only_the_episode_that_found_no_room(played: Path, whole: dict[str, Any]) -> None:
-    lines = (played / "run" / PLAYED).read_bytes().splitlines(keepends=True)
-    (played / "run" / PLAYED).unlink()
-    with files_of_at_most(sum(map(len, lines[: 1 + EPISODES + 2])) + 100):
-        failed = here(played, *COMMAND, "output=run", ok=False)
-    assert f"{PLAYED} cannot be written (File too large)" in failed.stderr
-    assert f"keeps what was played, {EPISODES + 2} in all" in failed.stdout + failed.stderr
-    done = here(played, *COMMAND, "output=run")
-    assert f"already played, {EPISODES + 2} in all" in done.stdout + done.stderr
-    assert reported(played / "run") == whole
+    assert f"/{EPISODES} (" in failed.stdout and not (tmp_path / "run/report.json").exists()
+    shutil.copytree(tmp_path / "run", tmp_path / "other")
+    for folder, more, says in (
+        ("run", (), f"already played, {2 * EPISODES} in all"),
+        ("other", LATER, "of another eva"),
+    ):
+        done = here(tmp_path, *COMMAND, *more, f"output={folder}")
+        assert says in done.stdout + done.stderr and ("already played" in says) == ("already" in done.stdout)
+        assert not (tmp_path / folder / PLAYED).exists()
+    assert reported(tmp_path / "run") == whole
 
 
 def test_only_episodes_that_ended_in_an_error_are_played_again(tmp_path: Path, whole: dict[str, Any]) -> None:
@@ -118,70 +87,29 @@ def test_only_episodes_that_ended_in_an_error_are_played_again(tmp_path: Path, w
     assert reported(tmp_path / "run") == whole
 
 
-@pytest.mark.parametrize("change", ["evaluate.seed=1000001", "task.time_limit=3"])
-def test_episodes_of_another_evaluation_are_not_used(played: Path, change: str) -> None:
-    done = here(played, *COMMAND, change, "output=run")
-    assert "is of another evaluation" in done.stdout + done.stderr
-    assert "already played" not in done.stdout + done.stderr
-
-
-def test_a_line_that_a_killed_process_left_unfinished_is_played_again(tmp_path: Path) -> None:
-    with pytest.raises(KeyboardInterrupt), Played(tmp_path, [], {}, {}) as first:
-        for seed in SEEDS:
-            first.add("seen", Result(seed, "success"))
+def play(folder: Path, sources: list[Path], versions: dict[str, str], *seeds: int) -> dict[int, Result]:
+    """What an evaluation finds that plays some seeds and is interrupted."""
+    with suppress(KeyboardInterrupt), Played(folder, sources, {}, versions) as played:
+        found = dict(played.of("seen"))
+        for seed in seeds:
+            played.add("seen", Result(seed, "success"))
         raise KeyboardInterrupt
-    file = tmp_path / PLAYED
-    file.write_bytes(file.read_bytes()[:-20])
-    with pytest.raises(KeyboardInterrupt), Played(tmp_path, [], {}, {}) as again:
-        assert list(again.of("seen")) == list(SEEDS[:-1])
-        again.add("seen", Result(SEEDS[-1], "dropped"))
-        raise KeyboardInterrupt
-    with Played(tmp_path, [], {}, {}) as last:
-        assert last.of("seen")[SEEDS[-1]].outcome == "dropped" and len(last) == len(SEEDS)
-    assert not file.exists()
+    return found
 
 
-def test_an_evaluation_of_any_length_goes_on(tmp_path: Path) -> None:
-    long = Result(FIRST_SEED, "success", "x" * (1 << 20))
-    with pytest.raises(KeyboardInterrupt), Played(tmp_path, [], {}, {}) as first:
-        for number in range(70):
-            first.add(f"condition_{number}", long)
-        raise KeyboardInterrupt
-    assert (tmp_path / PLAYED).stat().st_size > MAX_BYTES
-    with Played(tmp_path, [], {}, {}) as again:
-        assert len(again) == 70
-
-
-def test_weights_that_changed_since_start_anew(tmp_path: Path) -> None:
-    checkpoint = tmp_path / "last.ckpt"
-    checkpoint.write_bytes(b"weights")
-    for expected in (0, 1):
-        with pytest.raises(KeyboardInterrupt), Played(tmp_path, [checkpoint], {}, {}) as played:
-            assert len(played) == expected
-            played.add("seen", Result(FIRST_SEED, "success"))
-            raise KeyboardInterrupt
-    for versions in ({"mujoco": "3.3.0"}, {}):
-        with pytest.raises(KeyboardInterrupt), Played(tmp_path, [checkpoint], {}, versions) as played:
-            assert len(played) == 0
-            played.add("seen", Result(FIRST_SEED, "success"))
-            raise KeyboardInterrupt
-    checkpoint.touch()
-    with Played(tmp_path, [checkpoint], {}, {}) as played:
-        assert len(played) == 0
-
-
-def test_a_policy_in_a_folder_that_changed_since_starts_anew(tmp_path: Path) -> None:
+def test_what_was_played_is_used_until_weights_or_versions_change(tmp_path: Path) -> None:
     weights = tmp_path / "model/shards/weights.safetensors"
     weights.parent.mkdir(parents=True)
-    weights.write_bytes(b"weights")
-    for expected in (0, 1):
-        with pytest.raises(KeyboardInterrupt), Played(tmp_path, [tmp_path / "model"], {}, {}) as played:
-            assert len(played) == expected
-            played.add("seen", Result(FIRST_SEED, "success"))
-            raise KeyboardInterrupt
     weights.touch()
-    with Played(tmp_path, [tmp_path / "model"], {}, {}) as played:
-        assert len(played) == 0
+    folder = [tmp_path / "model"]
+    assert not play(tmp_path, folder, {}, *SEEDS)
+    file = tmp_path / PLAYED
+    file.write_bytes(file.read_bytes()[:-20])  # the line that a killed process left unfinished
+    assert [*play(tmp_path, folder, {}, SEEDS[-1])] == [*SEEDS[:-1]]
+    assert {*play(tmp_path, folder, {})} == {*SEEDS}
+    assert not play(tmp_path, folder, {"mujoco": "3.3.0"}, SEEDS[0])
+    weights.touch()
+    assert not play(tmp_path, folder, {"mujoco": "3.3.0"})
 
 
 @pytest.mark.parametrize("workers", [1, 2])

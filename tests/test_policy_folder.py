@@ -72,7 +72,7 @@ def test_what_is_no_policy_is_said_with_what_would_be_one(tmp_path: Path) -> Non
     (run / "checkpoints").mkdir(parents=True)
     (run / "checkpoints/last.ckpt").touch()
     for name, says in {
-        "nowhere": "there is no policy .*nowhere: name a run",
+        "nowhere": "there is no policy '.*nowhere': name a run",
         "run": r"run is neither a policy nor a run with one, there is no .*run/policy/spec\.json$",
         "run/checkpoints/last.ckpt": r"last\.ckpt only resumes its own training: a policy is a folder, .*run$",
     }.items():

@@ -198,7 +198,7 @@ def test_outliers_do_not_widen_the_bounds_and_rare_events_do() -> None:
         (["task.units={elbow: rad}"], "error: task.units names elbow, the components are joint1.pos"),
         (
             ["agent=remote", "agent.images.top=top"],
-            "error: there is no agent.images.top: add a camera with +agent.images.top",
+            "; +agent.images.top=VALUE adds it",
         ),
         (["validate.episodes=3"], "validate.episodes=3: nothing can be played in a recording"),
         (["job=preview"], "the task has no simulator, only recordings, so nothing can be played in it"),

@@ -22,8 +22,8 @@ from hydra import compose, initialize_config_dir
 
 from vla import jobs
 from vla.config.compose import compose as compose_config
-from vla.config.experiment import plain
-from vla.config.substitutes import builds_world, options, with_substitutes
+from vla.config.compose import substitutes
+from vla.config.experiment import Experiment, plain
 from vla.io.errors import UserError
 from vla.spec import Array
 from vla.tasks import gl
@@ -263,7 +263,7 @@ def test_a_store_belongs_to_a_renderer() -> None:
 
 def collected_with(renderer: str) -> tuple[str, str]:
     """Return the folder of the store and the class of the renderer, which its header tells."""
-    import vla.config.check  # noqa: F401  registers the resolvers
+    import vla.config.resolvers  # noqa: F401  registers them
 
     with initialize_config_dir(str(CONF), version_base="1.3"):
         config = compose("config", overrides=[f"task/renderer={renderer}"])
@@ -292,19 +292,17 @@ def test_without_egl_mujocos_renderer_is_chosen_and_named(
 ) -> None:
     monkeypatch.setenv(gl.EGL_WORKS, "False")
     config = compose_config("output=here")
-    usable = with_substitutes(config, ["output=here"])
+    others = substitutes(plain(config.task), ["output=here"])
+    usable = compose_config("output=here", *others)
     assert "the fast renderer needs EGL, which this machine lacks" in caplog.text
-    assert "task/renderer=mujoco instead" in caplog.text and set(options("task/renderer")) == {"mujoco"}
-    assert (
-        plain(usable.task)["renderer"] == plain(compose_config("task/renderer=mujoco", "output=here").task)["renderer"]
-    )
+    assert "task/renderer=mujoco instead" in caplog.text
     assert usable.collect.folder == collected_with("mujoco")[0] != collected_with("fast")[0]
-    assert with_substitutes(config, ["task/renderer=fast"]) is config  # and fails, in a sentence
+    assert not substitutes(plain(config.task), ["task/renderer=fast"])  # and fails, in a sentence
     monkeypatch.setenv(gl.EGL_WORKS, "True")
-    assert with_substitutes(config, []) is config
+    assert not substitutes(plain(config.task), [])
     for option, simulated in (("loop", True), ("simulator", True), ("ros2", False), ("server", False)):
-        deploying = compose_config("job=deploy", f"deploy={option}")
-        assert builds_world(deploying, jobs.find("deploy").JOB.needs(deploying)) == simulated
+        deploying = Experiment.of(compose_config("job=deploy", f"deploy={option}", "output=here"))
+        assert jobs.builds_world(deploying) == simulated
 
 
 def test_a_machine_without_gl_is_told_from_others(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -115,25 +115,16 @@ def test_a_run_continues_in_its_folder(tmp_path: Path, finished: bool, chosen: b
             training_progress(tmp_path, plain(composed(other)))
 
 
-def test_a_report_of_weights_that_were_trained_for_longer_since_is_not_this_one(tmp_path: Path) -> None:
-    asked = plain(composed())
-    checkpoint = tmp_path / "policy"
-    checkpoint.touch()
-    report = Report((Result(1_000_000, "success"), Result(1_000_001, "dropped")))
-    write_report(report, tmp_path / "report.json", str(checkpoint), asked)
-    assert cached_success(tmp_path, asked, checkpoint) == 0.5
-    assert cached_success(tmp_path, plain(composed("evaluate.episodes=9")), checkpoint) is None
-    os.utime(checkpoint, (time.time() + 10, time.time() + 10))
-    assert cached_success(tmp_path, asked, checkpoint) is None
-
-
-def test_a_report_that_compares_with_a_run_which_was_evaluated_again_is_not_this_one(tmp_path: Path) -> None:
-    checkpoint, other = tmp_path / "policy", tmp_path / "other/report.json"
-    checkpoint.touch()
+def test_a_report_of_older_weights_or_compared_with_an_older_run_is_not_this_one(tmp_path: Path) -> None:
+    policy, other = tmp_path / "policy", tmp_path / "other/report.json"
     other.parent.mkdir()
-    other.touch()
     asked = plain(composed(f"evaluate.against={other.parent}"))
-    write_report(Report((Result(1_000_000, "success"),)), tmp_path / "report.json", str(checkpoint), asked)
-    assert cached_success(tmp_path, asked, checkpoint) == 1.0
-    os.utime(other, (time.time() + 10, time.time() + 10))
-    assert cached_success(tmp_path, asked, checkpoint) is None
+    report = Report((Result(1_000_000, "success"), Result(1_000_001, "dropped")))
+    for changed in (policy, other):
+        policy.touch()
+        other.touch()
+        write_report(report, tmp_path / "report.json", str(policy), asked)
+        assert cached_success(tmp_path, asked, policy) == 0.5
+        assert cached_success(tmp_path, plain(composed("evaluate.episodes=9")), policy) is None
+        os.utime(changed, (time.time() + 10, time.time() + 10))
+        assert cached_success(tmp_path, asked, policy) is None

@@ -48,17 +48,7 @@ def test_the_key_of_a_server_is_in_no_file_of_a_training(tmp_path: Path, monkeyp
 
 def test_the_main_job_collects_trains_evaluates_and_records(home: Path) -> None:
     report = json.loads((home / "run/report.json").read_text())
-    assert {
-        "success",
-        "episodes",
-        "successes",
-        "ci_low",
-        "ci_high",
-        "seeds",
-        "outcome_counts",
-        "checkpoint",
-        "config",
-    } <= set(report)
+    assert {"success", "episodes", "ci_low", "ci_high", "seeds", "outcome_counts", "checkpoint", "config"} <= {*report}
     assert (report["experiment"], report["model"]) == ("none", "bc")
     assert {result["task"] for result in report["per_episode"]} == {"pick_place"}
     training = json.loads((home / "run/training.json").read_text())
@@ -74,8 +64,8 @@ def test_the_main_job_collects_trains_evaluates_and_records(home: Path) -> None:
     success = header.split(",").index("val/success")
     assert [row.split(",")[success] for row in rows if row.split(",")[success]] == ["0.0", "0.0"]  # hardly trained
     page = (home / "run/report.html").read_text()
-    for words in ("4 steps", "collect.episodes", ">500</code>", "First training batch", 'href="rollouts.rrd"', "${"):
-        assert (words in page) == (words != "${"), words
+    for words in ("4 steps", "collect.episodes", ">500</code>", "First training batch", 'href="rollouts.rrd"'):
+        assert words in page and "${" not in page, words
     command = report["origin"]["command"]
     assert training["origins"] == [report["origin"]] and command.startswith("python -m vla.run ")
     assert command in unescape(page)
@@ -137,14 +127,11 @@ def test_a_policy_sees_the_pictures_of_its_training_and_those_of_the_other_rende
     ],
 )
 def test_a_refused_run_leaves_no_folder(tmp_path: Path, overrides: tuple[str, ...]) -> None:
-    here(tmp_path, *overrides, "output=named", ok=False)
-    assert not (tmp_path / "named").exists() and not [*tmp_path.glob("outputs/*/*")]
-
-
-def test_a_folder_that_was_there_before_a_refused_run_stays(tmp_path: Path) -> None:
     (tmp_path / "mine").mkdir()
-    here(tmp_path, "checkpoint=nowhere.ckpt", "output=mine", ok=False)
-    assert not [*(tmp_path / "mine").iterdir()]
+    for folder in ("named", "mine"):
+        here(tmp_path, *overrides, f"output={folder}", ok=False)
+    assert not (tmp_path / "named").exists() and not [*tmp_path.glob("outputs/*/*")]
+    assert (tmp_path / "mine").exists() and not [*(tmp_path / "mine").iterdir()]
 
 
 def test_a_policy_behind_a_server_acts_as_it_does_from_its_checkpoint(home: Path) -> None:
@@ -225,7 +212,7 @@ def test_what_an_evaluation_cannot_decide_is_refused_before_any_work(home: Path)
     for asked, says in (
         ("evaluate.until=decided", "needs something to decide: evaluate.bar=0.95"),
         ("evaluate.against=nowhere", "nowhere is no run"),
-        ("evaluate.bar=1.0", "evaluate.bar must be a number, more than 0, less than 1, or null"),
+        ("evaluate.bar=1.0", "evaluate.bar must be less than 1, got 1.0"),
     ):
         refused = here(home, *arguments, asked, ok=False)
         assert says in refused.stderr and not (home / "refused/report.json").exists(), refused.stderr
@@ -279,26 +266,22 @@ def test_cells_run_at_the_same_time_and_one_that_fails_leaves_the_others_alone(h
     assert errors[0].startswith("error: 2 of 3 cells failed") and "Traceback" not in done.stderr
     assert errors[1].startswith("  0 collect.episodes=0: collect.episodes must be") and "=-2: " in errors[2]
     assert len(EpisodeStore(home / "grid/store").episodes) == 1 and not (home / "grid/1/error.txt").exists()
-    assert "at least 1" in (home / "grid/2/error.txt").read_text()
+    assert "greater than or equal to 1" in (home / "grid/2/error.txt").read_text()
 
 
-def test_the_menu_is_what_hydra_would_list(home: Path) -> None:
+def test_the_menu_lists_jobs_and_options(home: Path) -> None:
     menu = here(home, "--help").stdout
     assert "task/goal: chain, lift, mixed, mixed_or_stay, pick_place, pick_place_or_stay, pick_place_two, " in menu
-    assert menu == here(home, "-h").stdout == here(home, "--help", "job=train").stdout
+    assert "  evaluate    The default: collect, train and report a success rate" in menu
 
 
-def test_preview_shows_resets_and_their_draws(home: Path) -> None:
-    done = vla(home, "job=preview", "preview.episodes=2", "output=look")
+def test_preview_shows_resets_and_like_a_replay_needs_no_viewer(home: Path) -> None:
+    (store,) = (home / "outputs/episodes").iterdir()
+    look = here(home, "job=preview", "preview.episodes=2", "output=look").stdout
     sheet = np.asarray(Image.open(home / "look/preview.png").convert("RGB"))
     assert (np.ptp(sheet.astype(int), axis=-1) > 60).sum() > 500  # pixels of coloured blocks, of which text has none
     recorded = {chunk.entity_path for chunk in RrdReader(home / "look/preview.rrd").stream().to_chunks()}
-    assert "/camera/front/rgb" in recorded
-    assert "placement" in done.stdout
-
-
-def test_preview_and_replay_need_no_viewer(home: Path) -> None:
-    (store,) = (home / "outputs/episodes").iterdir()
+    assert "/camera/front/rgb" in recorded and "placement" in look
     (home / "bare").mkdir()
     for module in ("rerun", "rerun_cli", "av", "rclpy"):
         (home / f"bare/{module}.py").write_text("raise ImportError('not installed')")
@@ -316,27 +299,16 @@ def test_preview_and_replay_need_no_viewer(home: Path) -> None:
 
 
 def test_a_success_rate_is_printed_even_where_the_report_cannot_be_written(home: Path) -> None:
-    (home / "blocked/report.json").mkdir(parents=True)  # where a file is to go
+    for name in ("report.json", "report.png"):
+        (home / "blocked" / name).mkdir(parents=True)  # where a file is to go
     arguments = ("checkpoint=run", "evaluate.episodes=1", "cluster.workers=1", "recorder=none")
     done = here(home, *arguments, "output=blocked", ok=False)
     assert done.stdout.strip().splitlines()[-1].startswith("success ")
     errors = [line for line in done.stderr.splitlines() if line.startswith("error: ")]
     assert len(errors) == 1 and "blocked/report.json cannot be written (" in errors[0]
+    assert "could not write blocked/report.png" in done.stdout + done.stderr  # which alone costs no report
     names = ["changes.yaml", "config.yaml", "played.jsonl", "report.json", "report.png"]
     assert sorted(path.name for path in (home / "blocked").iterdir()) == names
-
-
-def test_a_picture_that_cannot_be_written_costs_no_report(home: Path) -> None:
-    (home / "no_picture/report.png").mkdir(parents=True)  # where a file is to go
-    arguments = ("checkpoint=run", "evaluate.episodes=1", "cluster.workers=1", "recorder=none")
-    done = here(home, *arguments, "output=no_picture")
-    assert "could not write no_picture/report.png" in done.stdout + done.stderr
-    assert (home / "no_picture/report.json").is_file()
-
-
-def test_export_writes_as_many_episodes_as_asked_for(home: Path) -> None:
-    here(home, *SMALL, "job=export", "export.folder=plain", "collect.episodes=5")
-    assert len(list((home / "plain").glob("episode_*/manifest.json"))) == 5
 
 
 def test_a_collection_killed_again_and_again_goes_on_and_ends_up_the_same(home: Path, tmp_path: Path) -> None:
@@ -391,13 +363,6 @@ def test_an_episode_is_replayed_into_a_recording(home: Path) -> None:
     assert "has no seed 99" in done.stderr and "Traceback" not in done.stderr
 
 
-def test_further_demonstrations_that_are_not_there_are_missed_before_any_are_collected(tmp_path: Path) -> None:
-    refused = here(
-        tmp_path, "job=train", "collect.more=[lessons]", "collect.folder=store", "output=run", ok=False
-    ).stderr
-    assert "lessons" in refused and not (tmp_path / "store").exists()
-
-
 def test_a_damaged_checkpoint_is_named(home: Path) -> None:
     weights = Path(shutil.copytree(home / "run/policy", home / "damaged")) / "model.safetensors"
     whole = weights.read_bytes()
@@ -443,14 +408,8 @@ def test_resuming_refuses_a_changed_identity_and_archives_the_evaluation(home: P
 
 def test_a_policy_is_trained_further_for_another_goal(home: Path, tmp_path: Path) -> None:
     shutil.copytree(home / "run/policy", tmp_path / "theirs")
-    arguments = (
-        *SMALL,
-        f"pretrained={tmp_path}/theirs",
-        "task/goal=push",
-        "job=train",
-        "collect.folder=pushed",
-        "collect.episodes=5",
-    )
+    arguments = (*SMALL, f"pretrained={tmp_path}/theirs", "task/goal=push", "job=train", "collect.folder=pushed")
+    arguments += ("collect.episodes=5",)
     done = here(home, *arguments, "learner.lr=1e-12", "trainer.max_steps=1", "output=tuned")
     assert f"starting from {tmp_path}/theirs" in done.stdout
     before, after = map(read_policy, (tmp_path / "theirs", home / "tuned"))
@@ -473,16 +432,6 @@ def test_a_policy_is_trained_further_for_another_goal(home: Path, tmp_path: Path
 def test_a_checkpoint_of_other_cameras_is_refused(home: Path) -> None:
     done = here(home, "checkpoint=run", "task.cameras=[front]", "cluster.workers=1", ok=False)
     assert "cameras" in done.stderr and "Traceback" not in done.stderr
-
-
-def test_a_damaged_store_is_named_and_left_alone(home: Path, tmp_path: Path) -> None:
-    (store,) = (home / "outputs/episodes").iterdir()
-    shutil.copytree(store, tmp_path / "store")
-    with open(tmp_path / "store/rgb_front.bin", "r+b") as file:
-        file.truncate(1000)
-    done = here(home, *SMALL, "job=train", f"collect.folder={tmp_path}/store", ok=False)
-    assert "rgb_front.bin" in done.stderr and "Traceback" not in done.stderr
-    assert (tmp_path / "store/rgb_front.bin").stat().st_size == 1000
 
 
 def test_a_model_that_memory_cannot_hold_is_refused_in_one_sentence(home: Path) -> None:

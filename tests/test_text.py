@@ -160,7 +160,7 @@ def test_sentences_go_without_a_share_of_their_parts_in_training_only(option: st
 def test_n_grams_are_short() -> None:
     """Over the lengths up to 2^31, which a checkpoint could ask for, a single sentence took minutes."""
     node: Any = OmegaConf.to_container(OmegaConf.load(CONF / "model/text/ngrams.yaml"))
-    with pytest.raises(ValueError, match=r"text\.words must be a whole number, at least 1, at most 16, got"):
+    with pytest.raises(ValueError, match=r"text\.words must be (greater|less) than or equal to 1"):
         check_node("text", {**node, "words": 2**31 - 1}, object)
 
 

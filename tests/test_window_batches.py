@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -46,7 +47,7 @@ def test_memory_is_used_again_once_nothing_refers_to_it() -> None:
 def test_rows_in_random_order_are_those_of_the_file(tmp_path: Path) -> None:
     values = np.random.default_rng(0).integers(0, 255, (900, 7, 5, 3), np.uint8)
     values.tofile(tmp_path / "rows.bin")
-    damaged = lambda row: UserError(f"row {row}")  # noqa: E731
+    damaged: Callable[[int], UserError] = lambda row: UserError(f"row {row}")  # noqa: E731
     rows = ScatteredRows(Field(tmp_path, "rows", (7, 5, 3), values.dtype, RAW), 850, damaged)  # more are being written
     index = np.array([[849, 0], [3, 500]])
     np.testing.assert_array_equal(rows.take(index), values[index])

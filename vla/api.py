@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from vla.config.build import require_no_paths
-from vla.config.check import with_changes
 from vla.config.experiment import make_environment, make_policy
+from vla.config.nodes import with_changes
 from vla.config.packages import trusting
 from vla.envs.gym import GymEnvironment
 from vla.models.policy_folder import policy_folder, read_policy

@@ -8,6 +8,7 @@ from __future__ import annotations
 import inspect
 import json
 import os
+import re
 import types
 from collections.abc import Collection, Iterable, Mapping, MutableMapping, Sequence
 from functools import cache
@@ -17,14 +18,16 @@ from pathlib import Path
 from socket import gethostname
 from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
 
-from annotated_types import Ge, Gt, Le, Lt, MaxLen, MinLen, Predicate
-from pydantic import BeforeValidator, ConfigDict, TypeAdapter, ValidationError
+from annotated_types import MinLen, Predicate
+from pydantic import AfterValidator, BeforeValidator, ConfigDict, TypeAdapter, ValidationError
+from pydantic_core import PydanticCustomError
 
 from vla.config.packages import can_be_trusted, is_trusted
 from vla.io.documents import mappings
 from vla.io.errors import UserError
+from vla.io.suggestion import suggestion
 
-# Configs also come from checkpoints and stores of other people. A `_target_` may name a class of this package, one of
+# Configs also come from policies and stores of other people. A `_target_` may name a class of this package, one of
 # those that `conf/` uses, or one that the user trusts.
 OWN = "vla."
 LIBRARY = (
@@ -41,16 +44,6 @@ SEQUENCES = (list, Sequence, Collection, Iterable)
 MAPPINGS = (dict, Mapping, MutableMapping)
 PATHS = (Path, os.PathLike)
 IN_EVERY_PROTOCOL = {"__init__", "__subclasshook__", "_no_init_or_replace_init"}
-BOUNDS = {Ge: "at least {0.ge}", Gt: "more than {0.gt}", Le: "at most {0.le}", Lt: "less than {0.lt}"}
-WORDS: dict[Any, tuple[str, str]] = {  # type → one, several
-    bool: ("true or false", "true or false"),
-    int: ("a whole number", "whole numbers"),
-    float: ("a number", "numbers"),
-    str: ("text", "texts"),
-    dict: ("a mapping", "mappings"),
-    object: ("any value", "values"),
-}
-ENDLESS = 2**31 - 1  # an upper bound that descriptions omit
 
 
 class MissingLibrary(UserError):
@@ -58,12 +51,7 @@ class MissingLibrary(UserError):
 
 
 def locate(key: str, target: Any) -> type:
-    """Import the class that the `_target_` at `key` names.
-
-    Raises:
-        MissingLibrary: a library is not installed.
-        UserError: the class is not allowed or does not exist.
-    """
+    """Import the class that the `_target_` at `key` names; a UserError if it is not allowed or does not exist."""
     require_trusted(key, target)
     if not isinstance(target, str) or not (target.startswith(OWN) or target in LIBRARY or is_trusted(target)):
         raise UserError(
@@ -131,68 +119,43 @@ def fits(found: type, expected: Any) -> bool:
     return issubclass(found, expected)
 
 
-def matches(value: Any, annotation: Any) -> bool:
-    """Return whether a plain value, with checked nodes in place of objects, is valid for `annotation`."""
-    try:
-        _adapter(annotation).validate_json(json.dumps(value), strict=True)
-    except ValidationError:
-        return False
-    return True
-
-
-def describe(annotation: Any) -> str:
-    """Describe an annotation in words."""
-    kind, arguments = get_origin(annotation), get_args(annotation)
-    if kind is Literal:
-        return f"one of {', '.join(str(choice) for choice in arguments)}"
-    if kind in (Union, types.UnionType):
-        choices = [describe(argument) for argument in arguments]
-        return (", or " if any("," in choice for choice in choices) else " or ").join(choices)
-    if kind is Annotated:
-        return ", ".join([describe(arguments[0]), *_bounds(arguments[1:])])
-    if annotation in (None, types.NoneType):
-        return "null"
-    if kind is tuple or kind in SEQUENCES:
-        return _describe_list(
-            [part for part in arguments if part is not Ellipsis], kind is tuple and ... not in arguments
-        )
-    if kind in MAPPINGS:
-        return f"a mapping of names to {_plural(arguments[1])}"
-    if annotation in WORDS:
-        return WORDS[annotation][0]
-    return str(getattr(arguments[1] if arguments else annotation, "__name__", annotation))
-
-
-def _describe_list(parts: Sequence[Any], fixed: bool) -> str:
-    if len(set(parts)) > 1:
-        return f"a list of {', '.join(describe(part) for part in parts)}"
-    return f"a list of {f'{len(parts)} ' if fixed else ''}{_plural(parts[0])}"
-
-
-def _plural(annotation: Any) -> str:
-    if get_origin(annotation) is Annotated:
-        inner, *bounds = get_args(annotation)
-        return f"{_plural(inner)}, each {', '.join(_bounds(bounds))}"
-    return WORDS[annotation][1] if annotation in WORDS else f"values, each {describe(annotation)}"
-
-
 def takes_path(annotation: Any) -> bool:
     """Return whether values of this annotation are paths."""
     return annotation in PATHS or get_origin(annotation) in PATHS or any(map(takes_path, get_args(annotation)))
 
 
-def _bounds(constraints: Iterable[Any]) -> list[str]:
-    words = []
-    for constraint in constraints:
-        if isinstance(constraint, Predicate):
-            words.append(str(constraint.func.__doc__))
-        elif isinstance(constraint, MinLen):
-            words.append("not empty" if constraint.min_length == 1 else f"at least {constraint.min_length} long")
-        elif isinstance(constraint, MaxLen):
-            words.append(f"at most {constraint.max_length} long")
-        elif not isinstance(constraint, Le) or constraint.le != ENDLESS:
-            words.append(BOUNDS[type(constraint)].format(constraint))
-    return words
+def mismatch(key: str, value: Any, annotation: Any) -> str:
+    """Say what is wrong with a plain value at `key`, with checked nodes in place of objects; "" if nothing is."""
+    try:
+        _adapter(annotation).validate_json(json.dumps(value), strict=True)
+    except ValidationError as error:
+        found = error.errors(include_url=False, include_context=False)
+    else:
+        return ""
+    # Members of a union fail in different depths: the deepest tells most.
+    place, part = max((_within(value, each["loc"]) for each in found), key=lambda within: len(within[0]))
+    reasons = dict.fromkeys(each["msg"] for each in found if _within(value, each["loc"])[0] == place)
+    words = [re.sub(r"^\w+ should (be )?| after validation.*", "", each).replace("None", "null") for each in reasons]
+    choices = [str(choice) for choice in get_args(annotation)] if get_origin(annotation) is Literal else []
+    verb = "must" if words[0].startswith("have ") else "must be"
+    return f"{key}{place} {verb} {' or '.join(words)}, got {short(part)}{suggestion(str(part), choices)}"
+
+
+def _within(value: Any, location: Sequence[int | str]) -> tuple[str, Any]:
+    """Return dotted path and part of a value at pydantic's `location`, which also names members of unions."""
+    path = ""
+    for key in location:
+        if isinstance(value, dict) and key in value:
+            path, value = f"{path}.{key}", value[key]
+        elif isinstance(value, list) and isinstance(key, int) and key < len(value):
+            path, value = f"{path}[{key}]", value[key]
+    return path, value
+
+
+def short(value: Any) -> str:
+    """Format a plain value in at most 200 characters."""
+    text = json.dumps(value) if value is None or isinstance(value, bool) else repr(value)
+    return text if len(text) <= 200 else f"{text[:200]}…"
 
 
 @cache
@@ -206,7 +169,8 @@ def _of_json(annotation: Any) -> Any:
     if annotation in SCALARS or annotation is None or kind is Literal:
         return annotation
     if kind is Annotated:
-        return Annotated[(_of_json(arguments[0]), *arguments[1:])]  # type: ignore[invalid-annotation]
+        constraints = (_required(each) if isinstance(each, Predicate) else each for each in arguments[1:])
+        return Annotated[(_of_json(arguments[0]), *constraints)]  # type: ignore[invalid-annotation]
     if kind in (Union, types.UnionType):
         return Union[tuple(map(_of_json, arguments))]  # type: ignore[invalid-annotation]  # noqa: UP007
     if (kind or annotation) in PATHS:
@@ -226,19 +190,30 @@ def _of_json(annotation: Any) -> Any:
     return Annotated[Any, BeforeValidator(lambda value: _node(value, annotation, partial=False))]
 
 
+def _required(predicate: Predicate) -> AfterValidator:
+    """Convert a predicate, whose docstring completes "must be …"."""
+
+    def checked(value: Any) -> Any:
+        if not predicate.func(value):
+            raise PydanticCustomError("predicate", str(predicate.func.__doc__))  # type: ignore[bad-argument-type]
+        return value
+
+    return AfterValidator(checked)
+
+
 def _plain(value: Any) -> Any:
     if is_node(value):
-        raise UserError("no object belongs here")
+        raise PydanticCustomError("plain", "no object")
     if isinstance(value, float) and not isfinite(value):
-        raise UserError("numbers are finite")
+        raise PydanticCustomError("plain", "finite")
     for part in value.values() if isinstance(value, dict) else value if isinstance(value, list) else ():
         _plain(part)
     return value
 
 
 def _node(value: Any, expected: Any, partial: bool) -> Any:
-    if not is_node(value) or bool(value.get("_partial_")) is not partial:
-        raise UserError("not a node")
-    if not fits(locate("_target_", value["_target_"]), expected):
-        raise UserError("a node of another class")
+    right = is_node(value) and bool(value.get("_partial_")) is partial
+    if not right or not fits(locate("_target_", value["_target_"]), expected):
+        name: Any = f"{'a factory of ' if partial else ''}{getattr(expected, '__name__', expected)}"
+        raise PydanticCustomError("node", name)
     return value

@@ -6,9 +6,7 @@ arguments, types and allowed values. A node is checked against that signature be
 
 from __future__ import annotations
 
-import copy
 import inspect
-import json
 import re
 import sys
 from collections import ChainMap
@@ -17,7 +15,7 @@ from dataclasses import dataclass
 from functools import cache, reduce
 from importlib import import_module
 from operator import or_
-from typing import Annotated, Any, Literal, get_args, get_origin
+from typing import Annotated, Any, Literal
 
 from annotated_types import Gt, Le, MinLen, Predicate
 from hydra.errors import InstantiationException
@@ -25,17 +23,18 @@ from hydra.utils import instantiate
 
 from vla.config.annotations import (
     MissingLibrary,
-    describe,
     fits,
     is_node,
     locate,
-    matches,
+    mismatch,
     packages,
     require_trusted,
     require_trusted_package,
+    short,
     takes_path,
     targets,
 )
+from vla.config.packages import MISSING
 from vla.io.documents import resolved
 from vla.io.errors import UserError
 from vla.io.suggestion import suggestion
@@ -47,48 +46,38 @@ ADDRESSES = ("url", "uri", "host", "address", "api_key")  # arguments that say w
 
 @dataclass(frozen=True)
 class Group:
-    """The kind of objects that a config group describes."""
+    """The kind of objects that a config group, or the node of a job, describes."""
 
     name: str
     makes: tuple[str, ...]  # alternative base classes or protocols
     runtime: tuple[str, ...] = ()  # constructor arguments from the program, never from YAML
     optional: bool = False  # jobs run without it
     several: bool = False  # an option is a mapping of name → node
+    plain: bool = False  # nodes among its arguments are not built with it
     training: Literal["", "part", "means"] = ""  # used in trainings: parts determine their result
 
+
+DEMONSTRATIONS = "vla.data.formats.imported_demonstrations.ImportedDemonstrations"
+OF_DATA = ("folder", "spec", "history", "chunk", "tokenize", "episodes", "more")
+LOGGER = "lightning.pytorch.loggers.Logger"
+TOKENIZER = "vla.models.tokenizers.tokenizer.ActionTokenizer"
 
 # A job may declare further groups of its own.
 GROUPS = {
     group.name: group
     for group in (
+        Group("collect", ("vla.config.nodes.Collection",), plain=True),
+        Group("validate", ("vla.config.nodes.Validation",), plain=True),
+        Group("evaluate", ("vla.config.nodes.Evaluation",), plain=True),
         Group("task", ("vla.spec.Environment", "vla.spec.SpecOnly"), training="part"),
-        Group(
-            "expert",
-            ("vla.spec.Agent", "vla.data.formats.imported_demonstrations.ImportedDemonstrations"),
-            ("spec",),
-            training="part",
-        ),
+        Group("expert", ("vla.spec.Agent", DEMONSTRATIONS), ("spec",), training="part"),
         Group("cluster", ("vla.parallel.pool.Cluster",), training="means"),
-        Group(
-            "data",
-            ("vla.data.datamodule.WindowDataModule",),
-            ("folder", "spec", "history", "chunk", "tokenize", "episodes", "more"),
-            training="part",
-        ),
-        Group(
-            "tokenizer", ("vla.models.tokenizers.tokenizer.ActionTokenizer",), ("spec", "statistics"), training="part"
-        ),
+        Group("data", ("vla.data.datamodule.WindowDataModule",), OF_DATA, training="part"),
+        Group("tokenizer", (TOKENIZER,), ("spec", "statistics"), training="part"),
         Group("model", ("vla.models.model.Model",), ("spec", "tokenizer"), training="part"),
         Group("learner", ("vla.models.learner.Learner",), ("model", "spec", "config"), training="part"),
         Group("trainer", ("lightning.Trainer",), ("callbacks", "logger"), training="means"),
-        Group(
-            "logger",
-            ("lightning.pytorch.loggers.Logger",),
-            ("save_dir",),
-            optional=True,
-            several=True,
-            training="means",
-        ),
+        Group("logger", (LOGGER,), ("save_dir",), optional=True, several=True, training="means"),
         Group("policy", ("vla.policy.Policy",), ("model", "spec")),
         Group("agent", ("vla.spec.Agent",), ("spec",), optional=True),
         Group("recorder", ("vla.spec.Recorder",), ("folder",), optional=True),
@@ -106,14 +95,12 @@ def device_list(text: str) -> bool:
 
 
 # Narrower than Lightning's annotations: with other values its trainer fails late, or silently trains nothing.
+Devices = Annotated[list[Natural], MinLen(1)] | Annotated[str, Predicate(device_list)]
 NARROWER: dict[str, dict[str, Any]] = {
     "lightning.Trainer": {
         "max_steps": Literal[-1] | Count,
         "max_epochs": Literal[-1],  # an epoch never ends
-        "devices": Literal["auto", -1]
-        | Count
-        | Annotated[list[Natural], MinLen(1)]
-        | Annotated[str, Predicate(device_list)],
+        "devices": Literal["auto", -1] | Count | Devices,
         "num_nodes": Count,
         "accumulate_grad_batches": Count,
         "gradient_clip_val": NonNegative | None,
@@ -127,15 +114,10 @@ NARROWER: dict[str, dict[str, Any]] = {
 
 
 def build(node: Mapping[str, Any], group: str | Group, **runtime: Any) -> Any:
-    """Build the object that a plain `node` of a group such as "model" describes.
+    """Build the object that a plain `node` of a group, or of its name in `GROUPS`, describes.
 
-    Nested nodes are built first; those with `_partial_: true` become factories. Unresolved references such as `${seed}`
-    are refused, so the checked mapping is the one that is built.
-
-    Args:
-        node: class in `_target_`, and its arguments.
-        group: config group, or its name in `GROUPS`, which determines the base class.
-        runtime: arguments from the program.
+    Nested nodes are built first; those with `_partial_: true` become factories; `runtime` is from the program.
+    Unresolved references such as `${seed}` are refused, so the checked mapping is the one that is built.
 
     Raises:
         UserError: a class that is not allowed or of another kind, wrong arguments, or an error of the constructor.
@@ -144,7 +126,7 @@ def build(node: Mapping[str, Any], group: str | Group, **runtime: Any) -> Any:
     node = resolved(node, group.name)
     check_node(group.name, node, makes(group), tuple(runtime))
     try:
-        factory = instantiate(node, _convert_="all", _partial_=True)
+        factory = instantiate(node, _convert_="all", _partial_=True, _recursive_=not group.plain)
     except InstantiationException as error:
         if isinstance(error.__cause__, ValueError):
             raise UserError(str(error.__cause__)) from error
@@ -170,31 +152,46 @@ def check_node(key: str, node: Any, expected: Any, runtime: Sequence[str] = ()) 
             allowed values.
     """
     if not is_node(node):
-        raise UserError(f"{key} must be a node with a _target_, got {_short(node)}")
+        raise UserError(f"{key} must be a node with a _target_, got {short(node)}")
     partial = node.get("_partial_", False)
     if not isinstance(partial, bool) or (partial and expected is not object):
         raise UserError(f"{key}._partial_ must be {'true or false' if expected is object else 'omitted here'}")
     target = locate(f"{key}._target_", node["_target_"])
     if not fits(target, expected):
-        raise UserError(f"{key}._target_ must name a class of kind {describe(expected)}, got {node['_target_']}")
+        kind = " or ".join(each.__name__ for each in getattr(expected, "__args__", (expected,)))
+        raise UserError(f"{key}._target_ must name a class of kind {kind}, got {node['_target_']}")
+    values = {name: value for name, value in node.items() if name not in HYDRA_KEYS}
+    check_arguments(key, values, target, runtime, partial, NARROWER.get(node["_target_"], {}))
+    if "package" in node:
+        require_trusted_package(key, node["package"])
+
+
+def check_arguments(
+    key: str,
+    values: Mapping[str, Any],
+    target: type,
+    runtime: Sequence[str] = (),
+    partial: bool = False,
+    narrower: Mapping[str, Any] | None = None,
+) -> None:
+    """Check the arguments of the class `target` in a node at `key`, see `check_node`."""
     parameters = arguments(target)
     several = [name for name, each in parameters.items() if each.kind is inspect.Parameter.VAR_KEYWORD]
     known = [name for name in parameters if name not in (*runtime, *several)]
     if lacking := [name for name in runtime if not several and name not in parameters]:
         raise UserError(f"{key}: {target.__name__} must take the arguments {', '.join(lacking)}, which the job gives")
-    hints = {name: each.annotation for name, each in parameters.items()} | NARROWER.get(node["_target_"], {})
-    for name, value in node.items():
-        if name in HYDRA_KEYS:
-            continue
+    hints = {name: each.annotation for name, each in parameters.items()} | dict(narrower or {})
+    prefix = f"{key}." if key else ""
+    for name, value in values.items():
         if not several or str(name).startswith("_"):
             require_known(key, name, known, target.__name__)
-        check_value(f"{key}.{name}", value, hints.get(name, Any))
-        if name == "package":
-            require_trusted_package(key, value)
+        if value == MISSING:
+            raise UserError(f"{prefix}{name} is missing: the options chosen need {prefix}{name}=VALUE")
+        check_value(f"{prefix}{name}", value, hints.get(name, Any))
     for name in known:
         by_caller = partial and (name in RUNTIME or parameters[name].kind is inspect.Parameter.KEYWORD_ONLY)
-        if name not in node and not by_caller and parameters[name].default is inspect.Parameter.empty:
-            raise UserError(f"{key}.{name} is missing: {target.__name__} needs it")
+        if name not in values and not by_caller and parameters[name].default is inspect.Parameter.empty:
+            raise UserError(f"{prefix}{name} is missing: {target.__name__} needs it")
 
 
 def require_trust(config: Mapping[str, Any], names: Iterable[Any], source: object) -> None:
@@ -209,18 +206,15 @@ def require_trust(config: Mapping[str, Any], names: Iterable[Any], source: objec
 def require_no_paths(
     config: Mapping[str, Any], names: Collection[str], source: object, given: Collection[str] | None = None
 ) -> None:
-    """Refuse nodes out of a file in which a class is given a file or folder, or an address or key of a connection.
+    """Raise a UserError if a node of the file `source` names a file, a folder, or an address or key of a connection.
 
     Args:
-        config: plain, with the nodes `names`, as far as there are any.
-        source: where it comes from, for the error.
+        config: plain, with the nodes `names`, as far as there are any, whose classes must be trusted.
+        source: for the error.
         given: dotted names of nodes that the command line gives in place of the file's; None: it cannot.
-
-    Raises:
-        UserError: with the dotted name of the first such argument, or a class that may not be built.
     """
     require_trust(config, names, source)
-    for key in (key for name in names for key in _paths_in(config.get(name), name)):
+    for key in (f"{path}.{argument}" for name in names for _, path, argument in _paths_in(config.get(name), name)):
         if not any(f"{key}.".startswith(f"{name}.") for name in given or ()):
             hint = "" if given is None else f"; {key.rpartition('.')[0].replace('.', '/')}=OPTION gives yours"
             raise UserError(
@@ -234,23 +228,18 @@ def without_paths(config: Mapping[str, Any], name: str) -> Any:
 
     Of a class that may not be built only the name is returned.
     """
-    node = copy.deepcopy(config[name])
+    node = resolved(config[name], name)  # a copy
     try:
         require_trust(config, [name], name)
-        for path in list(_paths_in(node, name)):
-            *parents, last = path.split(".")[1:]
-            reduce(_part, parents, node)[last] = None
-    except ValueError:
+        for part, _, argument in list(_paths_in(node, name)):
+            part[argument] = None
+    except UserError:
         return {"_target_": node["_target_"]} if is_node(node) else None
     return node
 
 
-def _part(node: Any, key: str) -> Any:
-    return node[int(key)] if isinstance(node, list) else node[key]
-
-
-def _paths_in(node: Any, key: str) -> Iterator[str]:
-    """Dotted names of the arguments in a node, called `key`, that name a file, a folder or an address.
+def _paths_in(node: Any, key: str) -> Iterator[tuple[dict[str, Any], str, str]]:
+    """Yield what names a file, a folder or an address in a node at `key`: the part, its dotted name, the argument.
 
     A class that this machine cannot import yields no paths, because jobs that build it fail in any case.
     """
@@ -259,45 +248,39 @@ def _paths_in(node: Any, key: str) -> Iterator[str]:
             known = arguments(locate(f"{key}._target_", node["_target_"]))
         except MissingLibrary:
             return
-        yield from (
-            f"{key}.{name}"
-            for name, value in node.items()
-            if value and name in known and (name in ADDRESSES or takes_path(known[name].annotation))
-        )
-    for name, part in node.items() if isinstance(node, dict) else enumerate(node) if isinstance(node, list) else ():
+        for name, value in node.items():
+            if value and name in known and (name in ADDRESSES or takes_path(known[name].annotation)):
+                yield node, key, name
+    for name, part in _parts(node):
         yield from _paths_in(part, f"{key}.{name}")
+
+
+def _parts(value: Any) -> Iterable[tuple[Any, Any]]:
+    """Return key and value of what is in a mapping or list."""
+    return value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
 
 
 def check_value(key: str, value: Any, annotation: Any) -> None:
     """Raise a UserError with the dotted name `key` if a value does not match an annotation."""
     _check_nodes(key, value)  # first, because an error within a node is more specific
-    if not matches(value, annotation):
-        choices = [str(choice) for choice in get_args(annotation)] if get_origin(annotation) is Literal else []
-        hint = suggestion(str(value), choices)
-        raise UserError(f"{key} must be {describe(annotation)}, got {_short(value)}{hint}")
+    if wrong := mismatch(key, value, annotation):
+        raise UserError(wrong)
 
 
 def _check_nodes(key: str, value: Any) -> None:
     """Check all nodes in a value against their signatures."""
     if is_node(value):
         return check_node(key, value, object)
-    children = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
-    for name, child in children:
+    for name, child in _parts(value):
         _check_nodes(f"{key}.{name}" if isinstance(value, dict) else f"{key}[{name}]", child)
     return None
 
 
-def _short(value: Any) -> str:
-    text = json.dumps(value) if value is None or isinstance(value, bool) else repr(value)
-    return text if len(text) <= 200 else f"{text[:200]}…"
-
-
 def require_known(key: str, name: str, known: Collection[str], owner: str) -> None:
-    """Raise a UserError with a suggestion for a name that `owner` does not take."""
+    """Raise a UserError for a name that `owner` does not take, with the one that was meant, or all that there are."""
     if name not in known:
-        prefix = f"{key}." if key else ""
-        hint = suggestion(name, known) or ":"
-        raise UserError(f"{prefix}{name} is unknown{hint} {owner} takes {', '.join(known)}")
+        hint = suggestion(name, known) or f": {owner} takes {', '.join(known)}"
+        raise UserError(f"{f'{key}.' if key else ''}{name} is unknown{hint}")
 
 
 def arguments(target: type) -> dict[str, inspect.Parameter]:

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import json
+import logging
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from functools import cache
-from pathlib import Path
 from typing import Any
 
 import hydra
@@ -16,23 +16,22 @@ from hydra.core.global_hydra import GlobalHydra
 from hydra.version import VersionBase
 from omegaconf import DictConfig, OmegaConf, open_dict
 
-import vla.config.check
-import vla.config.recorded  # noqa: F401  these two register the resolvers
+import vla.config.resolvers  # noqa: F401  registers them
+from vla.config.annotations import is_node, locate
 from vla.config.build import check_value
 from vla.config.experiment import Node, plain
-from vla.config.packages import CONF, config_folders, offer_options
+from vla.config.packages import CONF, offer_options
 from vla.io.documents import read_yaml
 from vla.io.errors import UserError
 from vla.io.suggestion import suggestion
 
+log = logging.getLogger(__name__)
+
 
 def compose(*overrides: str) -> DictConfig:
-    """Compose the config that `python -m vla.run` composes from the same overrides.
+    """Compose the config that `python -m vla.run` composes from the same overrides, see `with_variant`.
 
     Add `output=DIR`: only the command line creates a folder per run.
-
-    Raises:
-        UserError: see `with_variant`.
     """
     with _hydra():
         config = hydra.compose("config", list(overrides), return_hydra_config=True)
@@ -45,12 +44,7 @@ def compose(*overrides: str) -> DictConfig:
 def with_variant(config: DictConfig, overrides: Sequence[str]) -> DictConfig:
     """Return a config without its `variants`, composed again with the overrides of the one that `variant` names.
 
-    Args:
-        config: as composed from the overrides.
-        overrides: of the command line.
-
-    Raises:
-        UserError: the config has no such variant, or an override contradicts it.
+    `config` is as composed from `overrides`; a UserError if it has no such variant, or one of these contradicts it.
     """
     with open_dict(config):
         name, variants = config.pop("variant"), config.pop("variants")
@@ -77,9 +71,7 @@ def compose_task(task: str, **overrides: Any) -> Node:
             KEY=VALUE for an argument, such as image_size=(64, 64) or **{"goal.radius": 0.03}. As on the command line, a
             mapping is merged, and an optional argument that the task's files do not list begins with a plus.
 
-    Raises:
-        hydra.errors.HydraException: an option does not exist.
-        omegaconf.errors.OmegaConfBaseException: a key does not exist.
+    An option or key that does not exist raises an exception of Hydra or OmegaConf.
     """
     with _hydra() as loader:
         groups = {name: option for name, option in overrides.items() if loader.get_group_options(f"task/{name}")}
@@ -127,15 +119,18 @@ def _hydra() -> Iterator[ConfigLoader]:
         GlobalHydra.instance().hydra, VersionBase.instance().version_base = before
 
 
-def describe_jobs() -> str:
-    """Resolve `${jobs:}`: a line per option of the group `job`, with the first comment of its file."""
-    files = {file.stem: file for folder in reversed(config_folders()) for file in (folder / "job").glob("*.yaml")}
-    return "\n".join(f"  {name:11} {_comment(file)}" for name, file in sorted(files.items()))
+def substitutes(task: Node, overrides: Sequence[str]) -> list[str]:
+    """Return an override for every part of a task that this machine cannot use, which its class names; log a warning.
 
-
-def _comment(file: Path) -> str:
-    lines = (line.removeprefix("# ") for line in file.read_text(encoding="utf-8").splitlines() if line.startswith("# "))
-    return next((line for line in lines if not line.startswith("@")), "")
-
-
-OmegaConf.register_new_resolver("jobs", describe_jobs, replace=True)
+    None is for an option that the command line names: that fails, in a sentence.
+    """
+    found = []
+    for name, node in task.items():
+        if not is_node(node) or any(override.startswith(f"task/{name}=") for override in overrides):
+            continue
+        kind: Any = locate(f"task.{name}._target_", node["_target_"])
+        if substitute := getattr(kind, "substitute", lambda: None)():
+            reason, option = substitute
+            log.warning("%s: task/%s=%s instead", reason, name, option)
+            found.append(f"task/{name}={option}")
+    return found

@@ -1,22 +1,22 @@
-"""A composed config as plain values, and factories of environment, expert, model, policy and data."""
+"""A checked config as plain values and typed nodes, and factories of world, expert, policy, model and data."""
 
 from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Mapping
 from contextlib import nullcontext
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property, partial, reduce
 from operator import getitem
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from omegaconf import DictConfig, OmegaConf
 
 from vla.config.annotations import locate
-from vla.config.build import build, require_no_paths
-from vla.config.check import with_changes
+from vla.config.build import Group, build, require_no_paths
 from vla.config.differences import ABSENT, at, differences
+from vla.config.nodes import Collection, Evaluation, Settings, Validation, with_changes
 from vla.config.origin import SECRET, Origin, find_origin
 from vla.config.packages import trusted, with_trust
 from vla.io.errors import UserError
@@ -26,7 +26,6 @@ from vla.spec import Spec, SpecOnly
 if TYPE_CHECKING:
     from vla.data.datamodule import WindowDataModule
     from vla.data.episodes import EpisodeStore
-    from vla.data.header import Codec
     from vla.models.learner import Learner
     from vla.models.model import Model
     from vla.models.policy_folder import SavedPolicy
@@ -36,16 +35,15 @@ if TYPE_CHECKING:
     from vla.spec import Agent, Environment, Recorder
 
 Node = dict[str, Any]
+T = TypeVar("T")
+PARTS = ("tokenizer", "model")  # of a policy
 
 
 @dataclass(frozen=True)
 class Experiment:
-    """A checked config as plain values, with a factory per part.
+    """A checked config. Its factories can be sent to worker processes, with the list of trusted packages."""
 
-    Factories for worker processes hold only plain values, so they can be pickled, and the list of trusted packages.
-    """
-
-    nodes: Node  # resolved
+    nodes: Node  # plain, resolved
     changes: list[Node] = field(default_factory=list)  # key, value and default of differences from the default, to show
 
     @classmethod
@@ -74,8 +72,56 @@ class Experiment:
         """Where its results come from, found when it is first asked for."""
         return find_origin()
 
+    @cached_property
+    def settings(self) -> Settings:
+        """The values at the top."""
+        return Settings(**{each.name: self.nodes[each.name] for each in fields(Settings)})
+
+    @cached_property
+    def collect(self) -> Collection:
+        """Number, seeds and store of the demonstrations."""
+        return self.build("collect")
+
+    @cached_property
+    def validate(self) -> Validation:
+        """Episodes that select the weights."""
+        return self.build("validate")
+
+    @cached_property
+    def evaluate(self) -> Evaluation:
+        """Episodes and conditions of an evaluation."""
+        return self.build("evaluate")
+
+    @property
+    def task(self) -> Node:
+        """The plain node of the world."""
+        return self.nodes["task"]
+
+    @property
+    def trainer(self) -> Node:
+        """The plain node of Lightning's trainer."""
+        return self.nodes["trainer"]
+
+    @property
+    def held_out(self) -> float:
+        """Share of the episodes that training holds out."""
+        return self.nodes["data"]["validation_fraction"]
+
+    def options(self, kind: type[T]) -> T:
+        """Build the node of the job itself, of class `kind`."""
+        name = self.settings.job.rpartition(".")[2]
+        return build(self.nodes[name], Group(name, (f"{kind.__module__}.{kind.__name__}",), plain=True))
+
+    def build(self, group: str, **runtime: Any) -> Any:
+        """Build the node of a group, see `vla.config.build.build`."""
+        return build(self.nodes[group], group, **runtime)
+
+    def kind(self, group: str) -> type:
+        """Return the class of the node of a group."""
+        return locate(f"{group}._target_", self.nodes[group]["_target_"])
+
     def __getitem__(self, key: str) -> Any:
-        """Return a top-level node or value."""
+        """Return a plain node of a group."""
         return self.nodes[key]
 
     def with_values(self, values: Mapping[str, Any]) -> Experiment:
@@ -90,124 +136,111 @@ class Experiment:
     @property
     def output(self) -> Path:
         """Folder of the results, created if missing."""
-        folder = Path(self["output"])
+        folder = Path(self.settings.output)
         folder.mkdir(parents=True, exist_ok=True)
         return folder
 
     @property
+    def source(self) -> Node:
+        """The nodes that determine the demonstrations."""
+        return {name: self.nodes[name] for name in ("task", "expert")}
+
+    @property
     def playable(self) -> bool:
         """True if agents can act in the world of the task; else it is known from recordings only."""
-        return not issubclass(locate("task._target_", self["task"]["_target_"]), SpecOnly)
+        return not issubclass(self.kind("task"), SpecOnly)
 
     def world(self) -> Environment | SpecOnly:
         """Build the world of the task and close it: only its description is used, such as spec and tasks."""
         if not self.playable:
-            return build(self["task"], "task")
+            return self.build("task")
         environment = self.make_environment()()
         environment.close()
         return environment
 
-    @property
-    def checkpoint(self) -> Path | None:
-        """Folder of the policy that the job uses, if given; a UserError if there is none."""
-        return _policy_folder(self["checkpoint"])
+    # Factories can be sent to other processes, and are called there with the trust of this one.
 
-    @property
-    def source(self) -> Node:
-        """The nodes that determine the demonstrations."""
-        return {"task": self["task"], "expert": self["expert"]}
-
-    @property
-    def codec(self) -> Codec | None:
-        """Codec of the images of new stores; None: the one that suits their size."""
-        from vla.data.header import Codec
-
-        images, quality = self["collect"]["images"], self["collect"]["quality"]
-        return images and Codec(images, quality if images == "jpeg" else None)
-
-    def make_environment(self, changes: Node | None = None) -> Callable[[], Environment]:
+    def make_environment(self, changes: Mapping[str, Any] | None = None) -> Callable[[], Environment]:
         """Return the factory of the environment, with the `changes` of a condition."""
-        return partial(with_trust, trusted(), make_environment, with_changes(self["task"], changes or {}))
+        return _with_trust(make_environment, with_changes(self.task, changes or {}))
 
     def make_expert(self) -> Callable[[Environment], Agent]:
         """Return the factory of the expert for an environment."""
-        return partial(with_trust, trusted(), make_expert, self["expert"])
+        return _with_trust(make_agent, self.nodes["expert"], "expert")
+
+    def make_agent(self) -> Callable[[Environment], Agent] | None:
+        """Return the factory of the agent that acts in place of a policy, or None."""
+        if not (node := self.nodes.get("agent")):
+            return None
+        # Workers may be in another folder.
+        place = {"folder": str(Path(folder).resolve())} if (folder := self.agent_folder) else {}
+        return _with_trust(make_agent, {**node, **place}, "agent")
+
+    @property
+    def agent_folder(self) -> str | None:
+        """Folder that the agent reads, if any."""
+        return (self.nodes.get("agent") or {}).get("folder")
 
     def make_policy(self, checkpoint: Path | None = None) -> Callable[..., Policy]:
-        """Return the factory of the policy in a folder, by default `checkpoint` of the config.
-
-        Raises:
-            UserError: no policy is given.
-        """
+        """Return the factory of the policy in a folder, by default `checkpoint`; a UserError if there is none."""
         checkpoint = checkpoint or self.checkpoint
         if checkpoint is None:
             raise UserError("this needs a trained policy: checkpoint=RUN")
-        return partial(with_trust, trusted(), make_policy, self["policy"], checkpoint, own=True)
-
-    def make_agent(self) -> Callable[[Environment], Agent] | None:
-        """Return the factory of the agent that acts in place of a checkpoint, or None."""
-        if not self["agent"]:
-            return None
-        return partial(with_trust, trusted(), make_agent, self["agent"])
+        return _with_trust(make_policy, self.nodes["policy"], checkpoint, own=True)
 
     def make_recorder(self, folder: Path) -> Callable[[], Recorder] | None:
         """Return the factory of the recorder that writes into a folder, or None without a recorder."""
-        if not self["recorder"]:
-            return None
-        return partial(with_trust, trusted(), build, self["recorder"], "recorder", folder=folder)
+        node = self.nodes.get("recorder")
+        return _with_trust(build, node, "recorder", folder=folder) if node else None
 
     def cluster(self) -> Cluster:
         """Build the cluster."""
-        return build(self["cluster"], "cluster")
+        return self.build("cluster")
 
-    def learner(self, spec: Spec, origin: Path | None = None) -> Learner:
-        """Build the learner; without `origin`, fit its tokenizer afterwards with `fit_tokenizer`.
-
-        Args:
-            spec: of the demonstrations.
-            origin: folder of the policy with the initial weights.
-
-        Raises:
-            UserError: `origin` is no policy, or has another spec.
-        """
-        from vla.models.policy_folder import read_policy
-
-        node = self["model"]
-        saved = read_policy(origin) if origin else None
-        if saved:
-            saved.spec.require_input(spec, f"the policy {origin}", "the demonstrations")
-            layout = {"robot": saved.spec.robot, "image_size": saved.spec.image_size}
-            spec, node = replace(spec, **layout), _without_pretraining(node)
-        model = _model(node, spec, build(self["tokenizer"], "tokenizer", spec=spec), saved)
-        if saved:
-            saved.initialize(model)
-        return build(self["learner"], "learner", model=model, spec=spec, config=self.config)
-
-    def resumed_learner(self, spec: Spec, checkpoint: Path) -> Learner:
-        """Build the learner that Lightning's checkpoint of this training continues; a UserError if it is damaged."""
-        from vla.models.checkpoint import read_content, weights_of
-
-        content = read_content(checkpoint)
-        begun = Spec.from_dict(content["spec"], str(checkpoint))  # perhaps as that of `pretrained`
-        spec = replace(spec, robot=begun.robot, image_size=begun.image_size)
-        tokenizer = build(self["tokenizer"], "tokenizer", spec=spec)
-        model = _model(_without_pretraining(self["model"]), spec, tokenizer, None)
-        # Before Lightning does, because a sharded model cannot load what modules keep besides their weights.
-        model.load_state_dict(weights_of(content))
-        return build(self["learner"], "learner", model=model, spec=spec, config=self.config)
-
-    def fit_tokenizer(self, tokenizer: ActionTokenizer, store: EpisodeStore) -> None:
-        """Fit a tokenizer to a store's actions."""
-        fitted = build(self["tokenizer"], "tokenizer", spec=store.spec, statistics=store.statistics)
-        tokenizer.load_state_dict(fitted.state_dict())
+    @property
+    def checkpoint(self) -> Path | None:
+        """Folder of the policy that the job uses, if given; a UserError if there is none."""
+        return _policy_folder(self.settings.checkpoint)
 
     @property
     def pretrained(self) -> Path | None:
         """Folder of the policy with the initial weights of a training, if given; a UserError if there is none."""
-        return _policy_folder(self["pretrained"])
+        return _policy_folder(self.settings.pretrained)
+
+    def learner(self, spec: Spec, origin: Path | None = None, last: Path | None = None) -> Learner:
+        """Build the learner with initial weights; without any, fit its tokenizer afterwards with `fit_tokenizer`.
+
+        Args:
+            spec: of the demonstrations.
+            origin: folder of the policy that has the weights.
+            last: Lightning's checkpoint of this training, which is to continue.
+
+        Raises:
+            UserError: one of them is damaged, or the policy has another spec.
+        """
+        from vla.models.checkpoint import read_content, weights_of
+        from vla.models.policy_folder import read_policy
+
+        saved, content = read_policy(origin) if origin else None, read_content(last) if last else None
+        if saved:
+            saved.spec.require_input(spec, f"the policy {origin}", "the demonstrations")
+        begun = saved.spec if saved else Spec.from_dict(content["spec"], str(last)) if content else spec
+        spec = replace(spec, robot=begun.robot, image_size=begun.image_size)
+        model = _model(self.nodes, spec, saved, weights=bool(origin or last))
+        if saved:
+            saved.initialize(model)
+        if content:
+            # Before Lightning does, because a sharded model cannot load what modules keep besides their weights.
+            model.load_state_dict(weights_of(content))
+        return self.build("learner", model=model, spec=spec, config=self.config)
+
+    def fit_tokenizer(self, tokenizer: ActionTokenizer, store: EpisodeStore) -> None:
+        """Fit a tokenizer to a store's actions."""
+        fitted = self.build("tokenizer", spec=store.spec, statistics=store.statistics)
+        tokenizer.load_state_dict(fitted.state_dict())
 
     def fitted_learner(self, store: EpisodeStore) -> Learner:
-        """Build the learner of a new training, of the weights of `pretrained` or `checkpoint` if one is given.
+        """Build the learner of a new training, with the weights of `pretrained` or `checkpoint` if one is given.
 
         Without initial weights, the tokenizer is fitted to the store's actions.
         """
@@ -224,17 +257,13 @@ class Experiment:
 
         `tokenize` is that of a text encoder.
         """
-        return build(
-            self["data"],
-            "data",
-            folder=store.folder,
-            spec=store.spec,
-            history=history,
-            chunk=chunk,
-            tokenize=tokenize,
-            episodes=self["collect"]["episodes"],
-            more=self["collect"]["more"] or (),
-        )
+        windows = {"history": history, "chunk": chunk, "tokenize": tokenize}
+        episodes = {"episodes": self.collect.episodes, "more": self.collect.more or ()}
+        return self.build("data", folder=store.folder, spec=store.spec, **windows, **episodes)
+
+
+def _with_trust(function: Callable[..., T], *arguments: Any, **named: Any) -> Callable[..., T]:
+    return partial(with_trust, trusted(), function, *arguments, **named)
 
 
 def _without_secrets(values: Any) -> Any:
@@ -251,11 +280,7 @@ def plain(node: DictConfig) -> Node:
 
 
 def make_environment(task: Node) -> Environment:
-    """Build the environment of a task node.
-
-    Raises:
-        UserError: nothing can act in the world.
-    """
+    """Build the environment of a task node; a UserError if nothing can act in it."""
     without_triton()
     environment = build(task, "task")
     if isinstance(environment, SpecOnly):
@@ -267,23 +292,12 @@ def make_environment(task: Node) -> Environment:
     return environment
 
 
-def make_expert(expert: Node, environment: Environment) -> Agent:
-    """Build the expert for an environment.
-
-    Raises:
-        UserError: the expert is a recording, which cannot act.
-    """
-    from vla.data.formats.imported_demonstrations import ImportedDemonstrations
-
-    agent: Agent = build(expert, "expert", spec=environment.spec)
-    if isinstance(agent, ImportedDemonstrations):
+def make_agent(node: Node, group: str, environment: Environment) -> Agent:
+    """Build the expert, or the agent, for an environment; a UserError if it is a recording, which cannot act."""
+    agent: Agent = build(node, group, spec=environment.spec)
+    if not hasattr(agent, "act"):
         raise UserError("recorded demonstrations cannot act: this job needs the expert of a world that can be played")
     return agent
-
-
-def make_agent(agent: Node, environment: Environment) -> Agent:
-    """Build an agent for an environment."""
-    return build(agent, "agent", spec=environment.spec)
 
 
 def make_policy(policy: Node, checkpoint: Path, environment: Environment | None = None, *, own: bool = False) -> Policy:
@@ -303,11 +317,9 @@ def make_policy(policy: Node, checkpoint: Path, environment: Environment | None 
     saved = read_policy(checkpoint)
     if environment is not None:
         saved.spec.require_input(environment.spec, f"the policy {checkpoint}", "the task")
-    nodes = {"tokenizer": saved.config["tokenizer"], "model": _without_pretraining(saved.config["model"])}
     if not own:
-        require_no_paths(nodes, nodes, checkpoint)
-    tokenizer = build(nodes["tokenizer"], "tokenizer", spec=saved.spec)
-    model = _model(nodes["model"], saved.spec, tokenizer, saved)
+        require_no_paths({**saved.config, "model": _without_weights(saved.config["model"])}, PARTS, checkpoint)
+    model = _model(saved.config, saved.spec, saved, weights=True)
     saved.restore(model)
     try:
         return build(policy, "policy", model=model, spec=saved.spec)
@@ -332,21 +344,19 @@ def _policy_folder(name: str | None) -> Path | None:
     return policy_folder(name) if name else None
 
 
-def _model(node: Node, spec: Spec, tokenizer: ActionTokenizer, saved: SavedPolicy | None) -> Model:
-    """Build the model of a node; of a saved policy, refuse a model larger than its weights."""
+def _model(nodes: Node, spec: Spec, saved: SavedPolicy | None = None, weights: bool = False) -> Model:
+    """Build the model of a config, and its tokenizer; if it gets `weights`, without loading pretrained ones.
+
+    A model that is larger than the weights of the `saved` policy is refused.
+    """
+    node, tokenizer = nodes["model"], build(nodes["tokenizer"], "tokenizer", spec=spec)
     with saved.budget() if saved else nullcontext():
-        model: Model = build(node, "model", spec=spec, tokenizer=tokenizer)
+        model: Model = build(_without_weights(node) if weights else node, "model", spec=spec, tokenizer=tokenizer)
     return model
 
 
-def _without_pretraining(model: Node) -> Node:
+def _without_weights(model: Node) -> Node:
     """Return a model node without the initial weights of its image encoders, which lie in the policy."""
-    parts = {
-        part: {**node, "pretrained": False}
-        for part in ("image", "context")
-        if isinstance(node := model.get(part), dict) and "pretrained" in node
-    }
-    context = model.get("context")
-    if isinstance(context, dict) and isinstance(image := context.get("image"), dict) and "pretrained" in image:
-        parts["context"] = {**parts.get("context", context), "image": {**image, "pretrained": False}}
-    return {**model, **parts}
+    nodes = {name: node for name, node in model.items() if isinstance(node, dict)}
+    parts = {name: _without_weights(node) for name, node in nodes.items() if name in ("image", "context")}
+    return model | parts | ({"pretrained": False} if "pretrained" in model else {})

@@ -65,11 +65,7 @@ def config_folders() -> tuple[Path, ...]:
 
 @cache
 def option_folders() -> tuple[tuple[str, Path], ...]:
-    """Return (package, folder of options) of installed packages, without importing them.
-
-    Raises:
-        UserError: an installed package names a folder that does not exist.
-    """
+    """Return (package, folder of options) of installed packages; a UserError if one has no such folder."""
     found = []
     for entry in sorted(entry_points(group=ENTRY_POINTS), key=lambda entry: entry.value):
         package, *parts = entry.value.split(".")
@@ -86,16 +82,13 @@ def option_folders() -> tuple[tuple[str, Path], ...]:
 
 
 def trust(packages: Any, chosen: Iterable[Any], used: Iterable[Any] = ()) -> None:
-    """Set the third-party classes that this process and its children may build.
+    """Set the third-party classes that this process and its children may build; a UserError if they cannot be trusted.
 
     Args:
-        packages: names of packages, in addition to those in the environment variable `VLA_TRUST`.
+        packages: list of names, in addition to those in the environment variable `VLA_TRUST`.
         chosen: every `_target_` in the config composed from the command line, before any file is read. Of packages that
             add options, exactly these classes are trusted.
         used: every `package` in it, which is trusted.
-
-    Raises:
-        UserError: `packages` is not a list, or a package cannot be trusted.
     """
     if not isinstance(packages, list):
         raise UserError(f"trust must be a list of packages, as in trust=[mypackage], got {packages!r}")
@@ -110,17 +103,13 @@ def trust(packages: Any, chosen: Iterable[Any], used: Iterable[Any] = ()) -> Non
 
 @contextmanager
 def trusting(packages: Sequence[str], checkpoint: Path) -> Iterator[None]:
-    """Trust further packages within the context, and what this user trusted in the training of a checkpoint.
-
-    Raises:
-        UserError: a package cannot be trusted.
-    """
+    """Trust further packages within the context, and what this user trusted in the training of a policy."""
     if isinstance(packages, str):
         raise UserError(f"trust must be a list of packages, as in trust=[{packages!r}], got {packages!r}")
     for name in packages:
         _require_trustworthy("trust", name)
     before = os.environ.get(TRUSTED)
-    os.environ[TRUSTED] = ",".join(sorted({*trusted(), *packages}))
+    _trust_also(packages)
     try:
         trust_own(checkpoint)
         yield
@@ -131,7 +120,7 @@ def trusting(packages: Sequence[str], checkpoint: Path) -> Iterator[None]:
 
 
 def _own_trainings() -> Path:
-    """Return the file, outside all runs, that says what this user trusted in which folder of a training."""
+    """Return the file, outside all runs, of folder of a training → what this user trusted in it."""
     state = os.environ.get("XDG_STATE_HOME") or Path.home() / ".local/state"
     return Path(state) / "vla" / "trusted.json"
 
@@ -158,9 +147,11 @@ def trust_own(path: Path) -> None:
         log.warning("what was trusted in earlier trainings is unknown: %s", error)
         return
     folders = [path.resolve(), *path.resolve().parents]
-    os.environ[TRUSTED] = ",".join(
-        sorted({*trusted(), *(name for each in folders for name in known.get(str(each), []))})
-    )
+    _trust_also(name for each in folders for name in known.get(str(each), []))
+
+
+def _trust_also(names: Iterable[str]) -> None:
+    os.environ[TRUSTED] = ",".join(sorted({*trusted(), *names}))
 
 
 def trusted() -> list[str]:
@@ -195,7 +186,7 @@ def can_be_trusted(package: str) -> bool:
 
 def with_trust(names: list[str], function: Any, *arguments: Any, **named: Any) -> Any:
     """Call a function in a process of this or another machine with the trust of the calling process."""
-    os.environ[TRUSTED] = ",".join(sorted({*trusted(), *names}))
+    _trust_also(names)
     return function(*arguments, **named)
 
 

@@ -1,4 +1,4 @@
-"""Jobs, `job=…`: each names a module with its requirements, `JOB`, and a function `run`.
+"""Jobs, `job=…`: the requirements of each, which a config is checked for, and the module that does it.
 
 `collect`, `train` and `evaluate` are stages of a pipeline: each first runs the earlier stages whose product is missing.
 """
@@ -6,9 +6,12 @@
 from __future__ import annotations
 
 from importlib import import_module
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from vla.config.annotations import require_trusted
+from vla.config.build import Group
+from vla.config.check import TRAINING, Job
 from vla.config.packages import is_trusted
 from vla.io.errors import UserError
 from vla.jobs.machine import require_compiler, warn_of_bfloat16
@@ -17,23 +20,59 @@ if TYPE_CHECKING:
     from vla.config.experiment import Experiment
 
 
-def find(name: str) -> Any:
-    """Import the module of a job: `vla.jobs.NAME`, or of a trusted package if `name` has dots.
+def _own(name: str, kind: str) -> Group:
+    return Group(name, (f"vla.config.nodes.{kind}",), plain=True)
+
+
+# Each is the module of that name, with a function `run`.
+JOBS = {
+    "collect": Job(("task", "expert", "cluster"), adopts=True),
+    "train": Job(TRAINING, stored=("task", "expert")),
+    "evaluate": Job(
+        ("task", "cluster", "agent", "recorder"),
+        adopts=True,
+        without_agent=("tokenizer", "model", "policy"),
+        without_checkpoint=("expert", "data", "learner", "trainer", "logger"),
+    ),
+    "improve": Job((*TRAINING, "policy", "recorder", _own("improve", "Rounds"))),
+    "deploy": Job(("tokenizer", "model", "policy", "agent", "deploy"), adopts=True),
+    "export": Job(("task", "expert", "cluster", "tokenizer", "model", "policy", "export"), adopts=True),
+    "inspect": Job((_own("inspect", "Inspection"),)),
+    "preview": Job(("task", "expert", "recorder", _own("preview", "Preview"))),
+    "report": Job((_own("report", "ReportedRuns"),)),
+    "plan": Job((_own("plan", "Power"),)),
+    "benchmark": Job((*TRAINING, "policy", _own("benchmark", "Benchmark")), adopts=True),
+}
+
+
+def find(name: str) -> Job:
+    """Return the requirements of a job: one of `JOBS`, or `JOB` in the module that `name` is, of a trusted package.
 
     Raises:
         UserError: there is no such job, or its package is not trusted.
     """
-    module = name if "." in name else f"vla.jobs.{name}"
-    require_trusted("job", module)
+    if name in JOBS:
+        return JOBS[name]
+    require_trusted("job", name)
     try:
-        found = import_module(module) if module.startswith("vla.") or is_trusted(module) else None
+        found: Any = import_module(name) if is_trusted(name) else None
     except ModuleNotFoundError as error:
-        if not f"{module}.".startswith(f"{error.name}."):  # of another import
+        if not f"{name}.".startswith(f"{error.name}."):  # of another import
             raise
         found = None
     if not hasattr(found, "JOB"):
-        raise UserError(f"there is no job={name}; --help lists the jobs")
-    return found
+        raise UserError(f"there is no job '{name}'; --help lists the jobs")
+    return found.JOB
+
+
+def builds_world(experiment: Experiment) -> bool:
+    """Return whether a job simulates: a resumed run has its world, and a training on a store needs none."""
+    groups, settings = find(experiment.settings.job).needs(experiment.nodes), experiment.settings
+    if settings.resume is not None or (settings.job == "train" and Path(experiment.collect.folder).exists()):
+        return False
+    if "deploy" in groups:
+        return getattr(experiment.kind("deploy"), "needs_environment", False)
+    return "task" in groups
 
 
 def run(experiment: Experiment) -> float | None:
@@ -42,8 +81,8 @@ def run(experiment: Experiment) -> float | None:
     Raises:
         UserError: the config compiles a model, and this machine cannot; or an error of the job.
     """
-    job = find(experiment["job"])
-    groups = job.JOB.needs(experiment.config)
+    name = experiment.settings.job
+    groups = find(name).needs(experiment.config)
     require_compiler(experiment.config, groups)
     warn_of_bfloat16(experiment.config, groups)
-    return job.run(experiment)
+    return import_module(f"vla.jobs.{name}" if name in JOBS else name).run(experiment)

@@ -5,8 +5,6 @@ from __future__ import annotations
 import logging
 from pathlib import Path
 
-from vla.config.build import build
-from vla.config.check import Job
 from vla.config.experiment import Experiment
 from vla.data.episodes import EpisodeStore
 from vla.data.formats.imported_demonstrations import ImportedDemonstrations
@@ -16,8 +14,6 @@ from vla.rollouts.collect import collect
 from vla.spec import FIRST_SEED, Environment, Multitask, Spec, SpecOnly
 
 log = logging.getLogger(__name__)
-
-JOB = Job(("task", "expert", "cluster"), adopts=True)
 
 
 def run(experiment: Experiment) -> None:
@@ -31,9 +27,9 @@ def demonstrations(experiment: Experiment) -> EpisodeStore:
     Raises:
         UserError: the store has episodes of another experiment, or collection fails.
     """
-    asked = experiment["collect"]
-    if asked["seed"] + asked["episodes"] > FIRST_SEED:
-        raise UserError(f"collect.seed={asked['seed']}: seeds from {FIRST_SEED} on are reserved for evaluation")
+    wanted = experiment.collect
+    if wanted.seed + wanted.episodes > FIRST_SEED:
+        raise UserError(f"collect.seed={wanted.seed}: seeds from {FIRST_SEED} on are reserved for evaluation")
     store = complete_store(experiment)
     if store is None:
         store = _fill(experiment)
@@ -41,8 +37,8 @@ def demonstrations(experiment: Experiment) -> EpisodeStore:
         folder = experiment["expert"].get("folder")
         if folder and Path(folder).exists() and not store.derived and (recorded := _source(experiment)[2]):
             recorded.require_held(store)
-        log.info("%s: %d of its %d episodes, none of them new", store.folder, asked["episodes"], len(store.episodes))
-    return EpisodeStore(store.folder, asked["episodes"])
+        log.info("%s: %d of its %d episodes, none of them new", store.folder, wanted.episodes, len(store.episodes))
+    return EpisodeStore(store.folder, wanted.episodes)
 
 
 def demonstration_spec(experiment: Experiment) -> Spec:
@@ -57,49 +53,44 @@ def complete_store(experiment: Experiment) -> EpisodeStore | None:
     Raises:
         UserError: the store was collected with another task, expert or first seed, or its images have other losses.
     """
-    folder, asked = Path(experiment["collect"]["folder"]), experiment["collect"]
-    if not is_store(folder):
+    wanted = experiment.collect
+    if not is_store(Path(wanted.folder)):
         return None
-    store = EpisodeStore(folder)
+    store = EpisodeStore(Path(wanted.folder))
     store.require(experiment.source)
-    store.require_codec(experiment.codec)
-    store.require_first_seed(asked["seed"])
-    return store if len(store.episodes) >= asked["episodes"] else None
+    store.require_codec(wanted.codec)
+    store.require_first_seed(wanted.seed)
+    return store if len(store.episodes) >= wanted.episodes else None
 
 
 def _source(experiment: Experiment) -> tuple[Environment | SpecOnly, Spec, ImportedDemonstrations | None]:
     """Return the world, closed, the spec of the demonstrations, and the recordings to import, or None for an acting
     expert."""
     world = experiment.world()
-    expert = build(experiment["expert"], "expert", spec=world.spec)
+    expert = experiment.build("expert", spec=world.spec)
     recorded = expert if isinstance(expert, ImportedDemonstrations) else None
     return world, recorded.spec if recorded else world.spec, recorded
 
 
 def _fill(experiment: Experiment) -> EpisodeStore:
-    asked, cluster = experiment["collect"], experiment.cluster()
+    wanted, cluster = experiment.collect, experiment.cluster()
     world, spec, recorded = _source(experiment)
-    if recorded is not None and asked["seed"]:
-        raise UserError(f"collect.seed={asked['seed']}: recorded episodes are numbered from 0, so omit it")
-    store = EpisodeStore.create_or_open(Path(asked["folder"]), spec, experiment.source, experiment.codec)
+    if recorded is not None and wanted.seed:
+        raise UserError(f"collect.seed={wanted.seed}: recorded episodes are numbered from 0, so omit it")
+    store = EpisodeStore.create_or_open(Path(wanted.folder), spec, experiment.source, wanted.codec)
     if recorded is not None:
-        added = recorded.fill(store, asked["episodes"])
+        added = recorded.fill(store, wanted.episodes)
         log.info("%s: %d recorded episodes, %d of them new", store.folder, len(store.episodes), added)
         return store
     makers = experiment.make_environment(), experiment.make_expert()
     multitask = world if isinstance(world, Multitask) else None
-    summary = collect(store, *makers, asked["episodes"], cluster, asked["seed"], multitask)
+    summary = collect(store, *makers, wanted.episodes, cluster, wanted.seed, multitask)
     if len(summary.tasks) > 1:
         for task, (solved, tried) in summary.tasks.items():
             log.info("%s: %d episodes of %d seeds", task, solved, tried)
     failures = ", ".join(f"{count} {cause}" for cause, count in summary.failures.items()) or "none"
     log.info(
         "%s: %d episodes, %d of them new in %.0f s; expert success %.1f %%, failures: %s",
-        store.folder,
-        summary.episodes,
-        summary.added,
-        summary.seconds,
-        100 * summary.success_rate,
-        failures,
+        *(store.folder, summary.episodes, summary.added, summary.seconds, 100 * summary.success_rate, failures),
     )
     return store

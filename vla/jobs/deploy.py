@@ -5,8 +5,6 @@ from __future__ import annotations
 from functools import partial
 from typing import Any
 
-from vla.config.build import build
-from vla.config.check import Job
 from vla.config.differences import at
 from vla.config.experiment import Experiment
 from vla.io.errors import UserError
@@ -15,15 +13,12 @@ from vla.models.policy_folder import require_unseen
 from vla.reports.evaluation import plot_report, write_report
 from vla.runs.folder import PLOT, REPORT
 
-JOB = Job(("tokenizer", "model", "policy", "agent", "deploy"), adopts=True)
-
 
 def run(experiment: Experiment) -> None:
     """Run the deployment until done or interrupted; report a measured success rate like an evaluation.
 
     Raises:
-        UserError: an episode ended in an error; the report is written and contains it. Or, before anything is started,
-            an episode that is to be played selected the weights.
+        UserError: an episode to be played selected the weights; or one ended in an error, which the report contains.
     """
     seed, episodes = (at(experiment["deploy"], key, None) for key in ("simulator.seed", "episodes"))
     if experiment.checkpoint is not None and seed is not None and episodes is not None:
@@ -31,7 +26,7 @@ def run(experiment: Experiment) -> None:
     report = deployment(experiment).run()
     if report is not None:
         output = experiment.output
-        write_report(report, output / REPORT, experiment["checkpoint"], experiment.config)
+        write_report(report, output / REPORT, experiment.settings.checkpoint, experiment.config)
         plot_report(report, output / PLOT)
         print(printable(str(report)))
         if report.errors:
@@ -39,19 +34,10 @@ def run(experiment: Experiment) -> None:
 
 
 def deployment(experiment: Experiment) -> Any:
-    """Build the deployment of an experiment.
-
-    Raises:
-        UserError: it needs a policy, and there is none.
-    """
-    built = build(
-        experiment["deploy"],
-        "deploy",
-        policy=partial(_policy, experiment),
-        environment=experiment.make_environment(),
-        output=experiment.output,
-    )
-    if getattr(built, "needs_policy", True) and experiment.checkpoint is None and not experiment["agent"]:
+    """Build the deployment of an experiment; a UserError if it needs a policy, and there is none."""
+    policy, environment = partial(_policy, experiment), experiment.make_environment()
+    built = experiment.build("deploy", policy=policy, environment=environment, output=experiment.output)
+    if getattr(built, "needs_policy", True) and experiment.checkpoint is experiment.make_agent() is None:
         raise UserError("this deployment needs a trained policy: checkpoint=RUN")
     return built
 

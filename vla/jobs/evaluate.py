@@ -6,31 +6,32 @@ In a world of recordings there is no success to measure, only errors of actions:
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, nullcontext
-from dataclasses import asdict, replace
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, contextmanager, nullcontext
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 from vla.config.build import Group, build
-from vla.config.check import NEAREST, Job, conditions, with_changes
 from vla.config.experiment import Experiment
+from vla.config.nodes import NEAREST, with_changes
 from vla.io.errors import UserError
 from vla.io.files import warn_on_error, writing
 from vla.io.printable import printable, show
 from vla.io.versions import installed_versions
+from vla.models.policy_folder import is_gone, require_unseen
 from vla.policy import costs
 from vla.reports.evaluation import plot_report, write_report
 from vla.reports.result_tables import SecondaryRows, conditions_table, plot_conditions, secondary_table
 from vla.reports.run_page import write_page
 from vla.rollouts.comparison import compare_conditions, compare_secondary_metrics
-from vla.rollouts.evaluate import RecorderFactory, evaluate
+from vla.rollouts.evaluate import evaluate
 from vla.rollouts.memorisation import make_nearest, make_without, open_memory
-from vla.rollouts.realtime import Network, make_over_network
+from vla.rollouts.realtime import make_over_network
 from vla.rollouts.recordings import clear, keep_recordings
 from vla.rollouts.results import Report
-from vla.rollouts.rollout import AgentFactory
+from vla.rollouts.rollout import AgentFactory, EnvironmentFactory
 from vla.rollouts.shared_policy import shared_policy
 from vla.rollouts.statements import AgainstBar, AgainstRun, Statement, differs_clearly
 from vla.runs.files import Round
@@ -42,6 +43,7 @@ from vla.runs.folder import (
     RECORDINGS,
     REPORT,
     SUITE,
+    described,
     require_run,
     save_config,
     wall_time,
@@ -52,125 +54,76 @@ from vla.spec import IN_DISTRIBUTION, Multitask
 
 log = logging.getLogger(__name__)
 
-JOB = Job(
-    ("task", "cluster", "agent", "recorder"),
-    adopts=True,
-    without_agent=("tokenizer", "model", "policy"),
-    without_checkpoint=("expert", "data", "learner", "trainer", "logger"),
-)
+NETWORK = Group("evaluate.networks", ("vla.rollouts.realtime.Network",))
 
 
 def run(experiment: Experiment) -> float | None:
-    """Measure the success rate, or open-loop errors; return None in all but the first process of a training.
+    """Measure the success rate, or open-loop errors; a UserError if an episode ended in an error.
 
-    A policy that is trained on all episodes of a recording is not evaluated, as none is left: the result is None, too.
-
-    Raises:
-        UserError: an episode ended in an error; the report is written and contains it.
+    The result is None in all but the first process of a training, and if no episodes are left to evaluate on.
     """
-    output = experiment.output
     require_possible(experiment)
-    if experiment["agent"] and experiment.playable:
-        return _evaluated(experiment, None)
-    # Both modules import Lightning, which takes seconds.
-    if (checkpoint := experiment.checkpoint) is None and not experiment["agent"]:
-        from vla.jobs.train import train
-
-        if not experiment.playable and not experiment["data"]["validation_fraction"]:
-            log.warning("data.validation_fraction=0 trains on all episodes and leaves none to evaluate the policy on")
-            train(experiment.with_values({"job": "train"}))  # else resume=last would wait for an evaluation
-            return None
-        if (checkpoint := train(experiment)) is None:
-            return None
-    trained_here = checkpoint is not None and checkpoint.resolve().parent == output.resolve()
-    if not experiment.playable:
-        from vla.jobs.open_loop import evaluate_open_loop
-
-        with training_lock(output / CHECKPOINTS) if trained_here else nullcontext():
-            return evaluate_open_loop(experiment, checkpoint)
-    assert checkpoint is not None
-    if trained_here:
-        return evaluate_trained(experiment, checkpoint)
-    known = cached_success(output, experiment.config, checkpoint)
-    return _evaluated(experiment, checkpoint) if known is None else known
-
-
-def require_possible(experiment: Experiment) -> None:
-    """Check, before any work, that the evaluation can be completed.
-
-    Raises:
-        UserError: there is no such run to compare with, nothing to decide, no such network or store, or no world to
-            change; or its episodes selected the weights.
-    """
-    _require_unseen(experiment)
-    _statements(experiment)
-    _networks(experiment)
-    if not experiment.playable and experiment["evaluate"]["conditions"]:
-        raise UserError("evaluate.conditions change a world, and a recording has none: omit them")
-    if (folder := experiment["evaluate"]["nearest"]) is not None:
-        open_memory(Path(folder), None, experiment.world().spec)
-    output = Path(experiment["output"])  # not created yet
-    if experiment["job"] != "improve" and any(output.glob(f"round_*/{CHECKPOINTS}")):
-        raise UserError(f"{output} has the rounds of a job=improve, whose report this would replace: add output=DIR")
+    agent = experiment.make_agent()
+    checkpoint = None if agent else experiment.checkpoint or _trained(experiment)
+    if checkpoint is agent is None:
+        return None
     if experiment.playable:
-        for name, changes in conditions(experiment["evaluate"]).items():
-            _require_world(experiment, name, changes)
+        return evaluated(experiment, checkpoint)
+    from vla.jobs.open_loop import evaluate_open_loop  # imports Lightning, which takes seconds, as training does
+
+    with _lock(experiment, checkpoint):
+        return evaluate_open_loop(experiment, checkpoint)
 
 
-def _require_unseen(experiment: Experiment) -> None:
-    """Raise a UserError if an episode of the evaluation selected given weights, whatever `validate` is now."""
-    asked, named = experiment["evaluate"], [experiment["checkpoint"], experiment["pretrained"]]
-    if not any(named):
-        return
-    from vla.models.policy_folder import is_gone, require_unseen  # imports PyTorch
+def _trained(experiment: Experiment) -> Path | None:
+    """Train; return None in all but the first process, or if no episodes are left to evaluate on."""
+    from vla.jobs.train import train
 
-    for name in named:
-        if name and not is_gone(name):  # initial weights may have been deleted since
-            require_unseen(name, "evaluate.seed", range(asked["seed"], asked["seed"] + asked["episodes"]))
-
-
-def _require_world(experiment: Experiment, name: str, changes: dict[str, Any]) -> None:
-    """Raise a UserError if there is no episode under a condition, such as with more blocks than colours."""
-    try:
-        world = experiment.make_environment(changes)()
-        try:
-            with world.blind():
-                world.reset(experiment["evaluate"]["seed"])
-        finally:
-            world.close()
-    except ValueError as error:
-        raise UserError(f"condition {name} of the evaluation: {error}") from error
+    if experiment.playable or experiment.held_out:
+        return train(experiment)
+    log.warning("data.validation_fraction=0 trains on all episodes and leaves none to evaluate the policy on")
+    train(experiment.with_values({"job": "train"}))  # else resume=last would wait for an evaluation
+    return None
 
 
-def evaluate_trained(experiment: Experiment, checkpoint: Path, rounds: Sequence[Round] = ()) -> float:
-    """Return the success rate of a policy that this run trained, in `rounds` if given; a report of it is kept."""
-    if (success := cached_success(experiment.output, experiment.config, checkpoint)) is not None:
-        return success
-    with training_lock(checkpoint.parent / CHECKPOINTS):  # else resume=last would find it interrupted
-        return _evaluated(experiment, checkpoint, rounds)
+def evaluated(experiment: Experiment, checkpoint: Path | None, rounds: Sequence[Round] = ()) -> float:
+    """Return the success rate of a policy, trained in `rounds` if given, or of the agent of the config.
 
-
-def _evaluated(experiment: Experiment, checkpoint: Path | None, rounds: Sequence[Round] = ()) -> float:
-    """Play the episodes, write the reports, and return the success rate; print it even if writing fails."""
-    output, statements, result = experiment.output, _statements(experiment), list[str]()
+    Finished evaluations are kept, and of unfinished ones the episodes that were played. If an episode ended in an error
+    the report is written and contains it, then a UserError is raised.
+    """
+    output, wanted = experiment.output, experiment.evaluate
+    if checkpoint and (known := cached_success(output, experiment.config, checkpoint)) is not None:
+        return known
+    statements, conclusions = _statements(experiment), list[str]()
     _ = experiment.origin  # of the code that is evaluated, not of later changes
+    sources = [checkpoint, experiment.agent_folder, wanted.nearest]
+    paths = [Path(each) for each in sources if each is not None]
     try:
-        sources = _sources(experiment, checkpoint)
         with (
-            Played(output, sources, experiment.config, installed_versions()) as played,
+            _lock(experiment, checkpoint),
+            Played(output, paths, experiment.config, installed_versions()) as played,
             policy_for_workers(experiment, checkpoint) as make_policy,
         ):
-            reports = _play(experiment, checkpoint, make_policy, statements, played)
+            reports = _play(experiment, make_policy, statements, played)
             report = reports[IN_DISTRIBUTION]
-            result += [*(each.say(report) for each in statements), str(report)]
+            conclusions += [*(each.say(report) for each in statements), str(report)]
             with writing(output / REPORT):
-                _write(experiment, checkpoint, reports, statements, rounds, played.seconds)
+                facts = _facts(experiment, checkpoint, rounds, played.seconds)
+                facts["statements"] = [each.say(report) for each in statements]
+                _write(experiment, checkpoint, reports, facts)
             if errors := _errors(reports):  # what was played is kept, so that the same command plays only these again
                 raise UserError(f"{errors} episodes ended in an error, see {output / REPORT}")
     finally:
-        for line in result:  # after whatever was logged, because scripts read the last line
+        for line in conclusions:  # after whatever was logged, because scripts read the last line
             print(printable(line))
     return report.success
+
+
+def _lock(experiment: Experiment, checkpoint: Path | None) -> AbstractContextManager[None]:
+    """Lock the training of a policy of this run, which resume=last would else find interrupted."""
+    own = checkpoint is not None and checkpoint.resolve().is_relative_to(experiment.output.resolve())
+    return training_lock(checkpoint.parent / CHECKPOINTS) if checkpoint and own else nullcontext()
 
 
 @contextmanager
@@ -180,22 +133,132 @@ def policy_for_workers(experiment: Experiment, checkpoint: Path | None) -> Itera
         yield None
         return
     make_policy = experiment.make_policy(checkpoint.resolve())  # workers may be in another folder
-    if experiment["cluster"].get("policy") != "here":
+    if not _is_shared(experiment):
         yield make_policy
         return
     with shared_policy(make_policy) as make_agent:
         yield make_agent
 
 
-def _errors(reports: Mapping[str, Report]) -> int:
-    """Return the number of errors; conditions that are equal to the training condition share its report."""
-    return sum(len(each.errors) for each in {id(each): each for each in reports.values()}.values())
+def _is_shared(experiment: Experiment) -> bool:
+    return experiment["cluster"].get("policy") == "here"
 
 
-def _sources(experiment: Experiment, checkpoint: Path | None) -> list[Path]:
-    """Return the files and folders that agents are read from."""
-    named = [checkpoint, (experiment["agent"] or {}).get("folder"), experiment["evaluate"]["nearest"]]
-    return [Path(each) for each in named if each is not None]
+@dataclass(frozen=True)
+class _Condition:
+    """A world and an agent that plays in it on the seeds of the evaluation."""
+
+    name: str
+    make_environment: EnvironmentFactory
+    make_agent: AgentFactory
+
+
+def _conditions(experiment: Experiment, make_agent: AgentFactory) -> list[_Condition]:
+    """Return the training condition, then those that change its world or its agent.
+
+    Other agents are the same one without a modality or at the other end of a network, and the nearest demonstration.
+    """
+    wanted, task, world = experiment.evaluate, experiment.task, experiment.make_environment()
+    agents: dict[str, AgentFactory] = {
+        f"without_{each}": partial(make_without, make_agent, each) for each in wanted.without
+    }
+    if wanted.nearest:
+        agents[NEAREST] = partial(make_nearest, Path(wanted.nearest).resolve())
+    for name, node in wanted.networks.items():
+        agents[name] = partial(make_over_network, make_agent, build(node, NETWORK))
+    return [
+        _Condition(IN_DISTRIBUTION, world, make_agent),
+        *(
+            _Condition(name, experiment.make_environment(changes), make_agent)
+            for name, changes in wanted.changes.items()
+            if with_changes(task, changes) != task
+        ),
+        *(_Condition(name, world, agent) for name, agent in agents.items()),
+    ]
+
+
+def _play(
+    experiment: Experiment,
+    make_policy: AgentFactory | None,
+    statements: Sequence[Statement],
+    played: Played,
+) -> dict[str, Report]:
+    """Return condition → report on the same seeds; only the first, the training condition, is recorded.
+
+    Episodes in `played` are not played again; others are added to it. With `evaluate.until` the first condition stops
+    when all statements are clear; every other one has the seeds of the first, and stops when its difference is clear.
+    """
+    wanted, recordings = experiment.evaluate, experiment.output.resolve() / RECORDINGS
+    make_agent, make_recorder = experiment.make_agent() or make_policy, experiment.make_recorder(recordings)
+    assert make_agent is not None, "there is a checkpoint"
+    if make_recorder:
+        recordings.mkdir(exist_ok=True)
+    if not len(played):
+        clear(recordings)
+    world = experiment.world() if wanted.until else None
+    turns = len(world.tasks) if isinstance(world, Multitask) else 1
+    lanes = 1 if _is_shared(experiment) else (experiment["policy"] or {}).get("lanes", 1)  # else lanes are workers
+    play = partial(evaluate, cluster=experiment.cluster(), turns=turns, lanes=lanes)
+    tiers = experiment.task.get("tiers") or {}  # of worlds that have them
+    conditions, reports, seeds = _conditions(experiment, make_agent), dict[str, Report](), list(wanted.seeds)
+    until = (lambda so_far: all(each.is_decided(so_far) for each in statements)) if statements else None
+    for each in conditions:
+        first = each is conditions[0]
+        report = play(
+            *(each.make_environment, each.make_agent, make_recorder if first else None, seeds),
+            name="as configured" if first else each.name,
+            until=until if wanted.until else None,
+            recordings=wanted.recordings,
+            known=played.of(each.name),
+            keep=partial(played.add, each.name),
+        )
+        reports[each.name] = replace(report, tiers=tiers)
+        if first:
+            seeds = [result.seed for result in report.results]
+            until = partial(differs_clearly, report, wanted.margin, len(conditions) - 1)
+    # A condition that changes nothing is the first one.
+    return {name: reports.get(name, reports[IN_DISTRIBUTION]) for name in (IN_DISTRIBUTION, *wanted.changes, *reports)}
+
+
+def require_possible(experiment: Experiment) -> None:
+    """Check, before any work, that the evaluation can be completed.
+
+    Raises:
+        UserError: there is no such run to compare with, nothing to decide, no such network or store, or no world to
+            change; or its episodes selected the weights.
+    """
+    wanted, settings = experiment.evaluate, experiment.settings
+    for name in (settings.checkpoint, settings.pretrained):
+        if name and not is_gone(name):  # initial weights may have been deleted since
+            require_unseen(name, "evaluate.seed", wanted.seeds)  # whatever `validate` is now
+    _statements(experiment)
+    for node in wanted.networks.values():
+        build(node, NETWORK)
+    if not experiment.playable and wanted.conditions:
+        raise UserError("evaluate.conditions change a world, and a recording has none: omit them")
+    if wanted.nearest is not None:
+        open_memory(Path(wanted.nearest), None, experiment.world().spec)
+    output = Path(settings.output)  # not created yet
+    if settings.job != "improve" and any(output.glob(f"round_*/{CHECKPOINTS}")):
+        raise UserError(f"{output} has the rounds of a job=improve, whose report this would replace: add output=DIR")
+    if experiment.playable:
+        # Worlds take time to compile: of conditions that change the same arguments one is built; all nodes are checked.
+        kinds = {frozenset(changes): (name, changes) for name, changes in reversed(wanted.changes.items())}
+        for name, changes in kinds.values():
+            _require_world(experiment, name, changes)
+
+
+def _require_world(experiment: Experiment, name: str, changes: Mapping[str, Any]) -> None:
+    """Raise a UserError if there is no episode under a condition, such as with more blocks than colours."""
+    try:
+        world = experiment.make_environment(changes)()
+        try:
+            with world.blind():
+                world.reset(experiment.evaluate.seed)
+        finally:
+            world.close()
+    except ValueError as error:
+        raise UserError(f"condition {name} of the evaluation: {error}") from error
 
 
 def _statements(experiment: Experiment) -> list[Statement]:
@@ -204,27 +267,17 @@ def _statements(experiment: Experiment) -> list[Statement]:
     Raises:
         UserError: there is no such run to compare with, or nothing to decide.
     """
-    asked = experiment["evaluate"]
-    bar, against, found = asked["bar"], asked["against"], list[Statement]()
-    if bar is not None:
-        found.append(AgainstBar(bar))
-    if against is not None:
-        report = require_run(Path(against)).report
-        if report is None:
-            raise UserError(f"evaluate.against={against} has no report.json to compare with: evaluate that run first")
-        theirs = {result.seed: result for result in report.per_episode}
-        if not any(result.draws for result in report.per_episode) and report.config.get("task") != experiment["task"]:
-            theirs = {}  # without draws to compare, equal seeds are the same episodes in the same task only
-        statement = AgainstRun(against, theirs, asked["margin"], report.anytime)
-        statement.require_common(range(asked["seed"], asked["seed"] + asked["episodes"]))
-        found.append(statement)
-    others = asked["without"] or asked["nearest"] or asked["networks"]
-    if asked["until"] and not found and not (conditions(asked) or others):
+    wanted, found = experiment.evaluate, list[Statement]()
+    if wanted.bar is not None:
+        found.append(AgainstBar(wanted.bar))
+    if wanted.against is not None:
+        found.append(_against(experiment, wanted.against))
+    if wanted.until and not (found or wanted.changes or wanted.of_agents):
         raise UserError(
             "evaluate.until=decided needs something to decide: evaluate.bar=0.95, evaluate.against=RUN, or conditions, "
             "as in evaluate=suite"
         )
-    if not experiment.playable and (found or asked["until"] or others):
+    if not experiment.playable and (found or wanted.until or wanted.of_agents):
         raise UserError(
             "evaluate.bar, against, until, without, nearest and networks need success, which recordings do not have: "
             "omit them"
@@ -232,113 +285,35 @@ def _statements(experiment: Experiment) -> list[Statement]:
     return found
 
 
-def _networks(experiment: Experiment) -> dict[str, Network]:
-    """Return condition → network of `evaluate.networks`.
-
-    Raises:
-        UserError: one is invalid.
-    """
-    kind = Group("evaluate.networks", ("vla.rollouts.realtime.Network",))
-    return {name: build(node, kind) for name, node in experiment["evaluate"]["networks"].items()}
-
-
-def _play(
-    experiment: Experiment,
-    checkpoint: Path | None,
-    make_policy: AgentFactory | None,
-    statements: Sequence[Statement],
-    kept: Played,
-) -> dict[str, Report]:
-    """Return condition → report on the same seeds; only the first, the training condition, is recorded.
-
-    Episodes in `kept` are not played again; others are added to it. Without a checkpoint the agent of the config acts.
-    With `evaluate.until` the first condition stops when all statements are clear. Every other one has the seeds of the
-    first, and stops when its difference from it is clear.
-    """
-    asked, task = experiment["evaluate"], experiment["task"]
-    seeds: Sequence[int] = range(asked["seed"], asked["seed"] + asked["episodes"])
-    cluster = experiment.cluster()
-    named = (experiment["agent"] or {}).get("folder")
-    here = experiment["cluster"].get("policy") == "here"  # then lanes are workers
-    lanes = 1 if here else (experiment["policy"] or {}).get("lanes", 1)
-    if folder := named and Path(named).resolve():  # workers may be in another folder
-        experiment = experiment.with_values({"agent.folder": str(folder)})
-    make_agent = experiment.make_agent() or make_policy
-    assert make_agent is not None, "there is a checkpoint"
-    recordings = experiment.output.resolve() / RECORDINGS
-    recorder = experiment.make_recorder(recordings)
-    if recorder:
-        recordings.mkdir(exist_ok=True)
-    if not len(kept):
-        clear(recordings)
-
-    def played(
-        name: str,
-        seeds: Sequence[int],
-        until: Callable[[Report], bool] | None,
-        changes: dict[str, Any] | None = None,
-        agent: AgentFactory = make_agent,
-        recorder: RecorderFactory | None = None,
-    ) -> Report:
-        environment, wanted = experiment.make_environment(changes), asked["recordings"]
-        until = until if asked["until"] else None
-        known, keep = kept.of(name), partial(kept.add, name)
-        report = evaluate(environment, agent, recorder, seeds, cluster, name, until, wanted, turns, known, keep, lanes)
-        return replace(report, tiers=task.get("tiers") or {})  # of worlds that have them
-
-    world = experiment.world() if asked["until"] else None
-    turns = len(world.tasks) if isinstance(world, Multitask) else 1
-    decided = (lambda report: all(each.is_decided(report) for each in statements)) if statements else None
-    first = played(IN_DISTRIBUTION, seeds, decided, recorder=recorder)
-    reports, seeds = {IN_DISTRIBUTION: first}, [result.seed for result in first.results]
-    changed = {name: changes for name, changes in conditions(asked).items() if with_changes(task, changes) != task}
-    others = _other_agents(experiment, make_agent)
-    until = partial(differs_clearly, first, asked["margin"], len(changed) + len(others))
-    for name in conditions(asked):
-        reports[name] = played(name, seeds, until, changed[name]) if name in changed else first
-    return reports | {name: played(name, seeds, until, agent=agent) for name, agent in others.items()}
+def _against(experiment: Experiment, run: str) -> AgainstRun:
+    """Build the comparison with another run; a UserError if it has no such episodes."""
+    report = require_run(Path(run)).report
+    if report is None:
+        raise UserError(f"evaluate.against={run} has no report.json to compare with: evaluate that run first")
+    theirs = {result.seed: result for result in report.per_episode}
+    if not any(result.draws for result in report.per_episode) and report.config.get("task") != experiment.task:
+        theirs = {}  # without draws to compare, equal seeds are the same episodes in the same task only
+    statement = AgainstRun(run, theirs, experiment.evaluate.margin, report.anytime)
+    statement.require_common(experiment.evaluate.seeds)
+    return statement
 
 
-def _other_agents(experiment: Experiment, make_agent: AgentFactory) -> dict[str, AgentFactory]:
-    """Return condition → factory of another agent: the same one without a modality or at the other end of a network, or
-    the nearest demonstration."""
-    asked = experiment["evaluate"]
-    impaired = {f"without_{each}": partial(make_without, make_agent, each) for each in asked["without"]}
-    distant = {name: partial(make_over_network, make_agent, network) for name, network in _networks(experiment).items()}
-    folder = asked["nearest"]
-    replayed = {NEAREST: partial(make_nearest, Path(folder).resolve())} if folder else {}
-    return {**impaired, **replayed, **distant}
-
-
-def _write(
-    experiment: Experiment,
-    checkpoint: Path | None,
-    reports: dict[str, Report],
-    statements: Sequence[Statement],
-    rounds: Sequence[Round],
-    seconds: float,
-) -> None:
-    """Write all results of an evaluation that took `seconds`."""
-    output, report = experiment.output, reports[IN_DISTRIBUTION]
+def _write(experiment: Experiment, checkpoint: Path | None, reports: dict[str, Report], facts: dict[str, Any]) -> None:
+    """Write all results of an evaluation; `facts` are further entries of its report."""
+    output, wanted, report = experiment.output, experiment.evaluate, reports[IN_DISTRIBUTION]
     others = {name: each for name, each in reports.items() if name != IN_DISTRIBUTION}
-    compared, secondary = (
-        compare_conditions(reports, experiment["evaluate"]["margin"]),
-        compare_secondary_metrics(reports),
-    )
-    facts = _facts(experiment, checkpoint, rounds, seconds) | {"origin": asdict(experiment.origin)}
-    facts["statements"] = [each.say(report) for each in statements]
+    compared, secondary = compare_conditions(reports, wanted.margin), compare_secondary_metrics(reports)
     save_config(output, experiment.config, experiment.changes)
     recording = output / RECORDING
-    recording.unlink(missing_ok=True)  # of an earlier evaluation
+    for earlier in (recording, output / SUITE):
+        earlier.unlink(missing_ok=True)
     if experiment["recorder"]:
         with warn_on_error(recording):
-            again = _errors(reports) > 0  # this evaluation is then continued
-            wanted = experiment["evaluate"]["recordings"]
-            facts["recorded"] = keep_recordings(report, output / RECORDINGS, recording, wanted, again)
+            continues = _errors(reports) > 0
+            facts["recorded"] = keep_recordings(report, output / RECORDINGS, recording, wanted.recordings, continues)
     with warn_on_error(output / PLOT):
         (output / PLOT).unlink(missing_ok=True)  # of an earlier evaluation
         plot_report(report, output / PLOT)
-    (output / SUITE).unlink(missing_ok=True)  # of an earlier evaluation
     if others:
         with warn_on_error(output / SUITE):
             plot_conditions(reports, output / SUITE)
@@ -354,23 +329,24 @@ def _write(
     page = None
     with warn_on_error(output / PAGE):
         page = write_page(output)
-    written = [path for path in (page, output / REPORT, output / PLOT, recording) if path and path.is_file()]
-    log.info("wrote %s", ", ".join([str(written[0]), *(path.name for path in written[1:])]))
+    log.info("wrote %s", described([page, output / REPORT, output / PLOT, recording]))
+
+
+def _errors(reports: Mapping[str, Report]) -> int:
+    """Return the number of errors; conditions that are equal to the training condition share its report."""
+    return sum(len(each.errors) for each in {id(each): each for each in reports.values()}.values())
 
 
 def _facts(experiment: Experiment, checkpoint: Path | None, rounds: Sequence[Round], seconds: float) -> dict[str, Any]:
     """Return the entries of a report that describe the agent, given the duration of its evaluation [s]."""
-    chosen = {**experiment["chosen"], "versions": installed_versions()}
+    facts = {**experiment.settings.chosen, "versions": installed_versions(), "origin": asdict(experiment.origin)}
     if checkpoint is None:
-        return {**chosen, "model": chosen["agent"], "wall_time_s": seconds}
+        return {**facts, "model": facts["agent"], "wall_time_s": seconds}
+    # The last training is read from its own folder.
+    before = sum(each.collection_s + each.training_s for each in rounds) - (rounds[-1].training_s if rounds else 0.0)
     return {
-        **chosen,
+        **facts,
         **costs(experiment.make_policy(checkpoint)()),
-        "wall_time_s": wall_time(checkpoint, seconds + _before_last_training(rounds)),
+        "wall_time_s": wall_time(checkpoint, seconds + before),
         "rounds": [asdict(one) for one in rounds],
     }
-
-
-def _before_last_training(rounds: Sequence[Round]) -> float:
-    """Return the duration of all rounds [s] without the last training, which is read from its own folder."""
-    return sum(each.collection_s + each.training_s for each in rounds) - (rounds[-1].training_s if rounds else 0.0)

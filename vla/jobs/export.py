@@ -4,14 +4,10 @@ from __future__ import annotations
 
 import logging
 
-from vla.config.build import build
-from vla.config.check import Job
 from vla.config.experiment import Experiment
 from vla.jobs.collect import demonstrations
 
 log = logging.getLogger(__name__)
-
-JOB = Job(("task", "expert", "cluster", "tokenizer", "model", "policy", "export"), adopts=True)
 
 
 def run(experiment: Experiment) -> None:
@@ -20,7 +16,7 @@ def run(experiment: Experiment) -> None:
     Raises:
         UserError: the exporter needs a policy, and no checkpoint is given.
     """
-    exporter = build(experiment["export"], "export")
+    exporter = experiment.build("export")
     if hasattr(exporter, "export_policy"):
         log.info("wrote %s", exporter.export_policy(experiment.make_policy()()))
     else:

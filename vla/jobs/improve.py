@@ -9,23 +9,22 @@ acts; in the others the policy does, or both in turns (`improve.beta`). Every ro
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import closing
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 from vla.config.adopt import require_identity
-from vla.config.check import TRAINING, Job, devices, with_changes
+from vla.config.check import devices
 from vla.config.differences import at
 from vla.config.experiment import Experiment
+from vla.config.nodes import Rounds, with_changes
 from vla.data.episodes import EpisodeStore
 from vla.data.header import is_store
 from vla.data.index import listed
 from vla.io.errors import UserError
-from vla.io.types import Count, Seed, Share
 from vla.jobs.collect import complete_store, demonstrations
-from vla.jobs.evaluate import evaluate_trained, policy_for_workers, require_possible
+from vla.jobs.evaluate import evaluated, policy_for_workers, require_possible
 from vla.jobs.train import train
 from vla.models.policy_folder import read_policy
 from vla.rollouts.collect import collect, collection_time
@@ -38,18 +37,6 @@ from vla.spec import FIRST_SEED
 
 log = logging.getLogger(__name__)
 
-JOB = Job(
-    (*TRAINING, "policy", "recorder"),
-    options={
-        "rounds": Count,
-        "episodes": Count,
-        "seed": Seed,
-        "steps": Count,
-        "beta": Share,
-        "segment": Count,
-        "changes": dict[str, object],
-    },
-)
 EPISODES = "episodes"  # the store in the folder of a round
 
 
@@ -61,7 +48,7 @@ def run(experiment: Experiment) -> float:
     """
     seeds = _require_possible(experiment)
     known = complete_store(experiment)
-    for store in (*([known] if known else ()), *map(EpisodeStore, experiment["collect"]["more"] or ())):
+    for store in (*([known] if known else ()), *map(EpisodeStore, experiment.collect.more or ())):
         require_new(seeds, store)
     with training_lock(experiment.output):
         _save_config(experiment)
@@ -70,64 +57,52 @@ def run(experiment: Experiment) -> float:
 
 
 def _improved(experiment: Experiment, seeds: range) -> float:
-    asked, output = experiment["improve"], experiment.output
+    asked, output = experiment.options(Rounds), experiment.output
     checkpoint, rounds, stores = experiment.pretrained, list[Round](), list[Path]()
     if report := read_report(output):
-        evaluated = len(report.rounds) - (checkpoint is None)  # without a policy to begin with, round_0 is there, too
-        if evaluated < asked["rounds"]:
-            archive_evaluation(output, evaluated)
+        finished = len(report.rounds) - (checkpoint is None)  # without a policy to begin with, round_0 is there, too
+        if finished < asked.rounds:
+            archive_evaluation(output, finished)
     if checkpoint is None:
         checkpoint = _trained(experiment.with_values({"job": "train", "output": str(output / "round_0")}))
         rounds.append(_described(output / "round_0", None))
-    for number in range(1, asked["rounds"] + 1):
+    for number in range(1, asked.rounds + 1):
         folder = output / f"round_{number}"
-        store = _labelled(experiment, checkpoint, folder / EPISODES, seeds[(number - 1) * asked["episodes"]])
+        store = _labelled(experiment, checkpoint, folder / EPISODES, seeds[(number - 1) * asked.episodes])
         stores.append(store.folder)
         checkpoint = _trained(_round(experiment, checkpoint, folder, stores))
         rounds.append(_described(folder, store))
         log.info("round %d: %s", number, rounds[-1])
-    return evaluate_trained(experiment, checkpoint, rounds)
+    return evaluated(experiment, checkpoint, rounds)
 
 
 def _save_config(experiment: Experiment) -> None:
-    """Save the config for `resume=`.
-
-    Raises:
-        UserError: the folder has rounds of another training, or they begin where this one would not end.
-    """
+    """Save the config for `resume=`; a UserError if the folder has rounds of another training, or of another length."""
     saved = read_run(experiment.output).config
     if saved.get("job") == "improve":
         require_identity(saved, experiment.config, experiment.output)
-        if is_store(experiment.output / "round_1" / EPISODES):
-            _require_same_length(saved, experiment)
+        # Later trainings continue the earlier ones, which must not get another length.
+        begun = is_store(experiment.output / "round_1" / EPISODES)
+        lengths = [f"trainer.{name}" for name in LENGTHS] if experiment.pretrained is None else []
+        for key in (*lengths, "improve.steps") if begun else ():
+            before, now = at(saved, key, None), at(experiment.config, key, None)
+            if before != now:
+                raise UserError(
+                    f"{key}={now}: the rounds in {experiment.output} were trained with {before}: leave it at that, or "
+                    "choose another output=DIR"
+                )
     if saved != experiment.config:  # else its date would tell that the rounds began again
         save_config(experiment.output, experiment.config, experiment.changes)
 
 
-def _require_same_length(saved: Mapping[str, Any], experiment: Experiment) -> None:
-    """Raise a UserError if a training that later ones continue would get another length."""
-    lengths = [f"trainer.{name}" for name in LENGTHS] if experiment.pretrained is None else []
-    for key in (*lengths, "improve.steps"):
-        before, now = at(saved, key, None), at(experiment.config, key, None)
-        if before != now:
-            raise UserError(
-                f"{key}={now}: the rounds in {experiment.output} were trained with {before}: leave it at that, or "
-                "choose another output=DIR"
-            )
-
-
 def _require_possible(experiment: Experiment) -> range:
-    """Check the config, and return the seeds of all rounds.
-
-    Raises:
-        UserError: seeds are of evaluation, training is to use several devices, or the expert cannot label.
-    """
+    """Return the seeds of all rounds; a UserError if they are of evaluation, or the rounds cannot be played."""
     require_possible(experiment)
-    asked = experiment["improve"]
-    seeds = range(asked["seed"], asked["seed"] + asked["rounds"] * asked["episodes"])
+    asked = experiment.options(Rounds)
+    seeds = asked.seeds
     if seeds.stop > FIRST_SEED:
         raise UserError(f"improve.seed={seeds.start}: seeds from {FIRST_SEED} on are reserved for evaluation")
-    if devices(experiment["trainer"]) > 1:
+    if devices(experiment.trainer) > 1:
         raise UserError("job=improve trains on one device, because its trainings follow each other: trainer.devices=1")
     if experiment.pretrained is not None:
         _require_further_episodes(experiment, experiment.pretrained)
@@ -138,7 +113,7 @@ def _require_possible(experiment: Experiment) -> range:
         if (policy := experiment.pretrained) is not None:
             known = read_policy(policy).spec.without_truth
             known.require(environment.spec.without_truth, f"the checkpoint {policy}", "the task")
-        with closing(experiment.make_environment(asked["changes"])()) as changed:
+        with closing(experiment.make_environment(asked.changes)()) as changed:
             environment.spec.require(changed.spec, "the task", "the task with improve.changes")
             with changed.blind():
                 changed.reset(seeds.start)
@@ -148,7 +123,7 @@ def _require_possible(experiment: Experiment) -> range:
 def _require_further_episodes(experiment: Experiment, policy: Path) -> None:
     """Raise a UserError if the policy was trained on further stores, such as rounds, that nothing is said about."""
     further = at(read_policy(policy).config, "collect.more", None)
-    if isinstance(further, list) and further and experiment["collect"]["more"] is None:
+    if isinstance(further, list) and further and experiment.collect.more is None:
         names = ",".join(map(str, further))
         raise UserError(
             f"{policy} was also trained on {names}: add collect.more=[{names}] to train on "
@@ -168,29 +143,29 @@ def require_new(seeds: range, store: EpisodeStore) -> None:
 
 def _labelled(experiment: Experiment, checkpoint: Path, folder: Path, seed: int) -> EpisodeStore:
     """Return the store of a round: episodes of the policy in a checkpoint, labelled by the expert; add missing ones."""
-    asked = experiment["improve"]
-    task = with_changes(experiment["task"], asked["changes"])
-    environment = experiment.make_environment(asked["changes"])
+    asked = experiment.options(Rounds)
+    task = with_changes(experiment.task, asked.changes)
+    environment = experiment.make_environment(asked.changes)
     own = {
         "task": task,
         "expert": experiment["expert"],
         "policy": {**experiment["policy"], "weights": read_policy(checkpoint).training.weights[:12]},
-        "improve": {**{name: asked[name] for name in ("episodes", "beta", "segment")}, "seed": seed},
+        "improve": {"episodes": asked.episodes, "beta": asked.beta, "segment": asked.segment, "seed": seed},
     }
     world = environment()
     world.close()
-    store = EpisodeStore.create_or_open(folder, world.spec, own, experiment.codec)
+    store = EpisodeStore.create_or_open(folder, world.spec, own, experiment.collect.codec)
     with policy_for_workers(experiment, checkpoint) as policy:
         assert policy is not None, "there is a checkpoint"
-        agent = partial(make_supervised, policy, experiment.make_expert(), asked["beta"], asked["segment"])
-        collect(store, environment, agent, asked["episodes"], experiment.cluster(), seed, keep_failures=True)
+        agent = partial(make_supervised, policy, experiment.make_expert(), asked.beta, asked.segment)
+        collect(store, environment, agent, asked.episodes, experiment.cluster(), seed, keep_failures=True)
     return EpisodeStore(folder)
 
 
 def _round(experiment: Experiment, checkpoint: Path, folder: Path, stores: Sequence[Path]) -> Experiment:
     """Return the training of a round: from the weights of the one before, on demonstrations and all rounds so far."""
-    steps, batches = experiment["improve"]["steps"], experiment["trainer"]["accumulate_grad_batches"]
-    more = [*(experiment["collect"]["more"] or ()), *map(str, stores)]
+    steps, batches = experiment.options(Rounds).steps, experiment.trainer["accumulate_grad_batches"]
+    more = [*(experiment.collect.more or ()), *map(str, stores)]
     return experiment.with_values(
         {
             "job": "train",

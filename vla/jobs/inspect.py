@@ -5,13 +5,11 @@ from __future__ import annotations
 import logging
 import os
 from pathlib import Path
-from typing import Annotated, Any
-
-from annotated_types import MinLen
+from typing import Any
 
 from vla.config.build import require_no_paths
-from vla.config.check import Job
 from vla.config.experiment import Experiment, make_environment
+from vla.config.nodes import Inspection
 from vla.data.derivation import derive_store
 from vla.data.episodes import EpisodeStore
 from vla.data.index import listed
@@ -19,49 +17,31 @@ from vla.data.verification import find_episode, require_whole, verify_store
 from vla.io.errors import UserError
 from vla.io.files import warn_on_error
 from vla.io.printable import show
-from vla.io.types import Natural, Text
 from vla.reports.dataset_card import store_table, write_card
 from vla.rollouts.rollout import replay
 
 log = logging.getLogger(__name__)
 
-JOB = Job(
-    (),
-    {
-        "folder": Text,
-        "stores": Annotated[list[Text], MinLen(1)] | None,
-        "where": dict[str, Any] | None,
-        "repair": bool,
-        "into": Text | None,
-        "episode": Natural | None,
-    },
-)
-
 
 def run(experiment: Experiment) -> None:
     """Verify and describe a store, after merging or repairing if asked for, or replay one episode."""
-    asked = dict(experiment["inspect"])
-    seed = asked.pop("episode")
-    if seed is None:
-        inspect_store(**asked)
+    wanted = experiment.options(Inspection)
+    if wanted.episode is None:
+        inspect_store(wanted)
     else:
-        if others := [name for name in ("stores", "where", "repair", "into") if asked[name]]:
+        if others := [name for name in ("stores", "where", "repair", "into") if getattr(wanted, name)]:
             raise UserError(f"inspect.episode replays an episode of inspect.folder: omit inspect.{others[0]}")
-        recorded = experiment["recorder"] is not None
-        replay_episode(experiment.output, Path(asked["folder"]), seed, experiment["task"].get("robot"), recorded)
+        robot, recorded = experiment.task.get("robot"), experiment["recorder"] is not None
+        replay_episode(experiment.output, Path(wanted.folder), wanted.episode, robot, recorded)
 
 
-def inspect_store(
-    folder: str, stores: list[str] | None, where: dict[str, Any] | None, repair: bool, into: str | None
-) -> None:
-    """Verify and describe the store in `folder`, or a new store made by merging, filtering or repair.
-
-    Args: see the node `inspect` of the config.
+def inspect_store(wanted: Inspection) -> None:
+    """Verify and describe a store, or a new one made by merging, filtering or repair.
 
     Raises:
         UserError: the store does not exist, cannot be made, or is damaged; its intact episodes are described first.
     """
-    findings = verify_store(EpisodeStore(_chosen(folder, stores, where, repair, into), damaged=True))
+    findings = verify_store(EpisodeStore(_chosen(wanted), damaged=True))
     show(store_table(findings))
     if findings.whole:
         with warn_on_error(findings.store.folder / "card.md"):  # a store may be read-only
@@ -69,20 +49,20 @@ def inspect_store(
     require_whole(findings)
 
 
-def _chosen(
-    folder: str, stores: list[str] | None, where: dict[str, Any] | None, repair: bool, into: str | None
-) -> Path:
+def _chosen(wanted: Inspection) -> Path:
     """Return the path of the store to inspect; make it if needed."""
-    if into is None and (stores or where):
-        raise UserError("inspect.stores and inspect.where make a new store: give its folder, inspect.into=DIR")
-    if into is None and not repair:
-        return Path(folder)
-    sources = [EpisodeStore(source, damaged=repair) for source in stores or [folder]]
-    if into is None and not verify_store(sources[0]).damaged:
-        log.info("nothing in %s is damaged, so nothing is repaired", folder)
-        return Path(folder)
-    new = Path(f"{Path(folder)}-repaired" if into is None else into)
-    damaged = derive_store(sources, new, where, repair)
+    folder = Path(wanted.folder)
+    if wanted.into is None:
+        if wanted.stores or wanted.where:
+            raise UserError("inspect.stores and inspect.where make a new store: give its folder, inspect.into=DIR")
+        if not wanted.repair:
+            return folder
+        if not verify_store(EpisodeStore(folder, damaged=True)).damaged:
+            log.info("nothing in %s is damaged, so nothing is repaired", folder)
+            return folder
+    sources = [EpisodeStore(source, damaged=wanted.repair) for source in wanted.stores or [folder]]
+    new = Path(wanted.into or f"{folder}-repaired")
+    damaged = derive_store(sources, new, wanted.where, wanted.repair)
     log.info("wrote %s; its sources are unchanged", new)
     if damaged:
         log.warning("%d damaged seeds now count as failed: %s", len(damaged), listed(damaged))

@@ -16,9 +16,8 @@ from vla.io.errors import UserError
 
 log = logging.getLogger(__name__)
 
-# Node with a key `compile` → key of the device for which it compiles.
-COMPILING = {"learner": "trainer.accelerator", "policy": "policy.device", "benchmark": "trainer.accelerator"}
-DEVICE_KEYS = {"trainer": "accelerator", "policy": "device"}  # config group → key of its device
+COMPILING = {"learner": "trainer", "policy": "policy"}  # group with a key `compile` → group of its device
+DEVICES = {"trainer": "accelerator", "policy": "device"}  # group → key of its device
 
 
 def has_bfloat16() -> bool:
@@ -34,11 +33,9 @@ def has_bfloat16() -> bool:
 
 def warn_of_bfloat16(config: Mapping[str, Any], groups: Container[str]) -> None:
     """Log a warning for every one of the config `groups` that selects bfloat16 on a CPU where it is slow."""
-    for group, device in DEVICE_KEYS.items():
-        node = config[group] if group in groups else None
-        if node is None or node.get("precision") != "bf16":
-            continue
-        if computes_on_cpu(node.get(device)) and not has_bfloat16():
+    for group, device in DEVICES.items():
+        node = (config[group] if group in groups else None) or {}
+        if node.get("precision") == "bf16" and computes_on_cpu(node.get(device)) and not has_bfloat16():
             log.warning(
                 "%s.precision=bf16 is slow here: this processor has no instructions for bfloat16 and multiplies "
                 "matrices about a hundred times faster in 32 bits, %s.precision=fp32",
@@ -54,33 +51,25 @@ def computes_on_cpu(device: str | None) -> bool:
 
 
 def require_compiler(config: Mapping[str, Any], groups: Container[str]) -> None:
-    """Refuse a config of which a job that builds `groups` compiles a model, where this machine cannot.
+    """Raise a UserError if a job that builds `groups` compiles a model, and this machine lacks compiler or headers.
 
     On a CPU PyTorch calls a C++ compiler, on a GPU Triton calls one of C, and both include the headers of Python.
-
-    Raises:
-        UserError: the compiler or the headers are missing.
     """
-    for name, device in COMPILING.items():
-        if _compiles(config, name, groups):
-            group, _, key = device.partition(".")
-            if missing := _missing(computes_on_cpu(config[group].get(key))):
-                off = "[false]" if name == "benchmark" else "false"
-                raise UserError(f"{name}.compile needs {missing}, or set {name}.compile={off}")
-
-
-def _compiles(config: Mapping[str, Any], name: str, groups: Container[str]) -> bool:
-    node = config.get(name) or {}
-    if name == "benchmark":
-        return config["job"] == name and "train" in node["names"] and any(node["compile"])
-    return name in groups and node.get("compile") is True
+    compiling = [
+        (name, "false") for name in COMPILING if name in groups and (config[name] or {}).get("compile") is True
+    ]
+    if "benchmark" in groups and "train" in config["benchmark"]["names"] and any(config["benchmark"]["compile"]):
+        compiling.append(("benchmark", "[false]"))
+    for name, off in compiling:
+        group = COMPILING.get(name, "trainer")
+        if missing := _missing(computes_on_cpu(config[group].get(DEVICES[group]))):
+            raise UserError(f"{name}.compile needs {missing}, or set {name}.compile={off}")
 
 
 def _missing(on_processor: bool) -> str:
     """Return what this machine lacks to compile, and how to get it; nothing if it can."""
-    on_mac = sys.platform == "darwin"
     if on_processor:
-        known = [os.environ.get("CXX", "clang++" if on_mac else "g++")]
+        known = [os.environ.get("CXX", "clang++" if sys.platform == "darwin" else "g++")]
         language, package = "C++", "g++"
     else:
         known = [os.environ["CC"]] if "CC" in os.environ else ["gcc", "clang"]

@@ -17,7 +17,6 @@ from vla.config.experiment import Experiment
 from vla.data.datamodule import digest_of, held_out
 from vla.data.episodes import EpisodeStore
 from vla.data.header import is_store
-from vla.data.index import Entry
 from vla.data.verification import episode_of
 from vla.io.errors import UserError
 from vla.io.files import warn_on_error, writing
@@ -29,7 +28,7 @@ from vla.reports.open_loop import components, errors_table, plot_errors, write_e
 from vla.reports.run_page import write_page
 from vla.rollouts.open_loop import OpenLoop, open_loop
 from vla.rollouts.rollout import close_agent
-from vla.runs.folder import ERRORS, ERRORS_PLOT, PAGE, save_config, wall_time
+from vla.runs.folder import ERRORS, ERRORS_PLOT, PAGE, described, save_config, wall_time
 
 log = logging.getLogger(__name__)
 
@@ -43,36 +42,25 @@ def evaluate_open_loop(experiment: Experiment, checkpoint: Path | None) -> float
         UserError: the checkpoint was trained on other episodes, or on all of them.
     """
     started, output = time.monotonic(), experiment.output
-    facts = {**experiment["chosen"], "origin": asdict(experiment.origin)}
-    fraction = experiment["data"]["validation_fraction"]
-    if checkpoint is not None:  # before an import
-        saved = read_policy(checkpoint)
-        trained, world = saved.spec.without_truth, experiment.world().spec.without_truth
-        trained.require(world, f"the checkpoint {checkpoint}", "the task, with the options given here,")
-        fraction = saved.config["data"]["validation_fraction"]
-    if not fraction:
-        whose = f"{checkpoint} was trained" if checkpoint else "a training would be"
-        raise UserError(
-            f"data.validation_fraction=0: {whose} on all episodes, and errors on these say nothing about others: train "
-            "with a larger fraction"
-        )
-    store = _store(experiment)
+    facts: dict[str, Any] = {**experiment.settings.chosen, "origin": asdict(experiment.origin)}
+    fraction = _held_out(experiment, checkpoint)  # before an import
+    folder = Path(experiment.collect.folder)
+    store = EpisodeStore(folder, experiment.collect.episodes) if is_store(folder) else demonstrations(experiment)
     if checkpoint is None:
         make_agent: Any = experiment.make_agent()
         policy = make_agent(experiment.world())
-        unseen = _held_out(store, fraction)
+        facts["model"] = facts["agent"]
     else:
         policy = experiment.make_policy(checkpoint)()
         policy.spec.without_truth.require(store.spec.without_truth, f"the checkpoint {checkpoint}", f"{store.folder}")
-        unseen = _unseen(store, [Path(folder) for folder in experiment["collect"]["more"] or ()], checkpoint)
+        _require_trained_on(store, experiment.collect.more or (), checkpoint)
         facts |= costs(policy)
     try:
-        result = _measure(experiment, store, unseen, policy)
+        result = _measure(experiment, store, fraction, policy)
     finally:
         close_agent(policy)
     seconds = time.monotonic() - started
-    facts |= {"wall_time_s": wall_time(checkpoint, seconds)} if checkpoint else {"wall_time_s": seconds}
-    facts |= {} if checkpoint else {"model": facts["agent"]}
+    facts["wall_time_s"] = wall_time(checkpoint, seconds) if checkpoint else seconds
     with writing(output / ERRORS):
         save_config(output, experiment.config, experiment.changes)
         with warn_on_error(output / ERRORS_PLOT):
@@ -84,26 +72,34 @@ def evaluate_open_loop(experiment: Experiment, checkpoint: Path | None) -> float
         with warn_on_error(output / PAGE):
             page = write_page(output)
     show(errors_table(components(result), len(result.seeds)))
-    written = [path for path in (page, output / ERRORS, output / ERRORS_PLOT) if path and path.is_file()]
-    names = ", ".join([str(written[0]), *(path.name for path in written[1:])])
-    log.info("wrote %s: open-loop errors, which are not a success rate", names)
+    files = described([page, output / ERRORS, output / ERRORS_PLOT])
+    log.info("wrote %s: open-loop errors, which are not a success rate", files)
     return -result.relative
 
 
-def _store(experiment: Experiment) -> EpisodeStore:
-    """Return the episodes, imported if there is no store of them."""
-    folder, episodes = Path(experiment["collect"]["folder"]), experiment["collect"]["episodes"]
-    if is_store(folder):
-        return EpisodeStore(folder, episodes)
-    return demonstrations(experiment)
+def _held_out(experiment: Experiment, checkpoint: Path | None) -> float:
+    """Return the share of episodes that training holds out, or held out; a UserError if there are none."""
+    fraction, whose = experiment.held_out, "a training would be"
+    if checkpoint is not None:
+        saved, whose = read_policy(checkpoint), f"{checkpoint} was trained"
+        trained, world = saved.spec.without_truth, experiment.world().spec.without_truth
+        trained.require(world, f"the checkpoint {checkpoint}", "the task, with the options given here,")
+        fraction = at(saved.config, "data.validation_fraction", None)
+        if not isinstance(fraction, float | int):
+            raise UserError(f"{checkpoint} does not say which share of the episodes its training held out")
+    if not fraction:
+        raise UserError(
+            f"data.validation_fraction=0: {whose} on all episodes, and errors on these say nothing about others: train "
+            "with a larger fraction"
+        )
+    return fraction
 
 
-def _unseen(store: EpisodeStore, more: Sequence[Path], checkpoint: Path) -> list[Entry]:
-    """Return the episodes of the store that the training of a checkpoint on it, and on `more` stores, held out."""
+def _require_trained_on(store: EpisodeStore, more: Sequence[str], checkpoint: Path) -> None:
+    """Raise a UserError unless a checkpoint was trained on the episodes of a store, and of `more` stores."""
     saved, entries = read_policy(checkpoint), store.episodes
-    if saved.training.windows != digest_of(
-        [*entries, *(entry for folder in more for entry in EpisodeStore(folder).episodes)]
-    ):
+    further = [entry for folder in more for entry in EpisodeStore(folder).episodes]
+    if saved.training.windows != digest_of([*entries, *further]):
         folders = " and those in ".join(map(str, [store.folder, *more]))
         raise UserError(
             f"{checkpoint} was trained on other episodes than the {len(entries)} in {folders}, so which of them were "
@@ -113,30 +109,23 @@ def _unseen(store: EpisodeStore, more: Sequence[Path], checkpoint: Path) -> list
         log.warning(
             "%s began with the weights of %s: whether these were trained on its episodes is unknown", checkpoint, origin
         )
-    fraction = at(saved.config, "data.validation_fraction", None)
-    if not isinstance(fraction, float | int):
-        raise UserError(f"{checkpoint} does not say which share of the episodes its training held out")
-    return _held_out(store, fraction)
 
 
-def _held_out(store: EpisodeStore, fraction: float) -> list[Entry]:
+def _measure(experiment: Experiment, store: EpisodeStore, fraction: float, policy: Any) -> OpenLoop:
+    """Return the errors on the held-out episodes; a UserError if there are none, or no others."""
     unseen = [entry for entry in store.episodes if held_out(entry.recording, fraction)]
+    seen = [entry for entry in store.episodes if not held_out(entry.recording, fraction)]
     if not unseen:
         raise UserError(
             f"data.validation_fraction={fraction} holds none of the {len(store.episodes)} episodes in {store.folder} "
             "out of training: train with a larger fraction, or with more episodes"
         )
-    return unseen
-
-
-def _measure(experiment: Experiment, store: EpisodeStore, unseen: list[Entry], policy: Any) -> OpenLoop:
-    actions, known = store.rows("action"), {entry.seed for entry in unseen}
-    seen = [actions[entry.span] for entry in store.episodes if entry.seed not in known]
     if not seen:
         raise UserError(
             f"all {len(unseen)} episodes in {store.folder} are held out, so there is no constant action to compare "
             "with: record more, or raise collect.episodes"
         )
-    shown = unseen[: experiment["evaluate"]["episodes"]]
-    episodes = (episode_of(store, entry) for entry in track(shown, "evaluating"))
-    return open_loop(policy, store.spec, episodes, np.concatenate(seen).mean(0))
+    actions = store.rows("action")
+    constant = np.concatenate([actions[entry.span] for entry in seen]).mean(0)
+    shown = unseen[: experiment.evaluate.episodes]
+    return open_loop(policy, store.spec, (episode_of(store, entry) for entry in track(shown, "evaluating")), constant)

@@ -5,16 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
-from typing import Annotated
 
-from annotated_types import Gt, Lt
 from rich.table import Table
 
-from vla.config.check import Job
 from vla.config.experiment import Experiment
+from vla.config.nodes import Power
 from vla.io.errors import UserError
 from vla.io.printable import show
-from vla.io.types import Share, Text
 from vla.reports.comparison import common_episodes, read_runs
 from vla.rollouts.comparison import compare_pairs, pairs_of
 from vla.rollouts.planning import (
@@ -30,36 +27,24 @@ from vla.rollouts.results import Result
 from vla.rollouts.sequential import decided_after
 from vla.spec import IN_DISTRIBUTION
 
-Between = Annotated[float, Gt(0), Lt(1)]
-
-JOB = Job(
-    (),
-    {
-        "rates": tuple[Between, Between],
-        "power": Between,
-        "discordant": Share | None,
-        "runs": tuple[Text, Text] | None,
-    },
-)
-
 
 def run(experiment: Experiment) -> None:
     """Print a table, with a row per way to compare."""
-    asked = experiment["plan"]
-    one, other = asked["rates"]
+    asked = experiment.options(Power)
+    one, other = asked.rates
     if one == other:
-        raise UserError(f"plan.rates={asked['rates']} are equal: no number of episodes tells them apart")
-    if asked["runs"] and asked["discordant"] is not None:
+        raise UserError(f"plan.rates={asked.rates} are equal: no number of episodes tells them apart")
+    if asked.runs and asked.discordant is not None:
         raise UserError("plan.discordant is measured on plan.runs: omit one of the two")
-    common = _common(asked["runs"]) if asked["runs"] else []
-    share = sum(one.success != two.success for one, two in common) / len(common) if common else asked["discordant"]
-    show(plan_table(one, other, asked["power"], share))
+    common = _common(asked.runs) if asked.runs else []
+    share = sum(one.success != two.success for one, two in common) / len(common) if common else asked.discordant
+    show(plan_table(one, other, asked.power, share))
     show(
         "All numbers are exact; those with early stopping are for the same power. evaluate.until=decided also stops "
         "when two policies differ by less than evaluate.margin: set that below the difference."
     )
     if common:
-        show(_replayed(common, experiment["evaluate"]["margin"]))
+        show(_replayed(common, experiment.evaluate.margin))
 
 
 def plan_table(one: float, other: float, power: float, discordant: float | None) -> Table:

@@ -7,23 +7,20 @@ from contextlib import closing
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from vla.config.check import Job
 from vla.config.experiment import Experiment
+from vla.config.nodes import Preview
 from vla.io.files import writing
 from vla.io.printable import show
-from vla.io.types import Count, Seed
 from vla.reports.observations import draws_table, save_contact_sheet
 from vla.rollouts.rollout import close_agent, rollout
 
 log = logging.getLogger(__name__)
 
-JOB = Job(("task", "expert", "recorder"), {"episodes": Count, "seed": Seed})
-
 
 def run(experiment: Experiment) -> None:
     """Roll out the expert on a few seeds; write contact sheet and, with a recorder, recording; print the draws."""
-    output, asked = experiment.output, experiment["preview"]
-    seeds, written = range(asked["seed"], asked["seed"] + asked["episodes"]), [output / "preview.png"]
+    output, shown = experiment.output, experiment.options(Preview)
+    seeds, written = range(shown.seed, shown.seed + shown.episodes), [output / "preview.png"]
     with (
         writing(output / "preview.rrd"),
         TemporaryDirectory(prefix=".recordings-", dir=output) as folder,

@@ -5,27 +5,24 @@ from __future__ import annotations
 import logging
 from pathlib import Path
 
-from vla.config.check import Job
 from vla.config.experiment import Experiment
+from vla.config.nodes import ReportedRuns
 from vla.io.printable import show
-from vla.io.types import Text
 from vla.reports.comparison import compare_runs, differences_table, read_runs, remarks, rows_of, secondary_differences
 from vla.reports.comparison_page import COMPARISON, write_comparison
 
 log = logging.getLogger(__name__)
 
-JOB = Job((), {"runs": list[Text]})
-
 
 def run(experiment: Experiment) -> None:
     """Write `comparison.html`, and print how the runs differ."""
-    runs = read_runs([Path(folder) for folder in experiment["report"]["runs"]])
-    compared = compare_runs(runs, experiment["evaluate"]["margin"])
+    runs = read_runs([Path(folder) for folder in experiment.options(ReportedRuns).runs])
+    compared = compare_runs(runs, experiment.evaluate.margin)
     for table in (differences_table(compared), secondary_differences(compared)):
         if table.rows:
             show(table)
     for remark, about in (found := remarks(runs, compared)).items():
         log.info("%s: %s", remark, about)
     title = f"{len(runs)} runs" if len(runs) > 1 else next(iter(runs))
-    page = Path(experiment["output"]) / COMPARISON
+    page = Path(experiment.settings.output) / COMPARISON
     log.info("wrote %s", write_comparison(page, title, rows_of(runs), compared, found))

@@ -13,8 +13,6 @@ from hydra.types import RunMode
 from omegaconf import DictConfig
 
 from vla.io.printable import show
-from vla.runs.cells import FAILURE, OVERRIDES, cells
-from vla.runs.sweep import read_rows
 
 
 class SweepTable(Callback):
@@ -22,11 +20,16 @@ class SweepTable(Callback):
 
     def on_job_start(self, config: DictConfig, **kwargs: Any) -> None:
         """Remove an earlier error of the cell."""
-        (Path(config.hydra.runtime.output_dir) / FAILURE).unlink(missing_ok=True)
+        if config.hydra.mode == RunMode.MULTIRUN:
+            from vla.runs.sweep import FAILURE  # imports libraries, as below
+
+            (Path(config.hydra.runtime.output_dir) / FAILURE).unlink(missing_ok=True)
 
     def on_job_end(self, config: DictConfig, job_return: JobReturn, **kwargs: Any) -> None:
         """Write the table of all cells that have a report."""
         if config.hydra.mode == RunMode.MULTIRUN:
+            from vla.runs.sweep import FAILURE
+
             if job_return.status == JobStatus.COMPLETED:  # from a concurrent sweep in this folder
                 (Path(config.hydra.runtime.output_dir) / FAILURE).unlink(missing_ok=True)
             from vla.reports.sweep import tabulate  # imports matplotlib
@@ -38,6 +41,7 @@ class SweepTable(Callback):
     def on_multirun_end(self, config: DictConfig, **kwargs: Any) -> None:
         """Print the table of the sweep, and name its page; end the process with an error if there are no cells."""
         from vla.reports.comparison_page import SWEEP, results_table  # imports matplotlib
+        from vla.runs.sweep import OVERRIDES, cells, read_rows
 
         folder = Path(config.hydra.sweep.dir)
         if not (folder.is_dir() and cells(folder, OVERRIDES)):

@@ -13,10 +13,9 @@ import lightning
 import torch
 from lightning import Callback, LightningModule, Trainer
 
-from vla.config.check import TRAINING, Job
 from vla.config.experiment import Experiment, training_policy
-from vla.config.origin import Origin
 from vla.config.packages import remember_trust
+from vla.data.datamodule import WindowDataModule
 from vla.data.episodes import EpisodeStore
 from vla.io.errors import UserError
 from vla.io.files import atomic_path, warn_on_error, writing
@@ -40,15 +39,13 @@ from vla.runs.folder import (
     save_config,
     save_training,
 )
-from vla.runs.resume import LENGTHS, TrainingProgress, first_process, training_lock, training_progress
-from vla.spec import Array
+from vla.runs.resume import LENGTHS, first_process, training_lock, training_progress
 from vla.training.checkpoints import GracefulStop
 from vla.training.closed_loop import ClosedLoop
 from vla.training.trainer import explain_memory_errors, make_trainer, quiet_lightning, restore_metrics
 
 log = logging.getLogger(__name__)
 
-JOB = Job(TRAINING, stored=("task", "expert"))
 COARSE = 0.02  # mean error of actions as tokens, as a share of their range, of which is warned
 
 
@@ -65,25 +62,20 @@ def train(experiment: Experiment) -> Path | None:
     Raises:
         UserError: the output folder has another training, or this one cannot start.
     """
-    state = training_progress(experiment.output, experiment.config)
+    output = experiment.output
+    state = training_progress(output, experiment.config)
     if state.chosen is not None:
         return state.chosen if first_process() else None
     quiet_lightning()
-    output = experiment.output
-    checkpoints = output / CHECKPOINTS
-    graceful_stop = GracefulStop(checkpoints)
-    closed_loop = _closed_loop(experiment)
-    if _endless(experiment):
-        log.info("trainer.max_steps=-1: training runs until interrupted; Ctrl-C saves and stops")
-    if experiment["trainer"]["max_steps"] in (None, -1) and experiment["learner"]["schedule"] == "cosine":
-        log.warning("without trainer.max_steps learner.schedule=cosine has no end: the learning rate stays at its peak")
-    with closed_loop or nullcontext(), training_lock(checkpoints):
+    graceful_stop, closed_loop = GracefulStop(output / CHECKPOINTS), _closed_loop(experiment)
+    _warn_of_endless(experiment)
+    with closed_loop or nullcontext(), training_lock(output / CHECKPOINTS):
         # Before collection, so that missing devices are reported early.
         callbacks = [_Begun(experiment), *([closed_loop] if closed_loop else []), graceful_stop]
-        trainer = make_trainer(experiment.config, checkpoints, *callbacks)
+        trainer = make_trainer(experiment.config, output / CHECKPOINTS, *callbacks)
         if not trainer.is_global_zero:
             logging.getLogger("vla").setLevel(logging.WARNING)  # only the first process logs
-        _fit(experiment, state, trainer, graceful_stop)
+        _fit(experiment, state.resume_from, trainer, graceful_stop)
         if torch.distributed.is_available() and torch.distributed.is_initialized():
             torch.distributed.destroy_process_group()  # together: at their exit the others would wait for the first one
         if not trainer.is_global_zero:
@@ -92,23 +84,43 @@ def train(experiment: Experiment) -> Path | None:
     return output / POLICY
 
 
-def _fit(experiment: Experiment, state: TrainingProgress, trainer: Trainer, graceful_stop: GracefulStop) -> None:
-    """Collect missing demonstrations, train on them, and write the policy."""
-    more = [EpisodeStore(folder) for folder in experiment["collect"]["more"] or ()]
-    output, origin = experiment.output, None if state.resume_from else experiment.pretrained
-    lightning.seed_everything(experiment["seed"], verbose=False)
-    with explain_memory_errors(experiment.config), graceful_stop.explaining_restore(state.resume_from):
-        spec, last = demonstration_spec(experiment), state.resume_from
-        learner = experiment.resumed_learner(spec, last) if last else experiment.learner(spec, origin)
-    store = demonstrations(experiment)
+def _fit(experiment: Experiment, last: Path | None, trainer: Trainer, graceful_stop: GracefulStop) -> None:
+    """Collect missing demonstrations, train on them, from a `last` checkpoint if there is one, and write the policy."""
+    more = [EpisodeStore(folder) for folder in experiment.collect.more or ()]
+    output, origin = experiment.output, None if last else experiment.pretrained
+    lightning.seed_everything(experiment.settings.seed, verbose=False)
+    with explain_memory_errors(experiment.config), graceful_stop.explaining_restore(last):
+        spec = demonstration_spec(experiment)
+        learner = experiment.learner(spec, origin, last)
+    store, model = demonstrations(experiment), learner.model
     if origin is last is None:
-        experiment.fit_tokenizer(learner.model.tokenizer, store)
-    model = learner.model
+        experiment.fit_tokenizer(model.tokenizer, store)
+    _warn_of_tokenization(model, [store, *(each for each in more if each.episodes)])
+    data = _windows(experiment, store, model, trainer)
+    if last:
+        restore_metrics(trainer, last)
+    else:
+        save_config(output, experiment.config, experiment.changes)  # also of a training that fails at its start
+    with writing(output), _reported(experiment, trainer, graceful_stop, learner, store, last is not None):
+        try:
+            with (
+                explain_memory_errors(experiment.config),
+                graceful_stop.explaining_restore(last),
+                graceful_stop.handling_signals(),
+            ):
+                trainer.fit(learner, datamodule=data, ckpt_path=last, weights_only=True)
+        except SystemExit:  # on SIGTERM Lightning exits with status 0
+            if not graceful_stop.requested:
+                raise
+        if not graceful_stop.stopped:
+            _save(trainer, output)
+        if graceful_stop.requested and trainer.is_global_zero:
+            raise KeyboardInterrupt
+
+
+def _windows(experiment: Experiment, store: EpisodeStore, model: Model, trainer: Trainer) -> WindowDataModule:
+    """Return the windows of a store for a model, and draw some; a UserError if there are less than a batch."""
     data = experiment.data(store, model.history, model.chunk, model.text.tokenize)
-    _warn_of_rounding(model, store)
-    for further in more:
-        if further.episodes:
-            _warn_of_clipped(model, further, further.statistics.chunks(model.chunk))
     data.setup()
     if data.batch_size > len(data.training_windows):
         raise UserError(
@@ -117,33 +129,13 @@ def _fit(experiment: Experiment, state: TrainingProgress, trainer: Trainer, grac
         )
     if not len(data.held_out_windows):
         trainer.limit_val_batches = 0  # else callbacks wait for a validation that never runs
-        if experiment["validate"]["episodes"]:
+        if experiment.validate.episodes:
             log.warning(
                 "data.validation_fraction=0: no validation, so no episodes are played, and the last weights are used"
             )
-    with warn_on_error(output / SAMPLES):
-        draw_samples(data.make_batch(data.order(0)[:SHOWN]), store.spec, output / SAMPLES)
-    if state.resume_from:
-        restore_metrics(trainer, state.resume_from)
-    collection_s = collection_time(store, experiment["collect"]["episodes"])
-    if not state.resume_from:
-        save_config(output, experiment.config, experiment.changes)  # also of a training that fails at its start
-    origins = _origins(experiment, state)
-    with writing(output), _reported(experiment, trainer, graceful_stop, learner, collection_s, origins):
-        try:
-            with (
-                explain_memory_errors(experiment.config),
-                graceful_stop.explaining_restore(state.resume_from),
-                graceful_stop.handling_signals(),
-            ):
-                trainer.fit(learner, datamodule=data, ckpt_path=state.resume_from, weights_only=True)
-        except SystemExit:  # on SIGTERM Lightning exits with status 0
-            if not graceful_stop.requested:
-                raise
-        if not graceful_stop.stopped:
-            _save(trainer, output)
-        if graceful_stop.requested and trainer.is_global_zero:
-            raise KeyboardInterrupt
+    with warn_on_error(experiment.output / SAMPLES):
+        draw_samples(data.make_batch(data.order(0)[:SHOWN]), store.spec, experiment.output / SAMPLES)
+    return data
 
 
 def _save(trainer: Trainer, output: Path) -> None:
@@ -173,49 +165,40 @@ class _Begun(Callback):
             remember_trust(self._experiment.output)
 
 
-def _endless(experiment: Experiment) -> bool:
-    return all(experiment["trainer"].get(name) in (None, -1) for name in LENGTHS)
+def _warn_of_endless(experiment: Experiment) -> None:
+    trainer = experiment.trainer
+    if all(trainer.get(name) in (None, -1) for name in LENGTHS):
+        log.info("trainer.max_steps=-1: training runs until interrupted; Ctrl-C saves and stops")
+    if trainer["max_steps"] in (None, -1) and experiment["learner"]["schedule"] == "cosine":
+        log.warning("without trainer.max_steps learner.schedule=cosine has no end: the learning rate stays at its peak")
 
 
-def _warn_of_rounding(model: Model, store: EpisodeStore) -> None:
-    """Warn of actions that lose much as tokens, or are beyond the tokenizer's bounds."""
-    chunks = store.statistics.chunks(model.chunk)
-    if model.uses_tokens:
-        component, lost = rounding(model.tokenizer, chunks, store.spec)
-        if lost > COARSE:
-            log.warning(
-                "as tokens, the demonstrated actions lose %.1f %% of the range of %s on average: tokenizer=uniform and "
-                "more tokenizer.bins are finer",
-                100 * lost,
-                component,
-            )
-    _warn_of_clipped(model, store, chunks)
-
-
-def _warn_of_clipped(model: Model, store: EpisodeStore, chunks: Array) -> None:
-    """Log the share of `chunks` of a store beyond the tokenizer's bounds, to which they are clipped."""
-    if outside := out_of_bounds(model.tokenizer, chunks):
-        where = f"{100 * outside:.2g} % of the demonstrated actions in {store.folder}"
-        log.warning("%s exceed the bounds of the tokenizer, to which they are clipped", where)
+def _warn_of_tokenization(model: Model, stores: list[EpisodeStore]) -> None:
+    """Warn of actions that lose much as tokens, in the first store, or are beyond the tokenizer's bounds, in each."""
+    for store in stores:
+        chunks = store.statistics.chunks(model.chunk)
+        if model.uses_tokens and store is stores[0]:
+            component, lost = rounding(model.tokenizer, chunks, store.spec)
+            if lost > COARSE:
+                finer = "tokenizer=uniform and more tokenizer.bins are finer"
+                text = "as tokens, the demonstrated actions lose %.1f %% of the range of %s on average: %s"
+                log.warning(text, 100 * lost, component, finer)
+        if outside := out_of_bounds(model.tokenizer, chunks):
+            where = f"{100 * outside:.2g} % of the demonstrated actions in {store.folder}"
+            log.warning("%s exceed the bounds of the tokenizer, to which they are clipped", where)
 
 
 def _closed_loop(experiment: Experiment) -> ClosedLoop | None:
     """Return the callback that plays episodes in every validation, or None without episodes."""
-    asked = experiment["validate"]
-    seeds = range(asked["seed"], asked["seed"] + asked["episodes"])
-    if seeds and not experiment.playable:
+    seeds = experiment.validate.seeds
+    if not seeds:
+        return None
+    if not experiment.playable:
         raise UserError(f"validate.episodes={len(seeds)}: nothing can be played in a recording: set it to 0")
-    make_environment = experiment.make_environment(asked["changes"])
+    make_environment = experiment.make_environment(experiment.validate.changes)
     make_policy = partial(training_policy, experiment["policy"].get("precision", "fp32"))
     workers = experiment["cluster"].get("workers") or cores()
-    return ClosedLoop(make_environment, make_policy, seeds, experiment.output, workers) if seeds else None
-
-
-def _origins(experiment: Experiment, state: TrainingProgress) -> list[Origin]:
-    """Return the origins of a training: of its beginning, and of what continued it."""
-    before = read_training(experiment.output) if state.resume_from else None
-    earlier = before.origins if before else []
-    return earlier if experiment.origin in earlier else [*earlier, experiment.origin]
+    return ClosedLoop(make_environment, make_policy, seeds, experiment.output, workers)
 
 
 @contextmanager
@@ -224,30 +207,28 @@ def _reported(
     trainer: Trainer,
     graceful_stop: GracefulStop,
     learner: Learner,
-    collection_s: float | None,
-    origins: list[Origin],
+    store: EpisodeStore,
+    resumed: bool,
 ) -> Iterator[None]:
     """Write the report page and the log summary however training ends, including the runs it resumed from."""
-    output = experiment.output
+    output, before, ended = experiment.output, read_training(experiment.output), "done"
+    origins = before.origins if before and resumed else []
+    origins = origins if experiment.origin in origins else [*origins, experiment.origin]  # of its beginning, and later
     parameters = sum(parameter.numel() for parameter in learner.model.parameters())
-    start = f", starting from {experiment['pretrained']}" if experiment["pretrained"] else ""
+    start = f", starting from {origin}" if (origin := experiment.settings.pretrained) else ""
     log.info("training %s with %.2f M parameters%s", type(learner.model).__name__, parameters / 1e6, start)
-    ended = "done"
+    collected = collection_time(store, experiment.collect.episodes)
     try:
         yield
     except BaseException as error:
         ended = "interrupted" if isinstance(error, KeyboardInterrupt) else str(error) or type(error).__name__
         raise
     finally:
-        seconds = graceful_stop.seconds
         # A training that cannot be resumed stays as it was. One that was interrupted after its last step has nothing
         # to do, and does not start.
-        if trainer.is_global_zero and (
-            graceful_stop.started or (saved := read_training(output)) is None or ended == "done" != saved.ended
-        ):
-            collected = collection_s and round(collection_s, 1)
-            size = parameters, trainer.global_step, round(seconds, 1)
-            save_training(output, Training(*size, ended, collected, origins=origins))
+        if trainer.is_global_zero and (graceful_stop.started or before is None or ended == "done" != before.ended):
+            size = parameters, trainer.global_step, round(graceful_stop.seconds, 1)
+            save_training(output, Training(*size, ended, collected and round(collected, 1), origins=origins))
             with warn_on_error(output / PAGE):
                 write_page(output)
-    log.info("trained %d steps in %.0f s", trainer.global_step, seconds)
+    log.info("trained %d steps in %.0f s", trainer.global_step, graceful_stop.seconds)

@@ -130,7 +130,7 @@ def policy_folder(name: str | Path) -> Path:
     if path.is_dir():
         best = f"; the best so far is {path / BEST}" if (path / BEST).exists() else ""
         raise UserError(f"{path} is neither a policy nor a run with one, there is no {path / POLICY / SPEC}{best}")
-    raise UserError(f"there is no policy {path}: name a run, as in outputs/runs/…, its folder {POLICY}, or {HUB}…")
+    raise UserError(f"there is no policy '{path}': name a run, as in outputs/runs/…, its folder {POLICY}, or {HUB}…")
 
 
 def is_gone(name: str) -> bool:

@@ -8,8 +8,8 @@ from itertools import combinations
 from pathlib import Path
 from typing import Any
 
-from vla.config.check import conditions, with_changes
 from vla.config.differences import at
+from vla.config.nodes import conditions, with_changes
 from vla.io.errors import UserError
 from vla.reports.result_tables import secondary_table
 from vla.reports.tables import DIFFERENCE, Table, difference
@@ -183,6 +183,5 @@ def _scenes(run: Run, condition: str) -> tuple[Any, ...]:
 
 def _changes(run: Run, condition: str) -> dict[str, Any] | None:
     """Return what a condition changes in the task; None if it is another agent's, or unknown."""
-    asked = at(run.report.config if run.report else {}, "evaluate", {})
-    absent = {"conditions": {}, "one_by_one": {}, "without": [], "nearest": None, "networks": {}}
-    return conditions({**absent, **asked}).get(condition)
+    evaluate = at(run.report.config if run.report else {}, "evaluate", {})
+    return conditions(evaluate.get("conditions", {}), evaluate.get("one_by_one", {})).get(condition)

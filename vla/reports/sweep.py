@@ -10,8 +10,7 @@ from vla.io.files import atomic_path, warn_on_error, write_text
 from vla.reports.comparison import compare_rows, differences_table, remarks
 from vla.reports.comparison_page import SWEEP, results_table, success_panels, write_comparison
 from vla.reports.pictures import save
-from vla.runs.cells import failures
-from vla.runs.sweep import SweepRow, read_rows
+from vla.runs.sweep import SweepRow, failures, read_rows
 
 
 def tabulate(folder: Path) -> list[SweepRow]:

@@ -10,9 +10,10 @@ from typing import Annotated, Any
 
 from pydantic import AfterValidator
 
-from vla.config.annotations import describe, matches
-from vla.config.check import PLAIN
+from vla.config.annotations import mismatch
+from vla.config.build import arguments
 from vla.config.differences import ABSENT, at
+from vla.config.nodes import Evaluation
 from vla.config.origin import Origin
 from vla.io.documents import LENIENT, STRICT
 from vla.io.errors import UserError
@@ -26,14 +27,14 @@ Node = dict[str, Any]
 # What reports read of a config, key → type; everything else is only shown.
 READ: dict[str, Any] = {"task": dict[str, object], "task.tiers": dict[str, list[str]] | None}
 READ |= {"evaluate": dict[str, object]}
-READ |= {f"evaluate.{name}": kind for name, kind in PLAIN["evaluate"].items()}
+READ |= {f"evaluate.{name}": each.annotation for name, each in arguments(Evaluation).items()}
 
 
 def readable_config(config: Node) -> Node:
     """Return a config that reports can read; a UserError if one of its values is none of this project."""
     for key, kind in READ.items():
-        if (value := at(config, key)) != ABSENT and not matches(value, kind):
-            raise UserError(f"config.{key} is not {describe(kind)}")
+        if (value := at(config, key)) != ABSENT and (wrong := mismatch(f"config.{key}", value, kind)):
+            raise UserError(wrong)
     return config
 
 

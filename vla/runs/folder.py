@@ -7,7 +7,7 @@ import io
 import json
 import logging
 import shutil
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
@@ -77,11 +77,7 @@ class Run:
 
 
 def read_run(folder: Path) -> Run:
-    """Read a run's folder; every file is optional.
-
-    Raises:
-        UserError: a file is damaged.
-    """
+    """Read a run's folder; every file is optional, and a UserError names one that is damaged."""
     report, errors = read_report(folder), _read(folder / ERRORS, partial(read_json, kind=ErrorsFile), None)
     evaluated = report or errors
     config = _read(folder / CONFIG, partial(read_yaml, kind=Node), evaluated.config if evaluated else {})
@@ -101,12 +97,7 @@ def read_training(folder: Path) -> Training | None:
 
 
 def archive_evaluation(folder: Path, number: int) -> None:
-    """Archive the evaluation in a run's folder as `evaluation_NUMBER`, because further training changes the policy.
-
-    Args:
-        folder: of the run.
-        number: steps, or rounds, after which the policy was evaluated.
-    """
+    """Archive the evaluation after `number` steps, or rounds, because further training changes the policy."""
     names = (REPORT, ERRORS, PLOT, SUITE, ERRORS_PLOT, RECORDING, RECORDINGS)
     if files := [file for name in names if (file := folder / name).exists()]:
         target = folder / f"evaluation_{number}"
@@ -121,9 +112,7 @@ def archive_evaluation(folder: Path, number: int) -> None:
 def wall_time(policy: Path, evaluation: float) -> float | None:
     """Return the wall time of collection, training and evaluation of a policy [s], or None if unknown.
 
-    Args:
-        policy: its folder, in that of the run that trained it.
-        evaluation: duration of the evaluation [s].
+    `policy` is its folder, in that of the run that trained it, and `evaluation` the duration of the last part [s].
     """
     try:
         training = read_training(policy.resolve().parent)
@@ -136,11 +125,7 @@ def wall_time(policy: Path, evaluation: float) -> float | None:
 
 
 def require_run(folder: Path) -> Run:
-    """Read a run's folder that has a report, errors of an open-loop evaluation, or metrics.
-
-    Raises:
-        UserError: the folder has none of them, or a file is damaged.
-    """
+    """Read a run's folder; a UserError if it has no report, errors of an open-loop evaluation, or metrics."""
     if not any((folder / name).is_file() for name in (REPORT, ERRORS, METRICS)):
         raise UserError(f"{folder} is no run: it has none of {REPORT}, {ERRORS} and {METRICS}")
     return read_run(folder)
@@ -150,6 +135,12 @@ def save_config(folder: Path, config: Mapping[str, Any], changes: list[Node]) ->
     """Save the resolved config and its differences from the default."""
     for name, content in ((CONFIG, config), (CHANGES, changes)):
         write_text(folder / name, yaml.safe_dump(content, sort_keys=False, allow_unicode=True, width=120))
+
+
+def described(files: Sequence[Path | None]) -> str:
+    """List those files of a folder that are there."""
+    first, *others = [file for file in files if file and file.is_file()]
+    return ", ".join([str(first), *(file.name for file in others)])
 
 
 def save_training(folder: Path, training: Training) -> None:

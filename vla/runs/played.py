@@ -1,18 +1,19 @@
-"""Results of an unfinished evaluation, written episode by episode, so that an interrupted evaluation continues."""
+"""Results of an evaluation as they are played; what an interrupted one left is not played again."""
 
 from __future__ import annotations
 
 import json
 import logging
 import time
+from collections import defaultdict
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 from types import TracebackType
-from typing import Any
+from typing import Any, cast
 
 from vla.config.differences import differences
-from vla.io.documents import STRICT, parse_json, read_bounded
+from vla.io.documents import parse_json, read_bounded
 from vla.io.files import write_text, writing
 from vla.rollouts.results import Result
 
@@ -21,40 +22,11 @@ LARGEST = 4 << 30  # of that file [bytes], millions of episodes
 
 log = logging.getLogger(__name__)
 
-
-@dataclass(frozen=True)
-class _Evaluation:
-    """First line of the file: the inputs that determine the episodes."""
-
-    __pydantic_config__ = STRICT
-
-    changed_ns: dict[str, int | None]  # file or folder of the policy → time of its last change; None: there is none
-    config: dict[str, Any]
-    versions: dict[str, str]
-
-    def continues(self, other: _Evaluation) -> bool:
-        """Return whether both play the same episodes."""
-        mine, theirs = ((each.changed_ns, each.versions) for each in (self, other))
-        return mine == theirs and not differences(self.config, other.config)
-
-
-@dataclass(frozen=True)
-class _Episode:
-    """Any other line."""
-
-    __pydantic_config__ = STRICT
-
-    condition: str
-    seconds: float  # of the evaluation so far [s]
-    result: Result
+Episode = tuple[str, float, Result]  # condition, duration of the evaluation so far [s], result
 
 
 class Played:
-    """Results that an evaluation has so far, as a context manager which removes their file at the end.
-
-    If the evaluation is interrupted, or its report cannot be written, the file stays; the same evaluation in the same
-    folder then starts with its results.
-    """
+    """Results so far, in a file that is removed at the end of this context, but stays after an error."""
 
     def __init__(
         self, folder: Path, sources: Sequence[Path], config: Mapping[str, Any], versions: dict[str, str]
@@ -70,16 +42,34 @@ class Played:
         Raises:
             OSError: the file cannot be written.
         """
-        evaluation = _Evaluation({str(path): _changed_ns(path) for path in sources}, dict(config), versions)
         self._path = folder / PLAYED
-        episodes = _read(self._path, evaluation)
-        self._started = time.monotonic() - max((each.seconds for each in episodes), default=0.0)
-        self._results: dict[str, dict[int, Result]] = {}
-        for each in episodes:
-            self.of(each.condition)[each.result.seed] = each.result
+        # First line of the file: what determines the episodes.
+        head = {"changed_ns": {str(path): _changed_ns(path) for path in sources}, "versions": versions}
+        episodes = self._read(head, config)
+        self._started = time.monotonic() - max((seconds for _, seconds, _ in episodes), default=0.0)
+        self._results = defaultdict[str, dict[int, Result]](dict)
+        for condition, _, result in episodes:
+            self._results[condition][result.seed] = result
         if episodes:
             log.info("%s: already played, %d in all", self._path, len(self))
-        write_text(self._path, "".join(map(_line, (evaluation, *episodes))))
+        lines = [(condition, seconds, asdict(result)) for condition, seconds, result in episodes]
+        write_text(self._path, "".join(map(_line, ({**head, "config": config}, *lines))))
+
+    def _read(self, head: Mapping[str, Any], config: Mapping[str, Any]) -> list[Episode]:
+        """Return the episodes in the file, up to the first damaged line, if they are of this evaluation."""
+        if not self._path.is_file():
+            return []
+        first, *lines = read_bounded(self._path, LARGEST).splitlines() or [b""]
+        found = list[Episode]()
+        try:
+            saved = parse_json(first, dict[str, Any], str(self._path))
+            if differences(saved.pop("config", {}), config) or saved != head:
+                log.info("%s is of another evaluation, which this one replaces", self._path)
+                return []
+            found.extend(parse_json(line, cast(type[Episode], Episode), str(self._path)) for line in lines)
+        except ValueError as error:  # a process that was killed while it wrote
+            log.warning("%s; the episodes from there on are played again", error)
+        return found
 
     def __enter__(self) -> Played:
         """Return itself."""
@@ -92,12 +82,8 @@ class Played:
         if kind is None or not len(self):
             self._path.unlink(missing_ok=True)
         else:
-            log.info(
-                "%s keeps what was played, %d in all: the same command with output=%s continues",
-                self._path,
-                len(self),
-                self._path.parent,
-            )
+            again = "%s keeps what was played, %d in all: the same command with output=%s continues"
+            log.info(again, self._path, len(self), self._path.parent)
 
     def __len__(self) -> int:
         """Return the number of results under all conditions."""
@@ -110,17 +96,13 @@ class Played:
 
     def of(self, condition: str) -> dict[int, Result]:
         """Return seed → result of the episodes played under a condition."""
-        return self._results.setdefault(condition, {})
+        return self._results[condition]
 
     def add(self, condition: str, result: Result) -> None:
-        """Write the result of another episode.
-
-        Raises:
-            OSError: the file cannot be written.
-        """
+        """Write the result of another episode; an OSError if the file cannot be written."""
         with writing(self._path), self._path.open("a", encoding="utf-8") as file:
-            file.write(_line(_Episode(condition, self.seconds, result)))
-        self.of(condition)[result.seed] = result
+            file.write(_line((condition, self.seconds, asdict(result))))
+        self._results[condition][result.seed] = result
 
 
 def _changed_ns(path: Path) -> int | None:
@@ -129,22 +111,5 @@ def _changed_ns(path: Path) -> int | None:
     return max((file.stat().st_mtime_ns for file in files if file.exists()), default=None)
 
 
-def _line(content: _Evaluation | _Episode) -> str:
-    return json.dumps(asdict(content), allow_nan=False, ensure_ascii=False) + "\n"
-
-
-def _read(path: Path, evaluation: _Evaluation) -> list[_Episode]:
-    """Return the episodes in a file, up to the first damaged line, if they are of this evaluation."""
-    if not path.is_file():
-        return []
-    head, *lines = read_bounded(path, LARGEST).splitlines() or [b""]
-    found = list[_Episode]()
-    try:
-        if not parse_json(head, _Evaluation, str(path)).continues(evaluation):
-            log.info("%s is of another evaluation, which this one replaces", path)
-            return []
-        for line in lines:
-            found.append(parse_json(line, _Episode, str(path)))
-    except ValueError as error:  # a process that was killed while it wrote
-        log.warning("%s; the episodes from there on are played again", error)
-    return found
+def _line(content: Any) -> str:
+    return json.dumps(content, allow_nan=False, ensure_ascii=False) + "\n"

@@ -39,11 +39,7 @@ class TrainingProgress:
 
 
 def training_progress(folder: Path, config: Mapping[str, Any]) -> TrainingProgress:
-    """Return the progress of the training that `config` describes in a run's folder.
-
-    Raises:
-        UserError: the folder holds another training, or one that `config` cannot continue.
-    """
+    """Return the progress of the training that `config` describes in a folder; a UserError if it holds another one."""
     last = folder / CHECKPOINTS / LAST
     if not last.exists():
         return TrainingProgress()
@@ -82,12 +78,9 @@ def cached_success(folder: Path, config: Mapping[str, Any], checkpoint: Path) ->
 
 
 def interrupted_run(runs: Path) -> Path:
-    """Return the newest unfinished run in a folder, found once per command.
+    """Return the newest unfinished run in a folder, found once per command; a UserError if there is none.
 
     The first process passes the result to the processes that a trainer starts, because it locks that run.
-
-    Raises:
-        UserError: there is no unfinished run.
     """
     started = os.environ.get("SLURM_STEP_NUM_TASKS", os.environ.get("TORCHELASTIC_RUN_ID") and os.environ["WORLD_SIZE"])
     if int(started or 1) > 1:
@@ -125,10 +118,9 @@ def _unfinished(run: Path) -> bool:
 
 @contextmanager
 def training_lock(folder: Path) -> Iterator[None]:
-    """Lock a folder of checkpoints, or of rounds, against other processes; only the first of a training takes the lock.
+    """Lock a folder of checkpoints, or of rounds; a UserError if another process holds the lock.
 
-    Raises:
-        UserError: another process holds the lock.
+    Only the first process of a training takes it.
     """
     if not first_process():
         yield

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
@@ -37,15 +38,24 @@ class Distance:
         return float(np.linalg.norm(observation.truth["target"] - observation.state)) / self._unit
 
 
+@dataclass(frozen=True)
+class Survey:
+    """Episodes whose start is measured."""
+
+    episodes: Count
+    seed: Seed
+
+
 METRIC = Group("metric", ("mypackage.survey.Metric",))
-JOB = Job(("task", METRIC), {"episodes": Count, "seed": Seed})
+JOB = Job(("task", METRIC, Group("survey", ("mypackage.survey.Survey",))))
 
 
 def run(experiment: Experiment) -> float:
     """Print and return the mean over the episodes."""
     environment, metric = experiment.make_environment()(), build(experiment["metric"], METRIC)
-    first, episodes = experiment["survey"]["seed"], experiment["survey"]["episodes"]
-    mean = float(np.mean([metric.measure(environment.reset(seed)) for seed in range(first, first + episodes)]))
+    survey = experiment.options(Survey)
+    seeds = range(survey.seed, survey.seed + survey.episodes)
+    mean = float(np.mean([metric.measure(environment.reset(seed)) for seed in seeds]))
     environment.close()
     print(f"mean {mean:.3f}")
     return mean

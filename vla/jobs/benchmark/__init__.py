@@ -8,36 +8,16 @@ from __future__ import annotations
 
 import logging
 from importlib import import_module
-from typing import Annotated, Literal
 
-from annotated_types import MinLen
-
-from vla.config.check import TRAINING, Job
 from vla.config.experiment import Experiment
+from vla.config.nodes import Benchmark
 from vla.io.files import write_json
 from vla.io.printable import show
-from vla.io.types import Count
 from vla.jobs.benchmark.measure import BUSY, Measure, OtherLoad, machine
 from vla.parallel.limits import cores
 
 log = logging.getLogger(__name__)
 
-Stage = Literal["collect", "loader", "train", "policy", "evaluate", "deploy", "serve"]
-JOB = Job(
-    (*TRAINING, "policy"),
-    {
-        "names": Annotated[list[Stage], MinLen(1)],
-        "episodes": Count,
-        "batches": Count,
-        "steps": Count,
-        "rounds": Count,
-        "precisions": list[Literal["fp32", "bf16"]] | None,
-        "compile": list[bool],
-        "robosuite": str | None,
-        "lerobot": str | None,
-    },
-    adopts=True,
-)
 MODULES = dict.fromkeys(("policy", "evaluate", "deploy", "serve"), "acting")  # others are named like their stage
 
 
@@ -49,7 +29,7 @@ def run(experiment: Experiment) -> dict[str, Measure]:
     from vla.reports.tables import Table  # imports matplotlib
 
     here, found = machine(), dict[str, Measure]()
-    for name in experiment["benchmark"]["names"]:
+    for name in experiment.options(Benchmark).names:
         stage, others = getattr(import_module(f"{__name__}.{MODULES.get(name, name)}"), name), OtherLoad()
         measured, used = stage(experiment), others.cores()
         found |= {key: {**each, "others": round(used, 2)} for key, each in measured.items()}

@@ -15,6 +15,7 @@ import torch
 from vla.config.build import build
 from vla.config.compose import compose
 from vla.config.experiment import Experiment, plain
+from vla.config.nodes import Benchmark
 from vla.io.documents import parse_json
 from vla.io.errors import UserError
 from vla.jobs.benchmark.measure import Measure, measure, timed
@@ -28,11 +29,11 @@ def policy(experiment: Experiment) -> dict[str, Measure]:
     observation = environment.reset(0)
     environment.close()
     model = experiment.fitted_learner(demonstrations(experiment)).model
-    agent = build(experiment["policy"], "policy", model=model, spec=environment.spec)
+    agent = experiment.build("policy", model=model, spec=environment.spec)
     for _ in range(model.history + 1):  # warm-up: compiles and allocates
         agent.act(observation)
     frame = agent.frame(observation)
-    steps = experiment["benchmark"]["steps"]
+    steps = experiment.options(Benchmark).steps
     acting = _median(lambda: agent.plan(observation), steps)
     with torch.inference_mode():
         kept = agent.window()
@@ -47,7 +48,7 @@ def _median(work: Callable[[], object], rounds: int) -> float:
 
 def evaluate(experiment: Experiment) -> dict[str, Measure]:
     """Measure `job=evaluate` with every recording, in episodes per second; the floor is the same without recordings."""
-    count, rates = experiment["benchmark"]["episodes"], []
+    count, rates = experiment.options(Benchmark).episodes, []
     for recorder in (plain(compose().recorder), None):
         with TemporaryDirectory() as folder:
             asked = {"job": "evaluate", "evaluate.episodes": count, "evaluate.recordings": "all"}
@@ -70,7 +71,7 @@ def deploy(experiment: Experiment) -> dict[str, Measure]:
         for _ in range(loop.episodes):
             operator.play()
         operator.begin_episode()
-        delays = [1000 * operator.watchdog_delay() for _ in range(experiment["benchmark"]["episodes"])]
+        delays = [1000 * operator.watchdog_delay() for _ in range(experiment.options(Benchmark).episodes)]
         image, inference, tick = (
             parse_json(operator.status.get(key, ""), float, f"{key} of /vla_agent/status")
             for key in ("image to command p50 [ms]", "inference p50 [ms]", "tick p99 [ms]")
@@ -87,7 +88,7 @@ def serve(experiment: Experiment) -> dict[str, Measure]:
     """Measure round trips through the loopback interface, beside the policy called in its own process, in turns."""
     from vla.deploy.server import Service
 
-    served, steps = experiment.make_policy()(), experiment["benchmark"]["steps"]
+    served, steps = experiment.make_policy()(), experiment.options(Benchmark).steps
     images = {camera: f"observation.images.{camera}" for camera in served.spec.cameras}
     composed = compose("deploy=server", "agent=remote", "deploy.port=0", f"deploy.largest_message={2**26}")
     server, client = plain(composed.deploy), plain(composed.agent)

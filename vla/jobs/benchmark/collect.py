@@ -6,9 +6,12 @@ from functools import partial
 from tempfile import TemporaryDirectory
 from typing import Any
 
+from vla.config.annotations import locate
 from vla.config.experiment import Experiment
-from vla.config.substitutes import options
+from vla.config.nodes import Benchmark
+from vla.config.packages import CONF
 from vla.data.episodes import EpisodeStore
+from vla.io.documents import read_yaml
 from vla.jobs.benchmark.measure import DURATION, HasMinimalStep, Measure, measure, peer, timed
 from vla.parallel.limits import cores
 from vla.parallel.pool import Cluster
@@ -26,12 +29,12 @@ def collect(experiment: Experiment) -> dict[str, Measure]:
     Then the parts of a step, whose floor is the whole step; its images by each renderer, whose floor is the fastest;
     all processes, whose floor is that of one times their number; and robosuite, if `benchmark.robosuite` names it.
     """
-    asked, unit = experiment["benchmark"], "control steps/s"
+    asked, unit = experiment.options(Benchmark), "control steps/s"
     makers = experiment.make_environment(), experiment.make_expert()
     environment = makers[0]()
     expert = makers[1](environment)
     rollout(environment, expert, 0)  # warm-up: compiles shaders
-    episodes, taken = _timed_parts(environment, expert, asked["episodes"])
+    episodes, taken = _timed_parts(environment, expert, asked.episodes)
     steps = sum(len(episode.actions) for episode in episodes)
     with TemporaryDirectory() as folder:
         store = EpisodeStore.create_or_open(folder, environment.spec, {})
@@ -48,11 +51,11 @@ def collect(experiment: Experiment) -> dict[str, Measure]:
         found[f"collect: {name}"] = measure(1000 * seconds / steps, "ms/step", steps, whole)
     found |= _renderers(experiment)
     work = partial(DemonstrationWorker, *makers)
-    rates = {count: _verified(work, count, asked["episodes"]) for count in (1, cores())}
+    rates = {count: _verified(work, count, asked.episodes) for count in (1, cores())}
     found[f"collect: {cores()} processes"] = measure(rates[cores()], unit, steps, cores() * rates[1])
-    if asked["robosuite"] is not None:
+    if asked.robosuite is not None:
         arguments = (*environment.spec.image_size, DURATION)
-        rivals = {n: peer("robosuite", asked["robosuite"], "robosuite_lift.py", arguments, n) for n in rates}
+        rivals = {n: peer("robosuite", asked.robosuite, "robosuite_lift.py", arguments, n) for n in rates}
         # robosuite verifies nothing: the same work is a rollout without verification.
         found["collect, against robosuite"] = measure(steps / full, unit, steps, rivals[1])
         for count, rival in rivals.items():
@@ -89,12 +92,12 @@ def _keep(store: EpisodeStore, episodes: list[Episode]) -> None:
 
 def _renderers(experiment: Experiment) -> dict[str, Measure]:
     """Measure a step's images by every renderer of the task in turns; one with settings of the user's is "chosen"."""
-    own, choice = experiment["task"].get("renderer"), options("task/renderer")
+    own, choice = experiment.task.get("renderer"), _options()
     if own is None or own["_target_"] not in [node["_target_"] for node in choice.values()]:
         return {}
     nodes = choice if own in choice.values() else {**choice, "chosen": own}
     worlds: dict[str, Any] = {name: experiment.make_environment({"renderer": each})() for name, each in nodes.items()}
-    seconds, rounds = dict.fromkeys(worlds, 0.0), experiment["benchmark"]["episodes"]
+    seconds, rounds = dict.fromkeys(worlds, 0.0), experiment.options(Benchmark).episodes
     for seed in range(rounds):
         for name, world in worlds.items():
             world.reset(seed)
@@ -104,6 +107,17 @@ def _renderers(experiment: Experiment) -> dict[str, Measure]:
         world.close()
     times = {f"collect: rendering, {name}": 1000 * each / FRAMES / rounds for name, each in seconds.items()}
     return {name: measure(each, "ms/step", FRAMES * rounds, min(times.values())) for name, each in times.items()}
+
+
+def _options() -> dict[str, Any]:
+    """Return the renderers that this machine can use."""
+    found = {}
+    for file in sorted((CONF / "task/renderer").glob("*.yaml")):
+        node = read_yaml(file, dict[str, Any])
+        kind: Any = locate("task.renderer._target_", node["_target_"])
+        if not getattr(kind, "substitute", lambda: None)():
+            found[file.stem] = node
+    return found
 
 
 def _verified(make: WorkerFactory, processes: int, episodes_each: int) -> float:

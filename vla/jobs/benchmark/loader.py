@@ -12,6 +12,7 @@ import numpy as np
 from vla.config.build import build
 from vla.config.compose import compose
 from vla.config.experiment import Experiment, plain
+from vla.config.nodes import Benchmark
 from vla.data.episodes import EpisodeStore
 from vla.data.header import Codec
 from vla.data.window_batches import aligned_empty
@@ -32,20 +33,20 @@ def loader(experiment: Experiment) -> dict[str, Measure]:
     Where the size of images is an option of the task, so is a store of large ones from three cameras in two codecs; the
     floor of its size is the raw one. If `benchmark.lerobot` names a Python with LeRobot, so is its loader as a floor.
     """
-    asked, store = experiment["benchmark"], demonstrations(experiment)
+    asked, store = experiment.options(Benchmark), demonstrations(experiment)
     model = experiment.fitted_learner(store).model
     alone = experiment.with_values({"collect.more": None})  # the floor reads one store
     names = {"loader": model.history, "loader: 1 frame": 1, "loader: 6 frames": 6}
     found = {name: _loading(alone, store, frames, model.chunk) for name, frames in names.items()}
-    if "image_size" in experiment["task"]:
+    if "image_size" in experiment.task:
         found |= _of_large_images(alone.with_values({"task.image_size": [LARGE, LARGE]}), model.chunk)
-    if asked["lerobot"] is not None:
-        some = EpisodeStore(store.folder, min(experiment["collect"]["episodes"], PEER_EPISODES))
+    if asked.lerobot is not None:
+        some = EpisodeStore(store.folder, min(experiment.collect.episodes, PEER_EPISODES))
         with TemporaryDirectory() as folder:
             export = plain(compose("export=lerobot", f"output={folder}").export)
             dataset = build(export, "export").export(some, experiment.cluster())
             for name in [*names][1:]:
-                rival = peer("lerobot", asked["lerobot"], "lerobot_windows.py", (dataset, names[name], DURATION))
+                rival = peer("lerobot", asked.lerobot, "lerobot_windows.py", (dataset, names[name], DURATION))
                 own = found[name]
                 found[f"{name}, against LeRobot"] = measure(own["value"], own["unit"], own["n"], rival)
     return found
@@ -54,12 +55,12 @@ def loader(experiment: Experiment) -> dict[str, Measure]:
 def _of_large_images(experiment: Experiment, chunk: int) -> dict[str, Measure]:
     environment, found = experiment.make_environment()(), dict[str, Measure]()
     expert = experiment.make_expert()(environment)
-    seeds = range(experiment["benchmark"]["episodes"])
+    seeds = range(experiment.options(Benchmark).episodes)
     episodes = [_from_three_cameras(rollout(environment, expert, seed)) for seed in seeds]
     environment.close()
     spec = replace(environment.spec, cameras=tuple(episodes[0].observations[0].rgb), depth=(), cut=())
-    every = experiment.with_values({"collect.episodes": None, "data.validation_fraction": 0})
-    for codec in (Codec.suited(spec), Codec("jpeg", experiment["collect"]["quality"])):
+    every = experiment.with_values({"collect.episodes": len(seeds), "data.validation_fraction": 0})
+    for codec in (Codec.suited(spec), Codec("jpeg", experiment.collect.quality)):
         with TemporaryDirectory() as folder:
             store = EpisodeStore.create_or_open(folder, spec, {}, codec)
             with store.writing():
@@ -85,7 +86,7 @@ def _from_three_cameras(episode: Episode) -> Episode:
 
 
 def _loading(experiment: Experiment, store: EpisodeStore, history: int, chunk: int) -> Measure:
-    data, batches = experiment.data(store, history, chunk), experiment["benchmark"]["batches"]
+    data, batches = experiment.data(store, history, chunk), experiment.options(Benchmark).batches
     data.setup("fit")
     images = [store.rows(f"rgb_{camera}")[:] for camera in store.spec.cameras]
     starts = np.array([entry.start for entry in store.episodes])

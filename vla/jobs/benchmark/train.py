@@ -14,6 +14,7 @@ import lightning
 import torch
 
 from vla.config.experiment import Experiment
+from vla.config.nodes import Benchmark
 from vla.io.errors import UserError
 from vla.jobs.benchmark.measure import Measure, measure
 from vla.jobs.collect import demonstrations
@@ -35,26 +36,26 @@ def train(experiment: Experiment) -> dict[str, Measure]:
     Raises:
         UserError: there is nothing to measure, or not enough memory.
     """
-    asked = experiment["benchmark"]
-    precisions = _precisions(asked["precisions"], computes_on_cpu(experiment["trainer"]["accelerator"]))
-    if not precisions or not asked["compile"]:
+    asked = experiment.options(Benchmark)
+    precisions = _precisions(asked.precisions, computes_on_cpu(experiment.trainer["accelerator"]))
+    if not precisions or not asked.compile:
         raise UserError("training is timed in each of benchmark.precisions and benchmark.compile: both need an entry")
     quiet_lightning()
     store, trials = demonstrations(experiment), list[tuple[str, Experiment, Any, list[Stopwatch]]]()
-    for precision, compiled in product(precisions, sorted(set(asked["compile"]))):
+    for precision, compiled in product(precisions, sorted(set(asked.compile))):
         changes = {
             "learner.compile": compiled,
             "trainer.precision": precision,
-            "trainer.max_steps": WARM_UP + asked["steps"],
+            "trainer.max_steps": WARM_UP + asked.steps,
             "trainer.accumulate_grad_batches": 1,
             "trainer.limit_val_batches": 0,
         }
         changed = experiment.with_values(changes)
         name = f"train: {precision}{' compile' if compiled else ''}"
         trials.append((name, changed, changed.fitted_learner(store), []))
-    for _ in range(asked["rounds"]):
+    for _ in range(asked.rounds):
         for _, changed, learner, rounds in trials:
-            model, watch = learner.model, Stopwatch(asked["steps"])
+            model, watch = learner.model, Stopwatch(asked.steps)
             data = changed.data(store, model.history, model.chunk, model.text.tokenize)
             with explain_memory_errors(experiment.config), TemporaryDirectory() as folder:
                 trainer = make_trainer(changed.config, Path(folder) / CHECKPOINTS, watch)
@@ -62,7 +63,7 @@ def train(experiment: Experiment) -> dict[str, Measure]:
             if trainer.received_sigterm:  # Lightning ignores it in the last hook
                 raise KeyboardInterrupt
             rounds.append(watch)
-    found, samples = dict[str, Measure](), asked["steps"] * experiment["data"]["batch_size"]
+    found, samples = dict[str, Measure](), asked.steps * experiment["data"]["batch_size"]
     for name, _, _, rounds in trials:
         seconds, alone = (min(getattr(each, what) for each in rounds) for what in ("seconds", "alone"))
         found[name] = measure(samples / seconds, "samples/s", samples, samples / alone)
