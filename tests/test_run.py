@@ -64,7 +64,7 @@ def test_the_main_job_collects_trains_evaluates_and_records(home: Path) -> None:
     success = header.split(",").index("val/success")
     assert [row.split(",")[success] for row in rows if row.split(",")[success]] == ["0.0", "0.0"]  # hardly trained
     page = (home / "run/report.html").read_text()
-    for words in ("4 steps", "collect.episodes", ">500</code>", "First training batch", 'href="rollouts.rrd"'):
+    for words in ("4 steps", "collect.episodes", ">500</td>", "First training batch", 'href="rollouts.rrd"'):
         assert words in page and "${" not in page, words
     command = report["origin"]["command"]
     assert training["origins"] == [report["origin"]] and command.startswith("python -m vla.run ")
