@@ -44,9 +44,9 @@ def test_large_images_are_loaded_and_their_size_is_extrapolated() -> None:
 
 
 def test_training_without_a_precision_is_refused_before_any_work() -> None:
-    asked = {"benchmark": {"precisions": [], "compile": [True]}, "trainer": {"accelerator": "cpu"}}
+    asked = Experiment.of(composed("job=benchmark", "benchmark.precisions=[]", "trainer.accelerator=cpu"))
     with pytest.raises(ValueError, match="both need an entry"):
-        train(Experiment(asked))
+        train(asked)
 
 
 def test_a_deployment_is_measured_against_its_settings(monkeypatch: pytest.MonkeyPatch) -> None:

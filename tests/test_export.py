@@ -124,7 +124,7 @@ def test_compressed_data_do_not_depend_on_what_was_rendered_before() -> None:
     assert len(printed) == 1
 
 
-@pytest.mark.parametrize("name", ["lerobot", "files"])
+@pytest.mark.parametrize("name", ["files", "lerobot"])
 def test_killed_twice_at_random_an_export_goes_on_and_ends_up_the_same(name: str, tmp_path: Path) -> None:
     store = stored(tmp_path / "store", seeds=range(75))[0]  # 60 episodes, more than one video per camera
     whole = exporter(name, tmp_path / "whole").export(store)

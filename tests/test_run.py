@@ -64,7 +64,7 @@ def test_the_main_job_collects_trains_evaluates_and_records(home: Path) -> None:
     success = header.split(",").index("val/success")
     assert [row.split(",")[success] for row in rows if row.split(",")[success]] == ["0.0", "0.0"]  # hardly trained
     page = (home / "run/report.html").read_text()
-    for words in ("4 steps", "collect.episodes", ">500</code>", "First training batch", 'href="rollouts.rrd"'):
+    for words in ("4 steps", "collect.episodes", ">500</td>", "First training batch", 'href="rollouts.rrd"'):
         assert words in page and "${" not in page, words
     command = report["origin"]["command"]
     assert training["origins"] == [report["origin"]] and command.startswith("python -m vla.run ")
@@ -415,7 +415,9 @@ def test_a_policy_is_trained_further_for_another_goal(home: Path, tmp_path: Path
     before, after = map(read_policy, (tmp_path / "theirs", home / "tuned"))
     assert after.config["task"]["goal"] != before.config["task"]["goal"]
     for name, weight in before.state.items():
-        gathered = name.startswith(("proprioception.", "truth_scale."))  # statistics, of all that was ever seen
+        gathered = name.startswith(
+            ("features.proprioception.", "truth_scale.")
+        )  # statistics, of all that was ever seen
         assert gathered or torch.allclose(after.state[name], weight, atol=1e-9), name
     for other in ("model=rt1_tiny", "tokenizer.bins=64", "model.shift=[0,0]"):
         refused = here(home, *arguments, other, ok=False)
