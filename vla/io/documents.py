@@ -93,15 +93,16 @@ def resolved(value: Any, name: str) -> Any:
         UserError: a value is no mapping, list, text, number or null; a key is no text; or a text contains `${`, which
             would be resolved later.
     """
-    if isinstance(value, list | tuple):
+    # Exact types, because a checkpoint's pickle can make a mapping whose methods hide what it holds.
+    if type(value) in (list, tuple):
         return [resolved(part, name) for part in value]
-    if isinstance(value, dict):
-        if other := [key for key in value if not isinstance(key, str)]:
+    if type(value) is dict:
+        if other := [key for key in value if type(key) is not str]:
             raise UserError(f"{name} holds the key {str(other[0])[:200]}, which is no text")
         return {resolved(key, name): resolved(part, name) for key, part in value.items()}
-    if isinstance(value, str) and "${" in value:
+    if type(value) is str and "${" in value:
         raise UserError(f"{name} holds the reference {value[:200]!r}: only resolved values are read from files")
-    if value is not None and not isinstance(value, bool | int | float | str):
+    if value is not None and type(value) not in (bool, int, float, str):
         raise UserError(f"{name} holds a {type(value).__name__}, which is no plain data")
     return value
 
