@@ -234,7 +234,7 @@ def test_a_policy_is_trained_and_its_errors_measured_without_a_simulator(dataset
     assert all(each["ci_low"] <= each["error"] <= each["ci_high"] for each in errors["components"])
     assert "not a success rate" in done.stdout and "success" not in done.stdout.replace("not a success rate", "")
     page = (tmp_path / "run/report.html").read_text()
-    assert "held-out episodes" in page and "joint2.pos" in page and "success:" not in page
+    assert "Mean absolute errors on 2 held-out episodes" in page and "joint2.pos" in page and "success:" not in page
     assert "${" not in page and str(dataset) in page
     checkpoint = tmp_path / "run"
     again = ("job=evaluate", f"checkpoint={checkpoint}", "hydra.run.dir=again", "output=again")

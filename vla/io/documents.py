@@ -95,6 +95,7 @@ def resolved(value: Any, name: str) -> Any:
         UserError: a value is no mapping, list, text, number or null; a key is no text; a text contains `${`, which
             would be resolved later; or there are more than `MAX_VALUES` values or `MAX_DEPTH` levels.
     """
+    # Exact types, because a checkpoint's pickle can make a mapping whose methods hide what it holds.
     count = itertools.count(1)
 
     def copied(item: Any, depth: int) -> Any:
