@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import logging
 import logging.config
+import subprocess
 import sys
 from pathlib import Path
 from threading import Thread
@@ -19,7 +20,7 @@ from websockets.sync.server import ServerConnection, serve
 
 from vla.config.compose import CONF
 from vla.io.printable import printable, show
-from vla.run import main, sentence
+from vla.run import sentence
 
 TITLE = "\x1b]0;evil\x07"  # sets the title of a terminal
 SHOWN = r"\x1b]0;evil\x07"
@@ -57,12 +58,11 @@ def test_tables_are_printable_and_keep_their_style(monkeypatch: pytest.MonkeyPat
     assert r"\x1b]0;evil" in out.getvalue() and "\x1b[31m1" in out.getvalue() and "\x1b]" not in out.getvalue()
 
 
-def test_a_bug_shows_a_printable_traceback(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    monkeypatch.setattr(sys, "excepthook", sys.excepthook)
-    monkeypatch.setattr(sys, "argv", ["vla", "--help"])
-    main()
-    sys.excepthook(ValueError, ValueError(TITLE), None)
-    assert capsys.readouterr().err == f"ValueError: {SHOWN}\n"
+def test_a_bug_shows_a_printable_traceback() -> None:
+    program = "import vla.run as run\ndef bug(): raise KeyError(chr(27) + ']0;evil')\nrun._compose = bug\nrun.main()"
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert done.returncode == 1 and done.stderr.startswith("Traceback") and "\x1b" not in done.stderr
+    assert done.stderr.endswith(r"KeyError: '\x1b]0;evil'" + "\n")
 
 
 def test_a_servers_error_does_not_command_the_terminal_of_its_client(tmp_path: Path) -> None:
