@@ -15,24 +15,30 @@ from vla.io.files import atomic_path
 from vla.spec import Array
 
 METHOD = "fast-simplification 0.2"  # part of the content's name: another method gives other faces
+Mesh = tuple[Array, Array, Array]  # vertices (V, 3) float32, faces (F, 3) int32, texture coordinates (F, 3 corners, 2)
 
 
-def decimate(vertices: Array, faces: Array, most: int) -> tuple[Array, Array]:
-    """Return vertices (V, 3) float32 and at most about `most` faces (F, 3) int32 near a mesh's surface."""
-    content = hashlib.sha256(f"{METHOD} {most} {len(vertices)}".encode())
-    content.update(np.ascontiguousarray(vertices, np.float32).tobytes())
-    content.update(np.ascontiguousarray(faces, np.int32).tobytes())
+def decimate(vertices: Array, faces: Array, texcoord: Array | None, most: int) -> Mesh:
+    """Return a mesh of at most about `most` faces near a mesh's surface, with its texture in the same places.
+
+    Args:
+        vertices: (V, 3).
+        faces: (F, 3) indices of vertices.
+        texcoord: (F, 3 corners, 2), or None.
+        most: number of faces.
+    """
+    vertices, faces = np.ascontiguousarray(vertices, np.float32), np.ascontiguousarray(faces, np.int32)
+    content = hashlib.sha256(f"{METHOD} {most} {len(vertices)}".encode() + vertices.tobytes() + faces.tobytes())
+    content.update(b"" if texcoord is None else np.ascontiguousarray(texcoord, np.float32).tobytes())
     path = cache_folder() / f"{content.hexdigest()[:32]}.npz"
-    kept = _kept(path)
-    if kept is not None:
-        return kept
-    from fast_simplification import simplify
-
-    fewer = simplify(
-        np.ascontiguousarray(vertices, np.float32), np.ascontiguousarray(faces, np.int32), target_count=most
-    )
-    result = np.asarray(fewer[0], np.float32), np.asarray(fewer[1], np.int32)
-    _keep(path, *result)
+    with suppress(OSError, ValueError, KeyError, EOFError, BadZipFile, zlib.error), np.load(path) as kept:
+        return kept["vertices"], kept["faces"], kept["texcoord"]
+    result = _simplified(vertices, faces, texcoord, most)
+    # Atomically, as other processes may read it; without room for it, do without.
+    with suppress(OSError):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with atomic_path(path) as draft:
+            np.savez(draft, vertices=result[0], faces=result[1], texcoord=result[2])
     return result
 
 
@@ -41,21 +47,44 @@ def cache_folder() -> Path:
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "vla" / "meshes"
 
 
-def _kept(path: Path) -> tuple[Array, Array] | None:
-    """Return vertices and faces in a file, or None if it is not there, cut off or of another kind."""
-    try:
-        with np.load(path) as kept:
-            vertices, faces = kept["vertices"], kept["faces"]
-    except (OSError, ValueError, KeyError, EOFError, BadZipFile, zlib.error):
-        return None
-    right = (vertices.dtype, faces.dtype) == (np.float32, np.int32) and vertices.shape[1:] == faces.shape[1:] == (3,)
-    indexed = right and (not faces.size or 0 <= faces.min() <= faces.max() < len(vertices))
-    return (vertices, faces) if indexed and np.isfinite(vertices).all() else None
+def _simplified(vertices: Array, faces: Array, texcoord: Array | None, most: int) -> Mesh:
+    from fast_simplification import replay_simplification, simplify
+
+    fewer, triangles, collapses = simplify(vertices, faces, target_count=most, return_collapses=True)
+    fewer, triangles = np.asarray(fewer, np.float32), np.asarray(triangles, np.int32)
+    if texcoord is None:
+        return fewer, triangles, np.zeros((*triangles.shape, 2), np.float32)
+    moved, _, target = replay_simplification(vertices, faces, collapses)
+    triangles = target[faces]  # every face that remains is one of the mesh, whose corners were moved
+    one, two, three = triangles.T
+    kept = (one != two) & (two != three) & (three != one)
+    distance = np.linalg.norm(vertices - moved[target], axis=1)
+    coordinates = _transferred(faces, np.asarray(texcoord, np.float32), target, distance)
+    return np.asarray(moved, np.float32), triangles[kept].astype(np.int32), coordinates[kept]
 
 
-def _keep(path: Path, vertices: Array, faces: Array) -> None:
-    """Write the file atomically, as other processes may read it; without room for it, do without."""
-    with suppress(OSError):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with atomic_path(path) as draft:
-            np.savez(draft, vertices=vertices, faces=faces)
+def _transferred(faces: Array, texcoord: Array, target: Array, distance: Array) -> Array:
+    """Return the texture coordinates (F, 3, 2) of the corners of faces after their vertices were merged.
+
+    A corner gets those of the nearest of the vertices that were merged into one. Where a seam of the texture runs
+    through these, only those on the corner's side of it count: what edges within the merged vertices lead to.
+
+    Args:
+        faces: (F, 3) indices of vertices.
+        texcoord: (F, 3, 2) before.
+        target: (V,) vertex that each vertex was merged into.
+        distance: (V,) from there.
+    """
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    corners = np.column_stack([faces.ravel(), texcoord.reshape(-1, 2)])
+    places, index = np.unique(corners, axis=0, return_inverse=True)  # vertices, those on a seam once per side
+    index = index.reshape(faces.shape)
+    starts, ends = index.ravel(), np.roll(index, -1, axis=1).ravel()
+    merged = target[faces].ravel() == target[np.roll(faces, -1, axis=1)].ravel()
+    edges = np.ones(merged.sum(), bool), (starts[merged], ends[merged])
+    label = connected_components(coo_array(edges, shape=(len(places),) * 2), directed=False)[1]
+    weight = 1 / (distance[places[:, 0].astype(int)] ** 2 + 1e-12)
+    sums = [np.bincount(label, weight * values) for values in (places[:, 1], places[:, 2], np.ones(len(places)))]
+    return np.stack([sums[0] / sums[2], sums[1] / sums[2]], axis=1)[label[index]].astype(np.float32)
