@@ -14,7 +14,7 @@ import numpy as np
 
 from vla.tasks.libero.controller import Controller
 from vla.tasks.libero.goal import Goal
-from vla.tasks.libero.package import initial_states, scene_xml, tasks_of
+from vla.tasks.libero.package import tasks_of
 from vla.tasks.libero.scene import Detail, load_scene
 from vla.tasks.libero.starts import Starts, set_start
 

@@ -64,7 +64,11 @@ def composed(task: Any) -> tuple[str, dict[str, Any]]:
         "interest": env.parsed_problem["obj_of_interest"],
         "table": [float(value) for value in env.workspace_offset],
         "fixtures": {
-            name: {"body": model.body(body).name, "position": list(model.body_pos[body]), "quaternion": list(model.body_quat[body])}
+            name: {
+                "body": model.body(body).name,
+                "position": list(model.body_pos[body]),
+                "quaternion": list(model.body_quat[body]),
+            }
             for name, body in fixtures.items()
         },
     }

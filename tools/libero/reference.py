@@ -77,7 +77,10 @@ def measured(task: Any, seed: int) -> dict[str, np.ndarray]:
 
 def main() -> None:
     """Measure all tasks of the suites."""
-    folder, suites = Path(sys.argv[1]), sys.argv[2:] or [f"libero_{name}" for name in ("spatial", "object", "goal", "10")]
+    folder, suites = (
+        Path(sys.argv[1]),
+        sys.argv[2:] or [f"libero_{name}" for name in ("spatial", "object", "goal", "10")],
+    )
     folder.mkdir(parents=True, exist_ok=True)
     for name in suites:
         with contextlib.redirect_stdout(io.StringIO()):

@@ -15,7 +15,7 @@ from vla.spec import FIRST_SEED, Array, Observation, Spec
 from vla.tasks.blind import Blindable
 from vla.tasks.libero.controller import REACH, Controller
 from vla.tasks.libero.goal import Goal
-from vla.tasks.libero.package import SUITES, Task, tasks_of
+from vla.tasks.libero.package import ALL, SUITES, Task, tasks_of
 from vla.tasks.libero.scene import BURNER, VISIBLE, Detail, load_scene
 from vla.tasks.libero.starts import Starts, set_start
 from vla.tasks.rendering.renderer import Renderer, RendererFactory, View
@@ -165,9 +165,9 @@ class Libero(Blindable):
             "object": scene.position(subject),
             "goal": scene.position(place),
             "commanded_position": scene.data.site_xpos[scene.controller.site].copy(),
-            "task": np.array([self._tasks.index(self._task)]),
+            "task": np.array([ALL.index(self._task.suite), self._task.number]),
             "positions": scene.data.qpos.copy(),
-            "bodies": np.concatenate([scene.data.xpos, scene.data.xquat], axis=1),
+            "fixtures": scene.fixtures(self._task),
             "opening": np.array([scene.controller.opening]),
         }
         return Observation(
@@ -196,7 +196,8 @@ class Scene:
         model.mat_reflectance[:] = 0  # of the renderers none draws it
         self._burners = [n for n in range(model.nsite) if model.site(n).name.endswith(BURNER)]
         self._knobs = [
-            model.jnt_qposadr[model.joint(f"{model.site(n).name.removesuffix(BURNER)}_button").id] for n in self._burners
+            model.jnt_qposadr[model.joint(f"{model.site(n).name.removesuffix(BURNER)}_button").id]
+            for n in self._burners
         ]
         model.site_rgba[:, 3] = 0  # marks of regions, not to be seen
         cameras = [known.index(name) for name in spec.cameras]
@@ -212,6 +213,11 @@ class Scene:
         """Return the position (3,) of a thing or region in the world [m]."""
         found = mujoco.mj_name2id(self.model, mujoco.mjtObj.mjOBJ_BODY, f"{thing}_main")
         return (self.data.xpos[found] if found >= 0 else self.data.site(thing).xpos).copy()
+
+    def fixtures(self, task: Task) -> Array:
+        """Return position [m] and quaternion wxyz of the bodies of all fixtures (F, 7), in the order of the task."""
+        bodies = [self.model.body(one["body"]) for one in task.fixtures.values()]
+        return np.array([[*body.pos, *body.quat] for body in bodies]).reshape(-1, 7)
 
     def state(self) -> Array:
         """Return the state (8,) float32."""

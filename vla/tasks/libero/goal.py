@@ -28,10 +28,10 @@ class Goal:
         names = [model.body(number).name for number in range(model.nbody)]
         self.bodies = {name.removesuffix("_main"): n for n, name in enumerate(names) if name.endswith("_main")}
         self.sites = {model.site(number).name: number for number in range(model.nsite)}
-        self._owner = np.zeros(model.nbody, int)  # body → body of the thing that it is part of, 0: of none
+        self.owner = np.zeros(model.nbody, int)  # body → body of the thing that it is part of, 0: of none
         for number in range(1, model.nbody):
             own = names[number].endswith("_main")
-            self._owner[number] = number if own else self._owner[model.body_parentid[number]]
+            self.owner[number] = number if own else self.owner[model.body_parentid[number]]
 
     def reached(self, data: mujoco.MjData) -> bool:
         """Return whether all predicates hold."""
@@ -55,7 +55,7 @@ class Goal:
         """Return the joints of a fixture, or of the one body, such as a drawer, that a region belongs to."""
         bodies = self._model.jnt_bodyid
         if thing in self.bodies:
-            return np.flatnonzero(self._owner[bodies] == self.bodies[thing])
+            return np.flatnonzero(self.owner[bodies] == self.bodies[thing])
         return np.flatnonzero(bodies == self._model.site_bodyid[self.sites[thing]])
 
     def _on(self, data: mujoco.MjData, body: int, place: str) -> bool:
@@ -68,7 +68,7 @@ class Goal:
         # LIBERO turns by the matrix of the site, where its transpose was meant.
         gap = data.site_xmat[site].reshape(3, 3) @ (data.xpos[body] - data.site_xpos[site])
         over = size[2] + OVER[0] < gap[2] < size[2] + OVER[1] and bool((np.abs(gap[:2]) < size[:2]).all())
-        owner = self._owner[self._model.site_bodyid[site]]  # 0: a part of the table, which needs no touch
+        owner = self.owner[self._model.site_bodyid[site]]  # 0: a part of the table, which needs no touch
         return over and (owner == 0 or self.touch(data, body, owner))
 
     def _in(self, data: mujoco.MjData, body: int, place: str) -> bool:
@@ -80,5 +80,5 @@ class Goal:
 
     def touch(self, data: mujoco.MjData, one: int, other: int) -> bool:
         """Return whether two things, by their bodies, are in contact."""
-        pairs = self._owner[self._model.geom_bodyid[data.contact.geom[: data.ncon]]]
+        pairs = self.owner[self._model.geom_bodyid[data.contact.geom[: data.ncon]]]
         return bool((np.sort(pairs, axis=1) == sorted((one, other))).all(axis=1).any())

