@@ -6,7 +6,7 @@ read from the goal's predicates; where to grasp is computed from what collides, 
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -40,6 +40,8 @@ HELD = -0.3  # largest commanded opening at which the fingers press
 ARM = (0.34, 0.72)  # horizontal distances from the base between which the arm neither folds up nor stretches [m]
 CARRY = 0.05  # height over all that is on the way [m]
 SPACING = 0.015  # between points on surfaces [m]
+UP = np.array([0.0, 0.0, 1.0])
+UPRIGHT = -0.9  # largest vertical component of where a hand that points down points
 YAWS = np.radians(np.arange(-90, 91, 15))
 ORDER = ("open", "turnon", "on", "in", "close", "turnoff")  # in which parts of a goal are done
 
@@ -127,16 +129,26 @@ class Situation:
             return self._command(self.hand, self.yaw, -1.0)  # let go of what is where it should be
         held = touched if self.opening < HELD else None
         part = next((part for part in todo if held is not None and part[1] == held), todo[0])
-        if part[0] in ("on", "in"):
-            return self._carry(part[1], part[2]) if part[1] == held else self._reach(part[1], part[2])
-        raise NotImplementedError(part)
+        if part[0] in ("on", "in") and part[1] != held and self._shut(part[2]):
+            part = ("open", part[2])
+        if part[0] == "open":
+            return self._pull(part[1], touched)
+        if self.rotation[2, 2] > UPRIGHT:
+            return self._withdraw()
+        if part[0] == "turnon":
+            return self._twist(part[1], touched)
+        if part[0] == "close":
+            return self._push(part[1])
+        return self._carry(part[1], part[2]) if part[1] == held else self._reach(part[1], part[2])
 
     # Skills
 
     def _reach(self, thing: str, place: str) -> Array:
         """Grasp a thing from above that is then carried to a place."""
-        points = self.points(thing)
-        grasp = self.grasp(thing, place)
+        return self._approach(self.grasp(thing, place), self.points(thing), thing)
+
+    def _approach(self, grasp: Grasp, points: Array, thing: str) -> Array:
+        """Move to a grasp of points (N, 3) of a thing from above, and close the fingers there."""
         offset = grasp.position - self.hand
         away, turn = float(np.hypot(*offset[:2])), abs(grasp.yaw - self.yaw)
         there = away < NEAR and turn < TURNED
@@ -167,7 +179,94 @@ class Situation:
         )
         return self._command(self._rising(self.hand + offset + np.array([0.0, 0.0, lift])), self.yaw, 1.0)
 
+    def _pull(self, place: str, touched: str | None) -> Array:
+        """Open a drawer by its handle: the hand comes from the front, one finger over the bar and one under it."""
+        joint = int(self.goal.joints(place)[0])
+        way = -self.data.xaxis[joint]  # openings are negative
+        parts = self._moving(joint)
+        bar = max(parts, key=lambda points: float((points @ way).max()))
+        middle = (bar.max(axis=0) + bar.min(axis=0)) / 2
+        turned = np.stack([UP, np.cross(-way, UP), -way], axis=1)
+        if touched is not None and self.opening < HELD:
+            return self._move(self.hand + 0.05 * way, turned, 1.0)
+        offset = self.hand - middle
+        before, aside = float(offset @ way), float(np.linalg.norm(offset - (offset @ way) * way))
+        wrong = float(np.linalg.norm(self._turn(turned)))
+        if aside < NEAR and wrong < 2 * TURNED and abs(before) < LEVEL:
+            return self._move(middle, turned, 1.0)
+        if aside < 2 * NEAR and wrong < 2 * TURNED and self.opening > 0.9:
+            return self._move(middle, turned, -1.0)
+        if before < 0.09 and self.hand[2] < self._tops().max() and wrong > 0.5:
+            return self._move(self.hand + np.array([0, 0, 0.05]), turned, -1.0)
+        return self._move(middle + 0.11 * way, turned, -1.0)
+
+    def _twist(self, thing: str, touched: str | None) -> Array:
+        """Turn a knob: grasp it from above across its narrow side, and turn the hand."""
+        joint = int(self.goal.joints(thing)[0])
+        options = list(self._parts(self._moving(joint)))
+        grasp = min(options, key=lambda one: one[0] + 0.02 * abs(one[1].yaw - self.yaw))[1]
+        anchor = self.data.xanchor[joint]
+        grasp = Grasp(np.array([*anchor[:2], grasp.position[2]]), grasp.yaw)
+        if touched is not None and self.opening < HELD:
+            return self._command(grasp.position, self.yaw + 0.4, 1.0)
+        return self._approach(grasp, np.concatenate(self._moving(joint)), thing)
+
+    def _push(self, thing: str) -> Array:
+        """Close a drawer or a door: push it, from outside, with closed fingers at its far end."""
+        joint = int(self.goal.joints(thing)[0])
+        points = np.concatenate(self._moving(joint))
+        axis, anchor = self.data.xaxis[joint], self.data.xanchor[joint]
+        way = np.tile(axis, (len(points), 1))
+        if self.model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_HINGE:
+            arms = points - anchor - np.outer((points - anchor) @ axis, axis)
+            far = np.linalg.norm(arms, axis=1)
+            points, arms = points[far > 0.8 * far.max()], arms[far > 0.8 * far.max()]
+            way = np.cross(axis, arms)
+        ahead = way.mean(axis=0) / np.linalg.norm(way.mean(axis=0))
+        depth = points @ ahead
+        face = points[depth < depth.min() + 0.012]
+        contact = np.array([*face[:, :2].mean(axis=0), max(face[:, 2].max() - 0.02, face[:, 2].mean())])
+        offset = self.hand - contact
+        before = float(offset @ ahead)
+        aside = float(np.linalg.norm((offset - before * ahead)[:2]))
+        yaw = float(np.arctan2(ahead[1], ahead[0]))
+        yaw = (yaw + np.pi / 2) % np.pi - np.pi / 2  # the fingers' broad side pushes
+        if -0.06 < before < 0.02 and aside < 0.03 and abs(offset[2]) < 0.03:
+            return self._command(contact + 0.05 * ahead, yaw, 1.0)
+        start = contact - 0.045 * ahead
+        if np.linalg.norm((self.hand - start)[:2]) > 0.012:
+            start[2] = max(self._tops(thing).max(), contact[2]) + 0.04
+        return self._command(self._rising(start), yaw, 1.0)
+
+    def _withdraw(self) -> Array:
+        """Move a hand that does not point down away from where it points, then let it point down."""
+        near = np.linalg.norm(self._others("") - self.hand, axis=1).min() < 0.09
+        if near:
+            return self._move(self.hand - 0.05 * self.rotation[:, 2], self.rotation, -1.0)
+        return self._command(self.hand + np.array([0, 0, 0.03]), 0.0, -1.0)
+
+    def _shut(self, place: str) -> bool:
+        """Return whether a place is in a drawer or behind a door that must be opened first."""
+        if place in self.goal.bodies or not len(self.goal.joints(place)):
+            return False
+        body = int(self.model.site_bodyid[self.goal.sites[place]])
+        name = next((name for name, root in self.goal.bodies.items() if root == self.goal.owner[body]), "")
+        return name.startswith(("wooden_cabinet", "white_cabinet")) and not self.goal.holds(self.data, "open", place)
+
     # Geometry
+
+    def _moving(self, joint: int) -> list[Array]:
+        """Return points (N, 3) on each geom of the body that a joint moves [m]."""
+        body = int(self.model.jnt_bodyid[joint])
+        turn, place = self.data.xmat[body].reshape(3, 3), self.data.xpos[body]
+        thing = next(name for name, root in self.goal.bodies.items() if root == self.goal.owner[body])
+        return [local @ turn.T + place for local in self._geoms[thing][body]]
+
+    def _tops(self, thing: str = "") -> Array:
+        """Return heights (N,) of what stands near the hand [m]."""
+        rest = self._others("")
+        near = np.linalg.norm(rest[:, :2] - self.hand[:2], axis=1) < HAND + 0.05
+        return np.append(rest[near, 2], -np.inf)
 
     def points(self, thing: str) -> Array:
         """Return points (N, 3) on the surface of a thing [m]."""
@@ -187,7 +286,7 @@ class Situation:
         points, others = self.points(thing), self._others(thing)
         others = others[np.linalg.norm(others[:, :2] - points[:, :2].mean(axis=0), axis=1) < 0.25]
         way = self.spot(thing, place) - self.data.xpos[self.goal.bodies[thing]]
-        kinds = [list(kind) for kind in (self._across(points), self._walls(points), self._parts(thing))]
+        kinds = [list(kind) for kind in (self._across(points), self._walls(points), self._parts(self._pieces(thing)))]
         fitting = ([(width, one) for width, one in kind if self._fits(one, points)] for kind in kinds)
         options = next((kind for kind in fitting if kind), kinds[1])
         costs = [
@@ -217,19 +316,25 @@ class Situation:
                 edge = points[np.linalg.norm(points[:, :2] - spot, axis=1) < 0.012, 2].max()
                 yield 0.01, Grasp(np.array([*(spot - side * INWARDS * closing), edge - RIM]), float(yaw))
 
-    def _parts(self, thing: str) -> Iterator[tuple[float, Grasp]]:
-        top = self.points(thing)[:, 2].max()
-        for body, geoms in self._geoms[thing].items():
-            for local in geoms:
-                points = local @ self.data.xmat[body].reshape(3, 3).T + self.data.xpos[body]
-                height = max(points[:, 2].max() - 0.02, points[:, 2].min() + TIP, top - PALM)
-                if height > points[:, 2].max() - 0.004:
-                    continue
-                for yaw in YAWS:
-                    width = float(np.ptp(points[:, :2] @ _axes(yaw)[0]))
-                    if width < WIDEST / 2:
-                        middle = (points[:, :2].max(axis=0) + points[:, :2].min(axis=0)) / 2
-                        yield width, Grasp(np.array([*middle, height]), float(yaw))
+    def _pieces(self, thing: str) -> list[Array]:
+        """Return points (N, 3) on each geom of a thing [m]."""
+        return [
+            local @ self.data.xmat[body].reshape(3, 3).T + self.data.xpos[body]
+            for body, geoms in self._geoms[thing].items()
+            for local in geoms
+        ]
+
+    def _parts(self, pieces: Sequence[Array]) -> Iterator[tuple[float, Grasp]]:
+        top = max(points[:, 2].max() for points in pieces)
+        for points in pieces:
+            height = max(points[:, 2].max() - 0.02, points[:, 2].min() + TIP, top - PALM)
+            if height > points[:, 2].max() - 0.004:
+                continue
+            for yaw in YAWS:
+                width = float(np.ptp(points[:, :2] @ _axes(yaw)[0]))
+                if width < WIDEST / 2:
+                    middle = (points[:, :2].max(axis=0) + points[:, :2].min(axis=0)) / 2
+                    yield width, Grasp(np.array([*middle, height]), float(yaw))
 
     def _fits(self, grasp: Grasp, points: Array) -> bool:
         """Return whether the open fingers do not come down on the thing itself."""
@@ -341,15 +446,18 @@ class Situation:
 
     def _command(self, target: Array, yaw: float, grip: float) -> Array:
         """Return the command that moves the hand, pointing down, towards a position and a yaw."""
+        sine, cosine = np.sin(yaw), np.cos(yaw)
+        return self._move(target, np.array([[-sine, cosine, 0], [cosine, sine, 0], [0, 0, -1]]), grip)
+
+    def _move(self, target: Array, turned: Array, grip: float) -> Array:
+        """Return the command that moves the hand towards a position and a rotation (3, 3): closing, across, ahead."""
         move = GAIN * (target - self.hand) / REACH[:3]
         move /= max(1.0, float(np.abs(move).max()))
-        turn = np.clip(TURN_GAIN * self._turn(yaw) / REACH[3:], -1, 1)
-        return np.array([*move, *turn, grip])
+        turn = TURN_GAIN * self._turn(turned) / REACH[3:]
+        return np.array([*move, *(turn / max(1.0, float(np.abs(turn).max()))), grip])
 
-    def _turn(self, yaw: float) -> Array:
-        """Return the rotation vector (3,), in the world, to a hand that points down and closes at a yaw."""
-        sine, cosine = np.sin(yaw), np.cos(yaw)
-        wanted = np.array([[-sine, cosine, 0], [cosine, sine, 0], [0, 0, -1]])
+    def _turn(self, wanted: Array) -> Array:
+        """Return the rotation vector (3,), in the world, from the hand's rotation to another one."""
         quaternion, vector = np.empty(4), np.empty(3)
         mujoco.mju_mat2Quat(quaternion, (wanted @ self.rotation.T).ravel())
         mujoco.mju_quat2Vel(vector, quaternion, 1.0)
